@@ -1,6 +1,5 @@
-//! Gradient steps of every algorithm at Hopper's shapes, QUAD's also in parts, and the machine's peaks at these shapes, which
-//! bound them.
-//! `deploy/bench.sh` makes a table of the results.
+//! Gradient steps of every algorithm at Hopper's shapes, QUAD's also in parts, and the machine's
+//! peaks at these shapes, which bound them. `deploy/bench.sh` makes a table of the results.
 
 #![allow(clippy::expect_used)] // what cannot be had ends the run
 
@@ -12,7 +11,8 @@ use quad_dataset::{Arrays, Transitions};
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_kernels::product::{Matrix::RowMajor, by_gemm};
 use quad_policy::{
-    Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weighted, Weights, open_gpu,
+    Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision,
+    Weighted, Weights, open_gpu,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -27,8 +27,9 @@ const DIMS: (usize, usize) = (11, 3);
 /// The task whose values all algorithms but QUAD are measured with.
 const TASK: &str = "hopper-medium-v2";
 
-/// Other configurations that are measured: task, algorithm, and next actions sampled per state. deploy/bench/bench.py knows
-/// QUAD's shapes; algorithms/benches/jax_step.py names all as they are named here.
+/// Other configurations that are measured: task, algorithm, and next actions sampled per state.
+/// deploy/bench/bench.py knows QUAD's shapes; algorithms/benches/jax_step.py names all as they are
+/// named here.
 const CONFIGURATIONS: [(&str, [&str; 2], Option<u32>); 4] = [
     ("paper, 10 samples", ["hopper-medium-replay-v2", "quad"], Some(10)),
     ("paper, 1 sample", ["hopper-medium-replay-v2", "quad"], Some(1)),
@@ -45,9 +46,12 @@ struct Experiment {
 }
 
 fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment {
-    let definition = ALGORITHMS.into_iter().find(|known| known.name == algorithm).expect("an algorithm");
+    let definition =
+        ALGORITHMS.into_iter().find(|known| known.name == algorithm).expect("an algorithm");
     let mut values = Values::of(&definition).expect("its values").for_task(Some(task));
-    let Some(toml::Value::Table(mut agent)) = values.remove("agent") else { panic!("no values for {task}") };
+    let Some(toml::Value::Table(mut agent)) = values.remove("agent") else {
+        panic!("no values for {task}")
+    };
     agent.extend(samples.map(|samples| ("samples".to_owned(), samples.into())));
     let number = |name: &str| values[name].as_integer().expect("a whole number");
     let (batch_size, total_steps) = (number("batch_size") as usize, number("steps") as u64);
@@ -103,18 +107,28 @@ fn updates(criterion: &mut Criterion) {
     for (group, device, precision) in groups {
         let mut group = criterion.benchmark_group(group);
         group.sample_size(20);
-        let others =
-            ALGORITHMS.iter().filter(|known| known.name != "quad").map(|known| (known.name, [TASK, known.name], None));
+        let others = ALGORITHMS
+            .iter()
+            .filter(|known| known.name != "quad")
+            .map(|known| (known.name, [TASK, known.name], None));
         for (name, which, samples) in CONFIGURATIONS.into_iter().chain(others) {
             let experiment = experiment(which, samples);
             let context = context(&experiment, precision, &device);
-            let mut agent = Agent::new(experiment.definition, &experiment.agent, context).expect("usable values");
-            let items: Vec<u32> = (0..experiment.batch_size).map(|i| (i % agent.items()) as u32).collect();
+            let mut agent = Agent::new(experiment.definition, &experiment.agent, context)
+                .expect("usable values");
+            let items: Vec<u32> =
+                (0..experiment.batch_size).map(|i| (i % agent.items()) as u32).collect();
             let phases = agent.phases();
             for (i, start) in phases.iter().enumerate() {
                 agent.skip_to(*start);
-                let name = if phases.len() == 1 { name.to_owned() } else { format!("{name}, phase {}", i + 1) };
-                group.bench_function(name, |bencher| bencher.iter(|| agent.update(&items).expect("a step")));
+                let name = if phases.len() == 1 {
+                    name.to_owned()
+                } else {
+                    format!("{name}, phase {}", i + 1)
+                };
+                group.bench_function(name, |bencher| {
+                    bencher.iter(|| agent.update(&items).expect("a step"))
+                });
             }
         }
         group.finish();
@@ -127,14 +141,18 @@ fn peaks(criterion: &mut Criterion) {
     let (rows, width, threads) = (128, 256, 0..rayon::current_num_threads());
     let mut group = criterion.benchmark_group("peak");
     group.sample_size(10);
-    let mut tiles: Vec<_> =
-        threads.clone().map(|_| (numbers(rows * width), numbers(width * width), vec![0.0_f32; rows * width])).collect();
+    let mut tiles: Vec<_> = threads
+        .clone()
+        .map(|_| (numbers(rows * width), numbers(width * width), vec![0.0_f32; rows * width]))
+        .collect();
     let product = |(x, w, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
         for _ in 0..REPEAT {
             by_gemm([rows, width, width], RowMajor(x), RowMajor(w), out);
         }
     };
-    group.bench_function("product", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(product)));
+    group.bench_function("product", |bencher| {
+        bencher.iter(|| tiles.par_iter_mut().for_each(product))
+    });
     let zero = vec![0.0; width];
     let mish = |(x, _, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
         for _ in 0..REPEAT {
@@ -149,7 +167,9 @@ fn peaks(criterion: &mut Criterion) {
             activate_with_slope(Activation::Mish, out, &zero, &mut w[..rows * width]);
         }
     };
-    group.bench_function("mish and slope", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(slope)));
+    group.bench_function("mish and slope", |bencher| {
+        bencher.iter(|| tiles.par_iter_mut().for_each(slope))
+    });
     group.finish();
 }
 
@@ -158,18 +178,32 @@ fn parts(criterion: &mut Criterion) {
     for (name, which, samples) in CONFIGURATIONS {
         let Some(samples) = samples else { continue };
         let mut group = criterion.benchmark_group(name);
-        group.sample_size(20).measurement_time(Duration::from_secs(2)).warm_up_time(Duration::from_millis(500));
-        parts_of(&mut group, &experiment(which, Some(samples)), samples as usize).expect("candle works");
+        group
+            .sample_size(20)
+            .measurement_time(Duration::from_secs(2))
+            .warm_up_time(Duration::from_millis(500));
+        parts_of(&mut group, &experiment(which, Some(samples)), samples as usize)
+            .expect("candle works");
         group.finish();
     }
 }
 
 /// Benchmarks `work` on a thread of the pool, as an update runs.
-fn bench<R: Send>(group: &mut BenchmarkGroup<'_, WallTime>, name: &str, mut work: impl FnMut() -> Result<R> + Send) {
-    group.bench_function(name, |bencher| bencher.iter(|| rayon::scope(|_| work()).expect("candle works")));
+fn bench<R: Send>(
+    group: &mut BenchmarkGroup<'_, WallTime>,
+    name: &str,
+    mut work: impl FnMut() -> Result<R> + Send,
+) {
+    group.bench_function(name, |bencher| {
+        bencher.iter(|| rayon::scope(|_| work()).expect("candle works"))
+    });
 }
 
-fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, samples: usize) -> Result<()> {
+fn parts_of(
+    group: &mut BenchmarkGroup<'_, WallTime>,
+    experiment: &Experiment,
+    samples: usize,
+) -> Result<()> {
     let count = |name: &str| experiment.agent[name].as_integer().expect("a whole number") as usize;
     let (b, k, steps) = (experiment.batch_size, count("critics"), count("diffusion_steps"));
     let (observation_dim, action_dim) = DIMS;
@@ -192,13 +226,18 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     let next = target_actor.sample(&observations, &noise)?;
     bench(group, "target critics", || target_critics.values(&observations, &next));
     let regress = |critics: &Ensemble| {
-        Gradients::of(&critics.squared_error(&observations, &actions, &targets)?)?.with_respect_to(critics.weights())
+        Gradients::of(&critics.squared_error(&observations, &actions, &targets)?)?
+            .with_respect_to(critics.weights())
     };
     bench(group, "critic step", || regress(&critics));
     let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
     let gradient = regress(&critics)?.copy()?;
-    bench(group, "critic optimizer", || critic_adam.descend(critics.weights_mut(), &gradient, step));
-    bench(group, "critic EMA", || target_critics.weights_mut().ema_update(critics.weights(), 0.005));
+    bench(group, "critic optimizer", || {
+        critic_adam.descend(critics.weights_mut(), &gradient, step)
+    });
+    bench(group, "critic EMA", || {
+        target_critics.weights_mut().ema_update(critics.weights(), 0.005)
+    });
     bench(group, "Q-gradients' scale", || target_critics.values(&observations, &actions));
     bench(group, "Q-gradients", || target_critics.action_gradients(&observations, &actions));
     let t = Tensor::from_iter((0..b).map(|i| (i % steps + 1) as u32), observations.device())?;
@@ -226,8 +265,8 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
 criterion_group!(benches, peaks, updates, parts);
 
 fn main() {
-    // As the learner has it (quad_runtime::choose_threads): candle's own pool and Rayon's would take turns on the cores.
-    // SAFETY: there is no other thread yet.
+    // As the learner has it (quad_runtime::choose_threads): candle's own pool and Rayon's would
+    // take turns on the cores. SAFETY: there is no other thread yet.
     unsafe { std::env::set_var("CANDLE_NUM_THREADS", "1") };
     benches();
     Criterion::default().configure_from_args().final_summary();

@@ -1,4 +1,5 @@
-//! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads its whole state.
+//! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads
+//! its whole state.
 
 use crate::algorithm::{Algorithm, AlgorithmError, Measured};
 use crate::context::Context;
@@ -58,12 +59,18 @@ impl Agent {
     ///
     /// # Errors
     /// They cannot be used, or candle fails.
-    pub fn new(definition: Definition, table: &toml::Table, context: Context) -> Result<Self, AlgorithmError> {
+    pub fn new(
+        definition: Definition,
+        table: &toml::Table,
+        context: Context,
+    ) -> Result<Self, AlgorithmError> {
         let (device, transitions) = (context.device.clone(), context.transitions.len());
-        let scaling = Some(context.transitions.scaling().clone()).filter(|scaling| *scaling != Scaling::default());
+        let scaling = Some(context.transitions.scaling().clone())
+            .filter(|scaling| *scaling != Scaling::default());
         let names = context.transitions.names().clone();
         let algorithm = (definition.start)(table, context)?;
-        // Each thread has a queue of its own on a GPU; the next thread must find what this one has made.
+        // Each thread has a queue of its own on a GPU; the next thread must find what this one has
+        // made.
         device.synchronize()?;
         Ok(Self { definition, algorithm, device, transitions, scaling, names, step: 0 })
     }
@@ -99,8 +106,8 @@ impl Agent {
         self.step = step;
     }
 
-    /// One update on the items of these numbers. Gives the values of the metrics, in the order of their table; none of those
-    /// that this update did not measure.
+    /// One update on the items of these numbers. Gives the values of the metrics, in the order of
+    /// their table; none of those that this update did not measure.
     ///
     /// # Errors
     /// Candle fails.
@@ -114,20 +121,26 @@ impl Agent {
         Ok(self.in_order(&measured).collect())
     }
 
-    /// What the last update would measure on the items of these numbers if no network moved, as [`Self::update`] gives it, but
-    /// only of metrics that are measured on held-out episodes. Nothing is changed.
+    /// What the last update would measure on the items of these numbers if no network moved, as
+    /// [`Self::update`] gives it, but only of metrics that are measured on held-out episodes.
+    /// Nothing is changed.
     ///
     /// # Errors
     /// Candle fails.
     pub fn evaluate(&self, items: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
         let measured = self.algorithm.evaluate(self.step.saturating_sub(1), items)?;
         let metrics = self.metrics().iter();
-        Ok(self.in_order(&measured).zip(metrics).map(|(value, metric)| value.filter(|_| metric.held_out)).collect())
+        Ok(self
+            .in_order(&measured)
+            .zip(metrics)
+            .map(|(value, metric)| value.filter(|_| metric.held_out))
+            .collect())
     }
 
     /// Values in the order of the table.
     fn in_order(&self, measured: &Measured) -> impl Iterator<Item = Option<f32>> {
-        let value = |name| measured.iter().find(|(known, _)| *known == name).map(|(_, value)| *value);
+        let value =
+            |name| measured.iter().find(|(known, _)| *known == name).map(|(_, value)| *value);
         self.metrics().iter().map(move |metric| value(metric.name))
     }
 
@@ -139,11 +152,13 @@ impl Agent {
         let (policy, tensors) = self.algorithm.policy()?;
         let Names { observations: observation_names, actions: action_names } = self.names.clone();
         let scaling = self.scaling.clone();
-        let header = Header { scaling, observation_names, action_names, ..Header::new(policy, origin) };
+        let header =
+            Header { scaling, observation_names, action_names, ..Header::new(policy, origin) };
         Ok(header.to_safetensors(&tensors)?)
     }
 
-    /// Everything that decides the future of the run, as one safetensors file: the same bytes for the same state.
+    /// Everything that decides the future of the run, as one safetensors file: the same bytes for
+    /// the same state.
     ///
     /// # Errors
     /// A number that is not finite: a state with no future.
@@ -159,7 +174,10 @@ impl Agent {
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
         let counters: Counters = read_header(bytes, COUNTERS)?;
         if counters.algorithm != self.definition.name {
-            return Err(StateError::Algorithm { found: counters.algorithm, expected: self.definition.name });
+            return Err(StateError::Algorithm {
+                found: counters.algorithm,
+                expected: self.definition.name,
+            });
         }
         let mut tensors = read_tensors(bytes)?;
         self.algorithm.parts().load(&mut tensors)?;

@@ -1,4 +1,5 @@
-//! An algorithm in the middle of a run: its update, the policy to publish, its state as one list of named parts, and its errors.
+//! An algorithm in the middle of a run: its update, the policy to publish, its state as one list of
+//! named parts, and its errors.
 
 use candle_core::{Result, Tensor};
 use quad_policy::{PolicyConfig, PolicyError, Tensors};
@@ -10,25 +11,27 @@ pub type Measured = Vec<(&'static str, f32)>;
 
 /// An algorithm in the middle of a run.
 pub trait Algorithm: Send {
-    /// How many items updates draw from, of a dataset with so many transitions: these, unless it says otherwise.
+    /// How many items updates draw from, of a dataset with so many transitions: these, unless it
+    /// says otherwise.
     fn items(&self, transitions: usize) -> usize {
         transitions
     }
 
-    /// The steps at which phases begin whose updates take another time than those before; one phase, unless it says otherwise.
+    /// The steps at which phases begin whose updates take another time than those before; one
+    /// phase, unless it says otherwise.
     fn phases(&self) -> Vec<u64> {
         vec![0]
     }
 
-    /// Update number `step`, from 0, on the items of these numbers; its random numbers are a function of the run's seed and of
-    /// `step`.
+    /// Update number `step`, from 0, on the items of these numbers; its random numbers are a
+    /// function of the run's seed and of `step`.
     ///
     /// # Errors
     /// Candle fails.
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured>;
 
-    /// What update number `step` would measure on the items of these numbers if no network moved: its losses with the weights
-    /// as they are. Nothing is changed.
+    /// What update number `step` would measure on the items of these numbers if no network moved:
+    /// its losses with the weights as they are. Nothing is changed.
     ///
     /// # Errors
     /// Candle fails.
@@ -40,7 +43,8 @@ pub trait Algorithm: Send {
     /// Candle fails.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)>;
 
-    /// Everything that updates change, by name: with the step it decides the future of the run. Saving and loading go by it.
+    /// Everything that updates change, by name: with the step it decides the future of the run.
+    /// Saving and loading go by it.
     fn parts(&mut self) -> Parts<'_>;
 }
 
@@ -60,7 +64,9 @@ pub enum AlgorithmError {
     #[error("no episode of the dataset has {0} transitions (agent.shortest_episode)")]
     ShortEpisodes(usize),
     /// The dataset has no window of this many transitions to learn from.
-    #[error("no episode of the dataset has {0} transitions, which this algorithm plans ahead, and none terminates")]
+    #[error(
+        "no episode of the dataset has {0} transitions, which this algorithm plans ahead, and none terminates"
+    )]
     NoWindow(usize),
     /// A tensor cannot be computed or moved.
     #[error("candle failed")]
@@ -78,7 +84,9 @@ impl AlgorithmError {
             Self::ShortEpisodes(_) => {
                 "`learner datasets inspect` says how long episodes are; --agent shortest_episode=1 keeps them all"
             }
-            Self::NoWindow(_) => "a shorter horizon (--agent network.horizon=4, say), or longer episodes",
+            Self::NoWindow(_) => {
+                "a shorter horizon (--agent network.horizon=4, say), or longer episodes"
+            }
             Self::Policy(_) | Self::Agent(_) | Self::Candle(_) => {
                 "`learner presets TASK` prints hyper-parameters that work; smaller networks and batches take less memory"
             }
@@ -114,7 +122,8 @@ pub(super) fn check(
     if holds { Ok(()) } else { Err(AgentError::Range { field, value: value.to_string(), range }) }
 }
 
-/// The smaller of the critics' values, `[K, B]` → `[B]`. (`min` ignores NaN; adding 0·sum keeps it.)
+/// The smaller of the critics' values, `[K, B]` → `[B]`. (`min` ignores NaN; adding 0·sum keeps
+/// it.)
 pub(super) fn smaller(values: &Tensor) -> Result<Tensor> {
     values.min(0)? + (values.sum(0)? * 0.0)?
 }

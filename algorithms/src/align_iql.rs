@@ -1,7 +1,8 @@
-//! AlignIQL (He, Shen and Wang 2024, "AlignIQL: Policy Alignment in Implicit Q-Learning through Constrained Optimization"):
-//! IQL's critics and a diffusion policy that only clones the data, trained side by side. The policy is aligned with the
-//! critics when it acts: of its samples it takes the one whose Q is closest to V. Equations of critics and V are IQL's; what
-//! is left out, and what its authors' code does, is in docs/deviations.md.
+//! AlignIQL (He, Shen and Wang 2024, "AlignIQL: Policy Alignment in Implicit Q-Learning through
+//! Constrained Optimization"): IQL's critics and a diffusion policy that only clones the data,
+//! trained side by side. The policy is aligned with the critics when it acts: of its samples it
+//! takes the one whose Q is closest to V. Equations of critics and V are IQL's; what is left out,
+//! and what its authors' code does, is in docs/deviations.md.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -20,8 +21,8 @@ use super::replay::Computed;
 use super::trained::{Trained, ensemble};
 use candle_core::{Device, Result, Tensor};
 use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, MlpConfig, Reduce, Reverse, Rule,
-    Tensors, Weighted, cosine_decay,
+    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, MlpConfig, Reduce,
+    Reverse, Rule, Tensors, Weighted, cosine_decay,
 };
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
@@ -97,7 +98,12 @@ impl Config {
             ..DiffusionShape::default()
         };
         let networks = Networks::new(shape, *self.weight_decay, context)?;
-        let value = EnsembleShape { members: 1, action_dim: 0, layers: self.value.clone(), ..networks.shape.critics() };
+        let value = EnsembleShape {
+            members: 1,
+            action_dim: 0,
+            layers: self.value.clone(),
+            ..networks.shape.critics()
+        };
         let value = ensemble(value, &networks.context, 2)?;
         Ok(Diffusion::new(networks, AlignIql { config: self, rule, value }))
     }
@@ -116,11 +122,19 @@ impl AlignIql {
         Ok(Loss::new("value_loss", expectile_loss(&u, *self.config.expectile)?))
     }
 
-    /// Q(s, a) toward r + γ·V(s'), IQL's Eq. 6. Also measures V and, with the smaller Q̂(s, a), the advantage.
+    /// Q(s, a) toward r + γ·V(s'), IQL's Eq. 6. Also measures V and, with the smaller Q̂(s, a), the
+    /// advantage.
     fn critic_loss(&self, networks: &Networks, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
         let value = self.value.network.detach();
-        let targets = batch.target(*self.config.gamma, &value.state_values(&batch.next_observations)?.squeeze(0)?)?;
-        let loss = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let targets = batch.target(
+            *self.config.gamma,
+            &value.state_values(&batch.next_observations)?.squeeze(0)?,
+        )?;
+        let loss = networks.critics.network.squared_error(
+            &batch.observations,
+            &batch.actions,
+            &targets,
+        )?;
         let v = value.state_values(&batch.observations)?.squeeze(0)?;
         let loss = Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?);
         Ok(loss.with("v_mean", v.mean_all()?).with("advantage_mean", (q - v)?.mean_all()?))
@@ -142,7 +156,12 @@ impl Update for AlignIql {
         networks.critics.adam.set(adam(*config.critic_learning_rate))
     }
 
-    fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Denoising) -> Result<Computed> {
+    fn work(
+        &mut self,
+        networks: &mut Networks,
+        batch: &Minibatch,
+        noise: &Denoising,
+    ) -> Result<Computed> {
         let bc_loss = bc_loss(networks, batch, noise)?;
         let Networks { actor, target_actor, .. } = networks;
         actor.descend_as_set(&bc_loss.value)?;
@@ -159,7 +178,12 @@ impl Update for AlignIql {
         Computed::new(&[bc_loss, value_loss, critic_loss], &[])
     }
 
-    fn evaluate(&self, networks: &Networks, batch: &Minibatch, noise: &Denoising) -> Result<Computed> {
+    fn evaluate(
+        &self,
+        networks: &Networks,
+        batch: &Minibatch,
+        noise: &Denoising,
+    ) -> Result<Computed> {
         let q = smaller(&networks.target_critics.values(&batch.observations, &batch.actions)?)?;
         let of_critics = [self.value_loss(batch, &q)?, self.critic_loss(networks, batch, &q)?];
         let [value_loss, critic_loss] = of_critics;
@@ -170,12 +194,16 @@ impl Update for AlignIql {
         Ok(vec![("learning_rate", networks.actor.adam.step().rate)])
     }
 
-    /// AlignIQL takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of the aligned policy, as a penalty.
+    /// AlignIQL takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of
+    /// the aligned policy, as a penalty.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
         let Networks { target_actor, target_critics, .. } = networks;
         let value = (self.rule == Rule::Nearest).then_some(&self.value.network);
         let tensors = DiffusionPolicy::tensors(target_actor, target_critics, value)?;
-        Ok((Choice { candidates: *self.config.candidates, value: Reduce::Min, rule: self.rule }, tensors))
+        Ok((
+            Choice { candidates: *self.config.candidates, value: Reduce::Min, rule: self.rule },
+            tensors,
+        ))
     }
 
     fn parts<'a>(&'a mut self, parts: Parts<'a>, _: &'a Device) -> Parts<'a> {

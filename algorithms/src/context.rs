@@ -48,7 +48,9 @@ impl Context {
     pub(super) fn batch_on(&self, items: &[u32], device: &Device) -> Result<Minibatch> {
         let mut batch = Batch::default();
         self.transitions.gather(items, &mut batch);
-        let rows = |numbers: &[f32]| Tensor::from_slice(numbers, (items.len(), numbers.len() / items.len()), device);
+        let rows = |numbers: &[f32]| {
+            Tensor::from_slice(numbers, (items.len(), numbers.len() / items.len()), device)
+        };
         let column = |numbers: &[f32]| Tensor::from_slice(numbers, items.len(), device);
         Ok(Minibatch {
             observations: rows(&batch.observations)?,
@@ -69,7 +71,8 @@ impl Context {
         (0..transitions.len() as u32).filter(usable).collect()
     }
 
-    /// The actions that the data takes after these transitions, `[B, a]`; 0 at the end of an episode, where none counts.
+    /// The actions that the data takes after these transitions, `[B, a]`; 0 at the end of an
+    /// episode, where none counts.
     pub(super) fn next_actions(&self, rows: &[u32]) -> Result<Tensor> {
         let a = self.action_dim();
         let none = vec![0.0; a];

@@ -1,6 +1,7 @@
-//! CQL (Kumar, Zhou, Tucker and Levine 2020, "Conservative Q-Learning for Offline Reinforcement Learning"): soft actor-critic
-//! whose critics are also pushed down at actions that the policy takes and up at those of the data, so that they do not promise
-//! more than the policy is worth. Equations are that paper's; docs/deviations.md says which of several codes is followed.
+//! CQL (Kumar, Zhou, Tucker and Levine 2020, "Conservative Q-Learning for Offline Reinforcement
+//! Learning"): soft actor-critic whose critics are also pushed down at actions that the policy
+//! takes and up at those of the data, so that they do not promise more than the policy is worth.
+//! Equations are that paper's; docs/deviations.md says which of several codes is followed.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -17,7 +18,9 @@ use super::random::{Purpose, stream};
 use super::squashed::{Normal, Squashed};
 use super::trained::{Trained, ensemble, learned, scale_last_layer};
 use candle_core::{Result, Tensor};
-use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, Weights};
+use quad_policy::{
+    AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, Weights,
+};
 use rand::Rng;
 use serde::Deserialize;
 
@@ -65,7 +68,8 @@ struct Config {
     threshold: Option<Finite>,
     /// Each state's gap counts as at least this.
     least_gap: Option<Finite>,
-    /// Uniform actions, actions of the policy at s and at s' over which the gap of a state is taken: so many of each.
+    /// Uniform actions, actions of the policy at s and at s' over which the gap of a state is
+    /// taken: so many of each.
     actions: Count,
     /// Next actions drawn per next state for the target; of several, the best counts.
     samples: Count,
@@ -98,7 +102,8 @@ struct Phases {
 impl Phases {
     /// Whether the policy is cloned in this step of a run of so many.
     fn is_cloning(&self, step: u64, total_steps: u64) -> bool {
-        let [step, total, cloning, learning] = [step, total_steps, self.cloning, *self.learning].map(u128::from);
+        let [step, total, cloning, learning] =
+            [step, total_steps, self.cloning, *self.learning].map(u128::from);
         step * (cloning + learning) < total * cloning
     }
 }
@@ -140,7 +145,8 @@ impl Cql {
             outputs: 1,
         };
         let LogStd { multiplier, offset } = config.log_std;
-        let mut actor = Squashed::new(&config.actor, LOG_STD, Some([*multiplier, *offset]), &context, 0)?;
+        let mut actor =
+            Squashed::new(&config.actor, LOG_STD, Some([*multiplier, *offset]), &context, 0)?;
         let mut critics = ensemble(shape, &context, 1)?;
         scale_last_layer(actor.network.network.weights_mut(), &config.actor, LAST_LAYER)?;
         scale_last_layer(critics.network.weights_mut(), &config.critic, LAST_LAYER)?;
@@ -161,7 +167,8 @@ impl Cql {
         let Context { seed, batch_size, ref device, .. } = self.context;
         let (generator, a) = (&mut stream(seed, Purpose::Noise, step), self.context.action_dim());
         let each = (batch_size, *self.config.actions, a);
-        let uniform: Vec<f32> = (0..each.0 * each.1 * a).map(|_| generator.random_range(-1.0..1.0)).collect();
+        let uniform: Vec<f32> =
+            (0..each.0 * each.1 * a).map(|_| generator.random_range(-1.0..1.0)).collect();
         Ok(Noise {
             policy: normal((batch_size, 1, a), generator, device)?,
             target: normal((batch_size, *self.config.samples, a), generator, device)?,
@@ -174,14 +181,16 @@ impl Cql {
     /// Update number `step`, from 0. All losses are of the networks as they are before it.
     fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
         let adam = |rate: f32| AdamStep::after(step, rate);
-        let (slow, fast) = (adam(*self.config.actor_learning_rate), adam(*self.config.critic_learning_rate));
+        let (slow, fast) =
+            (adam(*self.config.actor_learning_rate), adam(*self.config.critic_learning_rate));
         let current = self.actor.distribution(&batch.observations)?;
         let next = self.actor.constant_distribution(&batch.next_observations)?;
         // The policy, and α so that the entropy is −(dimensions of an action).
         let (actor_loss, log_density) = self.actor_loss(step, batch, &current, noise)?;
         self.actor.descend(&actor_loss.value, slow)?;
         let excess = (log_density - self.context.action_dim() as f64)?;
-        self.log_alpha.descend(&(self.log_alpha.network.values().sum_all()? * excess)?.neg()?, slow)?;
+        self.log_alpha
+            .descend(&(self.log_alpha.network.values().sum_all()? * excess)?.neg()?, slow)?;
 
         let (critic_loss, gap) = self.critic_loss(batch, &current.detach(), &next, noise)?;
         let (weight, alpha_prime) = self.weight(&gap.detach(), fast)?;
@@ -192,50 +201,92 @@ impl Cql {
     }
 
     /// The policy toward large Q and entropy; and the mean of its log density, `[]`, a constant.
-    fn actor_loss(&self, step: u64, batch: &Minibatch, current: &Normal, noise: &Noise) -> Result<(Loss, Tensor)> {
+    fn actor_loss(
+        &self,
+        step: u64,
+        batch: &Minibatch,
+        current: &Normal,
+        noise: &Noise,
+    ) -> Result<(Loss, Tensor)> {
         let drawn = current.draw(&noise.policy)?;
         let log_density = drawn.log_density.squeeze(1)?;
         let worth = match self.config.phases.is_cloning(step, self.context.total_steps) {
             true => current.log_density(&self.actions(batch)?)?,
-            false => smaller(&self.critics.network.detach().values(&batch.observations, &drawn.actions.squeeze(1)?)?)?,
+            false => smaller(
+                &self
+                    .critics
+                    .network
+                    .detach()
+                    .values(&batch.observations, &drawn.actions.squeeze(1)?)?,
+            )?,
         };
         let alpha = self.log_alpha.network.values().detach().exp()?;
-        let loss = Loss::new("actor_loss", (log_density.broadcast_mul(&alpha)? - worth)?.mean_all()?);
+        let loss =
+            Loss::new("actor_loss", (log_density.broadcast_mul(&alpha)? - worth)?.mean_all()?);
         let log_density = log_density.detach().mean_all()?;
         Ok((loss.with("entropy", log_density.neg()?).with("alpha", alpha), log_density))
     }
 
-    /// The critics toward r + γ·Q̂(s', a'); and how far they also go down, the gap between all actions at s and the data's, `[]`.
-    fn critic_loss(&self, batch: &Minibatch, current: &Normal, next: &Normal, noise: &Noise) -> Result<(Loss, Tensor)> {
+    /// The critics toward r + γ·Q̂(s', a'); and how far they also go down, the gap between all
+    /// actions at s and the data's, `[]`.
+    fn critic_loss(
+        &self,
+        batch: &Minibatch,
+        current: &Normal,
+        next: &Normal,
+        noise: &Noise,
+    ) -> Result<(Loss, Tensor)> {
         let targets = self.targets(batch, next, &noise.target)?;
         let (q, gaps) = self.gaps(batch, current, next, noise)?;
         let loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
         let gap = gaps.mean_all()?;
-        Ok((Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?).with("gap", gap.clone()), gap))
+        Ok((
+            Loss::new("critic_loss", loss)
+                .with("q_mean", targets.mean_all()?)
+                .with("gap", gap.clone()),
+            gap,
+        ))
     }
 
-    /// The data's actions, clipped in all steps of a run that clones: at ±1 the density of a squashed Gaussian has no limit.
+    /// The data's actions, clipped in all steps of a run that clones: at ±1 the density of a
+    /// squashed Gaussian has no limit.
     fn actions(&self, batch: &Minibatch) -> Result<Tensor> {
         let bound = if self.config.phases.cloning > 0 { 0.999 } else { 1.0 };
         batch.actions.clamp(-bound, bound)
     }
 
-    /// y = r + γ·mask·max_a' min_k Q̂_k(s', a') over the actions drawn with this noise, `[B, S, a]`; `[B]`.
+    /// y = r + γ·mask·max_a' min_k Q̂_k(s', a') over the actions drawn with this noise, `[B, S,
+    /// a]`; `[B]`.
     fn targets(&self, batch: &Minibatch, next: &Normal, noise: &Tensor) -> Result<Tensor> {
         let actions = next.draw(noise)?.actions;
         let q = self.target_critics.values(&batch.next_observations, &actions.flatten(0, 1)?)?;
-        batch.target(*self.config.gamma, &largest(&smaller(&q)?.reshape(((), *self.config.samples))?, 1)?)
+        batch.target(
+            *self.config.gamma,
+            &largest(&smaller(&q)?.reshape(((), *self.config.samples))?, 1)?,
+        )
     }
 
-    /// Q_k(s, a) of the data's actions, and log Σ exp Q_k(s, ·) − Q_k(s, a): Eq. 4 with the sum over uniform actions and those
-    /// of the policy at s and s', all at s, each divided by its density (appendix F); `[K, B]` each.
-    fn gaps(&self, batch: &Minibatch, current: &Normal, next: &Normal, noise: &Noise) -> Result<(Tensor, Tensor)> {
+    /// Q_k(s, a) of the data's actions, and log Σ exp Q_k(s, ·) − Q_k(s, a): Eq. 4 with the sum
+    /// over uniform actions and those of the policy at s and s', all at s, each divided by its
+    /// density (appendix F); `[K, B]` each.
+    fn gaps(
+        &self,
+        batch: &Minibatch,
+        current: &Normal,
+        next: &Normal,
+        noise: &Noise,
+    ) -> Result<(Tensor, Tensor)> {
         let (b, n, a) = noise.uniform.dims3()?;
         let [next, current] = [next.draw(&noise.next)?, current.draw(&noise.current)?];
         // [B, 1 + 3N, a]: one pass through the critics for all.
-        let actions = [&self.actions(batch)?.unsqueeze(1)?, &noise.uniform, &next.actions, &current.actions];
+        let actions =
+            [&self.actions(batch)?.unsqueeze(1)?, &noise.uniform, &next.actions, &current.actions];
         let actions = Tensor::cat(&actions, 1)?.flatten(0, 1)?;
-        let q = self.critics.network.values(&batch.observations, &actions)?.reshape((CRITICS, b, 1 + 3 * n))?;
+        let q = self.critics.network.values(&batch.observations, &actions)?.reshape((
+            CRITICS,
+            b,
+            1 + 3 * n,
+        ))?;
         let of_data = q.narrow(2, 0, 1)?.squeeze(2)?;
         let uniform = Tensor::full(-(a as f32) * 2f32.ln(), (b, n), q.device())?;
         let densities = Tensor::cat(&[&uniform, &next.log_density, &current.log_density], 1)?;
@@ -245,14 +296,16 @@ impl Cql {
         Ok((of_data, gaps))
     }
 
-    /// The weight of the gap in the critics' loss, with α' if there is one (appendix, dual gradient descent), and α'. Moves α' up a
-    /// gap above the threshold.
+    /// The weight of the gap in the critics' loss, with α' if there is one (appendix, dual gradient
+    /// descent), and α'. Moves α' up a gap above the threshold.
     fn weight(&mut self, gap: &Tensor, adam: AdamStep) -> Result<(Tensor, Option<Tensor>)> {
         let weight = f64::from(*self.config.weight);
-        let (Some(learned), Some(threshold)) = (&mut self.log_alpha_prime, self.config.threshold) else {
+        let (Some(learned), Some(threshold)) = (&mut self.log_alpha_prime, self.config.threshold)
+        else {
             return Ok(((gap.ones_like()? * weight)?, None));
         };
-        let alpha_prime = learned.network.values().exp()?.clamp(0.0, MOST_ALPHA_PRIME)?.sum_all()?;
+        let alpha_prime =
+            learned.network.values().exp()?.clamp(0.0, MOST_ALPHA_PRIME)?.sum_all()?;
         let excess = ((gap - f64::from(*threshold))? * weight)?;
         learned.descend(&(&alpha_prime * excess)?.neg()?, adam)?;
         let alpha_prime = alpha_prime.detach();

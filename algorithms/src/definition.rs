@@ -1,4 +1,5 @@
-//! What is known of an algorithm before it runs: its values, its checks, what it measures, and what reports say of it.
+//! What is known of an algorithm before it runs: its values, its checks, what it measures, and what
+//! reports say of it.
 
 use std::collections::BTreeMap;
 
@@ -28,7 +29,8 @@ pub struct Definition {
 /// An algorithm, or why it cannot start.
 pub type Started = Result<Box<dyn Algorithm>, AlgorithmError>;
 
-/// A number that an update measures. Gauges, `metrics.jsonl`, the progress display and `learner presets --metrics` derive from it.
+/// A number that an update measures. Gauges, `metrics.jsonl`, the progress display and `learner
+/// presets --metrics` derive from it.
 #[derive(Clone, Copy, Debug)]
 pub struct Metric {
     /// Its name in `metrics.jsonl`; Prometheus sees `quad_learner_<name>`.
@@ -37,12 +39,13 @@ pub struct Metric {
     pub help: &'static str,
     /// What the progress display calls it; empty where it does not show it.
     pub label: &'static str,
-    /// Whether it is also measured on held-out episodes: it says something of data that is not learned from.
+    /// Whether it is also measured on held-out episodes: it says something of data that is not
+    /// learned from.
     pub held_out: bool,
 }
 
-/// A table of metrics: in each line a name, in brackets what the display calls it if it shows it, `held_out` if it is also
-/// measured on held-out episodes, and the help.
+/// A table of metrics: in each line a name, in brackets what the display calls it if it shows it,
+/// `held_out` if it is also measured on held-out episodes, and the help.
 macro_rules! metrics {
     (@ held_out) => { true };
     (@) => { false };
@@ -124,9 +127,11 @@ pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> Result<T, AgentE
     Ok(T::deserialize(table.clone())?)
 }
 
-/// Reads hyper-parameters into which those of `C` are flattened. Serde does not say which key of a flattened struct is refused, so
-/// these are read by themselves first.
-pub(super) fn read_with<C: DeserializeOwned, T: DeserializeOwned>(table: &toml::Table) -> Result<T, AgentError> {
+/// Reads hyper-parameters into which those of `C` are flattened. Serde does not say which key of a
+/// flattened struct is refused, so these are read by themselves first.
+pub(super) fn read_with<C: DeserializeOwned, T: DeserializeOwned>(
+    table: &toml::Table,
+) -> Result<T, AgentError> {
     readable::<C>(table)?;
     read(table)
 }

@@ -7,9 +7,14 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 /// Standard normal numbers.
-pub(super) fn normal(shape: impl Into<Shape>, generator: &mut impl Rng, device: &Device) -> Result<Tensor> {
+pub(super) fn normal(
+    shape: impl Into<Shape>,
+    generator: &mut impl Rng,
+    device: &Device,
+) -> Result<Tensor> {
     let shape = shape.into();
-    let numbers: Vec<f32> = (0..shape.elem_count()).map(|_| StandardNormal.sample(generator)).collect();
+    let numbers: Vec<f32> =
+        (0..shape.elem_count()).map(|_| StandardNormal.sample(generator)).collect();
     Tensor::from_vec(numbers, shape, device)
 }
 
@@ -57,7 +62,8 @@ impl NoiseInTime {
     /// α_t·a + σ_t·ε of actions a, all `[B, a]`.
     pub fn noisy(&self, actions: &Tensor) -> Result<Tensor> {
         let column = |of: fn(ContinuousNoise) -> f64| {
-            let numbers = self.t.iter().map(|t| of(ContinuousNoise::at(*t)) as f32).collect::<Vec<_>>();
+            let numbers =
+                self.t.iter().map(|t| of(ContinuousNoise::at(*t)) as f32).collect::<Vec<_>>();
             Tensor::from_vec(numbers, (self.t.len(), 1), actions.device())
         };
         let signal = actions.broadcast_mul(&column(|noise| noise.signal)?)?;

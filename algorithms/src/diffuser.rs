@@ -1,6 +1,7 @@
-//! Diffuser (Janner, Du, Tenenbaum and Levine 2022, "Planning with Diffusion for Flexible Behavior Synthesis"): a diffusion model
-//! of whole windows of actions and states, and a network that predicts the return of a noisy window, by whose gradient the
-//! model's samples are pulled when the policy plans. Equations are that paper's; where its authors' code does otherwise,
+//! Diffuser (Janner, Du, Tenenbaum and Levine 2022, "Planning with Diffusion for Flexible Behavior
+//! Synthesis"): a diffusion model of whole windows of actions and states, and a network that
+//! predicts the return of a noisy window, by whose gradient the model's samples are pulled when the
+//! policy plans. Equations are that paper's; where its authors' code does otherwise,
 //! docs/deviations.md says so.
 
 #[cfg(test)]
@@ -20,8 +21,8 @@ use super::trained::{Trained, initial};
 use candle_core::{Result, Tensor};
 use candle_nn::loss::mse;
 use quad_policy::{
-    AdamStep, Choice, Guidance, Layout, Planner, PlannerShape, PolicyConfig, Schedule, Tensors, Weighted, Weights,
-    WindowConfig, WindowError, WindowModel, WindowValue, with_first_state,
+    AdamStep, Choice, Guidance, Layout, Planner, PlannerShape, PolicyConfig, Schedule, Tensors,
+    Weighted, Weights, WindowConfig, WindowError, WindowModel, WindowValue, with_first_state,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -84,7 +85,12 @@ impl Config {
         }
         let (replan, Guidance { steps, scale, .. }) = (*self.replan_every, self.guidance);
         check("replan_every", replan, replan <= self.network.horizon, "at most the horizon")?;
-        check("guidance.steps", steps, (1..=1000).contains(&steps), "a whole number from 1 to 1000")?;
+        check(
+            "guidance.steps",
+            steps,
+            (1..=1000).contains(&steps),
+            "a whole number from 1 to 1000",
+        )?;
         check("guidance.scale", scale, scale >= 0.0 && scale.is_finite(), "at least 0")
     }
 }
@@ -129,14 +135,17 @@ impl Diffuser {
         config.check()?;
         let (o, a) = (context.observation_dim(), context.action_dim());
         let network = &config.network;
-        let windows = Windows::new(&context, network.horizon, *config.gamma, *config.terminal_penalty)?;
+        let windows =
+            Windows::new(&context, network.horizon, *config.gamma, *config.terminal_penalty)?;
         let mut weights = vec![1.0; network.horizon * (a + o)];
         weights[..a].fill(*config.first_action_weight);
         weights[a..a + o].fill(0.0);
         let of_model = |weights| WindowModel::new(network.clone(), weights);
         let of_value = |weights| WindowValue::new(network.clone(), weights);
-        let (model, target_model) = networks(&WindowModel::layout(network, a + o), of_model, &context, 0)?;
-        let (value, target_value) = networks(&WindowValue::layout(network, a + o), of_value, &context, 1)?;
+        let (model, target_model) =
+            networks(&WindowModel::layout(network, a + o), of_model, &context, 0)?;
+        let (value, target_value) =
+            networks(&WindowValue::layout(network, a + o), of_value, &context, 1)?;
         Ok(Self {
             schedule: Schedule::cosine(*config.diffusion_steps),
             weights: Tensor::from_vec(weights, (network.horizon, a + o), &context.device)?,
@@ -162,8 +171,8 @@ impl Diffuser {
     /// xᵗ = √ᾱ_t·x⁰ + √(1 − ᾱ_t)·ε, but for the first state, which stays as it is.
     fn noisy(&self, windows: &Tensor, noise: &Noise) -> Result<Tensor> {
         let (signal, deviation) = self.schedule.noising(&noise.t, 1, windows.device())?;
-        let noisy =
-            (windows.broadcast_mul(&signal.unsqueeze(2)?)? + noise.epsilon.broadcast_mul(&deviation.unsqueeze(2)?)?)?;
+        let noisy = (windows.broadcast_mul(&signal.unsqueeze(2)?)?
+            + noise.epsilon.broadcast_mul(&deviation.unsqueeze(2)?)?)?;
         let (a, o) = (self.context.action_dim(), self.context.observation_dim());
         with_first_state(&noisy, &windows.narrow(1, 0, 1)?.narrow(2, a, o)?.squeeze(1)?)
     }
@@ -196,14 +205,18 @@ impl Diffuser {
     fn model_loss(&self, batch: &Batch, noisy: &Tensor, noise: &Noise) -> Result<Loss> {
         let error = (self.model.network.clean(noisy, &noise.t)? - &batch.windows)?.sqr()?;
         let loss = Loss::new("model_loss", error.broadcast_mul(&self.weights)?.mean_all()?);
-        let first_action = error.narrow(1, 0, 1)?.narrow(2, 0, self.context.action_dim())?.mean_all()?;
-        Ok(loss.with("first_action_loss", first_action).with("return_mean", batch.returns.mean_all()?))
+        let first_action =
+            error.narrow(1, 0, 1)?.narrow(2, 0, self.context.action_dim())?.mean_all()?;
+        Ok(loss
+            .with("first_action_loss", first_action)
+            .with("return_mean", batch.returns.mean_all()?))
     }
 
     /// The value network: the return, as far as the noise lets it be seen.
     fn value_loss(&self, batch: &Batch, noisy: &Tensor, noise: &Noise) -> Result<Loss> {
         let values = self.value.network.values(noisy, &noise.t)?;
-        Ok(Loss::new("value_loss", mse(&values, &batch.returns)?).with("value_mean", values.mean_all()?))
+        Ok(Loss::new("value_loss", mse(&values, &batch.returns)?)
+            .with("value_mean", values.mean_all()?))
     }
 }
 
@@ -244,7 +257,10 @@ impl Algorithm for Diffuser {
             units: self.windows.units().clone(),
         };
         let tensors = Planner::tensors(&self.target_model, &self.target_value)?;
-        Ok((PolicyConfig::Planner { shape, choice: Choice::best_of(*self.config.candidates) }, tensors))
+        Ok((
+            PolicyConfig::Planner { shape, choice: Choice::best_of(*self.config.candidates) },
+            tensors,
+        ))
     }
 
     fn parts(&mut self) -> Parts<'_> {

@@ -1,5 +1,5 @@
-//! What algorithms share that train a diffusion policy and critics: their networks with the EMAs, and everything that is no
-//! equation. An algorithm of this kind is its [`Update`].
+//! What algorithms share that train a diffusion policy and critics: their networks with the EMAs,
+//! and everything that is no equation. An algorithm of this kind is its [`Update`].
 
 use super::algorithm::{Algorithm, Measured};
 use super::context::{Context, Minibatch};
@@ -9,7 +9,9 @@ use super::random::{Purpose, stream};
 use super::replay::{Computed, Inputs, Replay};
 use super::trained::{Trained, ensemble, initial};
 use candle_core::{Device, Result, Tensor};
-use quad_policy::{Choice, DiffusionShape, Ensemble, NoisePredictor, PolicyConfig, Tensors, Weighted};
+use quad_policy::{
+    Choice, DiffusionShape, Ensemble, NoisePredictor, PolicyConfig, Tensors, Weighted,
+};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -26,8 +28,8 @@ pub(super) struct Networks {
 }
 
 impl Networks {
-    /// At step 0; each step takes the share `actor_decay` of its rate off the actor's weights. The sizes of observations and
-    /// actions are the data's.
+    /// At step 0; each step takes the share `actor_decay` of its rate off the actor's weights. The
+    /// sizes of observations and actions are the data's.
     pub fn new(layers: DiffusionShape, actor_decay: f32, context: Context) -> Result<Self> {
         let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
         let shape = DiffusionShape { observation_dim, action_dim, ..layers };
@@ -45,18 +47,23 @@ impl Networks {
         })
     }
 
-    /// The noise of S sampled actions for each state of a batch, `[T, B·S, a]`: a^T, then that of the reverse steps from t = T
-    /// down to 2.
+    /// The noise of S sampled actions for each state of a batch, `[T, B·S, a]`: a^T, then that of
+    /// the reverse steps from t = T down to 2.
     pub fn chain_noise(&self, samples: usize, generator: &mut ChaCha8Rng) -> Result<Tensor> {
         let DiffusionShape { diffusion_steps, action_dim, .. } = self.shape;
-        normal((diffusion_steps, self.context.batch_size * samples, action_dim), generator, &Device::Cpu)
+        normal(
+            (diffusion_steps, self.context.batch_size * samples, action_dim),
+            generator,
+            &Device::Cpu,
+        )
     }
 
     /// t, each as likely, and ε for the actions of a batch.
     pub fn denoising(&self, generator: &mut ChaCha8Rng) -> Result<Denoising> {
         let DiffusionShape { diffusion_steps, action_dim, .. } = self.shape;
         let epsilon = normal((self.context.batch_size, action_dim), generator, &Device::Cpu)?;
-        let t = (0..self.context.batch_size).map(|_| generator.random_range(1..=diffusion_steps as u32));
+        let t = (0..self.context.batch_size)
+            .map(|_| generator.random_range(1..=diffusion_steps as u32));
         Denoising::new(&Vec::from_iter(t), epsilon, self.actor.network.schedule())
     }
 
@@ -68,7 +75,8 @@ impl Networks {
     }
 }
 
-/// The equations of one algorithm: its hyper-parameters, with what its updates change beside the networks.
+/// The equations of one algorithm: its hyper-parameters, with what its updates change beside the
+/// networks.
 pub(super) trait Update: Send {
     /// The random numbers of one update.
     type Noise: Inputs + Send;
@@ -80,17 +88,28 @@ pub(super) trait Update: Send {
     fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()>;
 
     /// The work of an update, as [`Replay::start`] wants it.
-    fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Self::Noise) -> Result<Computed>;
+    fn work(
+        &mut self,
+        networks: &mut Networks,
+        batch: &Minibatch,
+        noise: &Self::Noise,
+    ) -> Result<Computed>;
 
     /// The losses of an update with the weights as they are, as [`Self::work`] gives them.
-    fn evaluate(&self, networks: &Networks, batch: &Minibatch, noise: &Self::Noise) -> Result<Computed>;
+    fn evaluate(
+        &self,
+        networks: &Networks,
+        batch: &Minibatch,
+        noise: &Self::Noise,
+    ) -> Result<Computed>;
 
     /// What only some updates do, behind the work of all.
     fn end(&mut self, _: &mut Networks, _step: u64) -> Result<()> {
         Ok(())
     }
 
-    /// Metrics that are computed on the CPU, of the noise and of what an update computed beside scalars.
+    /// Metrics that are computed on the CPU, of the noise and of what an update computed beside
+    /// scalars.
     fn measure(&self, _: &Networks, _: &Self::Noise, _others: &[f32]) -> Result<Measured> {
         Ok(Measured::new())
     }
@@ -135,7 +154,8 @@ impl<U: Update> Diffusion<U> {
 
     /// The random numbers of update number `step`.
     pub fn noise(&self, step: u64) -> Result<U::Noise> {
-        self.update.noise(&self.networks, &mut stream(self.networks.context.seed, Purpose::Noise, step))
+        self.update
+            .noise(&self.networks, &mut stream(self.networks.context.seed, Purpose::Noise, step))
     }
 }
 
@@ -151,7 +171,8 @@ impl<U: Update> Algorithm for Diffusion<U> {
     fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
         let Self { update, networks, .. } = self;
         let (batch, noise) = (networks.context.batch(items)?, self.noise(step)?);
-        let (mut measured, others) = update.evaluate(networks, &batch, &noise.on(&networks.context.device)?)?.read()?;
+        let (mut measured, others) =
+            update.evaluate(networks, &batch, &noise.on(&networks.context.device)?)?.read()?;
         measured.extend(update.measure(networks, &noise, &others)?);
         Ok(measured)
     }
@@ -164,7 +185,8 @@ impl<U: Update> Algorithm for Diffusion<U> {
     fn parts(&mut self) -> Parts<'_> {
         // Who has the parts may put other tensors in their places.
         self.replay = Replay::default();
-        let Networks { context, actor, target_actor, critics, target_critics, .. } = &mut self.networks;
+        let Networks { context, actor, target_actor, critics, target_critics, .. } =
+            &mut self.networks;
         let parts = Parts::default()
             .trained("actor", actor)
             .trained("critic", critics)

@@ -1,6 +1,7 @@
-//! Diffusion-QL (Wang, Hunt and Zhou 2022, "Diffusion Policies as an Expressive Policy Class for Offline Reinforcement
-//! Learning"): a diffusion policy that is cloned from the data and moved toward actions of large Q, by the gradient through
-//! its whole reverse chain. Equations are that paper's; where its authors' code does otherwise, docs/deviations.md says so.
+//! Diffusion-QL (Wang, Hunt and Zhou 2022, "Diffusion Policies as an Expressive Policy Class for
+//! Offline Reinforcement Learning"): a diffusion policy that is cloned from the data and moved
+//! toward actions of large Q, by the gradient through its whole reverse chain. Equations are that
+//! paper's; where its authors' code does otherwise, docs/deviations.md says so.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -17,7 +18,8 @@ use super::replay::{Computed, Inputs};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::loss::mse;
 use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, MlpConfig, Reduce, Reverse, Rule, Tensors, Weighted,
+    AdamStep, Choice, DiffusionPolicy, DiffusionShape, MlpConfig, Reduce, Reverse, Rule, Tensors,
+    Weighted,
 };
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -58,7 +60,8 @@ struct Config {
     gamma: Share,
     /// Strength η of Q beside cloning.
     eta: NotNegative,
-    /// Next actions sampled per next state for the target, S; of several, each critic's largest value counts.
+    /// Next actions sampled per next state for the target, S; of several, each critic's largest
+    /// value counts.
     samples: Count,
     actor_learning_rate: Positive,
     critic_learning_rate: Positive,
@@ -112,7 +115,8 @@ impl Config {
         Ok(Diffusion::new(Networks::new(shape, 0.0, context)?, self))
     }
 
-    /// y of Eq. 4, `[B]`: of several next actions each critic takes its best, then the smaller of the critics counts.
+    /// y of Eq. 4, `[B]`: of several next actions each critic takes its best, then the smaller of
+    /// the critics counts.
     fn targets(&self, networks: &Networks, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
         let next_actions = networks.target_actor.sample(&batch.next_observations, noise)?;
         let q = networks.target_critics.values(&batch.next_observations, &next_actions)?;
@@ -123,7 +127,11 @@ impl Config {
     /// Q(s, a) toward r + γ·min_k Q̂_k(s', a'), Eq. 4.
     fn critic_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
         let targets = self.targets(networks, batch, &noise.next)?;
-        let error = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let error = networks.critics.network.squared_error(
+            &batch.observations,
+            &batch.actions,
+            &targets,
+        )?;
         Ok(Loss::new("critic_loss", (error * CRITICS as f64)?).with("q_mean", targets.mean_all()?))
     }
 
@@ -137,10 +145,11 @@ impl Config {
     }
 }
 
-/// −E[Q_i(s, a⁰)]/E|Q_j(s, a⁰)| of actions from the whole chain, `[]`: the second term of Eq. 3, without η. Its gradient
-/// reaches the actor alone, and not by way of the divisor.
+/// −E[Q_i(s, a⁰)]/E|Q_j(s, a⁰)| of actions from the whole chain, `[]`: the second term of Eq. 3,
+/// without η. Its gradient reaches the actor alone, and not by way of the divisor.
 fn q_loss(networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Tensor> {
-    let actions = networks.actor.network.sample_with_gradient(&batch.observations, &noise.policy)?;
+    let actions =
+        networks.actor.network.sample_with_gradient(&batch.observations, &noise.policy)?;
     let q = networks.critics.network.detach().values(&batch.observations, &actions)?;
     let q = q.index_select(&noise.raised, 0)?;
     let (raised, other) = (q.get(0)?, q.get(1)?);
@@ -155,7 +164,12 @@ impl Update for Config {
         let policy = networks.chain_noise(1, generator)?;
         let denoising = networks.denoising(generator)?;
         let raised = generator.random_range(0..CRITICS) as u32;
-        Ok(Noise { next, policy, denoising, raised: Tensor::new(&[raised, 1 - raised], &Device::Cpu)? })
+        Ok(Noise {
+            next,
+            policy,
+            denoising,
+            raised: Tensor::new(&[raised, 1 - raised], &Device::Cpu)?,
+        })
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
@@ -165,7 +179,12 @@ impl Update for Config {
     }
 
     /// One pass through Algorithm 1's loop, but for the target actor.
-    fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Noise) -> Result<Computed> {
+    fn work(
+        &mut self,
+        networks: &mut Networks,
+        batch: &Minibatch,
+        noise: &Noise,
+    ) -> Result<Computed> {
         let critic_loss = self.critic_loss(networks, batch, noise)?;
         let critic_norm = networks.critics.descend_as_set(&critic_loss.value)?;
         let actor_loss = self.actor_loss(networks, batch, noise)?;
@@ -187,9 +206,11 @@ impl Update for Config {
         Ok(())
     }
 
-    /// The actor as it is, not its EMA; one of its candidates is drawn by what the target critics say of them.
+    /// The actor as it is, not its EMA; one of its candidates is drawn by what the target critics
+    /// say of them.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let tensors = DiffusionPolicy::tensors(&networks.actor.network, &networks.target_critics, None)?;
+        let tensors =
+            DiffusionPolicy::tensors(&networks.actor.network, &networks.target_critics, None)?;
         let rule = Rule::Softmax { temperature: *self.temperature };
         Ok((Choice { candidates: *self.candidates, value: Reduce::Min, rule }, tensors))
     }

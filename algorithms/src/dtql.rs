@@ -1,7 +1,8 @@
-//! Diffusion Trusted Q-Learning (Chen, Wang and Zhou 2024, "Diffusion Policies creating a Trust Region for Offline
-//! Reinforcement Learning"): a diffusion policy μ_φ only clones the data. How badly it denoises the actions of a second policy
-//! π_θ, of one step, says how far these are from the data's: inside that trust region π_θ moves toward large Q, and no chain
-//! of denoising steps is ever sampled. Where the authors' code says more than their paper, docs/deviations.md has it.
+//! Diffusion Trusted Q-Learning (Chen, Wang and Zhou 2024, "Diffusion Policies creating a Trust
+//! Region for Offline Reinforcement Learning"): a diffusion policy μ_φ only clones the data. How
+//! badly it denoises the actions of a second policy π_θ, of one step, says how far these are from
+//! the data's: inside that trust region π_θ moves toward large Q, and no chain of denoising steps
+//! is ever sampled. Where the authors' code says more than their paper, docs/deviations.md has it.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -22,8 +23,9 @@ use super::squashed::{Normal, Squashed};
 use super::trained::{Trained, ensemble, initial};
 use candle_core::{Result, Tensor};
 use quad_policy::{
-    ActorCriticShape, AdamStep, Choice, Denoiser, DenoiserShape, Ensemble, EnsembleShape, MlpConfig, NoiseLevels,
-    PolicyConfig, Reduce, Rule, SquashedActor, Tensors, Weighted, cosine_decay,
+    ActorCriticShape, AdamStep, Choice, Denoiser, DenoiserShape, Ensemble, EnsembleShape,
+    MlpConfig, NoiseLevels, PolicyConfig, Reduce, Rule, SquashedActor, Tensors, Weighted,
+    cosine_decay,
 };
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
@@ -159,11 +161,15 @@ impl Dtql {
         phases::begin(self.context.total_steps, [pretraining, policy])[1]
     }
 
-    /// Update number `step`: critics and diffusion policy in both phases, then the one-step policy in the second.
+    /// Update number `step`: critics and diffusion policy in both phases, then the one-step policy
+    /// in the second.
     fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
         let pretraining = self.pretraining();
         let decay = match self.config.cosine {
-            true => cosine_decay(step.saturating_sub(pretraining), self.context.total_steps - pretraining),
+            true => cosine_decay(
+                step.saturating_sub(pretraining),
+                self.context.total_steps - pretraining,
+            ),
             false => 1.0,
         };
         let rate = *self.config.learning_rate * decay;
@@ -177,7 +183,8 @@ impl Dtql {
         let mut losses = vec![value_loss, critic_loss, bc_loss];
         if step >= pretraining {
             let actor_loss = self.actor_loss(batch, noise)?;
-            self.actor.descend(&actor_loss.value, AdamStep { count: step - pretraining + 1, ..adam })?;
+            self.actor
+                .descend(&actor_loss.value, AdamStep { count: step - pretraining + 1, ..adam })?;
             self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
             losses.push(actor_loss);
         }
@@ -186,9 +193,11 @@ impl Dtql {
         Ok(measured)
     }
 
-    /// V(s) toward an expectile of the smaller Q(s, a), and Q(s, a) toward r + γ·V(s'), both as they are before this step.
+    /// V(s) toward an expectile of the smaller Q(s, a), and Q(s, a) toward r + γ·V(s'), both as
+    /// they are before this step.
     fn value_losses(&self, batch: &Minibatch) -> Result<[Loss; 2]> {
-        let next = self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
+        let next =
+            self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = batch.target(*self.config.gamma, &next)?;
         let q = self.critics.network.values(&batch.observations, &batch.actions)?;
         let v = self.value.network.state_values(&batch.observations)?.squeeze(0)?;
@@ -200,7 +209,8 @@ impl Dtql {
 
     /// μ_φ toward the data's actions.
     fn bc_loss(&self, batch: &Minibatch, noising: &Noising) -> Result<Loss> {
-        let loss = denoising_loss(&self.diffusion.network, &batch.observations, &batch.actions, noising)?;
+        let loss =
+            denoising_loss(&self.diffusion.network, &batch.observations, &batch.actions, noising)?;
         Ok(Loss::new("bc_loss", loss))
     }
 
@@ -213,12 +223,14 @@ impl Dtql {
         let q = smaller(&self.critics.network.detach().values(&batch.observations, &actions)?)?;
         let q_loss = q.mean_all()?.neg()?;
         let mut loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
-        let likelihood = (*self.config.likelihood > 0.0).then(|| likelihood_loss(&distribution, &batch.actions));
+        let likelihood =
+            (*self.config.likelihood > 0.0).then(|| likelihood_loss(&distribution, &batch.actions));
         let likelihood = likelihood.transpose()?;
         if let Some(likelihood) = &likelihood {
             loss = (loss + (likelihood * f64::from(*self.config.likelihood))?)?;
         }
-        let loss = Loss::new("actor_loss", loss).with("trust_loss", trust_loss).with("q_loss", q_loss);
+        let loss =
+            Loss::new("actor_loss", loss).with("trust_loss", trust_loss).with("q_loss", q_loss);
         Ok(loss.with("likelihood_loss", likelihood))
     }
 
@@ -226,7 +238,9 @@ impl Dtql {
     fn noise(&self, step: u64) -> Result<Noise> {
         let mut generator = stream(self.context.seed, Purpose::Noise, step);
         let (batch, action_dim) = (self.context.batch_size, self.context.action_dim());
-        let rows = |generator: &mut ChaCha8Rng| normal((batch, action_dim), generator, &self.context.device);
+        let rows = |generator: &mut ChaCha8Rng| {
+            normal((batch, action_dim), generator, &self.context.device)
+        };
         let levels = NoiseLevels::draw(batch, &mut generator);
         let cloning = Noising { levels, noise: rows(&mut generator)? };
         let policy = rows(&mut generator)?;
@@ -235,17 +249,22 @@ impl Dtql {
     }
 }
 
-/// Mean of ((D_φ(a + σn; s, σ) − a)/c_out)², `[]`, of actions `[B, a]`, through which the gradient flows twice: the noisy ones
-/// and the clean ones.
-fn denoising_loss(diffusion: &Denoiser, observations: &Tensor, actions: &Tensor, noising: &Noising) -> Result<Tensor> {
+/// Mean of ((D_φ(a + σn; s, σ) − a)/c_out)², `[]`, of actions `[B, a]`, through which the gradient
+/// flows twice: the noisy ones and the clean ones.
+fn denoising_loss(
+    diffusion: &Denoiser,
+    observations: &Tensor,
+    actions: &Tensor,
+    noising: &Noising,
+) -> Result<Tensor> {
     let device = actions.device();
     let noisy = (actions + noising.noise.broadcast_mul(&noising.levels.sigma(device)?)?)?;
     let error = (diffusion.denoise(observations, &noisy, &noising.levels)? - actions)?;
     error.broadcast_div(&noising.levels.output_scale(device)?)?.sqr()?.mean_all()
 }
 
-/// −E[log N(atanh(a/1.001))] of the data's actions, `[]`: not of a, whose density would also have the tanh's Jacobian, which does
-/// not depend on θ.
+/// −E[log N(atanh(a/1.001))] of the data's actions, `[]`: not of a, whose density would also have
+/// the tanh's Jacobian, which does not depend on θ.
 fn likelihood_loss(distribution: &Normal, actions: &Tensor) -> Result<Tensor> {
     let scaled = (actions / ROOM)?;
     let u = (((1.0 + &scaled)?.log()? - (1.0 - &scaled)?.log()?)? * 0.5)?;
@@ -272,7 +291,8 @@ impl Algorithm for Dtql {
         measured(&losses)
     }
 
-    /// The one-step policy as it is; one of its candidates is drawn by what the target critics say of them.
+    /// The one-step policy as it is; one of its candidates is drawn by what the target critics say
+    /// of them.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let Config { actor, critic, candidates, temperature, .. } = &self.config;
         let shape = ActorCriticShape {

@@ -1,6 +1,7 @@
-//! Fitted Q evaluation (Le, Voloshin and Yue 2019, "Batch Policy Learning under Constraints"; with the clipped targets of Fu et
-//! al. 2021, "Benchmarks for Deep Off-Policy Evaluation"): what a policy that is given would be worth, learned from the data
-//! alone. Q moves toward r + γ·mask·Q̂(s', a') with the action a' that the policy takes at s', drawn once for each s'.
+//! Fitted Q evaluation (Le, Voloshin and Yue 2019, "Batch Policy Learning under Constraints"; with
+//! the clipped targets of Fu et al. 2021, "Benchmarks for Deep Off-Policy Evaluation"): what a
+//! policy that is given would be worth, learned from the data alone. Q moves toward r +
+//! γ·mask·Q̂(s', a') with the action a' that the policy takes at s', drawn once for each s'.
 //!
 //! It makes no policy, so it is none of [`ALGORITHMS`](crate::ALGORITHMS): `learner judge` runs it.
 
@@ -52,14 +53,16 @@ impl FqeConfig {
     }
 }
 
-/// Units of values: those of the network are so many times `scale` from `offset`. Targets stay within what rewards allow.
+/// Units of values: those of the network are so many times `scale` from `offset`. Targets stay
+/// within what rewards allow.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Units {
     /// Where values begin: the data's mean return from a state on.
     pub offset: f64,
     /// The standard deviation of these returns; 1 where they are all the same.
     pub scale: f64,
-    /// The value of the least reward for ever, or of one of it if that is less, because an episode may terminate.
+    /// The value of the least reward for ever, or of one of it if that is less, because an episode
+    /// may terminate.
     pub least: f64,
     /// Likewise of the largest.
     pub most: f64,
@@ -69,7 +72,9 @@ impl Units {
     /// Those of the data's rewards.
     pub fn of(context: &Context, gamma: f64) -> Self {
         let mut batch = quad_dataset::Batch::default();
-        context.transitions.gather(&Vec::from_iter(0..context.transitions.len() as u32), &mut batch);
+        context
+            .transitions
+            .gather(&Vec::from_iter(0..context.transitions.len() as u32), &mut batch);
         let mut returns: Vec<f64> = batch.rewards.iter().map(|reward| f64::from(*reward)).collect();
         for row in (0..returns.len() as u32).rev() {
             if let Some(next) = context.transitions.next(row) {
@@ -78,9 +83,11 @@ impl Units {
         }
         let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len() as f64;
         let offset = mean(&returns);
-        let scale = mean(&Vec::from_iter(returns.iter().map(|value| (value - offset).powi(2)))).sqrt();
+        let scale =
+            mean(&Vec::from_iter(returns.iter().map(|value| (value - offset).powi(2)))).sqrt();
         let rewards = batch.rewards.iter().map(|reward| f64::from(*reward));
-        let (low, high) = rewards.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), r| (low.min(r), high.max(r)));
+        let (low, high) = rewards
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), r| (low.min(r), high.max(r)));
         let forever = 1.0 / (1.0 - gamma);
         Self {
             offset,
@@ -106,31 +113,52 @@ pub struct Fqe {
 }
 
 impl Fqe {
-    /// An evaluation at its beginning of the policy that takes these actions, `[N, a]`, after the data's N transitions.
+    /// An evaluation at its beginning of the policy that takes these actions, `[N, a]`, after the
+    /// data's N transitions.
     ///
     /// # Errors
     /// Candle fails.
-    pub fn new(config: FqeConfig, units: Units, context: Context, next_actions: Vec<f32>) -> Result<Self> {
+    pub fn new(
+        config: FqeConfig,
+        units: Units,
+        context: Context,
+        next_actions: Vec<f32>,
+    ) -> Result<Self> {
         let items = (0..context.transitions.len() as u32).collect();
-        let next_actions =
-            Tensor::from_vec(next_actions, (context.transitions.len(), context.action_dim()), &context.device)?;
+        let next_actions = Tensor::from_vec(
+            next_actions,
+            (context.transitions.len(), context.action_dim()),
+            &context.device,
+        )?;
         Self::over(items, config, units, context, next_actions)
     }
 
-    /// An evaluation of the policy that recorded the data, over the transitions after which the data says what it did.
+    /// An evaluation of the policy that recorded the data, over the transitions after which the
+    /// data says what it did.
     ///
     /// # Errors
     /// There is no such transition, or candle fails.
-    pub fn of_behavior(config: FqeConfig, units: Units, context: Context) -> std::result::Result<Self, AlgorithmError> {
+    pub fn of_behavior(
+        config: FqeConfig,
+        units: Units,
+        context: Context,
+    ) -> std::result::Result<Self, AlgorithmError> {
         let items = context.items_with_next_action();
         if items.is_empty() {
             return Err(AlgorithmError::NoNextAction);
         }
-        let next_actions = context.next_actions(&Vec::from_iter(0..context.transitions.len() as u32))?;
+        let next_actions =
+            context.next_actions(&Vec::from_iter(0..context.transitions.len() as u32))?;
         Ok(Self::over(items, config, units, context, next_actions)?)
     }
 
-    fn over(items: Vec<u32>, config: FqeConfig, units: Units, context: Context, next_actions: Tensor) -> Result<Self> {
+    fn over(
+        items: Vec<u32>,
+        config: FqeConfig,
+        units: Units,
+        context: Context,
+        next_actions: Tensor,
+    ) -> Result<Self> {
         let shape = EnsembleShape {
             members: 1,
             observation_dim: context.observation_dim(),
@@ -138,12 +166,22 @@ impl Fqe {
             layers: config.critic.clone(),
             outputs: 1,
         };
-        let network = Ensemble::new(shape.clone(), initial(&shape.layout(), &context, 0)?, context.precision);
+        let network =
+            Ensemble::new(shape.clone(), initial(&shape.layout(), &context, 0)?, context.precision);
         let critic = Trained::new(network, *config.weight_decay)?;
-        Ok(Self { target_critic: critic.network.copy()?, critic, config, units, context, items, next_actions })
+        Ok(Self {
+            target_critic: critic.network.copy()?,
+            critic,
+            config,
+            units,
+            context,
+            items,
+            next_actions,
+        })
     }
 
-    /// Begins with the networks of another evaluation, such as the behavior's, from whose values a policy's differ little.
+    /// Begins with the networks of another evaluation, such as the behavior's, from whose values a
+    /// policy's differ little.
     ///
     /// # Errors
     /// Candle fails.
@@ -157,19 +195,23 @@ impl Fqe {
         self.items.len()
     }
 
-    /// Update number `step`, from 0, on the items of these numbers. Measures `critic_loss`, the mean over the batch of
-    /// (Q(s, a) − y)² in the network's units, and `q_mean`, the mean of the targets y in the rewards'.
+    /// Update number `step`, from 0, on the items of these numbers. Measures `critic_loss`, the
+    /// mean over the batch of (Q(s, a) − y)² in the network's units, and `q_mean`, the mean of the
+    /// targets y in the rewards'.
     ///
     /// # Errors
     /// Candle fails.
     pub fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
         let rows: Vec<u32> = items.iter().map(|item| self.items[*item as usize]).collect();
         let batch = self.context.batch(&rows)?;
-        let next_actions =
-            self.next_actions.index_select(&Tensor::from_vec(rows, items.len(), &self.context.device)?, 0)?;
+        let next_actions = self
+            .next_actions
+            .index_select(&Tensor::from_vec(rows, items.len(), &self.context.device)?, 0)?;
         let targets = self.targets(&batch, &next_actions)?;
-        let of_network = targets.affine(1.0 / self.units.scale, -self.units.offset / self.units.scale)?;
-        let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &of_network)?;
+        let of_network =
+            targets.affine(1.0 / self.units.scale, -self.units.offset / self.units.scale)?;
+        let loss =
+            self.critic.network.squared_error(&batch.observations, &batch.actions, &of_network)?;
         let loss = Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?);
         self.critic.descend(&loss.value, AdamStep::after(step, *self.config.learning_rate))?;
         self.target_critic.follow(&self.critic.network, *self.config.ema_rate)?;
@@ -180,7 +222,9 @@ impl Fqe {
     fn targets(&self, batch: &Minibatch, next_actions: &Tensor) -> Result<Tensor> {
         let next = self.target_critic.values(&batch.next_observations, next_actions)?.squeeze(0)?;
         let next = next.affine(self.units.scale, self.units.offset)?;
-        batch.target(*self.config.gamma, &next)?.clamp(self.units.least as f32, self.units.most as f32)
+        batch
+            .target(*self.config.gamma, &next)?
+            .clamp(self.units.least as f32, self.units.most as f32)
     }
 
     /// Q̂ of some actions `[n, a]`, each in a state of its own, `[n, o]`, in the rewards' units.
@@ -189,13 +233,18 @@ impl Fqe {
     /// Candle fails.
     pub fn values(&self, observations: &[f32], actions: &[f32]) -> Result<Vec<f32>> {
         let n = actions.len() / self.context.action_dim();
-        let rows = |numbers: &[f32]| Tensor::from_slice(numbers, (n, numbers.len() / n), &self.context.device);
-        let values = self.target_critic.values(&rows(observations)?, &rows(actions)?)?.squeeze(0)?;
+        let rows = |numbers: &[f32]| {
+            Tensor::from_slice(numbers, (n, numbers.len() / n), &self.context.device)
+        };
+        let values =
+            self.target_critic.values(&rows(observations)?, &rows(actions)?)?.squeeze(0)?;
         values.affine(self.units.scale, self.units.offset)?.to_device(&Device::Cpu)?.to_vec1()
     }
 
     /// Everything that updates change, by name.
     pub fn parts(&mut self) -> Parts<'_> {
-        Parts::default().trained("critic", &mut self.critic).weights("target_critic", self.target_critic.weights_mut())
+        Parts::default()
+            .trained("critic", &mut self.critic)
+            .weights("target_critic", self.target_critic.weights_mut())
     }
 }

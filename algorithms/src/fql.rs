@@ -1,6 +1,6 @@
-//! FQL (Park, Li and Levine 2025, "Flow Q-Learning"): a flow clones the data, and a policy of one step is distilled from it while
-//! it climbs the critics. No gradient passes through the flow's steps. Its update is its authors' code's; equations are that
-//! paper's.
+//! FQL (Park, Li and Levine 2025, "Flow Q-Learning"): a flow clones the data, and a policy of one
+//! step is distilled from it while it climbs the critics. No gradient passes through the flow's
+//! steps. Its update is its authors' code's; equations are that paper's.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -17,8 +17,8 @@ use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
 use candle_core::{Result, Tensor};
 use quad_policy::{
-    ActorCriticShape, AdamStep, Choice, Ensemble, EnsembleShape, Gradients, MlpConfig, OneStepActor, PolicyConfig,
-    Reduce, Rule, Tensors, Weighted,
+    ActorCriticShape, AdamStep, Choice, Ensemble, EnsembleShape, Gradients, MlpConfig,
+    OneStepActor, PolicyConfig, Reduce, Rule, Tensors, Weighted,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -106,7 +106,8 @@ impl Fql {
         })
     }
 
-    /// Update number `step`. All losses are those of the networks before it, and the targets follow these.
+    /// Update number `step`. All losses are those of the networks before it, and the targets follow
+    /// these.
     fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
         let adam = AdamStep::after(step, *self.config.learning_rate);
         let [critic_loss, bc_loss, actor_loss] = self.losses(batch, noise)?;
@@ -121,20 +122,24 @@ impl Fql {
     /// Those of critics, flow and policy.
     fn losses(&self, batch: &Minibatch, noise: &Noise) -> Result<[Loss; 3]> {
         let targets = self.targets(batch, &noise.of_targets)?;
-        let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let critic_loss =
+            self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         let bc_loss = self.flow_loss(batch, noise)?;
         let [distill_loss, q_loss] = self.actor_losses(batch, &noise.of_policy)?;
         let actor_loss = ((&distill_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         Ok([
             Loss::new("critic_loss", critic_loss).with("q_mean", targets.mean_all()?),
             Loss::new("bc_loss", bc_loss),
-            Loss::new("actor_loss", actor_loss).with("distill_loss", distill_loss).with("q_loss", q_loss),
+            Loss::new("actor_loss", actor_loss)
+                .with("distill_loss", distill_loss)
+                .with("q_loss", q_loss),
         ])
     }
 
     /// y = r + γ·mask·Q̂(s', π(s', z)), `[B]`.
     fn targets(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
-        let actions = OneStepActor::new(self.actor.network.detach()).sample(&batch.next_observations, noise)?;
+        let actions = OneStepActor::new(self.actor.network.detach())
+            .sample(&batch.next_observations, noise)?;
         let values = self.target_critics.values(&batch.next_observations, &actions)?;
         let q = match self.config.target {
             Reduce::Mean => values.mean(0)?,
@@ -147,7 +152,11 @@ impl Fql {
     fn flow_loss(&self, batch: &Minibatch, Noise { start, times, .. }: &Noise) -> Result<Tensor> {
         let velocity = (&batch.actions - start)?;
         let x = (start + velocity.broadcast_mul(times)?)?;
-        let predicted = self.flow.network.outputs(&batch.observations, &Tensor::cat(&[&x, times], 1)?)?.squeeze(0)?;
+        let predicted = self
+            .flow
+            .network
+            .outputs(&batch.observations, &Tensor::cat(&[&x, times], 1)?)?
+            .squeeze(0)?;
         (predicted - velocity)?.sqr()?.mean_all()
     }
 
@@ -163,10 +172,12 @@ impl Fql {
         x.clamp(-1f32, 1f32)
     }
 
-    /// The one-step policy's distance to the flow, and −Q of its actions, maybe divided by its mean size; both `[]`.
+    /// The one-step policy's distance to the flow, and −Q of its actions, maybe divided by its mean
+    /// size; both `[]`.
     fn actor_losses(&self, batch: &Minibatch, noise: &Tensor) -> Result<[Tensor; 2]> {
         let actions = self.actor.network.outputs(&batch.observations, noise)?.squeeze(0)?;
-        let distill_loss = (&actions - self.flow_actions(&batch.observations, noise)?)?.sqr()?.mean_all()?;
+        let distill_loss =
+            (&actions - self.flow_actions(&batch.observations, noise)?)?.sqr()?.mean_all()?;
         let actions = actions.clamp(-1f32, 1f32)?;
         let q = self.critics.network.detach().values(&batch.observations, &actions)?.mean(0)?;
         let mut q_loss = q.mean_all()?.neg()?;
@@ -177,13 +188,19 @@ impl Fql {
     }
 
     fn noise(&self, step: u64) -> Result<Noise> {
-        let (generator, device) = (&mut stream(self.context.seed, Purpose::Noise, step), &self.context.device);
-        let (rows, shape) = (self.context.batch_size, (self.context.batch_size, self.context.action_dim()));
+        let (generator, device) =
+            (&mut stream(self.context.seed, Purpose::Noise, step), &self.context.device);
+        let (rows, shape) =
+            (self.context.batch_size, (self.context.batch_size, self.context.action_dim()));
         Ok(Noise {
             start: normal(shape, generator, device)?,
             of_policy: normal(shape, generator, device)?,
             of_targets: normal(shape, generator, device)?,
-            times: Tensor::from_vec((0..rows).map(|_| generator.random::<f32>()).collect(), (rows, 1), device)?,
+            times: Tensor::from_vec(
+                (0..rows).map(|_| generator.random::<f32>()).collect(),
+                (rows, 1),
+                device,
+            )?,
         })
     }
 }
@@ -210,7 +227,11 @@ impl Algorithm for Fql {
 
     /// The one-step policy, with the target critics to choose by.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let choice = Choice { candidates: *self.config.candidates, value: self.config.target, rule: Rule::Best };
+        let choice = Choice {
+            candidates: *self.config.candidates,
+            value: self.config.target,
+            rule: Rule::Best,
+        };
         let tensors = ActorCriticShape::tensors(&self.actor.network, &self.target_critics)?;
         Ok((PolicyConfig::OneStep { shape: shape(&self.config, &self.context), choice }, tensors))
     }

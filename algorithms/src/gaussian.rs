@@ -1,10 +1,10 @@
-//! The Gaussian policy that several algorithms train by weighted regression: its mean is the tanh of a network, its log σ the
-//! same in all states.
+//! The Gaussian policy that several algorithms train by weighted regression: its mean is the tanh
+//! of a network, its log σ the same in all states.
 
 use candle_core::{Result, Tensor};
 use quad_policy::{
-    AdamStep, Ensemble, GaussianPolicy, GaussianShape, Gradients, MlpConfig, PolicyConfig, Tensors, Weights,
-    gaussian_mean,
+    AdamStep, Ensemble, GaussianPolicy, GaussianShape, Gradients, MlpConfig, PolicyConfig, Tensors,
+    Weights, gaussian_mean,
 };
 
 use super::context::Context;
@@ -26,7 +26,11 @@ pub(super) struct Gaussian {
 impl Gaussian {
     pub fn new(layers: &MlpConfig, context: &Context, network: u64) -> Result<Self> {
         let action_dim = context.action_dim();
-        let shape = GaussianShape { observation_dim: context.observation_dim(), action_dim, actor: layers.clone() };
+        let shape = GaussianShape {
+            observation_dim: context.observation_dim(),
+            action_dim,
+            actor: layers.clone(),
+        };
         let log_std = learned("log_std", &vec![0.0; action_dim], context)?;
         Ok(Self { mean: ensemble(shape.actor(), context, network)?, log_std, shape })
     }
@@ -57,16 +61,21 @@ impl Gaussian {
     }
 }
 
-/// log π(a|s), `[B]`, of actions and means `[B, a]`; log σ is `[B, a]`, or `[a]` in all states. The tanh is part of the mean:
-/// the density knows nothing of it.
+/// log π(a|s), `[B]`, of actions and means `[B, a]`; log σ is `[B, a]`, or `[a]` in all states. The
+/// tanh is part of the mean: the density knows nothing of it.
 pub(super) fn log_density(actions: &Tensor, mean: &Tensor, log_std: &Tensor) -> Result<Tensor> {
     let square = (actions - mean)?.broadcast_div(&log_std.exp()?)?.sqr()?;
     let half_log_2_pi = 0.5 * (2.0 * std::f64::consts::PI).ln();
     ((square * -0.5)?.broadcast_sub(log_std)? - half_log_2_pi)?.sum(1)
 }
 
-/// The policy that acts by the tanh of the first half of what comes out of a network of these hidden layers, `[n, 2a]`.
-pub(super) fn first_half(network: &Ensemble, layers: &MlpConfig, context: &Context) -> Result<(PolicyConfig, Tensors)> {
+/// The policy that acts by the tanh of the first half of what comes out of a network of these
+/// hidden layers, `[n, 2a]`.
+pub(super) fn first_half(
+    network: &Ensemble,
+    layers: &MlpConfig,
+    context: &Context,
+) -> Result<(PolicyConfig, Tensors)> {
     let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
     let mut tensors = GaussianPolicy::tensors(network)?;
     let last = format!(".{}.", layers.hidden.len());

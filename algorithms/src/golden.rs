@@ -13,12 +13,14 @@ use super::parts::Parts;
 use candle_core::{Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
 use quad_policy::{
-    Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, OneStepActor, PolicyConfig, Precision, Reverse,
-    Schedule, SquashedActor, Tensors, Weights, load_policy, open_gpu, read_tensors,
+    Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, OneStepActor, PolicyConfig,
+    Precision, Reverse, Schedule, SquashedActor, Tensors, Weights, load_policy, open_gpu,
+    read_tensors,
 };
 pub(super) use reader::{Golden, MAKE, goldens, run};
 
-/// Tests an update against the folders of an algorithm, on each device; and against one of a fresh seed of each of its variants.
+/// Tests an update against the folders of an algorithm, on each device; and against one of a fresh
+/// seed of each of its variants.
 macro_rules! golden_tests {
     ($algorithm:literal, $check:expr) => {
         #[test]
@@ -44,8 +46,8 @@ pub(super) fn fresh_ones(algorithm: &str) -> Vec<Golden> {
     reader::committed(algorithm).iter().filter_map(|golden| reader::fresh(&name(golden))).collect()
 }
 
-/// Where updates are tested: on the CPU, and on a GPU with the feature `cuda`. Without a GPU that share is skipped,
-/// unless QUAD_REQUIRE_PEERS=1 asks for one.
+/// Where updates are tested: on the CPU, and on a GPU with the feature `cuda`. Without a GPU that
+/// share is skipped, unless QUAD_REQUIRE_PEERS=1 asks for one.
 #[allow(clippy::print_stderr)] // what is skipped is said
 pub(super) fn devices() -> Vec<Device> {
     let mut devices = vec![Device::Cpu];
@@ -53,7 +55,8 @@ pub(super) fn devices() -> Vec<Device> {
         match open_gpu() {
             Ok(gpu) => devices.push(gpu),
             Err(error) => {
-                let required = std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");
+                let required =
+                    std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");
                 assert!(!required, "there is no GPU: {error}");
                 eprintln!("skipped on CUDA, because there is no GPU: {error}");
             }
@@ -67,11 +70,19 @@ pub(super) fn value(measured: &Measured, name: &str) -> Option<f32> {
     measured.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
 }
 
-/// Checks that an update gave what a golden folder expects: each metric and each tensor of the state. What the folder's update
-/// does not measure is 0 there.
-pub(super) fn check_update(golden: &Golden, metrics: &[Metric], measured: &Measured, state: Tensors) {
-    for Metric { name, .. } in metrics.iter().filter(|metric| golden.expected.contains_key(metric.name)) {
-        golden.close(name, &Tensor::new(value(measured, name).unwrap_or(0.0), &Device::Cpu).unwrap());
+/// Checks that an update gave what a golden folder expects: each metric and each tensor of the
+/// state. What the folder's update does not measure is 0 there.
+pub(super) fn check_update(
+    golden: &Golden,
+    metrics: &[Metric],
+    measured: &Measured,
+    state: Tensors,
+) {
+    for Metric { name, .. } in
+        metrics.iter().filter(|metric| golden.expected.contains_key(metric.name))
+    {
+        golden
+            .close(name, &Tensor::new(value(measured, name).unwrap_or(0.0), &Device::Cpu).unwrap());
     }
     for (name, tensor) in state {
         golden.close(&name, &tensor);
@@ -87,7 +98,9 @@ pub(super) fn load(golden: &Golden, parts: Parts<'_>) {
 
 /// The context of a golden folder, whose transitions are those of its batch.
 pub(super) fn context(golden: &Golden, device: &Device) -> Context {
-    let numbers = |name: &str| golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let numbers = |name: &str| {
+        golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap()
+    };
     let terminals: Vec<bool> = numbers("masks").iter().map(|mask| *mask == 0.0).collect();
     let arrays = Arrays {
         observation_dim: golden.count("/observation_dim"),
@@ -118,7 +131,8 @@ pub(super) fn table(golden: &Golden) -> toml::Table {
     toml::Table::try_from(&golden.config["agent"]).unwrap()
 }
 
-/// The noise of sampled actions, `[T, states, samples, a]` in a golden folder, one row for each action.
+/// The noise of sampled actions, `[T, states, samples, a]` in a golden folder, one row for each
+/// action.
 pub(super) fn chain_noise(golden: &Golden, name: &str, device: &Device) -> Tensor {
     golden.input(name, device).flatten(1, golden.inputs[name].rank() - 2).unwrap()
 }
@@ -127,7 +141,8 @@ pub(super) fn chain_noise(golden: &Golden, name: &str, device: &Device) -> Tenso
 pub(super) fn denoising(golden: &Golden, device: &Device) -> Denoising {
     let t: Vec<i64> = golden.inputs["t"].to_vec1().unwrap();
     let t: Vec<u32> = t.into_iter().map(|t| t as u32).collect();
-    let schedule = Schedule::variance_preserving(golden.count("/agent/diffusion_steps"), Reverse::ClipClean);
+    let schedule =
+        Schedule::variance_preserving(golden.count("/agent/diffusion_steps"), Reverse::ClipClean);
     Denoising::new(&t, golden.input("epsilon", device), &schedule).unwrap()
 }
 
@@ -156,7 +171,8 @@ pub(super) fn check_actions(golden: &Golden, algorithm: &dyn Algorithm) {
     let file = Header::new(policy, ()).to_safetensors(&tensors).unwrap();
     let policy = load_policy(&file, Precision::F32).unwrap();
     let observations = golden.input("select_observations", &Device::Cpu);
-    let mut states: Vec<_> = (0..observations.dim(0).unwrap() as u64).map(|seed| policy.begin(seed)).collect();
+    let mut states: Vec<_> =
+        (0..observations.dim(0).unwrap() as u64).map(|seed| policy.begin(seed)).collect();
     let observations: Vec<f32> = observations.flatten_all().unwrap().to_vec1().unwrap();
     let mut actions = vec![0.0; states.len() * policy.action_dim()];
     policy.act(&observations, &mut states, &mut actions).unwrap();
@@ -174,20 +190,27 @@ pub(super) struct Drawn {
     pub v: Option<Tensor>,
 }
 
-/// Checks that the networks of a published policy draw and value candidates as a golden folder expects.
+/// Checks that the networks of a published policy draw and value candidates as a golden folder
+/// expects.
 pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Drawn {
     let (policy, tensors) = algorithm.policy().unwrap();
     let file = Header::new(policy.clone(), ()).to_safetensors(&tensors).unwrap();
     load_policy(&file, Precision::F32).unwrap();
     let mut tensors = read_tensors(&file).unwrap();
-    let mut weights = |layout: Layout, prefix: &str| Weights::take(layout, &mut tensors, prefix).unwrap();
+    let mut weights =
+        |layout: Layout, prefix: &str| Weights::take(layout, &mut tensors, prefix).unwrap();
     let ensemble = |of: EnsembleShape, weights: Weights| Ensemble::new(of, weights, Precision::F32);
     let observations = golden.input("select_observations", &Device::Cpu);
     let noise = chain_noise(golden, "select_noise", &Device::Cpu);
     let (choice, candidates, critics, value) = match policy {
         PolicyConfig::Diffusion { shape, choice } => {
-            let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), "actor."), Precision::F32);
-            let value = shape.value().map(|of| ensemble(of.clone(), weights(of.layout(), "value.")));
+            let actor = NoisePredictor::new(
+                shape.actor(),
+                weights(shape.actor().layout(), "actor."),
+                Precision::F32,
+            );
+            let value =
+                shape.value().map(|of| ensemble(of.clone(), weights(of.layout(), "value.")));
             (choice, actor.sample(&observations, &noise), shape.critics(), value)
         }
         PolicyConfig::Squashed { shape, choice } => {
@@ -202,7 +225,8 @@ pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Dr
         }
         other => panic!("{other:?}"),
     };
-    let (candidates, critics) = (candidates.unwrap(), ensemble(critics.clone(), weights(critics.layout(), "critic.")));
+    let (candidates, critics) =
+        (candidates.unwrap(), ensemble(critics.clone(), weights(critics.layout(), "critic.")));
     let q = smaller(&critics.values(&observations, &candidates).unwrap()).unwrap();
     golden.close("select.candidates", &candidates);
     golden.close("select.q", &q);

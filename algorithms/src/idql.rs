@@ -1,6 +1,6 @@
-//! IDQL (Hansen-Estruch et al. 2023, "IDQL: Implicit Q-Learning as an Actor-Critic Method with Diffusion Policies"): IQL's critics
-//! and a diffusion policy that only clones the data, as AlignIQL trains them. When it acts, the policy takes the one of its samples
-//! that is worth most.
+//! IDQL (Hansen-Estruch et al. 2023, "IDQL: Implicit Q-Learning as an Actor-Critic Method with
+//! Diffusion Policies"): IQL's critics and a diffusion policy that only clones the data, as
+//! AlignIQL trains them. When it acts, the policy takes the one of its samples that is worth most.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]

@@ -1,6 +1,7 @@
-//! What IQL and its kin share: they never ask for the value of an action that is not in the data. V(s) is fitted to the target
-//! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move toward r + γ·V(s').
-//! An algorithm of this kind is its [`Losses`].
+//! What IQL and its kin share: they never ask for the value of an action that is not in the data.
+//! V(s) is fitted to the target critics' smaller value, a Gaussian policy is cloned from the data
+//! with weights, and twin critics move toward r + γ·V(s'). An algorithm of this kind is its
+//! [`Losses`].
 
 use super::algorithm::{AgentError, Algorithm, Loss, Measured, measured, smaller};
 use super::context::{Context, Minibatch};
@@ -10,7 +11,9 @@ use super::hyperparameters::{Positive, Rate, Share};
 use super::parts::Parts;
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
-use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, cosine_decay};
+use quad_policy::{
+    AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, cosine_decay,
+};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
@@ -76,12 +79,14 @@ pub(super) trait Losses: Send {
     /// The weights of actions with these advantages, `[B]`, before they are clipped at 0 and 100.
     fn weights(&self, advantages: &Tensor) -> Result<Tensor>;
 
-    /// The loss `[]` that the critics are moved down, of `q`, Q_k(s, a), `[2, B]`, and the targets y, `[B]`.
+    /// The loss `[]` that the critics are moved down, of `q`, Q_k(s, a), `[2, B]`, and the targets
+    /// y, `[B]`.
     fn critic_loss(&self, q: &Tensor, targets: &Tensor) -> Result<Tensor> {
         q.broadcast_sub(targets)?.sqr()?.mean_all()? * CRITICS as f64
     }
 
-    /// States and actions that V is fitted to in update number `step`, where they are not the batch's.
+    /// States and actions that V is fitted to in update number `step`, where they are not the
+    /// batch's.
     fn pairs(&self, _: &Context, _step: u64, _: &Minibatch) -> Result<Option<(Tensor, Tensor)>> {
         Ok(None)
     }
@@ -132,7 +137,12 @@ impl<L: Losses> InSample<L> {
     }
 
     /// Update number `step`; `pairs` are what [`Losses::pairs`] gives.
-    pub fn step(&mut self, step: u64, batch: &Minibatch, pairs: Option<(Tensor, Tensor)>) -> Result<Measured> {
+    pub fn step(
+        &mut self,
+        step: u64,
+        batch: &Minibatch,
+        pairs: Option<(Tensor, Tensor)>,
+    ) -> Result<Measured> {
         let common = self.losses.common();
         let q = self.q(&batch.observations, &batch.actions)?;
         let fitted = self.fitted(batch, &q, pairs)?;
@@ -147,12 +157,17 @@ impl<L: Losses> InSample<L> {
         }
 
         let actor_loss = self.actor_loss(batch, &q)?;
-        let decay = if self.losses.actor_rate_decays() { cosine_decay(step, self.context.total_steps) } else { 1.0 };
+        let decay = if self.losses.actor_rate_decays() {
+            cosine_decay(step, self.context.total_steps)
+        } else {
+            1.0
+        };
         let rate = *common.actor_learning_rate * decay;
         self.actor.descend(&actor_loss.value, AdamStep::after(step, rate))?;
 
         let critic_loss = self.critic_loss(batch)?;
-        self.critics.descend(&critic_loss.value, AdamStep::after(step, *common.critic_learning_rate))?;
+        self.critics
+            .descend(&critic_loss.value, AdamStep::after(step, *common.critic_learning_rate))?;
         self.target_critics.follow(&self.critics.network, *common.ema_rate)?;
 
         let mut measured = measured(&[value_loss, actor_loss, critic_loss])?;
@@ -166,7 +181,12 @@ impl<L: Losses> InSample<L> {
     }
 
     /// The states that V is fitted in, and to what; `q` is the smaller Q̂ of the batch.
-    fn fitted(&self, batch: &Minibatch, q: &Tensor, pairs: Option<(Tensor, Tensor)>) -> Result<(Tensor, Tensor)> {
+    fn fitted(
+        &self,
+        batch: &Minibatch,
+        q: &Tensor,
+        pairs: Option<(Tensor, Tensor)>,
+    ) -> Result<(Tensor, Tensor)> {
         match pairs {
             Some((states, actions)) => Ok((states.clone(), self.q(&states, &actions)?)),
             None => Ok((batch.observations.clone(), q.clone())),
@@ -175,7 +195,8 @@ impl<L: Losses> InSample<L> {
 
     /// V(s) toward the smaller Q̂(s, a).
     fn value_loss(&self, (states, q): &(Tensor, Tensor)) -> Result<Loss> {
-        let loss = self.losses.value_loss(q, &self.value.network.state_values(states)?.squeeze(0)?)?;
+        let loss =
+            self.losses.value_loss(q, &self.value.network.state_values(states)?.squeeze(0)?)?;
         Ok(Loss::new("value_loss", loss))
     }
 
@@ -196,10 +217,12 @@ impl<L: Losses> InSample<L> {
 
     /// Q(s, a) toward r + γ·V(s').
     fn critic_loss(&self, batch: &Minibatch) -> Result<Loss> {
-        let next = self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
+        let next =
+            self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = batch.target(*self.losses.common().gamma, &next)?;
         let values = self.critics.network.values(&batch.observations, &batch.actions)?;
-        Ok(Loss::new("critic_loss", self.losses.critic_loss(&values, &targets)?).with("q_mean", targets.mean_all()?))
+        Ok(Loss::new("critic_loss", self.losses.critic_loss(&values, &targets)?)
+            .with("q_mean", targets.mean_all()?))
     }
 }
 
@@ -214,7 +237,11 @@ impl<L: Losses> Algorithm for InSample<L> {
         let batch = self.context.batch(items)?;
         let q = self.q(&batch.observations, &batch.actions)?;
         let fitted = self.fitted(&batch, &q, self.losses.pairs(&self.context, step, &batch)?)?;
-        measured(&[self.value_loss(&fitted)?, self.actor_loss(&batch, &q)?, self.critic_loss(&batch)?])
+        measured(&[
+            self.value_loss(&fitted)?,
+            self.actor_loss(&batch, &q)?,
+            self.critic_loss(&batch)?,
+        ])
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
@@ -230,7 +257,8 @@ impl<L: Losses> Algorithm for InSample<L> {
     }
 }
 
-/// −max(largest z of the batch, −1), `[]`, a constant: exponentials of z that are multiplied by its exponential cannot overflow.
+/// −max(largest z of the batch, −1), `[]`, a constant: exponentials of z that are multiplied by its
+/// exponential cannot overflow.
 pub(super) fn scale_down(z: &Tensor) -> Result<Tensor> {
     z.max(0)?.maximum(-1.0)?.neg().map(|shift| shift.detach())
 }

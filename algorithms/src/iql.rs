@@ -1,6 +1,6 @@
-//! IQL (Kostrikov, Nair and Levine 2021, "Offline Reinforcement Learning with Implicit Q-Learning"): a value function
-//! learned by expectile regression, and a Gaussian policy cloned from the data with advantages as weights. Equations are
-//! that paper's.
+//! IQL (Kostrikov, Nair and Levine 2021, "Offline Reinforcement Learning with Implicit
+//! Q-Learning"): a value function learned by expectile regression, and a Gaussian policy cloned
+//! from the data with advantages as weights. Equations are that paper's.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]

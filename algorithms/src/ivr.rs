@@ -1,7 +1,8 @@
-//! IVR (Xu et al. 2023, "Offline RL with No OOD Actions: In-Sample Learning via Implicit Value Regularization"): V and Q of a
-//! problem whose reward is less what the policy's divergence from the data's costs, learned from actions of the data alone. The
-//! divergence decides the variant: SQL, sparse Q-learning, or EQL, exponential Q-learning. Equations are that paper's; where
-//! its authors' code does something else, docs/deviations.md says what holds.
+//! IVR (Xu et al. 2023, "Offline RL with No OOD Actions: In-Sample Learning via Implicit Value
+//! Regularization"): V and Q of a problem whose reward is less what the policy's divergence from
+//! the data's costs, learned from actions of the data alone. The divergence decides the variant:
+//! SQL, sparse Q-learning, or EQL, exponential Q-learning. Equations are that paper's; where its
+//! authors' code does something else, docs/deviations.md says what holds.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -20,7 +21,10 @@ pub(super) const DEFINITION: Definition = Definition {
     settings: include_str!("../../presets/ivr.toml"),
     metrics: METRICS,
     report: Reporting {
-        variant: Some(Variant { key: "divergence", called: |divergence| format!("ivr {divergence}") }),
+        variant: Some(Variant {
+            key: "divergence",
+            called: |divergence| format!("ivr {divergence}"),
+        }),
         ..Reporting::PLAIN
     },
     check: |table| read::<Config>(table).map(drop),
@@ -85,7 +89,8 @@ impl Losses for Config {
     fn value_loss(&self, q: &Tensor, v: &Tensor) -> Result<Tensor> {
         let (excess, alpha) = ((q - v)?, self.alpha());
         match self.divergence {
-            // SQL: max(z, 0) is π's density over the data's, so that its mean is 1 where the gradient is 0.
+            // SQL: max(z, 0) is π's density over the data's, so that its mean is 1 where the
+            // gradient is 0.
             Divergence::Sparse => {
                 let z = excess.affine(0.5 / alpha, 1.0)?;
                 (z.relu()?.sqr()? + (v / alpha)?)?.mean_all()
@@ -94,7 +99,8 @@ impl Losses for Config {
             Divergence::Exponential => {
                 let z = (excess / alpha)?.minimum(LARGEST_EXPONENT)?;
                 let down = scale_down(&z)?;
-                (z.broadcast_add(&down)?.exp()? + v.broadcast_mul(&(down.exp()? / alpha)?)?)?.mean_all()
+                (z.broadcast_add(&down)?.exp()? + v.broadcast_mul(&(down.exp()? / alpha)?)?)?
+                    .mean_all()
             }
         }
     }

@@ -1,7 +1,9 @@
 //! Learning algorithms, one file each, to be read beside its paper.
 //!
-//! `definition` is what is known of an algorithm before it runs, `algorithm` all that the learner sees of it at work, `agent`
-//! an algorithm at work, saved and loaded, and `values` its values for each task. A new algorithm is a file here, a line in [`ALGORITHMS`] and its values in `presets/`.
+//! `definition` is what is known of an algorithm before it runs, `algorithm` all that the learner
+//! sees of it at work, `agent` an algorithm at work, saved and loaded, and `values` its values for
+//! each task. A new algorithm is a file here, a line in [`ALGORITHMS`] and its values in
+//! `presets/`.
 
 #![deny(unsafe_code)]
 

@@ -1,6 +1,7 @@
-//! Onestep-RL (Brandfonbrener, Whitney, Ranganath and Bruna 2021, "Offline RL Without Off-Policy Evaluation"), with
-//! exponential weights, in three phases: the data's policy β is cloned, its value Q^β is learned from the data's own next
-//! actions, and β is improved once. No value of the improved policy is ever asked for.
+//! Onestep-RL (Brandfonbrener, Whitney, Ranganath and Bruna 2021, "Offline RL Without Off-Policy
+//! Evaluation"), with exponential weights, in three phases: the data's policy β is cloned, its
+//! value Q^β is learned from the data's own next actions, and β is improved once. No value of the
+//! improved policy is ever asked for.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -115,7 +116,15 @@ impl Onestep {
         let policy = || ensemble(shape(0, &config.behavior, 2 * action_dim), &context, 0);
         let (behavior, actor) = (policy()?, policy()?);
         let critic = ensemble(shape(action_dim, &config.critic, 1), &context, 1)?;
-        Ok(Self { target_critic: critic.network.copy()?, behavior, critic, actor, items, config, context })
+        Ok(Self {
+            target_critic: critic.network.copy()?,
+            behavior,
+            critic,
+            actor,
+            items,
+            config,
+            context,
+        })
     }
 
     /// The steps at which the phases begin.
@@ -154,11 +163,19 @@ impl Onestep {
 
     fn behavior_loss(&self, batch: &Minibatch) -> Result<Loss> {
         let (mean, log_std) = distribution(&self.behavior.network, &batch.observations)?;
-        Ok(Loss::new("behavior_loss", log_density(&batch.actions, &mean, &log_std)?.mean_all()?.neg()?))
+        Ok(Loss::new(
+            "behavior_loss",
+            log_density(&batch.actions, &mean, &log_std)?.mean_all()?.neg()?,
+        ))
     }
 
     /// Second phase: the critic, which its target follows.
-    fn evaluate_behavior(&mut self, batch: &Minibatch, next_actions: &Tensor, steps: u64) -> Result<Measured> {
+    fn evaluate_behavior(
+        &mut self,
+        batch: &Minibatch,
+        next_actions: &Tensor,
+        steps: u64,
+    ) -> Result<Measured> {
         let loss = self.critic_loss(batch, next_actions)?;
         self.critic.descend(&loss.value, self.adam(steps))?;
         if (steps + 1).is_multiple_of(*self.config.ema_every) {
@@ -171,7 +188,8 @@ impl Onestep {
     fn critic_loss(&self, batch: &Minibatch, next_actions: &Tensor) -> Result<Loss> {
         let next = self.target_critic.values(&batch.next_observations, next_actions)?.squeeze(0)?;
         let targets = batch.target(*self.config.gamma, &next)?;
-        let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let loss =
+            self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         Ok(Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?))
     }
 
@@ -184,7 +202,8 @@ impl Onestep {
 
     /// π toward actions of the data, the more so the better they are than β's.
     fn actor_loss(&self, batch: &Minibatch, noise: &Tensor) -> Result<Loss> {
-        let q = self.critic.network.detach().values(&batch.observations, &batch.actions)?.squeeze(0)?;
+        let q =
+            self.critic.network.detach().values(&batch.observations, &batch.actions)?.squeeze(0)?;
         let advantage = (q - self.value(&batch.observations, noise)?)?;
         let weight = (&advantage * f64::from(*self.config.temperature))?.exp()?;
         let clipped = weight.gt(MOST_WEIGHT)?.to_dtype(DType::F32)?;
@@ -195,7 +214,8 @@ impl Onestep {
         Ok(loss.with("weight_mean", weight.mean_all()?).with("clipped_share", clipped.mean_all()?))
     }
 
-    /// The mean of Q(s, ·) over actions that β draws with this noise, `[B, S, a]`, also beyond ±1; `[B]`.
+    /// The mean of Q(s, ·) over actions that β draws with this noise, `[B, S, a]`, also beyond ±1;
+    /// `[B]`.
     fn value(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         let (b, samples, a) = noise.dims3()?;
         let (mean, log_std) = distribution(&self.behavior.network.detach(), observations)?;
@@ -208,12 +228,14 @@ impl Onestep {
     fn noise(&self, step: u64) -> Result<Tensor> {
         let mut generator = stream(self.context.seed, Purpose::Noise, step);
         let shape = (self.context.batch_size, *self.config.samples, self.context.action_dim());
-        let numbers = (0..shape.0 * shape.1 * shape.2).map(|_| StandardNormal.sample(&mut generator));
+        let numbers =
+            (0..shape.0 * shape.1 * shape.2).map(|_| StandardNormal.sample(&mut generator));
         Tensor::from_vec(numbers.collect::<Vec<f32>>(), shape, &self.context.device)
     }
 }
 
-/// Mean and log σ of a policy's actions, `[n, a]` each: its network gives both, log σ through a tanh that keeps it in bounds.
+/// Mean and log σ of a policy's actions, `[n, a]` each: its network gives both, log σ through a
+/// tanh that keeps it in bounds.
 fn distribution(network: &Ensemble, observations: &Tensor) -> Result<(Tensor, Tensor)> {
     let out = network.state_outputs(observations)?.squeeze(0)?.tanh()?;
     let (a, half) = (out.dim(1)? / 2, (LOG_STD.1 - LOG_STD.0) / 2.0);
@@ -233,7 +255,9 @@ impl Algorithm for Onestep {
         let (batch, rows) = self.batch(items)?;
         match self.phase(step) {
             Phase::Behavior(steps) => self.clone_behavior(&batch, steps),
-            Phase::Critic(steps) => self.evaluate_behavior(&batch, &self.context.next_actions(&rows)?, steps),
+            Phase::Critic(steps) => {
+                self.evaluate_behavior(&batch, &self.context.next_actions(&rows)?, steps)
+            }
             Phase::Policy(steps) => self.improve(&batch, &self.noise(step)?, steps),
         }
     }

@@ -32,7 +32,11 @@ impl<'a> Parts<'a> {
     }
 
     /// The weights of a network, and its optimizer's moments.
-    pub(super) fn trained<N: Weighted>(mut self, name: &'static str, trained: &'a mut Trained<N>) -> Self {
+    pub(super) fn trained<N: Weighted>(
+        mut self,
+        name: &'static str,
+        trained: &'a mut Trained<N>,
+    ) -> Self {
         let Trained { network, adam } = trained;
         self.0.push((name, Part::Adam(adam, network.weights().layout().clone())));
         self.weights(name, network.weights_mut())
@@ -45,7 +49,12 @@ impl<'a> Parts<'a> {
     }
 
     /// A scalar on this device, which may be missing.
-    pub(super) fn maybe(mut self, name: &'static str, number: &'a mut Option<Tensor>, device: &'a Device) -> Self {
+    pub(super) fn maybe(
+        mut self,
+        name: &'static str,
+        number: &'a mut Option<Tensor>,
+        device: &'a Device,
+    ) -> Self {
         self.0.push((name, Part::Maybe(number, device)));
         self
     }
@@ -59,7 +68,9 @@ impl<'a> Parts<'a> {
         for (name, part) in self.0 {
             match part {
                 Part::Weights(weights) => tensors.extend(weights.tensors(&format!("{name}."))?),
-                Part::Adam(adam, layout) => tensors.extend(adam.tensors(&layout, &format!("{name}."))?),
+                Part::Adam(adam, layout) => {
+                    tensors.extend(adam.tensors(&layout, &format!("{name}."))?)
+                }
                 Part::Number(number) | Part::Maybe(Some(number), _) => {
                     tensors.insert(name.to_owned(), number.flatten_all()?);
                 }
@@ -72,7 +83,9 @@ impl<'a> Parts<'a> {
     /// The weights of all networks.
     #[cfg(test)]
     pub fn networks(self) -> Vec<(&'static str, &'a mut Weights)> {
-        let weights = |(name, part)| if let Part::Weights(weights) = part { Some((name, weights)) } else { None };
+        let weights = |(name, part)| {
+            if let Part::Weights(weights) = part { Some((name, weights)) } else { None }
+        };
         self.0.into_iter().filter_map(weights).collect()
     }
 
@@ -90,7 +103,12 @@ impl<'a> Parts<'a> {
                     write(number, &saved.to_device(number.device())?)?;
                 }
                 Part::Maybe(number, device) if tensors.contains_key(name) => {
-                    *number = Some(take(tensors, name.to_owned(), &[1])?.reshape(())?.to_device(device)?.copy()?);
+                    *number = Some(
+                        take(tensors, name.to_owned(), &[1])?
+                            .reshape(())?
+                            .to_device(device)?
+                            .copy()?,
+                    );
                 }
                 Part::Maybe(number, _) => *number = None,
             }

@@ -9,8 +9,9 @@ const PAUSES: usize = 50;
 
 /// Runs `work` as a whole on a thread of the pool, and keeps the others looking for work meanwhile.
 ///
-/// A gradient step has some fifteen parallel parts with microseconds of other work between them. Handing each of them to
-/// the pool from outside, or letting idle threads fall asleep in between, costs as much as that other work itself.
+/// A gradient step has some fifteen parallel parts with microseconds of other work between them.
+/// Handing each of them to the pool from outside, or letting idle threads fall asleep in between,
+/// costs as much as that other work itself.
 pub(crate) fn run_awake<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     let done = AtomicBool::new(false);
     rayon::scope(|scope| {

@@ -1,5 +1,6 @@
-//! QUAD (Algorithm 1 of the paper): a diffusion policy is cloned from the data and pulled along the critics' gradients,
-//! as far as the critics agree on them. Equations are the paper's; where it is silent, docs/deviations.md says what holds.
+//! QUAD (Algorithm 1 of the paper): a diffusion policy is cloned from the data and pulled along the
+//! critics' gradients, as far as the critics agree on them. Equations are the paper's; where it is
+//! silent, docs/deviations.md says what holds.
 
 mod config;
 #[cfg(test)]
@@ -24,7 +25,8 @@ use config::{Eta, Guidance, Quad as Config, TargetReduce};
 use guidance::Guide;
 use metrics::METRICS;
 use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Reverse, Tensors, Weighted, cosine_decay, mean_and_variance,
+    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Reverse, Tensors, Weighted, cosine_decay,
+    mean_and_variance,
 };
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -53,7 +55,8 @@ struct Quad {
     eta: Tensor,
     /// ν̂² (Eq. 23), `[]`; none before the first guided update.
     nu_squared: Option<Tensor>,
-    /// With guidance `mean`: the moving average of λ at each t, `[T]`; below 0 where there was none yet.
+    /// With guidance `mean`: the moving average of λ at each t, `[T]`; below 0 where there was none
+    /// yet.
     lambda_means: Option<Tensor>,
 }
 
@@ -109,8 +112,8 @@ impl Config {
 }
 
 impl Quad {
-    /// y = r + γ·mask·(mean - ρ·std over the critics of each one's value of s') (Eq. 20), `[B]`. Each critic's value of s'
-    /// is the mean, or the largest, of its values of the sampled actions.
+    /// y = r + γ·mask·(mean - ρ·std over the critics of each one's value of s') (Eq. 20), `[B]`.
+    /// Each critic's value of s' is the mean, or the largest, of its values of the sampled actions.
     fn targets(&self, networks: &Networks, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
         let next_actions = networks.target_actor.sample(&batch.next_observations, noise)?;
         let q = networks.target_critics.values(&batch.next_observations, &next_actions)?;
@@ -127,12 +130,22 @@ impl Quad {
     /// Lines 4–7: every critic toward the lower confidence bound (Eq. 20).
     fn critic_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
         let targets = self.targets(networks, batch, &noise.next)?;
-        let loss = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let loss = networks.critics.network.squared_error(
+            &batch.observations,
+            &batch.actions,
+            &targets,
+        )?;
         Ok(Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?))
     }
 
-    /// Lines 8–11: behavior cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
-    fn actor_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<ActorLoss> {
+    /// Lines 8–11: behavior cloning, pulled along the gradients that the critics agree on (Eq. 5
+    /// and 19).
+    fn actor_loss(
+        &self,
+        networks: &Networks,
+        batch: &Minibatch,
+        noise: &Noise,
+    ) -> Result<ActorLoss> {
         let Denoising { epsilon, deviation, .. } = &noise.denoising;
         let (noisy, predicted) = networks.denoise(batch, &noise.denoising)?;
         let error = (&predicted - epsilon)?;
@@ -145,7 +158,12 @@ impl Quad {
             let pull = (&guide.gradient * deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
             loss = (loss + (&predicted * pull)?.mean_all()?)?;
         }
-        Ok(ActorLoss { loss: Loss::new("actor_loss", loss).with("bc_loss", bc_loss), noisy, error, guide })
+        Ok(ActorLoss {
+            loss: Loss::new("actor_loss", loss).with("bc_loss", bc_loss),
+            noisy,
+            error,
+            guide,
+        })
     }
 
     /// η after a step of dual ascent: `excess` is how far the BC loss is above its threshold, `[]`.
@@ -163,27 +181,36 @@ impl Update for Quad {
         let next = networks.chain_noise(*self.config.samples, generator)?;
         let denoising = networks.denoising(generator)?;
         let permutation = match self.config.guidance {
-            Guidance::Shuffled => Some(Tensor::new(shuffled(&denoising.t.to_vec1()?, generator), &Device::Cpu)?),
+            Guidance::Shuffled => {
+                Some(Tensor::new(shuffled(&denoising.t.to_vec1()?, generator), &Device::Cpu)?)
+            }
             _ => None,
         };
         Ok(Noise { next, denoising, permutation })
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
-        let (decay, clip) = (cosine_decay(step, networks.context.total_steps), Some(*self.config.gradient_clip));
+        let (decay, clip) =
+            (cosine_decay(step, networks.context.total_steps), Some(*self.config.gradient_clip));
         let adam = |rate: f32| AdamStep { rate: rate * decay, clip, count: step + 1 };
         networks.critics.adam.set(adam(*self.config.critic_learning_rate))?;
         networks.actor.adam.set(adam(*self.config.actor_learning_rate))
     }
 
     /// One pass through Algorithm 1's loop, but for the target actor.
-    fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Noise) -> Result<Computed> {
+    fn work(
+        &mut self,
+        networks: &mut Networks,
+        batch: &Minibatch,
+        noise: &Noise,
+    ) -> Result<Computed> {
         let critic_loss = self.critic_loss(networks, batch, noise)?;
         let Networks { critics, target_critics, .. } = networks;
         let critic_gradient_norm = critics.descend_as_set(&critic_loss.value)?;
         target_critics.follow(&critics.network, *self.config.ema_rate)?;
 
-        let ActorLoss { loss: actor_loss, noisy, error, guide } = self.actor_loss(networks, batch, noise)?;
+        let ActorLoss { loss: actor_loss, noisy, error, guide } =
+            self.actor_loss(networks, batch, noise)?;
         if let Some(guide) = &guide {
             match &self.nu_squared {
                 Some(nu_squared) => write(nu_squared, &guide.nu_squared)?,
@@ -202,10 +229,14 @@ impl Update for Quad {
         {
             let Denoising { t, epsilon, .. } = &noise.denoising;
             let predicted = actor.network.detach().predict(&batch.observations, &noisy, t)?;
-            write(&self.eta, &self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?)?;
+            write(
+                &self.eta,
+                &self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?,
+            )?;
         }
 
-        let actor_loss = actor_loss.with("eta", self.eta.clone()).with("nu_squared", self.nu_squared.clone());
+        let actor_loss =
+            actor_loss.with("eta", self.eta.clone()).with("nu_squared", self.nu_squared.clone());
         let actor_loss = actor_loss.with("actor_gradient_norm", actor_gradient_norm);
         let losses = [critic_loss.with("critic_gradient_norm", critic_gradient_norm), actor_loss];
         Computed::new(&losses, &lambda::needed(guide.as_ref(), &error))
@@ -233,12 +264,14 @@ impl Update for Quad {
     }
 
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let tensors = DiffusionPolicy::tensors(&networks.target_actor, &networks.target_critics, None)?;
+        let tensors =
+            DiffusionPolicy::tensors(&networks.target_actor, &networks.target_critics, None)?;
         Ok((Choice::best_of(*self.config.candidates), tensors)) // Eq. 25
     }
 
     fn parts<'a>(&'a mut self, parts: Parts<'a>, device: &'a Device) -> Parts<'a> {
-        let parts = parts.number("eta", &mut self.eta).maybe("nu_squared", &mut self.nu_squared, device);
+        let parts =
+            parts.number("eta", &mut self.eta).maybe("nu_squared", &mut self.nu_squared, device);
         match &mut self.lambda_means {
             Some(means) => parts.number("lambda_means", means),
             None => parts,

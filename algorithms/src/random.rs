@@ -1,5 +1,5 @@
-//! Where the learner's random numbers come from: a stream per purpose, each a function of the run's seed and a counter, so
-//! that no generator holds anything that a saved run would have to remember.
+//! Where the learner's random numbers come from: a stream per purpose, each a function of the run's
+//! seed and a counter, so that no generator holds anything that a saved run would have to remember.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;

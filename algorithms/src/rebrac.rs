@@ -1,6 +1,7 @@
-//! ReBRAC (Tarasov, Kurenkov, Nikulin and Kolesnikov 2023, "Revisiting the Minimalist Approach to Offline Reinforcement
-//! Learning"): TD3+BC that keeps near the data's actions in policy and critics, each with a weight of its own. Its update is
-//! CORL's, in which its authors published it; equations are that paper's.
+//! ReBRAC (Tarasov, Kurenkov, Nikulin and Kolesnikov 2023, "Revisiting the Minimalist Approach to
+//! Offline Reinforcement Learning"): TD3+BC that keeps near the data's actions in policy and
+//! critics, each with a weight of its own. Its update is CORL's, in which its authors published it;
+//! equations are that paper's.
 
 use super::algorithm::smaller;
 use super::definition::{Definition, Metric, Reporting, metrics};

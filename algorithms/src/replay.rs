@@ -1,5 +1,6 @@
-//! The work of an update: a GPU does it once, records it in the next update, and replays it in those after that. It is hundreds
-//! of kernels, and the host takes longer to start one of them than the GPU to run it.
+//! The work of an update: a GPU does it once, records it in the next update, and replays it in
+//! those after that. It is hundreds of kernels, and the host takes longer to start one of them than
+//! the GPU to run it.
 
 use super::algorithm::{Loss, Measured, joined, scalars};
 use candle_core::{Device, Result, Tensor};
@@ -39,8 +40,12 @@ pub(super) struct Computed {
 impl Computed {
     /// What some losses measure, and tensors of any shape.
     pub fn new(losses: &[Loss], others: &[&Tensor]) -> Result<Self> {
-        let tensors: Vec<_> = scalars(losses).map(|(_, scalar)| scalar).chain(others.iter().copied()).collect();
-        Ok(Self { names: scalars(losses).map(|(name, _)| *name).collect(), numbers: joined(&tensors)? })
+        let tensors: Vec<_> =
+            scalars(losses).map(|(_, scalar)| scalar).chain(others.iter().copied()).collect();
+        Ok(Self {
+            names: scalars(losses).map(|(name, _)| *name).collect(),
+            numbers: joined(&tensors)?,
+        })
     }
 
     /// The scalars by name, and the other numbers; waits until they are computed.
@@ -71,10 +76,15 @@ impl<I> Default for Replay<I> {
 }
 
 impl<I: Inputs> Replay<I> {
-    /// Does `work` on a device, or queues it there. On a GPU that is the same each time but for the numbers of `inputs`, which
-    /// are on the CPU after the first time. It changes tensors in place; from the second time on none that it makes outlives
-    /// it.
-    pub fn start(&mut self, device: &Device, inputs: &I, work: impl FnOnce(&I) -> Result<Computed>) -> Result<()> {
+    /// Does `work` on a device, or queues it there. On a GPU that is the same each time but for the
+    /// numbers of `inputs`, which are on the CPU after the first time. It changes tensors in place;
+    /// from the second time on none that it makes outlives it.
+    pub fn start(
+        &mut self,
+        device: &Device,
+        inputs: &I,
+        work: impl FnOnce(&I) -> Result<Computed>,
+    ) -> Result<()> {
         let thread = current().id();
         let Some(mut kept) = self.0.take().filter(|kept| kept.thread == thread) else {
             let inputs = inputs.on(device)?;
@@ -108,7 +118,8 @@ impl<I: Inputs> Replay<I> {
     }
 }
 
-/// Gives a tensor of an earlier update the numbers of a new one: in place on a GPU, where recorded work reads it.
+/// Gives a tensor of an earlier update the numbers of a new one: in place on a GPU, where recorded
+/// work reads it.
 fn renew(tensor: &mut Tensor, new: &Tensor) -> Result<()> {
     if tensor.device().is_cuda() {
         return overwrite(tensor, new);

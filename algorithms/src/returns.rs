@@ -1,4 +1,5 @@
-//! Returns of a dataset's episodes as a critic's targets: standardized, and planned anew with values of states.
+//! Returns of a dataset's episodes as a critic's targets: standardized, and planned anew with
+//! values of states.
 
 use super::parts::Parts;
 use candle_core::{DType, Device, Result, Tensor};
@@ -26,7 +27,8 @@ impl Returns {
     pub fn new(rewards: Vec<f32>, episodes: Vec<Range<usize>>, gamma: f32) -> Result<Self> {
         let zeros = |count: usize| Tensor::zeros(count, DType::F32, &Device::Cpu);
         let (values, targets, scale) = (zeros(rewards.len())?, zeros(rewards.len())?, zeros(2)?);
-        let mut returns = Self { gamma: f64::from(gamma), rewards, episodes, values, targets, scale };
+        let mut returns =
+            Self { gamma: f64::from(gamma), rewards, episodes, values, targets, scale };
         returns.standardize(&returns.planned(None))?;
         Ok(returns)
     }
@@ -54,7 +56,8 @@ impl Returns {
         self.standardize(&returns)
     }
 
-    /// Returns backwards through each episode: R_i = r_i + γ·R_{i+1}, or the state's value if that is larger.
+    /// Returns backwards through each episode: R_i = r_i + γ·R_{i+1}, or the state's value if that
+    /// is larger.
     fn planned(&self, values: Option<&[f32]>) -> Vec<f64> {
         let mut returns = vec![0.0; self.rewards.len()];
         for episode in &self.episodes {
@@ -78,7 +81,10 @@ impl Returns {
         let deviation = (returns.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt();
         // Not their maximum, which would drop a NaN.
         let deviation = if deviation < LEAST_DEVIATION { LEAST_DEVIATION } else { deviation };
-        self.targets = Tensor::from_iter(returns.iter().map(|x| ((x - mean) / deviation) as f32), &Device::Cpu)?;
+        self.targets = Tensor::from_iter(
+            returns.iter().map(|x| ((x - mean) / deviation) as f32),
+            &Device::Cpu,
+        )?;
         self.scale = Tensor::new(&[mean as f32, deviation as f32], &Device::Cpu)?;
         Ok(())
     }
@@ -97,9 +103,11 @@ mod tests {
 
     #[test]
     fn returns_reach_to_the_end_of_an_episode_and_plans_improve_them() {
-        let mut returns = Returns::new(vec![1.0, 2.0, 0.0, 0.0, 4.0], vec![0..2, 2..5], 0.5).unwrap();
+        let mut returns =
+            Returns::new(vec![1.0, 2.0, 0.0, 0.0, 4.0], vec![0..2, 2..5], 0.5).unwrap();
         assert_eq!(returns.planned(None), [2.0, 2.0, 1.0, 2.0, 4.0]);
-        let (targets, deviation): (Vec<f32>, f32) = (returns.targets.to_vec1().unwrap(), 0.96f32.sqrt());
+        let (targets, deviation): (Vec<f32>, f32) =
+            (returns.targets.to_vec1().unwrap(), 0.96f32.sqrt());
         assert!((targets[4] - 1.8 / deviation).abs() < 1e-6, "{targets:?}");
         let of_target = returns.unscaled(&returns.targets).unwrap().to_vec1::<f32>().unwrap();
         assert!((of_target[4] - 4.0).abs() < 1e-6, "{of_target:?}");

@@ -1,6 +1,7 @@
-//! SfBC (Chen, Lu, Ying, Su and Zhu 2022, "Offline Reinforcement Learning via High-Fidelity Generative Behavior Modeling"):
-//! a score network clones the data's policy; a critic learns returns; then returns are planned anew with what the critic says
-//! of the clone's actions, and another critic learns these. The policy takes the best of the clone's samples.
+//! SfBC (Chen, Lu, Ying, Su and Zhu 2022, "Offline Reinforcement Learning via High-Fidelity
+//! Generative Behavior Modeling"): a score network clones the data's policy; a critic learns
+//! returns; then returns are planned anew with what the critic says of the clone's actions, and
+//! another critic learns these. The policy takes the best of the clone's samples.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -20,8 +21,8 @@ use super::trained::{Trained, ensemble, initial};
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::Batch;
 use quad_policy::{
-    AdamStep, Choice, DpmSolver, Ensemble, MlpConfig, PolicyConfig, Reduce, Rule, ScoreNetwork, ScorePolicy,
-    ScorePolicyShape, ScoreShape, Tensors,
+    AdamStep, Choice, DpmSolver, Ensemble, MlpConfig, PolicyConfig, Reduce, Rule, ScoreNetwork,
+    ScorePolicy, ScorePolicyShape, ScoreShape, Tensors,
 };
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -64,7 +65,8 @@ struct Config {
     /// Actions of the clone, of whose values V is made, and the temperature of its softmax.
     samples: Count,
     planning_temperature: Positive,
-    /// What the policy draws, how many of these it averages, and the temperature by which it draws them.
+    /// What the policy draws, how many of these it averages, and the temperature by which it draws
+    /// them.
     candidates: Candidates,
     averaged: Candidates,
     temperature: Positive,
@@ -80,12 +82,18 @@ impl Config {
         let config: Self = read(table)?;
         let Self { averaged, candidates, .. } = config;
         check("averaged", *averaged, *averaged <= *candidates, "at most candidates")?;
-        check("actor.norm", config.actor.norm, !config.actor.norm, "false: this network has no norm")?;
+        check(
+            "actor.norm",
+            config.actor.norm,
+            !config.actor.norm,
+            "false: this network has no norm",
+        )?;
         Ok(config)
     }
 }
 
-/// The phases' lengths in proportion: cloning, a round of each of two critics (K = 2), and between these planning.
+/// The phases' lengths in proportion: cloning, a round of each of two critics (K = 2), and between
+/// these planning.
 #[derive(Clone, Copy, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Phases {
@@ -155,7 +163,8 @@ impl Sfbc {
         })
     }
 
-    /// The steps at which cloning, the first critic's round, planning and the second critic's round begin.
+    /// The steps at which cloning, the first critic's round, planning and the second critic's round
+    /// begin.
     fn begins(&self) -> [u64; 4] {
         let Phases { behavior, critic, planning } = self.config.phases;
         phases::begin(self.context.total_steps, [behavior, critic, planning, critic])
@@ -182,7 +191,12 @@ impl Sfbc {
     }
 
     /// ε_θ toward the noise in the data's actions.
-    fn clone_behavior(&mut self, batch: &Minibatch, noise: &NoiseInTime, steps: u64) -> Result<Measured> {
+    fn clone_behavior(
+        &mut self,
+        batch: &Minibatch,
+        noise: &NoiseInTime,
+        steps: u64,
+    ) -> Result<Measured> {
         let noisy = noise.noisy(&batch.actions)?;
         let predicted = self.actor.network.predict(&batch.observations, &noisy, &noise.t)?;
         let loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
@@ -190,25 +204,35 @@ impl Sfbc {
         measured(&[Loss::new("bc_loss", loss)])
     }
 
-    /// Q(s, a) toward the returns of these items, the batch. Each round has a critic of its own, which begins as the first did.
-    fn learn_returns(&mut self, batch: &Minibatch, items: &[u32], round: usize, steps: u64) -> Result<Measured> {
+    /// Q(s, a) toward the returns of these items, the batch. Each round has a critic of its own,
+    /// which begins as the first did.
+    fn learn_returns(
+        &mut self,
+        batch: &Minibatch,
+        items: &[u32],
+        round: usize,
+        steps: u64,
+    ) -> Result<Measured> {
         if round > 0 && steps == 0 {
             self.critic = first_critic(&self.shape, &self.context)?;
         }
         let items = Tensor::from_slice(items, items.len(), &Device::Cpu)?;
-        let targets = self.returns.targets.index_select(&items, 0)?.to_device(&self.context.device)?;
-        let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let targets =
+            self.returns.targets.index_select(&items, 0)?.to_device(&self.context.device)?;
+        let loss =
+            self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         self.critic.descend(&loss, AdamStep::after(steps, *self.config.critic_learning_rate))?;
         measured(&[Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?)])
     }
 
-    /// Keeps V(s) = Σ softmax(Q/temperature)·Q over S actions of the clone, in units of the return, for the states of some
-    /// items. The actions are drawn with this noise, `[items · S, a]`.
+    /// Keeps V(s) = Σ softmax(Q/temperature)·Q over S actions of the clone, in units of the return,
+    /// for the states of some items. The actions are drawn with this noise, `[items · S, a]`.
     fn value(&mut self, items: Range<usize>, noise: &Tensor) -> Result<()> {
         let (first, count) = (items.start, items.len());
         let observations = self.context.batch(&self.items[items])?.observations;
         let actions = self.actor.network.sample(&self.solver, &observations, noise)?;
-        let q = self.critic.network.detach().values(&observations, &actions)?.reshape((count, ()))?;
+        let q =
+            self.critic.network.detach().values(&observations, &actions)?.reshape((count, ()))?;
         let exponents = q.broadcast_sub(&q.max_keepdim(1)?)?;
         let weights = (exponents / f64::from(*self.config.planning_temperature))?.exp()?;
         let values = ((&weights * q)?.sum(1)? / weights.sum(1)?)?;
@@ -225,8 +249,10 @@ impl Sfbc {
 
     /// The noise of a cloning step.
     fn noise(&self, step: u64) -> Result<NoiseInTime> {
-        let (context, generator) = (&self.context, &mut stream(self.context.seed, Purpose::Noise, step));
-        let epsilon = normal((context.batch_size, context.action_dim()), generator, &context.device)?;
+        let (context, generator) =
+            (&self.context, &mut stream(self.context.seed, Purpose::Noise, step));
+        let epsilon =
+            normal((context.batch_size, context.action_dim()), generator, &context.device)?;
         let t = (0..context.batch_size).map(|_| generator.random_range(FIRST_TIME..1.0)).collect();
         Ok(NoiseInTime { t, epsilon })
     }
@@ -238,7 +264,11 @@ impl Sfbc {
             let mut generator = stream(self.context.seed, Purpose::Actions, u64::from(*row));
             (0..count * a).map(move |_| StandardNormal.sample(&mut generator))
         });
-        Tensor::from_vec(numbers.collect::<Vec<f32>>(), (rows.len() * count, a), &self.context.device)
+        Tensor::from_vec(
+            numbers.collect::<Vec<f32>>(),
+            (rows.len() * count, a),
+            &self.context.device,
+        )
     }
 }
 
@@ -260,10 +290,18 @@ impl Algorithm for Sfbc {
         let (phase, steps) = self.phase(step);
         let rows: Vec<u32> = items.iter().map(|item| self.items[*item as usize]).collect();
         match phase {
-            Phase::Behavior => self.clone_behavior(&self.context.batch(&rows)?, &self.noise(step)?, steps),
-            Phase::Critic(round) => self.learn_returns(&self.context.batch(&rows)?, items, round, steps),
+            Phase::Behavior => {
+                self.clone_behavior(&self.context.batch(&rows)?, &self.noise(step)?, steps)
+            }
+            Phase::Critic(round) => {
+                self.learn_returns(&self.context.batch(&rows)?, items, round, steps)
+            }
             Phase::Planning(items) => {
-                for some in items.clone().step_by(TOGETHER).map(|first| first..(first + TOGETHER).min(items.end)) {
+                for some in items
+                    .clone()
+                    .step_by(TOGETHER)
+                    .map(|first| first..(first + TOGETHER).min(items.end))
+                {
                     let noise = self.noise_of(&self.items[some.clone()])?;
                     self.value(some, &noise)?;
                 }
@@ -278,7 +316,8 @@ impl Algorithm for Sfbc {
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let rule = Rule::Average { temperature: *self.config.temperature, actions: *self.config.averaged };
+        let rule =
+            Rule::Average { temperature: *self.config.temperature, actions: *self.config.averaged };
         let choice = Choice { candidates: *self.config.candidates, value: Reduce::Mean, rule };
         let tensors = ScorePolicy::tensors(&self.actor.network, &self.critic.network)?;
         Ok((PolicyConfig::Score { shape: self.shape.clone(), choice }, tensors))
@@ -286,7 +325,8 @@ impl Algorithm for Sfbc {
 
     fn parts(&mut self) -> Parts<'_> {
         // The frequencies do not change: they are a function of the seed.
-        let parts = Parts::default().trained("actor", &mut self.actor).trained("critic", &mut self.critic);
+        let parts =
+            Parts::default().trained("actor", &mut self.actor).trained("critic", &mut self.critic);
         self.returns.parts(parts)
     }
 }

@@ -1,9 +1,11 @@
-//! A tanh-squashed Gaussian policy in training (Haarnoja et al. 2018, "Soft Actor-Critic", appendix C): a = tanh(u), where a
-//! network of the state gives mean and log σ of u. Actions are drawn with a gradient, and their densities have the tanh's
-//! Jacobian.
+//! A tanh-squashed Gaussian policy in training (Haarnoja et al. 2018, "Soft Actor-Critic", appendix
+//! C): a = tanh(u), where a network of the state gives mean and log σ of u. Actions are drawn with
+//! a gradient, and their densities have the tanh's Jacobian.
 
 use candle_core::{Result, Tensor};
-use quad_policy::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, Weights};
+use quad_policy::{
+    AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, Weights,
+};
 
 use super::context::Context;
 use super::gaussian::first_half;
@@ -22,7 +24,8 @@ pub(super) struct Squashed {
 }
 
 impl Squashed {
-    /// At its beginning, as network number `network` of the run; `map` is what c₁ and c₂ begin with, where they are learned.
+    /// At its beginning, as network number `network` of the run; `map` is what c₁ and c₂ begin
+    /// with, where they are learned.
     pub fn new(
         layers: &MlpConfig,
         bounds: (f32, f32),
@@ -38,7 +41,12 @@ impl Squashed {
             outputs: 2 * context.action_dim(),
         };
         let map = map.map(|begin| learned("log_std_map", &begin, context)).transpose()?;
-        Ok(Self { network: ensemble(shape, context, network)?, map, bounds, layers: layers.clone() })
+        Ok(Self {
+            network: ensemble(shape, context, network)?,
+            map,
+            bounds,
+            layers: layers.clone(),
+        })
     }
 
     /// The distributions of u in these states, `[n, o]`; differentiable in all that is learned.
@@ -112,8 +120,8 @@ impl Normal {
         Self { mean: self.mean.detach(), log_std: self.log_std.detach() }
     }
 
-    /// Actions tanh(mean + σ·noise) for standard normal noise `[n, S, a]`. Actions and densities are differentiable in mean and
-    /// log σ.
+    /// Actions tanh(mean + σ·noise) for standard normal noise `[n, S, a]`. Actions and densities
+    /// are differentiable in mean and log σ.
     pub fn draw(&self, noise: &Tensor) -> Result<Drawn> {
         let log_std = self.log_std.unsqueeze(1)?;
         let u = noise.broadcast_mul(&log_std.exp()?)?.broadcast_add(&self.mean.unsqueeze(1)?)?;
@@ -128,11 +136,13 @@ impl Normal {
     }
 }
 
-/// log π(tanh u), summed over the last dimension, for noise (u − mean)/σ: log N(u) − log(1 − tanh² u). The second is taken as
-/// 2·(log 2 − |u| − log(1 + e^(−2|u|))), which is exact also where tanh u rounds to ±1.
+/// log π(tanh u), summed over the last dimension, for noise (u − mean)/σ: log N(u) − log(1 − tanh²
+/// u). The second is taken as 2·(log 2 − |u| − log(1 + e^(−2|u|))), which is exact also where tanh
+/// u rounds to ±1.
 fn log_density(u: &Tensor, noise: &Tensor, log_std: &Tensor) -> Result<Tensor> {
     let size = u.abs()?;
-    let jacobian = ((size.affine(-2.0, 0.0)?.exp()? + 1.0)?.log()? + size)?.affine(-2.0, 2.0 * 2f64.ln())?;
+    let jacobian =
+        ((size.affine(-2.0, 0.0)?.exp()? + 1.0)?.log()? + size)?.affine(-2.0, 2.0 * 2f64.ln())?;
     let half_log_2_pi = 0.5 * (2.0 * std::f64::consts::PI).ln();
     let normal = noise.sqr()?.affine(-0.5, -half_log_2_pi)?.broadcast_sub(log_std)?;
     (normal - jacobian)?.sum(candle_core::D::Minus1)

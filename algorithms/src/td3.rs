@@ -1,8 +1,10 @@
-//! What TD3+BC and ReBRAC share: TD3 (Fujimoto, van Hoof and Meger 2018), whose deterministic policy also stays near the data's
-//! actions. Critics move in every step, the policy and the targets in every second or so. An algorithm of this kind is its
-//! [`Near`].
+//! What TD3+BC and ReBRAC share: TD3 (Fujimoto, van Hoof and Meger 2018), whose deterministic
+//! policy also stays near the data's actions. Critics move in every step, the policy and the
+//! targets in every second or so. An algorithm of this kind is its [`Near`].
 
-use super::algorithm::{AgentError, Algorithm, AlgorithmError, Loss, Measured, joined, measured, smaller};
+use super::algorithm::{
+    AgentError, Algorithm, AlgorithmError, Loss, Measured, joined, measured, smaller,
+};
 use super::context::{Context, Minibatch};
 use super::definition;
 use super::denoising::normal;
@@ -12,8 +14,8 @@ use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
 use quad_policy::{
-    AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, MlpConfig, PolicyConfig, Tensors, Weighted,
-    gaussian_mean,
+    AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, MlpConfig, PolicyConfig,
+    Tensors, Weighted, gaussian_mean,
 };
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -53,13 +55,14 @@ pub(super) trait Near: Send {
 
     fn common(&self) -> &Common;
 
-    /// What the squared distance between next actions and those of the data costs in the critics' target, if anything.
+    /// What the squared distance between next actions and those of the data costs in the critics'
+    /// target, if anything.
     fn penalty(&self) -> Option<f32> {
         None
     }
 
-    /// The loss `[]` of the policy's actions, `[B, a]`, whose values are `q`, `[2, B]`; and the part of it that keeps them near
-    /// the data's.
+    /// The loss `[]` of the policy's actions, `[B, a]`, whose values are `q`, `[2, B]`; and the
+    /// part of it that keeps them near the data's.
     fn actor_loss(&self, actions: &Tensor, of_data: &Tensor, q: &Tensor) -> Result<[Tensor; 2]>;
 }
 
@@ -105,10 +108,17 @@ impl<N: Near> Td3<N> {
         })
     }
 
-    /// Update number `step`, with standard normal noise of the targets' actions, `[B, a]`, and the data's next actions, where
-    /// they count.
-    pub fn step(&mut self, step: u64, batch: &Minibatch, noise: &Tensor, next: Option<&Tensor>) -> Result<Measured> {
-        let Common { actor_every, ema_rate, actor_learning_rate, critic_learning_rate, .. } = self.near.common();
+    /// Update number `step`, with standard normal noise of the targets' actions, `[B, a]`, and the
+    /// data's next actions, where they count.
+    pub fn step(
+        &mut self,
+        step: u64,
+        batch: &Minibatch,
+        noise: &Tensor,
+        next: Option<&Tensor>,
+    ) -> Result<Measured> {
+        let Common { actor_every, ema_rate, actor_learning_rate, critic_learning_rate, .. } =
+            self.near.common();
         let mut losses = vec![self.critic_loss(batch, noise, next)?];
         self.critics.descend(&losses[0].value, AdamStep::after(step, **critic_learning_rate))?;
         let first = N::FIRST % **actor_every;
@@ -117,7 +127,10 @@ impl<N: Near> Td3<N> {
             if N::LAGS {
                 self.target_actor.follow(&self.actor.network, **ema_rate)?;
             }
-            self.actor.descend(&actor_loss, AdamStep::after(step / **actor_every, **actor_learning_rate))?;
+            self.actor.descend(
+                &actor_loss,
+                AdamStep::after(step / **actor_every, **actor_learning_rate),
+            )?;
             if !N::LAGS {
                 self.target_actor.follow(&self.actor.network, **ema_rate)?;
             }
@@ -125,14 +138,23 @@ impl<N: Near> Td3<N> {
             write(&self.of_actor, &joined(&[&actor_loss, &bc_loss])?.detach())?;
         }
         if step >= first {
-            losses.push(Loss::new("actor_loss", self.of_actor.get(0)?).with("bc_loss", self.of_actor.get(1)?));
+            losses.push(
+                Loss::new("actor_loss", self.of_actor.get(0)?)
+                    .with("bc_loss", self.of_actor.get(1)?),
+            );
         }
         measured(&losses)
     }
 
-    fn critic_loss(&self, batch: &Minibatch, noise: &Tensor, next: Option<&Tensor>) -> Result<Loss> {
+    fn critic_loss(
+        &self,
+        batch: &Minibatch,
+        noise: &Tensor,
+        next: Option<&Tensor>,
+    ) -> Result<Loss> {
         let targets = self.targets(batch, noise, next)?;
-        let loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let loss =
+            self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         Ok(Loss::new("critic_loss", (loss * CRITICS as f64)?).with("q_mean", targets.mean_all()?))
     }
 
@@ -146,18 +168,24 @@ impl<N: Near> Td3<N> {
     /// The batch of some items, noise and next actions, as [`Self::step`] takes them.
     fn inputs(&self, step: u64, items: &[u32]) -> Result<(Minibatch, Tensor, Option<Tensor>)> {
         let generator = &mut stream(self.context.seed, Purpose::Noise, step);
-        let noise = normal((self.context.batch_size, self.context.action_dim()), generator, &self.context.device)?;
+        let noise = normal(
+            (self.context.batch_size, self.context.action_dim()),
+            generator,
+            &self.context.device,
+        )?;
         let Some(rows) = &self.items else { return Ok((self.context.batch(items)?, noise, None)) };
         let rows: Vec<u32> = items.iter().map(|item| rows[*item as usize]).collect();
         Ok((self.context.batch(&rows)?, noise, Some(self.context.next_actions(&rows)?)))
     }
 
-    /// y = r + γ·mask·(min_k Q̂_k(s', ã') − penalty·Σ (ã' − a')²), `[B]`, with the data's next action a'.
+    /// y = r + γ·mask·(min_k Q̂_k(s', ã') − penalty·Σ (ã' − a')²), `[B]`, with the data's next
+    /// action a'.
     fn targets(&self, batch: &Minibatch, noise: &Tensor, next: Option<&Tensor>) -> Result<Tensor> {
         let Common { gamma, target_noise, target_noise_limit, .. } = self.near.common();
         let limit = f64::from(**target_noise_limit);
         let noise = (noise * f64::from(**target_noise))?.clamp(-limit, limit)?;
-        let actions = (gaussian_mean(&self.target_actor, &batch.next_observations)? + noise)?.clamp(-1.0, 1.0)?;
+        let actions = (gaussian_mean(&self.target_actor, &batch.next_observations)? + noise)?
+            .clamp(-1.0, 1.0)?;
         let mut q = smaller(&self.target_critics.values(&batch.next_observations, &actions)?)?;
         if let (Some(penalty), Some(next)) = (self.near.penalty(), next) {
             q = (q - ((actions - next)?.sqr()?.sum(1)? * f64::from(penalty))?)?;
@@ -211,14 +239,19 @@ pub(super) mod golden {
     use candle_core::Device;
 
     /// Checks an update against a golden folder.
-    pub fn check<N: Near + DeserializeOwned>(golden: &Golden, device: &Device, metrics: &[definition::Metric]) {
+    pub fn check<N: Near + DeserializeOwned>(
+        golden: &Golden,
+        device: &Device,
+        metrics: &[definition::Metric],
+    ) {
         let near = read::<N>(&table(golden)).unwrap();
         let next = near.penalty().map(|_| golden.input("next_actions", device));
         let mut td3 = Td3::new(near, context(golden, device)).unwrap();
         load(golden, td3.parts());
         check_actions(golden, &td3);
         let (batch, step) = (batch(golden, &td3.context), golden.count("/step") as u64);
-        let measured = td3.step(step, &batch, &golden.input("target_noise", device), next.as_ref()).unwrap();
+        let measured =
+            td3.step(step, &batch, &golden.input("target_noise", device), next.as_ref()).unwrap();
         check_update(golden, metrics, &measured, td3.parts().save().unwrap());
     }
 }

@@ -1,5 +1,6 @@
-//! TD3+BC (Fujimoto and Gu 2021, "A Minimalist Approach to Offline Reinforcement Learning"): TD3 whose policy also stays near the
-//! data's actions. Its update is its authors' code's; equations are that paper's.
+//! TD3+BC (Fujimoto and Gu 2021, "A Minimalist Approach to Offline Reinforcement Learning"): TD3
+//! whose policy also stays near the data's actions. Its update is its authors' code's; equations
+//! are that paper's.
 
 use super::definition::{Definition, Metric, Reporting, metrics};
 use super::hyperparameters::Positive;

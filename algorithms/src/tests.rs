@@ -50,9 +50,12 @@ fn context(seed: u64, device: &Device) -> Context {
     }
 }
 
-/// Every algorithm with the hyper-parameters of each of its golden folders, whose networks are small.
+/// Every algorithm with the hyper-parameters of each of its golden folders, whose networks are
+/// small.
 fn variants() -> Vec<(Definition, toml::Table)> {
-    let of = |known: Definition| goldens(known.name).into_iter().map(move |golden| (known, table(&golden)));
+    let of = |known: Definition| {
+        goldens(known.name).into_iter().map(move |golden| (known, table(&golden)))
+    };
     ALGORITHMS.into_iter().flat_map(of).collect()
 }
 
@@ -90,8 +93,16 @@ fn a_saved_state_goes_on_bit_for_bit() {
             for (done, saved) in saved.iter().enumerate() {
                 let mut resumed = agent(definition, &table, &context);
                 resumed.load(saved).unwrap();
-                assert_eq!((resumed.step(), resumed.save().unwrap() == *saved), (first + done as u64, true));
-                assert_eq!(train(&mut resumed, STEPS - done as u64), expected[done..], "{}", definition.name);
+                assert_eq!(
+                    (resumed.step(), resumed.save().unwrap() == *saved),
+                    (first + done as u64, true)
+                );
+                assert_eq!(
+                    train(&mut resumed, STEPS - done as u64),
+                    expected[done..],
+                    "{}",
+                    definition.name
+                );
                 assert!(resumed.save().unwrap() == end, "{}: another state", definition.name);
             }
         }
@@ -164,19 +175,26 @@ fn every_value_is_finite_and_every_weight_that_is_trained_has_a_gradient() {
         for values in train(&mut agent, STEPS) {
             assert!(values.iter().flatten().all(|value| value.is_finite()), "{values:?}");
         }
-        for (name, moment) in agent.parts().save().unwrap().iter().filter(|(name, _)| name.starts_with("adam_m")) {
+        for (name, moment) in
+            agent.parts().save().unwrap().iter().filter(|(name, _)| name.starts_with("adam_m"))
+        {
             let moment: Vec<f32> = moment.flatten_all().unwrap().to_vec1().unwrap();
             let zeros = moment.iter().filter(|x| **x == 0.0).count();
-            // Where a window has one step left, four of five taps of Diffuser's convolutions see only what is beside it.
-            let most = if definition.name == "diffuser" { moment.len() * 4 / 5 } else { (moment.len() - 1) / 2 };
+            // Where a window has one step left, four of five taps of Diffuser's convolutions see
+            // only what is beside it.
+            let most = if definition.name == "diffuser" {
+                moment.len() * 4 / 5
+            } else {
+                (moment.len() - 1) / 2
+            };
             let good = moment.iter().all(|x| x.is_finite()) && zeros <= most;
             assert!(good, "{}: {name} has a gradient that is 0 or not finite", definition.name);
         }
     }
 }
 
-/// Weights that are not a number end up in a metric, where the training loop sees it, whatever maximum or minimum they went
-/// through; and neither such a state nor such a policy is handed over.
+/// Weights that are not a number end up in a metric, where the training loop sees it, whatever
+/// maximum or minimum they went through; and neither such a state nor such a policy is handed over.
 #[test]
 fn a_nan_is_never_dropped() {
     for (definition, table) in variants() {
@@ -187,7 +205,8 @@ fn a_nan_is_never_dropped() {
             let (name, weights) = agent.parts().networks().swap_remove(network);
             weights.change(|values| values.slice_set(&(values * f64::NAN)?, 0, 0)).unwrap();
             let values = train(&mut agent, STEPS);
-            // By these the policy acts, but nothing is learned from them: they are averages of networks that are watched.
+            // By these the policy acts, but nothing is learned from them: they are averages of
+            // networks that are watched.
             let unread = match definition.name {
                 "align-iql" | "idql" => name == "target_actor",
                 "diffuser" => name.starts_with("target"),
@@ -207,7 +226,9 @@ fn a_nan_is_never_dropped() {
 #[test]
 fn a_hyper_parameter_that_is_refused_is_named() {
     for definition in ALGORITHMS {
-        let Some(toml::Value::Table(agent)) = Values::of(&definition).unwrap().for_task(None).remove("agent") else {
+        let Some(toml::Value::Table(agent)) =
+            Values::of(&definition).unwrap().for_task(None).remove("agent")
+        else {
             panic!("{} has no values", definition.name)
         };
         for key in agent.keys().filter(|key| agent[*key].is_float()) {
@@ -217,7 +238,11 @@ fn a_hyper_parameter_that_is_refused_is_named() {
             assert!(error.contains(&format!("in `{key}`")), "{} {key}: {error}", definition.name);
             changed.remove(key);
             let error = (definition.check)(&changed).unwrap_err().to_string();
-            assert!(error.contains(&format!("missing field `{key}`")), "{} {key}: {error}", definition.name);
+            assert!(
+                error.contains(&format!("missing field `{key}`")),
+                "{} {key}: {error}",
+                definition.name
+            );
         }
     }
 }
@@ -227,7 +252,9 @@ fn metric_names_are_prometheus_names_and_distinct() {
     for definition in ALGORITHMS {
         let mut names: Vec<_> = definition.metrics.iter().map(|metric| metric.name).collect();
         assert!(
-            names.iter().all(|name| name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')),
+            names.iter().all(|name| name
+                .chars()
+                .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')),
             "{names:?}"
         );
         names.sort_unstable();

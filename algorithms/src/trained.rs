@@ -2,7 +2,8 @@
 
 use candle_core::{Result, Tensor};
 use quad_policy::{
-    Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, MlpConfig, Part, Start, Weighted, Weights,
+    Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, MlpConfig, Part, Start, Weighted,
+    Weights,
 };
 
 use super::context::Context;
@@ -45,20 +46,29 @@ pub(super) fn initial(layout: &Layout, context: &Context, network: u64) -> Resul
 }
 
 /// An ensemble to be trained, at its beginning.
-pub(super) fn ensemble(shape: EnsembleShape, context: &Context, network: u64) -> Result<Trained<Ensemble>> {
+pub(super) fn ensemble(
+    shape: EnsembleShape,
+    context: &Context,
+    network: u64,
+) -> Result<Trained<Ensemble>> {
     let weights = initial(&shape.layout(), context, network)?;
     Trained::new(Ensemble::new(shape, weights, context.precision), 0.0)
 }
 
 /// Learned numbers, `[n]`, under one name, that begin as these.
 pub(super) fn learned(name: &str, begin: &[f32], context: &Context) -> Result<Trained<Weights>> {
-    let part = Part { name: name.to_owned(), shape: vec![begin.len()], start: Start::Constant(0.0) };
+    let part =
+        Part { name: name.to_owned(), shape: vec![begin.len()], start: Start::Constant(0.0) };
     let values = Tensor::from_slice(begin, begin.len(), &context.device)?;
     Trained::new(Weights::trainable(Layout::new(vec![part]), &values)?, 0.0)
 }
 
 /// Multiplies the last layer of networks with these hidden layers by a factor.
-pub(super) fn scale_last_layer(weights: &mut Weights, layers: &MlpConfig, factor: f64) -> Result<()> {
+pub(super) fn scale_last_layer(
+    weights: &mut Weights,
+    layers: &MlpConfig,
+    factor: f64,
+) -> Result<()> {
     let last = format!("{}.", layers.hidden.len());
     let of_last = weights.tensors("")?.into_iter().filter(|(name, _)| name.starts_with(&last));
     let count = of_last.map(|(_, tensor)| tensor.elem_count()).sum();

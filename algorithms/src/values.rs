@@ -1,7 +1,8 @@
-//! An algorithm's file of hyper-parameters: what all tasks share, and what groups of tasks have of their own.
+//! An algorithm's file of hyper-parameters: what all tasks share, and what groups of tasks have of
+//! their own.
 //!
-//! `[for."PATTERN"]` holds keys of an experiment for the tasks that fit the pattern, in which `*` stands for any letters. Of
-//! several such groups the one whose pattern has more letters wins.
+//! `[for."PATTERN"]` holds keys of an experiment for the tasks that fit the pattern, in which `*`
+//! stands for any letters. Of several such groups the one whose pattern has more letters wins.
 
 use std::collections::BTreeMap;
 
@@ -16,8 +17,9 @@ use crate::Definition;
 pub struct Values {
     /// What the algorithm is, in a few words.
     pub about: String,
-    /// What a gradient step costs with the values for `hopper-medium-v2`: billions of additions and multiplications in the products of
-    /// its networks, of which two cores do some 100 to 200 a second.
+    /// What a gradient step costs with the values for `hopper-medium-v2`: billions of additions and
+    /// multiplications in the products of its networks, of which two cores do some 100 to 200 a
+    /// second.
     pub gflop: String,
     /// Patterns of the tasks for which its authors give values.
     pub given: Vec<String>,
@@ -35,13 +37,15 @@ impl Values {
     /// # Errors
     /// Its file is broken, which a test of each excludes.
     pub fn of(definition: &Definition) -> anyhow::Result<Self> {
-        toml::from_str(definition.settings).with_context(|| format!("the file of algorithm {}", definition.name))
+        toml::from_str(definition.settings)
+            .with_context(|| format!("the file of algorithm {}", definition.name))
     }
 
     /// Keys of an experiment for a task; without one, what all tasks share.
     pub fn for_task(&self, task: Option<&str>) -> Table {
         let of_task = |pattern: &str| task.is_some_and(|task| fits(pattern, task));
-        let mut groups: Vec<_> = self.groups.iter().filter(|(pattern, _)| of_task(pattern)).collect();
+        let mut groups: Vec<_> =
+            self.groups.iter().filter(|(pattern, _)| of_task(pattern)).collect();
         groups.sort_by_key(|(pattern, _)| letters(pattern));
         let mut table = self.shared.clone();
         groups.into_iter().for_each(|(_, keys)| merge(&mut table, keys.clone()));
@@ -60,8 +64,8 @@ pub fn fits(pattern: &str, name: &str) -> bool {
     }
 }
 
-/// Lays `changes` over `table`: tables key by key, anything else in place of what was there. An integer that takes a
-/// number's place becomes one, so that 1 and 1.0 are the same setting.
+/// Lays `changes` over `table`: tables key by key, anything else in place of what was there. An
+/// integer that takes a number's place becomes one, so that 1 and 1.0 are the same setting.
 pub fn merge(table: &mut Table, changes: Table) {
     for (key, change) in changes {
         match (table.get_mut(&key), change) {

@@ -1,6 +1,7 @@
-//! XQL (Garg, Hejna, Geist and Ermon 2023, "Extreme Q-Learning: MaxEnt RL without Entropy"), which the QUAD paper calls EQL:
-//! Gumbel regression fits V to the soft maximum of Q over actions of the data, β·ln E exp(Q/β), without a sample of a policy.
-//! What its authors' scripts add for single datasets is in `pairs` and `value_steps`.
+//! XQL (Garg, Hejna, Geist and Ermon 2023, "Extreme Q-Learning: MaxEnt RL without Entropy"), which
+//! the QUAD paper calls EQL: Gumbel regression fits V to the soft maximum of Q over actions of the
+//! data, β·ln E exp(Q/β), without a sample of a policy. What its authors' scripts add for single
+//! datasets is in `pairs` and `value_steps`.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -76,25 +77,29 @@ impl Config {
         let (b, a, device) = (context.batch_size, context.action_dim(), &context.device);
         let (n, noisy) = (usize::from(self.random_actions), *self.value_noise > 0.0);
         let uniform: Vec<f32> = (0..n * b * a).map(|_| generator.random_range(-1.0..1.0)).collect();
-        let mut normal = || (0..b * a).map(|_| StandardNormal.sample(&mut generator)).collect::<Vec<f32>>();
+        let mut normal =
+            || (0..b * a).map(|_| StandardNormal.sample(&mut generator)).collect::<Vec<f32>>();
         Ok(Noise {
             actions: (n > 0).then(|| Tensor::from_vec(uniform, (n * b, a), device)).transpose()?,
             normal: noisy.then(|| Tensor::from_vec(normal(), (b, a), device)).transpose()?,
         })
     }
 
-    /// The batch's states and its actions with noise; behind these the states again, with actions at random.
+    /// The batch's states and its actions with noise; behind these the states again, with actions
+    /// at random.
     fn pairs_with(&self, batch: &Minibatch, noise: &Noise) -> Result<(Tensor, Tensor)> {
         let (mut states, mut actions) = (batch.observations.clone(), batch.actions.clone());
         if let Some(normal) = &noise.normal {
-            let noise = (normal * f64::from(*self.value_noise))?.clamp(-LARGEST_NOISE, LARGEST_NOISE)?;
+            let noise =
+                (normal * f64::from(*self.value_noise))?.clamp(-LARGEST_NOISE, LARGEST_NOISE)?;
             actions = (actions + noise)?.clamp(-1.0, 1.0)?;
         }
         if let Some(random) = &noise.actions {
             let (b, o) = states.dims2()?;
             let n = usize::from(self.random_actions);
             let again = states.unsqueeze(1)?.broadcast_as((b, n, o))?.reshape((n * b, o))?;
-            (states, actions) = (Tensor::cat(&[&states, &again], 0)?, Tensor::cat(&[&actions, random], 0)?);
+            (states, actions) =
+                (Tensor::cat(&[&states, &again], 0)?, Tensor::cat(&[&actions, random], 0)?);
         }
         Ok((states, actions))
     }
@@ -124,7 +129,12 @@ impl Losses for Config {
         ((near.sqr()? * 0.5)? + ((error - near)? * huber)?)?.sum(0)?.mean_all()
     }
 
-    fn pairs(&self, context: &Context, step: u64, batch: &Minibatch) -> Result<Option<(Tensor, Tensor)>> {
+    fn pairs(
+        &self,
+        context: &Context,
+        step: u64,
+        batch: &Minibatch,
+    ) -> Result<Option<(Tensor, Tensor)>> {
         if self.random_actions == 0 && *self.value_noise == 0.0 {
             return Ok(None);
         }

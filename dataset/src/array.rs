@@ -35,7 +35,11 @@ impl<T> Array<T> {
     pub(crate) fn of_rows(self, rows: usize) -> Result<Self, Problem> {
         match self.rows() == rows {
             true => Ok(self),
-            false => Err(Problem::Shape { expected: vec![rows, self.width], array: self.name, found: self.shape }),
+            false => Err(Problem::Shape {
+                expected: vec![rows, self.width],
+                array: self.name,
+                found: self.shape,
+            }),
         }
     }
 
@@ -43,7 +47,11 @@ impl<T> Array<T> {
     pub(crate) fn sized(self, rows: usize, width: usize) -> Result<Vec<T>, Problem> {
         match (self.rows(), self.width) == (rows, width) {
             true => Ok(self.values),
-            false => Err(Problem::Shape { array: self.name, found: self.shape, expected: vec![rows, width] }),
+            false => Err(Problem::Shape {
+                array: self.name,
+                found: self.shape,
+                expected: vec![rows, width],
+            }),
         }
     }
 }

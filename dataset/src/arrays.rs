@@ -1,4 +1,5 @@
-//! Transitions that a program has in memory, and the file that it writes of them: the custom layout.
+//! Transitions that a program has in memory, and the file that it writes of them: the custom
+//! layout.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -61,7 +62,11 @@ impl Arrays {
                 return Err(Problem::Numbers { array, found, rows, width });
             }
         }
-        let ends = self.terminals.iter().zip(&self.timeouts).map(|(terminal, timeout)| *terminal || *timeout);
+        let ends = self
+            .terminals
+            .iter()
+            .zip(&self.timeouts)
+            .map(|(terminal, timeout)| *terminal || *timeout);
         Ok(Recording {
             rounding: Rounding::between(&self.observations, &self.next_observations),
             observation_dim: o,
@@ -80,13 +85,14 @@ impl Arrays {
     }
 }
 
-/// Writes the custom layout (docs/data.md) in float32, compressed. The file appears under its name when it is
-/// whole; one that was there is replaced. The folder is made if need be. `names` are kept beside the arrays.
+/// Writes the custom layout (docs/data.md) in float32, compressed. The file appears under its name
+/// when it is whole; one that was there is replaced. The folder is made if need be. `names` are
+/// kept beside the arrays.
 ///
 /// # Errors
-/// The disk, or what would be refused when the file is read: arrays that do not fit one another, numbers that are not finite,
-/// no transition, rows without any end of an episode. Actions may have any range: whether they are to be scaled is decided
-/// by who trains on them.
+/// The disk, or what would be refused when the file is read: arrays that do not fit one another,
+/// numbers that are not finite, no transition, rows without any end of an episode. Actions may have
+/// any range: whether they are to be scaled is decided by who trains on them.
 pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result<(), DatasetError> {
     let path = path.as_ref();
     let error = |problem| DatasetError::new(path, problem);
@@ -102,9 +108,12 @@ pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result
 fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
     let layout = VarLenUnicode::from_str(OWN_LAYOUT).map_err(|error| error.to_string())?;
     file.hdf5.new_attr::<VarLenUnicode>().create("layout")?.write_scalar(&layout)?;
-    for (name, texts) in [(OBSERVATION_NAMES, &recording.names.observations), (ACTION_NAMES, &recording.names.actions)]
-    {
-        let texts = texts.iter().map(|text| VarLenUnicode::from_str(text)).collect::<Result<Vec<_>, _>>();
+    for (name, texts) in [
+        (OBSERVATION_NAMES, &recording.names.observations),
+        (ACTION_NAMES, &recording.names.actions),
+    ] {
+        let texts =
+            texts.iter().map(|text| VarLenUnicode::from_str(text)).collect::<Result<Vec<_>, _>>();
         let texts = texts.map_err(|error| error.to_string())?;
         if !texts.is_empty() {
             file.hdf5.new_attr_builder().with_data(&texts).create(name)?;

@@ -29,14 +29,19 @@ pub struct NamedDataset {
 }
 
 impl NamedDataset {
-    /// Whether it is OGBench's, which has npz files in a folder of its own; the others are D4RL's HDF5.
+    /// Whether it is OGBench's, which has npz files in a folder of its own; the others are D4RL's
+    /// HDF5.
     pub fn is_ogbench(&self) -> bool {
         self.file.ends_with(".npz")
     }
 
     /// The first bytes of its file, and what people call such a file.
     pub fn format(&self) -> (&'static [u8], &'static str) {
-        if self.is_ogbench() { (npz_file::SIGNATURE, "npz archive") } else { (hdf5_file::SIGNATURE, "HDF5 file") }
+        if self.is_ogbench() {
+            (npz_file::SIGNATURE, "npz archive")
+        } else {
+            (hdf5_file::SIGNATURE, "HDF5 file")
+        }
     }
 }
 
@@ -58,7 +63,8 @@ impl Collection {
     fn into_datasets(self) -> impl Iterator<Item = NamedDataset> {
         let Self { license, folders, dataset } = self;
         dataset.into_iter().map(move |dataset| {
-            let addresses = folders.iter().map(|folder| format!("{folder}{}", dataset.file)).collect();
+            let addresses =
+                folders.iter().map(|folder| format!("{folder}{}", dataset.file)).collect();
             NamedDataset { addresses, license: license.clone(), ..dataset }
         })
     }
@@ -66,8 +72,14 @@ impl Collection {
 
 #[allow(clippy::expect_used)] // The table is part of the program; the first test here reads it.
 static DATASETS: LazyLock<Vec<NamedDataset>> = LazyLock::new(|| {
-    let table: Table = toml::from_str(include_str!("../datasets.toml")).expect("the embedded table is valid");
-    table.collection.into_iter().flat_map(Collection::into_datasets).chain(ogbench::files()).collect()
+    let table: Table =
+        toml::from_str(include_str!("../datasets.toml")).expect("the embedded table is valid");
+    table
+        .collection
+        .into_iter()
+        .flat_map(Collection::into_datasets)
+        .chain(ogbench::files())
+        .collect()
 });
 
 /// All datasets.
@@ -94,13 +106,23 @@ mod tests {
     fn the_table_is_consistent() {
         for dataset in all().iter().filter(|dataset| !dataset.is_ogbench()) {
             let NamedDataset { name, file, sha256, addresses, .. } = dataset;
-            assert_eq!((find(name), find_file(file)), (Some(dataset), Some(dataset)), "names are unique");
+            assert_eq!(
+                (find(name), find_file(file)),
+                (Some(dataset), Some(dataset)),
+                "names are unique"
+            );
             let environment = environment::find(&dataset.environment).unwrap();
             assert!(name.starts_with(environment.simulation()), "{name}");
-            assert!(addresses.iter().all(|address| address.starts_with("http") && address.ends_with(file)), "{name}");
+            assert!(
+                addresses
+                    .iter()
+                    .all(|address| address.starts_with("http") && address.ends_with(file)),
+                "{name}"
+            );
             assert!(!addresses.is_empty() && dataset.license == "CC BY 4.0", "{name}");
-            let is_digest =
-                |text: &String| text.len() == 64 && text.chars().all(|digit| matches!(digit, '0'..='9' | 'a'..='f'));
+            let is_digest = |text: &String| {
+                text.len() == 64 && text.chars().all(|digit| matches!(digit, '0'..='9' | 'a'..='f'))
+            };
             assert!(sha256.as_ref().is_none_or(is_digest), "{name}: {sha256:?}");
             assert!(sha256.is_none() || dataset.bytes.is_some(), "{name}");
         }

@@ -4,15 +4,20 @@ use crate::environment::EnvironmentSpec;
 use crate::error::Problem;
 use crate::recording::{Recording, RowKind};
 
-/// Actions may be this far outside [-1, 1]: what rounding explains is clipped, anything more is another scale.
+/// Actions may be this far outside [-1, 1]: what rounding explains is clipped, anything more is
+/// another scale.
 const ACTION_TOLERANCE: f32 = 1e-3;
 
-/// The largest share of rows inside an episode that may lead elsewhere. D4RL's replay buffers have at most one in a thousand,
-/// where collection was cut off without a timeout; rows in another order than that of recording have nearly all.
+/// The largest share of rows inside an episode that may lead elsewhere. D4RL's replay buffers have
+/// at most one in a thousand, where collection was cut off without a timeout; rows in another order
+/// than that of recording have nearly all.
 const MOST_STRAYS: f64 = 0.01;
 
 /// Everything that is wrong with a recording as data of that environment, the gravest first.
-pub(crate) fn problems(recording: &Recording, environment: Option<&EnvironmentSpec>) -> Vec<Problem> {
+pub(crate) fn problems(
+    recording: &Recording,
+    environment: Option<&EnvironmentSpec>,
+) -> Vec<Problem> {
     let rows = recording.rows();
     let mut problems = Vec::new();
     if recording.transitions().next().is_none() {
@@ -21,9 +26,18 @@ pub(crate) fn problems(recording: &Recording, environment: Option<&EnvironmentSp
     if let Some(environment) = environment {
         let width = |array, found, expected| {
             let environment = environment.name.clone();
-            (found != expected && rows > 0).then_some(Problem::Width { array, found, expected, environment })
+            (found != expected && rows > 0).then_some(Problem::Width {
+                array,
+                found,
+                expected,
+                environment,
+            })
         };
-        problems.extend(width("observations", recording.observation_dim, environment.observation_dim));
+        problems.extend(width(
+            "observations",
+            recording.observation_dim,
+            environment.observation_dim,
+        ));
         problems.extend(width("actions", recording.action_dim, environment.action_dim));
     }
     let (o, a) = (recording.observation_dim, recording.action_dim);
@@ -41,8 +55,9 @@ pub(crate) fn problems(recording: &Recording, environment: Option<&EnvironmentSp
     problems
 }
 
-/// Rows inside an episode whose stored next observation is not the following row's, and whether they are refused: in a D4RL
-/// file, which is learned from as if each row led to the following one, where they are too many.
+/// Rows inside an episode whose stored next observation is not the following row's, and whether
+/// they are refused: in a D4RL file, which is learned from as if each row led to the following one,
+/// where they are too many.
 pub(crate) fn strays(recording: &Recording) -> Option<(Problem, bool)> {
     let unused = recording.unused_next_observations.as_ref();
     let stored = recording.next_observations.as_ref().or(unused)?;
@@ -64,7 +79,8 @@ fn not_finite(
     Some(Problem::NotFinite { array, row, value, rows })
 }
 
-/// Actions that no policy here can take, unless they are scaled: refused by who trains on them as they are.
+/// Actions that no policy here can take, unless they are scaled: refused by who trains on them as
+/// they are.
 pub(crate) fn actions_outside(recording: &Recording) -> Option<Problem> {
     let is_outside = |row: usize, value: f32| {
         let is_step = recording.kinds[row] != RowKind::LastState;
@@ -76,7 +92,11 @@ pub(crate) fn actions_outside(recording: &Recording) -> Option<Problem> {
 }
 
 /// The first row with a number that is wrong, that number, and how many rows have one.
-fn first(values: &[f32], width: usize, is_wrong: impl Fn(usize, f32) -> bool) -> Option<(usize, f32, usize)> {
+fn first(
+    values: &[f32],
+    width: usize,
+    is_wrong: impl Fn(usize, f32) -> bool,
+) -> Option<(usize, f32, usize)> {
     let wrong_in = |(row, values): (usize, &[f32])| {
         let value = values.iter().find(|&&value| is_wrong(row, value))?;
         Some((row, *value))

@@ -9,7 +9,8 @@ use crate::ogbench;
 use crate::reward::RewardRule;
 use crate::simulated::{Collect, Planar};
 
-/// One environment. Sizes and reference returns are what data is read by; the rest is how evaluators simulate it.
+/// One environment. Sizes and reference returns are what data is read by; the rest is how
+/// evaluators simulate it.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnvironmentSpec {
@@ -32,7 +33,8 @@ pub struct EnvironmentSpec {
     pub max_episode_steps: usize,
     /// Undiscounted returns that score 0 (D4RL's random policy) and 100 (D4RL's expert).
     reference_returns: (f64, f64),
-    /// How a dataset's rewards are scaled before training, unless a task or an algorithm says otherwise.
+    /// How a dataset's rewards are scaled before training, unless a task or an algorithm says
+    /// otherwise.
     pub reward: RewardRule,
     /// When the goal is drawn, if there is one.
     #[serde(default)]
@@ -40,7 +42,8 @@ pub struct EnvironmentSpec {
     /// The robot, if it is one in a vertical plane.
     #[serde(default)]
     pub planar: Option<Planar>,
-    /// The maze, if it is an ant or a ball in one: rows of cells along +y, in them cells along +x (1 wall, 0 free, R start, G goal).
+    /// The maze, if it is an ant or a ball in one: rows of cells along +y, in them cells along +x
+    /// (1 wall, 0 free, R start, G goal).
     #[serde(default)]
     pub maze: Option<Vec<String>>,
     /// The environment whose row has its maze, if its own has not.
@@ -70,7 +73,8 @@ struct Table {
 
 #[allow(clippy::expect_used)] // The table is part of the program; the first test here reads it.
 static ENVIRONMENTS: LazyLock<Vec<EnvironmentSpec>> = LazyLock::new(|| {
-    let table: Table = toml::from_str(include_str!("../environments.toml")).expect("the embedded table is valid");
+    let table: Table =
+        toml::from_str(include_str!("../environments.toml")).expect("the embedded table is valid");
     let mut rows = table.environment;
     let maze = |row: &EnvironmentSpec| Some((row.name.clone(), row.maze.clone()?));
     let mazes: BTreeMap<_, _> = rows.iter().filter_map(maze).collect();
@@ -124,7 +128,9 @@ pub fn simulation_of(name: &str) -> String {
 impl EnvironmentSpec {
     /// The row and, where it stands for several tasks, one for each.
     fn with_tasks(self) -> Vec<Self> {
-        let Some(place) = self.name.strip_suffix("-singletask-v0").filter(|_| self.goal == Some(Goal::OfTask)) else {
+        let Some(place) =
+            self.name.strip_suffix("-singletask-v0").filter(|_| self.goal == Some(Goal::OfTask))
+        else {
             return vec![self];
         };
         let task = |name: String| match name == self.name {
@@ -156,25 +162,55 @@ mod tests {
         for spec in all() {
             assert_eq!(find(&spec.name), Ok(spec), "names are unique");
             let physics = find(spec.simulation()).unwrap();
-            let sizes = |spec: &EnvironmentSpec| (spec.observation_dim, spec.action_dim, spec.qpos_dim, spec.qvel_dim);
+            let sizes = |spec: &EnvironmentSpec| {
+                (spec.observation_dim, spec.action_dim, spec.qpos_dim, spec.qvel_dim)
+            };
             assert_eq!(sizes(spec), sizes(physics), "{}", spec.name);
             assert!(spec.reference_returns.1 > spec.reference_returns.0, "{}", spec.name);
-            assert!(physics.planar.is_some() != physics.maze.is_some(), "{}: one kind of simulation", spec.name);
-            assert_eq!(physics.maze.is_some(), spec.goal.is_some(), "{}: a maze has a goal", spec.name);
+            assert!(
+                physics.planar.is_some() != physics.maze.is_some(),
+                "{}: one kind of simulation",
+                spec.name
+            );
+            assert_eq!(
+                physics.maze.is_some(),
+                spec.goal.is_some(),
+                "{}: a maze has a goal",
+                spec.name
+            );
             let is_free = |[x, y]: [f64; 2]| {
                 let rows = physics.maze.as_ref().unwrap();
                 rows[(y / 4.0) as usize + 1].as_bytes()[(x / 4.0) as usize + 1] == b'0'
             };
             let task = ogbench::maze_task(&spec.name);
             assert_eq!(task.is_some(), spec.goal == Some(Goal::OfTask), "{}", spec.name);
-            assert!(task.is_none_or(|task| is_free(task.start) && is_free(task.goal)), "{}", spec.name);
+            assert!(
+                task.is_none_or(|task| is_free(task.start) && is_free(task.goal)),
+                "{}",
+                spec.name
+            );
             match &spec.collect {
-                Collect::None(reason) => assert!(!reason.is_empty(), "{}: no recipe and no reason", spec.name),
+                Collect::None(reason) => {
+                    assert!(!reason.is_empty(), "{}: no recipe and no reason", spec.name)
+                }
                 Collect::Recipe(recipe) => {
-                    let (bounds, shares): (Vec<f64>, Vec<f64>) = recipe.mixture.iter().copied().unzip();
-                    assert!(bounds.is_sorted() && bounds[0] == f64::NEG_INFINITY, "{}: {bounds:?}", spec.name);
-                    assert!((shares.iter().sum::<f64>() - 1.0).abs() < 1e-9, "{}: {shares:?}", spec.name);
-                    assert!(recipe.searches > 0 && recipe.steps_per_transition > 0, "{}", spec.name);
+                    let (bounds, shares): (Vec<f64>, Vec<f64>) =
+                        recipe.mixture.iter().copied().unzip();
+                    assert!(
+                        bounds.is_sorted() && bounds[0] == f64::NEG_INFINITY,
+                        "{}: {bounds:?}",
+                        spec.name
+                    );
+                    assert!(
+                        (shares.iter().sum::<f64>() - 1.0).abs() < 1e-9,
+                        "{}: {shares:?}",
+                        spec.name
+                    );
+                    assert!(
+                        recipe.searches > 0 && recipe.steps_per_transition > 0,
+                        "{}",
+                        spec.name
+                    );
                 }
             }
         }

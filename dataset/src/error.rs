@@ -1,4 +1,5 @@
-//! What can go wrong with a dataset. Every message names the file, and where it can the array and the row.
+//! What can go wrong with a dataset. Every message names the file, and where it can the array and
+//! the row.
 
 use std::error::Error;
 use std::io;
@@ -29,7 +30,8 @@ impl DatasetError {
     }
 }
 
-/// What can be wrong with a dataset. Arrays are called by their path in the file; rows count from 0.
+/// What can be wrong with a dataset. Arrays are called by their path in the file; rows count from
+/// 0.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // The sentences say what each is.
 pub enum Problem {
@@ -53,7 +55,9 @@ pub enum Problem {
     DamagedNpz(#[source] zip::result::ZipError),
     #[error("cannot be understood")]
     Metadata(#[source] serde_json::Error),
-    #[error("the attribute `layout` is {found:?}, but the only value with a meaning is \"transitions\"")]
+    #[error(
+        "the attribute `layout` is {found:?}, but the only value with a meaning is \"transitions\""
+    )]
     UnknownLayout { found: String },
     #[error("the attribute `{attribute}` has {found} texts, but a row has {expected} numbers")]
     Names { attribute: String, found: usize, expected: usize },
@@ -61,15 +65,21 @@ pub enum Problem {
     Missing { array: String },
     #[error("array `{array}` holds {found}, but must hold {expected}")]
     Type { array: String, found: String, expected: &'static str },
-    #[error("array `{array}` has shape {found:?}, but must have one or two axes: rows, and the numbers in each")]
+    #[error(
+        "array `{array}` has shape {found:?}, but must have one or two axes: rows, and the numbers in each"
+    )]
     Axes { array: String, found: Vec<usize> },
     #[error("array `{array}` has shape {found:?}, but must have {expected:?}")]
     Shape { array: String, found: Vec<usize>, expected: Vec<usize> },
     #[error("array `{array}` has {found} numbers, but {rows} rows of {width} are {}", .rows * .width)]
     Numbers { array: String, found: usize, rows: usize, width: usize },
-    #[error("array `{array}` claims the shape {found:?}, more than a file of {bytes} bytes can hold")]
+    #[error(
+        "array `{array}` claims the shape {found:?}, more than a file of {bytes} bytes can hold"
+    )]
     Oversized { array: String, found: Vec<usize>, bytes: u64 },
-    #[error("array `{array}` is compressed by HDF5's filter {filter}, which this program cannot read")]
+    #[error(
+        "array `{array}` is compressed by HDF5's filter {filter}, which this program cannot read"
+    )]
     Filter { array: String, filter: String },
     #[error("array `{array}` is not in this file: it leads to numbers that lie elsewhere")]
     Elsewhere { array: String },
@@ -93,7 +103,9 @@ pub enum Problem {
     NotBoolean { array: String, row: usize, value: f32 },
     #[error("array `{array}`, row {row}: the action {value} is outside [-1, 1]{}", such_rows(*.rows))]
     ActionOutside { array: String, row: usize, value: f32, rows: usize },
-    #[error("array `{array}` holds whole numbers, as if actions were discrete; only continuous ones can be learned")]
+    #[error(
+        "array `{array}` holds whole numbers, as if actions were discrete; only continuous ones can be learned"
+    )]
     DiscreteActions { array: String },
     #[error(
         "array `next_observations`, row {row}: not the observation of the row that follows, though the episode continues there{}",
@@ -104,7 +116,9 @@ pub enum Problem {
     Endless { rows: usize },
     #[error("{rows} rows, of which none makes a transition")]
     NoTransitions { rows: usize },
-    #[error("all trajectories have the same return, so the reward rule `locomotion` cannot scale them")]
+    #[error(
+        "all trajectories have the same return, so the reward rule `locomotion` cannot scale them"
+    )]
     SameReturns,
     #[error("cannot be written")]
     Write(#[source] hdf5::Error),
@@ -124,7 +138,9 @@ impl Problem {
     /// What to do about it.
     pub fn hint(&self) -> String {
         let hint = match self {
-            Self::OtherEnvironment { claimed, expected } => return other_environment(claimed, expected),
+            Self::OtherEnvironment { claimed, expected } => {
+                return other_environment(claimed, expected);
+            }
             Self::Foreign { load, .. } if load.starts_with(CONVERT) => {
                 return format!(
                     "with quad_rl installed, `{load} --out my-robot.hdf5` makes a file that is read (docs/data.md)"
@@ -162,14 +178,20 @@ impl Problem {
                 "the file is damaged, or most of these rows were never written: fetch or copy it again, or write those alone \
                  that there are"
             }
-            Self::Metadata(_) => "fetch the Minari dataset again; metadata.json is what Minari writes beside the data",
-            Self::UnknownLayout { .. } | Self::Names { .. } => "see docs/data.md for what the attribute means",
+            Self::Metadata(_) => {
+                "fetch the Minari dataset again; metadata.json is what Minari writes beside the data"
+            }
+            Self::UnknownLayout { .. } | Self::Names { .. } => {
+                "see docs/data.md for what the attribute means"
+            }
             Self::Missing { array } if array == "rewards" => {
                 "learning needs a reward for each step; a task such as antmaze-large-navigate-singletask-task1-v0 has those of OGBench's \
                  mazes, and with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds others"
             }
             Self::Missing { .. } => "docs/data.md says which arrays each kind of file must have",
-            Self::Numbers { .. } => "all arrays need the same number of rows, which is that of `rewards`",
+            Self::Numbers { .. } => {
+                "all arrays need the same number of rows, which is that of `rewards`"
+            }
             Self::NotBoolean { .. } => {
                 "a flag is 0 or 1: of a discount, write 1 where it is 0, and else 0 (docs/data.md says what each flag means)"
             }
@@ -177,7 +199,9 @@ impl Problem {
                 "docs/data.md says which shape and type each array must have; all arrays need the same number of rows"
             }
             Self::Episodes { .. } => "the dataset is incomplete: fetch it again",
-            Self::NotFinite { .. } => "leave out or repair these rows: a single one would spoil every weight",
+            Self::NotFinite { .. } => {
+                "leave out or repair these rows: a single one would spoil every weight"
+            }
             Self::ActionOutside { .. } => {
                 "`learner train --scale actions` trains on them: it maps the least and the largest of each number to ±1, and the \
                  policy's actions back"
@@ -193,8 +217,12 @@ impl Problem {
                 "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for \
                  rows in any other order set the attribute `layout` as docs/data.md describes"
             }
-            Self::Endless { .. } => "set `timeouts` to 1 at the last row of each episode that did not terminate",
-            Self::NoTransitions { .. } => "record more: a transition needs a row and the one that follows it",
+            Self::Endless { .. } => {
+                "set `timeouts` to 1 at the last row of each episode that did not terminate"
+            }
+            Self::NoTransitions { .. } => {
+                "record more: a transition needs a row and the one that follows it"
+            }
             Self::SameReturns => {
                 "unless all rewards are alike, another reward rule learns from them: --set reward=as-is"
             }

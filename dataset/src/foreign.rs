@@ -1,4 +1,5 @@
-//! Formats that are not read here, named for what they are, and what reads them: `quad-convert`, or a call in Python.
+//! Formats that are not read here, named for what they are, and what reads them: `quad-convert`, or
+//! a call in Python.
 
 use std::fs;
 use std::path::Path;
@@ -13,9 +14,9 @@ pub(crate) const START: u64 = 256;
 /// How a hint begins that names all there is to do.
 pub(crate) const CONVERT: &str = "quad-convert";
 
-const TABLE: &str =
-    "quad-convert FILE --observations COLUMN … --actions COLUMN … --reward COLUMN --episode COLUMN --terminal COLUMN";
-const PICKLE: &str = "load it by pickle.load, if you trust who wrote it: a pickle can run any program";
+const TABLE: &str = "quad-convert FILE --observations COLUMN … --actions COLUMN … --reward COLUMN --episode COLUMN --terminal COLUMN";
+const PICKLE: &str =
+    "load it by pickle.load, if you trust who wrote it: a pickle can run any program";
 
 /// How files begin, what such a file is, and how to load it.
 const STARTS: [(&[u8], &str, &str); 8] = [
@@ -47,8 +48,12 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
     let text = text.map_or("", |chunk| chunk.valid());
     let first_line = text.lines().next().unwrap_or_default();
     match text {
-        text if text.contains(|c: char| c.is_control() && !c.is_whitespace()) => Problem::UnknownFormat,
-        text if text.starts_with(['{', '[']) => foreign("a JSON file", "load it by json.load or pandas.read_json"),
+        text if text.contains(|c: char| c.is_control() && !c.is_whitespace()) => {
+            Problem::UnknownFormat
+        }
+        text if text.starts_with(['{', '[']) => {
+            foreign("a JSON file", "load it by json.load or pandas.read_json")
+        }
         _ if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", TABLE),
         _ => Problem::UnknownFormat,
     }
@@ -64,15 +69,22 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
         let load = "quad-convert FOLDER --observations observation.state --reward step-cost --success EPISODE …";
         return foreign(format!("a LeRobot dataset of version {version}"), load);
     }
-    let format = text("data/metadata.json", "data_format").or_else(|| text("metadata.json", "data_format"));
+    let format =
+        text("data/metadata.json", "data_format").or_else(|| text("metadata.json", "data_format"));
     match format.filter(|format| format != "hdf5") {
-        Some(format) => foreign(format!("a Minari dataset stored as {format}"), "quad-convert FOLDER"),
+        Some(format) => {
+            foreign(format!("a Minari dataset stored as {format}"), "quad-convert FOLDER")
+        }
         None => Problem::UnknownFolder,
     }
 }
 
-/// What an HDF5 file is that has another layout, by what its group `data` holds, and what `within` says that a group there holds.
-pub(crate) fn of_group(members: &[String], within: impl Fn(&str) -> Vec<String>) -> Option<Problem> {
+/// What an HDF5 file is that has another layout, by what its group `data` holds, and what `within`
+/// says that a group there holds.
+pub(crate) fn of_group(
+    members: &[String],
+    within: impl Fn(&str) -> Vec<String>,
+) -> Option<Problem> {
     let demonstration = members.iter().find(|name| name.starts_with("demo_"))?;
     Some(match within(demonstration).iter().any(|name| name == "rewards") {
         true => foreign("a robomimic file", "quad-convert FILE --observations KEY …"),

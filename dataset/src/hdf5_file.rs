@@ -1,7 +1,7 @@
 //! Arrays of an HDF5 file, each checked for presence, type, shape and size before it is used.
 //!
-//! Damage to HDF5's own structures is libhdf5's to find, and its 1.10 does not survive all of it: a dataset is to come
-//! from a place that is trusted.
+//! Damage to HDF5's own structures is libhdf5's to find, and its 1.10 does not survive all of it: a
+//! dataset is to come from a place that is trusted.
 
 use std::fmt::Display;
 use std::fs::File;
@@ -19,10 +19,12 @@ use crate::foreign;
 /// The first bytes of an HDF5 file.
 pub const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
 
-/// deflate shrinks by a factor of 1032 at most, so more than that in an array is a lie about its size.
+/// deflate shrinks by a factor of 1032 at most, so more than that in an array is a lie about its
+/// size.
 const MAX_COMPRESSION: u64 = 1040;
 
-/// The largest number that is read, and the largest integer type that HDF5's own tools use for an enum.
+/// The largest number that is read, and the largest integer type that HDF5's own tools use for an
+/// enum.
 const MAX_ELEMENT_BYTES: usize = 8;
 
 /// The longest text of fixed length that is read whole.
@@ -31,7 +33,8 @@ const MAX_TEXT: usize = 256;
 const NUMBERS: &str = "numbers";
 const FLAGS: &str = "booleans (h5py's enum, or numbers that are 0 or 1)";
 
-/// Version of the HDF5 library that this program found, and whether it reads compressed arrays, as D4RL's are.
+/// Version of the HDF5 library that this program found, and whether it reads compressed arrays, as
+/// D4RL's are.
 pub fn hdf5_library() -> (String, bool) {
     let (major, minor, release) = hdf5::library_version();
     (format!("{major}.{minor}.{release}"), hdf5::filters::deflate_available())
@@ -81,7 +84,8 @@ impl Hdf5File {
         text_in(&*self.dataset(array).ok()?)
     }
 
-    /// A text that the file's root has as an attribute; empty where the attribute is something else.
+    /// A text that the file's root has as an attribute; empty where the attribute is something
+    /// else.
     pub(crate) fn attribute(&self, name: &str) -> Option<String> {
         Some(text_in(&*self.file.attr(name).ok()?).unwrap_or_default())
     }
@@ -91,7 +95,11 @@ impl Hdf5File {
         let Ok(holder) = self.file.attr(attribute) else { return Ok(Vec::new()) };
         match texts_in(&holder).unwrap_or_default() {
             texts if texts.len() == count => Ok(texts),
-            texts => Err(Problem::Names { attribute: attribute.to_owned(), found: texts.len(), expected: count }),
+            texts => Err(Problem::Names {
+                attribute: attribute.to_owned(),
+                found: texts.len(),
+                expected: count,
+            }),
         }
     }
 
@@ -119,7 +127,12 @@ impl Hdf5File {
     }
 
     /// An array of `rows × width` numbers.
-    pub(crate) fn table<T: H5Type>(&self, array: &str, rows: usize, width: usize) -> Result<Vec<T>, Problem> {
+    pub(crate) fn table<T: H5Type>(
+        &self,
+        array: &str,
+        rows: usize,
+        width: usize,
+    ) -> Result<Vec<T>, Problem> {
         self.numbers(array)?.sized(rows, width)
     }
 
@@ -130,7 +143,8 @@ impl Hdf5File {
         let shape = self.check_size(&dataset, array)?;
         let values = match descriptor {
             TypeDescriptor::Float(_) => dataset.read_raw::<f32>(),
-            // Not read as `bool`: a damaged file may hold any byte. HDF5 saturates, so nothing else becomes 0 or 1.
+            // Not read as `bool`: a damaged file may hold any byte. HDF5 saturates, so nothing else
+            // becomes 0 or 1.
             _ => dataset.read_raw::<i8>().map(|values| values.into_iter().map(f32::from).collect()),
         };
         let values = values.map_err(|source| unreadable(array, source))?;
@@ -153,7 +167,9 @@ impl Hdf5File {
             return Err(Problem::Elsewhere { array: name() });
         }
         match creation.filters().iter().find(|filter| !filter.is_available()) {
-            Some(filter) => Err(Problem::Filter { array: name(), filter: filter_name(filter.id()) }),
+            Some(filter) => {
+                Err(Problem::Filter { array: name(), filter: filter_name(filter.id()) })
+            }
             None => Ok(dataset),
         }
     }
@@ -161,8 +177,14 @@ impl Hdf5File {
     /// Whether an array's name leads to an array elsewhere, in this file or in another one.
     fn is_link(&self, array: &str) -> bool {
         let (group, name) = array.rsplit_once('/').unwrap_or(("/", array));
-        let links = self.file.group(group).and_then(|group| group.links(IndexType::Name, IterationOrder::Native));
-        links.unwrap_or_default().iter().any(|(link, info)| link == name && info.link_type != LinkType::Hard)
+        let links = self
+            .file
+            .group(group)
+            .and_then(|group| group.links(IndexType::Name, IterationOrder::Native));
+        links
+            .unwrap_or_default()
+            .iter()
+            .any(|(link, info)| link == name && info.link_type != LinkType::Hard)
     }
 
     fn descriptor(
@@ -179,8 +201,12 @@ impl Hdf5File {
         }
         let descriptor = datatype.to_descriptor().map_err(|error| wrong(error.to_string()))?;
         match descriptor {
-            TypeDescriptor::Float(_) | TypeDescriptor::Integer(_) | TypeDescriptor::Unsigned(_) => Ok(descriptor),
-            TypeDescriptor::Boolean | TypeDescriptor::Enum(_) if expected == FLAGS => Ok(descriptor),
+            TypeDescriptor::Float(_) | TypeDescriptor::Integer(_) | TypeDescriptor::Unsigned(_) => {
+                Ok(descriptor)
+            }
+            TypeDescriptor::Boolean | TypeDescriptor::Enum(_) if expected == FLAGS => {
+                Ok(descriptor)
+            }
             other => Err(wrong(other.to_string())),
         }
     }
@@ -239,7 +265,8 @@ fn text_in(holder: &Container) -> Option<String> {
     if texts.len() == 1 { texts.pop() } else { None }
 }
 
-/// The texts that an attribute or an array holds, as HDF5's programs write them: of variable or fixed length, ASCII or UTF-8.
+/// The texts that an attribute or an array holds, as HDF5's programs write them: of variable or
+/// fixed length, ASCII or UTF-8.
 fn texts_in(holder: &Container) -> Option<Vec<String>> {
     fn as_type<T: H5Type + Display>(holder: &Container) -> Option<Vec<String>> {
         Some(holder.read_raw::<T>().ok()?.iter().map(T::to_string).collect())
@@ -250,7 +277,8 @@ fn texts_in(holder: &Container) -> Option<Vec<String>> {
         .or_else(|| as_type::<FixedAscii<MAX_TEXT>>(holder))
 }
 
-/// The length that the file's superblock says the file has, of any of its versions with 8-byte addresses.
+/// The length that the file's superblock says the file has, of any of its versions with 8-byte
+/// addresses.
 ///
 /// HDF5 File Format Specification 3.0, II.A.
 fn end_of_file(start: &[u8]) -> Option<u64> {

@@ -30,7 +30,8 @@ pub enum HoldOut<'a> {
 pub struct Split {
     /// To learn from: statistics, scaling and doubts are of these alone.
     pub training: Transitions,
-    /// Episodes that are kept out, in the same units; none if the share is 0 or there is but one episode.
+    /// Episodes that are kept out, in the same units; none if the share is 0 or there is but one
+    /// episode.
     pub held_out: Option<Transitions>,
     /// Their numbers, from 0 in the order of the file.
     pub episodes: Vec<usize>,
@@ -45,8 +46,8 @@ impl HoldOut<'_> {
     }
 }
 
-/// Numbers of the episodes that are kept out, from 0 in the order of the recording, in ascending order. Where the share is not
-/// 0 there is at least one, and one is left to learn from.
+/// Numbers of the episodes that are kept out, from 0 in the order of the recording, in ascending
+/// order. Where the share is not 0 there is at least one, and one is left to learn from.
 pub(crate) fn chosen(hold_out: HoldOut<'_>, episodes: usize) -> Vec<usize> {
     let (share, seed) = match hold_out {
         HoldOut::Share { share, seed } => (share, seed),
@@ -81,7 +82,8 @@ impl Recording {
         let out = chosen(hold_out, episodes.len());
         let (mut training, mut held_out) = (self.like(), self.like());
         for (number, rows) in episodes.into_iter().enumerate() {
-            let part = if out.binary_search(&number).is_ok() { &mut held_out } else { &mut training };
+            let part =
+                if out.binary_search(&number).is_ok() { &mut held_out } else { &mut training };
             part.extend(self, rows);
         }
         for part in [&mut training, &mut held_out] {
@@ -93,14 +95,23 @@ impl Recording {
     /// No rows, of the same sizes.
     fn like(&self) -> Recording {
         let Recording { observation_dim, action_dim, goal, rounding, terminal_array, .. } = *self;
-        let (names, next_observations) = (self.names.clone(), self.next_observations.as_ref().map(|_| Vec::new()));
-        let sizes = Recording { observation_dim, action_dim, goal, rounding, terminal_array, ..Recording::default() };
+        let (names, next_observations) =
+            (self.names.clone(), self.next_observations.as_ref().map(|_| Vec::new()));
+        let sizes = Recording {
+            observation_dim,
+            action_dim,
+            goal,
+            rounding,
+            terminal_array,
+            ..Recording::default()
+        };
         Recording { names, next_observations, ..sizes }
     }
 
     fn extend(&mut self, from: &Recording, rows: Range<usize>) {
         let (o, a) = (from.observation_dim, from.action_dim);
-        let (of_observations, of_actions) = (rows.start * o..rows.end * o, rows.start * a..rows.end * a);
+        let (of_observations, of_actions) =
+            (rows.start * o..rows.end * o, rows.start * a..rows.end * a);
         self.observations.extend_from_slice(&from.observations[of_observations.clone()]);
         self.actions.extend_from_slice(&from.actions[of_actions]);
         self.rewards.extend_from_slice(&from.rewards[rows.clone()]);
@@ -113,7 +124,8 @@ impl Recording {
         self.ends.extend_from_slice(&from.ends[rows]);
     }
 
-    /// A last row that leads to the first row of an episode which is not here any more gets one to lead to.
+    /// A last row that leads to the first row of an episode which is not here any more gets one to
+    /// lead to.
     fn close(&mut self) {
         if self.kinds.last() != Some(&RowKind::Transition) || self.next_observations.is_some() {
             return;
@@ -137,7 +149,9 @@ mod tests {
     #[test]
     fn episodes_are_kept_out_whole() {
         use RowKind::{Dropped, LastState, Transition};
-        let mut whole = recording(&[Transition, Transition, Transition, Dropped, Transition, LastState, Transition]);
+        let mut whole = recording(&[
+            Transition, Transition, Transition, Dropped, Transition, LastState, Transition,
+        ]);
         (whole.ends[1], whole.terminals[1], whole.ends[3]) = (true, true, true);
         assert_eq!(whole.rows_of_episodes(), [0..2, 2..4, 4..6, 6..7]);
         let (mut seen, hold_out) = (Vec::new(), |seed| HoldOut::Share { share: 0.25, seed });
@@ -145,14 +159,24 @@ mod tests {
             let (training, held_out, out) = whole.hold_out(hold_out(seed));
             assert_eq!(out.len(), 1);
             let rows = whole.rows_of_episodes()[out[0]].clone();
-            // The rewards of these rows are their numbers; one more row may follow, which is no step.
-            assert_eq!(&held_out.rewards[..rows.len()], Vec::from_iter(rows.clone().map(|row| row as f32)));
+            // The rewards of these rows are their numbers; one more row may follow, which is no
+            // step.
+            assert_eq!(
+                &held_out.rewards[..rows.len()],
+                Vec::from_iter(rows.clone().map(|row| row as f32))
+            );
             let again = whole.hold_out(HoldOut::Episodes(&out));
-            assert_eq!((again.0.rewards, again.1.rewards), (training.rewards.clone(), held_out.rewards.clone()));
+            assert_eq!(
+                (again.0.rewards, again.1.rewards),
+                (training.rewards.clone(), held_out.rewards.clone())
+            );
             let others = (0..7).filter(|row| !rows.contains(row)).map(|row| row as f32);
             assert_eq!(&training.rewards[..7 - rows.len()], Vec::from_iter(others));
             for part in [training, held_out] {
-                assert!(part.transitions().all(|row| (row as usize) + 1 < part.rows()), "no next state");
+                assert!(
+                    part.transitions().all(|row| (row as usize) + 1 < part.rows()),
+                    "no next state"
+                );
             }
             seen.push(out[0]);
         }
@@ -164,6 +188,9 @@ mod tests {
     #[test]
     fn one_episode_is_left_to_learn_from() {
         let count = |share, episodes| chosen(HoldOut::Share { share, seed: 0 }, episodes).len();
-        assert_eq!([count(0.0, 10), count(0.1, 10), count(0.01, 10), count(0.9, 2), count(0.5, 1)], [0, 1, 1, 1, 0]);
+        assert_eq!(
+            [count(0.0, 10), count(0.1, 10), count(0.01, 10), count(0.9, 2), count(0.5, 1)],
+            [0, 1, 1, 1, 0]
+        );
     }
 }

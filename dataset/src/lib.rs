@@ -1,15 +1,18 @@
-//! Reads D4RL, Minari, OGBench and custom HDF5, yields transitions and mini-batches, and writes D4RL's and custom
-//! HDF5.
+//! Reads D4RL, Minari, OGBench and custom HDF5, yields transitions and mini-batches, and writes
+//! D4RL's and custom HDF5.
 //!
 //! # Layout
-//! In reading order: [`environment`] is all that is known of an environment, `simulated` that part of it by which evaluators
-//! simulate it; `task` is one that may be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything
-//! about its form; `foreign` names what is not read here. `formats` has a file for each format, which turns arrays into a
-//! `recording`. `transitions` are what is learned from, unless `checks` has objections, with `reward`, `scale` and `statistics`
-//! beside it; `doubts` are what makes learning from them doubtful, `rounding` what does not; `sampler` draws mini-batches; `inspect`
-//! describes a source to people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer`
-//! writes such a file, and `arrays` one of the custom layout, both by `new_file`. [`catalog`] lists the files that can be
-//! asked for by name, [`ogbench`] what OGBench's names mean; `error` is what can go wrong with any of them.
+//! In reading order: [`environment`] is all that is known of an environment, `simulated` that part
+//! of it by which evaluators simulate it; `task` is one that may be unknown. `hdf5_file` and
+//! `npz_file` read one `array` of a file and check everything about its form; `foreign` names what
+//! is not read here. `formats` has a file for each format, which turns arrays into a `recording`.
+//! `transitions` are what is learned from, unless `checks` has objections, with `reward`, `scale`
+//! and `statistics` beside it; `doubts` are what makes learning from them doubtful, `rounding` what
+//! does not; `sampler` draws mini-batches; `inspect` describes a source to people, whatever is
+//! wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a
+//! file, and `arrays` one of the custom layout, both by `new_file`. [`catalog`] lists the files
+//! that can be asked for by name, [`ogbench`] what OGBench's names mean; `error` is what can go
+//! wrong with any of them.
 //!
 //! This crate knows nothing of networks, simulators or the wire.
 

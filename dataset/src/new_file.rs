@@ -1,4 +1,5 @@
-//! An HDF5 file that is being written, and its arrays, which grow by rows: gzip 4, chunked, booleans as h5py writes them.
+//! An HDF5 file that is being written, and its arrays, which grow by rows: gzip 4, chunked,
+//! booleans as h5py writes them.
 
 use std::fs;
 use std::io;
@@ -20,8 +21,8 @@ const CHUNK_NUMBERS: usize = 1 << 20;
 /// D4RL's.
 const GZIP_LEVEL: u8 = 4;
 
-/// It appears under its name when [`finish`](Self::finish) says so, and not before: until then it is `<path>.partial`,
-/// which the next one of that path replaces.
+/// It appears under its name when [`finish`](Self::finish) says so, and not before: until then it
+/// is `<path>.partial`, which the next one of that path replaces.
 pub(crate) struct NewFile {
     path: PathBuf,
     partial: PathBuf,
@@ -36,20 +37,25 @@ impl NewFile {
         partial.push(".partial");
         let partial = PathBuf::from(partial);
         if let Some(folder) = path.parent() {
-            fs::create_dir_all(folder).map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
+            fs::create_dir_all(folder)
+                .map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
         }
         if path.is_dir() {
             return Err(DatasetError::new(path, Problem::Io(io::ErrorKind::IsADirectory.into())));
         }
-        // What a killed process has left, or a link, through which the library would write into another file.
+        // What a killed process has left, or a link, through which the library would write into
+        // another file.
         let made = fs::remove_file(&partial).or_else(|error| match error.kind() {
             io::ErrorKind::NotFound => Ok(()),
             _ => Err(error),
         });
         let made = made.and_then(|()| fs::File::create_new(&partial));
         made.map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
-        // The oldest format is read by every version of the library, and its groups do not say when they were made.
-        let hdf5 = hdf5::File::with_options().with_fapl(|access| access.libver_earliest()).create(&partial);
+        // The oldest format is read by every version of the library, and its groups do not say when
+        // they were made.
+        let hdf5 = hdf5::File::with_options()
+            .with_fapl(|access| access.libver_earliest())
+            .create(&partial);
         let hdf5 = hdf5.map_err(|source| DatasetError::new(path, Problem::Write(source)))?;
         Ok(Self { path: path.to_owned(), partial, hdf5 })
     }
@@ -74,11 +80,13 @@ impl NewFile {
     }
 }
 
-/// Properties of an array that does not say when it was made: equal rows make equal files, by whose hash a run knows its data.
+/// Properties of an array that does not say when it was made: equal rows make equal files, by whose
+/// hash a run knows its data.
 #[allow(unsafe_code)]
 fn timeless() -> hdf5::Result<DatasetCreate> {
     let properties = DatasetCreate::try_new()?;
-    // SAFETY: the number is that of these properties, and no other thread is in the library meanwhile.
+    // SAFETY: the number is that of these properties, and no other thread is in the library
+    // meanwhile.
     match hdf5::sync::sync(|| unsafe { H5Pset_obj_track_times(properties.id(), 0) }) {
         0.. => Ok(properties),
         _ => Err("the HDF5 library keeps the time of arrays".into()),
@@ -95,8 +103,13 @@ pub(crate) struct Column {
 
 impl Column {
     /// An array without rows, of numbers of type `T`.
-    pub(crate) fn create<T: H5Type>(file: &NewFile, name: &'static str, width: Option<usize>) -> hdf5::Result<Self> {
-        let builder = file.hdf5.new_dataset::<T>().set_create_plist(&timeless()?).deflate(GZIP_LEVEL);
+    pub(crate) fn create<T: H5Type>(
+        file: &NewFile,
+        name: &'static str,
+        width: Option<usize>,
+    ) -> hdf5::Result<Self> {
+        let builder =
+            file.hdf5.new_dataset::<T>().set_create_plist(&timeless()?).deflate(GZIP_LEVEL);
         let dataset = match width {
             None => builder.chunk((CHUNK_ROWS,)).shape((0..,)).create(name)?,
             Some(width) => {

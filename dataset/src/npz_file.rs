@@ -24,10 +24,13 @@ pub(crate) struct NpzFile {
 
 impl NpzFile {
     pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
-        let file = File::open(path).map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
+        let file =
+            File::open(path).map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
         let archive = ZipArchive::new(BufReader::new(file))
             .map_err(|source| DatasetError::new(path, Problem::DamagedNpz(source)))?;
-        if let Some(problem) = foreign::of_archive(&archive.file_names().filter_map(Result::ok).collect::<Vec<_>>()) {
+        if let Some(problem) =
+            foreign::of_archive(&archive.file_names().filter_map(Result::ok).collect::<Vec<_>>())
+        {
             return Err(DatasetError::new(path, problem));
         }
         Ok(Self { path: path.into(), archive })
@@ -52,7 +55,12 @@ impl NpzFile {
     }
 
     /// An array of `rows × width` numbers.
-    pub(crate) fn table(&mut self, array: &str, rows: usize, width: usize) -> Result<Vec<f32>, Problem> {
+    pub(crate) fn table(
+        &mut self,
+        array: &str,
+        rows: usize,
+        width: usize,
+    ) -> Result<Vec<f32>, Problem> {
         self.numbers(array)?.sized(rows, width)
     }
 
@@ -68,7 +76,8 @@ impl NpzFile {
             other => Problem::DamagedNpz(other),
         })?;
         let bytes = entry.size();
-        let unreadable = |source: io::Error| Problem::Unreadable { array: name.clone(), source: source.into() };
+        let unreadable =
+            |source: io::Error| Problem::Unreadable { array: name.clone(), source: source.into() };
         let mut reader = BufReader::new(entry);
         let file = NpyFile::new(&mut reader).map_err(unreadable)?;
         if continuous && holds_whole_numbers(&file.dtype()) {
@@ -83,7 +92,11 @@ impl NpzFile {
         let values = floats(file, &name)?;
         // Only at its end does the archive compare the entry with its checksum.
         io::copy(&mut reader, &mut io::sink()).map_err(unreadable)?;
-        Array::new(array, &shape, if order == Order::Fortran { by_rows(&shape, &values) } else { values })
+        Array::new(
+            array,
+            &shape,
+            if order == Order::Fortran { by_rows(&shape, &values) } else { values },
+        )
     }
 }
 

@@ -1,11 +1,13 @@
 //! OGBench's datasets, and what of them is a task, by their names.
 //!
-//! The task `antmaze-large-navigate-singletask-task1-v0` is to do what the environment `antmaze-large-singletask-task1-v0`
-//! rewards, and to learn it from the dataset `antmaze-large-navigate-v0`. Without `-task1` it is the default one of five.
+//! The task `antmaze-large-navigate-singletask-task1-v0` is to do what the environment
+//! `antmaze-large-singletask-task1-v0` rewards, and to learn it from the dataset
+//! `antmaze-large-navigate-v0`. Without `-task1` it is the default one of five.
 //!
-//! The datasets have no rewards. In a maze a task is to come to a place, so rewards and masks follow from the observations; they
-//! are those of `relabel_dataset` in OGBench 1.2, which judges the state before a step: the reward is 1 there and the mask 0, and
-//! else the other way round. OGBench's reward is this one less 1 ([`RewardRule::Subtract1`](crate::RewardRule::Subtract1)).
+//! The datasets have no rewards. In a maze a task is to come to a place, so rewards and masks
+//! follow from the observations; they are those of `relabel_dataset` in OGBench 1.2, which judges
+//! the state before a step: the reward is 1 there and the mask 0, and else the other way round.
+//! OGBench's reward is this one less 1 ([`RewardRule::Subtract1`](crate::RewardRule::Subtract1)).
 
 use crate::catalog::NamedDataset;
 use crate::recording::{Recording, RowKind};
@@ -41,13 +43,41 @@ const DATASETS: [(&str, &[&str]); 20] = [
 /// Row and column of a maze's map.
 type Cell = (u8, u8);
 
-/// Start and goal of tasks 1 to 5, by how the name of the robot's place ends. In soccer it is the ball that must come to the goal.
+/// Start and goal of tasks 1 to 5, by how the name of the robot's place ends. In soccer it is the
+/// ball that must come to the goal.
 const TASKS: [(&str, [(Cell, Cell); 5]); 5] = [
-    ("maze-medium", [((1, 1), (6, 6)), ((6, 1), (1, 6)), ((5, 3), (4, 2)), ((6, 5), (6, 1)), ((2, 6), (1, 1))]),
-    ("maze-large", [((1, 1), (7, 10)), ((5, 4), (7, 1)), ((7, 4), (1, 10)), ((3, 8), (5, 4)), ((1, 1), (5, 4))]),
-    ("maze-giant", [((1, 1), (10, 14)), ((1, 14), (10, 1)), ((8, 14), (1, 1)), ((8, 3), (5, 12)), ((5, 9), (3, 8))]),
-    ("soccer-arena", [((1, 6), (5, 2)), ((2, 2), (2, 2)), ((6, 1), (6, 6)), ((6, 6), (6, 1)), ((4, 6), (1, 6))]),
-    ("soccer-medium", [((1, 1), (6, 6)), ((6, 1), (1, 1)), ((5, 3), (6, 5)), ((6, 5), (5, 3)), ((1, 6), (1, 6))]),
+    (
+        "maze-medium",
+        [((1, 1), (6, 6)), ((6, 1), (1, 6)), ((5, 3), (4, 2)), ((6, 5), (6, 1)), ((2, 6), (1, 1))],
+    ),
+    (
+        "maze-large",
+        [
+            ((1, 1), (7, 10)),
+            ((5, 4), (7, 1)),
+            ((7, 4), (1, 10)),
+            ((3, 8), (5, 4)),
+            ((1, 1), (5, 4)),
+        ],
+    ),
+    (
+        "maze-giant",
+        [
+            ((1, 1), (10, 14)),
+            ((1, 14), (10, 1)),
+            ((8, 14), (1, 1)),
+            ((8, 3), (5, 12)),
+            ((5, 9), (3, 8)),
+        ],
+    ),
+    (
+        "soccer-arena",
+        [((1, 6), (5, 2)), ((2, 2), (2, 2)), ((6, 1), (6, 6)), ((6, 6), (6, 1)), ((4, 6), (1, 6))],
+    ),
+    (
+        "soccer-medium",
+        [((1, 1), (6, 6)), ((6, 1), (1, 1)), ((5, 3), (6, 5)), ((6, 5), (5, 3)), ((1, 6), (1, 6))],
+    ),
 ];
 /// The ball's x in an observation of soccer, after the ant's own positions.
 const BALL: usize = 15;
@@ -76,7 +106,8 @@ pub struct MazeTask {
     column: usize,
 }
 
-/// The task of an environment such as `humanoidmaze-large-singletask-task2-v0`; nothing for one that is in none of OGBench's mazes.
+/// The task of an environment such as `humanoidmaze-large-singletask-task2-v0`; nothing for one
+/// that is in none of OGBench's mazes.
 pub fn maze_task(environment: &str) -> Option<MazeTask> {
     let (place, number) = parts(environment)?;
     let (_, tasks) = TASKS.iter().find(|(ending, _)| place.ends_with(ending))?;
@@ -85,7 +116,12 @@ pub fn maze_task(environment: &str) -> Option<MazeTask> {
     let (start, goal) = *tasks.get(number.unwrap_or(default).checked_sub(1)?)?;
     let center = |(row, column): Cell| [column, row].map(|cell| (f64::from(cell) - 1.0) * CELL);
     let reach = if place.starts_with("pointmaze") { POINT_REACH } else { ANT_REACH };
-    Some(MazeTask { start: center(start), goal: center(goal), reach, column: if is_soccer { BALL } else { 0 } })
+    Some(MazeTask {
+        start: center(start),
+        goal: center(goal),
+        reach,
+        column: if is_soccer { BALL } else { 0 },
+    })
 }
 
 /// Robot and place of an environment's name, and the number of its task, if it says one.
@@ -95,7 +131,8 @@ fn parts(environment: &str) -> Option<(&str, Option<usize>)> {
     (number.is_some() || rest.is_empty()).then_some((place, number))
 }
 
-/// The environment of the default task in the same place: the simulation that all five tasks there share.
+/// The environment of the default task in the same place: the simulation that all five tasks there
+/// share.
 pub(crate) fn default_task(environment: &str) -> Option<String> {
     parts(environment).map(|(place, _)| format!("{place}-singletask-v0"))
 }
@@ -139,11 +176,20 @@ fn kinds() -> impl Iterator<Item = (&'static str, &'static str)> {
 
 /// The files of mazes. Their sizes and checksums are not known.
 pub(crate) fn files() -> impl Iterator<Item = NamedDataset> {
-    let mazes = kinds().map(|(place, kind)| (format!("{place}-singletask-v0"), format!("{place}-{kind}-v0")));
+    let mazes = kinds()
+        .map(|(place, kind)| (format!("{place}-singletask-v0"), format!("{place}-{kind}-v0")));
     mazes.filter(|(environment, _)| maze_task(environment).is_some()).map(|(environment, name)| {
         let file = format!("{name}.npz");
         let addresses = vec![format!("https://rail.eecs.berkeley.edu/datasets/ogbench/{file}")];
-        NamedDataset { name, environment, file, bytes: None, sha256: None, license: "MIT".to_owned(), addresses }
+        NamedDataset {
+            name,
+            environment,
+            file,
+            bytes: None,
+            sha256: None,
+            license: "MIT".to_owned(),
+            addresses,
+        }
     })
 }
 
@@ -182,8 +228,8 @@ mod tests {
             ("antmaze-large-v0", None),
             ("cube-single-singletask-v0", None),
         ] {
-            let found =
-                maze_task(environment).map(|MazeTask { start, goal, reach, column }| (start, goal, reach, column));
+            let found = maze_task(environment)
+                .map(|MazeTask { start, goal, reach, column }| (start, goal, reach, column));
             assert_eq!(found, expected, "{environment}");
         }
     }
@@ -193,11 +239,16 @@ mod tests {
         let (all, files) = (Vec::from_iter(tasks()), Vec::from_iter(files()));
         assert_eq!((all.len(), files.len()), (42 * 6, 24));
         let names = |at: usize| (&*all[at].task, &*all[at].environment, all[at].dataset.as_deref());
-        let (task, environment) = ("antmaze-medium-navigate-singletask-task1-v0", "antmaze-medium-singletask-task1-v0");
+        let (task, environment) =
+            ("antmaze-medium-navigate-singletask-task1-v0", "antmaze-medium-singletask-task1-v0");
         assert_eq!(names(36 + 1), (task, environment, Some("antmaze-medium-navigate-v0")));
-        assert_eq!(names(42 * 6 - 1), ("puzzle-4x6-noisy-singletask-task5-v0", "puzzle-4x6-singletask-task5-v0", None));
+        assert_eq!(
+            names(42 * 6 - 1),
+            ("puzzle-4x6-noisy-singletask-task5-v0", "puzzle-4x6-singletask-task5-v0", None)
+        );
         assert!(all.iter().all(|task| task.task != "antmaze-giant-explore-singletask-v0"));
-        let address = "https://rail.eecs.berkeley.edu/datasets/ogbench/antsoccer-medium-stitch-v0.npz";
+        let address =
+            "https://rail.eecs.berkeley.edu/datasets/ogbench/antsoccer-medium-stitch-v0.npz";
         assert_eq!(files[23].addresses, [address]);
     }
 }

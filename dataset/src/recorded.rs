@@ -27,8 +27,8 @@ pub struct Row<'a> {
     pub qvel: &'a [f64],
 }
 
-/// All rows of a file that has `infos/qpos` and `infos/qvel` besides the arrays to learn from and, where there is a goal,
-/// `infos/goal`.
+/// All rows of a file that has `infos/qpos` and `infos/qvel` besides the arrays to learn from and,
+/// where there is a goal, `infos/goal`.
 pub struct RecordedRows {
     environment: &'static EnvironmentSpec,
     observations: Vec<f64>,
@@ -44,11 +44,16 @@ pub struct RecordedRows {
 }
 
 /// The environments of the table whose sizes a file has.
-pub fn environments_of_its_sizes(path: impl AsRef<Path>) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
+pub fn environments_of_its_sizes(
+    path: impl AsRef<Path>,
+) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
     let file = Hdf5File::open(path.as_ref())?;
     let size = |array| file.size(array).map_err(|problem| DatasetError::new(file.path(), problem));
     let sizes = (size("observations")?.1, size("actions")?.1);
-    Ok(environment::all().iter().filter(|spec| (spec.observation_dim, spec.action_dim) == sizes).collect())
+    Ok(environment::all()
+        .iter()
+        .filter(|spec| (spec.observation_dim, spec.action_dim) == sizes)
+        .collect())
 }
 
 /// Numbers in a goal: x and y.
@@ -56,7 +61,10 @@ const GOAL_DIM: usize = 2;
 
 impl RecordedRows {
     /// Reads a file recorded in `environment`.
-    pub fn read(path: impl AsRef<Path>, environment: &'static EnvironmentSpec) -> Result<Self, DatasetError> {
+    pub fn read(
+        path: impl AsRef<Path>,
+        environment: &'static EnvironmentSpec,
+    ) -> Result<Self, DatasetError> {
         let file = Hdf5File::open(path.as_ref())?;
         Self::of(&file, environment).map_err(|problem| DatasetError::new(file.path(), problem))
     }
@@ -93,7 +101,8 @@ impl RecordedRows {
 
     /// Row `i`, which must be below [`len`](Self::len).
     pub fn row(&self, i: usize) -> Row<'_> {
-        let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } = *self.environment;
+        let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } =
+            *self.environment;
         let at = |width: usize| i * width..(i + 1) * width;
         Row {
             observation: &self.observations[at(observation_dim)],
@@ -112,7 +121,8 @@ impl RecordedRows {
         self.goals.as_ref().map(|goals| &goals[i * GOAL_DIM..][..GOAL_DIM])
     }
 
-    /// The stored one, or else the following row's observation where no episode ended between the two.
+    /// The stored one, or else the following row's observation where no episode ended between the
+    /// two.
     fn next_observation(&self, i: usize) -> &[f64] {
         let width = self.environment.observation_dim;
         match &self.next_observations {

@@ -18,7 +18,8 @@ pub(crate) enum RowKind {
     LastState,
 }
 
-/// Rows of a dataset, N of them. What follows the last end of an episode is an episode, too, cut off by the file's end.
+/// Rows of a dataset, N of them. What follows the last end of an episode is an episode, too, cut
+/// off by the file's end.
 #[derive(Default)]
 pub(crate) struct Recording {
     /// Numbers in an observation, o.
@@ -31,11 +32,14 @@ pub(crate) struct Recording {
     pub actions: Vec<f32>,
     /// N.
     pub rewards: Vec<f32>,
-    /// N × o, where the format stores them apart. Else the following row's observation is the next one.
+    /// N × o, where the format stores them apart. Else the following row's observation is the next
+    /// one.
     pub next_observations: Option<Vec<f32>>,
-    /// N × o, where a D4RL file stores them although the following row's observation is the next one.
+    /// N × o, where a D4RL file stores them although the following row's observation is the next
+    /// one.
     pub unused_next_observations: Option<Vec<f32>>,
-    /// What was done to observations and not to the next ones that are stored, or the other way round.
+    /// What was done to observations and not to the next ones that are stored, or the other way
+    /// round.
     pub rounding: Rounding,
     /// N.
     pub kinds: Vec<RowKind>,
@@ -51,7 +55,8 @@ pub(crate) struct Recording {
     pub goal: bool,
     /// What the numbers of its rows are called.
     pub names: Names,
-    /// Where the file has several arrays of each kind: the first row of each, and the path of the group it is in.
+    /// Where the file has several arrays of each kind: the first row of each, and the path of the
+    /// group it is in.
     pub parts: Vec<(usize, String)>,
 }
 
@@ -74,7 +79,8 @@ impl Recording {
         kinds.filter(|(kind, _)| **kind == RowKind::Transition).map(|(_, row)| row)
     }
 
-    /// Whether each row's episode has reached its goal before: a recording of a task with one continues there.
+    /// Whether each row's episode has reached its goal before: a recording of a task with one
+    /// continues there.
     pub(crate) fn past_goal(&self) -> Vec<bool> {
         let mut is_past = false;
         let of_row = |row: usize| {
@@ -99,8 +105,8 @@ impl Recording {
         episodes
     }
 
-    /// Returns of the trajectories that the locomotion rule speaks of: runs of rows to learn from, each up to a terminal,
-    /// the end of an episode, or a row that does not lead to the next one.
+    /// Returns of the trajectories that the locomotion rule speaks of: runs of rows to learn from,
+    /// each up to a terminal, the end of an episode, or a row that does not lead to the next one.
     pub(crate) fn trajectory_returns(&self) -> Vec<f64> {
         let following = self.transitions().skip(1).map(Some).chain([None]);
         let rows = self.transitions().zip(following).map(|(row, following)| {
@@ -123,12 +129,16 @@ impl Recording {
     pub(crate) fn goes_on(&self, row: usize) -> bool {
         let ends = self.ends[row] || self.terminals[row] || self.kinds[row] == RowKind::LastState;
         let is_step = self.kinds.get(row + 1).is_some_and(|kind| *kind != RowKind::LastState);
-        !ends && is_step && !self.next_observations.as_ref().is_some_and(|next| self.jumps(next, row))
+        !ends
+            && is_step
+            && !self.next_observations.as_ref().is_some_and(|next| self.jumps(next, row))
     }
 
-    /// Whether `following`, the next row to learn from after `row`, continues where that one led to.
+    /// Whether `following`, the next row to learn from after `row`, continues where that one led
+    /// to.
     fn continues(&self, row: usize, following: usize) -> bool {
-        following == row + 1 || !differ(self.observation(following), self.observation(row + 1), Rounding::default())
+        following == row + 1
+            || !differ(self.observation(following), self.observation(row + 1), Rounding::default())
     }
 
     /// Whether a row's stored next observation is not where the following row starts.

@@ -4,11 +4,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::recording::Recording;
 
-/// What happens to the rewards of a file. Statistics and scores are always of the rewards as they were recorded.
+/// What happens to the rewards of a file. Statistics and scores are always of the rewards as they
+/// were recorded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RewardRule {
-    /// `r · 1000 / (max - min trajectory return)`: IQL's and DAC's rule for locomotion. On returns of 0 and 1, as in
-    /// AntMaze, it is `r · 1000`.
+    /// `r · 1000 / (max - min trajectory return)`: IQL's and DAC's rule for locomotion. On returns
+    /// of 0 and 1, as in AntMaze, it is `r · 1000`.
     #[serde(rename = "locomotion")]
     Locomotion,
     /// `r`: the rewards as they were recorded.
@@ -44,9 +45,12 @@ impl Default for RewardScaling {
 impl RewardScaling {
     /// The root mean square of what is learned from.
     pub(crate) fn size(self, recording: &Recording) -> f64 {
-        let squares = recording.transitions().map(|row| f64::from(self.apply(recording.rewards[row as usize])).powi(2));
-        let (count, sum) =
-            squares.filter(|x| x.is_finite()).fold((0.0, 0.0), |(count, sum), square| (count + 1.0, sum + square));
+        let squares = recording
+            .transitions()
+            .map(|row| f64::from(self.apply(recording.rewards[row as usize])).powi(2));
+        let (count, sum) = squares
+            .filter(|x| x.is_finite())
+            .fold((0.0, 0.0), |(count, sum), square| (count + 1.0, sum + square));
         if count > 0.0 { f64::sqrt(sum / count) } else { 0.0 }
     }
 
@@ -56,7 +60,8 @@ impl RewardScaling {
 }
 
 impl RewardRule {
-    /// What it does, given the returns of the trajectories; none where their spread is zero but needed.
+    /// What it does, given the returns of the trajectories; none where their spread is zero but
+    /// needed.
     pub(crate) fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
         let (subtract, times) = match self {
             Self::Locomotion => {

@@ -1,6 +1,7 @@
 //! Whether one of two arrays of the same numbers was rounded, as to float16.
 
-/// Bits of a float32 that are 0 where it was rounded to bfloat16 or float16, and the share of a number by which that moves it.
+/// Bits of a float32 that are 0 where it was rounded to bfloat16 or float16, and the share of a
+/// number by which that moves it.
 const BINARY: [(u32, f32); 2] = [(0xffff, 1.0 / 256.0), (0x1fff, 1.0 / 2048.0)];
 /// Decimals to which logs are rounded.
 const DECIMALS: std::ops::RangeInclusive<i32> = 1..=6;
@@ -51,8 +52,13 @@ mod tests {
         let decimals = |x: &f32| (f64::from(*x) * 1e4).round() as f32 / 1e4;
         for rounded in [half, brain, decimals] {
             let rounded: Vec<f32> = exact.iter().map(rounded).collect();
-            for rounding in [Rounding::between(&exact, &rounded), Rounding::between(&rounded, &exact)] {
-                assert!(exact.iter().zip(&rounded).all(|(x, y)| rounding.explains(*x, *y)), "{rounding:?}");
+            for rounding in
+                [Rounding::between(&exact, &rounded), Rounding::between(&rounded, &exact)]
+            {
+                assert!(
+                    exact.iter().zip(&rounded).all(|(x, y)| rounding.explains(*x, *y)),
+                    "{rounding:?}"
+                );
                 assert!(!rounding.explains(1.0, 1.02));
             }
             assert_eq!(Rounding::between(&rounded, &rounded), Rounding::default());

@@ -6,8 +6,8 @@ use rand_chacha::ChaCha8Rng;
 /// Keeps these draws apart from other uses of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"batches ");
 
-/// Draws batches such that every transition comes once a pass, in an order that is a function of the seed and the pass
-/// alone. A batch that reaches the end of a pass continues with the next one.
+/// Draws batches such that every transition comes once a pass, in an order that is a function of
+/// the seed and the pass alone. A batch that reaches the end of a pass continues with the next one.
 pub struct BatchSampler {
     seed: u64,
     pass: u64,

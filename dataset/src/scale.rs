@@ -1,4 +1,5 @@
-//! What networks see of observations, actions and rewards: a recording's own numbers, or these scaled by what the data holds.
+//! What networks see of observations, actions and rewards: a recording's own numbers, or these
+//! scaled by what the data holds.
 
 use quad_kernels::scaling::{Affine, Scaling};
 use serde::{Deserialize, Serialize};
@@ -12,7 +13,8 @@ use crate::reward::RewardScaling;
 pub struct Scale {
     /// Each number of an action, so that the least and the largest of the data become -1 and 1.
     pub actions: bool,
-    /// Each number of an observation, so that those of the data have mean 0 and standard deviation 1.
+    /// Each number of an observation, so that those of the data have mean 0 and standard deviation
+    /// 1.
     pub states: bool,
     /// Rewards, so that the mean of their squares is 1 after the reward rule.
     pub rewards: bool,
@@ -33,7 +35,11 @@ pub enum Scaled {
 impl From<Vec<Scaled>> for Scale {
     fn from(names: Vec<Scaled>) -> Self {
         let has = |name| names.contains(&name);
-        Self { actions: has(Scaled::Actions), states: has(Scaled::States), rewards: has(Scaled::Rewards) }
+        Self {
+            actions: has(Scaled::Actions),
+            states: has(Scaled::States),
+            rewards: has(Scaled::Rewards),
+        }
     }
 }
 
@@ -47,14 +53,16 @@ impl From<Scale> for Vec<Scaled> {
 }
 
 impl Scale {
-    /// The maps for a recording whose numbers are finite. Observations count where a transition begins, actions wherever one
-    /// was taken, rewards where there is a transition.
+    /// The maps for a recording whose numbers are finite. Observations count where a transition
+    /// begins, actions wherever one was taken, rewards where there is a transition.
     pub(crate) fn of(self, recording: &Recording, rule: RewardScaling) -> Scaling {
         let Recording { observation_dim, action_dim, observations, actions, kinds, .. } = recording;
         let is_transition = |row: usize| kinds[row] == RowKind::Transition;
         let is_step = |row: usize| kinds[row] != RowKind::LastState;
         Scaling {
-            observations: self.states.then(|| affine(observations, *observation_dim, is_transition, standard)),
+            observations: self
+                .states
+                .then(|| affine(observations, *observation_dim, is_transition, standard)),
             actions: self.actions.then(|| affine(actions, *action_dim, is_step, unit_range)),
             // Rewards that are all 0 have no size.
             rewards: self.rewards.then(|| rule.size(recording) as f32).filter(|size| *size > 0.0),
@@ -62,8 +70,13 @@ impl Scale {
     }
 }
 
-/// The map with which each column of these numbers has mean 0 and standard deviation 1 over the rows that count.
-pub(crate) fn standard_units(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Affine {
+/// The map with which each column of these numbers has mean 0 and standard deviation 1 over the
+/// rows that count.
+pub(crate) fn standard_units(
+    values: &[f32],
+    width: usize,
+    counts: impl Fn(usize) -> bool,
+) -> Affine {
     affine(values, width, counts, standard)
 }
 
@@ -78,11 +91,18 @@ pub(crate) fn apply(scaling: &Scaling, recording: &mut Recording) {
     }
 }
 
-/// The map of each column, by the offset and the scale that `of` finds for its numbers in the rows that count.
-fn affine(values: &[f32], width: usize, counts: impl Fn(usize) -> bool, of: fn(&[f64]) -> (f64, f64)) -> Affine {
+/// The map of each column, by the offset and the scale that `of` finds for its numbers in the rows
+/// that count.
+fn affine(
+    values: &[f32],
+    width: usize,
+    counts: impl Fn(usize) -> bool,
+    of: fn(&[f64]) -> (f64, f64),
+) -> Affine {
     let column = |column: usize| {
         let values = values.iter().skip(column).step_by(width).enumerate();
-        let values: Vec<f64> = values.filter(|(row, _)| counts(*row)).map(|(_, value)| f64::from(*value)).collect();
+        let values: Vec<f64> =
+            values.filter(|(row, _)| counts(*row)).map(|(_, value)| f64::from(*value)).collect();
         let (offset, scale) = of(&values);
         // The scale is 0 where all are the same, or differ by less than a float32 can say.
         (offset as f32, scale as f32)
@@ -111,5 +131,7 @@ fn unit_range(values: &[f64]) -> (f64, f64) {
 
 /// The least and the largest.
 fn range(values: &[f64]) -> (f64, f64) {
-    values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(least, largest), &x| (x.min(least), x.max(largest)))
+    values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(least, largest), &x| {
+        (x.min(least), x.max(largest))
+    })
 }

@@ -2,8 +2,8 @@
 
 use serde::Deserialize;
 
-/// A robot in a vertical plane that is rewarded for running along x. Positions begin with its x, z (meters) and pitch (radians);
-/// a policy observes all but x, then the velocities.
+/// A robot in a vertical plane that is rewarded for running along x. Positions begin with its x, z
+/// (meters) and pitch (radians); a policy observes all but x, then the velocities.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Planar {
@@ -51,7 +51,8 @@ pub struct Healthy {
 }
 
 impl Healthy {
-    /// Whether an episode continues in a state. False for NaN, because no comparison with NaN holds.
+    /// Whether an episode continues in a state. False for NaN, because no comparison with NaN
+    /// holds.
     pub fn contains(&self, qpos: &[f64], qvel: &[f64]) -> bool {
         let within = |(least, most): (f64, f64), value: f64| value > least && value < most;
         let mut others = qpos[2..].iter().chain(qvel);
@@ -75,13 +76,15 @@ pub enum Collect {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
-    /// Independent searches. Each finds its own gait, so that the recorded actions in a state differ by more than noise.
+    /// Independent searches. Each finds its own gait, so that the recorded actions in a state
+    /// differ by more than noise.
     pub searches: u64,
     /// Steps that the searches may take for each recorded transition.
     pub steps_per_transition: u64,
     /// Bands of normalized score: the lower bound of each, and its share of the transitions.
     ///
-    /// Without shares, a search's history is mostly long, good episodes, from which offline learning can gain little. The
-    /// shares make a mixture with any seed: good actions exist, among worse ones in the same states.
+    /// Without shares, a search's history is mostly long, good episodes, from which offline
+    /// learning can gain little. The shares make a mixture with any seed: good actions exist, among
+    /// worse ones in the same states.
     pub mixture: Vec<(f64, f64)>,
 }

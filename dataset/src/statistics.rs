@@ -9,19 +9,24 @@ pub struct Statistics {
     pub transitions: usize,
     /// Recorded episodes; one that the end of the file cuts off counts as well.
     pub episodes: usize,
-    /// Mean undiscounted return of the episodes, every recorded step included. Where the task is to reach a goal, the
-    /// steps after it do not count, as an evaluation would end there.
+    /// Mean undiscounted return of the episodes, every recorded step included. Where the task is to
+    /// reach a goal, the steps after it do not count, as an evaluation would end there.
     pub return_mean: f64,
     /// Smallest return.
     pub return_min: f64,
     /// Largest return.
     pub return_max: f64,
-    /// Mean normalized score of the episodes ([`EnvironmentSpec::normalized_score`]), where there are reference returns.
+    /// Mean normalized score of the episodes ([`EnvironmentSpec::normalized_score`]), where there
+    /// are reference returns.
     pub score_mean: Option<f64>,
 }
 
 impl Statistics {
-    pub(crate) fn new(environment: Option<&EnvironmentSpec>, transitions: usize, episodes: &[Episode]) -> Self {
+    pub(crate) fn new(
+        environment: Option<&EnvironmentSpec>,
+        transitions: usize,
+        episodes: &[Episode],
+    ) -> Self {
         let returns = Extent::of(episodes.iter().map(|episode| episode.sum));
         Self {
             transitions,
@@ -65,7 +70,8 @@ pub(crate) struct Episode {
 }
 
 impl Episode {
-    /// Adds a step. With a `goal`, the first positive reward says that it is reached, and later ones do not count.
+    /// Adds a step. With a `goal`, the first positive reward says that it is reached, and later
+    /// ones do not count.
     pub(crate) fn push(&mut self, reward: f64, goal: bool) {
         self.length += 1;
         if !self.reached {
@@ -75,7 +81,8 @@ impl Episode {
     }
 }
 
-/// Sums of rewards up to each end, given (reward, whether the run ends here) in order. What follows the last end is a run too.
+/// Sums of rewards up to each end, given (reward, whether the run ends here) in order. What follows
+/// the last end is a run too.
 pub(crate) fn returns(rewards: impl Iterator<Item = (f32, bool)>) -> Vec<f64> {
     let mut finished = Vec::new();
     let mut open = None;

@@ -2,8 +2,8 @@
 
 use crate::environment::{self, EnvironmentSpec};
 
-/// Where a run's data is from and where its policies act. An environment that is not in the table has the sizes of its
-/// dataset, no known time limit, and no reference returns.
+/// Where a run's data is from and where its policies act. An environment that is not in the table
+/// has the sizes of its dataset, no known time limit, and no reference returns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Task {
     /// Name of the environment.
@@ -27,12 +27,14 @@ impl Task {
         self.spec.map(|spec| spec.max_episode_steps)
     }
 
-    /// Whether scores are D4RL's normalized ones. Without reference returns they are the returns themselves.
+    /// Whether scores are D4RL's normalized ones. Without reference returns they are the returns
+    /// themselves.
     pub fn is_normalized(&self) -> bool {
         self.spec.is_some()
     }
 
-    /// The score of an undiscounted return: normalized where there are reference returns, else the return itself.
+    /// The score of an undiscounted return: normalized where there are reference returns, else the
+    /// return itself.
     pub fn score(&self, episode_return: f64) -> f64 {
         self.spec.map_or(episode_return, |spec| spec.normalized_score(episode_return))
     }

@@ -20,7 +20,8 @@ use crate::{checks, doubts};
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
 
-/// B transitions, each array row by row. Reused from step to step; make the first one with `Batch::default()`.
+/// B transitions, each array row by row. Reused from step to step; make the first one with
+/// `Batch::default()`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Batch {
     /// s, B × o.
@@ -39,9 +40,13 @@ pub struct Batch {
 
 impl Batch {
     fn clear(&mut self) {
-        for array in
-            [&mut self.observations, &mut self.actions, &mut self.rewards, &mut self.next_observations, &mut self.masks]
-        {
+        for array in [
+            &mut self.observations,
+            &mut self.actions,
+            &mut self.rewards,
+            &mut self.next_observations,
+            &mut self.masks,
+        ] {
             array.clear();
         }
     }
@@ -50,10 +55,11 @@ impl Batch {
 /// How a source is to be read.
 #[derive(Clone, Copy, Debug)]
 pub struct ReadOptions {
-    /// The environment it was recorded in, if it is known: sizes, time limit and reference returns come from there. Else
-    /// the source's own sizes count, and without timeouts nothing is cut off.
+    /// The environment it was recorded in, if it is known: sizes, time limit and reference returns
+    /// come from there. Else the source's own sizes count, and without timeouts nothing is cut off.
     pub environment: Option<&'static EnvironmentSpec>,
-    /// The task in a maze of OGBench's that rewards and masks are to be of; else they are the source's.
+    /// The task in a maze of OGBench's that rewards and masks are to be of; else they are the
+    /// source's.
     pub task: Option<MazeTask>,
     /// What happens to its rewards.
     pub reward: RewardRule,
@@ -61,14 +67,16 @@ pub struct ReadOptions {
     pub scale: Scale,
 }
 
-/// Transitions to learn from, in the order of the recording. They do not change, so threads can share them.
+/// Transitions to learn from, in the order of the recording. They do not change, so threads can
+/// share them.
 ///
-/// The source's rows stay as they are; a transition is the number i of a row, and its next observation is row i + 1's,
-/// unless the format stores next observations of their own.
+/// The source's rows stay as they are; a transition is the number i of a row, and its next
+/// observation is row i + 1's, unless the format stores next observations of their own.
 ///
-/// A transition is followed by the next one if its episode continues there. An episode ends at a terminal, also at a goal after
-/// which the recording continues; at a timeout; and where the next row does not start where the transition led to. A row
-/// that makes no transition (D4RL's timeouts) is no part of an episode, but its action serves as the previous row's next action.
+/// A transition is followed by the next one if its episode continues there. An episode ends at a
+/// terminal, also at a goal after which the recording continues; at a timeout; and where the next
+/// row does not start where the transition led to. A row that makes no transition (D4RL's timeouts)
+/// is no part of an episode, but its action serves as the previous row's next action.
 pub struct Transitions {
     observation_dim: usize,
     action_dim: usize,
@@ -95,9 +103,10 @@ pub struct Transitions {
 }
 
 impl Transitions {
-    /// Reads a D4RL file, a Minari dataset, an OGBench file or one of the custom layout; docs/data.md has the rules of
-    /// each. Data that would spoil training is refused: numbers that are not finite, actions outside [-1, 1] that are not to be
-    /// scaled, other sizes than the environment's or another environment, a file that is one endless episode or makes no
+    /// Reads a D4RL file, a Minari dataset, an OGBench file or one of the custom layout;
+    /// docs/data.md has the rules of each. Data that would spoil training is refused: numbers that
+    /// are not finite, actions outside [-1, 1] that are not to be scaled, other sizes than the
+    /// environment's or another environment, a file that is one endless episode or makes no
     /// transition.
     pub fn read(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Self, DatasetError> {
         Ok(Self::read_split(path, options, HoldOut::NONE)?.training)
@@ -126,11 +135,20 @@ impl Transitions {
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
-        let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale: Scale::default() };
+        let options = ReadOptions {
+            environment: None,
+            task: None,
+            reward: RewardRule::AsIs,
+            scale: Scale::default(),
+        };
         Ok(Self::split(recording, &options, HoldOut::NONE).map_err(error)?.training)
     }
 
-    fn split(recording: Recording, options: &ReadOptions, hold_out: HoldOut<'_>) -> Result<Split, Problem> {
+    fn split(
+        recording: Recording,
+        options: &ReadOptions,
+        hold_out: HoldOut<'_>,
+    ) -> Result<Split, Problem> {
         let ReadOptions { environment, reward, scale, .. } = *options;
         let problems = checks::problems(&recording, environment);
         let outside = if scale.actions { None } else { checks::actions_outside(&recording) };
@@ -144,12 +162,18 @@ impl Transitions {
                 (training, (!episodes.is_empty()).then_some(held_out), episodes)
             }
         };
-        let rewards = reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
+        let rewards =
+            reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
         let scaling = scale.of(&recording, rewards);
-        let held_out = held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
+        let held_out =
+            held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
         let doubts = doubts::doubts(&recording, scale, reward);
         let training = Self { doubts, ..Self::new(recording, environment, rewards, scaling) };
-        Ok(Split { training, held_out: held_out.filter(|held_out| !held_out.rows.is_empty()), episodes })
+        Ok(Split {
+            training,
+            held_out: held_out.filter(|held_out| !held_out.rows.is_empty()),
+            episodes,
+        })
     }
 
     fn new(
@@ -163,9 +187,13 @@ impl Transitions {
         let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
         let past_goal = recording.past_goal();
         scale::apply(&scaling, &mut recording);
-        let Recording { observation_dim, action_dim, observations, mut actions, mut rewards, .. } = recording;
+        let Recording {
+            observation_dim, action_dim, observations, mut actions, mut rewards, ..
+        } = recording;
         actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
-        rewards.iter_mut().for_each(|reward| *reward = of_rewards.apply(*reward) / scaling.rewards.unwrap_or(1.0));
+        rewards.iter_mut().for_each(|reward| {
+            *reward = of_rewards.apply(*reward) / scaling.rewards.unwrap_or(1.0)
+        });
         Self {
             observation_dim,
             action_dim,
@@ -200,7 +228,8 @@ impl Transitions {
         self.action_dim
     }
 
-    /// How the numbers here, which are the networks', follow from those of the recording; rewards after the reward rule.
+    /// How the numbers here, which are the networks', follow from those of the recording; rewards
+    /// after the reward rule.
     pub fn scaling(&self) -> &Scaling {
         &self.scaling
     }
@@ -210,12 +239,16 @@ impl Transitions {
         &self.names
     }
 
-    /// Units in which the observations and actions that are learned from have mean 0 and standard deviation 1, number by number;
-    /// one that never changes has scale 0.
+    /// Units in which the observations and actions that are learned from have mean 0 and standard
+    /// deviation 1, number by number; one that never changes has scale 0.
     pub fn standard_units(&self) -> Scaling {
         let counts = |row: usize| self.rows.binary_search(&(row as u32)).is_ok();
         Scaling {
-            observations: Some(scale::standard_units(&self.observations, self.observation_dim, counts)),
+            observations: Some(scale::standard_units(
+                &self.observations,
+                self.observation_dim,
+                counts,
+            )),
             actions: Some(scale::standard_units(&self.actions, self.action_dim, counts)),
             rewards: None,
         }
@@ -231,15 +264,17 @@ impl Transitions {
         &self.doubts
     }
 
-    /// The number of the transition that follows this one (below [`len`](Self::len)) in its episode.
+    /// The number of the transition that follows this one (below [`len`](Self::len)) in its
+    /// episode.
     pub fn next(&self, index: u32) -> Option<u32> {
         let row = self.rows[index as usize];
         let is_next = self.rows.get(index as usize + 1) == Some(&(row + 1));
         (is_next && self.goes_on[row as usize]).then_some(index + 1)
     }
 
-    /// The action a' that was taken at s', of length a. Unlike [`next`](Self::next) it is also there where the next row
-    /// is a step that makes no transition, so among transitions with mask 1 it is missing only where it was not recorded.
+    /// The action a' that was taken at s', of length a. Unlike [`next`](Self::next) it is also
+    /// there where the next row is a step that makes no transition, so among transitions with mask
+    /// 1 it is missing only where it was not recorded.
     pub fn next_action(&self, index: u32) -> Option<&[f32]> {
         let row = self.rows[index as usize] as usize;
         let next = (row + 1) * self.action_dim..(row + 2) * self.action_dim;
@@ -259,21 +294,26 @@ impl Transitions {
         episodes
     }
 
-    /// Those of [`Self::episodes`] that begin with an episode of the recording: after a goal, where that continues, each step is an
-    /// episode of its own.
+    /// Those of [`Self::episodes`] that begin with an episode of the recording: after a goal, where
+    /// that continues, each step is an episode of its own.
     pub fn recorded_episodes(&self) -> Vec<Range<u32>> {
-        let is_past = |episode: &Range<u32>| self.past_goal[self.rows[episode.start as usize] as usize];
+        let is_past =
+            |episode: &Range<u32>| self.past_goal[self.rows[episode.start as usize] as usize];
         self.episodes().into_iter().filter(|episode| !is_past(episode)).collect()
     }
 
-    /// The first transition of each window of `length` transitions that follow one another: the window of i is i, i + 1, …,
-    /// which [`gather`](Self::gather) copies like any others. Episodes that are shorter have none. `length` is at least 1.
+    /// The first transition of each window of `length` transitions that follow one another: the
+    /// window of i is i, i + 1, …, which [`gather`](Self::gather) copies like any others. Episodes
+    /// that are shorter have none. `length` is at least 1.
     pub fn window_starts(&self, length: u32) -> Vec<u32> {
-        let starts = |episode: Range<u32>| episode.start..(episode.end + 1).saturating_sub(length).max(episode.start);
+        let starts = |episode: Range<u32>| {
+            episode.start..(episode.end + 1).saturating_sub(length).max(episode.start)
+        };
         self.episodes().into_iter().flat_map(starts).collect()
     }
 
-    /// Copies the transitions of these numbers (each below [`len`](Self::len)), in this order, over what `batch` holds.
+    /// Copies the transitions of these numbers (each below [`len`](Self::len)), in this order, over
+    /// what `batch` holds.
     pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
         let (o, a) = (self.observation_dim, self.action_dim);
         batch.clear();

@@ -22,8 +22,8 @@ pub struct Metadata<'a> {
     pub seed: u64,
 }
 
-/// A file that is being written. It appears under its name when [`finish`](Self::finish) says so, and not before:
-/// until then it is `<path>.partial`, which the next writer of that path replaces.
+/// A file that is being written. It appears under its name when [`finish`](Self::finish) says so,
+/// and not before: until then it is `<path>.partial`, which the next writer of that path replaces.
 pub struct D4rlWriter {
     environment: &'static EnvironmentSpec,
     file: NewFile,
@@ -35,7 +35,8 @@ pub struct D4rlWriter {
 }
 
 /// The columns of numbers, in the order of a row's.
-const FLOATS: [&str; 6] = ["observations", "actions", "next_observations", "rewards", "infos/qpos", "infos/qvel"];
+const FLOATS: [&str; 6] =
+    ["observations", "actions", "next_observations", "rewards", "infos/qpos", "infos/qvel"];
 const FLAGS: [&str; 2] = ["terminals", "timeouts"];
 
 /// A column, and rows that are not written yet: a chunk of them at most.
@@ -46,13 +47,18 @@ struct Buffered<T> {
 
 impl D4rlWriter {
     /// Starts a file of `environment`'s sizes, and the folder it lies in.
-    pub fn create(path: impl AsRef<Path>, environment: &'static EnvironmentSpec) -> Result<Self, DatasetError> {
+    pub fn create(
+        path: impl AsRef<Path>,
+        environment: &'static EnvironmentSpec,
+    ) -> Result<Self, DatasetError> {
         let file = NewFile::create(path.as_ref())?;
-        let EnvironmentSpec { observation_dim: o, action_dim: a, qpos_dim, qvel_dim, .. } = *environment;
+        let EnvironmentSpec { observation_dim: o, action_dim: a, qpos_dim, qvel_dim, .. } =
+            *environment;
         let widths = [Some(o), Some(a), Some(o), None, Some(qpos_dim), Some(qvel_dim)];
         let columns = || -> hdf5::Result<_> {
             file.hdf5.create_group("infos")?;
-            let floats = FLOATS.iter().zip(widths).map(|(name, width)| Buffered::create(&file, name, width));
+            let floats =
+                FLOATS.iter().zip(widths).map(|(name, width)| Buffered::create(&file, name, width));
             let flags = FLAGS.iter().map(|name| Buffered::create(&file, name, None));
             Ok((floats.collect::<hdf5::Result<_>>()?, flags.collect::<hdf5::Result<_>>()?))
         };
@@ -63,7 +69,8 @@ impl D4rlWriter {
     /// Appends a row. Rows of other sizes and numbers that are not finite in float32 are refused.
     pub fn push(&mut self, row: &Row) -> Result<(), DatasetError> {
         let reward = [row.reward];
-        let values = [row.observation, row.action, row.next_observation, &reward, row.qpos, row.qvel];
+        let values =
+            [row.observation, row.action, row.next_observation, &reward, row.qpos, row.qvel];
         for (Buffered { column, .. }, values) in self.floats.iter().zip(values) {
             let width = column.width.unwrap_or(1);
             let problem = if values.len() != width {
@@ -103,8 +110,14 @@ impl D4rlWriter {
     fn write_metadata(&self, metadata: &Metadata) -> hdf5::Result<()> {
         let text = |value: &str| VarLenUnicode::from_str(value).map_err(|error| error.to_string());
         let group = self.file.hdf5.create_group("metadata")?;
-        group.new_dataset::<VarLenUnicode>().create("algorithm")?.write_scalar(&text(metadata.algorithm)?)?;
-        group.new_dataset::<VarLenUnicode>().create("environment")?.write_scalar(&text(&self.environment.name)?)?;
+        group
+            .new_dataset::<VarLenUnicode>()
+            .create("algorithm")?
+            .write_scalar(&text(metadata.algorithm)?)?;
+        group
+            .new_dataset::<VarLenUnicode>()
+            .create("environment")?
+            .write_scalar(&text(&self.environment.name)?)?;
         group.new_dataset::<i64>().create("iteration")?.write_scalar(&metadata.iteration)?;
         group.new_dataset::<u64>().create("seed")?.write_scalar(&metadata.seed)
     }

@@ -1,5 +1,5 @@
-//! Ten Hopper episodes at the paper's sizes: a step of all of them together, and what it is made of. And a step of each
-//! environment.
+//! Ten Hopper episodes at the paper's sizes: a step of all of them together, and what it is made
+//! of. And a step of each environment.
 
 #![allow(clippy::expect_used)] // what cannot be had ends the run
 
@@ -8,8 +8,8 @@ use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use quad_dataset::environment;
 use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations, make};
 use quad_policy::{
-    Choice, DiffusionShape, EpisodeState, Header, Layout, MlpConfig, Policy, PolicyConfig, Precision, Weights,
-    load_policy,
+    Choice, DiffusionShape, EpisodeState, Header, Layout, MlpConfig, Policy, PolicyConfig,
+    Precision, Weights, load_policy,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -45,20 +45,33 @@ fn steps(criterion: &mut Criterion) {
         group.bench_function(format!("{STEPS} steps, {}", precision.name()), |bencher| {
             bencher.iter_batched_ref(
                 || {
-                    Rollout::new(|| Simulations.make("hopper", 0), (11, 3), &seeds, |seed| policy.begin(seed))
-                        .expect("MuJoCo compiles the embedded model")
+                    Rollout::new(
+                        || Simulations.make("hopper", 0),
+                        (11, 3),
+                        &seeds,
+                        |seed| policy.begin(seed),
+                    )
+                    .expect("MuJoCo compiles the embedded model")
                 },
                 |rollout| {
                     rayon::scope(|_| {
                         for _ in 0..STEPS {
-                            let act = |observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]| {
-                                policy.act(observations, states, actions).expect("the policy's numbers are finite");
+                            let act = |observations: &[f32],
+                                       states: &mut [EpisodeState],
+                                       actions: &mut [f32]| {
+                                policy
+                                    .act(observations, states, actions)
+                                    .expect("the policy's numbers are finite");
                                 Ok::<_, EnvironmentError>(())
                             };
                             rollout.step(act).expect("a simulation cannot break down");
                         }
                     });
-                    assert_eq!(rollout.environment_steps(), (EPISODES * STEPS) as u64, "an episode has ended");
+                    assert_eq!(
+                        rollout.environment_steps(),
+                        (EPISODES * STEPS) as u64,
+                        "an episode has ended"
+                    );
                 },
                 BatchSize::PerIteration,
             );
@@ -70,12 +83,14 @@ fn steps(criterion: &mut Criterion) {
 /// The policy alone, for ten states.
 fn select(criterion: &mut Criterion) {
     let mut random = ChaCha8Rng::seed_from_u64(1);
-    let observations: Vec<f32> = (0..EPISODES * 11).map(|_| random.random_range(-1.0..1.0)).collect();
+    let observations: Vec<f32> =
+        (0..EPISODES * 11).map(|_| random.random_range(-1.0..1.0)).collect();
     let mut actions = vec![0.0; EPISODES * 3];
     let mut group = criterion.benchmark_group("select");
     for precision in precisions() {
         let policy = policy(precision);
-        let mut states: Vec<EpisodeState> = (0..EPISODES as u64).map(|seed| policy.begin(seed)).collect();
+        let mut states: Vec<EpisodeState> =
+            (0..EPISODES as u64).map(|seed| policy.begin(seed)).collect();
         group.bench_function(precision.name(), |bencher| {
             bencher.iter(|| rayon::scope(|_| policy.act(&observations, &mut states, &mut actions)));
             black_box(&actions);

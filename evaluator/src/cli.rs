@@ -44,9 +44,9 @@ enum Command {
 
 /// Record a dataset of mediocre behavior to learn from, without a download
 ///
-/// Trains linear policies by augmented random search, from policies that fall at once to policies that move well, and mixes
-/// noisy episodes of all of them into one file in D4RL's layout (HDF5). This takes one to two minutes on two cores. The same
-/// seed makes the same data.
+/// Trains linear policies by augmented random search, from policies that fall at once to policies
+/// that move well, and mixes noisy episodes of all of them into one file in D4RL's layout (HDF5).
+/// This takes one to two minutes on two cores. The same seed makes the same data.
 #[derive(Debug, Args)]
 struct CollectArgs {
     /// Environment to act in, such as hopper
@@ -63,18 +63,20 @@ struct CollectArgs {
     seed: u64,
 }
 
-/// Replay a recorded file one step at a time from its own states, and measure how far the simulation is from it
+/// Replay a recorded file one step at a time from its own states, and measure how far the
+/// simulation is from it
 ///
-/// The file needs infos/qpos, infos/qvel and, for a maze, infos/goal in addition to the arrays for learning. Without
-/// next_observations, the replay compares with the observation of the following row of the same episode. The exit
-/// code is 1 if rewards or terminals differ. A reward differs if it is more
-/// than 0.001 (relative, for rewards above 1) from the recorded one, and further than the next observation, which rounding to
-/// float32 cannot explain.
+/// The file needs infos/qpos, infos/qvel and, for a maze, infos/goal in addition to the arrays for
+/// learning. Without next_observations, the replay compares with the observation of the following
+/// row of the same episode. The exit code is 1 if rewards or terminals differ. A reward differs if
+/// it is more than 0.001 (relative, for rewards above 1) from the recorded one, and further than
+/// the next observation, which rounding to float32 cannot explain.
 #[derive(Debug, Args)]
 struct VerifyArgs {
     /// File to replay
     file: PathBuf,
-    /// Environment of the recording [default: the one that the file names, or the only environment of its sizes]
+    /// Environment of the recording [default: the one that the file names, or the only environment
+    /// of its sizes]
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     env: Option<&'static EnvironmentSpec>,
     /// Print one JSON object
@@ -96,7 +98,8 @@ impl Cli {
             Command::Score(args) => print(&score::score(&args)?),
             Command::Film(args) => print(&film::film(&args)?),
             Command::Collect(args) => {
-                let summary = collect::collect(args.env, &args.out, args.transitions.get(), args.seed)?;
+                let summary =
+                    collect::collect(args.env, &args.out, args.transitions.get(), args.seed)?;
                 print(&collected(&args, &summary))
             }
             Command::VerifyDataset(args) => {
@@ -122,8 +125,14 @@ impl Cli {
 }
 
 fn collected(args: &CollectArgs, summary: &Summary) -> String {
-    let Summary { transitions, episodes, mean_score, score_percentiles: [p50, p90, p99, max], policies, seconds } =
-        summary;
+    let Summary {
+        transitions,
+        episodes,
+        mean_score,
+        score_percentiles: [p50, p90, p99, max],
+        policies,
+        seconds,
+    } = summary;
     format!(
         "{}: {transitions} transitions, {episodes} episodes of {policies} policies, in {seconds:.0} s\n\
          normalized score: mean {mean_score:.1}, median {p50:.1}, p90 {p90:.1}, p99 {p99:.1}, max {max:.1}",
@@ -132,8 +141,15 @@ fn collected(args: &CollectArgs, summary: &Summary) -> String {
 }
 
 fn verified(report: &Report) -> String {
-    let Report { environment, transitions, compared, obs_error, reward_error, rewards_differ, terminals_differ } =
-        report;
+    let Report {
+        environment,
+        transitions,
+        compared,
+        obs_error,
+        reward_error,
+        rewards_differ,
+        terminals_differ,
+    } = report;
     format!(
         "environment        {environment}\n\
          transitions        {transitions}, of which {compared} have a next observation to compare\n\

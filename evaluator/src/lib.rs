@@ -6,7 +6,8 @@
 //!
 //! - [`sim`]: environments, and batches of episodes.
 //! - [`serve`]: finds runs on the network, evaluates their snapshots, delivers the scores.
-//! - [`tools`]: records and replays datasets, scores and films saved policies, on this machine alone.
+//! - [`tools`]: records and replays datasets, scores and films saved policies, on this machine
+//!   alone.
 //!
 //! Also: [`cli`], the command line; `doctor`, checks of this machine; `metrics`, for Prometheus.
 

@@ -2,16 +2,20 @@
 
 use prometheus::core::Collector;
 use prometheus::process_collector::ProcessCollector;
-use prometheus::{Counter, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry};
+use prometheus::{
+    Counter, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry,
+};
 
 /// How a job ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JobOutcome {
     /// The learner acknowledged its scores.
     Scored,
-    /// The evaluator gave it up: it is leaving and hands the job back, or the learner refused the scores or never came back.
+    /// The evaluator gave it up: it is leaving and hands the job back, or the learner refused the
+    /// scores or never came back.
     Abandoned,
-    /// The evaluator could not use its weights or its environment, the policy could not act, or a return does not count.
+    /// The evaluator could not use its weights or its environment, the policy could not act, or a
+    /// return does not count.
     Failed,
 }
 
@@ -27,7 +31,8 @@ impl JobOutcome {
     }
 }
 
-/// The metrics of one evaluator process, in a registry of their own; their help says what each counts.
+/// The metrics of one evaluator process, in a registry of their own; their help says what each
+/// counts.
 #[derive(Clone)]
 pub struct Metrics {
     /// The registry that `/metrics` serves.
@@ -60,7 +65,10 @@ impl Metrics {
         };
         let metrics = Metrics {
             episodes: counter("quad_evaluator_episodes_total", "Episodes finished")?,
-            environment_steps: counter("quad_evaluator_environment_steps_total", "Environment steps taken")?,
+            environment_steps: counter(
+                "quad_evaluator_environment_steps_total",
+                "Environment steps taken",
+            )?,
             snapshots_received: counter(
                 "quad_evaluator_snapshots_received_total",
                 "Weight snapshots received whole and verified",
@@ -69,16 +77,28 @@ impl Metrics {
             episode_score: histogram(
                 "quad_evaluator_episode_score",
                 "Normalized score of each scored episode",
-                &[1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 110.0],
+                &[
+                    1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0,
+                    110.0,
+                ],
             )?,
             job_duration: histogram(
                 "quad_evaluator_job_duration_seconds",
                 "Time from a job's hand-out to the end of its last episode",
                 &[0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0, 250.0],
             )?,
-            select_seconds: seconds("quad_evaluator_select_seconds_total", "Time spent choosing actions")?,
-            physics_seconds: seconds("quad_evaluator_physics_seconds_total", "Time spent in the physics")?,
-            runs: register(&registry, IntGauge::new("quad_evaluator_runs", "Runs that are being served")?)?,
+            select_seconds: seconds(
+                "quad_evaluator_select_seconds_total",
+                "Time spent choosing actions",
+            )?,
+            physics_seconds: seconds(
+                "quad_evaluator_physics_seconds_total",
+                "Time spent in the physics",
+            )?,
+            runs: register(
+                &registry,
+                IntGauge::new("quad_evaluator_runs", "Runs that are being served")?,
+            )?,
             jobs: labeled("quad_evaluator_jobs_total", "Jobs by how they ended", "outcome")?,
             rejected_messages: labeled(
                 "quad_evaluator_rejected_messages_total",
@@ -98,14 +118,18 @@ impl Metrics {
         self.jobs.with_label_values(&[outcome.label()]).inc();
     }
 
-    /// Counts a message that the evaluator did not use. The reasons are a fixed list, because the registry keeps every label.
+    /// Counts a message that the evaluator did not use. The reasons are a fixed list, because the
+    /// registry keeps every label.
     pub fn rejected(&self, reason: &'static str) {
         self.rejected_messages.with_label_values(&[reason]).inc();
     }
 }
 
 /// Adds a metric to the registry.
-fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: M) -> prometheus::Result<M> {
+fn register<M: Collector + Clone + 'static>(
+    registry: &Registry,
+    metric: M,
+) -> prometheus::Result<M> {
     registry.register(Box::new(metric.clone()))?;
     Ok(metric)
 }

@@ -1,4 +1,5 @@
-//! A recorded dataset: the same for the same seed, true to the simulation, and what replaying it finds.
+//! A recorded dataset: the same for the same seed, true to the simulation, and what replaying it
+//! finds.
 #![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
@@ -57,7 +58,8 @@ fn whole_episodes_are_recorded_that_replay_and_a_change_is_noticed() {
     let report = verify(&path, hopper()).unwrap();
     assert_eq!((report.transitions, report.compared), (summary.transitions, summary.transitions));
     assert_eq!((report.rewards_differ, report.terminals_differ), (0, 0));
-    // Nothing but float32's rounding, which is there: an error of exactly zero would mean that nothing was compared.
+    // Nothing but float32's rounding, which is there: an error of exactly zero would mean that
+    // nothing was compared.
     assert!(report.obs_error.median > 1e-9 && report.obs_error.median < 1e-6, "{report:?}");
     assert!(report.obs_error.p99 < 1e-5 && report.reward_error.max < 1e-3, "{report:?}");
 
@@ -77,5 +79,8 @@ fn whole_episodes_are_recorded_that_replay_and_a_change_is_noticed() {
     writer.finish(&Metadata { algorithm: "changed", iteration: 0, seed: 0 }).unwrap();
     let report = verify(&changed, hopper()).unwrap();
     assert_eq!((report.rewards_differ, report.terminals_differ), (1, 1));
-    assert!((report.reward_error.max - 0.01).abs() < 1e-4 && (report.obs_error.max - 0.5).abs() < 1e-4, "{report:?}");
+    assert!(
+        (report.reward_error.max - 0.01).abs() < 1e-4 && (report.obs_error.max - 0.5).abs() < 1e-4,
+        "{report:?}"
+    );
 }

@@ -1,4 +1,5 @@
-//! The memory that a policy says its actions take is what they take: an evaluator refuses jobs by it.
+//! The memory that a policy says its actions take is what they take: an evaluator refuses jobs by
+//! it.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -6,11 +7,13 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use candle_core::{DType, Device, Tensor};
 use quad_policy::{
-    ActorCriticShape, Attention, Choice, DiffusionShape, GaussianShape, Guidance, Header, MlpConfig, PlannerShape,
-    Policy, PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, WindowConfig, load_policy,
+    ActorCriticShape, Attention, Choice, DiffusionShape, GaussianShape, Guidance, Header,
+    MlpConfig, PlannerShape, Policy, PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape,
+    WindowConfig, load_policy,
 };
 
-/// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
+/// What is not counted, such as the embedding of each denoising step: little of what an evaluator
+/// gives, bytes.
 const SMALL_CHANGE: usize = 1 << 20;
 
 /// The system's allocator, which counts.
@@ -36,19 +39,29 @@ unsafe impl GlobalAlloc for Counting {
 static ALLOCATOR: Counting = Counting;
 
 fn loaded(policy: PolicyConfig) -> Box<dyn Policy> {
-    let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
+    let tensors =
+        policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
     load_policy(&Header::new(policy, ()).to_safetensors(&tensors).unwrap(), Precision::F32).unwrap()
 }
 
-fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choice) -> Box<dyn Policy> {
+fn diffusion(
+    hidden: usize,
+    critics: usize,
+    diffusion_steps: usize,
+    choice: Choice,
+) -> Box<dyn Policy> {
     let layers = MlpConfig::mish(&[hidden; 3]);
     let value = (choice.rule == Rule::Nearest).then(|| layers.clone());
-    let shape = DiffusionShape { value, ..DiffusionShape::quad((11, 3), &layers, critics, diffusion_steps) };
+    let shape = DiffusionShape {
+        value,
+        ..DiffusionShape::quad((11, 3), &layers, critics, diffusion_steps)
+    };
     loaded(PolicyConfig::Diffusion { shape, choice })
 }
 
 fn gaussian(hidden: usize) -> Box<dyn Policy> {
-    let shape = GaussianShape { observation_dim: 11, action_dim: 3, actor: MlpConfig::mish(&[hidden; 3]) };
+    let shape =
+        GaussianShape { observation_dim: 11, action_dim: 3, actor: MlpConfig::mish(&[hidden; 3]) };
     loaded(PolicyConfig::Gaussian { shape })
 }
 
@@ -62,7 +75,8 @@ fn squashed(hidden: usize, norm: bool) -> Box<dyn Policy> {
 fn score(widths: &[usize], candidates: u32) -> Box<dyn Policy> {
     let actor = MlpConfig::mish(widths);
     let critic = MlpConfig::mish(&[8]);
-    let shape = ScorePolicyShape { observation_dim: 11, action_dim: 3, actor, critic, evaluations: 4 };
+    let shape =
+        ScorePolicyShape { observation_dim: 11, action_dim: 3, actor, critic, evaluations: 4 };
     loaded(PolicyConfig::Score { shape, choice: Choice::best_of(candidates) })
 }
 
@@ -80,7 +94,12 @@ fn planner(network: WindowConfig, plans: u32) -> Box<dyn Policy> {
 }
 
 /// A planner's networks with eight groups.
-fn windows(horizon: usize, channels: usize, multipliers: &[usize], attention: Option<Attention>) -> WindowConfig {
+fn windows(
+    horizon: usize,
+    channels: usize,
+    multipliers: &[usize],
+    attention: Option<Attention>,
+) -> WindowConfig {
     WindowConfig { horizon, channels, multipliers: multipliers.to_vec(), groups: 8, attention }
 }
 
@@ -106,7 +125,11 @@ fn actions_take_no_more_memory_than_was_said() {
             1,
         ),
         ("many plans", planner(windows(16, 16, &[1, 2, 4], None), 8), 64),
-        ("a plan of one step", planner(windows(1, 32, &[1], Some(Attention { heads: 16, width: 64 })), 1000), 4),
+        (
+            "a plan of one step",
+            planner(windows(1, 32, &[1], Some(Attention { heads: 16, width: 64 })), 1000),
+            4,
+        ),
     ];
     for (name, policy, n) in cases {
         let said = policy.memory(n) as usize;

@@ -1,5 +1,5 @@
-//! What simulations do where the comparison with Gymnasium does not come: initial states, bounds that are rarely met, time
-//! limits, numbers that are none.
+//! What simulations do where the comparison with Gymnasium does not come: initial states, bounds
+//! that are rarely met, time limits, numbers that are none.
 #![allow(clippy::unwrap_used)]
 
 use quad_dataset::EnvironmentSpec;
@@ -31,7 +31,8 @@ fn an_episode_is_a_function_of_its_seed() {
     }
 }
 
-/// The noise on the positions and velocities of 2,000 initial states, of which `rest` are the positions without it.
+/// The noise on the positions and velocities of 2,000 initial states, of which `rest` are the
+/// positions without it.
 fn initial_noise(name: &str, rest: &[f64]) -> (Vec<f64>, Vec<f64>) {
     let mut simulation = simulation(name);
     let (mut positions, mut velocities) = (Vec::new(), Vec::new());
@@ -44,7 +45,8 @@ fn initial_noise(name: &str, rest: &[f64]) -> (Vec<f64>, Vec<f64>) {
 }
 
 fn assert_fills(values: &[f64], bound: f64) {
-    let (least, most) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)));
+    let (least, most) =
+        values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)));
     // Sums with the position at rest are rounded.
     assert!(least >= -bound - 1e-12 && least < -0.99 * bound, "{least}");
     assert!(most <= bound + 1e-12 && most > 0.99 * bound, "{most}");
@@ -61,15 +63,23 @@ fn initial_states_lie_within_the_noise() {
     }
     let mut ant = [0.0; 15];
     (ant[2], ant[3]) = (0.75, 1.0);
-    for (name, rest) in [("halfcheetah", [0.0; 15])].into_iter().chain(MAZES.map(|name| (name, ant))) {
+    for (name, rest) in
+        [("halfcheetah", [0.0; 15])].into_iter().chain(MAZES.map(|name| (name, ant)))
+    {
         let (positions, velocities) = initial_noise(name, &rest);
         assert_fills(&positions, 0.1);
         let n = velocities.len() as f64;
         let mean = velocities.iter().sum::<f64>() / n;
         let deviation = (velocities.iter().map(|v| v * v).sum::<f64>() / n).sqrt();
         let within_one = velocities.iter().filter(|v| v.abs() < 0.1).count() as f64 / n;
-        assert!(mean.abs() < 0.003 && (deviation - 0.1).abs() < 0.003, "{name}: mean {mean}, deviation {deviation}");
-        assert!((within_one - 0.6827).abs() < 0.01, "{name}: {within_one}; a normal distribution has 0.6827");
+        assert!(
+            mean.abs() < 0.003 && (deviation - 0.1).abs() < 0.003,
+            "{name}: mean {mean}, deviation {deviation}"
+        );
+        assert!(
+            (within_one - 0.6827).abs() < 0.01,
+            "{name}: {within_one}; a normal distribution has 0.6827"
+        );
     }
 }
 
@@ -105,11 +115,18 @@ fn a_goal_is_reached_at_half_a_metre() {
     let (_, [x, y]) = step_with_goal([8.0, 8.0]);
     let edge = x + 0.5; // Exact: both lie between 1 and 2.
     assert_eq!(edge - x, 0.5);
-    assert_eq!(step_with_goal([edge, y]).0, Step { reward: 1.0, terminated: true, truncated: false });
-    assert_eq!(step_with_goal([edge.next_up(), y]).0, Step { reward: 0.0, terminated: false, truncated: false });
+    assert_eq!(
+        step_with_goal([edge, y]).0,
+        Step { reward: 1.0, terminated: true, truncated: false }
+    );
+    assert_eq!(
+        step_with_goal([edge.next_up(), y]).0,
+        Step { reward: 0.0, terminated: false, truncated: false }
+    );
 }
 
-/// Where nothing but the time limit ends an episode: in the air, or on the back. A walker has no such place.
+/// Where nothing but the time limit ends an episode: in the air, or on the back. A walker has no
+/// such place.
 fn endless(spec: &EnvironmentSpec) -> Option<Vec<f64>> {
     let mut qpos = vec![0.0; spec.qpos_dim];
     match spec.simulation() {
@@ -124,7 +141,8 @@ fn endless(spec: &EnvironmentSpec) -> Option<Vec<f64>> {
 
 #[test]
 fn the_time_limit_truncates_and_does_not_terminate() {
-    // OGBench's five tasks in a maze differ in start and goal alone, so the default one stands for them.
+    // OGBench's five tasks in a maze differ in start and goal alone, so the default one stands for
+    // them.
     for spec in all().iter().filter(|spec| !spec.name.contains("-task")) {
         let Some(qpos) = endless(spec) else { continue };
         let mut simulation = make(spec, 0).unwrap();
@@ -132,10 +150,18 @@ fn the_time_limit_truncates_and_does_not_terminate() {
         simulation.set_state(&qpos, &vec![0.0; spec.qvel_dim]);
         for step in 1..=spec.max_episode_steps {
             let Step { terminated, truncated, .. } = simulation.step(&vec![0.0; spec.action_dim]);
-            assert_eq!((terminated, truncated), (false, step == spec.max_episode_steps), "{}, {step}", spec.name);
+            assert_eq!(
+                (terminated, truncated),
+                (false, step == spec.max_episode_steps),
+                "{}, {step}",
+                spec.name
+            );
         }
         simulation.reset(0);
-        assert!(!simulation.step(&vec![0.0; spec.action_dim]).truncated, "a reset starts the time anew");
+        assert!(
+            !simulation.step(&vec![0.0; spec.action_dim]).truncated,
+            "a reset starts the time anew"
+        );
     }
 }
 

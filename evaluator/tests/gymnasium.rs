@@ -16,7 +16,8 @@ const TOLERANCE: f64 = 1e-9;
 /// What the script prints, or nothing where Gymnasium is not installed and need not be.
 fn reference<T: DeserializeOwned>(arguments: &[&str]) -> Option<T> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let python = std::env::var_os("QUAD_PYTHON").map_or(folder.join("../.deps/venv/bin/python"), PathBuf::from);
+    let python = std::env::var_os("QUAD_PYTHON")
+        .map_or(folder.join("../.deps/venv/bin/python"), PathBuf::from);
     let has_gymnasium = Command::new(&python)
         .args(["-c", "import gymnasium, mujoco, ogbench"])
         .stderr(Stdio::null())
@@ -24,8 +25,15 @@ fn reference<T: DeserializeOwned>(arguments: &[&str]) -> Option<T> {
         .is_ok_and(|status| status.success());
     if !has_gymnasium {
         let required = std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        assert!(!required, "{} has no gymnasium; deploy/setup.sh --tests installs it", python.display());
-        println!("skipped, because {} has no gymnasium; deploy/setup.sh --tests installs it", python.display());
+        assert!(
+            !required,
+            "{} has no gymnasium; deploy/setup.sh --tests installs it",
+            python.display()
+        );
+        println!(
+            "skipped, because {} has no gymnasium; deploy/setup.sh --tests installs it",
+            python.display()
+        );
         return None;
     }
     let output = Command::new(python)
@@ -51,7 +59,11 @@ struct ModelComparison {
 fn assert_model(ours: &str, theirs: &str, may_differ: &[&str]) {
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), ours).unwrap();
-    let Some(model) = reference::<ModelComparison>(&["model", theirs, file.path().to_str().unwrap()]) else { return };
+    let Some(model) =
+        reference::<ModelComparison>(&["model", theirs, file.path().to_str().unwrap()])
+    else {
+        return;
+    };
     assert!(model.compared > 1000, "only {} numbers were compared", model.compared);
     assert!(model.differ.keys().eq(may_differ), "{:#?}", model.differ);
 }
@@ -78,7 +90,8 @@ struct RecordedStep {
     terminated: bool,
 }
 
-/// Compares an environment with Gymnasium's: its model, and its steps, of which a share in `terminated` terminates.
+/// Compares an environment with Gymnasium's: its model, and its steps, of which a share in
+/// `terminated` terminates.
 fn assert_gymnasiums(name: &str, terminated: RangeInclusive<f64>) {
     assert_model(&mjcf(find(name).unwrap()), name, &[]);
     assert_steps(name, terminated);
@@ -96,7 +109,10 @@ fn assert_steps(name: &str, terminated: RangeInclusive<f64>) {
             let step = environment.step(&expected.action);
             let observation = environment.observation();
             assert_eq!(observation.len(), expected.observation.len());
-            let errors = observation.iter().zip(&expected.observation).map(|(ours, theirs)| (ours - theirs).abs());
+            let errors = observation
+                .iter()
+                .zip(&expected.observation)
+                .map(|(ours, theirs)| (ours - theirs).abs());
             let error = errors.fold((step.reward - expected.reward).abs(), f64::max);
             assert!(error <= TOLERANCE, "sequence {number}, step {place}: {error:e} apart");
             assert_eq!(step.terminated, expected.terminated, "sequence {number}, step {place}");
@@ -106,7 +122,10 @@ fn assert_steps(name: &str, terminated: RangeInclusive<f64>) {
         }
     }
     println!("{name}: {steps} steps, {ended} of them terminated; the worst error is {worst:.1e}");
-    assert!(terminated.contains(&(ended as f64 / steps as f64)), "{ended} of {steps} steps terminated");
+    assert!(
+        terminated.contains(&(ended as f64 / steps as f64)),
+        "{ended} of {steps} steps terminated"
+    );
 }
 
 #[test]
@@ -119,7 +138,8 @@ fn planar_robots_are_gymnasiums() {
 
 #[test]
 fn the_ant_is_gymnasiums_but_for_motors_contacts_and_time_step() {
-    let differ = ["actuator_acc0", "actuator_ctrlrange", "actuator_gear", "geom_solimp", "opt.timestep"];
+    let differ =
+        ["actuator_acc0", "actuator_ctrlrange", "actuator_gear", "geom_solimp", "opt.timestep"];
     assert_model(include_str!("../assets/ant.xml"), "ant", &differ);
 }
 
@@ -132,10 +152,12 @@ fn the_ant_in_a_maze_is_gymnasiums_among_walls() {
 
 #[test]
 fn the_ant_and_the_ball_in_a_maze_of_ogbench_move_as_there() {
-    for (robot, maze) in
-        ["antmaze", "pointmaze"].iter().flat_map(|robot| ["medium", "large", "giant"].map(|maze| (robot, maze)))
+    for (robot, maze) in ["antmaze", "pointmaze"]
+        .iter()
+        .flat_map(|robot| ["medium", "large", "giant"].map(|maze| (robot, maze)))
     {
-        // Their models differ in what nothing depends on: the unit of controls, a mark at the goal, where the floor's center is.
+        // Their models differ in what nothing depends on: the unit of controls, a mark at the goal,
+        // where the floor's center is.
         assert_steps(&format!("{robot}-{maze}-singletask-v0"), 0.1..=0.9);
     }
 }

@@ -1,4 +1,5 @@
-//! Episodes do not depend on the batch they run in, and are what stepping an environment by hand gives.
+//! Episodes do not depend on the batch they run in, and are what stepping an environment by hand
+//! gives.
 #![allow(clippy::unwrap_used)]
 
 use quad_dataset::environment::find;
@@ -15,10 +16,16 @@ fn act(observation: &[f32], noise: &mut ChaCha8Rng, action: &mut [f32]) {
     }
 }
 
-fn select(observations: &[f32], noise: &mut [ChaCha8Rng], actions: &mut [f32]) -> Result<(), EnvironmentError> {
+fn select(
+    observations: &[f32],
+    noise: &mut [ChaCha8Rng],
+    actions: &mut [f32],
+) -> Result<(), EnvironmentError> {
     assert_eq!(observations.len(), 11 * noise.len());
     assert_eq!(actions.len(), 3 * noise.len());
-    for ((observation, noise), action) in observations.chunks(11).zip(noise).zip(actions.chunks_mut(3)) {
+    for ((observation, noise), action) in
+        observations.chunks(11).zip(noise).zip(actions.chunks_mut(3))
+    {
         act(observation, noise, action);
     }
     Ok(())
@@ -39,7 +46,10 @@ fn run(seeds: &[u64]) -> Vec<EpisodeOutcome> {
     assert_eq!(rollout.episodes_done(), seeds.len());
     let environment_steps = rollout.environment_steps();
     let outcomes = rollout.into_outcomes();
-    assert_eq!(environment_steps, outcomes.iter().map(|outcome| u64::from(outcome.length)).sum::<u64>());
+    assert_eq!(
+        environment_steps,
+        outcomes.iter().map(|outcome| u64::from(outcome.length)).sum::<u64>()
+    );
     outcomes
 }
 
@@ -52,7 +62,8 @@ fn an_outcome_depends_on_its_seed_alone() {
         let alone = run(&[seed])[0];
         assert_eq!(alone, EpisodeOutcome { index: 0, ..*outcome });
     }
-    let lengths: std::collections::HashSet<u32> = together.iter().map(|outcome| outcome.length).collect();
+    let lengths: std::collections::HashSet<u32> =
+        together.iter().map(|outcome| outcome.length).collect();
     assert!(lengths.len() > 1, "episodes of one length only prove nothing about leaving the batch");
 }
 
@@ -65,7 +76,8 @@ fn an_outcome_is_what_stepping_by_hand_gives() {
         let (mut episode_return, mut length) = (0.0, 0);
         hopper.reset(outcome.seed);
         loop {
-            let observation: Vec<f32> = hopper.observation().iter().map(|&value| value as f32).collect();
+            let observation: Vec<f32> =
+                hopper.observation().iter().map(|&value| value as f32).collect();
             let mut action = [0.0; 3];
             act(&observation, &mut noise, &mut action);
             let step = hopper.step(&action);
@@ -91,8 +103,8 @@ fn a_policy_that_fails_stops_the_batch_where_it_is() {
     assert_eq!(rollout.environment_steps(), 4);
 }
 
-/// An environment of another make: it observes and pays how many steps it has taken. In the third it breaks down if it is to,
-/// or pays something else.
+/// An environment of another make: it observes and pays how many steps it has taken. In the third
+/// it breaks down if it is to, or pays something else.
 struct Made {
     steps: [f64; 2],
     breaks: bool,
@@ -110,7 +122,10 @@ impl Environment for Made {
         assert_eq!(action, [0.5]);
         self.steps[0] += 1.0;
         if self.breaks && self.steps[0] == 3.0 {
-            return Err(EnvironmentError::Failed { name: "made".to_owned(), reason: "a cable is loose".to_owned() });
+            return Err(EnvironmentError::Failed {
+                name: "made".to_owned(),
+                reason: "a cable is loose".to_owned(),
+            });
         }
         let reward = self.pays.filter(|_| self.steps[0] == 3.0).unwrap_or(self.steps[0]);
         Ok(Step { reward, terminated: self.steps[0] == 4.0, truncated: false })
@@ -129,7 +144,10 @@ fn made(breaks: bool, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>, Envi
     roll_out(|| Made { steps: [0.0; 2], breaks, pays: None, worth: 0.1 }, sizes)
 }
 
-fn roll_out(made: impl Fn() -> Made, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
+fn roll_out(
+    made: impl Fn() -> Made,
+    sizes: (usize, usize),
+) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
     let make = || Ok(Box::new(made()) as Box<dyn Environment>);
     let mut rollout = Rollout::new(make, sizes, &[7, 8], |_| ())?;
     while !rollout.is_done() {
@@ -144,7 +162,8 @@ fn roll_out(made: impl Fn() -> Made, sizes: (usize, usize)) -> Result<Vec<Episod
 
 #[test]
 fn an_environment_of_another_make_has_scores_of_its_own() {
-    let outcome = |index, seed| EpisodeOutcome { index, seed, episode_return: 10.0, length: 4, score: 1.0 };
+    let outcome =
+        |index, seed| EpisodeOutcome { index, seed, episode_return: 10.0, length: 4, score: 1.0 };
     assert_eq!(made(false, (2, 1)).unwrap(), [outcome(0, 7), outcome(1, 8)]);
 }
 
@@ -155,10 +174,13 @@ fn an_environment_that_breaks_down_or_does_not_fit_says_so() {
     assert_eq!(error(false, (3, 1)), "an observation has 2 numbers, but the policy takes 3");
 }
 
-/// No episode counts whose return or score a learner would refuse; one that cannot come right again does not go on.
+/// No episode counts whose return or score a learner would refuse; one that cannot come right again
+/// does not go on.
 #[test]
 fn a_return_or_score_that_cannot_count_is_told_as_soon_as_it_is_known() {
-    let told = |pays, worth| roll_out(|| Made { steps: [0.0; 2], breaks: false, pays: Some(pays), worth }, (2, 1));
+    let told = |pays, worth| {
+        roll_out(|| Made { steps: [0.0; 2], breaks: false, pays: Some(pays), worth }, (2, 1))
+    };
     for (pays, worth, sentence) in [
         (f64::NAN, 0.1, "the return of the episode with seed 8 is NaN after 3 steps"),
         (f64::NEG_INFINITY, 0.1, "the return of the episode with seed 8 is -inf after 3 steps"),
@@ -166,7 +188,10 @@ fn a_return_or_score_that_cannot_count_is_told_as_soon_as_it_is_known() {
         (3.0, f64::NAN, "the score of the episode with seed 8 is NaN after 4 steps"),
         (3.0, -1e12, "the score of the episode with seed 8 is -10000000000000 after 4 steps"),
     ] {
-        assert_eq!(told(pays, worth).unwrap_err().to_string(), format!("{sentence}, not a finite number up to 1e12"));
+        assert_eq!(
+            told(pays, worth).unwrap_err().to_string(),
+            format!("{sentence}, not a finite number up to 1e12")
+        );
     }
     assert_eq!(told(1e12 - 7.0, 1.0).unwrap()[0].score, 1e12, "the largest that counts");
 }

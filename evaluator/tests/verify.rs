@@ -6,8 +6,8 @@ use std::path::Path;
 use quad_dataset::environment::find;
 use quad_evaluator::tools::verify::{environment_of, verify};
 
-/// Median and 99th percentile of the error that the reference implementation itself has, replaying the same file; rows
-/// whose next observation is known.
+/// Median and 99th percentile of the error that the reference implementation itself has, replaying
+/// the same file; rows whose next observation is known.
 const FILES: [(&str, &str, f64, f64, usize); 3] = [
     ("halfcheetah_medium_replay", "halfcheetah", 6.2e-7, 2.9e-5, 100_000),
     ("walker2d_medium_replay", "walker2d", 3.8e-7, 6.9e-6, 101_998),

@@ -1,11 +1,14 @@
-//! Our kernels beside what a library does, at the shapes of a gradient step and on one thread. A library's line stands
-//! next to ours and is timed within the same second or two: compare neighbors, the machine may be shared.
-//! The rates are GFLOP/s of products (criterion calls them Gelem/s) and G elements/s of activations.
+//! Our kernels beside what a library does, at the shapes of a gradient step and on one thread. A
+//! library's line stands next to ours and is timed within the same second or two: compare
+//! neighbors, the machine may be shared. The rates are GFLOP/s of products (criterion calls them
+//! Gelem/s) and G elements/s of activations.
 
 #![allow(missing_docs)] // criterion's macros define public functions without any
 
 use criterion::measurement::WallTime;
-use criterion::{BenchmarkGroup, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use criterion::{
+    BenchmarkGroup, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main,
+};
 use quad_kernels::Buffer;
 use quad_kernels::activation::Activation::Mish;
 use quad_kernels::activation::{activate, activate_with_slope};
@@ -14,8 +17,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Duration;
 
-/// Right-hand sides that take turns: the hidden layers of ten critics, which come from a cache that cores share. So do the
-/// results of outer products, the gradients of as many layers.
+/// Right-hand sides that take turns: the hidden layers of ten critics, which come from a cache that
+/// cores share. So do the results of outer products, the gradients of as many layers.
 const IN_TURN: usize = 20;
 
 /// `len` numbers from a cache line on, as the networks keep them.
@@ -32,9 +35,16 @@ fn zeros(len: usize) -> Buffer {
     buffer
 }
 
-fn group<'a>(criterion: &'a mut Criterion, name: &str, elements: usize) -> BenchmarkGroup<'a, WallTime> {
+fn group<'a>(
+    criterion: &'a mut Criterion,
+    name: &str,
+    elements: usize,
+) -> BenchmarkGroup<'a, WallTime> {
     let mut group = criterion.benchmark_group(name);
-    group.sample_size(20).warm_up_time(Duration::from_millis(200)).measurement_time(Duration::from_millis(800));
+    group
+        .sample_size(20)
+        .warm_up_time(Duration::from_millis(200))
+        .measurement_time(Duration::from_millis(800));
     group.throughput(Throughput::Elements(elements as u64));
     group
 }
@@ -60,9 +70,13 @@ fn compare(
     let right: Vec<_> = (1..=IN_TURN).map(|seed| numbers(k * n, seed)).collect();
     let mut outs: Vec<_> = (0..outs).map(|_| zeros(m * n)).collect();
     let count = outs.len();
-    let by_gemm = |_, a: &[f32], b: &[f32], out: &mut [f32]| by_gemm([m, k, n], left_side(a), right_side(b), out);
+    let by_gemm = |_, a: &[f32], b: &[f32], out: &mut [f32]| {
+        by_gemm([m, k, n], left_side(a), right_side(b), out)
+    };
     let both: [(&str, Product<'_>); 2] = [("ours", ours), ("gemm", &by_gemm)];
-    for (sides, (name, work)) in [1, IN_TURN].into_iter().flat_map(|sides| both.map(|one| (sides, one))) {
+    for (sides, (name, work)) in
+        [1, IN_TURN].into_iter().flat_map(|sides| both.map(|one| (sides, one)))
+    {
         let mut turn = 0;
         group.bench_function(BenchmarkId::new(name, format!("{sides} in turn")), |bencher| {
             bencher.iter(|| {
@@ -74,17 +88,21 @@ fn compare(
     group.finish();
 }
 
-/// A layer's forward pass, the gradient that it passes on, and that of its weights: the hidden layers of the paper's networks
-/// and of the demonstration's, and the first layer.
+/// A layer's forward pass, the gradient that it passes on, and that of its weights: the hidden
+/// layers of the paper's networks and of the demonstration's, and the first layer.
 fn products(criterion: &mut Criterion) {
     for [m, k, n] in [[128, 256, 256], [128, 128, 128], [128, 11, 256]] {
         let (name, orders) = (format!("product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
-        compare(criterion, (&name, [m, k, n]), orders, &|_, x, weights, out| product(x, weights, out, k, n));
+        compare(criterion, (&name, [m, k, n]), orders, &|_, x, weights, out| {
+            product(x, weights, out, k, n)
+        });
     }
     for [m, k, n] in [[128, 256, 256], [128, 128, 128]] {
         let name = format!("product with the transpose, {m} × {n} × {k}");
         let orders = (AS_IT_IS, TRANSPOSED, 1);
-        compare(criterion, (&name, [m, n, k]), orders, &|_, g, weights, out| product_transposed(g, weights, out, k, n));
+        compare(criterion, (&name, [m, n, k]), orders, &|_, g, weights, out| {
+            product_transposed(g, weights, out, k, n)
+        });
     }
     for [m, k, n] in [[128, 256, 256], [256, 256, 256], [128, 128, 128]] {
         let name = format!("outer product of {m} rows, {k} × {n}");
@@ -98,7 +116,8 @@ fn products(criterion: &mut Criterion) {
         let (name, orders) = (format!("packed product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
         compare(criterion, (&name, [m, k, n]), orders, &|i, x, _, out| packed[i].product(x, out));
     }
-    // The library has no product of rounded operands and multiplies in f32; nor has a CPU that gains nothing by it.
+    // The library has no product of rounded operands and multiplies in f32; nor has a CPU that
+    // gains nothing by it.
     for [m, k, n] in [[32, 256, 256], [32, 128, 128]] {
         let round = |seed| Packed::rounded(numbers(k * n, seed).first(k * n), k, n);
         let Some(rounded) = (1..=IN_TURN).map(round).collect::<Option<Vec<_>>>() else { return };
@@ -116,8 +135,8 @@ fn mish_by_std(x: &mut [f32]) {
     }
 }
 
-/// Those that work in place are given the same numbers again by a copy, which is measured with them: Mish of Mish of …
-/// ends at numbers that CPUs are slow with.
+/// Those that work in place are given the same numbers again by a copy, which is measured with
+/// them: Mish of Mish of … ends at numbers that CPUs are slow with.
 fn activations(criterion: &mut Criterion) {
     let (rows, width) = (128, 256);
     let len = rows * width;

@@ -3,8 +3,9 @@
 use crate::vectorized::vectorized;
 use serde::{Deserialize, Serialize};
 
-/// Below this, Mish and its slope are taken to be what they are here: some -2e-14, nothing beside numbers of order 1. Followed
-/// further down, gradients behind such a unit would become subnormal numbers, with which a CPU is ten times slower.
+/// Below this, Mish and its slope are taken to be what they are here: some -2e-14, nothing beside
+/// numbers of order 1. Followed further down, gradients behind such a unit would become subnormal
+/// numbers, with which a CPU is ten times slower.
 const MISH_ZERO: f32 = -35.0;
 /// Above this, Mish is x and its slope 1 to the last bit of f32; it keeps squares of e^x finite.
 const MISH_LINEAR: f32 = 20.0;
@@ -63,11 +64,13 @@ pub enum Activation {
     Silu,
     /// tanh(x).
     Tanh,
-    /// The tanh form of x·Φ(x) (Hendrycks and Gimpel 2016): x/2·(1 + tanh(√(2/π)·(x + 0.044715·x³))).
+    /// The tanh form of x·Φ(x) (Hendrycks and Gimpel 2016): x/2·(1 + tanh(√(2/π)·(x +
+    /// 0.044715·x³))).
     Gelu,
 }
 
-/// Below this, GELU and its slope are taken to be what they are here, -8e-15; above, GELU is x to the last bit of f32.
+/// Below this, GELU and its slope are taken to be what they are here, -8e-15; above, GELU is x to
+/// the last bit of f32.
 const GELU_ZERO: f32 = -6.9;
 const GELU_LINEAR: f32 = 5.4;
 
@@ -200,7 +203,10 @@ pub(crate) mod tests {
             Activation::Gelu => {
                 let c = (2.0 / std::f64::consts::PI).sqrt();
                 let t = (c * (x + 0.044715 * x.powi(3))).tanh();
-                (0.5 * x * (1.0 + t), 0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * c * (1.0 + 0.134145 * x * x))
+                (
+                    0.5 * x * (1.0 + t),
+                    0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * c * (1.0 + 0.134145 * x * x),
+                )
             }
         }
     }
@@ -221,16 +227,28 @@ pub(crate) mod tests {
         for (f, i) in ALL.into_iter().flat_map(|f| (-4000..=4000).map(move |i| (f, i))) {
             let x = i as f32 * 0.025;
             let ((y, slope), (y64, slope64)) = (at(f, x), exact(f, f64::from(x)));
-            assert!((f64::from(y) - y64).abs() <= 1e-6 * y64.abs() + 2e-7, "{f:?}({x}) = {y} for {y64}");
-            assert!((f64::from(slope) - slope64).abs() <= 2e-6 * slope64.abs() + 1e-6, "{f:?}'({x})");
+            assert!(
+                (f64::from(y) - y64).abs() <= 1e-6 * y64.abs() + 2e-7,
+                "{f:?}({x}) = {y} for {y64}"
+            );
+            assert!(
+                (f64::from(slope) - slope64).abs() <= 2e-6 * slope64.abs() + 1e-6,
+                "{f:?}'({x})"
+            );
         }
         let mish = at(Activation::Mish, -30.0).0;
-        assert!((f64::from(mish) / exact(Activation::Mish, -30.0).0 - 1.0).abs() < 1e-6, "relatively, too: {mish}");
+        assert!(
+            (f64::from(mish) / exact(Activation::Mish, -30.0).0 - 1.0).abs() < 1e-6,
+            "relatively, too: {mish}"
+        );
     }
 
     #[test]
     fn activations_are_finite_everywhere() {
-        for (f, x) in ALL.into_iter().flat_map(|f| [-f32::MAX, -1e30, -100.0, -0.0, 88.0, 89.0, 1e30].map(|x| (f, x))) {
+        for (f, x) in ALL
+            .into_iter()
+            .flat_map(|f| [-f32::MAX, -1e30, -100.0, -0.0, 88.0, 89.0, 1e30].map(|x| (f, x)))
+        {
             let (y, slope) = at(f, x);
             assert!(y.is_finite() && slope.is_finite(), "{f:?} at {x}: {y} {slope}");
         }
@@ -243,7 +261,10 @@ pub(crate) mod tests {
             .flat_map(|f| [-30.0, -87.0, -1e30].map(|x| (f, x)))
         {
             let (y, slope) = at(f, x);
-            assert!((1e-10 * y).is_normal() && (1e-10 * slope).is_normal(), "{f:?} at {x}: {y} {slope}");
+            assert!(
+                (1e-10 * y).is_normal() && (1e-10 * slope).is_normal(),
+                "{f:?} at {x}: {y} {slope}"
+            );
         }
     }
 

@@ -1,8 +1,8 @@
 //! Products with a packed right-hand side for CPUs with AVX2 and FMA.
 
 use std::arch::x86_64::{
-    _MM_HINT_T0, _mm_prefetch, _mm256_broadcast_ss, _mm256_fmadd_ps, _mm256_loadu_ps, _mm256_setzero_ps,
-    _mm256_storeu_ps,
+    _MM_HINT_T0, _mm_prefetch, _mm256_broadcast_ss, _mm256_fmadd_ps, _mm256_loadu_ps,
+    _mm256_setzero_ps, _mm256_storeu_ps,
 };
 
 /// Lanes of a register.
@@ -45,7 +45,14 @@ unsafe fn block<const R: usize>(k: usize, a: *const f32, b: *const f32, c: *mut 
 /// # Safety
 /// The CPU must have AVX2 and FMA, and the three matrices must span that many elements.
 #[target_feature(enable = "avx2,fma")]
-pub(crate) unsafe fn multiply_packed(m: usize, n: usize, k: usize, a: *const f32, b: *const f32, c: *mut f32) {
+pub(crate) unsafe fn multiply_packed(
+    m: usize,
+    n: usize,
+    k: usize,
+    a: *const f32,
+    b: *const f32,
+    c: *mut f32,
+) {
     let blocks = m.div_ceil(ROWS);
     for j in (0..n).step_by(COLUMNS) {
         // Blocks of nearly equal height: in a low one the sums would wait for one another.

@@ -1,13 +1,15 @@
 //! A dense product for CPUs with AVX-512 that copies little.
 //!
-//! The matrices of these networks fit into a core's own cache, so the copies of both sides that a general library makes
-//! first cost more than they gain (benches/README.md): the left side is read where it lies, and of the right one a block
-//! of columns is copied or transposed at a time, to stay in the nearest cache.
+//! The matrices of these networks fit into a core's own cache, so the copies of both sides that a
+//! general library makes first cost more than they gain (benches/README.md): the left side is read
+//! where it lies, and of the right one a block of columns is copied or transposed at a time, to
+//! stay in the nearest cache.
 
 use std::arch::x86_64::{
-    _MM_HINT_T0, _mm_prefetch, _mm512_castpd_ps, _mm512_castps_pd, _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps,
-    _mm512_setzero_ps, _mm512_shuffle_f32x4, _mm512_store_ps, _mm512_storeu_ps, _mm512_unpackhi_pd, _mm512_unpackhi_ps,
-    _mm512_unpacklo_pd, _mm512_unpacklo_ps,
+    _MM_HINT_T0, _mm_prefetch, _mm512_castpd_ps, _mm512_castps_pd, _mm512_fmadd_ps,
+    _mm512_loadu_ps, _mm512_set1_ps, _mm512_setzero_ps, _mm512_shuffle_f32x4, _mm512_store_ps,
+    _mm512_storeu_ps, _mm512_unpackhi_pd, _mm512_unpackhi_ps, _mm512_unpacklo_pd,
+    _mm512_unpacklo_ps,
 };
 use std::cell::RefCell;
 
@@ -25,7 +27,8 @@ pub(crate) fn serves(columns: usize) -> bool {
     columns.is_multiple_of(COLUMNS) && Level::in_use() == Level::Avx512
 }
 
-/// What a register holds, where one cache line holds it: other addresses take two for each register.
+/// What a register holds, where one cache line holds it: other addresses take two for each
+/// register.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 pub(crate) struct Line<T>(pub [T; LANES]);
@@ -56,8 +59,8 @@ thread_local! {
 /// Numbers apart at which rows crowd into few places of a core's caches.
 const CROWDED: usize = 512;
 
-/// The left side `m × k` of a product: as it is, or copied to `room` with a gap behind each row where its rows in memory are so
-/// far apart that they would drive each other out of the cache.
+/// The left side `m × k` of a product: as it is, or copied to `room` with a gap behind each row
+/// where its rows in memory are so far apart that they would drive each other out of the cache.
 ///
 /// # Safety
 /// The matrix must span that many elements.
@@ -71,7 +74,9 @@ unsafe fn spread(m: usize, k: usize, a: Strided<f32>, room: &mut Vec<f32>) -> St
     room.resize(rows * wider, 0.0);
     for (i, row) in room.chunks_exact_mut(wider).enumerate() {
         // SAFETY: row i of the matrix as it lies in memory.
-        row[..columns].copy_from_slice(unsafe { std::slice::from_raw_parts(a.first.add(i * apart), columns) });
+        row[..columns].copy_from_slice(unsafe {
+            std::slice::from_raw_parts(a.first.add(i * apart), columns)
+        });
     }
     let (row, column) = if a.column == 1 { (wider, 1) } else { (1, wider) };
     Strided { first: room.as_ptr(), row, column }
@@ -84,8 +89,9 @@ struct Ahead<T> {
     row: usize,
 }
 
-/// Defines `panel`, `c = a·b` for all `m` rows and one block of columns, `b` being `k × 32` and `c` part of a matrix, for
-/// elements of 32 bits: `$add(sum, x, b)` adds the products of one element, in all lanes, with a register of others.
+/// Defines `panel`, `c = a·b` for all `m` rows and one block of columns, `b` being `k × 32` and `c`
+/// part of a matrix, for elements of 32 bits: `$add(sum, x, b)` adds the products of one element,
+/// in all lanes, with a register of others.
 macro_rules! panel {
     ($features:literal, $element:ty, $broadcast:expr, $load:expr, $add:expr) => {
         #[inline]
@@ -137,7 +143,8 @@ macro_rules! panel {
                 let (from, to) = (i * m / blocks, (i + 1) * m / blocks);
                 // SAFETY: rows from..to are inside, and at most `ROWS`.
                 unsafe {
-                    let (a, c) = (Strided { first: a.first.add(from * a.row), ..a }, c.add(from * c_row));
+                    let (a, c) =
+                        (Strided { first: a.first.add(from * a.row), ..a }, c.add(from * c_row));
                     match to - from {
                         1 => block::<1>(k, a, b, ahead, c, c_row),
                         2 => block::<2>(k, a, b, ahead, c, c_row),
@@ -168,7 +175,14 @@ panel!("avx512f", f32, _mm512_set1_ps, _mm512_loadu_ps, |sum, x, b| _mm512_fmadd
 /// # Safety
 /// [`serves`] must hold for `n`, and the three matrices must span that many elements.
 #[target_feature(enable = "avx512f")]
-pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided<f32>, b: *const f32, c: *mut f32) {
+pub(crate) unsafe fn multiply(
+    m: usize,
+    n: usize,
+    k: usize,
+    a: Strided<f32>,
+    b: *const f32,
+    c: *mut f32,
+) {
     let (mut block_of_b, mut left) = (BLOCK.take(), LEFT.take());
     // SAFETY: the caller's.
     let a = unsafe { spread(m, k, a, &mut left) };
@@ -179,10 +193,21 @@ pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided<f32>, b: 
         unsafe {
             for p in 0..k {
                 for half in [0, LANES] {
-                    _mm512_store_ps(block.add(p * COLUMNS + half), _mm512_loadu_ps(b.add(p * n + j + half)));
+                    _mm512_store_ps(
+                        block.add(p * COLUMNS + half),
+                        _mm512_loadu_ps(b.add(p * n + j + half)),
+                    );
                 }
             }
-            panel(m, k, a, block, Ahead { first: b.wrapping_add(j + COLUMNS), row: n }, c.add(j), n);
+            panel(
+                m,
+                k,
+                a,
+                block,
+                Ahead { first: b.wrapping_add(j + COLUMNS), row: n },
+                c.add(j),
+                n,
+            );
         }
     }
     BLOCK.set(block_of_b);
@@ -194,13 +219,28 @@ pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided<f32>, b: 
 /// # Safety
 /// [`serves`] must hold for `n`, and the three matrices must span that many elements.
 #[target_feature(enable = "avx512f")]
-pub(crate) unsafe fn multiply_packed(m: usize, n: usize, k: usize, a: *const f32, b: *const f32, c: *mut f32) {
+pub(crate) unsafe fn multiply_packed(
+    m: usize,
+    n: usize,
+    k: usize,
+    a: *const f32,
+    b: *const f32,
+    c: *mut f32,
+) {
     let a = Strided { first: a, row: k, column: 1 };
     for j in (0..n).step_by(COLUMNS) {
         // SAFETY: block j and its columns of the result are inside.
         unsafe {
             let block = b.add(j * k);
-            panel(m, k, a, block, Ahead { first: block.wrapping_add(k * COLUMNS), row: COLUMNS }, c.add(j), n);
+            panel(
+                m,
+                k,
+                a,
+                block,
+                Ahead { first: block.wrapping_add(k * COLUMNS), row: COLUMNS },
+                c.add(j),
+                n,
+            );
         }
     }
 }
@@ -251,7 +291,14 @@ unsafe fn transpose(from: *const f32, from_row: usize, to: *mut f32, to_row: usi
 /// # Safety
 /// [`serves`] must hold for `k` and `n`, and the three matrices must span that many elements.
 #[target_feature(enable = "avx512f")]
-pub(crate) unsafe fn multiply_transposed(m: usize, k: usize, n: usize, a: *const f32, b: *const f32, c: *mut f32) {
+pub(crate) unsafe fn multiply_transposed(
+    m: usize,
+    k: usize,
+    n: usize,
+    a: *const f32,
+    b: *const f32,
+    c: *mut f32,
+) {
     let (mut block_of_b, mut left) = (BLOCK.take(), LEFT.take());
     block_of_b.resize(n * COLUMNS / LANES, Line([0.0; LANES]));
     let block = block_of_b.as_mut_ptr().cast::<f32>();
@@ -265,7 +312,15 @@ pub(crate) unsafe fn multiply_transposed(m: usize, k: usize, n: usize, a: *const
                     transpose(b.add((j + half) * n + p), n, block.add(p * COLUMNS + half), COLUMNS);
                 }
             }
-            panel(m, n, a, block, Ahead { first: b.wrapping_add((j + COLUMNS) * n), row: COLUMNS }, c.add(j), k);
+            panel(
+                m,
+                n,
+                a,
+                block,
+                Ahead { first: b.wrapping_add((j + COLUMNS) * n), row: COLUMNS },
+                c.add(j),
+                k,
+            );
         }
     }
     BLOCK.set(block_of_b);

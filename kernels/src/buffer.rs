@@ -3,7 +3,8 @@
 /// Bytes of a cache line, and of the widest register.
 const LINE: usize = 64;
 
-/// Numbers from the beginning of a cache line on: a register of them elsewhere costs two accesses. Grows, never shrinks.
+/// Numbers from the beginning of a cache line on: a register of them elsewhere costs two accesses.
+/// Grows, never shrinks.
 #[derive(Default)]
 pub struct Buffer(Vec<f32>);
 

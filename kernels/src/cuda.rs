@@ -1,6 +1,6 @@
-//! The loops of a gradient step on an Nvidia GPU, each one launch: activations, a reverse step, Adam and EMA. Products are
-//! cuBLAS's, through candle. `cuda.cu` has the kernels; the driver's compiler translates them for the GPU at hand when the
-//! first is launched.
+//! The loops of a gradient step on an Nvidia GPU, each one launch: activations, a reverse step,
+//! Adam and EMA. Products are cuBLAS's, through candle. `cuda.cu` has the kernels; the driver's
+//! compiler translates them for the GPU at hand when the first is launched.
 //!
 //! Every function queues its work on a stream and returns before the GPU has done it.
 
@@ -8,7 +8,8 @@ use crate::activation::Activation;
 use cudarc::driver::result::{device, mem_pool};
 use cudarc::driver::sys::CUmemPool_attribute;
 use cudarc::driver::{
-    CudaContext, CudaFunction, CudaSlice, CudaStream, CudaView, CudaViewMut, DriverError, LaunchConfig, PushKernelArg,
+    CudaContext, CudaFunction, CudaSlice, CudaStream, CudaView, CudaViewMut, DriverError,
+    LaunchConfig, PushKernelArg,
 };
 use cudarc::nvrtc::{CompileError, compile_ptx};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -33,7 +34,8 @@ pub enum CudaError {
 pub type Result<T> = std::result::Result<T, CudaError>;
 
 /// The numbers of a reverse step: `clean = clamp((x - deviation·ε)·scale)`, then
-/// `clamp(from_clean·clean + from_noisy·x + noise·z)`, each with a bound of its own, which may be infinite.
+/// `clamp(from_clean·clean + from_noisy·x + noise·z)`, each with a bound of its own, which may be
+/// infinite.
 #[derive(Clone, Copy, Debug)]
 pub struct ReverseStep {
     /// What multiplies the predicted noise.
@@ -79,21 +81,23 @@ fn kernels(stream: &CudaStream) -> Result<Arc<Kernels>> {
     Ok(kernels.insert(Arc::new(translated)).clone())
 }
 
-/// Spares a process that computes on one stream two costs: without this, the driver gives the memory that is free back
-/// whenever the host waits for the GPU, so that each update begins without any; and each array has two events, which would
-/// order streams.
+/// Spares a process that computes on one stream two costs: without this, the driver gives the
+/// memory that is free back whenever the host waits for the GPU, so that each update begins without
+/// any; and each array has two events, which would order streams.
 ///
 /// # Errors
 /// The driver refuses.
 pub fn prepare(context: &CudaContext) -> Result<()> {
     let mut all = u64::MAX;
     let threshold = CUmemPool_attribute::CU_MEMPOOL_ATTR_RELEASE_THRESHOLD;
-    // SAFETY: the pool is that of the context's device, and this attribute is an unsigned number of 64 bits.
+    // SAFETY: the pool is that of the context's device, and this attribute is an unsigned number of
+    // 64 bits.
     unsafe {
         let pool = device::get_default_mem_pool(context.cu_device())?;
         mem_pool::set_attribute(pool, threshold, (&raw mut all).cast())?;
     }
-    // SAFETY: cudarc records events only where there are streams that it has made, and there are none.
+    // SAFETY: cudarc records events only where there are streams that it has made, and there are
+    // none.
     unsafe { context.disable_event_tracking() };
     Ok(())
 }
@@ -104,8 +108,9 @@ fn threads(count: usize) -> LaunchConfig {
     LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 }
 }
 
-/// `f(z + bias)` of `members × rows × width` numbers, where each member has a bias of its own, `members × width`; without `f`
-/// just the sum. With `slope`, the derivatives f'(z + bias) follow behind all values.
+/// `f(z + bias)` of `members × rows × width` numbers, where each member has a bias of its own,
+/// `members × width`; without `f` just the sum. With `slope`, the derivatives f'(z + bias) follow
+/// behind all values.
 pub fn activate(
     stream: &Arc<CudaStream>,
     f: Option<Activation>,
@@ -162,9 +167,9 @@ pub fn reverse(
     Ok(out)
 }
 
-/// Adam's step, as [`crate::optimizer::adam`]; the gradient is scaled down to the norm `clip` if it is longer. Gives its norm
-/// before that. `rates` are those of [`crate::optimizer::AdamRates`], in its order: as numbers of the GPU they can differ each
-/// time that recorded work is replayed.
+/// Adam's step, as [`crate::optimizer::adam`]; the gradient is scaled down to the norm `clip` if it
+/// is longer. Gives its norm before that. `rates` are those of [`crate::optimizer::AdamRates`], in
+/// its order: as numbers of the GPU they can differ each time that recorded work is replayed.
 pub fn adam(
     stream: &Arc<CudaStream>,
     parameters: &mut CudaViewMut<'_, f32>,
@@ -186,7 +191,13 @@ pub fn adam(
     unsafe { launch.launch(threads(SUMS * BLOCK as usize))? };
     let (mut first, mut second) = moments.split_at_mut(count);
     let mut launch = stream.launch_builder(&kernels.adam);
-    launch.arg(parameters).arg(&mut first).arg(&mut second).arg(gradient).arg(&partial).arg(&mut norm);
+    launch
+        .arg(parameters)
+        .arg(&mut first)
+        .arg(&mut second)
+        .arg(gradient)
+        .arg(&partial)
+        .arg(&mut norm);
     launch.arg(&all).arg(&clip).arg(rates);
     // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
     unsafe { launch.launch(threads(count))? };

@@ -1,5 +1,5 @@
-//! Which of the CPU's vector instructions are used: the widest that it has, or fewer where a developer asks for it, to test and
-//! to measure what other CPUs run.
+//! Which of the CPU's vector instructions are used: the widest that it has, or fewer where a
+//! developer asks for it, to test and to measure what other CPUs run.
 
 use std::sync::LazyLock;
 
@@ -51,7 +51,8 @@ impl Level {
     /// `QUAD_INSTRUCTIONS=avx2`.
     pub fn in_use() -> Self {
         static IN_USE: LazyLock<Level> = LazyLock::new(|| {
-            let only_avx2 = std::env::var("QUAD_INSTRUCTIONS").is_ok_and(|asked| asked == Level::Avx2.name());
+            let only_avx2 =
+                std::env::var("QUAD_INSTRUCTIONS").is_ok_and(|asked| asked == Level::Avx2.name());
             Level::available().min(if only_avx2 { Level::Avx2 } else { Level::Avx512 })
         });
         *IN_USE

@@ -10,7 +10,13 @@ const LANES: usize = 16;
 
 /// `acc + Σ_j coefficients[j] · vectors[j·stride + at ..][..LANES]`.
 #[inline(always)]
-fn combine(mut acc: [f32; LANES], coefficients: &[f32], vectors: &[f32], stride: usize, at: usize) -> [f32; LANES] {
+fn combine(
+    mut acc: [f32; LANES],
+    coefficients: &[f32],
+    vectors: &[f32],
+    stride: usize,
+    at: usize,
+) -> [f32; LANES] {
     for (j, c) in coefficients.iter().enumerate() {
         let v = &vectors[j * stride + at..][..LANES];
         for l in 0..LANES {
@@ -22,7 +28,13 @@ fn combine(mut acc: [f32; LANES], coefficients: &[f32], vectors: &[f32], stride:
 
 /// [`combine`] for one column.
 #[inline(always)]
-fn combine_one(mut acc: f32, coefficients: &[f32], vectors: &[f32], stride: usize, at: usize) -> f32 {
+fn combine_one(
+    mut acc: f32,
+    coefficients: &[f32],
+    vectors: &[f32],
+    stride: usize,
+    at: usize,
+) -> f32 {
     for (j, c) in coefficients.iter().enumerate() {
         acc = c.mul_add(vectors[j * stride + at], acc);
     }
@@ -104,8 +116,8 @@ vectorized! {
 }
 
 vectorized! {
-    /// `slope = slope ⊙ (coefficients · vectors)`: the gradient before an activation whose output feeds a narrow
-    /// linear layer. `coefficients` is `rows × n`, `vectors` `n × width`.
+    /// `slope = slope ⊙ (coefficients · vectors)`: the gradient before an activation whose output
+    /// feeds a narrow linear layer. `coefficients` is `rows × n`, `vectors` `n × width`.
     pub fn scale_by_combination(slope: &mut [f32], coefficients: &[f32], vectors: &[f32], width: usize) {
         let n = vectors.len() / width;
         for (slope, c) in slope.chunks_exact_mut(width).zip(coefficients.chunks_exact(n)) {
@@ -125,7 +137,8 @@ vectorized! {
 }
 
 vectorized! {
-    /// `out[row, j] = offset[j] + x[row] · vectors[j]`: a narrow linear layer. `vectors` is `n × width`.
+    /// `out[row, j] = offset[j] + x[row] · vectors[j]`: a narrow linear layer. `vectors` is `n ×
+    /// width`.
     pub fn dots(x: &[f32], vectors: &[f32], offset: &[f32], out: &mut [f32], width: usize) {
         for (x, out) in x.chunks_exact(width).zip(out.chunks_exact_mut(offset.len())) {
             for ((out, v), offset) in out.iter_mut().zip(vectors.chunks_exact(width)).zip(offset) {
@@ -168,8 +181,13 @@ mod tests {
                     assert!((out - (sum + [0.5, -0.5][j])).abs() < 1e-5);
                 }
             }
-            let layer =
-                FirstLayer { base: &x, repeat: 1, shift: &v[..width], actions: &[0.3, -0.2, 0.9], kernel: &v[width..] };
+            let layer = FirstLayer {
+                base: &x,
+                repeat: 1,
+                shift: &v[..width],
+                actions: &[0.3, -0.2, 0.9],
+                kernel: &v[width..],
+            };
             let mut y = vec![0.0; 3 * width];
             first_layer(Some(Activation::Mish), &layer, &mut y);
             for (i, y) in y.iter().enumerate() {

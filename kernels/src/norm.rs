@@ -1,7 +1,8 @@
 //! Layer norm (Ba et al. 2016) of a tile's rows, and its backward pass.
 //!
-//! What is kept of a tile for the backward pass is one slice: the gradients of scale and shift, `width` numbers each; for each
-//! row one over its deviation; and the normalized rows, `rows × width`.
+//! What is kept of a tile for the backward pass is one slice: the gradients of scale and shift,
+//! `width` numbers each; for each row one over its deviation; and the normalized rows, `rows ×
+//! width`.
 
 use crate::vectorized::vectorized;
 
@@ -31,7 +32,8 @@ fn mean(x: &[f32], y: &[f32], f: impl Fn(f32, f32) -> f32) -> f32 {
 }
 
 vectorized! {
-    /// `x = scale ⊙ (z − mean)/√(variance + epsilon)` with z = x + bias, over each row. Fills `kept`.
+    /// `x = scale ⊙ (z − mean)/√(variance + epsilon)` with z = x + bias, over each row. Fills
+    /// `kept`.
     pub fn normalize(x: &mut [f32], bias: Option<&[f32]>, scale: &[f32], epsilon: f32, kept: &mut [f32]) {
         let width = scale.len();
         let (inverse, normed) = kept[2 * width..].split_at_mut(x.len() / width);
@@ -61,8 +63,8 @@ vectorized! {
 }
 
 vectorized! {
-    /// Turns gradients behind a norm, `rows × width`, into those before it, and leaves the gradients of scale and shift in what
-    /// [`normalize`] has kept.
+    /// Turns gradients behind a norm, `rows × width`, into those before it, and leaves the
+    /// gradients of scale and shift in what [`normalize`] has kept.
     pub fn normalize_backward(delta: &mut [f32], scale: &[f32], kept: &mut [f32]) {
         let width = scale.len();
         let (sums, rows) = kept.split_at_mut(2 * width);
@@ -92,16 +94,22 @@ mod tests {
 
     /// The formulas in double precision.
     fn exact(row: &[f32], bias: &[f32], scale: &[f32], epsilon: f64) -> Vec<f64> {
-        let z: Vec<f64> = row.iter().zip(bias).map(|(x, b)| f64::from(*x) + f64::from(*b)).collect();
+        let z: Vec<f64> =
+            row.iter().zip(bias).map(|(x, b)| f64::from(*x) + f64::from(*b)).collect();
         let mean = z.iter().sum::<f64>() / z.len() as f64;
         let variance = z.iter().map(|z| (z - mean).powi(2)).sum::<f64>() / z.len() as f64;
-        z.iter().zip(scale).map(|(z, s)| f64::from(*s) * (z - mean) / (variance + epsilon).sqrt()).collect()
+        z.iter()
+            .zip(scale)
+            .map(|(z, s)| f64::from(*s) * (z - mean) / (variance + epsilon).sqrt())
+            .collect()
     }
 
     #[test]
     fn a_norm_and_its_gradients_match_their_definition() {
         for width in [1, 5, 16, 40] {
-            let numbers = |len: usize, by: f32| (0..len).map(|i| (by * (i + 1) as f32).sin()).collect::<Vec<f32>>();
+            let numbers = |len: usize, by: f32| {
+                (0..len).map(|i| (by * (i + 1) as f32).sin()).collect::<Vec<f32>>()
+            };
             let (x, delta, rows) = (numbers(3 * width, 2.1), numbers(3 * width, 1.3), 3);
             let (bias, scale) = (numbers(width, 0.7), numbers(width, 0.3));
             let (mut y, mut keeps) = (x.clone(), vec![f32::NAN; kept(rows, width)]);
@@ -112,7 +120,13 @@ mod tests {
             };
             for (found, row) in y.chunks(width).zip(x.chunks(width)) {
                 let expected = exact(row, &bias, &scale, 1e-2);
-                assert!(found.iter().zip(expected).all(|(y, exact)| (f64::from(*y) - exact).abs() < 1e-5), "{width}");
+                assert!(
+                    found
+                        .iter()
+                        .zip(expected)
+                        .all(|(y, exact)| (f64::from(*y) - exact).abs() < 1e-5),
+                    "{width}"
+                );
             }
             let mut found = delta.clone();
             normalize_backward(&mut found, &scale, &mut keeps);
@@ -124,7 +138,10 @@ mod tests {
             let slope = |of: &dyn Fn(f32) -> f64| (of(0.01) - of(-0.01)) / 0.02;
             for (i, found) in found.iter().enumerate() {
                 let expected = slope(&|by| loss(&moved(&x, i, by), &scale));
-                assert!((f64::from(*found) - expected).abs() < 1e-3 * (1.0 + expected.abs()), "{width}, x {i}");
+                assert!(
+                    (f64::from(*found) - expected).abs() < 1e-3 * (1.0 + expected.abs()),
+                    "{width}, x {i}"
+                );
             }
             for i in 0..width {
                 let expected = slope(&|by| loss(&x, &moved(&scale, i, by)));

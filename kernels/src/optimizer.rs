@@ -53,14 +53,16 @@ impl AdamRates {
 
 vectorized! {
     fn adam_chunk(scale: f32, rates: AdamRates, parameters: &mut [f32], first: &mut [f32], second: &mut [f32], gradient: &[f32]) {
-        // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in 20,000.
+        // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in
+        // 20,000.
         const NEW: [f32; 2] = [(1.0 - BETA1) as f32, (1.0 - BETA2) as f32];
         const OLD: [f32; 2] = [BETA1 as f32, BETA2 as f32];
         for (((p, m), v), g) in parameters.iter_mut().zip(first).zip(second).zip(gradient) {
             let g = g * scale;
             *m = OLD[0] * *m + NEW[0] * g;
             *v = OLD[1] * *v + NEW[1] * g * g;
-            // In one subtraction: a decay by itself would be too small a part of the parameter to change it.
+            // In one subtraction: a decay by itself would be too small a part of the parameter to
+            // change it.
             *p -= rates.rate * *m / (v.sqrt() * rates.correction + EPSILON) + rates.decay * *p;
         }
     }
@@ -80,8 +82,9 @@ pub fn norm(x: &[f32]) -> f32 {
     squares.iter().map(|x| f64::from(*x)).sum::<f64>().sqrt() as f32
 }
 
-/// Adam's step number `count` along a gradient g that is first multiplied by `scale`:
-/// m = β1·m + (1 - β1)·g, v = β2·v + (1 - β2)·g², p -= rate · m/(1 - β1^count) / (√(v/(1 - β2^count)) + ε) + rate·decay·p.
+/// Adam's step number `count` along a gradient g that is first multiplied by `scale`: m = β1·m + (1
+/// - β1)·g, v = β2·v + (1 - β2)·g², p -= rate · m/(1 - β1^count) / (√(v/(1 - β2^count)) + ε) +
+/// rate·decay·p.
 pub fn adam(
     parameters: &mut [f32],
     (first, second): (&mut [f32], &mut [f32]),

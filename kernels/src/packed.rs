@@ -5,7 +5,8 @@ use crate::avx512::bf16::Rounded;
 use crate::avx512::{self, LANES, Line};
 use crate::level::Level;
 
-/// A matrix `k × n` that many others are multiplied with: block after block of columns, so that a product copies nothing.
+/// A matrix `k × n` that many others are multiplied with: block after block of columns, so that a
+/// product copies nothing.
 pub struct Packed(Blocks);
 
 enum Blocks {
@@ -14,7 +15,8 @@ enum Blocks {
 }
 
 impl Packed {
-    /// Packs a row-major matrix; `None` where this CPU gains nothing by it, or the matrix is not made of whole blocks.
+    /// Packs a row-major matrix; `None` where this CPU gains nothing by it, or the matrix is not
+    /// made of whole blocks.
     pub fn new(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
         assert_eq!(matrix.len(), k * n, "the matrix's shape");
         let columns = match Level::in_use() {
@@ -38,7 +40,8 @@ impl Packed {
         Some(Self(Blocks::F32 { lines, k, n }))
     }
 
-    /// Packs a matrix with its numbers rounded to bfloat16, as those of the left side will be; sums are in f32.
+    /// Packs a matrix with its numbers rounded to bfloat16, as those of the left side will be; sums
+    /// are in f32.
     pub fn rounded(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
         Some(Self(Blocks::Bf16(Rounded::new(matrix, k, n)?)))
     }
@@ -56,7 +59,8 @@ impl Packed {
                 let m = a.len() / k;
                 assert!(a.len() == m * k && c.len() == m * n, "the product's shape");
                 let (a, b, c) = (a.as_ptr(), lines.as_ptr().cast(), c.as_mut_ptr());
-                // SAFETY: they were packed for the instructions in use, which the CPU has, and the shapes are those.
+                // SAFETY: they were packed for the instructions in use, which the CPU has, and the
+                // shapes are those.
                 unsafe {
                     match Level::in_use() {
                         Level::Avx512 => avx512::multiply_packed(m, *n, *k, a, b, c),

@@ -22,7 +22,8 @@ pub enum Matrix<'a> {
     RowMajor(&'a [f32]),
     /// The transpose of the matrix that has these elements, row by row.
     TransposeOf(&'a [f32]),
-    /// The transpose of some columns, from one on, of the matrix that has these elements, row by row, and so many columns.
+    /// The transpose of some columns, from one on, of the matrix that has these elements, row by
+    /// row, and so many columns.
     TransposeOfColumns(&'a [f32], usize, usize),
 }
 
@@ -46,7 +47,8 @@ impl Matrix<'_> {
     }
 }
 
-/// `out[m × n] = a[m × k] · b[k × n]`, as the crate `gemm` does it with the instructions in use ([`Level`]).
+/// `out[m × n] = a[m × k] · b[k × n]`, as the crate `gemm` does it with the instructions in use
+/// ([`Level`]).
 ///
 /// # Panics
 /// If an operand has another number of elements.
@@ -64,7 +66,10 @@ pub fn by_gemm([m, k, n]: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32]) {
     // SAFETY: as above.
     unsafe {
         let out = out.as_mut_ptr();
-        gemm(m, n, k, out, 1, n as isize, no, a.0, a.1, a.2, b.0, b.1, b.2, 0.0, 1.0, no, no, no, one);
+        gemm(
+            m, n, k, out, 1, n as isize, no, a.0, a.1, a.2, b.0, b.1, b.2, 0.0, 1.0, no, no, no,
+            one,
+        );
     }
 }
 
@@ -131,8 +136,8 @@ pub fn rounding_is_faster() -> bool {
     available
 }
 
-/// The instructions that this CPU multiplies with, `rounded` operands or not. Other instructions add up in another order, and
-/// so to other last bits.
+/// The instructions that this CPU multiplies with, `rounded` operands or not. Other instructions
+/// add up in another order, and so to other last bits.
 pub fn instructions(rounded: bool) -> &'static str {
     #[cfg(target_arch = "x86_64")]
     let names = if rounded { avx512::bf16::instructions() } else { Level::in_use().name() };
@@ -177,7 +182,9 @@ pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: us
         assert!(g.len() == m * n && w.len() == k * n, "operands of a product");
         assert_eq!(out.len(), m * k, "the product's shape");
         // SAFETY: as in `by_gemm`.
-        return unsafe { avx512::multiply_transposed(m, k, n, g.as_ptr(), w.as_ptr(), out.as_mut_ptr()) };
+        return unsafe {
+            avx512::multiply_transposed(m, k, n, g.as_ptr(), w.as_ptr(), out.as_mut_ptr())
+        };
     }
     by_gemm([m, n, k], Matrix::RowMajor(g), Matrix::TransposeOf(w), out);
 }
@@ -201,15 +208,20 @@ mod tests {
     fn assert_close(out: &[f32], expected: impl Fn(usize) -> f64, shape: &str) {
         for (i, x) in out.iter().enumerate() {
             let exact = expected(i);
-            assert!((f64::from(*x) - exact).abs() < 1e-5 * exact.abs().max(1.0), "{shape} at {i}: {x} for {exact}");
+            assert!(
+                (f64::from(*x) - exact).abs() < 1e-5 * exact.abs().max(1.0),
+                "{shape} at {i}: {x} for {exact}"
+            );
         }
     }
 
-    /// Rows that are whole blocks and that are not; columns that AVX-512 serves and that it does not.
+    /// Rows that are whole blocks and that are not; columns that AVX-512 serves and that it does
+    /// not.
     #[test]
     fn products_match_their_definition() {
         let mut generator = ChaCha8Rng::seed_from_u64(0);
-        let mut numbers = |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
+        let mut numbers =
+            |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
         for (m, k, n) in [
             (1, 3, 1),
             (5, 14, 32),
@@ -243,14 +255,25 @@ mod tests {
             // Each term is off by at most a part in 2^8: twice half a unit in the last of 8 bits.
             let terms = |i: usize| sum(k, &|p| (x[i / n * k + p].abs(), w[p * n + i % n].abs()));
             for (i, x) in out.iter().enumerate() {
-                assert!((f64::from(*x) - exact(i)).abs() <= terms(i) / 256.0 + 1e-5, "{m} × {k} × {n} in bf16 at {i}");
+                assert!(
+                    (f64::from(*x) - exact(i)).abs() <= terms(i) / 256.0 + 1e-5,
+                    "{m} × {k} × {n} in bf16 at {i}"
+                );
             }
             let mut out = vec![f32::NAN; m * k];
             product_transposed(&g, &w, &mut out, k, n);
-            assert_close(&out, |i| sum(n, &|p| (g[i / k * n + p], w[i % k * n + p])), &format!("{m} × {n} × {k}ᵀ"));
+            assert_close(
+                &out,
+                |i| sum(n, &|p| (g[i / k * n + p], w[i % k * n + p])),
+                &format!("{m} × {n} × {k}ᵀ"),
+            );
             let mut out = vec![f32::NAN; k * n];
             outer(&x, &g, &mut out, k, n);
-            assert_close(&out, |i| sum(m, &|p| (x[p * k + i / n], g[p * n + i % n])), &format!("{k} × {m}ᵀ × {n}"));
+            assert_close(
+                &out,
+                |i| sum(m, &|p| (x[p * k + i / n], g[p * n + i % n])),
+                &format!("{k} × {m}ᵀ × {n}"),
+            );
             let (whole, from) = (out.clone(), k / 3);
             let (above, below) = out.split_at_mut(from * n);
             above.fill(f32::NAN);

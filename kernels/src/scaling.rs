@@ -1,5 +1,6 @@
-//! Between a user's units and those of networks: an affine map of each number of an observation or an action, and a factor of
-//! rewards. Training scales its data by the same arithmetic by which the policy scales what it is given.
+//! Between a user's units and those of networks: an affine map of each number of an observation or
+//! an action, and a factor of rewards. Training scales its data by the same arithmetic by which the
+//! policy scales what it is given.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,19 +14,21 @@ pub struct Scaling {
     /// Map of actions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actions: Option<Affine>,
-    /// What a reward of 1 is to the user that training saw; values that critics give are in the same unit.
+    /// What a reward of 1 is to the user that training saw; values that critics give are in the
+    /// same unit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rewards: Option<f32>,
 }
 
-/// user's = offset + scale · network's, column by column. The file of a policy has both as they are here.
+/// user's = offset + scale · network's, column by column. The file of a policy has both as they are
+/// here.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Affine {
     /// What a network's 0 is to the user, a number for each column.
     pub offset: Vec<f32>,
-    /// What a network's 1 is to the user beyond that, as many; 0 for a number that never changes: the network sees 0, and the
-    /// user gets the offset exactly.
+    /// What a network's 1 is to the user beyond that, as many; 0 for a number that never changes:
+    /// the network sees 0, and the user gets the offset exactly.
     pub scale: Vec<f32>,
 }
 
@@ -39,7 +42,10 @@ impl Affine {
 
     /// Maps the user's numbers to the network's, in place; `numbers` is `rows × columns`.
     pub fn to_network(&self, numbers: &mut [f32]) {
-        self.change(numbers, |x, offset, scale| if scale == 0.0 { 0.0 } else { (x - offset) / scale });
+        self.change(
+            numbers,
+            |x, offset, scale| if scale == 0.0 { 0.0 } else { (x - offset) / scale },
+        );
     }
 
     /// Maps the network's numbers to the user's, in place; `numbers` is `rows × columns`.

@@ -1,4 +1,5 @@
-//! Loops that are compiled for several instruction sets, of which the one in use is chosen at run time.
+//! Loops that are compiled for several instruction sets, of which the one in use is chosen at run
+//! time.
 
 macro_rules! vectorized {
     ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $(-> $result:ty)? $body:block) => {

@@ -1,4 +1,5 @@
-//! The learner: trains on a dataset, publishes snapshots, collects their scores, and keeps everything in the run's folder.
+//! The learner: trains on a dataset, publishes snapshots, collects their scores, and keeps
+//! everything in the run's folder.
 //!
 //! # Layout
 //! In reading order; each module may use those below it:
@@ -11,10 +12,12 @@
 //! - `report` summarizes scores as tables and figures.
 //! - `judge` ranks policies without a simulator.
 //! - `train` makes gradient steps.
-//! - `evaluation` tracks which episodes wait for a score, and which evaluator has which. It does no input or output.
+//! - `evaluation` tracks which episodes wait for a score, and which evaluator has which. It does no
+//!   input or output.
 //! - `data` finds or fetches the data that a run learns from.
 //!
-//! Below it: the crate `quad_run` has the folder, settings and results of a run, `quad_algorithms` the algorithms.
+//! Below it: the crate `quad_run` has the folder, settings and results of a run, `quad_algorithms`
+//! the algorithms.
 
 #![deny(unsafe_code)]
 

@@ -14,14 +14,15 @@ use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal
 
 /// The program.
 const EVALUATOR: &str = "evaluator";
-/// An evaluator delivers its scores and leaves within two seconds; the learner kills it after this time.
+/// An evaluator delivers its scores and leaves within two seconds; the learner kills it after this
+/// time.
 const LEAVE: Duration = Duration::from_secs(4);
 const GLANCE: Duration = Duration::from_millis(20);
 /// First and longest pause before an evaluator that has ended is started again.
 const PAUSE: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(300)];
 
-/// Sets up a command so that its process ends with the thread that starts it, and appends all its output to a file. The
-/// process does not get a terminal's Ctrl-C; its parent tells it to leave.
+/// Sets up a command so that its process ends with the thread that starts it, and appends all its
+/// output to a file. The process does not get a terminal's Ctrl-C; its parent tells it to leave.
 pub(crate) fn run_beside(command: &mut Command, log: &Path) -> io::Result<()> {
     let file = files::append(log)?;
     command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).process_group(0);
@@ -33,7 +34,8 @@ pub(crate) fn run_beside(command: &mut Command, log: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Hides the user's certificates from a program that connects to an endpoint without encryption, which would refuse them.
+/// Hides the user's certificates from a program that connects to an endpoint without encryption,
+/// which would refuse them.
 pub(crate) fn not_encrypted(command: &mut Command, endpoint: &str) {
     if endpoint.starts_with("tcp/") {
         command.env_remove("QUAD_CERTIFICATES");
@@ -70,7 +72,10 @@ impl LocalEvaluators {
         if count == 0 {
             return Ok(Self::default());
         }
-        let beside = std::env::current_exe().ok().map(|own| own.with_file_name(EVALUATOR)).filter(|path| path.exists());
+        let beside = std::env::current_exe()
+            .ok()
+            .map(|own| own.with_file_name(EVALUATOR))
+            .filter(|path| path.exists());
         let program = beside.unwrap_or_else(|| EVALUATOR.into());
         match Command::new(&program).arg("--version").output() {
             Ok(output) if output.status.success() => {}
@@ -91,28 +96,37 @@ impl LocalEvaluators {
         Ok(Self { count, cores, program, places: Vec::new() })
     }
 
-    /// Starts the evaluators. They connect to the first of these endpoints, write their logs into a folder, and are called
-    /// after `owner`, the run or study: several learners may meet at one router.
+    /// Starts the evaluators. They connect to the first of these endpoints, write their logs into a
+    /// folder, and are called after `owner`, the run or study: several learners may meet at one
+    /// router.
     ///
-    /// Call this and [`news`](Self::news) on a thread that lives as long as the learner: the system ends the evaluators with
-    /// that thread.
+    /// Call this and [`news`](Self::news) on a thread that lives as long as the learner: the system
+    /// ends the evaluators with that thread.
     ///
     /// # Errors
     /// A process or its log file cannot be made.
-    pub fn start(&mut self, reachable_at: &[String], folder: &Path, owner: &str) -> anyhow::Result<()> {
+    pub fn start(
+        &mut self,
+        reachable_at: &[String],
+        folder: &Path,
+        owner: &str,
+    ) -> anyhow::Result<()> {
         for number in 1..=self.count {
             let log = folder.join(format!("{EVALUATOR}-{number}.log"));
-            let mut command = self.command(reachable_at, Name::new(format!("{owner}-{EVALUATOR}-{number}")).ok());
+            let mut command =
+                self.command(reachable_at, Name::new(format!("{owner}-{EVALUATOR}-{number}")).ok());
             let started = run_beside(&mut command, &log).and_then(|()| command.spawn());
-            let process =
-                started.with_context(|| format!("cannot start an evaluator that logs to {}", log.display()))?;
+            let process = started.with_context(|| {
+                format!("cannot start an evaluator that logs to {}", log.display())
+            })?;
             let (process, since) = (Some(process), Instant::now());
             self.places.push(Place { command, log, process, since, pause: Duration::ZERO });
         }
         Ok(())
     }
 
-    /// The command of an evaluator. Without a name, as where that would be too long, it chooses one that no other has.
+    /// The command of an evaluator. Without a name, as where that would be too long, it chooses one
+    /// that no other has.
     fn command(&self, reachable_at: &[String], name: Option<Name>) -> Command {
         let mut command = Command::new(&self.program);
         command.arg("serve");
@@ -134,7 +148,8 @@ impl LocalEvaluators {
         self.places.first().map(|place| place.log.as_path())
     }
 
-    /// Starts others in place of evaluators that have ended by themselves, and returns log lines about them.
+    /// Starts others in place of evaluators that have ended by themselves, and returns log lines
+    /// about them.
     pub fn news(&mut self) -> Vec<String> {
         self.places.iter_mut().filter_map(|place| place.look(Instant::now())).collect()
     }
@@ -142,7 +157,8 @@ impl LocalEvaluators {
     /// Tells the evaluators to leave, and waits until they have.
     pub async fn end(&mut self) {
         let until = Instant::now() + LEAVE;
-        let mut processes: Vec<Child> = self.places.drain(..).filter_map(|place| place.process).collect();
+        let mut processes: Vec<Child> =
+            self.places.drain(..).filter_map(|place| place.process).collect();
         for process in &processes {
             kill_process(Pid::from_child(process), Signal::TERM).ok();
         }
@@ -159,8 +175,8 @@ impl LocalEvaluators {
 }
 
 impl Place {
-    /// Starts the next evaluator when it is time. One that ends again and again is started less and less often. Returns what
-    /// there is to say.
+    /// Starts the next evaluator when it is time. One that ends again and again is started less and
+    /// less often. Returns what there is to say.
     fn look(&mut self, now: Instant) -> Option<String> {
         let lasted = now.saturating_duration_since(self.since);
         let end = match &mut self.process {
@@ -182,7 +198,9 @@ impl Place {
         self.pause = if has_worked { PAUSE[0] } else { (2 * self.pause).clamp(PAUSE[0], PAUSE[1]) };
         self.since = now;
         let (seconds, log) = (self.pause.as_secs(), self.log.display());
-        Some(format!("an evaluator {end}; another takes its place in {seconds} s; their log is {log}"))
+        Some(format!(
+            "an evaluator {end}; another takes its place in {seconds} s; their log is {log}"
+        ))
     }
 }
 
@@ -194,7 +212,8 @@ mod tests {
     #[test]
     fn a_log_is_no_link_and_no_pipe() {
         let folder = tempfile::tempdir().unwrap();
-        let [precious, link, pipe] = ["precious", "link", "pipe"].map(|name| folder.path().join(name));
+        let [precious, link, pipe] =
+            ["precious", "link", "pipe"].map(|name| folder.path().join(name));
         std::fs::write(&precious, "precious").unwrap();
         std::os::unix::fs::symlink(&precious, &link).unwrap();
         assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
@@ -210,7 +229,13 @@ mod tests {
     #[test]
     fn one_that_ends_again_and_again_is_started_less_and_less_often() {
         let (mut now, log) = (Instant::now(), PathBuf::from("log"));
-        let mut place = Place { command: Command::new("false"), log, process: None, since: now, pause: Duration::ZERO };
+        let mut place = Place {
+            command: Command::new("false"),
+            log,
+            process: None,
+            since: now,
+            pause: Duration::ZERO,
+        };
         let mut pauses = Vec::new();
         for _ in 0..10 {
             assert_eq!(place.look(now), None, "it is started");
@@ -218,7 +243,10 @@ mod tests {
                 std::thread::sleep(GLANCE);
             }
             pauses.push(place.pause.as_secs());
-            assert!(place.look(now + place.pause - GLANCE).is_none() && place.process.is_none(), "that is too soon");
+            assert!(
+                place.look(now + place.pause - GLANCE).is_none() && place.process.is_none(),
+                "that is too soon"
+            );
             now += place.pause;
         }
         assert_eq!(pauses, [1, 2, 4, 8, 16, 32, 64, 128, 256, 300]);

@@ -1,5 +1,6 @@
-//! ∇_a Q_k(s, a): a custom operation of (weights, observations, actions) on the CPU. It goes forward and back through one tile
-//! of rows after the other, while the tile's activations are in a core's cache; tiles run in parallel.
+//! ∇_a Q_k(s, a): a custom operation of (weights, observations, actions) on the CPU. It goes
+//! forward and back through one tile of rows after the other, while the tile's activations are in a
+//! core's cache; tiles run in parallel.
 
 use crate::layers::TILE;
 use crate::mlp::Mlp;

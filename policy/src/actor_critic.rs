@@ -1,4 +1,5 @@
-//! Policies of a network that draws and of critics: the shapes of these, their tensors, and what loads them.
+//! Policies of a network that draws and of critics: the shapes of these, their tensors, and what
+//! loads them.
 
 use crate::candidates::{Actor, CandidatePolicy, Networks};
 use crate::choice::Choice;
@@ -35,7 +36,13 @@ impl ActorCriticShape {
     /// Shape of the critics.
     pub fn critics(&self) -> EnsembleShape {
         let Self { observation_dim, action_dim, critics, .. } = *self;
-        EnsembleShape { members: critics, observation_dim, action_dim, layers: self.critic.clone(), outputs: 1 }
+        EnsembleShape {
+            members: critics,
+            observation_dim,
+            action_dim,
+            layers: self.critic.clone(),
+            outputs: 1,
+        }
     }
 
     /// The tensors of a policy of these networks, as they are named in a file.
@@ -48,8 +55,8 @@ impl ActorCriticShape {
         Ok(tensors)
     }
 
-    /// Takes the networks of a policy out of a file's tensors: one of the shape `of_actor`, of which `actor` makes what draws,
-    /// and critics.
+    /// Takes the networks of a policy out of a file's tensors: one of the shape `of_actor`, of
+    /// which `actor` makes what draws, and critics.
     pub(crate) fn load<A: Actor + 'static>(
         &self,
         of_actor: EnsembleShape,

@@ -1,4 +1,5 @@
-//! Policies that draw candidates with noise and choose among them by what critics say, whatever it is that draws.
+//! Policies that draw candidates with noise and choose among them by what critics say, whatever it
+//! is that draws.
 
 use crate::choice::{Choice, Rule};
 use crate::ensemble::Ensemble;
@@ -19,11 +20,12 @@ pub(crate) trait Actor: Send + Sync {
     /// How many vectors of noise, each as long as an action, one action takes.
     fn noises(&self) -> usize;
 
-    /// Draws actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal `noise`, `[noises, rows, a]`;
-    /// equally many consecutive rows share a state.
+    /// Draws actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal
+    /// `noise`, `[noises, rows, a]`; equally many consecutive rows share a state.
     fn draw(&self, observations: &Tensor, noise: &Tensor) -> candle_core::Result<Tensor>;
 
-    /// Numbers that drawing so many actions in each of some states takes beside the noise and the actions.
+    /// Numbers that drawing so many actions in each of some states takes beside the noise and the
+    /// actions.
     fn memory(&self, states: u128, candidates: u128) -> u128;
 }
 
@@ -44,7 +46,11 @@ pub(crate) struct CandidatePolicy {
 }
 
 impl CandidatePolicy {
-    pub fn new(networks: Networks, choice: Choice, precision: Precision) -> Result<Self, PolicyError> {
+    pub fn new(
+        networks: Networks,
+        choice: Choice,
+        precision: Precision,
+    ) -> Result<Self, PolicyError> {
         Self { choice, networks: Arc::new(networks), precision }.choosing(choice)
     }
 
@@ -70,27 +76,43 @@ impl CandidatePolicy {
         noise
     }
 
-    /// The observations, `[states, observation_dim]`, and the candidates that this noise leads to, `[states · candidates, action_dim]`.
-    fn candidates(&self, observations: &[f32], noise: Vec<f32>) -> Result<(Tensor, Tensor), PolicyError> {
+    /// The observations, `[states, observation_dim]`, and the candidates that this noise leads to,
+    /// `[states · candidates, action_dim]`.
+    fn candidates(
+        &self,
+        observations: &[f32],
+        noise: Vec<f32>,
+    ) -> Result<(Tensor, Tensor), PolicyError> {
         let (observation_dim, action_dim) = self.networks.actor.dims();
         let states = observations.len() / observation_dim;
         let rows = states * self.choice.candidates as usize;
-        let observations = Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
-        let noise = Tensor::from_vec(noise, (self.networks.actor.noises(), rows, action_dim), &Device::Cpu)?;
+        let observations =
+            Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
+        let noise = Tensor::from_vec(
+            noise,
+            (self.networks.actor.noises(), rows, action_dim),
+            &Device::Cpu,
+        )?;
         let drawn = self.networks.actor.draw(&observations, &noise)?;
         Ok((observations, drawn))
     }
 
-    /// What the critics say of each of some actions, by the choice's [`Reduce`](crate::choice::Reduce).
+    /// What the critics say of each of some actions, by the choice's
+    /// [`Reduce`](crate::choice::Reduce).
     fn values(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>, PolicyError> {
         let rows = actions.dim(0)?;
         let values = self.networks.critics.values(observations, actions)?;
         Ok(read(&values, |values: &[f32]| self.choice.value.reduce(values, rows))?)
     }
 
-    /// Draws candidates with noise `noises × states × candidates × action_dim`. Gives these, `states × candidates × action_dim`,
-    /// and what the choice's rule compares of each, `states × candidates`: zeros where there is nothing to choose.
-    pub fn draw(&self, observations: &[f32], noise: Vec<f32>) -> Result<(Vec<f32>, Vec<f32>), PolicyError> {
+    /// Draws candidates with noise `noises × states × candidates × action_dim`. Gives these,
+    /// `states × candidates × action_dim`, and what the choice's rule compares of each, `states ×
+    /// candidates`: zeros where there is nothing to choose.
+    pub fn draw(
+        &self,
+        observations: &[f32],
+        noise: Vec<f32>,
+    ) -> Result<(Vec<f32>, Vec<f32>), PolicyError> {
         let (observations, drawn) = self.candidates(observations, noise)?;
         let worth = match self.choice.candidates {
             1 => vec![0.0; drawn.dim(0)?],
@@ -104,7 +126,9 @@ impl CandidatePolicy {
         let mut worth = self.values(observations, actions)?;
         if let (Rule::Nearest, Some(value)) = (self.choice.rule, &self.networks.value) {
             let of_states = read(&value.state_values(observations)?, <[f32]>::to_vec)?;
-            for (of_one, v) in worth.chunks_exact_mut(self.choice.candidates as usize).zip(of_states) {
+            for (of_one, v) in
+                worth.chunks_exact_mut(self.choice.candidates as usize).zip(of_states)
+            {
                 of_one.iter_mut().for_each(|q| *q = -(*q - v).powi(2));
             }
         }
@@ -156,17 +180,29 @@ impl Policy for CandidatePolicy {
         vec![self.networks.actor.noises(), self.choice.candidates as usize, self.action_dim()]
     }
 
-    fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
+    fn act(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError> {
         let (action_dim, candidates) = (self.action_dim(), self.choice.candidates as usize);
         let (drawn, worth) = self.draw(observations, self.drawn(states))?;
-        let of_each = drawn.chunks_exact(candidates * action_dim).zip(worth.chunks_exact(candidates)).zip(states);
+        let of_each = drawn
+            .chunks_exact(candidates * action_dim)
+            .zip(worth.chunks_exact(candidates))
+            .zip(states);
         for (action, ((drawn, worth), state)) in actions.chunks_exact_mut(action_dim).zip(of_each) {
             mean_of(&self.choice.pick(worth, state)?, drawn, action);
         }
         check_numbers("a sampled action", actions)
     }
 
-    fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Sampled, PolicyError> {
+    fn sample(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+    ) -> Result<Sampled, PolicyError> {
         let (observations, drawn) = self.candidates(observations, self.drawn(states))?;
         let values = self.values(&observations, &drawn)?;
         let actions = read(&drawn, <[f32]>::to_vec)?;

@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// How many actions are drawn in each state, and which of them is taken, or the mean of which. It travels in a policy's file; an
-/// operator may have the policy scored with another.
+/// How many actions are drawn in each state, and which of them is taken, or the mean of which. It
+/// travels in a policy's file; an operator may have the policy scored with another.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Choice {
-    /// Actions that are drawn, N_a of Eq. 25, within 1..=[`Self::MOST_CANDIDATES`]. Of one nothing is chosen, and the critics
-    /// are not asked.
+    /// Actions that are drawn, N_a of Eq. 25, within 1..=[`Self::MOST_CANDIDATES`]. Of one nothing
+    /// is chosen, and the critics are not asked.
     pub candidates: u32,
     /// How the values that the critics give an action become one.
     pub value: Reduce,
@@ -44,8 +44,9 @@ pub enum Rule {
     },
     /// The one whose value Q is nearest to the state's own, V: the largest -(Q - V)² (AlignIQL).
     Nearest,
-    /// The mean of several that are drawn, each once, with probabilities as of [`Self::Softmax`] (SfBC). Values count up to
-    /// forty temperatures above the smallest of as many largest, so that no draw is a certainty too early.
+    /// The mean of several that are drawn, each once, with probabilities as of [`Self::Softmax`]
+    /// (SfBC). Values count up to forty temperatures above the smallest of as many largest, so that
+    /// no draw is a certainty too early.
     Average {
         /// Temperature in units of the value, above 0.
         temperature: f32,
@@ -89,19 +90,27 @@ impl Choice {
     pub fn uniforms(&self) -> usize {
         match self.rule {
             Rule::Softmax { .. } if self.candidates > 1 => 1,
-            Rule::Average { actions, .. } if self.candidates > 1 => actions.min(self.candidates) as usize,
+            Rule::Average { actions, .. } if self.candidates > 1 => {
+                actions.min(self.candidates) as usize
+            }
             _ => 0,
         }
     }
 
-    /// Which of a state's candidates are taken: one, or several of which the mean is the action. `worth` has what the rule
-    /// compares of each: its value, or -(Q - V)².
-    pub(crate) fn pick(&self, worth: &[f32], state: &mut EpisodeState) -> Result<Vec<usize>, PolicyError> {
+    /// Which of a state's candidates are taken: one, or several of which the mean is the action.
+    /// `worth` has what the rule compares of each: its value, or -(Q - V)².
+    pub(crate) fn pick(
+        &self,
+        worth: &[f32],
+        state: &mut EpisodeState,
+    ) -> Result<Vec<usize>, PolicyError> {
         if worth.iter().any(|worth| worth.is_nan()) {
             return Err(PolicyError::NotANumber("the value of a candidate"));
         }
         Ok(match self.rule {
-            Rule::Softmax { temperature } if worth.len() > 1 => vec![draw(worth, temperature, state.uniform())],
+            Rule::Softmax { temperature } if worth.len() > 1 => {
+                vec![draw(worth, temperature, state.uniform())]
+            }
             Rule::Average { temperature, actions } if worth.len() > 1 => {
                 draw_several(worth, temperature, actions as usize, state)
             }
@@ -111,14 +120,17 @@ impl Choice {
 }
 
 impl Reduce {
-    /// The value of each of `rows` actions, of `values`, `critics × rows`. A NaN of one critic is kept.
+    /// The value of each of `rows` actions, of `values`, `critics × rows`. A NaN of one critic is
+    /// kept.
     pub(crate) fn reduce(self, values: &[f32], rows: usize) -> Vec<f32> {
         let critics = (values.len() / rows) as f32;
         let of_action = |row| {
             let values = values.iter().skip(row).step_by(rows).copied();
             match self {
                 Self::Mean => values.map(|q| q / critics).sum(),
-                Self::Min => values.fold(f32::INFINITY, |min, q| if q < min || q.is_nan() { q } else { min }),
+                Self::Min => {
+                    values.fold(f32::INFINITY, |min, q| if q < min || q.is_nan() { q } else { min })
+                }
             }
         };
         (0..rows).map(of_action).collect()
@@ -130,8 +142,8 @@ fn best(worth: &[f32]) -> usize {
     (1..worth.len()).fold(0, |best, i| if worth[i] > worth[best] { i } else { best })
 }
 
-/// A place, with a probability proportional to exp(worth / temperature); `uniform` is in [0, 1). Relative to the largest worth
-/// nothing overflows, and infinite worth counts as equal.
+/// A place, with a probability proportional to exp(worth / temperature); `uniform` is in [0, 1).
+/// Relative to the largest worth nothing overflows, and infinite worth counts as equal.
 fn draw(worth: &[f32], temperature: f32, uniform: f64) -> usize {
     let largest = worth[best(worth)];
     let weight = |worth: &f32| match *worth == largest {
@@ -148,8 +160,14 @@ fn draw(worth: &[f32], temperature: f32, uniform: f64) -> usize {
     place.unwrap_or(best(worth))
 }
 
-/// So many places, or all of fewer, each once, with a probability among those left as [`draw`] has it.
-fn draw_several(worth: &[f32], temperature: f32, count: usize, state: &mut EpisodeState) -> Vec<usize> {
+/// So many places, or all of fewer, each once, with a probability among those left as [`draw`] has
+/// it.
+fn draw_several(
+    worth: &[f32],
+    temperature: f32,
+    count: usize,
+    state: &mut EpisodeState,
+) -> Vec<usize> {
     let count = count.min(worth.len());
     let mut sorted = worth.to_vec();
     sorted.sort_unstable_by(|x, y| y.total_cmp(x));

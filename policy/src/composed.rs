@@ -1,5 +1,6 @@
-//! Layers act(x·W + b) whose backward pass is written out: products by candle, and one operation for bias, activation and its
-//! slope. So a GPU launches two kernels a layer forward and four backward, where candle's own differentiation takes some forty.
+//! Layers act(x·W + b) whose backward pass is written out: products by candle, and one operation
+//! for bias, activation and its slope. So a GPU launches two kernels a layer forward and four
+//! backward, where candle's own differentiation takes some forty.
 
 use crate::layers::Layers;
 use crate::slices::slice;
@@ -26,13 +27,19 @@ pub(crate) struct Pass {
 }
 
 impl Pass {
-    /// Computes the outputs for inputs `[rows, in]`, which all members share; `differentiable` keeps what a backward
-    /// pass needs.
-    pub fn forward(layers: &Arc<Layers>, weights: &Weights, x: &Tensor, differentiable: bool) -> Result<Self> {
+    /// Computes the outputs for inputs `[rows, in]`, which all members share; `differentiable`
+    /// keeps what a backward pass needs.
+    pub fn forward(
+        layers: &Arc<Layers>,
+        weights: &Weights,
+        x: &Tensor,
+        differentiable: bool,
+    ) -> Result<Self> {
         let values = weights.values().detach();
         let (rows, inputs) = x.dims2()?;
         // All members read the same numbers: no copy is made.
-        let x = x.detach().contiguous()?.unsqueeze(0)?.broadcast_as((layers.members, rows, inputs))?;
+        let x =
+            x.detach().contiguous()?.unsqueeze(0)?.broadcast_as((layers.members, rows, inputs))?;
         let mut pass = Self {
             layers: layers.clone(),
             count: values.elem_count(),
@@ -62,13 +69,19 @@ impl Pass {
         Ok(pass)
     }
 
-    /// The gradients of a loss, given that of the output, `[K, rows, out]`: of the whole vector of weights, if asked for, and of
-    /// each member's inputs, `[K, rows, in]`, if asked for.
-    pub fn backward(&self, gradient: &Tensor, weights: bool, inputs: bool) -> Result<(Option<Tensor>, Option<Tensor>)> {
+    /// The gradients of a loss, given that of the output, `[K, rows, out]`: of the whole vector of
+    /// weights, if asked for, and of each member's inputs, `[K, rows, in]`, if asked for.
+    pub fn backward(
+        &self,
+        gradient: &Tensor,
+        weights: bool,
+        inputs: bool,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let mut delta = gradient.contiguous()?;
         let mut parts = Vec::new();
         let (members, rows, _) = delta.dims3()?;
-        let ones = Tensor::ones((1, 1, rows), DType::F32, delta.device())?.broadcast_as((members, 1, rows))?;
+        let ones = Tensor::ones((1, 1, rows), DType::F32, delta.device())?
+            .broadcast_as((members, 1, rows))?;
         for layer in (0..self.layers.count()).rev() {
             if weights {
                 // From the last part to the first: a layer's biases follow its kernels.
@@ -100,7 +113,8 @@ impl Pass {
     }
 }
 
-/// The operation of (weights, inputs) by which candle's differentiation meets a pass: its outcome is that of the pass.
+/// The operation of (weights, inputs) by which candle's differentiation meets a pass: its outcome
+/// is that of the pass.
 pub(crate) struct Composed(pub Pass);
 
 impl Composed {
@@ -116,8 +130,16 @@ impl CustomOp2 for Composed {
         "composed-mlp"
     }
 
-    fn cpu_fwd(&self, _: &CpuStorage, _: &Layout, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
-        self.outcome(|storage, layout| Ok(CpuStorage::F32(crate::slices::on_cpu(storage, layout)?.to_vec())))
+    fn cpu_fwd(
+        &self,
+        _: &CpuStorage,
+        _: &Layout,
+        _: &CpuStorage,
+        _: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        self.outcome(|storage, layout| {
+            Ok(CpuStorage::F32(crate::slices::on_cpu(storage, layout)?.to_vec()))
+        })
     }
 
     #[cfg(feature = "cuda")]
@@ -141,13 +163,14 @@ impl CustomOp2 for Composed {
         _: &Tensor,
         gradient: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let (of_weights, of_inputs) = self.0.backward(gradient, weights.track_op(), x.track_op())?;
+        let (of_weights, of_inputs) =
+            self.0.backward(gradient, weights.track_op(), x.track_op())?;
         Ok((of_weights, of_inputs.map(|gradient| gradient.sum(0)).transpose()?))
     }
 }
 
-/// The operation of (z `[K, rows, width]`, biases `[K, width]`): f(z + bias), or z + bias without f, `[1, K, rows, width]`; with
-/// `slope` also the derivatives f'(z + bias), `[2, K, rows, width]`.
+/// The operation of (z `[K, rows, width]`, biases `[K, width]`): f(z + bias), or z + bias without
+/// f, `[1, K, rows, width]`; with `slope` also the derivatives f'(z + bias), `[2, K, rows, width]`.
 struct Activate {
     f: Option<Activation>,
     slope: bool,
@@ -164,16 +187,28 @@ impl CustomOp2 for Activate {
         "bias-activation"
     }
 
-    fn cpu_fwd(&self, z: &CpuStorage, z_layout: &Layout, bias: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
+    fn cpu_fwd(
+        &self,
+        z: &CpuStorage,
+        z_layout: &Layout,
+        bias: &CpuStorage,
+        l: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
         let (z, bias): (&[f32], &[f32]) = (slice(z, z_layout)?, slice(bias, l)?);
         let (width, member) = (l.dims()[1], z.len() / l.dims()[0]);
         let mut out = z.to_vec();
         let mut slopes = vec![0.0; if self.slope { z.len() } else { 0 }];
-        for (i, (out, bias)) in out.chunks_exact_mut(member).zip(bias.chunks_exact(width)).enumerate() {
+        for (i, (out, bias)) in
+            out.chunks_exact_mut(member).zip(bias.chunks_exact(width)).enumerate()
+        {
             match self.f {
-                Some(f) if self.slope => activate_with_slope(f, out, bias, &mut slopes[i * member..][..member]),
+                Some(f) if self.slope => {
+                    activate_with_slope(f, out, bias, &mut slopes[i * member..][..member])
+                }
                 Some(f) => activate(f, out, bias),
-                None => out.chunks_exact_mut(width).for_each(|row| row.iter_mut().zip(bias).for_each(|(x, b)| *x += b)),
+                None => out
+                    .chunks_exact_mut(width)
+                    .for_each(|row| row.iter_mut().zip(bias).for_each(|(x, b)| *x += b)),
             }
         }
         out.extend(slopes);

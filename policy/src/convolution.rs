@@ -1,5 +1,6 @@
-//! Convolutions along the steps of windows `[B, L, C]`, each as a product of unfolded windows: a row of the left side has the
-//! steps that a step of the result depends on. On the CPU one operation of candle's, tile by tile; elsewhere plain ones.
+//! Convolutions along the steps of windows `[B, L, C]`, each as a product of unfolded windows: a
+//! row of the left side has the steps that a step of the result depends on. On the CPU one
+//! operation of candle's, tile by tile; elsewhere plain ones.
 
 use crate::slices::{has_fast_implementation, read, slice};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
@@ -10,25 +11,33 @@ use rayon::prelude::*;
 /// Rows of unfolded windows that are worked on together.
 const ROWS: usize = 128;
 
-/// `x [B, L, C]`, `kernel [taps, C, C']`, `bias [C']` → `[B, L', C']`: every `stride`-th step, with zeros before the first and
-/// after the last, so that L' = ⌈L / stride⌉. `taps` is odd. Differentiable in all three.
-pub(crate) fn convolve(x: &Tensor, kernel: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
+/// `x [B, L, C]`, `kernel [taps, C, C']`, `bias [C']` → `[B, L', C']`: every `stride`-th step, with
+/// zeros before the first and after the last, so that L' = ⌈L / stride⌉. `taps` is odd.
+/// Differentiable in all three.
+pub(crate) fn convolve(
+    x: &Tensor,
+    kernel: &Tensor,
+    bias: &Tensor,
+    stride: usize,
+) -> Result<Tensor> {
     let ((windows, length, inputs), (taps, _, outputs)) = (x.dims3()?, kernel.dims3()?);
     let shape = Convolution { taps, stride, length, inputs, outputs };
     let x = x.contiguous()?;
     if has_fast_implementation(x.device()) {
         return x.apply_op3(&kernel.contiguous()?, &bias.contiguous()?, shape);
     }
-    let places = (0..shape.steps()).flat_map(|step| (0..taps).map(move |tap| (step * stride + tap) as u32));
+    let places =
+        (0..shape.steps()).flat_map(|step| (0..taps).map(move |tap| (step * stride + tap) as u32));
     let places = Tensor::from_iter(places, x.device())?;
     let rows = (windows * shape.steps(), taps * inputs);
-    let unfolded = x.pad_with_zeros(1, taps / 2, taps / 2)?.index_select(&places, 1)?.reshape(rows)?;
+    let unfolded =
+        x.pad_with_zeros(1, taps / 2, taps / 2)?.index_select(&places, 1)?.reshape(rows)?;
     let out = unfolded.matmul(&kernel.reshape((taps * inputs, outputs))?)?.broadcast_add(bias)?;
     out.reshape((windows, shape.steps(), outputs))
 }
 
-/// The transposed convolution of four taps and stride 2 that doubles the steps: `x [B, L, C]`, `kernel [C, 4, C']`, `bias [C']`
-/// → `[B, 2L, C']`. Tap j of step i adds to step 2i + j − 1.
+/// The transposed convolution of four taps and stride 2 that doubles the steps: `x [B, L, C]`,
+/// `kernel [C, 4, C']`, `bias [C']` → `[B, 2L, C']`. Tap j of step i adds to step 2i + j − 1.
 pub(crate) fn double(x: &Tensor, kernel: &Tensor, bias: &Tensor) -> Result<Tensor> {
     let ((windows, length, _), (inputs, taps, outputs)) = (x.dims3()?, kernel.dims3()?);
     let none = bias.zeros_like()?;
@@ -63,9 +72,13 @@ impl Convolution {
         (ROWS / self.steps()).max(1)
     }
 
-    /// Calls `work` with each step of the result, each of these taps, and the step of the window that the tap reads, if it is
-    /// within the window.
-    fn places(&self, taps: std::ops::Range<usize>, mut work: impl FnMut(usize, usize, Option<usize>)) {
+    /// Calls `work` with each step of the result, each of these taps, and the step of the window
+    /// that the tap reads, if it is within the window.
+    fn places(
+        &self,
+        taps: std::ops::Range<usize>,
+        mut work: impl FnMut(usize, usize, Option<usize>),
+    ) {
         for step in 0..self.steps() {
             for tap in taps.clone() {
                 let place = (step * self.stride + tap).checked_sub(self.taps / 2);
@@ -90,7 +103,9 @@ impl Convolution {
     /// Adds up what [`Self::unfold`] has copied, into zeros.
     fn fold(&self, unfolded: &[f32], x: &mut [f32]) {
         let (c, width) = (self.inputs, self.taps * self.inputs);
-        for (window, rows) in x.chunks_exact_mut(self.length * c).zip(unfolded.chunks_exact(self.steps() * width)) {
+        for (window, rows) in
+            x.chunks_exact_mut(self.length * c).zip(unfolded.chunks_exact(self.steps() * width))
+        {
             self.places(0..self.taps, |step, tap, place| {
                 if let Some(place) = place {
                     let from = &rows[step * width + tap * c..][..c];
@@ -102,7 +117,8 @@ impl Convolution {
 
     fn forward(&self, x: &[f32], kernel: &[f32], bias: &[f32]) -> Vec<f32> {
         let (tile, width) = (self.tile(), self.taps * self.inputs);
-        let mut out = vec![0.0; x.len() / (self.length * self.inputs) * self.steps() * self.outputs];
+        let mut out =
+            vec![0.0; x.len() / (self.length * self.inputs) * self.steps() * self.outputs];
         let tiles = out.par_chunks_mut(tile * self.steps() * self.outputs);
         tiles.zip(x.par_chunks(tile * self.length * self.inputs)).for_each(|(out, x)| {
             match self.taps {
@@ -121,14 +137,16 @@ impl Convolution {
         let rows = gradient.len() / self.outputs;
         let mut out = vec![0.0; rows / self.steps() * self.length * self.inputs];
         let tiles = out.par_chunks_mut(tile * self.length * self.inputs);
-        tiles.zip(gradient.par_chunks(tile * self.steps() * self.outputs)).for_each(|(out, gradient)| {
-            if self.taps == 1 {
-                return product_transposed(gradient, kernel, out, width, self.outputs);
-            }
-            let mut unfolded = vec![0.0; gradient.len() / self.outputs * width];
-            product_transposed(gradient, kernel, &mut unfolded, width, self.outputs);
-            self.fold(&unfolded, out);
-        });
+        tiles.zip(gradient.par_chunks(tile * self.steps() * self.outputs)).for_each(
+            |(out, gradient)| {
+                if self.taps == 1 {
+                    return product_transposed(gradient, kernel, out, width, self.outputs);
+                }
+                let mut unfolded = vec![0.0; gradient.len() / self.outputs * width];
+                product_transposed(gradient, kernel, &mut unfolded, width, self.outputs);
+                self.fold(&unfolded, out);
+            },
+        );
         out
     }
 
@@ -157,7 +175,11 @@ impl CustomOp3 for Convolution {
         bias: &CpuStorage,
         bias_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let out = self.forward(slice(x, x_layout)?, slice(kernel, kernel_layout)?, slice(bias, bias_layout)?);
+        let out = self.forward(
+            slice(x, x_layout)?,
+            slice(kernel, kernel_layout)?,
+            slice(bias, bias_layout)?,
+        );
         Ok((CpuStorage::F32(out), (x_layout.dims()[0], self.steps(), self.outputs).into()))
     }
 
@@ -170,10 +192,13 @@ impl CustomOp3 for Convolution {
         gradient: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let gradient = gradient.contiguous()?;
-        let tensor = |numbers: Vec<f32>, of: &Tensor| Tensor::from_vec(numbers, of.shape(), of.device());
+        let tensor =
+            |numbers: Vec<f32>, of: &Tensor| Tensor::from_vec(numbers, of.shape(), of.device());
         read(&gradient, |g: &[f32]| {
             let of_x = match x.track_op() {
-                true => Some(tensor(read(kernel, |kernel: &[f32]| self.input_gradient(kernel, g))?, x)?),
+                true => {
+                    Some(tensor(read(kernel, |kernel: &[f32]| self.input_gradient(kernel, g))?, x)?)
+                }
                 false => None,
             };
             let of_kernel = match kernel.track_op() {
@@ -201,7 +226,12 @@ mod tests {
     use crate::slices::plainly;
 
     /// The definition, number by number.
-    fn by_hand(x: &[Vec<Vec<f32>>], kernel: &[Vec<Vec<f32>>], bias: &[f32], stride: usize) -> Vec<f32> {
+    fn by_hand(
+        x: &[Vec<Vec<f32>>],
+        kernel: &[Vec<Vec<f32>>],
+        bias: &[f32],
+        stride: usize,
+    ) -> Vec<f32> {
         let (taps, length) = (kernel.len(), x[0].len());
         let mut out = Vec::new();
         for window in x {
@@ -224,15 +254,22 @@ mod tests {
     fn close(found: &Tensor, expected: &[f32]) {
         let found = found.flatten_all().unwrap().to_vec1::<f32>().unwrap();
         assert_eq!(found.len(), expected.len());
-        assert!(found.iter().zip(expected).all(|(x, y)| (x - y).abs() < 1e-5), "{found:?} {expected:?}");
+        assert!(
+            found.iter().zip(expected).all(|(x, y)| (x - y).abs() < 1e-5),
+            "{found:?} {expected:?}"
+        );
     }
 
     #[test]
     fn a_convolution_is_what_its_definition_says() {
-        for (length, taps, stride) in [(7, 5, 1), (1, 5, 1), (6, 3, 2), (5, 3, 2), (1, 3, 2), (4, 1, 1)] {
-            let (x, kernel, bias) = (random((3, length, 2), 0), random((taps, 2, 4), 1), random(4, 2));
+        for (length, taps, stride) in
+            [(7, 5, 1), (1, 5, 1), (6, 3, 2), (5, 3, 2), (1, 3, 2), (4, 1, 1)]
+        {
+            let (x, kernel, bias) =
+                (random((3, length, 2), 0), random((taps, 2, 4), 1), random(4, 2));
             let numbers = |x: &Tensor| x.to_vec3::<f32>().unwrap();
-            let expected = by_hand(&numbers(&x), &numbers(&kernel), &bias.to_vec1::<f32>().unwrap(), stride);
+            let expected =
+                by_hand(&numbers(&x), &numbers(&kernel), &bias.to_vec1::<f32>().unwrap(), stride);
             close(&convolve(&x, &kernel, &bias, stride).unwrap(), &expected);
             close(&plainly(|| convolve(&x, &kernel, &bias, stride)).unwrap(), &expected);
         }
@@ -242,14 +279,23 @@ mod tests {
     fn a_doubling_is_what_its_definition_says() {
         for length in [1, 2, 5] {
             let (x, kernel, bias) = (random((2, length, 3), 3), random((3, 4, 2), 4), random(2, 5));
-            let (rows, kernels, biases) =
-                (x.to_vec3::<f32>().unwrap(), kernel.to_vec3::<f32>().unwrap(), bias.to_vec1::<f32>().unwrap());
+            let (rows, kernels, biases) = (
+                x.to_vec3::<f32>().unwrap(),
+                kernel.to_vec3::<f32>().unwrap(),
+                bias.to_vec1::<f32>().unwrap(),
+            );
             let mut expected = biases.repeat(2 * 2 * length);
             for (b, window) in rows.iter().enumerate() {
                 for (i, row) in window.iter().enumerate() {
-                    for (tap, place) in (0..4).filter_map(|tap| Some((tap, (2 * i + tap).checked_sub(1)?))) {
+                    for (tap, place) in
+                        (0..4).filter_map(|tap| Some((tap, (2 * i + tap).checked_sub(1)?)))
+                    {
                         for o in (0..2).filter(|_| place < 2 * length) {
-                            let product: f32 = row.iter().zip(&kernels).map(|(x, kernel)| x * kernel[tap][o]).sum();
+                            let product: f32 = row
+                                .iter()
+                                .zip(&kernels)
+                                .map(|(x, kernel)| x * kernel[tap][o])
+                                .sum();
                             expected[(b * 2 * length + place) * 2 + o] += product;
                         }
                     }

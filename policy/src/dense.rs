@@ -23,7 +23,12 @@ pub(crate) struct Dense {
 }
 
 impl Dense {
-    pub fn new(start: usize, inputs: usize, outputs: usize, activation: Option<Activation>) -> Self {
+    pub fn new(
+        start: usize,
+        inputs: usize,
+        outputs: usize,
+        activation: Option<Activation>,
+    ) -> Self {
         Self { start, inputs, outputs, activation }
     }
 
@@ -47,14 +52,23 @@ impl Dense {
         self.activation.is_some()
     }
 
-    /// f(x·W + b), `[rows, out]`, of `x [rows, in]`; plus `added` c, `[n, out]`, where equally many consecutive rows share a
-    /// row of c. Where plain operations do it, it is differentiable in all of them; else in none.
+    /// f(x·W + b), `[rows, out]`, of `x [rows, in]`; plus `added` c, `[n, out]`, where equally many
+    /// consecutive rows share a row of c. Where plain operations do it, it is differentiable in all
+    /// of them; else in none.
     pub fn forward(&self, weights: &Tensor, x: &Tensor, added: Option<&Tensor>) -> Result<Tensor> {
         let (rows, width) = x.dims2()?;
-        let of_added = added.map(|added| added.dims2()).transpose()?.unwrap_or((rows, self.outputs));
-        let fits = of_added.0 > 0 && rows > 0 && rows.is_multiple_of(of_added.0) && of_added.1 == self.outputs;
+        let of_added =
+            added.map(|added| added.dims2()).transpose()?.unwrap_or((rows, self.outputs));
+        let fits = of_added.0 > 0
+            && rows > 0
+            && rows.is_multiple_of(of_added.0)
+            && of_added.1 == self.outputs;
         if width != self.inputs || !fits {
-            bail!("a layer of {} and {} numbers got {rows} × {width} and {of_added:?}", self.inputs, self.outputs);
+            bail!(
+                "a layer of {} and {} numbers got {rows} × {width} and {of_added:?}",
+                self.inputs,
+                self.outputs
+            );
         }
         if !has_fast_implementation(weights.device()) {
             return self.plain(weights, x, added);
@@ -118,7 +132,8 @@ impl CustomOp3 for Operation {
         added: &CpuStorage,
         added_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let (weights, x, added) = (slice(weights, weights_layout)?, slice(x, x_layout)?, slice(added, added_layout)?);
+        let (weights, x, added) =
+            (slice(weights, weights_layout)?, slice(x, x_layout)?, slice(added, added_layout)?);
         let (rows, n) = (x_layout.dims()[0], self.0.outputs);
         let repeat = if added.is_empty() { 1 } else { rows * n / added.len() };
         let mut out = vec![0.0; rows * n];

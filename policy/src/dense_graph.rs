@@ -1,8 +1,9 @@
 //! Networks whose dense layers form a graph: outputs are added to others, or stand beside them.
 //!
-//! On the CPU a network that is trained is one custom operation of candle's. It works on parts of the rows in parallel, each
-//! through all layers and back, and leaves the gradient where [`Weights`] keep it. Elsewhere, and for a network that only acts,
-//! the layers are operations of their own.
+//! On the CPU a network that is trained is one custom operation of candle's. It works on parts of
+//! the rows in parallel, each through all layers and back, and leaves the gradient where
+//! [`Weights`] keep it. Elsewhere, and for a network that only acts, the layers are operations of
+//! their own.
 
 use crate::dense::{Dense, add};
 use crate::kept_gradient::KeptGradient;
@@ -23,7 +24,8 @@ const PARTS: usize = 8;
 /// Weights whose gradient is added up at a time.
 const TOGETHER: usize = 1 << 14;
 
-/// How a value follows from those before it, which go by their numbers: the inputs' come first, then one for each step.
+/// How a value follows from those before it, which go by their numbers: the inputs' come first,
+/// then one for each step.
 pub(crate) enum Step {
     /// A layer of one value; plus another.
     Dense {
@@ -76,7 +78,8 @@ struct Part {
 }
 
 impl DenseGraph {
-    /// A network of inputs of these widths. Every layer's weights are in a vector of `len`, which they fill.
+    /// A network of inputs of these widths. Every layer's weights are in a vector of `len`, which
+    /// they fill.
     pub fn new(inputs: Vec<usize>, steps: Vec<Step>, len: usize) -> Self {
         let (count, mut widths) = (inputs.len(), inputs);
         for step in &steps {
@@ -85,32 +88,52 @@ impl DenseGraph {
                 Step::Beside(one, other) => widths[*one] + widths[*other],
             });
         }
-        let is_last = |i: usize, number: &usize| !steps[i + 1..].iter().any(|step| step.values().any(|n| n == *number));
-        let done =
-            steps.iter().enumerate().map(|(i, step)| step.values().filter(|n| is_last(i, n)).collect()).collect();
+        let is_last = |i: usize, number: &usize| {
+            !steps[i + 1..].iter().any(|step| step.values().any(|n| n == *number))
+        };
+        let done = steps
+            .iter()
+            .enumerate()
+            .map(|(i, step)| step.values().filter(|n| is_last(i, n)).collect())
+            .collect();
         Self { inputs: count, steps, widths, done, len, pool: Pool::default() }
     }
 
-    /// The output of these inputs, `[n, width]` each; of one with fewer rows equally many consecutive rows of the others share
-    /// one. Differentiable in the weights.
+    /// The output of these inputs, `[n, width]` each; of one with fewer rows equally many
+    /// consecutive rows of the others share one. Differentiable in the weights.
     pub fn forward(self: &Arc<Self>, weights: &Weights, inputs: &[Tensor]) -> Result<Tensor> {
         let values = weights.values();
-        if let Some(kept) =
-            weights.kept_gradient().filter(|_| values.track_op() && has_fast_implementation(values.device()))
+        if let Some(kept) = weights
+            .kept_gradient()
+            .filter(|_| values.track_op() && has_fast_implementation(values.device()))
         {
-            let rows = inputs.iter().map(|x| x.dim(0)).collect::<Result<Vec<_>>>()?.into_iter().max().unwrap_or(0);
-            let repeated = inputs.iter().map(|x| repeat_rows(x, rows / x.dim(0)?)).collect::<Result<Vec<_>>>()?;
+            let rows = inputs
+                .iter()
+                .map(|x| x.dim(0))
+                .collect::<Result<Vec<_>>>()?
+                .into_iter()
+                .max()
+                .unwrap_or(0);
+            let repeated = inputs
+                .iter()
+                .map(|x| repeat_rows(x, rows / x.dim(0)?))
+                .collect::<Result<Vec<_>>>()?;
             let x = Tensor::cat(&repeated, 1)?.detach();
-            let operation = Operation { graph: self.clone(), kept: kept.clone(), parts: self.pool.lend() };
+            let operation =
+                Operation { graph: self.clone(), kept: kept.clone(), parts: self.pool.lend() };
             return values.apply_op2(&x, operation);
         }
         let mut known: Vec<Option<Tensor>> = inputs.iter().cloned().map(Some).collect();
         for (step, done) in self.steps.iter().zip(&self.done) {
             let value = |number: usize| {
-                known[number].as_ref().ok_or_else(|| candle_core::Error::Msg("a value was dropped too early".into()))
+                known[number]
+                    .as_ref()
+                    .ok_or_else(|| candle_core::Error::Msg("a value was dropped too early".into()))
             };
             let next = match step {
-                Step::Dense { layer, x, added } => layer.forward(values, value(*x)?, added.map(value).transpose()?)?,
+                Step::Dense { layer, x, added } => {
+                    layer.forward(values, value(*x)?, added.map(value).transpose()?)?
+                }
                 Step::Beside(one, other) => Tensor::cat(&[value(*one)?, value(*other)?], 1)?,
             };
             known.push(Some(next));
@@ -145,8 +168,8 @@ impl DenseGraph {
                     added.iter().for_each(|added| add(value, &before[*added]));
                 }
                 Step::Beside(one, other) => {
-                    let pairs =
-                        rows_in(&before[*one], self.widths[*one]).zip(rows_in(&before[*other], self.widths[*other]));
+                    let pairs = rows_in(&before[*one], self.widths[*one])
+                        .zip(rows_in(&before[*other], self.widths[*other]));
                     for (out, (one, other)) in value.chunks_exact_mut(width).zip(pairs) {
                         out[..one.len()].copy_from_slice(one);
                         out[one.len()..].copy_from_slice(other);
@@ -173,12 +196,19 @@ impl DenseGraph {
                     if layer.is_active() {
                         multiply(&mut delta, &slopes[i]);
                     }
-                    let (kernel, bias) = of_weights[layer.range()].split_at_mut(layer.inputs * layer.outputs);
+                    let (kernel, bias) =
+                        of_weights[layer.range()].split_at_mut(layer.inputs * layer.outputs);
                     outer(&values[*x], &delta, kernel, layer.inputs, layer.outputs);
                     column_sums(&delta, bias);
                     if *x >= self.inputs {
                         scratch.resize(values[*x].len(), 0.0);
-                        product_transposed(&delta, layer.kernel(weights), &mut scratch, layer.inputs, layer.outputs);
+                        product_transposed(
+                            &delta,
+                            layer.kernel(weights),
+                            &mut scratch,
+                            layer.inputs,
+                            layer.outputs,
+                        );
                         deposit(&mut gradients[*x], &scratch);
                     }
                 }
@@ -186,7 +216,8 @@ impl DenseGraph {
                     let (left, width) = (self.widths[*one], self.widths[self.inputs + i]);
                     for (number, columns) in [(one, 0..left), (other, left..width)] {
                         scratch.clear();
-                        rows_in(&delta, width).for_each(|row| scratch.extend_from_slice(&row[columns.clone()]));
+                        rows_in(&delta, width)
+                            .for_each(|row| scratch.extend_from_slice(&row[columns.clone()]));
                         deposit(&mut gradients[*number], &scratch);
                     }
                 }
@@ -231,7 +262,8 @@ impl CustomOp2 for Operation {
         x_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let (weights, x) = (slice(weights, weights_layout)?, slice(x, x_layout)?);
-        let ((rows, width), outputs) = (x_layout.shape().dims2()?, self.graph.widths[self.graph.widths.len() - 1]);
+        let ((rows, width), outputs) =
+            (x_layout.shape().dims2()?, self.graph.widths[self.graph.widths.len() - 1]);
         let (mut out, of_part) = (vec![0.0; rows * outputs], rows_of_part(rows));
         let mut parts = self.parts.lock();
         parts.resize_with(rows.div_ceil(of_part), Part::default);
@@ -251,15 +283,20 @@ impl CustomOp2 for Operation {
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let ((rows, outputs), gradient) = (gradient.dims2()?, gradient.contiguous()?);
         let held = [weights, &gradient].map(Tensor::storage_and_layout);
-        let [weights, gradient] = held.each_ref().map(|(storage, layout)| on_cpu::<f32>(storage, layout));
+        let [weights, gradient] =
+            held.each_ref().map(|(storage, layout)| on_cpu::<f32>(storage, layout));
         let (weights, gradient) = (weights?, gradient?);
         let mut parts = self.parts.lock();
         let of_parts = parts.par_iter_mut().zip(gradient.par_chunks(rows_of_part(rows) * outputs));
-        of_parts.with_max_len(1).for_each(|(part, gradient)| self.graph.backward_part(weights, gradient, part));
+        of_parts
+            .with_max_len(1)
+            .for_each(|(part, gradient)| self.graph.backward_part(weights, gradient, part));
         self.kept.write(0..self.graph.len, |out| {
             out.par_chunks_mut(TOGETHER).enumerate().for_each(|(i, out)| {
                 out.fill(0.0);
-                parts.iter().for_each(|part| add(out, rows_of(&part.of_weights, i * TOGETHER, TOGETHER, 1)));
+                parts.iter().for_each(|part| {
+                    add(out, rows_of(&part.of_weights, i * TOGETHER, TOGETHER, 1))
+                });
             });
         })?;
         Ok((None, None))

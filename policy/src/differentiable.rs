@@ -1,4 +1,5 @@
-//! The named tensors of a network, through each of which a gradient flows to the network's vector of weights.
+//! The named tensors of a network, through each of which a gradient flows to the network's vector
+//! of weights.
 
 use crate::kept_gradient::KeptGradient;
 use crate::slices::{read, slice};
@@ -8,10 +9,13 @@ use std::ops::Range;
 use std::sync::Arc;
 
 impl Weights {
-    /// The named tensors. Where a gradient is taken of the weights, each leaves its own where the others' are kept: candle's
-    /// views of a vector would each make a gradient as long as the vector.
+    /// The named tensors. Where a gradient is taken of the weights, each leaves its own where the
+    /// others' are kept: candle's views of a vector would each make a gradient as long as the
+    /// vector.
     pub(crate) fn differentiable(&self) -> Result<Tensors> {
-        let Some(kept) = self.kept_gradient() else { return self.layout().split(self.values(), "") };
+        let Some(kept) = self.kept_gradient() else {
+            return self.layout().split(self.values(), "");
+        };
         let mut start = 0;
         let tensor = |part: &crate::weights::Part| {
             let range = start..start + part.shape.iter().product::<usize>();
@@ -43,7 +47,9 @@ impl CustomOp1 for View {
 
     fn bwd(&self, _: &Tensor, _: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
         let gradient = gradient.contiguous()?;
-        read(&gradient, |mine: &[f32]| self.kept.write(self.range.clone(), |out| out.copy_from_slice(mine)))??;
+        read(&gradient, |mine: &[f32]| {
+            self.kept.write(self.range.clone(), |out| out.copy_from_slice(mine))
+        })??;
         Ok(None)
     }
 }

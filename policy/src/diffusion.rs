@@ -1,5 +1,5 @@
-//! The diffusion policy: it draws candidates from the target actor, of which it takes one by what the target critics say of
-//! them, the best if nothing else is asked for (Eq. 25).
+//! The diffusion policy: it draws candidates from the target actor, of which it takes one by what
+//! the target critics say of them, the best if nothing else is asked for (Eq. 25).
 
 use crate::candidates::{Actor, CandidatePolicy, Networks};
 use crate::choice::Choice;
@@ -48,7 +48,12 @@ pub struct DiffusionShape {
 
 impl DiffusionShape {
     /// QUAD's: noise predictor and critics with the same hidden layers.
-    pub fn quad(dims: (usize, usize), layers: &MlpConfig, critics: usize, diffusion_steps: usize) -> Self {
+    pub fn quad(
+        dims: (usize, usize),
+        layers: &MlpConfig,
+        critics: usize,
+        diffusion_steps: usize,
+    ) -> Self {
         Self {
             observation_dim: dims.0,
             action_dim: dims.1,
@@ -63,13 +68,25 @@ impl DiffusionShape {
     /// Shape of the noise predictor.
     pub fn actor(&self) -> NoiseShape {
         let Self { observation_dim, action_dim, diffusion_steps, reverse, .. } = *self;
-        NoiseShape { observation_dim, action_dim, layers: self.actor.clone(), diffusion_steps, reverse }
+        NoiseShape {
+            observation_dim,
+            action_dim,
+            layers: self.actor.clone(),
+            diffusion_steps,
+            reverse,
+        }
     }
 
     /// Shape of the critics.
     pub fn critics(&self) -> EnsembleShape {
         let Self { observation_dim, action_dim, critics, .. } = *self;
-        EnsembleShape { members: critics, observation_dim, action_dim, layers: self.critic.clone(), outputs: 1 }
+        EnsembleShape {
+            members: critics,
+            observation_dim,
+            action_dim,
+            layers: self.critic.clone(),
+            outputs: 1,
+        }
     }
 
     /// Shape of the value function, if there is one.
@@ -86,12 +103,13 @@ impl DiffusionShape {
     }
 }
 
-/// The diffusion policy, of target actor, target critics and, if the choice takes it, a value function.
+/// The diffusion policy, of target actor, target critics and, if the choice takes it, a value
+/// function.
 pub struct DiffusionPolicy;
 
 impl DiffusionPolicy {
-    /// The tensors of a policy of these networks, as they are named in a file. There is a value function exactly if
-    /// the shape says so.
+    /// The tensors of a policy of these networks, as they are named in a file. There is a value
+    /// function exactly if the shape says so.
     pub fn tensors(
         actor: &NoisePredictor,
         critics: &Ensemble,
@@ -115,7 +133,8 @@ impl DiffusionPolicy {
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
         let actor = NoisePredictor::new(shape.actor(), weights, precision).packed()?;
         let critics = Ensemble::take(shape.critics(), tensors, CRITIC, precision)?;
-        let value = shape.value().map(|of| Ensemble::take(of, tensors, VALUE, precision)).transpose()?;
+        let value =
+            shape.value().map(|of| Ensemble::take(of, tensors, VALUE, precision)).transpose()?;
         CandidatePolicy::new(Networks { actor: Box::new(actor), critics, value }, choice, precision)
     }
 }

@@ -1,4 +1,5 @@
-//! The noise process in continuous time, and DPM-Solver (Lu et al. 2022), which goes back through it in few steps.
+//! The noise process in continuous time, and DPM-Solver (Lu et al. 2022), which goes back through
+//! it in few steps.
 
 use candle_core::{Result, Tensor};
 
@@ -29,7 +30,8 @@ impl ContinuousNoise {
     }
 }
 
-/// DPM-Solver-fast: single steps of order 3, the last ones of lower order so that the evaluations come out even.
+/// DPM-Solver-fast: single steps of order 3, the last ones of lower order so that the evaluations
+/// come out even.
 #[derive(Clone, Debug)]
 pub struct DpmSolver {
     /// Times from the beginning to the end: one for each evaluation, and the last.
@@ -55,12 +57,16 @@ impl DpmSolver {
         Self { times: (0..=evaluations).map(time).collect(), orders }
     }
 
-    /// Takes x, `[rows, a]`, from the noise that it is at the beginning to the end of the process. `noise` predicts the noise
-    /// in x at a time.
+    /// Takes x, `[rows, a]`, from the noise that it is at the beginning to the end of the process.
+    /// `noise` predicts the noise in x at a time.
     ///
     /// # Errors
     /// What `noise` fails with.
-    pub fn solve(&self, x: &Tensor, noise: impl Fn(&Tensor, f64) -> Result<Tensor>) -> Result<Tensor> {
+    pub fn solve(
+        &self,
+        x: &Tensor,
+        noise: impl Fn(&Tensor, f64) -> Result<Tensor>,
+    ) -> Result<Tensor> {
         let (mut x, mut first) = (x.clone(), 0);
         for order in &self.orders {
             x = step(&self.times[first..=first + order], &x, &noise)?;
@@ -71,14 +77,20 @@ impl DpmSolver {
 }
 
 /// One step from the first to the last of some times, whose number less one is its order.
-fn step(times: &[f64], x: &Tensor, noise: impl Fn(&Tensor, f64) -> Result<Tensor>) -> Result<Tensor> {
+fn step(
+    times: &[f64],
+    x: &Tensor,
+    noise: impl Fn(&Tensor, f64) -> Result<Tensor>,
+) -> Result<Tensor> {
     let at: Vec<_> = times.iter().map(|t| ContinuousNoise::at(*t)).collect();
     let [start, .., end] = at[..] else { return Ok(x.clone()) };
-    // How much λ has grown at a time, and x there if the predicted noise was the first one's all the way.
+    // How much λ has grown at a time, and x there if the predicted noise was the first one's all
+    // the way.
     let growth = |to: ContinuousNoise| to.half_log_ratio() - start.half_log_ratio();
     let epsilon = noise(x, times[0])?;
-    let straight =
-        |to: ContinuousNoise| (x * (to.signal / start.signal))? - (&epsilon * (to.deviation * growth(to).exp_m1()))?;
+    let straight = |to: ContinuousNoise| {
+        (x * (to.signal / start.signal))? - (&epsilon * (to.deviation * growth(to).exp_m1()))?
+    };
     // Of exponential integrators: (e^h - 1)/h - 1.
     let curvature = |h: f64| h.exp_m1() / h - 1.0;
     let h = growth(end);
@@ -91,7 +103,8 @@ fn step(times: &[f64], x: &Tensor, noise: impl Fn(&Tensor, f64) -> Result<Tensor
         [_, middle, later, _] => {
             let (h1, h2) = (growth(middle), growth(later));
             let change = (noise(&straight(middle)?, times[1])? - &epsilon)?;
-            let bent = (straight(later)? - (change * (h2 / h1 * later.deviation * curvature(h2)))?)?;
+            let bent =
+                (straight(later)? - (change * (h2 / h1 * later.deviation * curvature(h2)))?)?;
             let change = (noise(&bent, times[2])? - &epsilon)?;
             straight(end)? - (change * (h / h2 * end.deviation * curvature(h)))?
         }
@@ -119,7 +132,8 @@ mod tests {
         (signal * DATA.1).powi(2) + deviation.powi(2)
     }
 
-    /// Where the process takes x from one time to another: as many standard deviations from the mean.
+    /// Where the process takes x from one time to another: as many standard deviations from the
+    /// mean.
     fn exact(x: f64, from: f64, to: f64) -> f64 {
         let mean = |t| ContinuousNoise::at(t).signal * DATA.0;
         mean(to) + (x - mean(from)) * (variance(to) / variance(from)).sqrt()
@@ -131,7 +145,8 @@ mod tests {
         (found.to_vec2::<f64>().unwrap()[0][0] - exact(x, from, to)).abs()
     }
 
-    /// As steps are halved, the error falls to an eighth; to a quarter with one step of the first order.
+    /// As steps are halved, the error falls to an eighth; to a quarter with one step of the first
+    /// order.
     #[test]
     fn the_error_falls_with_the_third_power_of_the_step() {
         for (left, order) in [(2, 3.0), (1, 2.0)] {
@@ -152,11 +167,13 @@ mod tests {
         }
     }
 
-    /// What the authors' formulas, written a second time, make of 1.3. The last step decides: of the first order it falls short
-    /// (exact is 0.789), of the second it goes far beyond.
+    /// What the authors' formulas, written a second time, make of 1.3. The last step decides: of
+    /// the first order it falls short (exact is 0.789), of the second it goes far beyond.
     #[test]
     fn few_evaluations_give_what_the_formulas_say() {
-        for (evaluations, expected) in [(5, 1.1023273220338656), (6, 0.5953293444900605), (15, 0.7262775745014273)] {
+        for (evaluations, expected) in
+            [(5, 1.1023273220338656), (6, 0.5953293444900605), (15, 0.7262775745014273)]
+        {
             let x = Tensor::new(&[[1.3f64]], &Device::Cpu).unwrap();
             let found = DpmSolver::new(evaluations).solve(&x, exact_noise).unwrap();
             let found = found.to_vec2::<f64>().unwrap()[0][0];

@@ -1,5 +1,6 @@
-//! The denoiser of EDM (Karras et al. 2022, "Elucidating the Design Space of Diffusion-Based Generative Models") over
-//! actions: a network that is told how much noise there is, by a number that may be any.
+//! The denoiser of EDM (Karras et al. 2022, "Elucidating the Design Space of Diffusion-Based
+//! Generative Models") over actions: a network that is told how much noise there is, by a number
+//! that may be any.
 
 use crate::layers::Layers;
 use crate::mlp::Mlp;
@@ -45,7 +46,8 @@ impl NoiseLevels {
         self.column(device, |sigma| sigma)
     }
 
-    /// c_out of Karras et al.'s Table 1, `[B, 1]`: what comes out of the network is as many times as large.
+    /// c_out of Karras et al.'s Table 1, `[B, 1]`: what comes out of the network is as many times
+    /// as large.
     pub fn output_scale(&self, device: &Device) -> Result<Tensor> {
         self.column(device, |sigma| sigma * SIGMA_DATA / sigma.hypot(SIGMA_DATA))
     }
@@ -60,7 +62,8 @@ impl NoiseLevels {
 
     /// What the network is told of σ: sinusoids of ln(σ)/4, `[B, 16]`.
     fn features(&self, device: &Device) -> Result<Tensor> {
-        let features: Vec<f32> = self.0.iter().flat_map(|sigma| sinusoids(f64::from(*sigma).ln() / 4.0)).collect();
+        let features: Vec<f32> =
+            self.0.iter().flat_map(|sigma| sinusoids(f64::from(*sigma).ln() / 4.0)).collect();
         Tensor::from_vec(features, (self.0.len(), TIME_FEATURES), device)
     }
 
@@ -83,7 +86,8 @@ pub struct DenoiserShape {
 
 impl DenoiserShape {
     fn time_layers(&self) -> Layers {
-        let config = MlpConfig { initial: self.layers.initial, ..MlpConfig::mish(&[EMBEDDING_WIDTH]) };
+        let config =
+            MlpConfig { initial: self.layers.initial, ..MlpConfig::mish(&[EMBEDDING_WIDTH]) };
         Layers::new(1, TIME_FEATURES, &config, EMBEDDING, 0)
     }
 
@@ -101,7 +105,8 @@ impl DenoiserShape {
         self.layers.hidden.first().copied().unwrap_or(1)
     }
 
-    /// Tensors `time.{0,1}`, `input.0` and `trunk.{0..}`, each with `.kernel` `[in, out]` and `.bias` `[out]`.
+    /// Tensors `time.{0,1}`, `input.0` and `trunk.{0..}`, each with `.kernel` `[in, out]` and
+    /// `.bias` `[out]`.
     pub fn layout(&self) -> Layout {
         let mut parts = self.time_layers().named("time.", false);
         parts.extend(self.input_layers().named("input.", false));
@@ -135,17 +140,26 @@ impl Denoiser {
         Self { time, input, trunk, weights: self.weights.detach() }
     }
 
-    /// D(a + σ·n; s, σ), the clean actions that it sees in noisy ones, within ±1 (Karras et al.'s Eq. 7):
-    /// `observations [B, o]`, `noisy [B, a]` → `[B, a]`. Differentiable in weights, observations and actions.
+    /// D(a + σ·n; s, σ), the clean actions that it sees in noisy ones, within ±1 (Karras et al.'s
+    /// Eq. 7): `observations [B, o]`, `noisy [B, a]` → `[B, a]`. Differentiable in weights,
+    /// observations and actions.
     ///
     /// # Errors
     /// Shapes that do not fit, or candle fails.
-    pub fn denoise(&self, observations: &Tensor, noisy: &Tensor, levels: &NoiseLevels) -> Result<Tensor> {
+    pub fn denoise(
+        &self,
+        observations: &Tensor,
+        noisy: &Tensor,
+        levels: &NoiseLevels,
+    ) -> Result<Tensor> {
         let device = noisy.device();
-        let embedding = self.time.forward(&self.weights, &[&levels.features(device)?])?.squeeze(0)?;
+        let embedding =
+            self.time.forward(&self.weights, &[&levels.features(device)?])?.squeeze(0)?;
         let scaled = noisy.broadcast_mul(&levels.input_scale(device)?)?;
         // One linear map: the fast networks have hidden layers.
-        let x = self.input.plain_forward(&self.weights, &Tensor::cat(&[observations, &scaled, &embedding], 1)?)?;
+        let x = self
+            .input
+            .plain_forward(&self.weights, &Tensor::cat(&[observations, &scaled, &embedding], 1)?)?;
         let out = self.trunk.forward(&self.weights, &[&x.squeeze(0)?])?.squeeze(0)?;
         let skipped = noisy.broadcast_mul(&levels.skip_scale(device)?)?;
         (out.broadcast_mul(&levels.output_scale(device)?)? + skipped)?.clamp(-1f32, 1f32)
@@ -183,13 +197,16 @@ mod tests {
         assert!(sigma.iter().all(|x| (0.002..=80.0).contains(x)));
         sigma.sort_by(f32::total_cmp);
         // p/(1 − p) = (σ/0.5)²: quartiles at 0.5/√3 and 0.5·√3, and one in ten below 0.5/3.
-        for (share, expected) in [(0.1, 0.5 / 3.0), (0.25, 0.5 / 3f32.sqrt()), (0.5, 0.5), (0.75, 0.5 * 3f32.sqrt())] {
+        for (share, expected) in
+            [(0.1, 0.5 / 3.0), (0.25, 0.5 / 3f32.sqrt()), (0.5, 0.5), (0.75, 0.5 * 3f32.sqrt())]
+        {
             let found = sigma[(share * DRAWS as f64) as usize];
             assert!((found / expected - 1.0).abs() < 0.03, "{found} at {share}, not {expected}");
         }
     }
 
-    /// Clean actions of deviation 0.5 with noise have deviation 1 as the network sees them, and so has what it is to predict.
+    /// Clean actions of deviation 0.5 with noise have deviation 1 as the network sees them, and so
+    /// has what it is to predict.
     #[test]
     fn the_scales_keep_inputs_and_targets_at_variance_one() {
         for sigma in [0.002f64, 0.3, 0.5, 4.0, 80.0] {
@@ -199,11 +216,15 @@ mod tests {
             let (skip, out) = (of(levels.skip_scale(device)), of(levels.output_scale(device)));
             let input = of(levels.input_scale(device)).powi(2) * (sigma.powi(2) + 0.25);
             let target = ((1.0 - skip).powi(2) * 0.25 + (skip * sigma).powi(2)) / out.powi(2);
-            assert!((input - 1.0).abs() < 1e-5 && (target - 1.0).abs() < 1e-3, "{sigma}: {input} {target}");
+            assert!(
+                (input - 1.0).abs() < 1e-5 && (target - 1.0).abs() < 1e-3,
+                "{sigma}: {input} {target}"
+            );
         }
     }
 
-    /// Gradients by finite differences, through a denoiser as it is and through one whose weights are constant.
+    /// Gradients by finite differences, through a denoiser as it is and through one whose weights
+    /// are constant.
     #[test]
     fn gradients_reach_weights_and_actions() {
         let generator = &mut ChaCha8Rng::seed_from_u64(2);
@@ -222,11 +243,15 @@ mod tests {
         };
         let number = |x: Tensor| f64::from(x.to_scalar::<f32>().unwrap());
         let gradients = Gradients::of(&loss(&denoiser, &a)).unwrap();
-        let (w, of_weights) =
-            (denoiser.weights.values().detach(), gradients.with_respect_to(&denoiser.weights).unwrap());
+        let (w, of_weights) = (
+            denoiser.weights.values().detach(),
+            gradients.with_respect_to(&denoiser.weights).unwrap(),
+        );
         let of_actions = gradients.store.get(&a).unwrap().clone();
         let with = |w: Tensor| Denoiser::new(&shape, Weights::constant(shape.layout(), w));
-        for (what, at, gradient) in [("weights", &w, &of_weights), ("actions", &a.detach(), &of_actions)] {
+        for (what, at, gradient) in
+            [("weights", &w, &of_weights), ("actions", &a.detach(), &of_actions)]
+        {
             let size = number(gradient.sqr().unwrap().sum_all().unwrap()).sqrt();
             let moved = |by: f64| (at + (gradient * (by / size)).unwrap()).unwrap();
             let value = |by: f64| match what {
@@ -239,7 +264,12 @@ mod tests {
         let constant = denoiser.detach();
         let gradients = Gradients::of(&loss(&constant, &a)).unwrap();
         let same = |(x, y): (&f32, &f32)| (x - y).abs() < 1e-5;
-        assert!(numbers(gradients.store.get(&a).unwrap()).iter().zip(&numbers(&of_actions)).all(same));
-        assert!(gradients.with_respect_to(&denoiser.weights).is_err(), "no gradient reaches constants");
+        assert!(
+            numbers(gradients.store.get(&a).unwrap()).iter().zip(&numbers(&of_actions)).all(same)
+        );
+        assert!(
+            gradients.with_respect_to(&denoiser.weights).is_err(),
+            "no gradient reaches constants"
+        );
     }
 }

@@ -7,16 +7,18 @@ use rand_distr::{Distribution, StandardNormal};
 /// The stream, among those of an episode's seed, that a policy draws from.
 const POLICY_STREAM: u64 = 2;
 
-/// What a policy carries through one episode. Each episode has its own, so that its outcome does not depend on which other
-/// episodes share a batch with it.
+/// What a policy carries through one episode. Each episode has its own, so that its outcome does
+/// not depend on which other episodes share a batch with it.
 pub struct EpisodeState {
     noise: ChaCha8Rng,
-    /// Numbers that the policy keeps from one step to the next, such as a plan or a history; none when an episode begins.
+    /// Numbers that the policy keeps from one step to the next, such as a plan or a history; none
+    /// when an episode begins.
     pub memory: Vec<f32>,
 }
 
 impl EpisodeState {
-    /// Begins an episode. Its noise is a stream of the episode's seed that the environment does not use.
+    /// Begins an episode. Its noise is a stream of the episode's seed that the environment does not
+    /// use.
     pub fn new(seed: u64) -> Self {
         let mut noise = ChaCha8Rng::seed_from_u64(seed);
         noise.set_stream(POLICY_STREAM);
@@ -38,7 +40,8 @@ impl EpisodeState {
 mod tests {
     use super::*;
 
-    /// The environments of the evaluator draw the initial state from stream 1 of an episode's seed, the goal from stream 4.
+    /// The environments of the evaluator draw the initial state from stream 1 of an episode's seed,
+    /// the goal from stream 4.
     #[test]
     fn a_policy_s_noise_is_apart_from_the_initial_state_and_the_goal() {
         let mut noise = [0.0; 4];

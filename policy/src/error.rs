@@ -85,7 +85,11 @@ pub enum PolicyError {
 pub(crate) const MOST: usize = u16::MAX as usize;
 
 /// Checks that a number of a shape is from 1 to `most`.
-pub(crate) fn check_range(field: &'static str, value: usize, most: usize) -> Result<(), PolicyError> {
+pub(crate) fn check_range(
+    field: &'static str,
+    value: usize,
+    most: usize,
+) -> Result<(), PolicyError> {
     if (1..=most).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
 }
 

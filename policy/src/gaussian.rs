@@ -1,4 +1,5 @@
-//! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is sampled.
+//! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is
+//! sampled.
 
 use crate::ensemble::Ensemble;
 use crate::episode::EpisodeState;
@@ -43,7 +44,8 @@ pub struct GaussianPolicy {
     actor: Ensemble,
 }
 
-/// The mean of the policy with this network: `observations [n, o]` → `[n, a]`, each number in (-1, 1).
+/// The mean of the policy with this network: `observations [n, o]` → `[n, a]`, each number in (-1,
+/// 1).
 pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> {
     actor.state_outputs(observations)?.squeeze(0)?.tanh()
 }
@@ -54,7 +56,10 @@ impl GaussianPolicy {
         actor.weights().tensors(ACTOR)
     }
 
-    pub(crate) fn load(shape: GaussianShape, tensors: &mut Tensors) -> std::result::Result<Self, PolicyError> {
+    pub(crate) fn load(
+        shape: GaussianShape,
+        tensors: &mut Tensors,
+    ) -> std::result::Result<Self, PolicyError> {
         check_range("observation_dim", shape.observation_dim, MOST)?;
         check_range("action_dim", shape.action_dim, MOST)?;
         let actor = Ensemble::take(shape.actor(), tensors, ACTOR, Precision::F32)?;
@@ -78,7 +83,10 @@ impl Policy for GaussianPolicy {
     fn memory(&self, states: usize) -> u64 {
         let GaussianShape { observation_dim, action_dim, .. } = self.shape;
         let states = states as u128;
-        bytes(self.shape.actor().memory(states, 1) + states * (observation_dim + 2 * action_dim) as u128)
+        bytes(
+            self.shape.actor().memory(states, 1)
+                + states * (observation_dim + 2 * action_dim) as u128,
+        )
     }
 
     fn act(
@@ -87,7 +95,11 @@ impl Policy for GaussianPolicy {
         states: &mut [EpisodeState],
         actions: &mut [f32],
     ) -> std::result::Result<(), PolicyError> {
-        let observations = Tensor::from_slice(observations, (states.len(), self.shape.observation_dim), &Device::Cpu)?;
+        let observations = Tensor::from_slice(
+            observations,
+            (states.len(), self.shape.observation_dim),
+            &Device::Cpu,
+        )?;
         let means = gaussian_mean(&self.actor, &observations)?;
         read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
         check_numbers("an action", actions)

@@ -1,5 +1,5 @@
-//! Tests: the sampler and acting by the best of several candidates, against an independent implementation
-//! (tests/golden/README.md).
+//! Tests: the sampler and acting by the best of several candidates, against an independent
+//! implementation (tests/golden/README.md).
 
 #[path = "../../tests/golden/golden.rs"]
 mod reader;
@@ -45,7 +45,8 @@ fn file(shape: DiffusionShape, choice: Choice, tensors: &Tensors) -> Vec<u8> {
 fn golden_reverse_steps() {
     for golden in goldens("quad") {
         let shape = shape(&golden).actor();
-        let weights = Weights::take(shape.layout(), &mut golden.state.clone(), "target_actor.").unwrap();
+        let weights =
+            Weights::take(shape.layout(), &mut golden.state.clone(), "target_actor.").unwrap();
         let actor = NoisePredictor::new(shape.clone(), weights, Precision::F32);
         let observations = golden.input("observations", &Device::Cpu);
         let rows = observations.dim(0).unwrap();
@@ -67,11 +68,15 @@ fn golden_choices() {
     for golden in goldens("quad") {
         let (shape, candidates) = (shape(&golden), golden.count("/agent/candidates"));
         let choice = Choice::best_of(candidates as u32);
-        let network =
-            |(name, tensor): (&String, &Tensor)| Some((name.strip_prefix("target_")?.to_owned(), tensor.clone()));
+        let network = |(name, tensor): (&String, &Tensor)| {
+            Some((name.strip_prefix("target_")?.to_owned(), tensor.clone()))
+        };
         let mut tensors = golden.state.iter().filter_map(network).collect();
-        let policy = DiffusionPolicy::load(shape.clone(), choice, &mut tensors, Precision::F32).unwrap();
-        let numbers = |name: &str| golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let policy =
+            DiffusionPolicy::load(shape.clone(), choice, &mut tensors, Precision::F32).unwrap();
+        let numbers = |name: &str| {
+            golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        };
         let (observations, noise) = (numbers("select_observations"), numbers("select_noise"));
         let (drawn, values) = policy.draw(&observations, noise).unwrap();
         let chosen = |values| choice.pick(values, &mut policy.begin(0)).unwrap()[0];
@@ -83,7 +88,10 @@ fn golden_choices() {
         golden.close("select.q", &tensor(values));
         golden.close("select.actions", &tensor(actions));
         let index: Vec<i64> = golden.expected["select.index"].to_vec1().unwrap();
-        assert!(chosen.iter().zip(&index).all(|(found, expected)| *found as i64 == *expected), "{chosen:?} {index:?}");
+        assert!(
+            chosen.iter().zip(&index).all(|(found, expected)| *found as i64 == *expected),
+            "{chosen:?} {index:?}"
+        );
     }
 }
 
@@ -95,9 +103,14 @@ fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>
     load_policy(&file_of(choice, critic, v, None), Precision::F32)
 }
 
-/// The file of a policy whose critics' weights are so large, of both signs, and whose value function says `v` in every state, if
-/// it has one.
-pub(crate) fn file_of(choice: Choice, critic: f32, v: Option<f32>, scaling: Option<Scaling>) -> Vec<u8> {
+/// The file of a policy whose critics' weights are so large, of both signs, and whose value
+/// function says `v` in every state, if it has one.
+pub(crate) fn file_of(
+    choice: Choice,
+    critic: f32,
+    v: Option<f32>,
+    scaling: Option<Scaling>,
+) -> Vec<u8> {
     let shape = DiffusionShape { value: v.map(|_| small().critic), ..small() };
     let weights = |layout: Layout, size: f32, last: f32| {
         let values = (1..=layout.count()).map(|i| match i / 3 % 2 {
@@ -107,10 +120,19 @@ pub(crate) fn file_of(choice: Choice, critic: f32, v: Option<f32>, scaling: Opti
         });
         Weights::constant(layout.clone(), Tensor::from_iter(values, &Device::Cpu).unwrap())
     };
-    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), 0.1, 0.1), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), critic, critic), Precision::F32);
+    let actor = NoisePredictor::new(
+        shape.actor(),
+        weights(shape.actor().layout(), 0.1, 0.1),
+        Precision::F32,
+    );
+    let critics = Ensemble::new(
+        shape.critics(),
+        weights(shape.critics().layout(), critic, critic),
+        Precision::F32,
+    );
     let value = shape.value().zip(v);
-    let value = value.map(|(of, v)| Ensemble::new(of.clone(), weights(of.layout(), 0.0, v), Precision::F32));
+    let value = value
+        .map(|(of, v)| Ensemble::new(of.clone(), weights(of.layout(), 0.0, v), Precision::F32));
     let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
     let policy = PolicyConfig::Diffusion { shape, choice };
     Header { scaling, ..Header::new(policy, ()) }.to_safetensors(&tensors).unwrap()
@@ -122,17 +144,22 @@ fn first_action(policy: &dyn Policy, observation: [f32; 4]) -> Result<Vec<f32>, 
     policy.act(&observation, &mut [policy.begin(3)], &mut actions).map(|()| actions)
 }
 
-/// Finite weights so large that values overflow: the error says what is not a number, and nothing is chosen.
+/// Finite weights so large that values overflow: the error says what is not a number, and nothing
+/// is chosen.
 #[test]
 fn a_candidate_without_a_value_is_an_error() {
-    let [good, broken] = [0.1, 1e38].map(|critic| policy(Choice::best_of(5), critic, None).unwrap());
+    let [good, broken] =
+        [0.1, 1e38].map(|critic| policy(Choice::best_of(5), critic, None).unwrap());
     // Of both signs, so that infinities meet.
     let observation = [1.0, -1.0, 1.0, 1.0];
     assert!(first_action(&*good, observation).is_ok());
     let value = first_action(&*broken, observation).unwrap_err().to_string();
     assert!(value.contains("value of a candidate is not a number"), "{value}");
     let of_one = broken.with_choice(Choice::best_of(1)).unwrap();
-    assert!(first_action(&*of_one, observation).is_ok(), "of one candidate the critics are not asked");
+    assert!(
+        first_action(&*of_one, observation).is_ok(),
+        "of one candidate the critics are not asked"
+    );
     let sampled = of_one.sample(&observation, &mut [of_one.begin(3)]).unwrap_err().to_string();
     assert!(sampled.contains("value of a candidate is not a number"), "{sampled}");
     assert!(of_one.value(&observation, &[0.5, -0.5]).is_err());
@@ -149,7 +176,10 @@ fn a_shape_out_of_range_is_refused() {
         matches!(load_policy(&file, Precision::F32), Err(PolicyError::Range { .. }))
     };
     for steps in [0, 1001, (1 << 58) + 1, usize::MAX] {
-        assert!(refused(DiffusionShape { diffusion_steps: steps, ..good.clone() }), "{steps} denoising steps");
+        assert!(
+            refused(DiffusionShape { diffusion_steps: steps, ..good.clone() }),
+            "{steps} denoising steps"
+        );
     }
     assert!(refused(DiffusionShape { critics: 0, ..good.clone() }));
     assert!(!refused(good), "it lacks its tensors, but its shape is one");
@@ -170,11 +200,19 @@ fn the_file_s_rule_chooses_unless_another_is_asked_for() {
     assert_eq!((other.choice(), act(&*other)), (Some(cold), high.clone()));
     assert!(matches!(policy_of_best.with_choice(nearest), Err(PolicyError::NoValue)));
     assert!(matches!(policy(nearest, 0.1, None), Err(PolicyError::NoValue)));
-    assert!(matches!(policy_of_best.with_choice(Choice::best_of(10_001)), Err(PolicyError::Range { .. })));
-    assert_eq!((policy_of_best.choice(), act(&*policy_of_best)), (Some(best), high), "it stays as it is");
+    assert!(matches!(
+        policy_of_best.with_choice(Choice::best_of(10_001)),
+        Err(PolicyError::Range { .. })
+    ));
+    assert_eq!(
+        (policy_of_best.choice(), act(&*policy_of_best)),
+        (Some(best), high),
+        "it stays as it is"
+    );
 }
 
-/// What is drawn in some states: `act` takes of each state's candidates the one of the largest value, which `value` gives, too.
+/// What is drawn in some states: `act` takes of each state's candidates the one of the largest
+/// value, which `value` gives, too.
 #[test]
 fn what_is_sampled_is_what_is_chosen_among() {
     for value in [Reduce::Mean, Reduce::Min] {

@@ -1,9 +1,12 @@
 //! Candle's tensors on a GPU as the kernels of `quad_kernels::cuda` take them.
 
 use candle_core::cuda_backend::CudaDType;
-use candle_core::cuda_backend::cudarc::driver::{CudaSlice, CudaStream, CudaView, CudaViewMut, DeviceRepr};
+use candle_core::cuda_backend::cudarc::driver::{
+    CudaSlice, CudaStream, CudaView, CudaViewMut, DeviceRepr,
+};
 use candle_core::{
-    CpuStorage, CudaStorage, Device, Error, InplaceOp1, Layout, Result, Shape, Storage, Tensor, WithDType, bail,
+    CpuStorage, CudaStorage, Device, Error, InplaceOp1, Layout, Result, Shape, Storage, Tensor,
+    WithDType, bail,
 };
 use quad_kernels::cuda::CudaError;
 use std::cell::Cell;
@@ -42,7 +45,10 @@ pub(crate) fn with_stream(
 }
 
 /// Hands the numbers of a contiguous tensor to `work`.
-pub(crate) fn read<R>(tensor: &Tensor, work: impl FnOnce(&CudaView<'_, f32>) -> Result<R>) -> Result<R> {
+pub(crate) fn read<R>(
+    tensor: &Tensor,
+    work: impl FnOnce(&CudaView<'_, f32>) -> Result<R>,
+) -> Result<R> {
     let (storage, layout) = tensor.storage_and_layout();
     match &*storage {
         Storage::Cuda(storage) => work(&view(storage, layout)?),
@@ -57,7 +63,9 @@ pub(crate) fn modify<T: CudaDType, R>(
 ) -> Result<R> {
     /// Candle asks for an operation that could be applied many times; this one is applied once.
     struct Once<T, F, R>(Cell<Option<F>>, Cell<Option<R>>, PhantomData<T>);
-    impl<T: CudaDType, R, F: FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, T>) -> Result<R>> InplaceOp1 for Once<T, F, R> {
+    impl<T: CudaDType, R, F: FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, T>) -> Result<R>>
+        InplaceOp1 for Once<T, F, R>
+    {
         fn name(&self) -> &'static str {
             "modify"
         }
@@ -81,17 +89,28 @@ pub(crate) fn modify<T: CudaDType, R>(
 }
 
 /// Writes the numbers of a tensor on the CPU over those of a contiguous one on the GPU.
-pub(crate) fn overwrite<T: CudaDType + DeviceRepr + WithDType>(tensor: &Tensor, with: &Tensor) -> Result<()> {
+pub(crate) fn overwrite<T: CudaDType + DeviceRepr + WithDType>(
+    tensor: &Tensor,
+    with: &Tensor,
+) -> Result<()> {
     if tensor.elem_count() != with.elem_count() {
         bail!("{:?} cannot be written over {:?}", with.shape(), tensor.shape());
     }
-    let copy = |with: &[T]| modify(tensor, |stream, numbers| stream.memcpy_htod(with, numbers).map_err(Error::wrap));
+    let copy = |with: &[T]| {
+        modify(tensor, |stream, numbers| stream.memcpy_htod(with, numbers).map_err(Error::wrap))
+    };
     crate::slices::read(with, copy)?
 }
 
 /// Numbers of the GPU as a tensor.
-pub(crate) fn tensor(numbers: CudaSlice<f32>, shape: impl Into<Shape>, like: &Tensor) -> Result<Tensor> {
-    let candle_core::Device::Cuda(device) = like.device() else { bail!("a tensor is not on the GPU") };
+pub(crate) fn tensor(
+    numbers: CudaSlice<f32>,
+    shape: impl Into<Shape>,
+    like: &Tensor,
+) -> Result<Tensor> {
+    let candle_core::Device::Cuda(device) = like.device() else {
+        bail!("a tensor is not on the GPU")
+    };
     let storage = Storage::Cuda(CudaStorage::wrap_cuda_slice(numbers, device.clone()));
     Ok(Tensor::from_storage(storage, shape, candle_core::op::BackpropOp::none(), false))
 }

@@ -18,8 +18,8 @@ impl Gradients {
         Ok(Self { store: store?, pass })
     }
 
-    /// Gradient of all weights of a network, in the order of its vector. The next backward pass to these weights
-    /// overwrites it.
+    /// Gradient of all weights of a network, in the order of its vector. The next backward pass to
+    /// these weights overwrites it.
     ///
     /// # Errors
     /// The loss does not depend on them, or another backward pass has come in between.

@@ -1,5 +1,6 @@
-//! Group norm over groups of channels and all steps of a window (Wu and He 2018), followed by Mish: one operation of candle's on
-//! the CPU, which computes the statistics again on the backward pass; plain ones elsewhere.
+//! Group norm over groups of channels and all steps of a window (Wu and He 2018), followed by Mish:
+//! one operation of candle's on the CPU, which computes the statistics again on the backward pass;
+//! plain ones elsewhere.
 
 use crate::plain::mish;
 use crate::slices::{has_fast_implementation, read, slice};
@@ -10,9 +11,15 @@ use rayon::prelude::*;
 /// Added to the variance, as in PyTorch.
 const EPSILON: f32 = 1e-5;
 
-/// Mish((x − mean)/√(variance + ε)·scale + shift), for `x [B, L, C]` and `[C]`, with the moments of each window and each of the
-/// `groups` of consecutive channels, whose number divides C. Differentiable in all three.
-pub(crate) fn normed_mish(x: &Tensor, scale: &Tensor, shift: &Tensor, groups: usize) -> Result<Tensor> {
+/// Mish((x − mean)/√(variance + ε)·scale + shift), for `x [B, L, C]` and `[C]`, with the moments of
+/// each window and each of the `groups` of consecutive channels, whose number divides C.
+/// Differentiable in all three.
+pub(crate) fn normed_mish(
+    x: &Tensor,
+    scale: &Tensor,
+    shift: &Tensor,
+    groups: usize,
+) -> Result<Tensor> {
     let (windows, length, channels) = x.dims3()?;
     if has_fast_implementation(x.device()) {
         let operation = NormedMish { groups, channels, length };
@@ -82,23 +89,36 @@ impl NormedMish {
     }
 
     /// The gradients of a window's numbers, and of scale and shift, `[2, C]`, by this window.
-    fn backward(&self, x: &[f32], [scale, shift]: [&[f32]; 2], gradient: &[f32], out: &mut [f32], sums: &mut [f32]) {
+    fn backward(
+        &self,
+        x: &[f32],
+        [scale, shift]: [&[f32]; 2],
+        gradient: &[f32],
+        out: &mut [f32],
+        sums: &mut [f32],
+    ) {
         let (mut normed, mut slope) = (vec![0.0; x.len()], vec![0.0; x.len()]);
         let inverse = self.norm(x, &mut normed);
         out.copy_from_slice(&normed);
         scale_rows(out, scale);
         activate_with_slope(Activation::Mish, out, shift, &mut slope);
         // Before the activation.
-        out.iter_mut().zip(gradient.iter().zip(&slope)).for_each(|(out, (g, slope))| *out = g * slope);
+        out.iter_mut()
+            .zip(gradient.iter().zip(&slope))
+            .for_each(|(out, (g, slope))| *out = g * slope);
         let (of_scale, of_shift) = sums.split_at_mut(self.channels);
         add_rows(of_scale, out, &normed, |delta, x| delta * x);
         add_rows(of_shift, out, &normed, |delta, _| delta);
         // Before scale and shift; then through the moments.
-        let mut along: Vec<f32> = of_scale.iter().zip(scale).map(|(sum, scale)| sum * scale).collect();
-        let mut mean: Vec<f32> = of_shift.iter().zip(scale).map(|(sum, scale)| sum * scale).collect();
+        let mut along: Vec<f32> =
+            of_scale.iter().zip(scale).map(|(sum, scale)| sum * scale).collect();
+        let mut mean: Vec<f32> =
+            of_shift.iter().zip(scale).map(|(sum, scale)| sum * scale).collect();
         self.spread(&mut along);
         self.spread(&mut mean);
-        for (out, normed) in out.chunks_exact_mut(self.channels).zip(normed.chunks_exact(self.channels)) {
+        for (out, normed) in
+            out.chunks_exact_mut(self.channels).zip(normed.chunks_exact(self.channels))
+        {
             for (i, (out, x)) in out.iter_mut().zip(normed).enumerate() {
                 *out = (*out * scale[i] - mean[i] - x * along[i]) * inverse[i];
             }
@@ -127,7 +147,11 @@ impl CustomOp3 for NormedMish {
         shift: &CpuStorage,
         shift_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let out = self.forward(slice(x, x_layout)?, slice(scale, scale_layout)?, slice(shift, shift_layout)?);
+        let out = self.forward(
+            slice(x, x_layout)?,
+            slice(scale, scale_layout)?,
+            slice(shift, shift_layout)?,
+        );
         Ok((CpuStorage::F32(out), x_layout.shape().clone()))
     }
 
@@ -145,7 +169,8 @@ impl CustomOp3 for NormedMish {
         let mut sums = vec![0.0; x.elem_count() / self.size() * 2 * self.channels];
         read(x, |x: &[f32]| {
             read(&gradient, |gradient: &[f32]| {
-                let windows = out.par_chunks_mut(self.size()).zip(sums.par_chunks_mut(2 * self.channels));
+                let windows =
+                    out.par_chunks_mut(self.size()).zip(sums.par_chunks_mut(2 * self.channels));
                 let given = x.par_chunks(self.size()).zip(gradient.par_chunks(self.size()));
                 windows.zip(given).for_each(|((out, sums), (x, gradient))| {
                     self.backward(x, [&scales, &shifts], gradient, out, sums);
@@ -155,7 +180,9 @@ impl CustomOp3 for NormedMish {
         let mut both = vec![0.0; 2 * self.channels];
         add_rows(&mut both, &sums, &sums, |x, _| x);
         let of_shift = both.split_off(self.channels);
-        let tensor = |numbers: Vec<f32>, of: &Tensor| Tensor::from_vec(numbers, of.shape(), of.device()).map(Some);
+        let tensor = |numbers: Vec<f32>, of: &Tensor| {
+            Tensor::from_vec(numbers, of.shape(), of.device()).map(Some)
+        };
         Ok((tensor(out, x)?, tensor(both, scale)?, tensor(of_shift, shift)?))
     }
 }

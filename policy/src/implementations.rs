@@ -1,5 +1,5 @@
-//! Tests: gradients against finite differences for every shape of network, and each fast implementation against the plain one
-//! at random shapes.
+//! Tests: gradients against finite differences for every shape of network, and each fast
+//! implementation against the plain one at random shapes.
 
 use crate::ensemble::Ensemble;
 use crate::gradient::Gradients;
@@ -22,7 +22,8 @@ const ACTIVATIONS: [Activation; 5] =
     [Activation::Mish, Activation::Relu, Activation::Silu, Activation::Tanh, Activation::Gelu];
 
 fn tensor(generator: &mut ChaCha8Rng, shape: &[usize]) -> Tensor {
-    let numbers: Vec<f32> = (0..shape.iter().product()).map(|_| generator.random_range(-1.0..1.0)).collect();
+    let numbers: Vec<f32> =
+        (0..shape.iter().product()).map(|_| generator.random_range(-1.0..1.0)).collect();
     Tensor::from_vec(numbers, shape, &Device::Cpu).unwrap()
 }
 
@@ -54,12 +55,15 @@ fn layers(generator: &mut ChaCha8Rng) -> MlpConfig {
     // Widths that AVX-512 serves, and others.
     let widths = [13, 24, 32, 64];
     MlpConfig {
-        hidden: (0..generator.random_range(1..5)).map(|_| widths[generator.random_range(0..4)]).collect(),
+        hidden: (0..generator.random_range(1..5))
+            .map(|_| widths[generator.random_range(0..4)])
+            .collect(),
         activation: ACTIVATIONS[generator.random_range(0..5)],
         norm: generator.random(),
         norm_after: generator.random(),
         norm_epsilon: [Epsilon::Flax, Epsilon::Torch][generator.random_range(0..2)],
-        initial: [Initial::Xavier, Initial::Orthogonal, Initial::Torch][generator.random_range(0..3)],
+        initial: [Initial::Xavier, Initial::Orthogonal, Initial::Torch]
+            [generator.random_range(0..3)],
     }
 }
 
@@ -78,15 +82,22 @@ fn ensemble(generator: &mut ChaCha8Rng, shape: EnsembleShape) -> Ensemble {
     Ensemble::new(shape, weights, Precision::F32)
 }
 
-fn noise_predictor(generator: &mut ChaCha8Rng, layers: MlpConfig, diffusion_steps: usize) -> NoisePredictor {
-    let (observation_dim, action_dim) = (generator.random_range(1..20), generator.random_range(1..8));
-    let reverse = [Reverse::ClipClean, Reverse::Posterior, Reverse::ClipSample][generator.random_range(0..3)];
+fn noise_predictor(
+    generator: &mut ChaCha8Rng,
+    layers: MlpConfig,
+    diffusion_steps: usize,
+) -> NoisePredictor {
+    let (observation_dim, action_dim) =
+        (generator.random_range(1..20), generator.random_range(1..8));
+    let reverse =
+        [Reverse::ClipClean, Reverse::Posterior, Reverse::ClipSample][generator.random_range(0..3)];
     let shape = NoiseShape { observation_dim, action_dim, layers, diffusion_steps, reverse };
     let weights = weights(shape.layout(), generator);
     NoisePredictor::new(shape, weights, Precision::F32)
 }
 
-/// Checks the gradient of a loss by finite differences: along the gradient, and along a random direction.
+/// Checks the gradient of a loss by finite differences: along the gradient, and along a random
+/// direction.
 fn check_gradient(
     (what, step, room): (&str, f64, f64),
     generator: &mut ChaCha8Rng,
@@ -109,17 +120,28 @@ fn check_gradient(
 
 /// A loss that every output has another part in.
 fn loss(outputs: &Tensor) -> Tensor {
-    let factors = Tensor::arange(0f32, outputs.elem_count() as f32, &Device::Cpu).unwrap().sin().unwrap();
+    let factors =
+        Tensor::arange(0f32, outputs.elem_count() as f32, &Device::Cpu).unwrap().sin().unwrap();
     (outputs.flatten_all().unwrap() * factors).unwrap().sqr().unwrap().sum_all().unwrap()
 }
 
 #[test]
 fn gradients_are_what_finite_differences_say() {
-    let norms = [(false, false, 1), (false, false, 3), (true, false, 1), (true, false, 2), (true, true, 2)];
-    for (activation, (norm, norm_after, depth)) in ACTIVATIONS.into_iter().flat_map(|f| norms.map(|n| (f, n))) {
+    let norms =
+        [(false, false, 1), (false, false, 3), (true, false, 1), (true, false, 2), (true, true, 2)];
+    for (activation, (norm, norm_after, depth)) in
+        ACTIVATIONS.into_iter().flat_map(|f| norms.map(|n| (f, n)))
+    {
         let mut generator = ChaCha8Rng::seed_from_u64(depth as u64);
-        let layers = MlpConfig { activation, norm, norm_after, ..MlpConfig::mish(&[24, 32, 7][..depth]) };
-        let shape = EnsembleShape { members: 2, observation_dim: 4, action_dim: 3, layers: layers.clone(), outputs: 2 };
+        let layers =
+            MlpConfig { activation, norm, norm_after, ..MlpConfig::mish(&[24, 32, 7][..depth]) };
+        let shape = EnsembleShape {
+            members: 2,
+            observation_dim: 4,
+            action_dim: 3,
+            layers: layers.clone(),
+            outputs: 2,
+        };
         let networks = ensemble(&mut generator, shape.clone());
         let observations = Var::from_tensor(&tensor(&mut generator, &[5, 4])).unwrap();
         let actions = Var::from_tensor(&tensor(&mut generator, &[10, 3])).unwrap();
@@ -128,29 +150,56 @@ fn gradients_are_what_finite_differences_say() {
             let weights = Weights::constant(shape.layout(), weights.clone());
             loss(&Ensemble::new(shape.clone(), weights, Precision::F32).outputs(s, a).unwrap())
         };
-        let gradients = Gradients::of(&loss(&networks.outputs(&observations, &actions).unwrap())).unwrap();
+        let gradients =
+            Gradients::of(&loss(&networks.outputs(&observations, &actions).unwrap())).unwrap();
         let of_weights = gradients.with_respect_to(networks.weights()).unwrap();
-        let (w, s, a) = (networks.weights().values().detach(), observations.detach(), actions.detach());
-        check_gradient((&format!("{what}: weights"), 1e-3, 0.02), &mut generator, (&w, &of_weights), |w| at(w, &s, &a));
+        let (w, s, a) =
+            (networks.weights().values().detach(), observations.detach(), actions.detach());
+        check_gradient(
+            (&format!("{what}: weights"), 1e-3, 0.02),
+            &mut generator,
+            (&w, &of_weights),
+            |w| at(w, &s, &a),
+        );
         let of_s = gradients.store.get(&observations).unwrap();
-        check_gradient((&format!("{what}: observations"), 1e-3, 0.02), &mut generator, (&s, of_s), |s| at(&w, s, &a));
+        check_gradient(
+            (&format!("{what}: observations"), 1e-3, 0.02),
+            &mut generator,
+            (&s, of_s),
+            |s| at(&w, s, &a),
+        );
         let of_a = gradients.store.get(&actions).unwrap();
-        check_gradient((&format!("{what}: actions"), 1e-3, 0.02), &mut generator, (&a, of_a), |a| at(&w, &s, a));
+        check_gradient(
+            (&format!("{what}: actions"), 1e-3, 0.02),
+            &mut generator,
+            (&a, of_a),
+            |a| at(&w, &s, a),
+        );
 
         // Many steps: clipping leaves the first ones no gradient.
         let predictor = noise_predictor(&mut generator, layers, 8);
-        let NoiseShape { observation_dim, action_dim, diffusion_steps: steps, .. } = *predictor.shape();
-        let (s, z) = (tensor(&mut generator, &[60, observation_dim]), tensor(&mut generator, &[steps, 60, action_dim]));
+        let NoiseShape { observation_dim, action_dim, diffusion_steps: steps, .. } =
+            *predictor.shape();
+        let (s, z) = (
+            tensor(&mut generator, &[60, observation_dim]),
+            tensor(&mut generator, &[steps, 60, action_dim]),
+        );
         let at = |weights: &Tensor| {
             let weights = Weights::constant(predictor.shape().layout(), weights.clone());
             let predictor = NoisePredictor::new(predictor.shape().clone(), weights, Precision::F32);
             loss(&predictor.sample_with_gradient(&s, &z).unwrap())
         };
-        let gradients = Gradients::of(&loss(&predictor.sample_with_gradient(&s, &z).unwrap())).unwrap();
+        let gradients =
+            Gradients::of(&loss(&predictor.sample_with_gradient(&s, &z).unwrap())).unwrap();
         let of_weights = gradients.with_respect_to(predictor.weights()).unwrap();
         let w = predictor.weights().values().detach();
         // Clipping has corners, for which there is more room.
-        check_gradient((&format!("{what}: sampler"), 1e-4, 0.1), &mut generator, (&w, &of_weights), at);
+        check_gradient(
+            (&format!("{what}: sampler"), 1e-4, 0.1),
+            &mut generator,
+            (&w, &of_weights),
+            at,
+        );
     }
 }
 
@@ -163,7 +212,9 @@ fn ensembles_give_the_plain_values_and_gradients() {
         let (states, repeat) = (generator.random_range(1..200), generator.random_range(1..4));
         let repeat = if shape.action_dim == 0 { 1 } else { repeat };
         let observations = tensor(&mut generator, &[states, shape.observation_dim]);
-        let actions = Var::from_tensor(&tensor(&mut generator, &[states * repeat, shape.action_dim])).unwrap();
+        let actions =
+            Var::from_tensor(&tensor(&mut generator, &[states * repeat, shape.action_dim]))
+                .unwrap();
         let what = format!("{shape:?}, {states} × {repeat}");
         let plain = plainly(|| networks.outputs(&observations, &actions)).unwrap();
         let constant = networks.detach().outputs(&observations, &actions.detach()).unwrap();
@@ -172,14 +223,19 @@ fn ensembles_give_the_plain_values_and_gradients() {
         close(&what, &fast, &plain);
         let gradients = |loss: Tensor| {
             let gradients = Gradients::of(&loss).unwrap();
-            let of_actions = if shape.action_dim > 0 { gradients.store.get(&actions).unwrap().clone() } else { loss };
+            let of_actions = if shape.action_dim > 0 {
+                gradients.store.get(&actions).unwrap().clone()
+            } else {
+                loss
+            };
             (gradients.with_respect_to(networks.weights()).unwrap().copy().unwrap(), of_actions)
         };
         let (fast, plain) = (gradients(loss(&fast)), gradients(loss(&plain)));
         close(&format!("weights of {what}"), &fast.0, &plain.0);
         close(&format!("actions of {what}"), &fast.1, &plain.1);
         // A loss that has the network in it twice.
-        let [once, again] = [0; 2].map(|_| loss(&networks.outputs(&observations, &actions).unwrap()));
+        let [once, again] =
+            [0; 2].map(|_| loss(&networks.outputs(&observations, &actions).unwrap()));
         close("twice", &gradients((once + again).unwrap()).0, &(fast.0 * 2.0).unwrap());
 
         let critics = ensemble(&mut generator, EnsembleShape { outputs: 1, ..shape.clone() });
@@ -195,15 +251,22 @@ fn a_gradient_that_is_not_taken_is_not_added_to_the_next() {
     let mut generator = ChaCha8Rng::seed_from_u64(0);
     let shape = EnsembleShape { action_dim: 2, ..shape(&mut generator) };
     let networks = ensemble(&mut generator, shape.clone());
-    let (s, a) = (tensor(&mut generator, &[9, shape.observation_dim]), tensor(&mut generator, &[9, 2]));
+    let (s, a) =
+        (tensor(&mut generator, &[9, shape.observation_dim]), tensor(&mut generator, &[9, 2]));
     let pass = || Gradients::of(&loss(&networks.outputs(&s, &a).unwrap())).unwrap();
     let first = pass().with_respect_to(networks.weights()).unwrap().copy().unwrap();
     let not_taken = pass();
     let second = pass().with_respect_to(networks.weights()).unwrap();
     assert_eq!(numbers(&first), numbers(&second));
     if has_fast_implementation(&Device::Cpu) {
-        assert!(not_taken.with_respect_to(networks.weights()).is_err(), "another pass has overwritten it");
-        assert!(loss(&networks.outputs(&s, &a).unwrap()).backward().is_err(), "it would be left nowhere");
+        assert!(
+            not_taken.with_respect_to(networks.weights()).is_err(),
+            "another pass has overwritten it"
+        );
+        assert!(
+            loss(&networks.outputs(&s, &a).unwrap()).backward().is_err(),
+            "it would be left nowhere"
+        );
     }
 }
 
@@ -218,14 +281,24 @@ fn noise_predictors_give_the_plain_values_and_samples() {
         let rows = generator.random_range(1..300);
         let observations = tensor(&mut generator, &[rows, observation_dim]);
         let actions = tensor(&mut generator, &[rows, action_dim]);
-        let t: Vec<u32> = (0..rows).map(|_| generator.random_range(1..=diffusion_steps as u32)).collect();
+        let t: Vec<u32> =
+            (0..rows).map(|_| generator.random_range(1..=diffusion_steps as u32)).collect();
         let t = Tensor::from_vec(t, rows, &Device::Cpu).unwrap();
         let fast = actor.predict(&observations, &actions, &t).unwrap();
         let plain = plainly(|| actor.predict(&observations, &actions, &t)).unwrap();
         close("prediction", &fast, &plain);
-        close("of constants", &actor.detach().predict(&observations, &actions, &t).unwrap(), &plain);
+        close(
+            "of constants",
+            &actor.detach().predict(&observations, &actions, &t).unwrap(),
+            &plain,
+        );
         let gradient = |predicted: &Tensor| {
-            Gradients::of(&loss(predicted)).unwrap().with_respect_to(actor.weights()).unwrap().copy().unwrap()
+            Gradients::of(&loss(predicted))
+                .unwrap()
+                .with_respect_to(actor.weights())
+                .unwrap()
+                .copy()
+                .unwrap()
         };
         close(&format!("{:?}, {rows} rows", actor.shape()), &gradient(&fast), &gradient(&plain));
 
@@ -242,16 +315,25 @@ fn adam_the_ema_and_statistics_do_what_plain_operations_do() {
     let mut generator = ChaCha8Rng::seed_from_u64(1);
     for (clip, decay) in [(None, 0.0), (Some(0.3), 0.0), (Some(1e6), 0.0), (None, 0.5)] {
         // Enough numbers for several chunks, and no whole number of registers.
-        let shape = EnsembleShape { members: 3, layers: MlpConfig::mish(&[77, 78]), ..shape(&mut generator) };
+        let shape = EnsembleShape {
+            members: 3,
+            layers: MlpConfig::mish(&[77, 78]),
+            ..shape(&mut generator)
+        };
         let mut fast = weights(shape.layout(), &mut generator);
         let mut plain = Weights::trainable(shape.layout(), fast.values()).unwrap();
-        let [mut fast_adam, mut plain_adam] = [&fast, &plain].map(|weights| Adam::new(weights, decay).unwrap());
+        let [mut fast_adam, mut plain_adam] =
+            [&fast, &plain].map(|weights| Adam::new(weights, decay).unwrap());
         let [mut target, mut plain_target] = [(); 2].map(|()| fast.copy().unwrap());
         for count in 1..4 {
             let gradient = tensor(&mut generator, &[fast.values().elem_count()]);
             let step = AdamStep { rate: 0.01, clip, count };
             let size = fast_adam.descend(&mut fast, &gradient, step).unwrap();
-            close("norm", &size, &plainly(|| plain_adam.descend(&mut plain, &gradient, step)).unwrap());
+            close(
+                "norm",
+                &size,
+                &plainly(|| plain_adam.descend(&mut plain, &gradient, step)).unwrap(),
+            );
             close("moments", &fast_adam.moments, &plain_adam.moments);
             close("weights", fast.values(), plain.values());
         }
@@ -262,7 +344,10 @@ fn adam_the_ema_and_statistics_do_what_plain_operations_do() {
     for dims in [vec![1, 4], vec![3, 7], vec![10, 5, 3]] {
         let x = tensor(&mut generator, &dims);
         let statistics = || <[Tensor; 2]>::from(mean_and_variance(&x).unwrap());
-        statistics().iter().zip(plainly(statistics)).for_each(|(fast, plain)| close("statistics", fast, &plain));
+        statistics()
+            .iter()
+            .zip(plainly(statistics))
+            .for_each(|(fast, plain)| close("statistics", fast, &plain));
     }
 }
 
@@ -270,11 +355,13 @@ fn adam_the_ema_and_statistics_do_what_plain_operations_do() {
 fn rounding_changes_little_and_follows_the_weights() {
     let mut generator = ChaCha8Rng::seed_from_u64(3);
     let layers = MlpConfig::mish(&[64, 64, 64]);
-    let shape = EnsembleShape { members: 3, observation_dim: 11, action_dim: 3, layers, outputs: 1 };
+    let shape =
+        EnsembleShape { members: 3, observation_dim: 11, action_dim: 3, layers, outputs: 1 };
     let weights = weights(shape.layout(), &mut generator);
     let exact = Ensemble::new(shape.clone(), weights.copy().unwrap(), Precision::F32);
     let mut rounded = Ensemble::new(shape, weights.copy().unwrap(), Precision::Bf16);
-    let (observations, actions) = (tensor(&mut generator, &[50, 11]), tensor(&mut generator, &[50, 3]));
+    let (observations, actions) =
+        (tensor(&mut generator, &[50, 11]), tensor(&mut generator, &[50, 3]));
     let values = |ensemble: &Ensemble| numbers(&ensemble.values(&observations, &actions).unwrap());
     let (a, b) = (values(&exact), values(&rounded));
     let difference = a.iter().zip(&b).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
@@ -283,7 +370,10 @@ fn rounding_changes_little_and_follows_the_weights() {
     assert!(difference < 0.02, "values differ by {difference}");
     assert_eq!(values(&rounded.detach()), b, "constant weights are rounded alike");
     rounded.weights_mut().change(|values| modify(values, |x| x.fill(0.0))).unwrap();
-    assert!(values(&rounded).iter().all(|q| *q == 0.0), "kernels rounded before the change were used");
+    assert!(
+        values(&rounded).iter().all(|q| *q == 0.0),
+        "kernels rounded before the change were used"
+    );
 }
 
 #[test]
@@ -292,8 +382,11 @@ fn shapes_that_do_not_fit_are_errors() {
     let layers = MlpConfig::mish(&[8]);
     let shape = EnsembleShape { members: 2, observation_dim: 4, action_dim: 2, layers, outputs: 1 };
     let ensemble = ensemble(&mut generator, shape);
-    for (observations, actions) in [([5, 4], [5, 3]), ([5, 3], [5, 2]), ([5, 4], [7, 2]), ([5, 4], [0, 2])] {
-        let (observations, actions) = (tensor(&mut generator, &observations), tensor(&mut generator, &actions));
+    for (observations, actions) in
+        [([5, 4], [5, 3]), ([5, 3], [5, 2]), ([5, 4], [7, 2]), ([5, 4], [0, 2])]
+    {
+        let (observations, actions) =
+            (tensor(&mut generator, &observations), tensor(&mut generator, &actions));
         assert!(ensemble.values(&observations, &actions).is_err(), "{observations} {actions}");
     }
 }

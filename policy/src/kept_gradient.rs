@@ -24,8 +24,9 @@ pub(crate) fn backward_pass<R>(work: impl FnOnce() -> R) -> (R, u64) {
     (result, pass)
 }
 
-/// A gradient in memory that is kept from step to step. Handing megabytes to candle's `GradStore` instead costs some
-/// milliseconds in each backward pass: they are allocated three times over, and given back to the system.
+/// A gradient in memory that is kept from step to step. Handing megabytes to candle's `GradStore`
+/// instead costs some milliseconds in each backward pass: they are allocated three times over, and
+/// given back to the system.
 #[derive(Debug)]
 pub(crate) struct KeptGradient {
     values: Tensor,
@@ -38,8 +39,8 @@ impl KeptGradient {
         Ok(Self { values: weights.zeros_like()?.detach(), written: Mutex::default() })
     }
 
-    /// Has `work` write the gradient of a range of the weights, all of it. What the same pass wrote there before is added;
-    /// what an earlier pass left is gone.
+    /// Has `work` write the gradient of a range of the weights, all of it. What the same pass wrote
+    /// there before is added; what an earlier pass left is gone.
     pub fn write(&self, range: Range<usize>, work: impl FnOnce(&mut [f32])) -> Result<()> {
         let pass = PASS.get();
         if pass == 0 {
@@ -55,7 +56,9 @@ impl KeptGradient {
         }
         let mut more = vec![0.0; range.len()];
         work(&mut more);
-        modify(&self.values, |values| values[range].iter_mut().zip(&more).for_each(|(sum, x)| *sum += x))
+        modify(&self.values, |values| {
+            values[range].iter_mut().zip(&more).for_each(|(sum, x)| *sum += x)
+        })
     }
 
     /// What that pass has written, 0 elsewhere; none if it wrote nothing.

@@ -28,8 +28,8 @@ use std::collections::{BTreeMap, HashMap};
 const HEADER: &str = "quad";
 /// The version that writes.
 pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
-/// Longest header of a safetensors file that is read, bytes. The paper's networks have 3 KB; a million empty tensors would
-/// take a gigabyte of memory before anything else is known of them.
+/// Longest header of a safetensors file that is read, bytes. The paper's networks have 3 KB; a
+/// million empty tensors would take a gigabyte of memory before anything else is known of them.
 const MAX_HEADER: u64 = 1 << 20;
 
 /// What a policy is: its kind, the shapes of its networks, and how it chooses.
@@ -80,8 +80,8 @@ pub enum PolicyConfig {
 }
 
 impl PolicyConfig {
-    /// The tensors of such a policy whose networks have the numbers that `values` gives for their layouts, as
-    /// [`Weights::initial`] does. Tests and benchmarks act with it.
+    /// The tensors of such a policy whose networks have the numbers that `values` gives for their
+    /// layouts, as [`Weights::initial`] does. Tests and benchmarks act with it.
     pub fn tensors(
         &self,
         mut values: impl FnMut(&Layout) -> candle_core::Result<Tensor>,
@@ -122,17 +122,19 @@ impl PolicyConfig {
     }
 }
 
-/// What a policy's file says beside its tensors: JSON under one key of its metadata, written once, with the tensors. `O` says
-/// where the policy comes from, which is not looked into here.
+/// What a policy's file says beside its tensors: JSON under one key of its metadata, written once,
+/// with the tensors. `O` says where the policy comes from, which is not looked into here.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Header<O> {
     /// What it is.
     pub policy: PolicyConfig,
-    /// The maps between the units that its networks have learned in and those that it is asked in, unless they are the same.
+    /// The maps between the units that its networks have learned in and those that it is asked in,
+    /// unless they are the same.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scaling: Option<Scaling>,
-    /// What the data that it has learned from calls the numbers of an observation; empty where they have no names.
+    /// What the data that it has learned from calls the numbers of an observation; empty where they
+    /// have no names.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub observation_names: Vec<String>,
     /// Names of the numbers of an action.
@@ -155,10 +157,20 @@ struct Written {
 }
 
 impl<O> Header<O> {
-    /// The header of networks that have learned in the user's own units, from numbers without names.
+    /// The header of networks that have learned in the user's own units, from numbers without
+    /// names.
     pub fn new(policy: PolicyConfig, origin: O) -> Self {
-        let (observation_names, action_names, version) = (Vec::new(), Vec::new(), VERSION.to_owned());
-        Self { policy, scaling: None, observation_names, action_names, origin, about: Value::Null, version }
+        let (observation_names, action_names, version) =
+            (Vec::new(), Vec::new(), VERSION.to_owned());
+        Self {
+            policy,
+            scaling: None,
+            observation_names,
+            action_names,
+            origin,
+            about: Value::Null,
+            version,
+        }
     }
 }
 
@@ -187,8 +199,8 @@ impl<O: DeserializeOwned> Header<O> {
     }
 }
 
-/// Reads a policy from its file: exactly the tensors that its header asks for, all finite. Where the file has a scaling, the
-/// policy takes and gives the user's units.
+/// Reads a policy from its file: exactly the tensors that its header asks for, all finite. Where
+/// the file has a scaling, the policy takes and gives the user's units.
 ///
 /// # Errors
 /// A file that is not what it should be, or a kind of policy that is not known here.
@@ -208,7 +220,9 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
             Box::new(shape.load(of_actor, OneStepActor::new, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
-        PolicyConfig::Score { shape, choice } => Box::new(ScorePolicy::load(shape, choice, &mut tensors, precision)?),
+        PolicyConfig::Score { shape, choice } => {
+            Box::new(ScorePolicy::load(shape, choice, &mut tensors, precision)?)
+        }
         PolicyConfig::Planner { shape, choice } => {
             let units = shape.units.clone();
             scaled(Box::new(Planner::load(shape, choice, &mut tensors)?), Some(units))?
@@ -220,12 +234,16 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
     }
 }
 
-/// The safetensors file of some tensors, with `header` as JSON under that key of its metadata: always the same bytes for the same
-/// header and numbers.
+/// The safetensors file of some tensors, with `header` as JSON under that key of its metadata:
+/// always the same bytes for the same header and numbers.
 ///
 /// # Errors
 /// A number that is not finite.
-pub fn write_tensors(tensors: &Tensors, key: &str, header: &impl Serialize) -> Result<Vec<u8>, PolicyError> {
+pub fn write_tensors(
+    tensors: &Tensors,
+    key: &str,
+    header: &impl Serialize,
+) -> Result<Vec<u8>, PolicyError> {
     let mut here = BTreeMap::new();
     for (name, tensor) in tensors {
         check_finite(name, tensor)?;
@@ -256,10 +274,13 @@ pub fn read_tensors(bytes: &[u8]) -> Result<Tensors, PolicyError> {
     file.tensors().into_iter().map(|(name, view)| Ok((name, view.load(&Device::Cpu)?))).collect()
 }
 
-/// Checks the header's length, which the file's first eight bytes say; a file without them is refused later.
+/// Checks the header's length, which the file's first eight bytes say; a file without them is
+/// refused later.
 fn check_header(file: &[u8]) -> Result<(), PolicyError> {
     match file.first_chunk() {
-        Some(length) if u64::from_le_bytes(*length) > MAX_HEADER => Err(SafeTensorError::HeaderTooLarge.into()),
+        Some(length) if u64::from_le_bytes(*length) > MAX_HEADER => {
+            Err(SafeTensorError::HeaderTooLarge.into())
+        }
         _ => Ok(()),
     }
 }

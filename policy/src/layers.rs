@@ -1,7 +1,8 @@
 //! Where the layers of some networks of one shape lie in one flat vector.
 //!
-//! A vector for all weights keeps an optimizer's step at one operation, and each named tensor is one contiguous run of it:
-//! layer after layer the kernels of all members, then their biases, then scales and shifts of the norm, if there is one.
+//! A vector for all weights keeps an optimizer's step at one operation, and each named tensor is
+//! one contiguous run of it: layer after layer the kernels of all members, then their biases, then
+//! scales and shifts of the norm, if there is one.
 
 use crate::mlp_config::{Epsilon, Initial, MlpConfig};
 use crate::weights::{Part, Start};
@@ -42,11 +43,19 @@ pub(crate) struct LayerMut<'a> {
 
 impl Layers {
     /// The first kernel lies at `start`.
-    pub fn new(members: usize, inputs: usize, config: &MlpConfig, outputs: usize, start: usize) -> Self {
-        let widths: Vec<usize> = [inputs].iter().chain(&config.hidden).chain(&[outputs]).copied().collect();
+    pub fn new(
+        members: usize,
+        inputs: usize,
+        config: &MlpConfig,
+        outputs: usize,
+        start: usize,
+    ) -> Self {
+        let widths: Vec<usize> =
+            [inputs].iter().chain(&config.hidden).chain(&[outputs]).copied().collect();
         let MlpConfig { norm, norm_after, norm_epsilon, activation, initial, .. } = *config;
         let offsets = vec![start];
-        let mut layers = Self { members, widths, norm, norm_after, norm_epsilon, activation, initial, offsets };
+        let mut layers =
+            Self { members, widths, norm, norm_after, norm_epsilon, activation, initial, offsets };
         for layer in 0..layers.count() {
             let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
             let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;
@@ -95,8 +104,11 @@ impl Layers {
 
     /// Kernels `[K, in, out]` and biases `[K, out]` of a layer, as views of the vector.
     pub fn views(&self, vector: &Tensor, layer: usize) -> Result<(Tensor, Tensor)> {
-        let ((inputs, outputs), start, members) = (self.shape(layer), self.offsets[layer], self.members);
-        let kernels = vector.narrow(0, start, members * inputs * outputs)?.reshape((members, inputs, outputs))?;
+        let ((inputs, outputs), start, members) =
+            (self.shape(layer), self.offsets[layer], self.members);
+        let kernels = vector
+            .narrow(0, start, members * inputs * outputs)?
+            .reshape((members, inputs, outputs))?;
         let biases = vector.narrow(0, start + members * inputs * outputs, members * outputs)?;
         Ok((kernels, biases.reshape((members, outputs))?))
     }
@@ -112,15 +124,22 @@ impl Layers {
     }
 
     /// Scale and shift of a layer's norm, if it has one.
-    pub fn norm<'a>(&self, weights: &'a [f32], layer: usize, member: usize) -> Option<[&'a [f32]; 2]> {
+    pub fn norm<'a>(
+        &self,
+        weights: &'a [f32],
+        layer: usize,
+        member: usize,
+    ) -> Option<[&'a [f32]; 2]> {
         let (inputs, outputs) = self.shape(layer);
-        let of =
-            |kind| &weights[self.offsets[layer] + (self.members * (inputs + kind) + member) * outputs..][..outputs];
+        let of = |kind| {
+            &weights[self.offsets[layer] + (self.members * (inputs + kind) + member) * outputs..]
+                [..outputs]
+        };
         self.is_normed(layer).then(|| [of(1), of(2)])
     }
 
-    /// All parameters in the part of a vector that is these layers'. They share nothing, so that each may be written by another
-    /// thread.
+    /// All parameters in the part of a vector that is these layers'. They share nothing, so that
+    /// each may be written by another thread.
     pub fn split_mut<'a>(&self, mut rest: &'a mut [f32]) -> Vec<LayerMut<'a>> {
         let mut all = Vec::with_capacity(self.count() * self.members);
         for layer in 0..self.count() {
@@ -132,7 +151,8 @@ impl Layers {
             let (shifts, behind) = behind.split_at_mut(norms);
             rest = behind;
             let mut norms = scales.chunks_exact_mut(outputs).zip(shifts.chunks_exact_mut(outputs));
-            let members = kernels.chunks_exact_mut(inputs * outputs).zip(biases.chunks_exact_mut(outputs));
+            let members =
+                kernels.chunks_exact_mut(inputs * outputs).zip(biases.chunks_exact_mut(outputs));
             all.extend(members.enumerate().map(|(member, (kernel, bias))| {
                 let norm = norms.next().map(|(scale, shift)| [scale, shift]);
                 LayerMut { layer, member, kernel, bias, norm }
@@ -141,8 +161,9 @@ impl Layers {
         all
     }
 
-    /// Names, shapes and initial values of the tensors `{prefix}{layer}.kernel` and `.bias`, and with a norm
-    /// `.scale` and `.shift`; `leading` says whether the number of members is their first dimension.
+    /// Names, shapes and initial values of the tensors `{prefix}{layer}.kernel` and `.bias`, and
+    /// with a norm `.scale` and `.shift`; `leading` says whether the number of members is their
+    /// first dimension.
     pub fn named(&self, prefix: &str, leading: bool) -> Vec<Part> {
         let mut parts = Vec::new();
         for layer in 0..self.count() {

@@ -1,31 +1,38 @@
-//! What the weights mean: networks, the diffusion they predict the noise of, and the policies made of them.
+//! What the weights mean: networks, the diffusion they predict the noise of, and the policies made
+//! of them.
 //!
 //! # Layout
 //!
-//! - [`MlpConfig`] (`mlp_config`): a network's hidden layers, a line of configuration; `shape`: what goes in and comes out.
-//! - `mlp`: K networks of layers act(x·W + b) as one operation of candle's, with gradients to x, W and b. It has a fast
-//!   implementation for the CPU, one of few operations for a GPU (`composed`), and a plain one (`plain`) that runs on any
-//!   device and has layer norm.
-//! - [`Ensemble`] (`ensemble`): such networks as critics, value functions or means; [`NoisePredictor`] (`noise_predictor`):
-//!   ε_θ; [`Denoiser`] (`edm`), told of noise by a real number; [`Schedule`] (`schedule`): the noise schedule and one reverse step. `sampler` and `action_gradients` go through
-//!   whole networks tile by tile.
-//! - [`ScoreNetwork`] (`score_network`): residual blocks of single layers (`dense`), the noise in continuous time, sampled by
-//!   [`DpmSolver`] (`dpm_solver`).
-//! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it; [`Gradients`] (`gradient`) of a loss
-//!   with respect to them; [`Adam`] (`optimizer`).
-//! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries through an episode. `kind`
-//!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`),
-//!   [`ScorePolicy`] (`score`), and with a [`SquashedActor`] (`squashed`) or a [`OneStepActor`] (`one_step`) those of an
-//!   [`ActorCriticShape`] (`actor_critic`) take one of N_a samples (`candidates`), or the mean of some, by their [`Choice`]
-//!   (`choice`), [`GaussianPolicy`] (`gaussian`) a mean; one with a [`Scaling`] is asked in its user's units (`scaled`).
-//! - [`WindowModel`] and [`WindowValue`] (`window_networks`): networks over windows of consecutive steps, of the layers in
-//!   `window_layers`, `convolution` and `group_norm`; `window` lists their tensors. [`Planner`] (`planner`) acts by plans that
-//!   `planning` draws with them.
+//! - [`MlpConfig`] (`mlp_config`): a network's hidden layers, a line of configuration; `shape`:
+//!   what goes in and comes out.
+//! - `mlp`: K networks of layers act(x·W + b) as one operation of candle's, with gradients to x, W
+//!   and b. It has a fast implementation for the CPU, one of few operations for a GPU (`composed`),
+//!   and a plain one (`plain`) that runs on any device and has layer norm.
+//! - [`Ensemble`] (`ensemble`): such networks as critics, value functions or means;
+//!   [`NoisePredictor`] (`noise_predictor`): ε_θ; [`Denoiser`] (`edm`), told of noise by a real
+//!   number; [`Schedule`] (`schedule`): the noise schedule and one reverse step. `sampler` and
+//!   `action_gradients` go through whole networks tile by tile.
+//! - [`ScoreNetwork`] (`score_network`): residual blocks of single layers (`dense`), the noise in
+//!   continuous time, sampled by [`DpmSolver`] (`dpm_solver`).
+//! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it;
+//!   [`Gradients`] (`gradient`) of a loss with respect to them; [`Adam`] (`optimizer`).
+//! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries
+//!   through an episode. `kind` reads one from a file whose [`Header`] says what it is:
+//!   [`DiffusionPolicy`] (`diffusion`), [`ScorePolicy`] (`score`), and with a [`SquashedActor`]
+//!   (`squashed`) or a [`OneStepActor`] (`one_step`) those of an [`ActorCriticShape`]
+//!   (`actor_critic`) take one of N_a samples (`candidates`), or the mean of some, by their
+//!   [`Choice`] (`choice`), [`GaussianPolicy`] (`gaussian`) a mean; one with a [`Scaling`] is asked
+//!   in its user's units (`scaled`).
+//! - [`WindowModel`] and [`WindowValue`] (`window_networks`): networks over windows of consecutive
+//!   steps, of the layers in `window_layers`, `convolution` and `group_norm`; `window` lists their
+//!   tensors. [`Planner`] (`planner`) acts by plans that `planning` draws with them.
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
-//! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
-//!   `kernels`, with the buffers of `workspace`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
-//!   operations), `packed` (kernels packed once), `slices` (candle's tensors as slices), `gpu` (the same on a GPU), `device`
-//!   (a GPU to compute on), [`Recording`] (`recording`: its work, recorded), `statistics` (mean and variance over an ensemble).
+//! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of
+//!   rows, over the crate `kernels`, with the buffers of `workspace`), `saved` and `kept_gradient`
+//!   (what forward and backward passes leave), `operation` (candle's custom operations), `packed`
+//!   (kernels packed once), `slices` (candle's tensors as slices), `gpu` (the same on a GPU),
+//!   `device` (a GPU to compute on), [`Recording`] (`recording`: its work, recorded), `statistics`
+//!   (mean and variance over an ensemble).
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
 

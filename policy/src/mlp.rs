@@ -1,7 +1,8 @@
 //! K networks of one shape side by side: layers act(x·W + b), differentiable in x, W and b.
 //!
-//! On the CPU a custom operation of candle's runs all layers, cut into (member, tile of rows) and in parallel; the cut does
-//! not depend on the number of threads, so neither do the results. Elsewhere `composed` does, and with a norm plain operations do.
+//! On the CPU a custom operation of candle's runs all layers, cut into (member, tile of rows) and
+//! in parallel; the cut does not depend on the number of threads, so neither do the results.
+//! Elsewhere `composed` does, and with a norm plain operations do.
 
 use crate::composed::{Composed, Pass};
 use crate::kept_gradient::KeptGradient;
@@ -17,7 +18,8 @@ use quad_kernels::product::Packed;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// For each network the kernels between its hidden layers, packed; none where products are as fast without.
+/// For each network the kernels between its hidden layers, packed; none where products are as fast
+/// without.
 pub(crate) type Kernels = Vec<Vec<Packed>>;
 
 /// Kernels of one member, if any were packed.
@@ -45,20 +47,40 @@ impl Mlp {
     }
 
     /// Applies the network; where no gradient is taken, by these packed kernels of the members.
-    pub fn forward_by(&self, packed: Option<Arc<Kernels>>, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
+    pub fn forward_by(
+        &self,
+        packed: Option<Arc<Kernels>>,
+        weights: &Weights,
+        inputs: &[&Tensor],
+    ) -> Result<Tensor> {
         let x = if let [x] = inputs { (*x).clone() } else { Tensor::cat(inputs, 1)? };
         let (values, layers) = (weights.values(), &self.layers);
         if !matches!(*x.dims(), [rows, width] if rows > 0 && width == layers.inputs()) {
-            bail!("{} networks of {} numbers got inputs of shape {:?}", layers.members, layers.inputs(), x.dims());
+            bail!(
+                "{} networks of {} numbers got inputs of shape {:?}",
+                layers.members,
+                layers.inputs(),
+                x.dims()
+            );
         }
         if !self.is_fast(weights) {
-            return if layers.norm { self.plain_forward(weights, &x) } else { self.composed_forward(weights, &x) };
+            return if layers.norm {
+                self.plain_forward(weights, &x)
+            } else {
+                self.composed_forward(weights, &x)
+            };
         }
         let kept = if values.track_op() { weights.kept_gradient().cloned() } else { None };
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
-        let constant =
-            inputs.iter().take_while(|input| !input.track_op()).map(|input| input.dim(1)).sum::<Result<_>>()?;
-        values.apply_op2(&x.contiguous()?, Operation { mlp: self.clone(), kept, saved, packed, constant })
+        let constant = inputs
+            .iter()
+            .take_while(|input| !input.track_op())
+            .map(|input| input.dim(1))
+            .sum::<Result<_>>()?;
+        values.apply_op2(
+            &x.contiguous()?,
+            Operation { mlp: self.clone(), kept, saved, packed, constant },
+        )
     }
 
     /// Whether the fast implementation serves them.
@@ -72,7 +94,8 @@ impl Mlp {
         if differentiable { weights.values().apply_op2(x, Composed(pass)) } else { Ok(pass.out) }
     }
 
-    /// [`Self::forward`] in plain candle operations; here each member may have inputs of its own, `[K, rows, in]`.
+    /// [`Self::forward`] in plain candle operations; here each member may have inputs of its own,
+    /// `[K, rows, in]`.
     pub fn plain_forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
         let tensors = weights.layout().split(weights.values(), "")?;
         let x = if x.rank() == 2 { x.unsqueeze(0)? } else { x.clone() };
@@ -88,14 +111,19 @@ impl Mlp {
         let (inputs, outputs) = (self.layers.inputs(), self.layers.outputs());
         let rows = out.len() / (self.layers.members * outputs);
         out.par_chunks_mut(rows * outputs).enumerate().for_each(|(member, out)| {
-            let network = Network { packed: of_member(packed, member), ..self.network(weights, member) };
+            let network =
+                Network { packed: of_member(packed, member), ..self.network(weights, member) };
             out.par_chunks_mut(TILE * outputs).enumerate().for_each(|(i, out)| {
                 let x = rows_of(x, i * TILE, TILE, inputs);
                 with_workspace(|work| {
                     work.with_base(x.len() / inputs * network.width(), 0, |base, _, work| {
                         network.first_part(x, inputs, base);
                         let shift = network.bias(0);
-                        network.forward(Input { base, repeat: 1, shift, actions: &[], kernel: &[] }, work, out);
+                        network.forward(
+                            Input { base, repeat: 1, shift, actions: &[], kernel: &[] },
+                            work,
+                            out,
+                        );
                     });
                 });
             });
@@ -117,7 +145,13 @@ struct Operation {
 }
 
 impl Operation {
-    fn forward_saving(&self, weights: &[f32], x: &[f32], lent: &Lent<SavedActivations>, out: &mut [f32]) {
+    fn forward_saving(
+        &self,
+        weights: &[f32],
+        x: &[f32],
+        lent: &Lent<SavedActivations>,
+        out: &mut [f32],
+    ) {
         let layers = &self.mlp.layers;
         let rows = out.len() / (layers.members * layers.outputs());
         let mut saved = lent.lock();
@@ -129,7 +163,8 @@ impl Operation {
         });
     }
 
-    /// Leaves the weights' gradient where it is kept, and gives that of the inputs, if there is to be one.
+    /// Leaves the weights' gradient where it is kept, and gives that of the inputs, if there is to
+    /// be one.
     fn backward(
         &self,
         weights: &[f32],
@@ -146,7 +181,9 @@ impl Operation {
             with_workspace(|work| network.backward(tile.out, &mut tile.activations, work));
         });
         if let Some(kept) = &self.kept {
-            kept.write(layers.range(), |out| saved.weight_gradients(layers.split_mut(out), x, gradient))?;
+            kept.write(layers.range(), |out| {
+                saved.weight_gradients(layers.split_mut(out), x, gradient)
+            })?;
         }
         let width = inputs - self.constant;
         if width == 0 {
@@ -204,7 +241,8 @@ impl CustomOp2 for Operation {
             let [w, input, g] = held.each_ref().map(|(storage, layout)| on_cpu(storage, layout));
             self.backward(w?, input?, g?, &mut saved.lock())?
         };
-        let of_input = of_input.map(|numbers| Tensor::from_vec(numbers, x.shape(), x.device())).transpose()?;
+        let of_input =
+            of_input.map(|numbers| Tensor::from_vec(numbers, x.shape(), x.device())).transpose()?;
         Ok((None, of_input))
     }
 }

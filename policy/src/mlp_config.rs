@@ -87,7 +87,9 @@ impl Initial {
             Self::RebracActor | Self::RebracCritic => {
                 (Start::Uniform(1.0 / (inputs as f32).sqrt()), Start::Constant(0.1))
             }
-            Self::Xavier => (Start::Uniform((6.0 / (inputs + outputs) as f32).sqrt()), Start::Constant(0.0)),
+            Self::Xavier => {
+                (Start::Uniform((6.0 / (inputs + outputs) as f32).sqrt()), Start::Constant(0.0))
+            }
             Self::Orthogonal => (Start::Orthogonal(std::f32::consts::SQRT_2), Start::Constant(0.0)),
             Self::Orthonormal => (Start::Orthogonal(1.0), Start::Constant(0.0)),
             Self::Torch => {
@@ -112,10 +114,14 @@ impl MlpConfig {
 
 fn widths<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<usize>, D::Error> {
     let widths = Vec::<usize>::deserialize(deserializer)?;
-    if (1..=MOST_LAYERS).contains(&widths.len()) && widths.iter().all(|width| (1..=MOST).contains(width)) {
+    if (1..=MOST_LAYERS).contains(&widths.len())
+        && widths.iter().all(|width| (1..=MOST).contains(width))
+    {
         return Ok(widths);
     }
-    Err(D::Error::custom(format_args!("hidden layers are 1 to {MOST_LAYERS} widths from 1 to {MOST}, not {widths:?}")))
+    Err(D::Error::custom(format_args!(
+        "hidden layers are 1 to {MOST_LAYERS} widths from 1 to {MOST}, not {widths:?}"
+    )))
 }
 
 #[cfg(test)]
@@ -125,7 +131,8 @@ mod tests {
 
     #[test]
     fn a_configuration_names_what_a_norm_adds_only_where_it_is_not_the_usual() {
-        let config = MlpConfig { norm: true, norm_epsilon: Epsilon::Torch, ..MlpConfig::mish(&[4]) };
+        let config =
+            MlpConfig { norm: true, norm_epsilon: Epsilon::Torch, ..MlpConfig::mish(&[4]) };
         let json = serde_json::to_string(&config).unwrap();
         assert!(json.contains(r#""norm_epsilon":"torch""#), "{json}");
         assert_eq!(serde_json::from_str::<MlpConfig>(&json).unwrap(), config);
@@ -136,18 +143,27 @@ mod tests {
     fn rebrac_s_last_layer_begins_smaller_than_the_others() {
         let shape = |initial| {
             let layers = MlpConfig { initial, ..MlpConfig::mish(&[4]) };
-            crate::shape::EnsembleShape { members: 1, observation_dim: 16, action_dim: 0, layers, outputs: 2 }
+            crate::shape::EnsembleShape {
+                members: 1,
+                observation_dim: 16,
+                action_dim: 0,
+                layers,
+                outputs: 2,
+            }
         };
         for (initial, last) in [(Initial::RebracActor, 1e-3), (Initial::RebracCritic, 3e-3)] {
-            let starts: Vec<Start> = shape(initial).layout().parts().iter().map(|part| part.start).collect();
-            let (first, last) = ([Start::Uniform(0.25), Start::Constant(0.1)], [Start::Uniform(last); 2]);
+            let starts: Vec<Start> =
+                shape(initial).layout().parts().iter().map(|part| part.start).collect();
+            let (first, last) =
+                ([Start::Uniform(0.25), Start::Constant(0.1)], [Start::Uniform(last); 2]);
             assert_eq!(starts, [first, last].concat());
         }
     }
 
     #[test]
     fn orthogonal_weights_have_the_gain_that_their_name_says() {
-        let gains = [Initial::Orthogonal, Initial::Orthonormal].map(|initial| initial.of_layer(3, 5, false).0);
+        let gains = [Initial::Orthogonal, Initial::Orthonormal]
+            .map(|initial| initial.of_layer(3, 5, false).0);
         assert_eq!(gains, [Start::Orthogonal(std::f32::consts::SQRT_2), Start::Orthogonal(1.0)]);
     }
 }

@@ -1,8 +1,9 @@
-//! One network on one tile of rows: hidden layers with a norm, if they have one, and an activation each, and a linear output;
-//! forward and backward.
+//! One network on one tile of rows: hidden layers with a norm, if they have one, and an activation
+//! each, and a linear output; forward and backward.
 //!
-//! Forward passes that nothing is kept of take the first layer apart: the state's part is computed once per state, whatever
-//! number of actions is tried in it, and the action's few columns are fused with the activation.
+//! Forward passes that nothing is kept of take the first layer apart: the state's part is computed
+//! once per state, whatever number of actions is tried in it, and the action's few columns are
+//! fused with the activation.
 
 use crate::layers::{Layers, TILE};
 use crate::precision::Precision;
@@ -13,7 +14,8 @@ use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
 use quad_kernels::norm::{kept, normalize, normalize_backward, shift_rows};
 use quad_kernels::product::{Packed, product, product_transposed};
 
-/// Rows of a tile that are worked on together in a task whose products are rounded: these are so fast that activations must be in the nearest cache.
+/// Rows of a tile that are worked on together in a task whose products are rounded: these are so
+/// fast that activations must be in the nearest cache.
 const BLOCK: usize = 32;
 /// Most inputs whose gradients are sums of products, one by one.
 const NARROW: usize = 16;
@@ -118,7 +120,9 @@ impl<'a> Network<'a> {
         let block = if rounded { BLOCK } else { TILE };
         let states = (block / input.repeat).max(1);
         let rows = states * input.repeat;
-        for (i, (base, out)) in input.base.chunks(states * width).zip(out.chunks_mut(rows * outputs)).enumerate() {
+        for (i, (base, out)) in
+            input.base.chunks(states * width).zip(out.chunks_mut(rows * outputs)).enumerate()
+        {
             let count = out.len() / outputs;
             let actions = &input.actions[i * rows * action_dim..][..count * action_dim];
             let Input { repeat, shift, kernel, .. } = input;
@@ -133,7 +137,9 @@ impl<'a> Network<'a> {
                 }
                 _ => {
                     first_layer(Some(self.layers.activation), &first, out_of_first);
-                    self.normalize_after(0, out_of_first, || work.not_kept.sized(kept(count, width)));
+                    self.normalize_after(0, out_of_first, || {
+                        work.not_kept.sized(kept(count, width))
+                    });
                 }
             }
             for layer in 1..last {
@@ -154,8 +160,15 @@ impl<'a> Network<'a> {
         }
     }
 
-    /// `forward` of whole rows `rows × inputs` that leaves activations and slopes behind for `backward`.
-    pub fn forward_saving(&self, input: &[f32], left: &mut Activations<'_>, work: &mut Workspace, out: &mut [f32]) {
+    /// `forward` of whole rows `rows × inputs` that leaves activations and slopes behind for
+    /// `backward`.
+    pub fn forward_saving(
+        &self,
+        input: &[f32],
+        left: &mut Activations<'_>,
+        work: &mut Workspace,
+        out: &mut [f32],
+    ) {
         let last = self.last();
         for layer in 0..last {
             let (inputs, width) = self.layers.shape(layer);
@@ -166,12 +179,23 @@ impl<'a> Network<'a> {
             activate_with_slope(self.layers.activation, here[0], bias, left.slope[layer]);
             self.normalize_after(layer, here[0], || left.norm[layer]);
         }
-        dots(left.x[last - 1], self.output_rows(&mut work.output), self.bias(last), out, self.layers.shape(last).0);
+        dots(
+            left.x[last - 1],
+            self.output_rows(&mut work.output),
+            self.bias(last),
+            out,
+            self.layers.shape(last).0,
+        );
     }
 
-    /// Adds the bias of a layer that has a norm before its activation, and normalizes. Gives what is to be added before the
-    /// activation.
-    fn normalize<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) -> &'a [f32] {
+    /// Adds the bias of a layer that has a norm before its activation, and normalizes. Gives what
+    /// is to be added before the activation.
+    fn normalize<'b>(
+        &self,
+        layer: usize,
+        x: &mut [f32],
+        keep: impl FnOnce() -> &'b mut [f32],
+    ) -> &'a [f32] {
         let bias = self.bias(layer);
         match self.norm(layer) {
             Some([scale, shift]) if !self.layers.norm_after => {
@@ -183,15 +207,26 @@ impl<'a> Network<'a> {
     }
 
     /// Normalizes what follows the activation of a layer that has a norm there.
-    fn normalize_after<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) {
+    fn normalize_after<'b>(
+        &self,
+        layer: usize,
+        x: &mut [f32],
+        keep: impl FnOnce() -> &'b mut [f32],
+    ) {
         if let Some([scale, shift]) = self.norm(layer).filter(|_| self.layers.norm_after) {
             normalize(x, None, scale, self.layers.epsilon(), keep());
             shift_rows(x, shift);
         }
     }
 
-    /// Turns the slopes of a tile into the gradients δ before each activation and norm, given that of the output.
-    pub fn backward(&self, output_gradient: &[f32], left: &mut Activations<'_>, work: &mut Workspace) {
+    /// Turns the slopes of a tile into the gradients δ before each activation and norm, given that
+    /// of the output.
+    pub fn backward(
+        &self,
+        output_gradient: &[f32],
+        left: &mut Activations<'_>,
+        work: &mut Workspace,
+    ) {
         let last = self.last();
         let Activations { slope, norm, .. } = left;
         let after = self.layers.norm_after;
@@ -228,8 +263,16 @@ impl<'a> Network<'a> {
     pub fn input_gradient(&self, first: &[f32], (from, count): (usize, usize), out: &mut [f32]) {
         match count {
             // A library's product is slow at few columns.
-            0..=NARROW => dots(first, self.first_kernel(from, count), &[0.0; NARROW][..count], out, self.width()),
-            _ => product_transposed(first, self.first_kernel(from, count), out, count, self.width()),
+            0..=NARROW => dots(
+                first,
+                self.first_kernel(from, count),
+                &[0.0; NARROW][..count],
+                out,
+                self.width(),
+            ),
+            _ => {
+                product_transposed(first, self.first_kernel(from, count), out, count, self.width())
+            }
         }
     }
 }

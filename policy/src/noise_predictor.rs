@@ -24,7 +24,10 @@ pub struct NoisePredictor {
 pub(crate) fn sinusoids(x: f64) -> impl Iterator<Item = f32> {
     let half = TIME_FEATURES / 2;
     let angle = move |k: usize| x * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp();
-    (0..half).map(move |k| angle(k).cos()).chain((0..half).map(move |k| angle(k).sin())).map(|x| x as f32)
+    (0..half)
+        .map(move |k| angle(k).cos())
+        .chain((0..half).map(move |k| angle(k).sin()))
+        .map(|x| x as f32)
 }
 
 /// The sinusoids of t = 1..T.
@@ -69,12 +72,13 @@ impl NoisePredictor {
         Ok(features_tensor.get_or_init(|| tensor).clone())
     }
 
-    /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`. Differentiable in weights,
-    /// observations and actions.
+    /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`.
+    /// Differentiable in weights, observations and actions.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
         let Parts { time, trunk, .. } = &*self.parts;
         let embedding = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
-        let embedding = embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
+        let embedding =
+            embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
         trunk.forward(&self.weights, &[observations, actions, &embedding])?.squeeze(0)
     }
 
@@ -86,9 +90,9 @@ impl NoisePredictor {
 
     /// Draws actions by the whole reverse process (DDPM).
     ///
-    /// `observations` is `[n, o]`; `noise` is `[T, rows, a]`, standard normal, where equally many consecutive rows share an
-    /// observation: first a^T, then the noise of the reverse steps from t = T down to 2. Gives `[rows, a]`, through which no
-    /// gradient flows.
+    /// `observations` is `[n, o]`; `noise` is `[T, rows, a]`, standard normal, where equally many
+    /// consecutive rows share an observation: first a^T, then the noise of the reverse steps from t
+    /// = T down to 2. Gives `[rows, a]`, through which no gradient flows.
     pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         if !self.parts.trunk.is_fast(&self.weights) {
             return self.detach().composed_sample(observations, noise);
@@ -100,7 +104,8 @@ impl NoisePredictor {
         weights.apply_op3_no_bwd(&observations.contiguous()?, &noise.contiguous()?, &operation)
     }
 
-    /// [`Self::sample`] with the embeddings of all t computed once, and one operation for a reverse step on a GPU.
+    /// [`Self::sample`] with the embeddings of all t computed once, and one operation for a reverse
+    /// step on a GPU.
     fn composed_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
         let Parts { time, trunk, .. } = &*self.parts;
@@ -110,7 +115,8 @@ impl NoisePredictor {
         let mut actions = noise.get(0)?;
         for t in (1..=steps).rev() {
             let embedding = embeddings.get(t - 1)?.broadcast_left(rows)?.contiguous()?;
-            let epsilon = trunk.forward(&self.weights, &[&observations, &actions, &embedding])?.squeeze(0)?;
+            let epsilon =
+                trunk.forward(&self.weights, &[&observations, &actions, &embedding])?.squeeze(0)?;
             let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
             actions = self.schedule().constant_reverse(t, &actions, &epsilon, z.as_ref())?;
         }
@@ -135,9 +141,15 @@ impl NoisePredictor {
     fn check_noise(&self, observations: &Tensor, noise: &Tensor) -> Result<()> {
         let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } = self.parts.shape;
         let ((states, o), (steps, rows, a)) = (observations.dims2()?, noise.dims3()?);
-        let fits = states > 0 && rows > 0 && rows.is_multiple_of(states) && (o, a) == (observation_dim, action_dim);
+        let fits = states > 0
+            && rows > 0
+            && rows.is_multiple_of(states)
+            && (o, a) == (observation_dim, action_dim);
         if !fits || steps != diffusion_steps {
-            bail!("a noise predictor of {:?} got {states} × {o} and noise {steps} × {rows} × {a}", self.parts.shape);
+            bail!(
+                "a noise predictor of {:?} got {states} × {o} and noise {steps} × {rows} × {a}",
+                self.parts.shape
+            );
         }
         Ok(())
     }

@@ -1,5 +1,5 @@
-//! The one-step policy (Park, Li and Levine 2025, "Flow Q-Learning"): a network of state and noise gives an action at once. Of
-//! several such candidates it takes one by what critics say of them.
+//! The one-step policy (Park, Li and Levine 2025, "Flow Q-Learning"): a network of state and noise
+//! gives an action at once. Of several such candidates it takes one by what critics say of them.
 
 use crate::actor_critic::ActorCriticShape;
 use crate::candidates::Actor;
@@ -19,11 +19,17 @@ impl OneStepActor {
     /// Shape of the network over state and noise, which is as long as an action.
     pub fn shape(of: &ActorCriticShape) -> EnsembleShape {
         let ActorCriticShape { observation_dim, action_dim, .. } = *of;
-        EnsembleShape { members: 1, observation_dim, action_dim, layers: of.actor.clone(), outputs: action_dim }
+        EnsembleShape {
+            members: 1,
+            observation_dim,
+            action_dim,
+            layers: of.actor.clone(),
+            outputs: action_dim,
+        }
     }
 
-    /// Actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal `noise`, `[rows, a]`; equally many
-    /// consecutive rows share a state. What is beyond ±1 is ±1.
+    /// Actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal `noise`,
+    /// `[rows, a]`; equally many consecutive rows share a state. What is beyond ±1 is ±1.
     ///
     /// # Errors
     /// Shapes that do not fit, or candle fails.
@@ -65,10 +71,17 @@ mod tests {
     #[test]
     fn an_action_is_what_the_network_says_of_state_and_noise_within_bounds() {
         let layers = MlpConfig { activation: crate::Activation::Relu, ..MlpConfig::mish(&[2]) };
-        let shape =
-            ActorCriticShape { observation_dim: 1, action_dim: 1, actor: layers.clone(), critic: layers, critics: 2 };
+        let shape = ActorCriticShape {
+            observation_dim: 1,
+            action_dim: 1,
+            actor: layers.clone(),
+            critic: layers,
+            critics: 2,
+        };
         // The actor gives s + z; the critics value an action by itself and by twice that.
-        let tensor = |numbers: &[f32], dims: &[usize]| Tensor::from_slice(numbers, dims, &Device::Cpu).unwrap();
+        let tensor = |numbers: &[f32], dims: &[usize]| {
+            Tensor::from_slice(numbers, dims, &Device::Cpu).unwrap()
+        };
         let tensors = [
             ("actor.0.kernel", tensor(&[1.0, -1.0, 1.0, -1.0], &[1, 2, 2])),
             ("actor.0.bias", tensor(&[0.0; 2], &[1, 2])),
@@ -89,7 +102,10 @@ mod tests {
         policy.begin(3).fill_normal(&mut noise);
         for ((action, value), noise) in actions.iter().zip(values).zip(noise) {
             let expected = (0.25 + noise).clamp(-1.0, 1.0);
-            assert!((action - expected).abs() < 1e-6 && (value - 1.5 * expected).abs() < 1e-6, "{action} {value}");
+            assert!(
+                (action - expected).abs() < 1e-6 && (value - 1.5 * expected).abs() < 1e-6,
+                "{action} {value}"
+            );
         }
         let mut taken = [0.0];
         policy.act(&[0.25], &mut [policy.begin(3)], &mut taken).unwrap();

@@ -41,8 +41,12 @@ impl<O: Operation> CustomOp3 for OnCpu<O> {
         actions: &CpuStorage,
         actions_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let (&[states, _], &[.., rows, _]) = (observations_layout.dims(), actions_layout.dims()) else {
-            candle_core::bail!("{} of {observations_layout:?} and {actions_layout:?}, which are no rows", O::NAME)
+        let (&[states, _], &[.., rows, _]) = (observations_layout.dims(), actions_layout.dims())
+        else {
+            candle_core::bail!(
+                "{} of {observations_layout:?} and {actions_layout:?}, which are no rows",
+                O::NAME
+            )
         };
         let (out, shape) = self.0.forward(Arguments {
             weights: slice(weights, weights_layout)?,

@@ -1,4 +1,5 @@
-//! Adam over the weights of a network, with an implementation for the CPU and one of plain candle operations.
+//! Adam over the weights of a network, with an implementation for the CPU and one of plain candle
+//! operations.
 
 use crate::error::PolicyError;
 use crate::recording::overwrite;
@@ -7,8 +8,8 @@ use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{DType, Device, Result, Tensor};
 use quad_kernels::optimizer::{AdamRates, BETA1, BETA2, EPSILON, adam, norm};
 
-/// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network; with a weight decay it is
-/// AdamW (Loshchilov and Hutter 2019).
+/// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network;
+/// with a weight decay it is AdamW (Loshchilov and Hutter 2019).
 pub struct Adam {
     /// Running means of the gradient and of its square, `[2, P]`.
     pub(crate) moments: Tensor,
@@ -47,7 +48,12 @@ impl Adam {
     }
 
     /// Moves the weights down a gradient. Gives its norm before clipping, `[]`.
-    pub fn descend(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+    pub fn descend(
+        &mut self,
+        weights: &mut Weights,
+        gradient: &Tensor,
+        step: AdamStep,
+    ) -> Result<Tensor> {
         self.set(step)?;
         self.descend_as_set(weights, gradient)
     }
@@ -56,7 +62,8 @@ impl Adam {
     pub fn set(&mut self, step: AdamStep) -> Result<()> {
         self.step = step;
         if self.rates.device().is_cuda() {
-            let AdamRates { rate, decay, correction } = AdamRates::new(step.rate, self.decay, step.count);
+            let AdamRates { rate, decay, correction } =
+                AdamRates::new(step.rate, self.decay, step.count);
             overwrite(&self.rates, &Tensor::new(&[rate, decay, correction], &Device::Cpu)?)?;
         }
         Ok(())
@@ -79,7 +86,12 @@ impl Adam {
         }
     }
 
-    fn fused_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+    fn fused_step(
+        &mut self,
+        weights: &mut Weights,
+        gradient: &Tensor,
+        step: AdamStep,
+    ) -> Result<Tensor> {
         let len = gradient.elem_count();
         let size = read(gradient, norm)?;
         let scale = step.clip.map_or(1.0, |clip| (clip / size).min(1.0));
@@ -87,7 +99,9 @@ impl Adam {
         read(gradient, |gradient: &[f32]| {
             modify(&self.moments, |moments| {
                 let moments = moments.split_at_mut(len);
-                weights.change(|weights| modify(weights, |weights| adam(weights, moments, gradient, scale, rates)))
+                weights.change(|weights| {
+                    modify(weights, |weights| adam(weights, moments, gradient, scale, rates))
+                })
             })
         })???;
         Tensor::new(size, gradient.device())
@@ -104,8 +118,10 @@ impl Adam {
                 modify(moments, |_, moments| {
                     weights.change(|weights| {
                         size = Some(modify(weights, |stream, weights| {
-                            quad_kernels::cuda::adam(stream, weights, moments, gradient, clip, rates)
-                                .map_err(candle_core::Error::wrap)
+                            quad_kernels::cuda::adam(
+                                stream, weights, moments, gradient, clip, rates,
+                            )
+                            .map_err(candle_core::Error::wrap)
                         })?);
                         Ok(())
                     })
@@ -116,10 +132,17 @@ impl Adam {
         tensor(size, (), &gradient)
     }
 
-    fn plain_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+    fn plain_step(
+        &mut self,
+        weights: &mut Weights,
+        gradient: &Tensor,
+        step: AdamStep,
+    ) -> Result<Tensor> {
         let size = gradient.sqr()?.sum_all()?.sqrt()?;
         let gradient = match step.clip {
-            Some(clip) => gradient.broadcast_mul(&(size.recip()? * f64::from(clip))?.minimum(1f32)?)?,
+            Some(clip) => {
+                gradient.broadcast_mul(&(size.recip()? * f64::from(clip))?.minimum(1f32)?)?
+            }
             None => gradient.clone(),
         };
         let first = ((self.moments.get(0)? * BETA1)? + (&gradient * (1.0 - BETA1))?)?;
@@ -137,7 +160,8 @@ impl Adam {
         Ok(size)
     }
 
-    /// The moments by name, like the weights of this layout that they are of: `adam_m.…` and `adam_v.…`.
+    /// The moments by name, like the weights of this layout that they are of: `adam_m.…` and
+    /// `adam_v.…`.
     pub fn tensors(&self, layout: &Layout, name: &str) -> Result<Tensors> {
         let mut tensors = layout.split(&self.moments.get(0)?, &format!("adam_m.{name}"))?;
         tensors.extend(layout.split(&self.moments.get(1)?, &format!("adam_v.{name}"))?);
@@ -148,7 +172,12 @@ impl Adam {
     ///
     /// # Errors
     /// A moment that is missing or does not fit.
-    pub fn load(&mut self, layout: &Layout, tensors: &mut Tensors, name: &str) -> std::result::Result<(), PolicyError> {
+    pub fn load(
+        &mut self,
+        layout: &Layout,
+        tensors: &mut Tensors,
+        name: &str,
+    ) -> std::result::Result<(), PolicyError> {
         let first = layout.join(tensors, &format!("adam_m.{name}"))?;
         let second = layout.join(tensors, &format!("adam_v.{name}"))?;
         self.moments = Tensor::stack(&[first, second], 0)?.to_device(self.moments.device())?;
@@ -168,7 +197,10 @@ mod tests {
 
     #[test]
     fn the_learning_rate_falls_along_a_cosine() {
-        assert_eq!((cosine_decay(0, 100), cosine_decay(100, 100), cosine_decay(200, 100)), (1.0, 0.0, 0.0));
+        assert_eq!(
+            (cosine_decay(0, 100), cosine_decay(100, 100), cosine_decay(200, 100)),
+            (1.0, 0.0, 0.0)
+        );
         assert!((cosine_decay(50, 100) - 0.5).abs() < 1e-7);
     }
 }

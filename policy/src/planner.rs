@@ -1,5 +1,6 @@
-//! The planner: it denoises windows of actions and states that begin with the state that it is in, pulls them toward large
-//! returns on the way, and takes the first actions of the one that its value network likes best (Janner et al. 2022, Algorithm 1).
+//! The planner: it denoises windows of actions and states that begin with the state that it is in,
+//! pulls them toward large returns on the way, and takes the first actions of the one that its
+//! value network likes best (Janner et al. 2022, Algorithm 1).
 
 use crate::choice::{Choice, Rule};
 use crate::episode::EpisodeState;
@@ -38,7 +39,8 @@ pub struct PlannerShape {
     pub guidance: Guidance,
     /// Steps of an episode that are taken by one plan, from 1 to the horizon.
     pub replan_every: usize,
-    /// The units in which the networks see observations and actions, beside those of the file's own scaling.
+    /// The units in which the networks see observations and actions, beside those of the file's own
+    /// scaling.
     pub units: Scaling,
 }
 
@@ -63,18 +65,21 @@ impl PlannerShape {
     fn check(&self) -> Result<(), PolicyError> {
         check_range("observation_dim", self.observation_dim, MOST)?;
         check_range("action_dim", self.action_dim, MOST)?;
-        self.network.check().map_err(|WindowError { field, value, .. }| PolicyError::Range { field, value })?;
+        self.network
+            .check()
+            .map_err(|WindowError { field, value, .. }| PolicyError::Range { field, value })?;
         check_range("diffusion_steps", self.diffusion_steps, MOST_STEPS)?;
         check_range("guidance.steps", self.guidance.steps, MOST_STEPS)?;
         check_range("replan_every", self.replan_every, self.network.horizon)
     }
 
-    /// Numbers that are kept of a window while a gradient is taken: those of the networks' layers, some of them unfolded, with
-    /// their gradients.
+    /// Numbers that are kept of a window while a gradient is taken: those of the networks' layers,
+    /// some of them unfolded, with their gradients.
     fn numbers(&self) -> u128 {
         let WindowConfig { horizon, attention, .. } = &self.network;
         let levels = self.network.lengths().into_iter().zip(self.network.widths());
-        let of_blocks = levels.map(|(steps, wide)| 100 * steps * wide.max(self.width())).sum::<usize>();
+        let of_blocks =
+            levels.map(|(steps, wide)| 100 * steps * wide.max(self.width())).sum::<usize>();
         let inner = attention.map_or(0, |of| of.heads * of.width * (16 * horizon + 4 * of.width));
         (of_blocks + inner * 2 * self.network.multipliers.len()) as u128
     }
@@ -96,12 +101,17 @@ impl Planner {
         Ok(tensors)
     }
 
-    pub(crate) fn load(shape: PlannerShape, choice: Choice, tensors: &mut Tensors) -> Result<Self, PolicyError> {
+    pub(crate) fn load(
+        shape: PlannerShape,
+        choice: Choice,
+        tensors: &mut Tensors,
+    ) -> Result<Self, PolicyError> {
         shape.check()?;
         let (config, width) = (&shape.network, shape.width());
         let model = Weights::take(WindowModel::layout(config, width), tensors, MODEL)?;
         let value = Weights::take(WindowValue::layout(config, width), tensors, VALUE)?;
-        let (model, value) = (WindowModel::new(config.clone(), model), WindowValue::new(config.clone(), value));
+        let (model, value) =
+            (WindowModel::new(config.clone(), model), WindowValue::new(config.clone(), value));
         let planning = Arc::new(Planning::new(shape.clone(), model, value));
         Self { shape, choice, planning }.choosing(choice)
     }
@@ -115,8 +125,8 @@ impl Planner {
         }
     }
 
-    /// Plans in states with these observations. Gives the first actions of all plans, `states × plans × replan_every · action_dim`,
-    /// and their values, `states × plans`.
+    /// Plans in states with these observations. Gives the first actions of all plans, `states ×
+    /// plans × replan_every · action_dim`, and their values, `states × plans`.
     fn plan(
         &self,
         observations: &[f32],
@@ -143,14 +153,18 @@ impl Planner {
 }
 
 /// The states that have no plan, with their observations side by side.
-fn without_plan<'a>(observations: &[f32], states: &'a mut [EpisodeState]) -> (Vec<f32>, Vec<&'a mut EpisodeState>) {
+fn without_plan<'a>(
+    observations: &[f32],
+    states: &'a mut [EpisodeState],
+) -> (Vec<f32>, Vec<&'a mut EpisodeState>) {
     let each = observations.chunks_exact(observations.len() / states.len());
     let lacking = each.zip(states).filter(|(_, state)| state.memory.is_empty());
     let (observations, states): (Vec<&[f32]>, _) = lacking.unzip();
     (observations.concat(), states)
 }
 
-/// The value of the plan that a state has, and the action that comes next in it, which is then done.
+/// The value of the plan that a state has, and the action that comes next in it, which is then
+/// done.
 fn next_of_plan(state: &mut EpisodeState, action_dim: usize) -> (f32, Vec<f32>) {
     let value = state.memory[0];
     let action = state.memory.drain(1..=action_dim).collect();
@@ -184,7 +198,8 @@ impl Policy for Planner {
     fn memory(&self, states: usize) -> u64 {
         let rows = states as u128 * u128::from(self.choice.candidates);
         let window = (self.shape.network.horizon * self.shape.width()) as u128;
-        let drawn = rows * (window * self.shape.diffusion_steps as u128 + 2 * self.taken() as u128 + 2);
+        let drawn =
+            rows * (window * self.shape.diffusion_steps as u128 + 2 * self.taken() as u128 + 2);
         let observations = 2 * (states * self.shape.observation_dim) as u128;
         bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape.numbers())
     }
@@ -195,7 +210,12 @@ impl Policy for Planner {
     }
 
     /// In a state that has a plan left, its next action; else that of a new plan.
-    fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
+    fn act(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError> {
         let (plans, taken) = (self.choice.candidates as usize, self.taken());
         let (lacking, mut planning) = without_plan(observations, states);
         if !planning.is_empty() {
@@ -204,8 +224,9 @@ impl Policy for Planner {
             for (state, (planned, values)) in planning.into_iter().zip(of_each) {
                 let chosen = self.choice.pick(values, state)?;
                 // The value, then the actions: of one plan, or the mean of some.
-                let number =
-                    |of: &dyn Fn(usize) -> f32| chosen.iter().map(|plan| of(*plan)).sum::<f32>() / chosen.len() as f32;
+                let number = |of: &dyn Fn(usize) -> f32| {
+                    chosen.iter().map(|plan| of(*plan)).sum::<f32>() / chosen.len() as f32
+                };
                 state.memory.push(number(&|plan| values[plan]));
                 state.memory.extend((0..taken).map(|i| number(&|plan| planned[plan * taken + i])));
             }
@@ -216,9 +237,13 @@ impl Policy for Planner {
         Ok(())
     }
 
-    /// In a state that has a plan left, as often as there are plans its next action and the plan's value; else the first
-    /// action and the value of each new plan.
-    fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Sampled, PolicyError> {
+    /// In a state that has a plan left, as often as there are plans its next action and the plan's
+    /// value; else the first action and the value of each new plan.
+    fn sample(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+    ) -> Result<Sampled, PolicyError> {
         let (plans, action_dim) = (self.choice.candidates as usize, self.shape.action_dim);
         let (lacking, mut planning) = without_plan(observations, states);
         let (planned, drawn) = match planning.is_empty() {
@@ -231,7 +256,8 @@ impl Policy for Planner {
             // Both of states without a plan, in their order, and of the others.
             match if state.memory.is_empty() { new.next() } else { None } {
                 Some((planned, values)) => {
-                    let firsts = planned.chunks_exact(self.taken()).flat_map(|plan| &plan[..action_dim]);
+                    let firsts =
+                        planned.chunks_exact(self.taken()).flat_map(|plan| &plan[..action_dim]);
                     sampled.actions.extend(firsts);
                     sampled.values.extend_from_slice(values);
                 }

@@ -1,4 +1,5 @@
-//! Plans: windows `[action, state] × H`, denoised together from their first state on, and guided by the gradient of their value.
+//! Plans: windows `[action, state] × H`, denoised together from their first state on, and guided by
+//! the gradient of their value.
 
 use crate::error::PolicyError;
 use crate::planner::{Guidance, PlannerShape};
@@ -24,7 +25,10 @@ pub struct Planning {
 /// Candle fails.
 pub fn with_first_state(windows: &Tensor, states: &Tensor) -> Result<Tensor> {
     let (horizon, action_dim) = (windows.dim(1)?, windows.dim(2)? - states.dim(1)?);
-    let first = Tensor::cat(&[&windows.narrow(1, 0, 1)?.narrow(2, 0, action_dim)?, &states.unsqueeze(1)?], 2)?;
+    let first = Tensor::cat(
+        &[&windows.narrow(1, 0, 1)?.narrow(2, 0, action_dim)?, &states.unsqueeze(1)?],
+        2,
+    )?;
     Tensor::cat(&[&first, &windows.narrow(1, 1, horizon - 1)?], 1)
 }
 
@@ -34,15 +38,22 @@ impl Planning {
         Self { schedule: Schedule::cosine(shape.diffusion_steps), shape, model, value }
     }
 
-    /// Plans in n states, whose observations are `n × observation_dim`; `noise` is `T × n × plans × H × (a + o)`, standard
-    /// normal: first the windows as they begin, then the noise of the reverse steps from t = T down to 2. Gives the first
-    /// actions of each plan, `n × plans × replan_every × a`, and the value of each as its last guidance finds it; all in the
-    /// networks' units.
+    /// Plans in n states, whose observations are `n × observation_dim`; `noise` is `T × n × plans ×
+    /// H × (a + o)`, standard normal: first the windows as they begin, then the noise of the
+    /// reverse steps from t = T down to 2. Gives the first actions of each plan, `n × plans ×
+    /// replan_every × a`, and the value of each as its last guidance finds it; all in the networks'
+    /// units.
     ///
     /// # Errors
     /// Candle fails.
-    pub fn plan(&self, observations: &[f32], noise: &[f32]) -> std::result::Result<(Vec<f32>, Vec<f32>), PolicyError> {
-        let PlannerShape { observation_dim: o, action_dim: a, diffusion_steps, replan_every, .. } = self.shape;
+    pub fn plan(
+        &self,
+        observations: &[f32],
+        noise: &[f32],
+    ) -> std::result::Result<(Vec<f32>, Vec<f32>), PolicyError> {
+        let PlannerShape {
+            observation_dim: o, action_dim: a, diffusion_steps, replan_every, ..
+        } = self.shape;
         let (horizon, states) = (self.shape.network.horizon, observations.len() / o);
         let size = horizon * self.shape.width();
         let all = noise.len() / diffusion_steps;
@@ -64,9 +75,13 @@ impl Planning {
         Ok((actions, values))
     }
 
-    /// The whole reverse process of windows with these first states, `[B, o]`. Gives the windows, `[B, H, a + o]`, and their
-    /// values.
-    fn denoise(&self, first: &Tensor, noise: impl Fn(usize) -> Result<Tensor>) -> Result<(Tensor, Vec<f32>)> {
+    /// The whole reverse process of windows with these first states, `[B, o]`. Gives the windows,
+    /// `[B, H, a + o]`, and their values.
+    fn denoise(
+        &self,
+        first: &Tensor,
+        noise: impl Fn(usize) -> Result<Tensor>,
+    ) -> Result<(Tensor, Vec<f32>)> {
         let Guidance { steps, scale, stop } = self.shape.guidance;
         let mut x = with_first_state(&noise(0)?, first)?;
         let mut values = Vec::new();
@@ -77,7 +92,8 @@ impl Planning {
                 values = self.value.values(&x, &all)?.to_vec1()?;
             } else if t > stop {
                 for _ in 0..steps {
-                    let along = (self.gradient(&x, &all)? * f64::from(scale * self.schedule.variance(t)))?;
+                    let along =
+                        (self.gradient(&x, &all)? * f64::from(scale * self.schedule.variance(t)))?;
                     x = with_first_state(&(x + along)?, first)?;
                 }
             }
@@ -94,6 +110,8 @@ impl Planning {
     fn gradient(&self, x: &Tensor, t: &[u32]) -> Result<Tensor> {
         let x = Var::from_tensor(x)?;
         let gradient = self.value.values(&x, t)?.sum_all()?.backward()?.remove(&x);
-        gradient.map(|gradient| gradient.detach()).ok_or_else(|| Error::Msg("no gradient reaches the windows".into()))
+        gradient
+            .map(|gradient| gradient.detach())
+            .ok_or_else(|| Error::Msg("no gradient reaches the windows".into()))
     }
 }

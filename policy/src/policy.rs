@@ -13,7 +13,8 @@ pub trait Policy: Send + Sync {
     /// Numbers in an action.
     fn action_dim(&self) -> usize;
 
-    /// The precision that its actions are computed in, which need not be the one that was asked for.
+    /// The precision that its actions are computed in, which need not be the one that was asked
+    /// for.
     fn precision(&self) -> Precision;
 
     /// How it chooses among the actions that it draws; none if it draws none.
@@ -21,7 +22,8 @@ pub trait Policy: Send + Sync {
         None
     }
 
-    /// Makes a policy that chooses in another way, by the same networks in the same memory. This one stays as it is.
+    /// Makes a policy that chooses in another way, by the same networks in the same memory. This
+    /// one stays as it is.
     ///
     /// # Errors
     /// It draws no actions, it lacks a network that this takes, or a number is out of range.
@@ -29,8 +31,8 @@ pub trait Policy: Send + Sync {
         Err(PolicyError::NoCandidates)
     }
 
-    /// Memory beside the weights that one call of [`Self::act`] takes for so many states at most, bytes. It can be asked
-    /// before it is too much.
+    /// Memory beside the weights that one call of [`Self::act`] takes for so many states at most,
+    /// bytes. It can be asked before it is too much.
     fn memory(&self, states: usize) -> u64;
 
     /// What it carries through the episode of that seed, at its beginning.
@@ -38,34 +40,45 @@ pub trait Policy: Send + Sync {
         EpisodeState::new(seed)
     }
 
-    /// The shape of the standard normal numbers that [`Self::act`] draws in a state of an episode that begins; empty if it
-    /// draws none. [`Choice::uniforms`] says how many uniform ones follow.
+    /// The shape of the standard normal numbers that [`Self::act`] draws in a state of an episode
+    /// that begins; empty if it draws none. [`Choice::uniforms`] says how many uniform ones follow.
     fn noise(&self) -> Vec<usize> {
         Vec::new()
     }
 
     /// Acts in each of n states.
     ///
-    /// `observations` is `n × observation_dim`, `actions` (written) `n × action_dim`; `states` has what the policy carries
-    /// through each state's episode.
+    /// `observations` is `n × observation_dim`, `actions` (written) `n × action_dim`; `states` has
+    /// what the policy carries through each state's episode.
     ///
     /// # Errors
     /// An action or its value is not a number, or candle fails.
-    fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError>;
+    fn act(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError>;
 
-    /// Draws the actions that [`Self::act`] would choose among in each of n states, and says what the critics give each.
+    /// Draws the actions that [`Self::act`] would choose among in each of n states, and says what
+    /// the critics give each.
     ///
-    /// `observations` is `n × observation_dim`, n at least 1; `states` has what the policy carries through each state's episode.
-    /// From equal states, [`Self::act`] takes one of these actions, or the mean of some.
+    /// `observations` is `n × observation_dim`, n at least 1; `states` has what the policy carries
+    /// through each state's episode. From equal states, [`Self::act`] takes one of these actions,
+    /// or the mean of some.
     ///
     /// # Errors
     /// It has no critics, an action or its value is not a number, or candle fails.
-    fn sample(&self, _observations: &[f32], _states: &mut [EpisodeState]) -> Result<Sampled, PolicyError> {
+    fn sample(
+        &self,
+        _observations: &[f32],
+        _states: &mut [EpisodeState],
+    ) -> Result<Sampled, PolicyError> {
         Err(PolicyError::NoCritics)
     }
 
-    /// What the critics say of n actions, each in a state of its own: n numbers, by the choice's [`Reduce`](crate::Reduce), in
-    /// units of the return that they were trained for.
+    /// What the critics say of n actions, each in a state of its own: n numbers, by the choice's
+    /// [`Reduce`](crate::Reduce), in units of the return that they were trained for.
     ///
     /// `observations` is `n × observation_dim`, `actions` `n × action_dim`, n at least 1.
     ///

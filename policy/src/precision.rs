@@ -11,8 +11,8 @@ pub enum Precision {
     /// f32 throughout.
     #[default]
     F32,
-    /// Operands rounded to bfloat16 (8 bits of mantissa), sums in f32. Faster on AMD's CPUs with AVX512-BF16, several times
-    /// on those with AMX; others compute in f32.
+    /// Operands rounded to bfloat16 (8 bits of mantissa), sums in f32. Faster on AMD's CPUs with
+    /// AVX512-BF16, several times on those with AMX; others compute in f32.
     Bf16,
 }
 
@@ -34,11 +34,16 @@ impl Precision {
         if quad_kernels::product::rounding_is_faster() { self } else { Precision::F32 }
     }
 
-    /// How this CPU computes where it is asked for, as it is called on the wire and in `scores.jsonl`: what is in effect, and by
-    /// which instructions, e.g. `bf16-amx`. Two CPUs give the same bits only if this is the same.
+    /// How this CPU computes where it is asked for, as it is called on the wire and in
+    /// `scores.jsonl`: what is in effect, and by which instructions, e.g. `bf16-amx`. Two CPUs give
+    /// the same bits only if this is the same.
     pub fn arithmetic(self) -> String {
         let precision = self.in_effect();
-        format!("{}-{}", precision.name(), quad_kernels::product::instructions(precision == Precision::Bf16))
+        format!(
+            "{}-{}",
+            precision.name(),
+            quad_kernels::product::instructions(precision == Precision::Bf16)
+        )
     }
 
     /// Whether this CPU computes with it, rather than with f32 in its place.

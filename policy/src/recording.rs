@@ -6,16 +6,21 @@ use candle_core::{Device, Result, Tensor, bail};
 pub struct Recording(#[cfg(feature = "cuda")] quad_kernels::recording::Recording);
 
 impl Recording {
-    /// Does `work` as a rehearsal: what it sends to the GPU, sizes and constants, stays there for its recording.
+    /// Does `work` as a rehearsal: what it sends to the GPU, sizes and constants, stays there for
+    /// its recording.
     pub fn rehearse<R>(device: &Device, work: impl FnOnce() -> R) -> R {
         #[cfg(feature = "cuda")]
-        let _kept = if let Device::Cuda(gpu) = device { Some(gpu.enable_cuda_graph_htod_cache()) } else { None };
+        let _kept = if let Device::Cuda(gpu) = device {
+            Some(gpu.enable_cuda_graph_htod_cache())
+        } else {
+            None
+        };
         let _ = device;
         work()
     }
 
-    /// Records `work`, which was rehearsed on this thread, without doing it. It changes tensors that there are, and lets go of
-    /// none of these and of all that it makes.
+    /// Records `work`, which was rehearsed on this thread, without doing it. It changes tensors
+    /// that there are, and lets go of none of these and of all that it makes.
     ///
     /// # Errors
     /// `work` fails, or cannot be recorded.

@@ -1,5 +1,6 @@
-//! The sampler's work on the CPU: a custom operation of (weights, observations, noise) that runs the whole reverse process for
-//! one tile of rows after the other, so that activations stay in a core's cache; tiles run in parallel.
+//! The sampler's work on the CPU: a custom operation of (weights, observations, noise) that runs
+//! the whole reverse process for one tile of rows after the other, so that activations stay in a
+//! core's cache; tiles run in parallel.
 
 use crate::layers::TILE;
 use crate::mlp::{Kernels, Mlp, of_member};
@@ -69,8 +70,16 @@ impl Parts {
                     actions.copy_from_slice(&noise[i * tile..][..actions.len()]);
                     for t in (1..=steps).rev() {
                         let shift = &shifts[(t - 1) * width..][..width];
-                        network.forward(Input { base, repeat, shift, actions, kernel }, work, epsilon);
-                        let z = if t > 1 { &noise[(steps - t + 1) * all + i * tile..][..actions.len()] } else { &[] };
+                        network.forward(
+                            Input { base, repeat, shift, actions, kernel },
+                            work,
+                            epsilon,
+                        );
+                        let z = if t > 1 {
+                            &noise[(steps - t + 1) * all + i * tile..][..actions.len()]
+                        } else {
+                            &[]
+                        };
                         self.schedule.reverse_in_place(t, actions, epsilon, z);
                     }
                 });

@@ -9,8 +9,8 @@ use quad_kernels::product::outer_rows;
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Activations of all hidden layers of all members, and their slopes, each `members × rows × width`; on the backward pass the
-/// gradients before the activations take the slopes' place.
+/// Activations of all hidden layers of all members, and their slopes, each `members × rows ×
+/// width`; on the backward pass the gradients before the activations take the slopes' place.
 #[derive(Default)]
 pub(crate) struct SavedActivations {
     x: Vec<Buffer>,
@@ -56,14 +56,19 @@ impl SavedActivations {
         let mut tiles: Vec<_> = cut(out).enumerate().map(tile).collect();
         for ((x, slope), width) in self.x.iter_mut().zip(&mut self.slope).zip(&self.widths) {
             let len = members * rows * width;
-            for ((tile, x), slope) in tiles.iter_mut().zip(cut(x.sized(len))).zip(cut(slope.sized(len))) {
+            for ((tile, x), slope) in
+                tiles.iter_mut().zip(cut(x.sized(len))).zip(cut(slope.sized(len)))
+            {
                 tile.activations.x.push(x);
                 tile.activations.slope.push(slope);
             }
         }
         for (layer, (norm, width)) in self.norm.iter_mut().zip(&self.widths).enumerate() {
             let full = kept(TILE, *width);
-            for (tile, norm) in tiles.iter_mut().zip(norm.sized(members * each_member * full).chunks_exact_mut(full)) {
+            for (tile, norm) in tiles
+                .iter_mut()
+                .zip(norm.sized(members * each_member * full).chunks_exact_mut(full))
+            {
                 let rows = tile.activations.x[layer].len() / width;
                 tile.activations.norm.push(&mut norm[..kept(rows, *width)]);
             }
@@ -81,9 +86,14 @@ impl SavedActivations {
         self.of_member(&self.slope[0], 0, member)
     }
 
-    /// After the backward pass: the gradients of these layers. `input` is `rows × inputs`, `output_gradient`
-    /// `members × rows × outputs`.
-    pub fn weight_gradients(&self, layers: Vec<LayerMut<'_>>, input: &[f32], output_gradient: &[f32]) {
+    /// After the backward pass: the gradients of these layers. `input` is `rows × inputs`,
+    /// `output_gradient` `members × rows × outputs`.
+    pub fn weight_gradients(
+        &self,
+        layers: Vec<LayerMut<'_>>,
+        input: &[f32],
+        output_gradient: &[f32],
+    ) {
         layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias, norm }| {
             let x = match layer {
                 0 => input,

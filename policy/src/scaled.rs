@@ -18,7 +18,10 @@ struct Scaled {
 }
 
 /// The policy in the units that its file says.
-pub(crate) fn scaled(policy: Box<dyn Policy>, scaling: Option<Scaling>) -> Result<Box<dyn Policy>, PolicyError> {
+pub(crate) fn scaled(
+    policy: Box<dyn Policy>,
+    scaling: Option<Scaling>,
+) -> Result<Box<dyn Policy>, PolicyError> {
     let Some(scaling) = scaling else { return Ok(policy) };
     for (what, affine, columns) in [
         ("observations", &scaling.observations, policy.observation_dim()),
@@ -69,7 +72,10 @@ impl Policy for Scaled {
     }
 
     fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
-        Ok(Box::new(Self { policy: self.policy.with_choice(choice)?, scaling: self.scaling.clone() }))
+        Ok(Box::new(Self {
+            policy: self.policy.with_choice(choice)?,
+            scaling: self.scaling.clone(),
+        }))
     }
 
     fn memory(&self, states: usize) -> u64 {
@@ -85,13 +91,22 @@ impl Policy for Scaled {
         self.policy.noise()
     }
 
-    fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
+    fn act(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError> {
         self.policy.act(&self.observations(observations), states, actions)?;
         self.to_user(actions);
         Ok(())
     }
 
-    fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Sampled, PolicyError> {
+    fn sample(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+    ) -> Result<Sampled, PolicyError> {
         let mut sampled = self.policy.sample(&self.observations(observations), states)?;
         self.to_user(&mut sampled.actions);
         Ok(sampled)
@@ -124,16 +139,20 @@ mod tests {
 
     /// One policy, without and with maps.
     fn pair(scaling: Scaling) -> [Result<Box<dyn Policy>, PolicyError>; 2] {
-        let load = |scaling| load_policy(&file_of(Choice::best_of(6), 1.0, None, scaling), Precision::F32);
+        let load =
+            |scaling| load_policy(&file_of(Choice::best_of(6), 1.0, None, scaling), Precision::F32);
         [load(None), load(Some(scaling))]
     }
 
     #[test]
     fn the_user_s_units_go_in_and_come_out() {
         let [plain, scaled] = pair(scaling()).map(Result::unwrap);
-        // (108, -2.5, 1.5, -4) is (1, 1, 1, -1) to the networks, (100, -3, 0.5, 8) is (0, 0, 0, 2): all without rounding.
-        let (ours, theirs) =
-            ([1.0, 1.0, 1.0, -1.0, 0.0, 0.0, 0.0, 2.0], [108.0, -2.5, 1.5, -4.0, 100.0, -3.0, 0.5, 8.0]);
+        // (108, -2.5, 1.5, -4) is (1, 1, 1, -1) to the networks, (100, -3, 0.5, 8) is (0, 0, 0, 2):
+        // all without rounding.
+        let (ours, theirs) = (
+            [1.0, 1.0, 1.0, -1.0, 0.0, 0.0, 0.0, 2.0],
+            [108.0, -2.5, 1.5, -4.0, 100.0, -3.0, 0.5, 8.0],
+        );
         let begin = || [4, 5].map(|seed| plain.begin(seed));
         let to_user = |actions: &[f32]| -> Vec<f32> {
             actions.chunks_exact(2).flat_map(|a| [30.0 + 16.0 * a[0], -1.0 + 0.25 * a[1]]).collect()
@@ -144,11 +163,15 @@ mod tests {
             actions
         };
         let acted = act(&*scaled, &theirs);
-        let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5) && a.len() == b.len();
+        let close = |a: &[f32], b: &[f32]| {
+            a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5) && a.len() == b.len()
+        };
         assert!(close(&acted, &to_user(&act(&*plain, &ours))), "{acted:?}");
         let inside = |a: &[f32]| (14.0..=46.0).contains(&a[0]) && (-1.25..=-0.75).contains(&a[1]);
-        let (plainly, sampled) =
-            (plain.sample(&ours, &mut begin()).unwrap(), scaled.sample(&theirs, &mut begin()).unwrap());
+        let (plainly, sampled) = (
+            plain.sample(&ours, &mut begin()).unwrap(),
+            scaled.sample(&theirs, &mut begin()).unwrap(),
+        );
         assert!(sampled.actions.chunks_exact(2).all(inside), "{:?}", sampled.actions);
         assert!(close(&sampled.actions, &to_user(&plainly.actions)));
         assert_eq!(sampled.values, plainly.values);
@@ -159,7 +182,10 @@ mod tests {
         assert_ne!(value, plain.value(&theirs, &[38.0, -1.125, 22.0, -0.75]).unwrap());
 
         let of_one = scaled.with_choice(Choice::best_of(1)).unwrap();
-        assert_eq!(act(&*of_one, &theirs), to_user(&act(&*plain.with_choice(Choice::best_of(1)).unwrap(), &ours)));
+        assert_eq!(
+            act(&*of_one, &theirs),
+            to_user(&act(&*plain.with_choice(Choice::best_of(1)).unwrap(), &ours))
+        );
         assert!(scaled.memory(3) > plain.memory(3));
         assert_eq!((scaled.noise(), scaled.choice()), (vec![2, 6, 2], plain.choice()));
     }
@@ -167,7 +193,11 @@ mod tests {
     #[test]
     fn a_number_that_never_changed_is_given_exactly_and_not_seen() {
         let observations = affine(&[100.0, -3.0, 0.1, 0.0], &[8.0, 0.5, 0.0, 4.0]);
-        let constant = Scaling { observations, actions: affine(&[30.0, 0.1], &[16.0, 0.0]), rewards: Some(200.0) };
+        let constant = Scaling {
+            observations,
+            actions: affine(&[30.0, 0.1], &[16.0, 0.0]),
+            rewards: Some(200.0),
+        };
         let [plain, scaled] = pair(constant).map(Result::unwrap);
         let begin = || [plain.begin(4)];
         let mut acted = [vec![0.0; 2], vec![0.0; 2]];
@@ -180,7 +210,10 @@ mod tests {
         assert!(sampled.actions.chunks_exact(2).all(|action| action[1] == 0.1));
         let mut ours = vec![0.0; 2];
         plain.act(&[1.0, 1.0, 0.0, -1.0], &mut begin(), &mut ours).unwrap();
-        assert!((acted[0][0] - (30.0 + 16.0 * ours[0])).abs() < 1e-5 && ours[1] != 0.0, "{acted:?} {ours:?}");
+        assert!(
+            (acted[0][0] - (30.0 + 16.0 * ours[0])).abs() < 1e-5 && ours[1] != 0.0,
+            "{acted:?} {ours:?}"
+        );
         let value = scaled.value(&[108.0, -2.5, 0.1, -4.0], &[38.0, 0.1]).unwrap();
         assert_eq!(value, plain.value(&[1.0, 1.0, 0.0, -1.0], &[0.5, 0.0]).unwrap());
     }
@@ -203,7 +236,8 @@ mod tests {
         };
         assert!(header(None).get("scaling").is_none());
         let written = header(Some(Scaling { observations: None, ..scaling() }));
-        let expected = serde_json::json!({ "actions": { "offset": [30.0, -1.0], "scale": [16.0, 0.25] } });
+        let expected =
+            serde_json::json!({ "actions": { "offset": [30.0, -1.0], "scale": [16.0, 0.25] } });
         assert_eq!(written["scaling"], expected);
     }
 }

@@ -1,5 +1,5 @@
-//! The policy of SfBC: it draws candidates by solving the reverse process of a cloned score network, and takes some by what a
-//! critic says of them.
+//! The policy of SfBC: it draws candidates by solving the reverse process of a cloned score
+//! network, and takes some by what a critic says of them.
 
 use crate::candidates::{Actor, CandidatePolicy, Networks};
 use crate::choice::Choice;
@@ -48,7 +48,13 @@ impl ScorePolicyShape {
     /// Shape of the critic, an ensemble of one.
     pub fn critic(&self) -> EnsembleShape {
         let Self { observation_dim, action_dim, .. } = *self;
-        EnsembleShape { members: 1, observation_dim, action_dim, layers: self.critic.clone(), outputs: 1 }
+        EnsembleShape {
+            members: 1,
+            observation_dim,
+            action_dim,
+            layers: self.critic.clone(),
+            outputs: 1,
+        }
     }
 
     fn check(&self) -> Result<(), PolicyError> {
@@ -87,7 +93,11 @@ impl ScorePolicy {
             solver: DpmSolver::new(shape.evaluations),
         };
         let critics = Ensemble::take(shape.critic(), tensors, CRITIC, precision)?;
-        CandidatePolicy::new(Networks { actor: Box::new(actor), critics, value: None }, choice, Precision::F32)
+        CandidatePolicy::new(
+            Networks { actor: Box::new(actor), critics, value: None },
+            choice,
+            Precision::F32,
+        )
     }
 }
 
@@ -113,7 +123,8 @@ impl Actor for Drawing {
     fn memory(&self, states: u128, candidates: u128) -> u128 {
         // The solver holds some actions more.
         let shape = self.network.shape();
-        shape.memory(states, states * candidates) + states * candidates * (6 * shape.action_dim) as u128
+        shape.memory(states, states * candidates)
+            + states * candidates * (6 * shape.action_dim) as u128
     }
 }
 
@@ -131,14 +142,21 @@ mod tests {
 
     fn shape() -> ScorePolicyShape {
         let actor = MlpConfig { activation: Activation::Silu, ..MlpConfig::mish(&[16, 8]) };
-        ScorePolicyShape { observation_dim: 3, action_dim: 2, critic: actor.clone(), actor, evaluations: 5 }
+        ScorePolicyShape {
+            observation_dim: 3,
+            action_dim: 2,
+            critic: actor.clone(),
+            actor,
+            evaluations: 5,
+        }
     }
 
     fn file(shape: &ScorePolicyShape, choice: Choice) -> Vec<u8> {
         let generator = &mut ChaCha8Rng::seed_from_u64(1);
         let actor = Weights::initial(&shape.actor().layout(), generator, &Device::Cpu).unwrap();
         let actor = Weights::constant(shape.actor().layout(), actor);
-        let actor = ScoreNetwork::new(shape.actor(), actor, ScoreShape::frequencies(generator).unwrap());
+        let actor =
+            ScoreNetwork::new(shape.actor(), actor, ScoreShape::frequencies(generator).unwrap());
         let critic = Weights::initial(&shape.critic().layout(), generator, &Device::Cpu).unwrap();
         let critic = Weights::constant(shape.critic().layout(), critic);
         let critic = Ensemble::new(shape.critic(), critic, Precision::F32);
@@ -147,11 +165,14 @@ mod tests {
         Header::new(policy, ()).to_safetensors(&tensors).unwrap()
     }
 
-    /// The action is the mean of the best four candidates where the temperature leaves no doubt which these are.
+    /// The action is the mean of the best four candidates where the temperature leaves no doubt
+    /// which these are.
     #[test]
     fn it_does_the_mean_of_the_best_of_what_it_samples() {
         let rule = Rule::Average { temperature: 1e-7, actions: 4 };
-        let policy = load_policy(&file(&shape(), Choice { rule, ..Choice::best_of(6) }), Precision::Bf16).unwrap();
+        let policy =
+            load_policy(&file(&shape(), Choice { rule, ..Choice::best_of(6) }), Precision::Bf16)
+                .unwrap();
         assert_eq!(policy.precision(), Precision::F32);
         let observations = [0.5, -0.2, 0.1, 1.0, 0.0, -1.0];
         let begin = || [7, 8].map(|seed| policy.begin(seed));
@@ -164,9 +185,15 @@ mod tests {
             order.sort_by(|x, y| values[*y].total_cmp(&values[*x]));
             for (j, taken) in taken.iter().enumerate() {
                 let mean = order[..4].iter().map(|place| actions[place * 2 + j]).sum::<f32>() / 4.0;
-                assert!((taken - mean).abs() < 1e-5 * mean.abs().max(1.0), "state {i}: {taken} for {mean}");
+                assert!(
+                    (taken - mean).abs() < 1e-5 * mean.abs().max(1.0),
+                    "state {i}: {taken} for {mean}"
+                );
             }
-            assert_eq!(policy.value(&observations[i * 3..][..3].repeat(6), actions).unwrap(), values);
+            assert_eq!(
+                policy.value(&observations[i * 3..][..3].repeat(6), actions).unwrap(),
+                values
+            );
         }
         let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(2) };
         assert!(matches!(policy.with_choice(nearest), Err(PolicyError::NoValue)));

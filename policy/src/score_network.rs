@@ -1,5 +1,5 @@
-//! The noise predictor of SfBC, ε_θ(a_t, s, t) in continuous time: residual blocks that narrow, then widen again and see what
-//! the narrowing ones made. A score is −ε_θ/σ_t.
+//! The noise predictor of SfBC, ε_θ(a_t, s, t) in continuous time: residual blocks that narrow,
+//! then widen again and see what the narrowing ones made. A score is −ε_θ/σ_t.
 
 use crate::dense::Dense;
 use crate::dense_graph::{DenseGraph, Step};
@@ -27,8 +27,8 @@ pub struct ScoreShape {
     pub observation_dim: usize,
     /// Numbers in an action a.
     pub action_dim: usize,
-    /// Widths of the narrowing blocks; the last is also that of the middle block, and of what state and time become. It has
-    /// no norm.
+    /// Widths of the narrowing blocks; the last is also that of the middle block, and of what state
+    /// and time become. It has no norm.
     pub layers: MlpConfig,
 }
 
@@ -48,13 +48,15 @@ impl Builder<'_> {
 
     /// A layer, whose weights come behind those of the layers before it.
     fn dense(&mut self, name: &str, (inputs, outputs): (usize, usize), active: bool) -> Dense {
-        let layer = Dense::new(self.start, inputs, outputs, active.then_some(self.layers.activation));
+        let layer =
+            Dense::new(self.start, inputs, outputs, active.then_some(self.layers.activation));
         self.start = layer.range().end;
         self.parts.extend(layer.parts(name, self.layers.initial));
         layer
     }
 
-    /// Applies a layer to value number `x`, and adds value number `added`. Gives the number of what comes out.
+    /// Applies a layer to value number `x`, and adds value number `added`. Gives the number of what
+    /// comes out.
     fn apply(&mut self, layer: Dense, x: usize, added: Option<usize>) -> usize {
         self.steps.push(Step::Dense { layer, x, added });
         self.next() - 1
@@ -70,8 +72,8 @@ impl Builder<'_> {
         self.next() - 1
     }
 
-    /// A block: f(x·W + b) plus what state and time add, value number `condition` of width `of_condition`; then the same again, plus
-    /// the block's input, in the output's width.
+    /// A block: f(x·W + b) plus what state and time add, value number `condition` of width
+    /// `of_condition`; then the same again, plus the block's input, in the output's width.
     fn block(
         &mut self,
         name: &str,
@@ -98,7 +100,8 @@ impl Builder<'_> {
 /// The network of (state, features of time, actions), and the layout of its weights.
 fn build(shape: &ScoreShape) -> (DenseGraph, Layout) {
     let (layers, a) = (&shape.layers, shape.action_dim);
-    let (widths, mut of) = (&layers.hidden, Builder { layers, parts: Vec::new(), start: 0, steps: Vec::new() });
+    let (widths, mut of) =
+        (&layers.hidden, Builder { layers, parts: Vec::new(), start: 0, steps: Vec::new() });
     let narrowest = widths.last().copied().unwrap_or(1);
     let state = of.layer("state", 0, (shape.observation_dim, EMBEDDING), true);
     let time = of.layer("time", 1, (EMBEDDING, EMBEDDING), false);
@@ -112,14 +115,18 @@ fn build(shape: &ScoreShape) -> (DenseGraph, Layout) {
         narrowed.push(x);
     }
     x = of.block("middle", x, (narrowest, narrowest), condition);
-    // Each sees the block before it and the narrowing block of that width, and is as wide as the one above that.
+    // Each sees the block before it and the narrowing block of that width, and is as wide as the
+    // one above that.
     for (i, pair) in widths.windows(2).rev().enumerate() {
         let both = of.beside(narrowed.pop().unwrap_or(x), x);
         x = of.block(&format!("up.{i}"), both, (2 * pair[1], pair[0]), condition);
     }
     let both = of.beside(narrowed.pop().unwrap_or(x), x);
     of.layer("last", both, (2 * widths.first().copied().unwrap_or(1), a), false);
-    (DenseGraph::new(vec![shape.observation_dim, EMBEDDING, a], of.steps, of.start), Layout::new(of.parts))
+    (
+        DenseGraph::new(vec![shape.observation_dim, EMBEDDING, a], of.steps, of.start),
+        Layout::new(of.parts),
+    )
 }
 
 /// A noise predictor in continuous time, and its weights.
@@ -152,7 +159,8 @@ impl ScoreShape {
     /// Numbers that a forward pass holds at once at most.
     pub(crate) fn memory(&self, states: u128, rows: u128) -> u128 {
         let (widths, widest) = (&self.layers.hidden, self.layers.widest());
-        // What narrowing blocks made; and of a block its input, which is two outputs side by side, and three steps to its output.
+        // What narrowing blocks made; and of a block its input, which is two outputs side by side,
+        // and three steps to its output.
         let of_row = widths.iter().sum::<usize>() + 6 * widest;
         let of_state = 4 * EMBEDDING + 4 * widest;
         rows * of_row as u128 + states * of_state as u128
@@ -187,12 +195,14 @@ impl ScoreNetwork {
 
     /// Makes constants of the weights; they share the memory of this network.
     pub fn detach(&self) -> Self {
-        let (shape, graph, frequencies) = (self.shape.clone(), self.graph.clone(), self.frequencies.clone());
+        let (shape, graph, frequencies) =
+            (self.shape.clone(), self.graph.clone(), self.frequencies.clone());
         Self { shape, graph, weights: self.weights.detach(), frequencies }
     }
 
-    /// ε_θ(a_t, s, t), `[rows, a]`: `observations [n, o]` and `t` (n of them) of states, `actions [rows, a]`, where equally many
-    /// consecutive rows share a state. Differentiable in the weights.
+    /// ε_θ(a_t, s, t), `[rows, a]`: `observations [n, o]` and `t` (n of them) of states, `actions
+    /// [rows, a]`, where equally many consecutive rows share a state. Differentiable in the
+    /// weights.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &[f64]) -> Result<Tensor> {
         let (n, rows) = (observations.dim(0)?, actions.dim(0)?);
         if n == 0 || n != t.len() || !rows.is_multiple_of(n) {
@@ -206,16 +216,23 @@ impl ScoreNetwork {
     fn time_features(&self, t: &[f64], device: &Device) -> Result<Tensor> {
         let frequencies = self.frequencies.to_vec1::<f32>()?;
         let row = |t: &f64| {
-            let angles: Vec<f64> = frequencies.iter().map(|frequency| TAU * t * f64::from(*frequency)).collect();
+            let angles: Vec<f64> =
+                frequencies.iter().map(|frequency| TAU * t * f64::from(*frequency)).collect();
             angles.iter().map(|x| x.sin()).chain(angles.iter().map(|x| x.cos())).collect::<Vec<_>>()
         };
         let features: Vec<f32> = t.iter().flat_map(row).map(|x| x as f32).collect();
         Tensor::from_vec(features, (t.len(), EMBEDDING), device)
     }
 
-    /// Draws actions `[rows, a]` from standard normal `noise`, `[rows, a]`, in the states of `observations`, `[n, o]`, where equally
-    /// many consecutive rows share a state. No gradient flows through them.
-    pub fn sample(&self, solver: &DpmSolver, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+    /// Draws actions `[rows, a]` from standard normal `noise`, `[rows, a]`, in the states of
+    /// `observations`, `[n, o]`, where equally many consecutive rows share a state. No gradient
+    /// flows through them.
+    pub fn sample(
+        &self,
+        solver: &DpmSolver,
+        observations: &Tensor,
+        noise: &Tensor,
+    ) -> Result<Tensor> {
         let (network, states) = (self.detach(), observations.dim(0)?);
         solver.solve(noise, |x, t| network.predict(observations, x, &vec![t; states]))
     }
@@ -233,12 +250,17 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     fn normal(generator: &mut ChaCha8Rng, shape: (usize, usize)) -> Tensor {
-        let numbers: Vec<f32> = (0..shape.0 * shape.1).map(|_| StandardNormal.sample(generator)).collect();
+        let numbers: Vec<f32> =
+            (0..shape.0 * shape.1).map(|_| StandardNormal.sample(generator)).collect();
         Tensor::from_vec(numbers, shape, &Device::Cpu).unwrap()
     }
 
     fn network(generator: &mut ChaCha8Rng, hidden: &[usize]) -> ScoreNetwork {
-        let layers = MlpConfig { activation: Activation::Silu, initial: Initial::Torch, ..MlpConfig::mish(hidden) };
+        let layers = MlpConfig {
+            activation: Activation::Silu,
+            initial: Initial::Torch,
+            ..MlpConfig::mish(hidden)
+        };
         let shape = ScoreShape { observation_dim: 5, action_dim: 3, layers };
         let layout = shape.layout();
         let weights = Weights::initial(&layout, generator, &Device::Cpu).unwrap();
@@ -249,26 +271,40 @@ mod tests {
     fn close(fast: &Tensor, plain: &Tensor) {
         assert_eq!(fast.dims(), plain.dims());
         let size = plain.sqr().unwrap().mean_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
-        let difference = (fast - plain).unwrap().abs().unwrap().flatten_all().unwrap().max(0).unwrap();
-        assert!(difference.to_scalar::<f32>().unwrap() < 1e-4 * size, "{difference} at a size of {size}");
+        let difference =
+            (fast - plain).unwrap().abs().unwrap().flatten_all().unwrap().max(0).unwrap();
+        assert!(
+            difference.to_scalar::<f32>().unwrap() < 1e-4 * size,
+            "{difference} at a size of {size}"
+        );
     }
 
-    /// Values and gradients of the fast layers are those of candle's operations; rows fill several tiles and parts, or none.
+    /// Values and gradients of the fast layers are those of candle's operations; rows fill several
+    /// tiles and parts, or none.
     #[test]
     fn it_gives_the_plain_values_and_gradients() {
         let generator = &mut ChaCha8Rng::seed_from_u64(0);
-        for (hidden, states, repeat) in
-            [(&[24, 16, 8][..], 300, 1), (&[16, 32], 40, 7), (&[7], 3, 1), (&[16, 16, 16, 16], 1500, 1)]
-        {
+        for (hidden, states, repeat) in [
+            (&[24, 16, 8][..], 300, 1),
+            (&[16, 32], 40, 7),
+            (&[7], 3, 1),
+            (&[16, 16, 16, 16], 1500, 1),
+        ] {
             let network = network(generator, hidden);
-            let (observations, actions) = (normal(generator, (states, 5)), normal(generator, (states * repeat, 3)));
+            let (observations, actions) =
+                (normal(generator, (states, 5)), normal(generator, (states * repeat, 3)));
             let t: Vec<f64> = (1..=states).map(|i| i as f64 / states as f64).collect();
             let predict = || network.predict(&observations, &actions, &t).unwrap();
             let (fast, plain) = (predict(), plainly(predict));
             close(&fast, &plain);
             let gradient = |predicted: &Tensor| {
                 let loss = (predicted - &actions).unwrap().sqr().unwrap().sum_all().unwrap();
-                Gradients::of(&loss).unwrap().with_respect_to(network.weights()).unwrap().copy().unwrap()
+                Gradients::of(&loss)
+                    .unwrap()
+                    .with_respect_to(network.weights())
+                    .unwrap()
+                    .copy()
+                    .unwrap()
             };
             close(&gradient(&fast), &gradient(&plain));
             close(&network.detach().predict(&observations, &actions, &t).unwrap(), &plain);
@@ -285,7 +321,10 @@ mod tests {
         let shared = network.sample(&solver, &observations, &noise).unwrap();
         let each = crate::plain::repeat_rows(&observations, 3).unwrap();
         close(&shared, &network.sample(&solver, &each, &noise).unwrap());
-        assert!(network.predict(&observations, &noise, &[0.5; 3]).is_err(), "a time for each state");
+        assert!(
+            network.predict(&observations, &noise, &[0.5; 3]).is_err(),
+            "a time for each state"
+        );
         assert!(network.predict(&observations, &normal(generator, (5, 3)), &[0.5; 4]).is_err());
     }
 }

@@ -27,7 +27,13 @@ pub struct EnsembleShape {
 
 impl EnsembleShape {
     pub(crate) fn layers(&self) -> Layers {
-        Layers::new(self.members, self.observation_dim + self.action_dim, &self.layers, self.outputs, 0)
+        Layers::new(
+            self.members,
+            self.observation_dim + self.action_dim,
+            &self.layers,
+            self.outputs,
+            0,
+        )
     }
 
     /// Numbers that it takes to run all networks forward on so many states, `repeat` rows for each.
@@ -43,14 +49,15 @@ impl EnsembleShape {
         rows * self.outputs as u128 + fed + inside
     }
 
-    /// Tensors `{0..}.kernel` `[K, in, out]` and `{0..}.bias` `[K, out]`, and with a norm `.scale` and `.shift` `[K, out]`.
+    /// Tensors `{0..}.kernel` `[K, in, out]` and `{0..}.bias` `[K, out]`, and with a norm `.scale`
+    /// and `.shift` `[K, out]`.
     pub fn layout(&self) -> Layout {
         Layout::new(self.layers().named("", true))
     }
 }
 
-/// Numbers that the threads keep of the tiles of rows that they are at: rows of one state are not parted, and of each row
-/// there are some hidden layers.
+/// Numbers that the threads keep of the tiles of rows that they are at: rows of one state are not
+/// parted, and of each row there are some hidden layers.
 pub(crate) fn tile_numbers(repeat: u128, layers: &MlpConfig) -> u128 {
     let each = (2 * layers.hidden.len()).max(4) * layers.widest();
     (rayon::current_num_threads() * each) as u128 * repeat.max(TILE as u128)
@@ -79,7 +86,8 @@ pub struct NoiseShape {
 impl NoiseShape {
     /// The network that embeds a denoising step; always the same.
     pub(crate) fn time_layers(&self) -> Layers {
-        let config = MlpConfig { initial: self.layers.initial, ..MlpConfig::mish(&[TIME_EMBEDDING]) };
+        let config =
+            MlpConfig { initial: self.layers.initial, ..MlpConfig::mish(&[TIME_EMBEDDING]) };
         Layers::new(1, TIME_FEATURES, &config, TIME_EMBEDDING, 0)
     }
 

@@ -4,7 +4,8 @@ use std::cell::Cell;
 
 use candle_core::{CpuStorage, Device, Error, InplaceOp1, Layout, Result, Storage, Tensor};
 
-/// Whether operations on this device have a fast implementation: on the CPU, unless the feature `plain` says otherwise.
+/// Whether operations on this device have a fast implementation: on the CPU, unless the feature
+/// `plain` says otherwise.
 pub fn has_fast_implementation(device: &Device) -> bool {
     #[cfg(test)]
     if PLAINLY.get() {
@@ -28,13 +29,21 @@ pub(crate) fn plainly<R>(work: impl FnOnce() -> R) -> R {
 }
 
 /// The numbers behind a contiguous layout.
-pub(crate) fn slice<'a, T: candle_core::WithDType>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [T]> {
-    let Some((from, to)) = layout.contiguous_offsets() else { candle_core::bail!("a tensor is not contiguous") };
+pub(crate) fn slice<'a, T: candle_core::WithDType>(
+    storage: &'a CpuStorage,
+    layout: &Layout,
+) -> Result<&'a [T]> {
+    let Some((from, to)) = layout.contiguous_offsets() else {
+        candle_core::bail!("a tensor is not contiguous")
+    };
     Ok(&storage.as_slice()?[from..to])
 }
 
 /// The numbers of a contiguous tensor on the CPU.
-pub(crate) fn on_cpu<'a, T: candle_core::WithDType>(storage: &'a Storage, layout: &Layout) -> Result<&'a [T]> {
+pub(crate) fn on_cpu<'a, T: candle_core::WithDType>(
+    storage: &'a Storage,
+    layout: &Layout,
+) -> Result<&'a [T]> {
     match storage {
         Storage::Cpu(storage) => slice(storage, layout),
         _ => candle_core::bail!("a tensor is not on the CPU"),
@@ -42,7 +51,10 @@ pub(crate) fn on_cpu<'a, T: candle_core::WithDType>(storage: &'a Storage, layout
 }
 
 /// Hands the numbers of a contiguous tensor on the CPU to `work`.
-pub fn read<T: candle_core::WithDType, R>(tensor: &Tensor, work: impl FnOnce(&[T]) -> R) -> Result<R> {
+pub fn read<T: candle_core::WithDType, R>(
+    tensor: &Tensor,
+    work: impl FnOnce(&[T]) -> R,
+) -> Result<R> {
     let (storage, layout) = tensor.storage_and_layout();
     Ok(work(on_cpu(&storage, layout)?))
 }
@@ -60,7 +72,9 @@ pub fn modify<R>(tensor: &Tensor, work: impl FnOnce(&mut [f32]) -> R) -> Result<
             let (CpuStorage::F32(numbers), Some((from, to)), Some(work)) =
                 (storage, layout.contiguous_offsets(), self.0.take())
             else {
-                return Err(Error::Msg("only contiguous tensors of f32 can be changed in place".into()));
+                return Err(Error::Msg(
+                    "only contiguous tensors of f32 can be changed in place".into(),
+                ));
             };
             self.1.set(Some(work(&mut numbers[from..to])));
             Ok(())

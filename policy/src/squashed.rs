@@ -1,5 +1,5 @@
-//! The squashed Gaussian policy: its candidates are tanh(u), where u is normal and a network of the state gives its mean and
-//! log σ. Of these it takes one by what critics say of them.
+//! The squashed Gaussian policy: its candidates are tanh(u), where u is normal and a network of the
+//! state gives its mean and log σ. Of these it takes one by what critics say of them.
 
 use crate::actor_critic::ActorCriticShape;
 use crate::candidates::Actor;
@@ -22,11 +22,17 @@ impl SquashedActor {
     /// Shape of the network of which the mean comes first, then log σ.
     pub fn shape(of: &ActorCriticShape) -> EnsembleShape {
         let ActorCriticShape { observation_dim, action_dim, .. } = *of;
-        EnsembleShape { members: 1, observation_dim, action_dim: 0, layers: of.actor.clone(), outputs: 2 * action_dim }
+        EnsembleShape {
+            members: 1,
+            observation_dim,
+            action_dim: 0,
+            layers: of.actor.clone(),
+            outputs: 2 * action_dim,
+        }
     }
 
-    /// Actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal `noise`, `[rows, a]`; equally many
-    /// consecutive rows share a state. No gradient flows through them.
+    /// Actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal `noise`,
+    /// `[rows, a]`; equally many consecutive rows share a state. No gradient flows through them.
     ///
     /// # Errors
     /// Shapes that do not fit, or candle fails.
@@ -72,15 +78,26 @@ mod tests {
     use crate::precision::Precision;
     use candle_core::Device;
 
-    const CHOICE: Choice =
-        Choice { candidates: 3000, value: Reduce::Min, rule: Rule::Softmax { temperature: f32::MIN_POSITIVE } };
+    const CHOICE: Choice = Choice {
+        candidates: 3000,
+        value: Reduce::Min,
+        rule: Rule::Softmax { temperature: f32::MIN_POSITIVE },
+    };
 
-    /// A policy whose mean is (0.5·s, −1) and whose log σ is (−1, what the state says times ten); both critics' value is a_0.
+    /// A policy whose mean is (0.5·s, −1) and whose log σ is (−1, what the state says times ten);
+    /// both critics' value is a_0.
     fn policy() -> Box<dyn Policy> {
         let layers = MlpConfig { activation: crate::Activation::Relu, ..MlpConfig::mish(&[2]) };
-        let shape =
-            ActorCriticShape { observation_dim: 1, action_dim: 2, actor: layers.clone(), critic: layers, critics: 2 };
-        let tensor = |numbers: &[f32], dims: &[usize]| Tensor::from_slice(numbers, dims, &Device::Cpu).unwrap();
+        let shape = ActorCriticShape {
+            observation_dim: 1,
+            action_dim: 2,
+            actor: layers.clone(),
+            critic: layers,
+            critics: 2,
+        };
+        let tensor = |numbers: &[f32], dims: &[usize]| {
+            Tensor::from_slice(numbers, dims, &Device::Cpu).unwrap()
+        };
         // relu(x) and relu(−x), put together again.
         let actor = [
             ("0.kernel", tensor(&[1.0, -1.0], &[1, 1, 2])),
@@ -125,7 +142,10 @@ mod tests {
             (moments(second), (0.4, (-1f64).exp())),
         ] {
             let near = |x: f64, y: f64| (x - y).abs() < 0.06 * expected.1;
-            assert!(near(found.0, expected.0) && near(found.1, expected.1), "{found:?} for {expected:?}");
+            assert!(
+                near(found.0, expected.0) && near(found.1, expected.1),
+                "{found:?} for {expected:?}"
+            );
         }
         // σ is e² at most: so 5.9 % lie within ±0.5. With e⁸ none would.
         let inside = second[1..].iter().step_by(2).filter(|a| a.abs() < 0.5).count();

@@ -36,7 +36,10 @@ impl CustomOp1 for MeanAndVariance {
         }
         for member in x.chunks_exact(count) {
             let squares = member.iter().zip(&*mean).map(|(x, mean)| (x - mean) * (x - mean));
-            variance.iter_mut().zip(squares).for_each(|(variance, square)| *variance += square * share);
+            variance
+                .iter_mut()
+                .zip(squares)
+                .for_each(|(variance, square)| *variance += square * share);
         }
         Ok((CpuStorage::F32(out), dims.into()))
     }

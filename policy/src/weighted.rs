@@ -30,7 +30,8 @@ impl Weighted for Weights {
     }
 }
 
-/// Implements it for a network type with the fields `weights` and `packing`, whose products are those of the MLP in a field.
+/// Implements it for a network type with the fields `weights` and `packing`, whose products are
+/// those of the MLP in a field.
 macro_rules! weighted {
     ($type:ty, $($mlp:ident).+) => {
         impl crate::weighted::Weighted for $type {
@@ -45,7 +46,8 @@ macro_rules! weighted {
         }
 
         impl $type {
-            /// Lays its kernels out for products now: for a policy that acts, whose weights do not change.
+            /// Lays its kernels out for products now: for a policy that acts, whose weights do not
+            /// change.
             pub(crate) fn packed(self) -> Result<Self> {
                 self.packing.pack(&self.$($mlp).+, &self.weights)?;
                 Ok(self)

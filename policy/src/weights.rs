@@ -42,7 +42,9 @@ impl Part {
     fn fill(&self, values: &mut [f32], generator: &mut impl Rng) {
         match (self.start, &self.shape[..]) {
             (Start::Constant(value), _) => values.fill(value),
-            (Start::Uniform(bound), _) => values.fill_with(|| generator.random_range(-bound..bound)),
+            (Start::Uniform(bound), _) => {
+                values.fill_with(|| generator.random_range(-bound..bound))
+            }
             (Start::Orthogonal(gain), [.., rows, columns]) => {
                 values.chunks_exact_mut(rows * columns).for_each(|matrix| {
                     orthogonal(matrix, (*rows, *columns), generator);
@@ -54,7 +56,8 @@ impl Part {
     }
 }
 
-/// Fills a matrix with orthonormal columns, or rows if these are fewer: normal numbers, orthogonalized one after the other.
+/// Fills a matrix with orthonormal columns, or rows if these are fewer: normal numbers,
+/// orthogonalized one after the other.
 fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &mut impl Rng) {
     let (count, length) = (rows.min(columns), rows.max(columns));
     let mut vectors: Vec<Vec<f64>> = Vec::with_capacity(count);
@@ -65,7 +68,8 @@ fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &m
             vector.iter_mut().zip(other).for_each(|(x, y)| *x -= along * y);
         }
         let size = vector.iter().map(|x| x * x).sum::<f64>().sqrt();
-        // A vector that hardly stands out of the others is drawn again: its direction would be rounding.
+        // A vector that hardly stands out of the others is drawn again: its direction would be
+        // rounding.
         if size > 1e-3 {
             vector.iter_mut().for_each(|x| *x /= size);
             vectors.push(vector);
@@ -77,7 +81,8 @@ fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &m
     }
 }
 
-/// The named tensors of a network, in the order in which they follow one another in its vector, without gaps.
+/// The named tensors of a network, in the order in which they follow one another in its vector,
+/// without gaps.
 #[derive(Clone, Debug)]
 pub struct Layout(Arc<[Part]>);
 
@@ -97,7 +102,8 @@ impl Layout {
         self.0.iter().map(Part::count).sum()
     }
 
-    /// The tensors in a vector of this layout, as views of it, named with `prefix` before each name.
+    /// The tensors in a vector of this layout, as views of it, named with `prefix` before each
+    /// name.
     pub fn split(&self, vector: &Tensor, prefix: &str) -> Result<Tensors> {
         let mut offset = 0;
         let view = |part: &Part| {
@@ -108,11 +114,16 @@ impl Layout {
         self.0.iter().map(view).collect()
     }
 
-    /// Puts a vector together of the tensors that [`Self::split`] names, and takes them out of `tensors`.
+    /// Puts a vector together of the tensors that [`Self::split`] names, and takes them out of
+    /// `tensors`.
     ///
     /// # Errors
     /// One that is missing, or has another type or shape, or a number that is not finite.
-    pub fn join(&self, tensors: &mut Tensors, prefix: &str) -> std::result::Result<Tensor, PolicyError> {
+    pub fn join(
+        &self,
+        tensors: &mut Tensors,
+        prefix: &str,
+    ) -> std::result::Result<Tensor, PolicyError> {
         let mut flat = Vec::with_capacity(self.0.len());
         for part in self.0.iter() {
             let tensor = take(tensors, format!("{prefix}{}", part.name), &part.shape)?;
@@ -126,9 +137,14 @@ impl Layout {
 ///
 /// # Errors
 /// It is missing, or has another type or shape, or a number that is not finite.
-pub fn take(tensors: &mut Tensors, name: String, shape: &[usize]) -> std::result::Result<Tensor, PolicyError> {
+pub fn take(
+    tensors: &mut Tensors,
+    name: String,
+    shape: &[usize],
+) -> std::result::Result<Tensor, PolicyError> {
     let Some(tensor) = tensors.remove(&name) else { return Err(PolicyError::Missing(name)) };
-    let [found, expected] = [(tensor.dtype(), tensor.dims()), (DType::F32, shape)].map(|form| format!("{form:?}"));
+    let [found, expected] =
+        [(tensor.dtype(), tensor.dims()), (DType::F32, shape)].map(|form| format!("{form:?}"));
     if found != expected {
         return Err(PolicyError::Shape { name, found, expected });
     }
@@ -139,7 +155,11 @@ pub fn take(tensors: &mut Tensors, name: String, shape: &[usize]) -> std::result
 /// Checks that a tensor holds neither a NaN nor an infinity.
 pub(crate) fn check_finite(name: &str, tensor: &Tensor) -> std::result::Result<(), PolicyError> {
     let numbers = tensor.flatten_all()?.to_vec1::<f32>()?;
-    if numbers.iter().all(|x| x.is_finite()) { Ok(()) } else { Err(PolicyError::NotFinite(name.to_owned())) }
+    if numbers.iter().all(|x| x.is_finite()) {
+        Ok(())
+    } else {
+        Err(PolicyError::NotFinite(name.to_owned()))
+    }
 }
 
 /// Weights of one network, as a vector on one of candle's devices.
@@ -154,8 +174,11 @@ impl Weights {
     /// Weights that gradients are taken of: a variable of candle's.
     pub fn trainable(layout: Layout, values: &Tensor) -> Result<Self> {
         let values = Var::from_tensor(values)?.into_inner();
-        let kept =
-            if has_fast_implementation(values.device()) { Some(Arc::new(KeptGradient::new(&values)?)) } else { None };
+        let kept = if has_fast_implementation(values.device()) {
+            Some(Arc::new(KeptGradient::new(&values)?))
+        } else {
+            None
+        };
         Ok(Self { layout, values, kept })
     }
 
@@ -168,7 +191,11 @@ impl Weights {
     ///
     /// # Errors
     /// As [`Layout::join`].
-    pub fn take(layout: Layout, tensors: &mut Tensors, prefix: &str) -> std::result::Result<Self, PolicyError> {
+    pub fn take(
+        layout: Layout,
+        tensors: &mut Tensors,
+        prefix: &str,
+    ) -> std::result::Result<Self, PolicyError> {
         let values = layout.join(tensors, prefix)?;
         Ok(Self::constant(layout, values))
     }
@@ -213,7 +240,11 @@ impl Weights {
     ///
     /// # Errors
     /// As [`Layout::join`].
-    pub fn load(&mut self, tensors: &mut Tensors, prefix: &str) -> std::result::Result<(), PolicyError> {
+    pub fn load(
+        &mut self,
+        tensors: &mut Tensors,
+        prefix: &str,
+    ) -> std::result::Result<(), PolicyError> {
         let values = self.layout.join(tensors, prefix)?.to_device(self.values.device())?;
         Ok(self.change(|mine| mine.slice_set(&values, 0, 0))?)
     }
@@ -236,14 +267,17 @@ impl Weights {
             return crate::gpu::read(&online, |online| {
                 self.change(|mine| {
                     crate::gpu::modify(mine, |stream, mine| {
-                        quad_kernels::cuda::ema(stream, mine, online, rate).map_err(candle_core::Error::wrap)
+                        quad_kernels::cuda::ema(stream, mine, online, rate)
+                            .map_err(candle_core::Error::wrap)
                     })
                 })
             });
         }
         if has_fast_implementation(online.device()) {
             return crate::slices::read(&online, |online: &[f32]| {
-                self.change(|mine| modify(mine, |mine| quad_kernels::optimizer::ema(mine, online, rate)))
+                self.change(|mine| {
+                    modify(mine, |mine| quad_kernels::optimizer::ema(mine, online, rate))
+                })
             })?;
         }
         let (keep, take) = (1.0 - f64::from(rate), f64::from(rate));
@@ -259,14 +293,19 @@ mod tests {
 
     #[test]
     fn each_part_begins_with_what_it_says() {
-        let part = |name: &str, shape: &[usize], start| Part { name: name.to_owned(), shape: shape.to_vec(), start };
+        let part = |name: &str, shape: &[usize], start| Part {
+            name: name.to_owned(),
+            shape: shape.to_vec(),
+            start,
+        };
         let layout = Layout::new(vec![
             part("wide", &[2, 3, 5], Start::Orthogonal(2.0)),
             part("tall", &[1, 5, 3], Start::Orthogonal(2.0)),
             part("scale", &[4], Start::Constant(1.0)),
             part("flat", &[100], Start::Uniform(0.25)),
         ]);
-        let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu).unwrap();
+        let values =
+            Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu).unwrap();
         let parts = layout.split(&values, "").unwrap();
         for (name, transposed) in [("wide", false), ("tall", true)] {
             for matrix in parts[name].to_vec3::<f32>().unwrap() {

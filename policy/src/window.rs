@@ -1,4 +1,5 @@
-//! Networks over windows of consecutive steps: their configuration, and the named tensors of their layers.
+//! Networks over windows of consecutive steps: their configuration, and the named tensors of their
+//! layers.
 
 use crate::error::MOST;
 use crate::weights::{Layout, Part, Start};
@@ -11,7 +12,8 @@ const MOST_LEVELS: usize = 8;
 /// Longest window that is believed.
 const MOST_STEPS: usize = 1000;
 
-/// The networks over windows of a planner (Janner et al. 2022), as a configuration or a policy's file has them.
+/// The networks over windows of a planner (Janner et al. 2022), as a configuration or a policy's
+/// file has them.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WindowConfig {
@@ -19,7 +21,8 @@ pub struct WindowConfig {
     pub horizon: usize,
     /// Numbers of the embedding of a denoising step, and what `multipliers` multiply.
     pub channels: usize,
-    /// Channels of each level, in multiples of `channels`. A level has half as many steps as the one before.
+    /// Channels of each level, in multiples of `channels`. A level has half as many steps as the
+    /// one before.
     pub multipliers: Vec<usize>,
     /// Groups of channels whose numbers are normed together.
     pub groups: usize,
@@ -57,8 +60,9 @@ impl WindowConfig {
     pub fn check(&self) -> Result<(), WindowError> {
         let Self { horizon, channels, groups, .. } = *self;
         let levels = self.multipliers.len();
-        let is =
-            |field, value, holds: bool, range| if holds { Ok(()) } else { Err(WindowError { field, value, range }) };
+        let is = |field, value, holds: bool, range| {
+            if holds { Ok(()) } else { Err(WindowError { field, value, range }) }
+        };
         is("multipliers", levels, (1..=MOST_LEVELS).contains(&levels), "1 to 8 numbers")?;
         is("groups", groups, (1..=MOST).contains(&groups), "from 1 to 65535")?;
         let even = (4..=MOST).contains(&channels) && channels.is_multiple_of(2);
@@ -89,7 +93,12 @@ impl WindowConfig {
         )?;
         let Attention { heads, width } = self.attention.unwrap_or(Attention { heads: 1, width: 1 });
         is("heads", heads, (1..=MOST).contains(&heads), "from 1 to 65535")?;
-        is("width", width, (1..=MOST / heads).contains(&width), "at least 1, and with the heads at most 65535")
+        is(
+            "width",
+            width,
+            (1..=MOST / heads).contains(&width),
+            "at least 1, and with the heads at most 65535",
+        )
     }
 
     /// Channels of each level.
@@ -103,7 +112,8 @@ impl WindowConfig {
     }
 }
 
-/// The named tensors of a network over windows, one layer after the other. What they begin with is PyTorch's.
+/// The named tensors of a network over windows, one layer after the other. What they begin with is
+/// PyTorch's.
 pub(crate) struct Parts {
     parts: Vec<Part>,
     /// Numbers of the embedding of a denoising step.
@@ -152,7 +162,8 @@ impl Parts {
         self.norm(name, outputs);
     }
 
-    /// A residual block: two convolutions `.0` and `.1`, the step's part `.time`, and `.skip` where widths differ.
+    /// A residual block: two convolutions `.0` and `.1`, the step's part `.time`, and `.skip` where
+    /// widths differ.
     pub fn block(&mut self, name: &str, inputs: usize, outputs: usize) {
         self.normed(&format!("{name}.0"), inputs, outputs);
         self.linear(&format!("{name}.time"), self.embedding, outputs);
@@ -172,8 +183,8 @@ impl Parts {
         self.kernel(name, &[channels, 4, channels], channels, 4 * channels);
     }
 
-    /// Attention, if the configuration has it: a layer norm, `.queries.kernel [C, 3 · heads · width]` without a bias for
-    /// queries, keys and values, and `.out`.
+    /// Attention, if the configuration has it: a layer norm, `.queries.kernel [C, 3 · heads ·
+    /// width]` without a bias for queries, keys and values, and `.out`.
     pub fn attention(&mut self, name: &str, channels: usize) {
         let Some(Attention { heads, width }) = self.attention else { return };
         self.norm(name, channels);
@@ -189,8 +200,13 @@ mod tests {
     use super::*;
 
     fn refused(change: impl Fn(&mut WindowConfig)) -> &'static str {
-        let mut config =
-            WindowConfig { horizon: 16, channels: 16, multipliers: vec![1, 2, 4], groups: 8, attention: None };
+        let mut config = WindowConfig {
+            horizon: 16,
+            channels: 16,
+            multipliers: vec![1, 2, 4],
+            groups: 8,
+            attention: None,
+        };
         config.check().unwrap();
         change(&mut config);
         config.check().unwrap_err().field
@@ -206,7 +222,13 @@ mod tests {
         assert_eq!(refused(|config| config.channels = 7), "channels");
         assert_eq!(refused(|config| config.horizon = 18), "horizon");
         assert_eq!(refused(|config| config.horizon = 0), "horizon");
-        assert_eq!(refused(|config| config.attention = Some(Attention { heads: 0, width: 1 })), "heads");
-        assert_eq!(refused(|config| config.attention = Some(Attention { heads: 2, width: usize::MAX })), "width");
+        assert_eq!(
+            refused(|config| config.attention = Some(Attention { heads: 0, width: 1 })),
+            "heads"
+        );
+        assert_eq!(
+            refused(|config| config.attention = Some(Attention { heads: 2, width: usize::MAX })),
+            "width"
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! The layers of networks over windows `[B, L, C]`, by the names of their tensors (which `window` lists).
+//! The layers of networks over windows `[B, L, C]`, by the names of their tensors (which `window`
+//! lists).
 
 use crate::convolution::{convolve, double};
 use crate::group_norm::normed_mish;
@@ -32,14 +33,18 @@ impl<'a> Layers<'a> {
         self.tensors.get(&path).ok_or_else(|| Error::CannotFindTensor { path }.bt())
     }
 
-    /// The embedding of t, in 1..=T, of each window: sines, then cosines, of (t − 1)·f_k, f_k from 1 down to 10⁻⁴, through two
-    /// layers.
+    /// The embedding of t, in 1..=T, of each window: sines, then cosines, of (t − 1)·f_k, f_k from
+    /// 1 down to 10⁻⁴, through two layers.
     pub fn time(&self, t: &[u32], device: &Device) -> Result<Time> {
         let half = self.config.channels / 2;
-        let angle = |t: u32, k: usize| f64::from(t - 1) * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp();
+        let angle = |t: u32, k: usize| {
+            f64::from(t - 1) * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp()
+        };
         let row = |t: &u32| {
             let t = *t;
-            (0..half).map(move |k| angle(t, k).sin()).chain((0..half).map(move |k| angle(t, k).cos()))
+            (0..half)
+                .map(move |k| angle(t, k).sin())
+                .chain((0..half).map(move |k| angle(t, k).cos()))
         };
         let features: Vec<f32> = t.iter().flat_map(row).map(|x| x as f32).collect();
         let features = Tensor::from_vec(features, (t.len(), 1, 2 * half), device)?;
@@ -64,7 +69,11 @@ impl<'a> Layers<'a> {
         let inside = self.normed(&format!("{name}.0"), x)?.broadcast_add(&of_time)?;
         let inside = self.normed(&format!("{name}.1"), &inside)?;
         let skip = format!("{name}.skip");
-        if self.tensors.contains_key(&format!("{skip}.kernel")) { inside + self.linear(&skip, x)? } else { inside + x }
+        if self.tensors.contains_key(&format!("{skip}.kernel")) {
+            inside + self.linear(&skip, x)?
+        } else {
+            inside + x
+        }
     }
 
     /// Every second step of a convolution.
@@ -77,15 +86,16 @@ impl<'a> Layers<'a> {
         double(x, self.get(name, "kernel")?, self.get(name, "bias")?)
     }
 
-    /// x plus linear attention (Shen et al. 2021) of its layer norm, if the configuration has it: keys are softened over the
-    /// steps, and what they gather of the values is read by the queries.
+    /// x plus linear attention (Shen et al. 2021) of its layer norm, if the configuration has it:
+    /// keys are softened over the steps, and what they gather of the values is read by the queries.
     pub fn attend(&self, name: &str, x: &Tensor) -> Result<Tensor> {
         let Some(Attention { heads, width }) = self.config.attention else { return Ok(x.clone()) };
         let (windows, length, _) = x.dims3()?;
         let normed = layer_norm(x, self.get(name, "scale")?, self.get(name, "shift")?, EPSILON)?;
         let kernel = self.get(name, "queries.kernel")?;
         let none = Tensor::zeros(kernel.dim(1)?, x.dtype(), x.device())?;
-        let all = convolve(&normed, &kernel.unsqueeze(0)?, &none, 1)?.reshape((windows, length, 3, heads, width))?;
+        let all = convolve(&normed, &kernel.unsqueeze(0)?, &none, 1)?
+            .reshape((windows, length, 3, heads, width))?;
         let part = |part: usize| all.narrow(2, part, 1)?.squeeze(2)?.transpose(1, 2)?.contiguous();
         let (queries, keys, values) = (part(0)?, part(1)?, part(2)?); // [B, heads, L, width]
         let powers = keys.broadcast_sub(&keys.max_keepdim(2)?.detach())?.exp()?;
@@ -103,16 +113,25 @@ mod tests {
     use super::*;
     use crate::finite_differences::{check_gradients, random};
 
-    /// Two heads read what keys gather; the gradient is that of differences, of weights and of what goes in.
+    /// Two heads read what keys gather; the gradient is that of differences, of weights and of what
+    /// goes in.
     #[test]
     fn attention_has_the_gradient_of_finite_differences() {
         let attention = Some(Attention { heads: 2, width: 3 });
-        let config = WindowConfig { horizon: 4, channels: 4, multipliers: vec![1], groups: 1, attention };
+        let config =
+            WindowConfig { horizon: 4, channels: 4, multipliers: vec![1], groups: 1, attention };
         let names = ["a.scale", "a.shift", "a.queries.kernel", "a.out.kernel", "a.out.bias"];
-        let arguments =
-            [random((2, 4, 4), 0), random(4, 1), random(4, 2), random((4, 18), 3), random((6, 4), 4), random(4, 5)];
+        let arguments = [
+            random((2, 4, 4), 0),
+            random(4, 1),
+            random(4, 2),
+            random((4, 18), 3),
+            random((6, 4), 4),
+            random(4, 5),
+        ];
         check_gradients(&arguments, |x| {
-            let tensors = names.iter().zip(&x[1..]).map(|(name, x)| (name.to_string(), x.clone())).collect();
+            let tensors =
+                names.iter().zip(&x[1..]).map(|(name, x)| (name.to_string(), x.clone())).collect();
             Layers { tensors, config: &config }.attend("a", &x[0])
         });
     }

@@ -1,5 +1,6 @@
-//! The two networks of a planner over windows of [action, state] (Janner et al. 2022): a temporal U-Net, which predicts the clean
-//! window in a noisy one, and a value network, which predicts the return from its first step on.
+//! The two networks of a planner over windows of [action, state] (Janner et al. 2022): a temporal
+//! U-Net, which predicts the clean window in a noisy one, and a value network, which predicts the
+//! return from its first step on.
 
 use crate::weighted::Weighted;
 use crate::weights::{Layout, Weights};
@@ -20,9 +21,10 @@ pub struct WindowValue {
 }
 
 impl WindowModel {
-    /// Tensors of a network over windows of `width` numbers a step: `time`, for each level from the longest windows down
-    /// `down.{0..}` with two blocks, `attention` and `halve`, then two blocks `middle`, for each level up again `up.{0..}`
-    /// with two blocks, `attention` and `double`, `last`, and `out`.
+    /// Tensors of a network over windows of `width` numbers a step: `time`, for each level from the
+    /// longest windows down `down.{0..}` with two blocks, `attention` and `halve`, then two blocks
+    /// `middle`, for each level up again `up.{0..}` with two blocks, `attention` and `double`,
+    /// `last`, and `out`.
     pub fn layout(config: &WindowConfig, width: usize) -> Layout {
         let (mut parts, widths) = (Parts::new(config), config.widths());
         let inputs = [width].into_iter().chain(widths.iter().copied());
@@ -54,8 +56,8 @@ impl WindowModel {
         Self { config, weights }
     }
 
-    /// The clean windows in noisy ones, `x [B, H, width]`; `t` has the denoising step of each, in 1..=T. Differentiable in
-    /// weights and windows.
+    /// The clean windows in noisy ones, `x [B, H, width]`; `t` has the denoising step of each, in
+    /// 1..=T. Differentiable in weights and windows.
     pub fn clean(&self, x: &Tensor, t: &[u32]) -> Result<Tensor> {
         let layers = Layers::new(&self.weights, &self.config)?;
         let time = layers.time(t, x.device())?;
@@ -84,8 +86,9 @@ impl WindowModel {
 }
 
 impl WindowValue {
-    /// Tensors of a network over windows of `width` numbers a step: `time`, for each level `level.{0..}` with two blocks and
-    /// `halve`, then `middle.{0,1}` with a block and `halve` each, and `head.{0,1}`.
+    /// Tensors of a network over windows of `width` numbers a step: `time`, for each level
+    /// `level.{0..}` with two blocks and `halve`, then `middle.{0,1}` with a block and `halve`
+    /// each, and `head.{0,1}`.
     pub fn layout(config: &WindowConfig, width: usize) -> Layout {
         let (mut parts, widths) = (Parts::new(config), config.widths());
         let inputs = [width].into_iter().chain(widths.iter().copied());
@@ -95,7 +98,9 @@ impl WindowValue {
             parts.halve(&format!("level.{level}.halve"), outputs);
         }
         let last = widths[widths.len() - 1];
-        for (level, (inputs, outputs)) in [(last, last / 2), (last / 2, last / 4)].into_iter().enumerate() {
+        for (level, (inputs, outputs)) in
+            [(last, last / 2), (last / 2, last / 4)].into_iter().enumerate()
+        {
             parts.block(&format!("middle.{level}.0"), inputs, outputs);
             parts.halve(&format!("middle.{level}.halve"), outputs);
         }
@@ -111,8 +116,8 @@ impl WindowValue {
         Self { config, weights }
     }
 
-    /// The returns of noisy windows, `x [B, H, width]` → `[B]`; `t` has the denoising step of each, in 1..=T. Differentiable in
-    /// weights and windows.
+    /// The returns of noisy windows, `x [B, H, width]` → `[B]`; `t` has the denoising step of each,
+    /// in 1..=T. Differentiable in weights and windows.
     pub fn values(&self, x: &Tensor, t: &[u32]) -> Result<Tensor> {
         let layers = Layers::new(&self.weights, &self.config)?;
         let time = layers.time(t, x.device())?;
@@ -127,7 +132,9 @@ impl WindowValue {
             x = layers.halve(&format!("middle.{level}.halve"), &x)?;
         }
         let flat = Tensor::cat(&[&x.flatten_from(1)?.unsqueeze(1)?, &time.embedding], 2)?;
-        layers.linear("head.1", &crate::plain::mish(&layers.linear("head.0", &flat)?)?)?.flatten_all()
+        layers
+            .linear("head.1", &crate::plain::mish(&layers.linear("head.0", &flat)?)?)?
+            .flatten_all()
     }
 }
 
@@ -168,15 +175,24 @@ mod tests {
         WindowConfig { horizon: 4, channels: 4, multipliers: vec![1, 2], groups: 2, attention }
     }
 
-    /// Numbers and gradients of a network: by one operation for each layer, by plain ones, and by differences.
-    fn check<N: Weighted>(layout: &Layout, network: fn(Weights) -> N, of: fn(&N, &Tensor) -> Result<Tensor>) {
-        let values = Weights::initial(layout, &mut ChaCha8Rng::seed_from_u64(1), &Device::Cpu).unwrap();
+    /// Numbers and gradients of a network: by one operation for each layer, by plain ones, and by
+    /// differences.
+    fn check<N: Weighted>(
+        layout: &Layout,
+        network: fn(Weights) -> N,
+        of: fn(&N, &Tensor) -> Result<Tensor>,
+    ) {
+        let values =
+            Weights::initial(layout, &mut ChaCha8Rng::seed_from_u64(1), &Device::Cpu).unwrap();
         let x = random((2, 4, 3), 2);
         let run = || {
             let network = network(Weights::trainable(layout.clone(), &values).unwrap());
             let out = of(&network, &x).unwrap();
             let loss = (random(out.shape(), 3) * &out).unwrap().sum_all().unwrap();
-            (out.detach(), Gradients::of(&loss).unwrap().with_respect_to(network.weights()).unwrap())
+            (
+                out.detach(),
+                Gradients::of(&loss).unwrap().with_respect_to(network.weights()).unwrap(),
+            )
         };
         let ((fast, of_fast), (plain, of_plain)) = (run(), plainly(run));
         let largest = |x: &Tensor| x.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
@@ -191,12 +207,20 @@ mod tests {
     #[test]
     fn the_model_has_the_gradients_of_finite_differences() {
         let layout = WindowModel::layout(&config(), 3);
-        check(&layout, |weights| WindowModel::new(config(), weights), |model, x| model.clean(x, &[1, 5]));
+        check(
+            &layout,
+            |weights| WindowModel::new(config(), weights),
+            |model, x| model.clean(x, &[1, 5]),
+        );
     }
 
     #[test]
     fn the_value_network_has_the_gradients_of_finite_differences() {
         let layout = WindowValue::layout(&config(), 3);
-        check(&layout, |weights| WindowValue::new(config(), weights), |value, x| value.values(x, &[1, 5]));
+        check(
+            &layout,
+            |weights| WindowValue::new(config(), weights),
+            |value, x| value.values(x, &[1, 5]),
+        );
     }
 }

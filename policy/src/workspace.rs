@@ -5,7 +5,8 @@ use quad_kernels::Buffer;
 use quad_kernels::norm::kept;
 use std::cell::RefCell;
 
-/// Activations of a tile's hidden layers, and their slopes; on the backward pass the gradients before the activations.
+/// Activations of a tile's hidden layers, and their slopes; on the backward pass the gradients
+/// before the activations.
 pub(crate) struct Activations<'a> {
     pub x: Vec<&'a mut [f32]>,
     pub slope: Vec<&'a mut [f32]>,
@@ -40,14 +41,16 @@ pub(crate) fn with_workspace<R>(work: impl FnOnce(&mut Workspace) -> R) -> R {
 }
 
 impl Workspace {
-    /// Lends the buffer of the state part, `len` numbers, and that of the output, `out` numbers, beside the others.
+    /// Lends the buffer of the state part, `len` numbers, and that of the output, `out` numbers,
+    /// beside the others.
     pub fn with_base<R>(
         &mut self,
         len: usize,
         out: usize,
         work: impl FnOnce(&mut [f32], &mut [f32], &mut Self) -> R,
     ) -> R {
-        let (mut base, mut outputs) = (std::mem::take(&mut self.base), std::mem::take(&mut self.out));
+        let (mut base, mut outputs) =
+            (std::mem::take(&mut self.base), std::mem::take(&mut self.out));
         let result = work(base.sized(len), outputs.sized(out), self);
         (self.base, self.out) = (base, outputs);
         result
@@ -62,12 +65,23 @@ impl Workspace {
     ) -> R {
         let mut all = [&mut self.x, &mut self.slope, &mut self.norm].map(std::mem::take);
         let widths = layers.hidden();
-        all.iter_mut().for_each(|buffers| buffers.resize_with(widths.len().max(buffers.len()), Buffer::default));
+        all.iter_mut().for_each(|buffers| {
+            buffers.resize_with(widths.len().max(buffers.len()), Buffer::default)
+        });
         let [x, slope, norm] = &mut all;
         let normed = if layers.norm { widths } else { &[] };
-        let x = x.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
-        let slope = slope.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
-        let norm = norm.iter_mut().zip(normed).map(|(buffer, width)| buffer.sized(kept(rows, *width))).collect();
+        let x =
+            x.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
+        let slope = slope
+            .iter_mut()
+            .zip(widths)
+            .map(|(buffer, width)| buffer.sized(rows * width))
+            .collect();
+        let norm = norm
+            .iter_mut()
+            .zip(normed)
+            .map(|(buffer, width)| buffer.sized(kept(rows, *width)))
+            .collect();
         let result = work(&mut Activations { x, slope, norm }, self);
         [self.x, self.slope, self.norm] = all;
         result

@@ -1,12 +1,13 @@
 //! Messages to bytes and back. Each message says beside its fields which kind of frame it is.
 //!
-//! A frame is the four bytes `QUAD`, the protocol version (u16), the message's kind (u8) and its fields in order of
-//! declaration, without padding: integers and floats little-endian at their own width, texts and lists with their
-//! length (u64) before them, an enumeration with its variant's index (u32) before its fields. (It is bincode with
-//! fixed-width integers.)
+//! A frame is the four bytes `QUAD`, the protocol version (u16), the message's kind (u8) and its
+//! fields in order of declaration, without padding: integers and floats little-endian at their own
+//! width, texts and lists with their length (u64) before them, an enumeration with its variant's
+//! index (u32) before its fields. (It is bincode with fixed-width integers.)
 //!
-//! The bytes may come from any peer. Whatever they are, [`decode`] gives a message that keeps all rules or a typed error.
-//! A frame of up to 1 MiB never makes it allocate more than 4 MiB at once, a larger one never more than 64 MiB.
+//! The bytes may come from any peer. Whatever they are, [`decode`] gives a message that keeps all
+//! rules or a typed error. A frame of up to 1 MiB never makes it allocate more than 4 MiB at once,
+//! a larger one never more than 64 MiB.
 
 use std::io::Read;
 
@@ -27,10 +28,12 @@ const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
 const SMALL: usize = 1 << 20;
 /// Largest frame with a policy; the paper's networks take a tenth of it.
 pub(crate) const LARGE: usize = 64 << 20;
-/// Most bytes of memory per byte of a valid small frame: an empty text in a list takes 24 bytes, 8 of them in the frame.
+/// Most bytes of memory per byte of a valid small frame: an empty text in a list takes 24 bytes, 8
+/// of them in the frame.
 const MEMORY_PER_WIRE_BYTE: usize = 4;
 
-const FIXED: Configuration<LittleEndian, Fixint> = bincode::config::standard().with_fixed_int_encoding();
+const FIXED: Configuration<LittleEndian, Fixint> =
+    bincode::config::standard().with_fixed_int_encoding();
 
 /// A message: each type has a kind of frame of its own.
 pub trait Message: Encode + Decode<()> {
@@ -51,7 +54,9 @@ pub trait Message: Encode + Decode<()> {
 pub enum CodecError {
     #[error("this is no QUAD message")]
     NotQuad,
-    #[error("the message has protocol version {theirs}, this program speaks {ours}: update the older of the two")]
+    #[error(
+        "the message has protocol version {theirs}, this program speaks {ours}: update the older of the two"
+    )]
     Version { theirs: u16, ours: u16 },
     #[error("the message is of kind {found}, kind {expected} belongs here")]
     Kind { found: u8, expected: u8 },
@@ -106,8 +111,8 @@ pub fn decode<M: Message>(frame: &[u8]) -> Result<M, CodecError> {
     decode_from(frame.len(), frame)
 }
 
-/// [`decode`] of a frame of `length` bytes that are read one after the other. It saves a copy of those that did not come
-/// in one piece.
+/// [`decode`] of a frame of `length` bytes that are read one after the other. It saves a copy of
+/// those that did not come in one piece.
 ///
 /// # Errors
 ///
@@ -137,7 +142,10 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
     let mut body = frame.take((length - HEADER_LENGTH) as u64);
     // Bincode allocates what a length field claims before it reads; the limit bounds that.
     let message: M = if length <= SMALL {
-        bincode::decode_from_std_read(&mut body, FIXED.with_limit::<{ SMALL * MEMORY_PER_WIRE_BYTE }>())
+        bincode::decode_from_std_read(
+            &mut body,
+            FIXED.with_limit::<{ SMALL * MEMORY_PER_WIRE_BYTE }>(),
+        )
     } else {
         bincode::decode_from_std_read(&mut body, FIXED.with_limit::<LARGE>())
     }
@@ -151,7 +159,8 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
 
 fn body_error(error: DecodeError) -> CodecError {
     match error {
-        // The limits are never below what the frame's own bytes can hold, so more was claimed than there is.
+        // The limits are never below what the frame's own bytes can hold, so more was claimed than
+        // there is.
         DecodeError::UnexpectedEnd { .. } | DecodeError::Io { .. } | DecodeError::LimitExceeded => {
             CodecError::Truncated
         }

@@ -15,8 +15,8 @@ pub enum JobRequest {
     Claim {
         /// Who asks.
         evaluator: Name,
-        /// A random number, the same when the claim is sent again because no answer came: it is answered with the same job
-        /// again.
+        /// A random number, the same when the claim is sent again because no answer came: it is
+        /// answered with the same job again.
         attempt: u64,
         /// The environments it has.
         environments: Vec<String>,
@@ -78,11 +78,13 @@ pub struct Job {
     pub weights: Hash,
     /// Environment to act in.
     pub environment: String,
-    /// Seed of what an environment draws once and keeps over all episodes (AntMaze-v0: its goal); the same for a whole run.
+    /// Seed of what an environment draws once and keeps over all episodes (AntMaze-v0: its goal);
+    /// the same for a whole run.
     pub environment_seed: u64,
     /// One episode for each seed.
     pub seeds: Vec<u64>,
-    /// Progress is to be told this often; after three times as long without any, the job may go to another evaluator.
+    /// Progress is to be told this often; after three times as long without any, the job may go to
+    /// another evaluator.
     pub progress_milliseconds: u64,
 }
 

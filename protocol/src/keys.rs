@@ -10,8 +10,9 @@
 //! | `quad/<run>/live/learner/<incarnation>` | learner's liveliness token | |
 //! | `quad/<run>/live/evaluator/<evaluator>` | evaluator's liveliness token | |
 //!
-//! A learner's answers, jobs and snapshots name its incarnation: an evaluator believes those of the incarnation that it
-//! follows by its token, and not those of an earlier incarnation. Which peers may use these keys is up to TLS and access control.
+//! A learner's answers, jobs and snapshots name its incarnation: an evaluator believes those of the
+//! incarnation that it follows by its token, and not those of an earlier incarnation. Which peers
+//! may use these keys is up to TLS and access control.
 
 use crate::name::Name;
 
@@ -58,7 +59,8 @@ pub fn live_learner(run: &Name, incarnation: u64) -> String {
     format!("quad/{run}/live/learner/{incarnation}")
 }
 
-/// Key expression of the tokens of all incarnations of a run's learner, and of all learners that took the same name.
+/// Key expression of the tokens of all incarnations of a run's learner, and of all learners that
+/// took the same name.
 pub fn all_incarnations(run: &Name) -> String {
     format!("quad/{run}/live/learner/*")
 }
@@ -123,17 +125,28 @@ mod tests {
 
     #[test]
     fn strangers_keys_give_nothing() {
-        for key in
-            ["", "quad", "quad/", "quad//live", "quad/a b/live/learner/1", "quad/*/live/learner/1", "other/run/jobs"]
-        {
+        for key in [
+            "",
+            "quad",
+            "quad/",
+            "quad//live",
+            "quad/a b/live/learner/1",
+            "quad/*/live/learner/1",
+            "other/run/jobs",
+        ] {
             assert_eq!(run_of(key), None, "{key}");
         }
-        for key in
-            ["quad/run/live/learner", "quad/run/live/learner/x", "quad/run/live/learner/01", "quad/run/live/learner/+1"]
-        {
+        for key in [
+            "quad/run/live/learner",
+            "quad/run/live/learner/x",
+            "quad/run/live/learner/01",
+            "quad/run/live/learner/+1",
+        ] {
             assert_eq!(incarnation_of(key), None, "{key}");
         }
-        for key in ["quad/run/weights/", "quad/run/weights/x", "quad/run/weights/-1", "quad/run/jobs/1"] {
+        for key in
+            ["quad/run/weights/", "quad/run/weights/x", "quad/run/weights/-1", "quad/run/jobs/1"]
+        {
             assert_eq!(step_of(key), None, "{key}");
         }
     }

@@ -6,7 +6,8 @@
 //!
 //! - `name`: what runs and evaluators may be called; `hash`: how weights are identified.
 //! - [`keys`]: where on Zenoh each message is found.
-//! - `snapshot`: weights, from the learner to evaluators; `origin`: what the header of their file says of where it comes from.
+//! - `snapshot`: weights, from the learner to evaluators; `origin`: what the header of their file
+//!   says of where it comes from.
 //! - `seeds`: which episodes an evaluation has; `job`: an evaluator asks for work and gets some.
 //! - `progress`: an evaluator tells how far its job is.
 //! - `score`: an evaluator delivers scores, the learner acknowledges them.

@@ -8,7 +8,8 @@ use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 use serde::{Deserialize, Serialize};
 
-/// Name of a run or of an evaluator: 1 to 64 ASCII letters, digits, dots, dashes and underscores, and neither `.` nor `..`.
+/// Name of a run or of an evaluator: 1 to 64 ASCII letters, digits, dots, dashes and underscores,
+/// and neither `.` nor `..`.
 ///
 /// It fits into a Zenoh key, a file name and a metric's label without quoting.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -29,10 +30,16 @@ impl Name {
         let text = text.into();
         let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_');
         if let Some(other) = text.chars().find(|&c| !allowed(c)) {
-            return Err(InvalidName(format!("a name has only letters, digits, '.', '-' and '_', not {other:?}")));
+            return Err(InvalidName(format!(
+                "a name has only letters, digits, '.', '-' and '_', not {other:?}"
+            )));
         }
         if !(1..=Self::MAX_LENGTH).contains(&text.len()) {
-            return Err(InvalidName(format!("a name has 1 to {} characters, not {}", Self::MAX_LENGTH, text.len())));
+            return Err(InvalidName(format!(
+                "a name has 1 to {} characters, not {}",
+                Self::MAX_LENGTH,
+                text.len()
+            )));
         }
         // A folder by this name would be the one that it is in, or the one above.
         if text == "." || text == ".." {
@@ -69,7 +76,8 @@ impl Encode for Name {
 
 impl<Context> Decode<Context> for Name {
     fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Name, DecodeError> {
-        Name::new(String::decode(decoder)?).map_err(|error| DecodeError::OtherString(error.to_string()))
+        Name::new(String::decode(decoder)?)
+            .map_err(|error| DecodeError::OtherString(error.to_string()))
     }
 }
 
@@ -87,7 +95,10 @@ mod tests {
         let refused = |text: String| Name::new(text).unwrap_err().to_string();
         assert_eq!(refused(String::new()), "a name has 1 to 64 characters, not 0");
         assert_eq!(refused("x".repeat(65)), "a name has 1 to 64 characters, not 65");
-        assert_eq!([".", ".."].map(|text| refused(text.to_owned())), ["\".\" is not a name", "\"..\" is not a name"]);
+        assert_eq!(
+            [".", ".."].map(|text| refused(text.to_owned())),
+            ["\".\" is not a name", "\"..\" is not a name"]
+        );
         for character in ['/', '*', '$', ' ', '#', '?', '@', 'é', '\n', '\0'] {
             assert!(refused(format!("a{character}b")).ends_with(&format!("not {character:?}")));
         }

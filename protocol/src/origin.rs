@@ -2,9 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Where a snapshot comes from, and how its run evaluates it: a part of the header in the snapshot's file.
+/// Where a snapshot comes from, and how its run evaluates it: a part of the header in the
+/// snapshot's file.
 ///
-/// All of it is a function of the run's configuration, so runs of the same configuration make the same bytes.
+/// All of it is a function of the run's configuration, so runs of the same configuration make the
+/// same bytes.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Origin {

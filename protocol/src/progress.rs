@@ -6,7 +6,8 @@ use crate::codec::Message;
 use crate::job::Job;
 use crate::name::Name;
 
-/// How far a job is, and what the evaluator has done so far. Extends the job's lease, if it is further than before.
+/// How far a job is, and what the evaluator has done so far. Extends the job's lease, if it is
+/// further than before.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Progress {
     /// The evaluator.

@@ -16,14 +16,15 @@ pub struct EpisodeScore {
     pub episode_return: f64,
     /// Its environment steps.
     pub length: u32,
-    /// Its score: D4RL's normalized one, 100 · (return − random) / (expert − random), where the environment has such
-    /// references; else what the evaluator's user counts, by default the return.
+    /// Its score: D4RL's normalized one, 100 · (return − random) / (expert − random), where the
+    /// environment has such references; else what the evaluator's user counts, by default the
+    /// return.
     pub score: f64,
 }
 
 impl EpisodeScore {
-    /// Largest return or score that counts, whichever its sign. It is far above any use; statistics of larger ones would not
-    /// be finite.
+    /// Largest return or score that counts, whichever its sign. It is far above any use; statistics
+    /// of larger ones would not be finite.
     pub const LARGEST: f64 = 1e12;
 
     /// Whether a return or a score is finite and no larger than [`LARGEST`](Self::LARGEST).
@@ -32,8 +33,9 @@ impl EpisodeScore {
     }
 }
 
-/// An evaluator delivers the episodes of a job. The learner records them even if the job has gone to another evaluator, or an
-/// earlier incarnation of the learner handed it out: what counts is that run, step, weights and seeds are those of an evaluation.
+/// An evaluator delivers the episodes of a job. The learner records them even if the job has gone
+/// to another evaluator, or an earlier incarnation of the learner handed it out: what counts is
+/// that run, step, weights and seeds are those of an evaluation.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub struct ScoreReport {
     /// Who delivers.
@@ -48,7 +50,8 @@ pub struct ScoreReport {
     pub step: u64,
     /// Hash of the snapshot's file.
     pub weights: Hash,
-    /// The arithmetic that the policy's actions were computed in, e.g. `f32-avx2` or `bf16-amx`: the same name gives the same bits.
+    /// The arithmetic that the policy's actions were computed in, e.g. `f32-avx2` or `bf16-amx`:
+    /// the same name gives the same bits.
     pub precision: Name,
     /// The episodes.
     pub episodes: Vec<EpisodeScore>,

@@ -9,9 +9,10 @@ use rand_chacha::ChaCha8Rng;
 /// Keeps these draws apart from other uses of a run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"episodes");
 
-/// The episode seeds of the evaluation at `step`: a function of the run's seed and the step alone, distinct within an
-/// evaluation, and new ones at each step, so that no evaluation is tuned to one set of starting states. Runs with the
-/// same seed that differ in guidance or candidates meet the same episodes. 53 bits, which JSON readers keep exactly.
+/// The episode seeds of the evaluation at `step`: a function of the run's seed and the step alone,
+/// distinct within an evaluation, and new ones at each step, so that no evaluation is tuned to one
+/// set of starting states. Runs with the same seed that differ in guidance or candidates meet the
+/// same episodes. 53 bits, which JSON readers keep exactly.
 pub fn episode_seeds(run_seed: u64, step: u64, episodes: u32) -> Vec<u64> {
     let mut generator = ChaCha8Rng::seed_from_u64(run_seed ^ PURPOSE);
     generator.set_stream(step);
@@ -30,7 +31,11 @@ mod tests {
         assert_eq!(episode_seeds(3, 1000, 10)[..4], episode_seeds(3, 1000, 4));
         let mut seen = HashSet::new();
         for (run, step) in [(3, 1000), (3, 2000), (4, 1000)] {
-            assert!(episode_seeds(run, step, 50).into_iter().all(|seed| seed < 1 << 53 && seen.insert(seed)));
+            assert!(
+                episode_seeds(run, step, 50)
+                    .into_iter()
+                    .all(|seed| seed < 1 << 53 && seen.insert(seed))
+            );
         }
     }
 }

@@ -20,8 +20,8 @@ pub struct Snapshot {
     pub step: u64,
     /// BLAKE3 hash of exactly the bytes in `file`. Decoding verifies it.
     pub hash: Hash,
-    /// The policy's whole safetensors file. Its header says what policy it is, and its [`Origin`](crate::Origin). It is not
-    /// looked into here.
+    /// The policy's whole safetensors file. Its header says what policy it is, and its
+    /// [`Origin`](crate::Origin). It is not looked into here.
     pub file: Vec<u8>,
 }
 
@@ -36,6 +36,10 @@ impl Message for Snapshot {
 
     fn verify(&self) -> Result<(), CodecError> {
         let found = Hash::of(&self.file);
-        if found == self.hash { Ok(()) } else { Err(CodecError::Hash { claimed: self.hash, found }) }
+        if found == self.hash {
+            Ok(())
+        } else {
+            Err(CodecError::Hash { claimed: self.hash, found })
+        }
     }
 }

@@ -49,7 +49,8 @@ static ALLOCATOR: Watched = Watched;
 struct ClaimTooMuch;
 
 impl Check for ClaimTooMuch {
-    /// Writes every claim over every eight bytes of the frame, among them every length, and decodes.
+    /// Writes every claim over every eight bytes of the frame, among them every length, and
+    /// decodes.
     fn check<M: Message + PartialEq + Debug>(&mut self, message: &M) {
         let frame = encode(message).unwrap();
         for claim in [u64::MAX, 1 << 60, 1 << 40, 1 << 32, 1 << 26, 1 << 22, 1 << 16] {
@@ -59,7 +60,10 @@ impl Check for ClaimTooMuch {
                 LARGEST.set(0);
                 drop(decode::<M>(&frame));
                 let largest = LARGEST.get();
-                assert!(largest <= 4 << 20, "{claim} at byte {position}: {largest} bytes were allocated");
+                assert!(
+                    largest <= 4 << 20,
+                    "{claim} at byte {position}: {largest} bytes were allocated"
+                );
             }
         }
     }

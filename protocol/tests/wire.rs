@@ -17,11 +17,23 @@ impl Check for Withstands {
         let frame = encode(message).unwrap();
         assert_eq!(&decode::<M>(&frame).unwrap(), message);
         let (begin, end) = frame.split_at(frame.len() / 2);
-        assert_eq!(&decode_from::<M>(frame.len(), begin.chain(end)).unwrap(), message, "in two pieces");
-        assert_eq!(decode_from::<M>(frame.len(), begin), Err(CodecError::Truncated), "without the second piece");
+        assert_eq!(
+            &decode_from::<M>(frame.len(), begin.chain(end)).unwrap(),
+            message,
+            "in two pieces"
+        );
+        assert_eq!(
+            decode_from::<M>(frame.len(), begin),
+            Err(CodecError::Truncated),
+            "without the second piece"
+        );
 
         for length in 0..frame.len() {
-            assert_eq!(decode::<M>(&frame[..length]), Err(CodecError::Truncated), "cut to {length} bytes");
+            assert_eq!(
+                decode::<M>(&frame[..length]),
+                Err(CodecError::Truncated),
+                "cut to {length} bytes"
+            );
         }
         let longer = [&frame[..], &[0; 3]].concat();
         assert_eq!(decode::<M>(&longer), Err(CodecError::Trailing(3)));
@@ -38,7 +50,10 @@ impl Check for Withstands {
                 assert_eq!(decode::<M>(&flipped(&frame, byte, bit)), expected);
             }
             let found = M::KIND ^ (1 << bit);
-            assert_eq!(decode::<M>(&flipped(&frame, 6, bit)), Err(CodecError::Kind { found, expected: M::KIND }));
+            assert_eq!(
+                decode::<M>(&flipped(&frame, 6, bit)),
+                Err(CodecError::Kind { found, expected: M::KIND })
+            );
         }
     }
 }
@@ -62,7 +77,10 @@ fn a_file_that_is_not_the_hash_s() {
     for bit in 0..8 * message.file.len() {
         let frame = flipped(&frame, first + bit / 8, bit % 8);
         let found = Hash::of(&frame[first..]);
-        assert_eq!(decode::<Snapshot>(&frame), Err(CodecError::Hash { claimed: message.hash, found }));
+        assert_eq!(
+            decode::<Snapshot>(&frame),
+            Err(CodecError::Hash { claimed: message.hash, found })
+        );
     }
 }
 
@@ -74,12 +92,18 @@ fn a_name_that_is_not_allowed_is_malformed() {
     let dash = frame.iter().position(|&byte| byte == b'-').unwrap();
     frame[dash] = b'/';
     let error = decode::<JobRequest>(&frame).unwrap_err();
-    assert_eq!(error, CodecError::Malformed("a name has only letters, digits, '.', '-' and '_', not '/'".to_owned()));
+    assert_eq!(
+        error,
+        CodecError::Malformed(
+            "a name has only letters, digits, '.', '-' and '_', not '/'".to_owned()
+        )
+    );
 }
 
 #[test]
 fn the_largest_file_is_sent_and_what_every_receiver_refuses_is_not() {
-    let named_longest = |file| Snapshot { run: Name::new("r".repeat(Name::MAX_LENGTH)).unwrap(), ..snapshot(file) };
+    let named_longest =
+        |file| Snapshot { run: Name::new("r".repeat(Name::MAX_LENGTH)).unwrap(), ..snapshot(file) };
     let largest = named_longest(vec![1; Snapshot::MOST_FILE]);
     assert!(decode::<Snapshot>(&encode(&largest).unwrap()).unwrap() == largest);
     let error = encode(&named_longest(vec![0; Snapshot::LIMIT])).unwrap_err();

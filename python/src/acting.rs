@@ -12,7 +12,8 @@ use quad_policy::{EpisodeState, Policy, PolicyError};
 use crate::arrays::Rows;
 use crate::error::of_policy;
 
-/// Memory that one call of the policy may take, bytes; more rows are split. An action does not depend on the other rows.
+/// Memory that one call of the policy may take, bytes; more rows are split. An action does not
+/// depend on the other rows.
 const MEMORY: u64 = 256 << 20;
 
 const FORKED: &str = "this process was forked from one in which a policy has acted, and a fork lacks the threads that compute\n\
@@ -45,9 +46,12 @@ pub fn act<'py>(
 /// Has a policy compute without Python's lock.
 ///
 /// # Errors
-/// It fails, or this process was forked from one in which a policy has computed: then rayon's threads, which a fork does not
-/// copy, would never answer.
-pub fn compute<T: Send>(py: Python<'_>, work: impl Send + FnOnce() -> Result<T, PolicyError>) -> PyResult<T> {
+/// It fails, or this process was forked from one in which a policy has computed: then rayon's
+/// threads, which a fork does not copy, would never answer.
+pub fn compute<T: Send>(
+    py: Python<'_>,
+    work: impl Send + FnOnce() -> Result<T, PolicyError>,
+) -> PyResult<T> {
     static PROCESS: OnceLock<u32> = OnceLock::new();
     if *PROCESS.get_or_init(process::id) != process::id() {
         return Err(PyRuntimeError::new_err(FORKED));
@@ -70,11 +74,17 @@ pub fn begin(policy: &dyn Policy, seeds: &[u64]) -> Vec<EpisodeState> {
     seeds.iter().map(|seed| policy.begin(*seed)).collect()
 }
 
-/// What a policy draws in the first step of these episodes, by name: what is not drawn is not there.
-pub fn noise<'py>(py: Python<'py>, policy: &dyn Policy, states: &mut [EpisodeState]) -> PyResult<Bound<'py, PyDict>> {
+/// What a policy draws in the first step of these episodes, by name: what is not drawn is not
+/// there.
+pub fn noise<'py>(
+    py: Python<'py>,
+    policy: &dyn Policy,
+    states: &mut [EpisodeState],
+) -> PyResult<Bound<'py, PyDict>> {
     let (shape, draws) = (policy.noise(), policy.choice().map_or(0, |choice| choice.uniforms()));
     let row = if shape.is_empty() { 0 } else { shape.iter().product() };
-    let (mut normal, mut uniform) = (vec![0.0; states.len() * row], Vec::with_capacity(states.len() * draws));
+    let (mut normal, mut uniform) =
+        (vec![0.0; states.len() * row], Vec::with_capacity(states.len() * draws));
     for (i, state) in states.iter_mut().enumerate() {
         state.fill_normal(&mut normal[i * row..][..row]);
         // The last f32 below 1 rather than 1 itself.
@@ -82,10 +92,14 @@ pub fn noise<'py>(py: Python<'py>, policy: &dyn Policy, states: &mut [EpisodeSta
     }
     let inputs = PyDict::new(py);
     if row > 0 {
-        inputs.set_item("noise", PyArray::from_vec(py, normal).reshape([&[states.len()], &shape[..]].concat())?)?;
+        inputs.set_item(
+            "noise",
+            PyArray::from_vec(py, normal).reshape([&[states.len()], &shape[..]].concat())?,
+        )?;
     }
     if draws > 0 {
-        inputs.set_item("uniform", PyArray::from_vec(py, uniform).reshape([states.len(), draws])?)?;
+        inputs
+            .set_item("uniform", PyArray::from_vec(py, uniform).reshape([states.len(), draws])?)?;
     }
     Ok(inputs)
 }

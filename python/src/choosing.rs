@@ -25,8 +25,13 @@ pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn 
     let mut choice = policy.choice().unwrap_or(Choice::best_of(1));
     if let Some(candidates) = changes.candidates {
         let most = Choice::MOST_CANDIDATES;
-        let error = || PyValueError::new_err(format!("candidates is {candidates}, but must be from 1 to {most}"));
-        choice.candidates = u32::try_from(candidates).ok().filter(|n| (1..=most).contains(n)).ok_or_else(error)?;
+        let error = || {
+            PyValueError::new_err(format!(
+                "candidates is {candidates}, but must be from 1 to {most}"
+            ))
+        };
+        choice.candidates =
+            u32::try_from(candidates).ok().filter(|n| (1..=most).contains(n)).ok_or_else(error)?;
     }
     if let Some(rule) = changes.rule {
         let error = |expected| PyValueError::new_err(format!("rule is {rule:?}, not {expected}"));

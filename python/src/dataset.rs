@@ -13,7 +13,8 @@ fn refused(error: &DatasetError) -> PyErr {
     with_hint(error, &error.hint())
 }
 
-/// Writes the custom layout. All arrays are C-contiguous and have the same number of rows; names may be empty lists.
+/// Writes the custom layout. All arrays are C-contiguous and have the same number of rows; names
+/// may be empty lists.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "they are the file's arrays")]
 pub fn write_dataset(

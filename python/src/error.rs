@@ -28,7 +28,9 @@ pub fn with_hint(error: &dyn Error, hint: &str) -> PyErr {
 /// RuntimeError where arithmetic fails, ValueError for what was asked for.
 pub fn of_policy(error: &PolicyError) -> PyErr {
     match error {
-        PolicyError::Candle(_) | PolicyError::NotANumber(_) => PyRuntimeError::new_err(chain(error)),
+        PolicyError::Candle(_) | PolicyError::NotANumber(_) => {
+            PyRuntimeError::new_err(chain(error))
+        }
         _ => PyValueError::new_err(chain(error)),
     }
 }

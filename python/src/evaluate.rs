@@ -1,6 +1,8 @@
-//! Environments that Python moves, and the evaluator that serves them: the one of `evaluator serve`, with another body.
+//! Environments that Python moves, and the evaluator that serves them: the one of `evaluator
+//! serve`, with another body.
 //!
-//! `quad_rl/_worker.py` is the other side: its objects make, reset and step environments, and say what went wrong.
+//! `quad_rl/_worker.py` is the other side: its objects make, reset and step environments, and say
+//! what went wrong.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -36,7 +38,11 @@ impl Environments for PythonEnvironments {
         self.sizes
     }
 
-    fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+    fn make(
+        &self,
+        name: &str,
+        environment_seed: u64,
+    ) -> Result<Box<dyn Environment>, EnvironmentError> {
         let made = Python::attach(|py| self.factory.call_method1(py, "make", (environment_seed,)));
         Ok(Box::new(PythonEnvironment {
             name: name.to_owned(),
@@ -73,7 +79,8 @@ impl Environment for PythonEnvironment {
     fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
         let stepped = self.observe(|environment| {
             let action = PyArray1::from_slice(environment.py(), action);
-            let (observed, reward, terminated, truncated) = environment.call_method1("step", (action,))?.extract()?;
+            let (observed, reward, terminated, truncated) =
+                environment.call_method1("step", (action,))?.extract()?;
             Ok((observed, (reward, terminated, truncated)))
         });
         stepped.map(|(reward, terminated, truncated)| Step { reward, terminated, truncated })
@@ -84,7 +91,9 @@ impl Environment for PythonEnvironment {
     }
 
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
-        let scored = Python::attach(|py| self.environment.bind(py).call_method1("score", (episode_return,))?.extract());
+        let scored = Python::attach(|py| {
+            self.environment.bind(py).call_method1("score", (episode_return,))?.extract()
+        });
         scored.map_err(|error| failed(&self.name, &error))
     }
 }
@@ -102,8 +111,9 @@ fn failed(name: &str, error: &PyErr) -> EnvironmentError {
     EnvironmentError::Failed { name: name.to_owned(), reason }
 }
 
-/// Serves learners with `factory`'s environments until this process gets SIGTERM. `factory` has `make(seed)`, `release(made)`,
-/// and what it makes has `reset(seed)`, `step(action)` and `score(return)`.
+/// Serves learners with `factory`'s environments until this process gets SIGTERM. `factory` has
+/// `make(seed)`, `release(made)`, and what it makes has `reset(seed)`, `step(action)` and
+/// `score(return)`.
 #[pyfunction]
 #[pyo3(signature = (name, factory, *, sizes, connect, certificates, precision))]
 pub fn serve_environment(
@@ -115,7 +125,8 @@ pub fn serve_environment(
     certificates: Option<PathBuf>,
     precision: &str,
 ) -> PyResult<()> {
-    let precision = precision.parse().map_err(|error| PyValueError::new_err(format!("precision: {error}")))?;
+    let precision =
+        precision.parse().map_err(|error| PyValueError::new_err(format!("precision: {error}")))?;
     let args = ServeArgs { connect, certificates, http: None, name: None, precision };
     let environments = Arc::new(PythonEnvironments { name, sizes, factory: Arc::new(factory) });
     let served = py.detach(|| {

@@ -9,18 +9,19 @@ use serde_json::{Value, json};
 use crate::error::with_hint;
 
 /// What such a file is.
-pub const HINT: &str =
-    "a policy is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this version writes them";
+pub const HINT: &str = "a policy is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this version writes them";
 
-/// Reads a policy of this file, which errors call `name`, in this precision; others than this CPU has warn.
+/// Reads a policy of this file, which errors call `name`, in this precision; others than this CPU
+/// has warn.
 pub fn read(
     py: Python<'_>,
     file: &[u8],
     precision: &str,
     name: &str,
 ) -> PyResult<(Precision, Box<dyn Policy>, Header<Origin>)> {
-    let asked: Precision =
-        precision.parse().map_err(|_| PyValueError::new_err(format!("precision is {precision:?}, not f32 or bf16")))?;
+    let asked: Precision = precision.parse().map_err(|_| {
+        PyValueError::new_err(format!("precision is {precision:?}, not f32 or bf16"))
+    })?;
     if !asked.is_available() {
         let message = std::ffi::CString::new(Precision::UNAVAILABLE)?;
         PyErr::warn(py, &py.get_type::<PyUserWarning>(), &message, 2)?;

@@ -19,9 +19,10 @@ use crate::file::{HINT, all_about, read};
 
 /// A policy that `learner train` has saved: `Policy.load(path)`.
 ///
-/// It takes and gives the units of the data that it has learned from. All calls release Python's lock and share the processor's
-/// cores with rayon: the environment variable RAYON_NUM_THREADS says, before the first call, how many. In a process that was
-/// forked after a call, calls raise RuntimeError; with multiprocessing use "spawn".
+/// It takes and gives the units of the data that it has learned from. All calls release Python's
+/// lock and share the processor's cores with rayon: the environment variable RAYON_NUM_THREADS
+/// says, before the first call, how many. In a process that was forked after a call, calls raise
+/// RuntimeError; with multiprocessing use "spawn".
 #[pyclass(name = "Policy", module = "quad_rl", frozen)]
 pub struct PyPolicy {
     policy: Arc<dyn Policy>,
@@ -39,7 +40,8 @@ pub struct PyPolicy {
 impl PyPolicy {
     /// Reads the file of a snapshot, like "runs/mine/snapshots/step_000020000.safetensors".
     ///
-    /// precision: "f32", or "bf16", which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16; others warn and use f32.
+    /// precision: "f32", or "bf16", which rounds and is faster on CPUs with AMX or AMD's
+    /// AVX512-BF16; others warn and use f32.
     ///
     /// Raises OSError if the file cannot be read, ValueError if it is no policy.
     #[staticmethod]
@@ -64,22 +66,26 @@ impl PyPolicy {
         Ok(Self { policy: policy.into(), config, origin, names, about, file, asked })
     }
 
-    /// Acts in each of n states: observations [n, observation_size] -> actions [n, action_size], float32.
+    /// Acts in each of n states: observations [n, observation_size] -> actions [n, action_size],
+    /// float32.
     ///
-    /// An array of one axis is one state, and gives one action. float32 arrays whose numbers lie side by side are not copied;
-    /// anything else that NumPy takes is converted. A dictionary, such as of a message's joints, is read by `observation_names`,
-    /// in any order: single numbers are one state, [n] each are n; what else it has is not looked at.
+    /// An array of one axis is one state, and gives one action. float32 arrays whose numbers lie
+    /// side by side are not copied; anything else that NumPy takes is converted. A dictionary, such
+    /// as of a message's joints, is read by `observation_names`, in any order: single numbers are
+    /// one state, [n] each are n; what else it has is not looked at.
     ///
-    /// candidates: how many actions are drawn in each state. rule: which of them is taken, "best", "softmax:TEMPERATURE",
+    /// candidates: how many actions are drawn in each state. rule: which of them is taken, "best",
+    /// "softmax:TEMPERATURE",
     ///     "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest". value: what the critics' values of an action count
     ///     as, "mean" or "min". None: what the file says (`choice`).
-    /// seed: an int: row i draws from seed + i, so that one observation gives what an evaluator does in the first step of the
+    /// seed: an int: row i draws from seed + i, so that one observation gives what an evaluator
+    /// does in the first step of the
     ///     episode of that seed. A sequence of n ints: a seed for each row. None: fresh random numbers.
     ///
     /// For whole episodes see `begin`.
     ///
-    /// Raises ValueError for another shape, NaN or infinite numbers, or a choice that this policy cannot make; RuntimeError if its
-    /// networks give no number.
+    /// Raises ValueError for another shape, NaN or infinite numbers, or a choice that this policy
+    /// cannot make; RuntimeError if its networks give no number.
     #[pyo3(signature = (observations, *, candidates = None, rule = None, value = None, seed = None))]
     fn act<'py>(
         &self,
@@ -110,10 +116,11 @@ impl PyPolicy {
         self.act(py, observations, candidates, rule, value, seed)
     }
 
-    /// Draws what `act` chooses among: (actions [n, candidates, action_size], values [n, candidates]), float32.
+    /// Draws what `act` chooses among: (actions [n, candidates, action_size], values [n,
+    /// candidates]), float32.
     ///
-    /// For one state, without the first axis. With the same seed `act` takes one of these. Raises as `act`, and ValueError if the
-    /// policy has no critics.
+    /// For one state, without the first axis. With the same seed `act` takes one of these. Raises
+    /// as `act`, and ValueError if the policy has no critics.
     #[pyo3(signature = (observations, *, candidates = None, value = None, seed = None))]
     fn sample<'py>(
         &self,
@@ -136,13 +143,18 @@ impl PyPolicy {
             Ok((actions, values))
         })?;
         let candidates = policy.choice().map_or(1, |choice| choice.candidates as usize);
-        Ok((rows.array(py, actions, &[candidates, policy.action_dim()])?, rows.array(py, values, &[candidates])?))
+        Ok((
+            rows.array(py, actions, &[candidates, policy.action_dim()])?,
+            rows.array(py, values, &[candidates])?,
+        ))
     }
 
-    /// What the critics say that actions are worth: observations [n, observation_size], actions [n, action_size] -> [n], float32,
-    /// the discounted return that they expect of the rewards that the learner saw. For one state and action an array without axes.
+    /// What the critics say that actions are worth: observations [n, observation_size], actions [n,
+    /// action_size] -> [n], float32, the discounted return that they expect of the rewards that the
+    /// learner saw. For one state and action an array without axes.
     ///
-    /// value: "mean" of the critics or their "min". Raises as `act`, and ValueError if the policy has no critics.
+    /// value: "mean" of the critics or their "min". Raises as `act`, and ValueError if the policy
+    /// has no critics.
     #[pyo3(signature = (observations, actions, *, value = None))]
     fn value<'py>(
         &self,
@@ -154,7 +166,10 @@ impl PyPolicy {
         let rows = self.rows(&observations)?;
         let taken = Rows::of("actions", &actions, self.policy.action_dim(), &self.names.actions)?;
         if (taken.count, taken.single) != (rows.count, rows.single) {
-            let error = format!("{} observations, but {} actions: one action for each", rows.count, taken.count);
+            let error = format!(
+                "{} observations, but {} actions: one action for each",
+                rows.count, taken.count
+            );
             return Err(PyValueError::new_err(error));
         }
         let policy = choosing(&self.policy, Changes { value, ..Changes::default() })?;
@@ -165,9 +180,10 @@ impl PyPolicy {
         rows.array(py, values, &[])
     }
 
-    /// The noise that `act` draws with these arguments in n states: the inputs, beside the observations, of what `export_onnx`
-    /// writes. A dictionary, empty if the policy draws nothing, of "noise", standard normal numbers [n, ...], and, where the rule
-    /// draws too, "uniform", numbers within [0, 1), [n, draws]; float32. Raises as `act`.
+    /// The noise that `act` draws with these arguments in n states: the inputs, beside the
+    /// observations, of what `export_onnx` writes. A dictionary, empty if the policy draws nothing,
+    /// of "noise", standard normal numbers [n, ...], and, where the rule draws too, "uniform",
+    /// numbers within [0, 1), [n, draws]; float32. Raises as `act`.
     #[pyo3(signature = (n, *, candidates = None, rule = None, value = None, seed = None))]
     fn noise<'py>(
         &self,
@@ -182,8 +198,9 @@ impl PyPolicy {
         noise(py, &*policy, &mut begin(&*policy, &seeds(seed, n)?))
     }
 
-    /// Begins an episode for each seed (an int, or a sequence of them). In each, the policy draws as an evaluator does from
-    /// step to step: the same seed and observations give the same actions, bit for bit.
+    /// Begins an episode for each seed (an int, or a sequence of them). In each, the policy draws
+    /// as an evaluator does from step to step: the same seed and observations give the same
+    /// actions, bit for bit.
     ///
     ///     episodes = policy.begin([0, 1, 2])
     ///     actions = episodes.act(observations)  # [3, observation_size] -> [3, action_size]
@@ -215,7 +232,8 @@ impl PyPolicy {
         self.policy.action_dim()
     }
 
-    /// What its data calls the numbers of an observation; empty where they have no names. Other columns are refused.
+    /// What its data calls the numbers of an observation; empty where they have no names. Other
+    /// columns are refused.
     #[getter]
     fn observation_names(&self) -> Vec<String> {
         self.names.observations.clone()
@@ -239,8 +257,9 @@ impl PyPolicy {
         self.origin.step
     }
 
-    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's) or "score" (SfBC's), which draw actions and choose; "planner", which
-    /// draws plans and chooses one; or "gaussian", which acts by its mean.
+    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's) or "score" (SfBC's),
+    /// which draw actions and choose; "planner", which draws plans and chooses one; or "gaussian",
+    /// which acts by its mean.
     #[getter]
     fn kind(&self) -> &'static str {
         match self.config {
@@ -253,9 +272,10 @@ impl PyPolicy {
         }
     }
 
-    /// All that its file says of it, a dictionary: version that wrote it, environment, step, names of the numbers of observations
-    /// and actions, scaling (user's = offset + scale · network's, or None); and, if `learner export` made the file, run, task,
-    /// algorithm, data with its license, score, and judgment.
+    /// All that its file says of it, a dictionary: version that wrote it, environment, step, names
+    /// of the numbers of observations and actions, scaling (user's = offset + scale · network's, or
+    /// None); and, if `learner export` made the file, run, task, algorithm, data with its license,
+    /// score, and judgment.
     #[getter]
     fn about<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         py.import("json")?.call_method1("loads", (&self.about,))
@@ -267,7 +287,8 @@ impl PyPolicy {
         self.policy.precision().name()
     }
 
-    /// How it chooses: a dictionary of candidates, rule and value, as `act` takes them. None if it draws nothing.
+    /// How it chooses: a dictionary of candidates, rule and value, as `act` takes them. None if it
+    /// draws nothing.
     #[getter]
     fn choice<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
         self.policy.choice().map(|choice| as_dictionary(py, choice)).transpose()
@@ -283,7 +304,9 @@ impl PyPolicy {
         let (o, a) = (self.policy.observation_dim(), self.policy.action_dim());
         let Origin { environment, step, .. } = &self.origin;
         let (kind, precision) = (self.kind(), self.precision());
-        format!("Policy({environment}, {kind} after step {step}, {o} -> {a} numbers{choice}, {precision})")
+        format!(
+            "Policy({environment}, {kind} after step {step}, {o} -> {a} numbers{choice}, {precision})"
+        )
     }
 
     fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyTuple>> {
@@ -295,6 +318,11 @@ impl PyPolicy {
 
 impl PyPolicy {
     fn rows<'a>(&self, observations: &'a Like<'_>) -> PyResult<Rows<'a>> {
-        Rows::of("observations", observations, self.policy.observation_dim(), &self.names.observations)
+        Rows::of(
+            "observations",
+            observations,
+            self.policy.observation_dim(),
+            &self.names.observations,
+        )
     }
 }

@@ -16,6 +16,9 @@ pub fn read_run(py: Python<'_>, folder: PathBuf) -> PyResult<(String, String)> {
     };
     py.detach(read).map_err(|error| {
         let hint = error.downcast_ref().map(RunDirError::hint);
-        PyRuntimeError::new_err(format!("{error:#}{}", hint.map(|hint| format!("\nhint: {hint}")).unwrap_or_default()))
+        PyRuntimeError::new_err(format!(
+            "{error:#}{}",
+            hint.map(|hint| format!("\nhint: {hint}")).unwrap_or_default()
+        ))
     })
 }

@@ -1,8 +1,9 @@
 //! The one way to open and the one way to make a file in a run's folder, for all programs.
 //!
-//! Another user may have made the folder. So a file there is opened through no link, and a pipe or a device in its place is
-//! neither waited for nor read without end. A file is made beside its place under a random name, and renamed when it is whole:
-//! what was there before, or all of the new contents, also after a power cut. The tests find every other call.
+//! Another user may have made the folder. So a file there is opened through no link, and a pipe or
+//! a device in its place is neither waited for nor read without end. A file is made beside its
+//! place under a random name, and renamed when it is whole: what was there before, or all of the
+//! new contents, also after a power cut. The tests find every other call.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom, Write};
@@ -14,7 +15,8 @@ use rustix::io::Errno;
 
 /// Ending of a file that is being written.
 const PARTIAL: &str = "partial";
-/// The most that is read of a file, bytes: a checkpoint of networks as large as evaluators take has less.
+/// The most that is read of a file, bytes: a checkpoint of networks as large as evaluators take has
+/// less.
 const LARGEST: u64 = 2 << 30;
 
 /// Opens a file of a run's folder for reading.
@@ -76,7 +78,8 @@ pub fn read_named(path: &Path) -> io::Result<Vec<u8>> {
 /// # Errors
 /// Those of [`read`], or it is not UTF-8.
 pub fn read_text(path: &Path) -> io::Result<String> {
-    String::from_utf8(read(path)?).map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is not UTF-8"))
+    String::from_utf8(read(path)?)
+        .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is not UTF-8"))
 }
 
 /// What a file has from a byte on.
@@ -86,7 +89,10 @@ pub fn read_text(path: &Path) -> io::Result<String> {
 pub fn rest(file: &mut File, from: u64) -> io::Result<Vec<u8>> {
     let length = file.metadata()?.len().saturating_sub(from);
     if length > LARGEST {
-        return Err(io::Error::new(ErrorKind::FileTooLarge, format!("it is too large, with {length} bytes")));
+        return Err(io::Error::new(
+            ErrorKind::FileTooLarge,
+            format!("it is too large, with {length} bytes"),
+        ));
     }
     let mut bytes = Vec::new();
     bytes.try_reserve_exact(length as usize)?;
@@ -114,10 +120,12 @@ pub fn replace(target: &Path, bytes: &[u8]) -> io::Result<()> {
 
 /// Removes a file, if it is there.
 pub(crate) fn remove_if_there(path: &Path) -> io::Result<()> {
-    fs::remove_file(path).or_else(|error| if error.kind() == ErrorKind::NotFound { Ok(()) } else { Err(error) })
+    fs::remove_file(path)
+        .or_else(|error| if error.kind() == ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }
 
-/// Removes the half files that killed processes have left in a folder. One that stays does no harm but to take room.
+/// Removes the half files that killed processes have left in a folder. One that stays does no harm
+/// but to take room.
 pub(crate) fn remove_partial_files(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
@@ -128,7 +136,8 @@ pub(crate) fn remove_partial_files(folder: &Path) {
     }
 }
 
-/// Makes a folder and those above it that are missing, so that a power cut does not take what will be in them.
+/// Makes a folder and those above it that are missing, so that a power cut does not take what will
+/// be in them.
 pub(crate) fn create_folder(path: &Path) -> io::Result<()> {
     if path.is_dir() {
         return Ok(());
@@ -145,7 +154,8 @@ pub(crate) fn create_folder(path: &Path) -> io::Result<()> {
 /// # Errors
 /// The folder cannot be opened or synchronized.
 pub fn synchronize_folder(path: &Path) -> io::Result<()> {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder =
+        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     File::open(folder)?.sync_all()
 }
 

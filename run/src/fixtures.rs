@@ -13,7 +13,8 @@ pub fn config(name: &str, seed: u64) -> RunConfig {
         "path": "data.hdf5", "transitions": 100, "episodes": 3, "min_return": 10.0, "mean_return": 20.0, "max_return": 30.0,
         "mean_score": 10.7,
     });
-    serde_json::from_value(json!({ "run": run, "dataset": dataset, "experiment": experiment })).unwrap()
+    serde_json::from_value(json!({ "run": run, "dataset": dataset, "experiment": experiment }))
+        .unwrap()
 }
 
 /// A line of `scores.jsonl`.

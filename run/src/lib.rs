@@ -1,6 +1,8 @@
-//! Runs on the disk: a run's settings, its folder, its results and its state. It is the one reader of what a learner writes.
+//! Runs on the disk: a run's settings, its folder, its results and its state. It is the one reader
+//! of what a learner writes.
 //!
-//! It has no thread; every program calls it on threads of its own. In reading order; each module may use those below it:
+//! It has no thread; every program calls it on threads of its own. In reading order; each module
+//! may use those below it:
 //!
 //! - [`status`]: how far runs are, and a list of all runs.
 //! - [`results`]: a run's scores, summarized, and the paper's.

@@ -31,12 +31,15 @@ impl Part {
         match (self, style) {
             (Self::Table(table), _) => table.render(style),
             (Self::Words(text), Style::Text | Style::Markdown) => text.clone(),
-            (Self::Words(text), Style::Latex) => text.lines().map(|line| format!("{}\n\n", latex(line))).collect(),
+            (Self::Words(text), Style::Latex) => {
+                text.lines().map(|line| format!("{}\n\n", latex(line))).collect()
+            }
         }
     }
 }
 
-/// A table: which columns are aligned to the right, and rows of cells, of which the first is the header.
+/// A table: which columns are aligned to the right, and rows of cells, of which the first is the
+/// header.
 #[derive(Serialize)]
 pub struct Table {
     right: Vec<bool>,
@@ -47,7 +50,10 @@ impl Table {
     /// A table with this header and no rows.
     pub fn new<T: AsRef<str>>(header: &[(T, Alignment)]) -> Self {
         let right = header.iter().map(|(_, alignment)| *alignment == Right).collect();
-        Self { right, rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()] }
+        Self {
+            right,
+            rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()],
+        }
     }
 
     /// A row has a cell for each column. A cell is in one line, whatever file its text is from.
@@ -58,9 +64,12 @@ impl Table {
     /// The table as text.
     pub fn render(&self, style: Style) -> String {
         match style {
-            Style::Text => self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat(),
+            Style::Text => {
+                self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat()
+            }
             Style::Markdown => {
-                let rows = self.rows.iter().map(|row| row.iter().map(|cell| markdown(cell)).collect());
+                let rows =
+                    self.rows.iter().map(|row| row.iter().map(|cell| markdown(cell)).collect());
                 let escaped = Self { right: self.right.clone(), rows: rows.collect() };
                 let mut lines = escaped.lines(|cells| format!("| {} |\n", cells.join(" | ")));
                 let rule = self.right.iter().map(|right| if *right { "---:" } else { "---" });
@@ -88,13 +97,18 @@ impl Table {
 
     /// The rows, with cells as wide as their columns.
     fn lines(&self, line: impl Fn(&[String]) -> String) -> Vec<String> {
-        let width = |column: usize| self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+        let width = |column: usize| {
+            self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0)
+        };
         let widths: Vec<usize> = (0..self.right.len()).map(width).collect();
         let padded = |row: &Vec<String>| {
-            let cells = row.iter().zip(&widths).zip(&self.right).map(|((cell, width), right)| match right {
-                false => format!("{cell:<width$}"),
-                true => format!("{cell:>width$}"),
-            });
+            let cells =
+                row.iter().zip(&widths).zip(&self.right).map(
+                    |((cell, width), right)| match right {
+                        false => format!("{cell:<width$}"),
+                        true => format!("{cell:>width$}"),
+                    },
+                );
             line(&Vec::from_iter(cells))
         };
         self.rows.iter().map(padded).collect()

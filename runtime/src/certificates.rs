@@ -1,4 +1,5 @@
-//! The certificate by which a program shows its role: three files that `deploy/zenoh/certificates.sh` makes.
+//! The certificate by which a program shows its role: three files that
+//! `deploy/zenoh/certificates.sh` makes.
 
 use std::env;
 use std::fmt;
@@ -21,24 +22,26 @@ use x509_parser::time::ASN1Time;
 /// The trusted authority, the program's own certificate, and its private key.
 const FILES: [&str; 3] = ["ca.pem", "cert.pem", "key.pem"];
 
-/// The program warns about a certificate that is valid for fewer days than this: an operator needs time to renew it.
+/// The program warns about a certificate that is valid for fewer days than this: an operator needs
+/// time to renew it.
 const EXPIRES_SOON: i64 = 14;
 
 const HINT: &str = "--certificates takes a folder with ca.pem, cert.pem and key.pem that this user may read; \
                     deploy/zenoh/certificates.sh makes one";
-const HINT_TIME: &str =
-    "if the clock of this machine is right, make a new certificate with deploy/zenoh/certificates.sh";
+const HINT_TIME: &str = "if the clock of this machine is right, make a new certificate with deploy/zenoh/certificates.sh";
 const HINT_ROLE: &str = "give the folder that was made for this program's role";
 
 /// Names the folder of certificates where the command line does not.
 const VARIABLE: &str = "QUAD_CERTIFICATES";
 
-/// The folder of certificates that the command line names, or else the variable QUAD_CERTIFICATES, unless it is empty.
+/// The folder of certificates that the command line names, or else the variable QUAD_CERTIFICATES,
+/// unless it is empty.
 pub fn certificates_folder(named: Option<PathBuf>) -> Option<PathBuf> {
     named.or_else(|| env::var_os(VARIABLE).filter(|folder| !folder.is_empty()).map(PathBuf::from))
 }
 
-/// What the owner of a certificate may do. Access control tells roles apart by the certificate's common name.
+/// What the owner of a certificate may do. Access control tells roles apart by the certificate's
+/// common name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// Publishes weights, answers jobs and scores.
@@ -57,9 +60,11 @@ impl Role {
     }
 }
 
-/// A folder with an authority (ca.pem), a certificate that it has signed (cert.pem), and the certificate's key (key.pem).
+/// A folder with an authority (ca.pem), a certificate that it has signed (cert.pem), and the
+/// certificate's key (key.pem).
 ///
-/// Zenoh reads the files again for each connection that it opens, and once for each endpoint that it listens at.
+/// Zenoh reads the files again for each connection that it opens, and once for each endpoint that
+/// it listens at.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Certificates {
     folder: PathBuf,
@@ -89,12 +94,12 @@ impl CertificatesError {
 }
 
 impl Certificates {
-    /// Checks the files in `folder` as the other side of a connection would, and that the certificate is for `role`. Logs
-    /// until when the certificate is valid.
+    /// Checks the files in `folder` as the other side of a connection would, and that the
+    /// certificate is for `role`. Logs until when the certificate is valid.
     ///
     /// # Errors
-    /// A file is missing or malformed; the certificate is of another role, not valid now, or of another authority; the key is
-    /// another certificate's.
+    /// A file is missing or malformed; the certificate is of another role, not valid now, or of
+    /// another authority; the key is another certificate's.
     pub fn read(folder: &Path, role: Role) -> Result<Self, CertificatesError> {
         let certificates = Self::check(folder, role)?;
         match certificates.expire_soon() {
@@ -108,9 +113,12 @@ impl Certificates {
     pub(crate) fn check(folder: &Path, role: Role) -> Result<Self, CertificatesError> {
         let [ca, own, key] = FILES.map(|name| folder.join(name));
         let (authorities, chain) = (certificates(&ca)?, certificates(&own)?);
-        let private = PrivateKeyDer::from_pem_file(&key).map_err(|error| unreadable(&key, "private key", &error))?;
+        let private = PrivateKeyDer::from_pem_file(&key)
+            .map_err(|error| unreadable(&key, "private key", &error))?;
         let certificate = X509Certificate::from_der(&chain[0])
-            .map_err(|_| CertificatesError::new(&own, "holds no certificate that can be read", HINT))?
+            .map_err(|_| {
+                CertificatesError::new(&own, "holds no certificate that can be read", HINT)
+            })?
             .1;
 
         let names = certificate.subject().iter_common_name().filter_map(|name| name.as_str().ok());
@@ -128,13 +136,25 @@ impl Certificates {
         let (expires, hosts) = (validity.not_after, hosts(&certificate));
         verify(&chain, authorities).map_err(|error| match error {
             // The second authority has the same name as the first.
-            TlsError::InvalidCertificate(CertificateError::UnknownIssuer | CertificateError::BadSignature) => {
-                CertificatesError::new(&own, format!("is of another authority than {}", ca.display()), HINT)
-            }
-            other => CertificatesError::new(&own, format!("does not pass with {}: {other}", ca.display()), HINT),
+            TlsError::InvalidCertificate(
+                CertificateError::UnknownIssuer | CertificateError::BadSignature,
+            ) => CertificatesError::new(
+                &own,
+                format!("is of another authority than {}", ca.display()),
+                HINT,
+            ),
+            other => CertificatesError::new(
+                &own,
+                format!("does not pass with {}: {other}", ca.display()),
+                HINT,
+            ),
         })?;
         if CertifiedKey::from_der(chain, private, &ring::default_provider()).is_err() {
-            return Err(CertificatesError::new(&key, format!("is not the key of {}", own.display()), HINT));
+            return Err(CertificatesError::new(
+                &key,
+                format!("is not the key of {}", own.display()),
+                HINT,
+            ));
         }
         Ok(Self { folder: folder.to_owned(), expires, hosts })
     }
@@ -149,7 +169,8 @@ impl Certificates {
         self.hosts.iter().all(|host| is_this_machine(host))
     }
 
-    /// Zenoh's `transport/link/tls`: both sides show a certificate, and stay connected only while it is valid.
+    /// Zenoh's `transport/link/tls`: both sides show a certificate, and stay connected only while
+    /// it is valid.
     pub(crate) fn settings(&self) -> Value {
         let [authority, certificate, key] = FILES.map(|name| self.folder.join(name));
         json!({
@@ -192,24 +213,36 @@ fn unreadable(path: &Path, wanted: &str, error: &PemError) -> CertificatesError 
 }
 
 /// Whether one of the authorities has signed the certificate, now and for a client.
-fn verify(chain: &[CertificateDer<'_>], authorities: Vec<CertificateDer<'static>>) -> Result<(), TlsError> {
+fn verify(
+    chain: &[CertificateDer<'_>],
+    authorities: Vec<CertificateDer<'static>>,
+) -> Result<(), TlsError> {
     let mut roots = RootCertStore::empty();
     for authority in authorities {
         roots.add(authority)?;
     }
-    let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::new(ring::default_provider()));
+    let verifier = WebPkiClientVerifier::builder_with_provider(
+        Arc::new(roots),
+        Arc::new(ring::default_provider()),
+    );
     let verifier = verifier.build().map_err(|error| TlsError::General(error.to_string()))?;
     verifier.verify_client_cert(&chain[0], &chain[1..], UnixTime::now()).map(|_| ())
 }
 
 /// The names and addresses in a certificate at which clients may connect to its owner.
 fn hosts(certificate: &X509Certificate<'_>) -> Vec<String> {
-    let names = certificate.subject_alternative_name().ok().flatten().map(|names| &names.value.general_names);
+    let names = certificate
+        .subject_alternative_name()
+        .ok()
+        .flatten()
+        .map(|names| &names.value.general_names);
     let host = |name: &GeneralName<'_>| match *name {
         GeneralName::DNSName(name) => Some(name.to_owned()),
         GeneralName::IPAddress(bytes) => {
             let four = <[u8; 4]>::try_from(bytes).map(IpAddr::from);
-            four.or_else(|_| <[u8; 16]>::try_from(bytes).map(IpAddr::from)).ok().map(|address| address.to_string())
+            four.or_else(|_| <[u8; 16]>::try_from(bytes).map(IpAddr::from))
+                .ok()
+                .map(|address| address.to_string())
         }
         _ => None,
     };

@@ -4,23 +4,25 @@ use zenoh::config::EndPoint;
 
 use crate::certificates::{Certificates, is_this_machine};
 
-/// The two protocols that this program's Zenoh supports: without and with encryption and authentication.
+/// The two protocols that this program's Zenoh supports: without and with encryption and
+/// authentication.
 const OPEN: &str = "tcp/";
 const PROTECTED: &str = "tls/";
 
 /// The endpoints of a session: `tcp/127.0.0.1:7447`, or with certificates `tls/127.0.0.1:7447`.
 ///
-/// There is no scouting: a session uses only the endpoints named here. A session that listens is a peer, to which clients
-/// connect directly. A session that does not listen is a client of the peer or router that it connects to.
+/// There is no scouting: a session uses only the endpoints named here. A session that listens is a
+/// peer, to which clients connect directly. A session that does not listen is a client of the peer
+/// or router that it connects to.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Endpoints {
     /// Listen here. Port 0 takes a free port; [`reachable_at`](crate::reachable_at) returns it.
     pub listen: Vec<String>,
-    /// Connect to these. A client keeps one connection, so a program that must reach several learners or routers opens a
-    /// session for each.
+    /// Connect to these. A client keeps one connection, so a program that must reach several
+    /// learners or routers opens a session for each.
     pub connect: Vec<String>,
-    /// With certificates, every connection uses TLS, and both sides show a certificate. A client of a session that listens may
-    /// do what deploy/zenoh/router-tls.json5 allows its role.
+    /// With certificates, every connection uses TLS, and both sides show a certificate. A client of
+    /// a session that listens may do what deploy/zenoh/router-tls.json5 allows its role.
     pub certificates: Option<Certificates>,
 }
 
@@ -30,8 +32,11 @@ pub enum SessionError {
     /// The endpoints name neither a place to listen at nor one to connect to.
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
-    /// This program cannot use the endpoint. (Zenoh would try for ever to connect by an unknown protocol.)
-    #[error("{0:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447")]
+    /// This program cannot use the endpoint. (Zenoh would try for ever to connect by an unknown
+    /// protocol.)
+    #[error(
+        "{0:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447"
+    )]
     NotAnEndpoint(String),
     /// There are certificates, but the endpoint would not use them.
     #[error("certificates are given, but the connection at {0} would not be encrypted")]
@@ -56,7 +61,9 @@ impl SessionError {
     /// What to do about it.
     pub fn hint(&self) -> &'static str {
         match self {
-            SessionError::Open(_) => "write the endpoint like tls/HOST:PORT, or leave --certificates away",
+            SessionError::Open(_) => {
+                "write the endpoint like tls/HOST:PORT, or leave --certificates away"
+            }
             SessionError::NoCertificates(_) => {
                 "name their folder by --certificates DIR or QUAD_CERTIFICATES; deploy/zenoh/certificates.sh makes one"
             }
@@ -94,17 +101,20 @@ impl Endpoints {
         self.for_others().filter(|_| self.certificates.is_none())
     }
 
-    /// The endpoint for other machines whose certificate all of them would refuse, if there is one: the certificate contains
-    /// only names that this machine has for itself.
+    /// The endpoint for other machines whose certificate all of them would refuse, if there is one:
+    /// the certificate contains only names that this machine has for itself.
     pub(crate) fn closed_to_all(&self) -> Option<&str> {
-        self.for_others().filter(|_| self.certificates.as_ref().is_some_and(Certificates::is_for_this_machine_alone))
+        self.for_others().filter(|_| {
+            self.certificates.as_ref().is_some_and(Certificates::is_for_this_machine_alone)
+        })
     }
 
     /// The first endpoint to listen at that other machines can reach, so not on loopback.
     fn for_others(&self) -> Option<&str> {
         let is_local = |endpoint: &&String| {
             let address = address_of(endpoint);
-            let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
+            let host =
+                address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
             is_this_machine(host)
         };
         self.listen.iter().find(|endpoint| !is_local(endpoint)).map(String::as_str)
@@ -125,7 +135,9 @@ pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> Strin
 ///
 /// [`SessionError::NotAnEndpoint`]: the endpoint is malformed, or names a protocol other than TCP and TLS.
 pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
-    if [OPEN, PROTECTED].iter().any(|protocol| text.starts_with(protocol)) && text.parse::<EndPoint>().is_ok() {
+    if [OPEN, PROTECTED].iter().any(|protocol| text.starts_with(protocol))
+        && text.parse::<EndPoint>().is_ok()
+    {
         return Ok(text.to_owned());
     }
     Err(SessionError::NotAnEndpoint(text.to_owned()))
@@ -152,20 +164,31 @@ mod tests {
             let listen = vec!["tcp/127.0.0.1:1".to_owned(), endpoint.to_owned()];
             Endpoints { listen, ..Endpoints::default() }.open_to_all().map(str::to_owned)
         };
-        for endpoint in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:0", "tcp/127.1.2.3:1#iface=lo"] {
+        for endpoint in
+            ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:0", "tcp/127.1.2.3:1#iface=lo"]
+        {
             assert_eq!(open(endpoint), None, "{endpoint}");
         }
-        for endpoint in ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/192.0.2.1:0", "tcp/learner:1?prio=1-7"] {
+        for endpoint in
+            ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/192.0.2.1:0", "tcp/learner:1?prio=1-7"]
+        {
             assert_eq!(open(endpoint).as_deref(), Some(endpoint));
         }
     }
 
     #[test]
     fn which_ports_the_system_chooses() {
-        for endpoint in ["tcp/127.0.0.1:0", "tcp/[::1]:0", "tcp/0.0.0.0:0#iface=lo", "tcp/127.0.0.1:0?prio=1-7"] {
+        for endpoint in
+            ["tcp/127.0.0.1:0", "tcp/[::1]:0", "tcp/0.0.0.0:0#iface=lo", "tcp/127.0.0.1:0?prio=1-7"]
+        {
             assert!(leaves_port_open(endpoint), "{endpoint}");
         }
-        for endpoint in ["tcp/127.0.0.1:7447", "tcp/learner:10", "tcp/[::0]:7447", "tcp/127.0.0.1:7447#iface=e:0"] {
+        for endpoint in [
+            "tcp/127.0.0.1:7447",
+            "tcp/learner:10",
+            "tcp/[::0]:7447",
+            "tcp/127.0.0.1:7447#iface=e:0",
+        ] {
             assert!(!leaves_port_open(endpoint), "{endpoint}");
         }
     }

@@ -1,4 +1,5 @@
-//! Whether a process still works: its parts report that they are alive, and `/healthz` names the parts that have stopped.
+//! Whether a process still works: its parts report that they are alive, and `/healthz` names the
+//! parts that have stopped.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,8 +14,8 @@ pub struct Health {
 }
 
 impl Health {
-    /// Adds a part of the process that will report at least every `limit` while it is alive. The part counts as alive from
-    /// this call on.
+    /// Adds a part of the process that will report at least every `limit` while it is alive. The
+    /// part counts as alive from this call on.
     pub fn part(&self, name: impl Into<String>, limit: Duration) -> Beat {
         let part = Arc::new(Part {
             name: name.into(),
@@ -34,7 +35,8 @@ impl Health {
 
     /// Whether the part of this name should have reported that it is alive, and has not.
     pub fn is_silent(&self, name: &str) -> bool {
-        let (parts, now) = (self.parts.lock().unwrap_or_else(PoisonError::into_inner), Instant::now());
+        let (parts, now) =
+            (self.parts.lock().unwrap_or_else(PoisonError::into_inner), Instant::now());
         parts.iter().any(|part| part.name == name && part.silence(now).is_some())
     }
 
@@ -44,16 +46,16 @@ impl Health {
     }
 }
 
-/// A part's handle to report its health. If it is dropped without [`finish`](Beat::finish), as by a panic, the part counts as
-/// broken.
+/// A part's handle to report its health. If it is dropped without [`finish`](Beat::finish), as by a
+/// panic, the part counts as broken.
 #[derive(Debug)]
 pub struct Beat {
     part: Arc<Part>,
 }
 
 impl Beat {
-    /// Reports that the part is alive. This reads the clock and stores an atomic, so a thread may call it as often as it
-    /// likes.
+    /// Reports that the part is alive. This reads the clock and stores an atomic, so a thread may
+    /// call it as often as it likes.
     pub fn alive(&self) {
         self.alive_at(Instant::now());
     }
@@ -67,7 +69,8 @@ impl Beat {
         self.part.limit / 4
     }
 
-    /// Reports a problem of a part that is alive, like a full disk; `None` when the problem is over.
+    /// Reports a problem of a part that is alive, like a full disk; `None` when the problem is
+    /// over.
     pub fn set_trouble(&self, trouble: Option<String>) {
         self.part.state().trouble = trouble;
     }
@@ -117,21 +120,28 @@ impl Part {
 
     /// How long a part that runs has given no sign of life, if that is too long.
     fn silence(&self, now: Instant) -> Option<Duration> {
-        let silent = (now - self.start).saturating_sub(Duration::from_millis(self.last.load(Relaxed)));
+        let silent =
+            (now - self.start).saturating_sub(Duration::from_millis(self.last.load(Relaxed)));
         (self.state().ending == Ending::Running && silent > self.limit).then_some(silent)
     }
 
     fn problems(&self, now: Instant) -> Vec<String> {
-        let silent = self
-            .silence(now)
-            .map(|silent| format!("{}: no sign of life for {:.0?}, {:?} are allowed", self.name, silent, self.limit));
+        let silent = self.silence(now).map(|silent| {
+            format!(
+                "{}: no sign of life for {:.0?}, {:?} are allowed",
+                self.name, silent, self.limit
+            )
+        });
         let State { ending, trouble } = &*self.state();
         let stopped = match ending {
             Ending::Finished => return Vec::new(),
             Ending::Broken => Some(format!("{}: it ended before its work was done", self.name)),
             Ending::Running => silent,
         };
-        stopped.into_iter().chain(trouble.iter().map(|trouble| format!("{}: {trouble}", self.name))).collect()
+        stopped
+            .into_iter()
+            .chain(trouble.iter().map(|trouble| format!("{}: {trouble}", self.name)))
+            .collect()
     }
 }
 
@@ -150,7 +160,10 @@ mod tests {
         assert!(health.problems().is_empty());
         let later = Instant::now() + 2 * SHORT;
         let problems = health.clone().problems_at(later);
-        assert!(problems.len() == 1 && problems[0].starts_with("scores: no sign of life for "), "{problems:?}");
+        assert!(
+            problems.len() == 1 && problems[0].starts_with("scores: no sign of life for "),
+            "{problems:?}"
+        );
         scores.alive_at(later);
         assert!(health.problems_at(later).is_empty());
     }

@@ -5,8 +5,9 @@
 //! In reading order, which follows a process from start to end:
 //!
 //! - `logging`: which log lines a program writes, and where to.
-//! - `endpoints`: where learner and evaluators meet; `certificates`: how they show their roles; `access`: what each role may
-//!   do; `session`: the connection over Zenoh; `router`: a meeting point of many learners on one machine.
+//! - `endpoints`: where learner and evaluators meet; `certificates`: how they show their roles;
+//!   `access`: what each role may do; `session`: the connection over Zenoh; `router`: a meeting
+//!   point of many learners on one machine.
 //! - `threads`, `background`: limit the processor time that the network takes.
 //! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
@@ -33,7 +34,10 @@ mod threads;
 pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role, certificates_folder};
 pub use endpoints::{DEFAULT_PORT, Endpoints, SessionError, default_endpoint, parse_endpoint};
-pub use exit::{ENDED_AT_ONCE, Hint, UNFINISHED, clean, error_in, hinted, hints, json, print, run_main, unfinished};
+pub use exit::{
+    ENDED_AT_ONCE, Hint, UNFINISHED, clean, error_in, hinted, hints, json, print, run_main,
+    unfinished,
+};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
 pub use metrics_server::{MetricsServer, serve_metrics};

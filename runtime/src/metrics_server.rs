@@ -26,11 +26,13 @@ use tracing::{debug, warn};
 use crate::exit::Hint;
 use crate::health::Health;
 
-/// A request is a few lines in one packet. The server closes a connection whose request is incomplete after this time.
+/// A request is a few lines in one packet. The server closes a connection whose request is
+/// incomplete after this time.
 const REQUEST: Duration = Duration::from_secs(3);
 /// A connection serves one request, and lasts at most this long, however slowly its client reads.
 const CONNECTION: Duration = Duration::from_secs(15);
-/// Most connections at a time. A further connection ends the oldest, so that idle clients do not keep others out.
+/// Most connections at a time. A further connection ends the oldest, so that idle clients do not
+/// keep others out.
 const MOST_CONNECTIONS: usize = 64;
 /// Bytes of a connection's request that the server buffers; hyper takes no fewer.
 const MOST_BUFFERED: usize = 8 << 10;
@@ -45,13 +47,15 @@ pub struct MetricsServer {
     task: JoinHandle<()>,
 }
 
-/// Serves over HTTP at `address`: `/metrics` with the metrics of `registry` in Prometheus's text format; `/healthz` with `ok`,
-/// or with status 503 and a line for each problem; and the program's own `pages`.
+/// Serves over HTTP at `address`: `/metrics` with the metrics of `registry` in Prometheus's text
+/// format; `/healthz` with `ok`, or with status 503 and a line for each problem; and the program's
+/// own `pages`.
 ///
-/// A request must name this machine by an address, as `localhost` or, if other machines can ask, by its own name, alone or with a
-/// domain that this machine searches.
+/// A request must name this machine by an address, as `localhost` or, if other machines can ask, by
+/// its own name, alone or with a domain that this machine searches.
 ///
-/// The server cuts off clients that send or read slowly, or hold idle connections; they cost a bounded amount of memory.
+/// The server cuts off clients that send or read slowly, or hold idle connections; they cost a
+/// bounded amount of memory.
 ///
 /// # Errors
 /// The server cannot listen at the address.
@@ -61,13 +65,19 @@ pub async fn serve_metrics(
     health: Health,
     pages: Router,
 ) -> anyhow::Result<MetricsServer> {
-    let listener = TcpListener::bind(address).await.with_context(|| format!("cannot listen at {address}"));
     let listener =
-        listener.hint("another program may listen there: choose another address, or port 0 for a free one")?;
+        TcpListener::bind(address).await.with_context(|| format!("cannot listen at {address}"));
+    let listener = listener.hint(
+        "another program may listen there: choose another address, or port 0 for a free one",
+    )?;
     let address = listener.local_addr()?;
     let metrics = get(metrics).with_state(registry);
     let [name, resolver] = ["/proc/sys/kernel/hostname", "/etc/resolv.conf"].map(|path| {
-        if address.ip().is_loopback() { String::new() } else { fs::read_to_string(path).unwrap_or_default() }
+        if address.ip().is_loopback() {
+            String::new()
+        } else {
+            fs::read_to_string(path).unwrap_or_default()
+        }
     });
     let own_names: Arc<[String]> = own_names(name.trim(), &resolver).into();
     let router = Router::new()
@@ -106,7 +116,11 @@ async fn accept(listener: TcpListener, router: Router) {
 /// One request and its response.
 async fn answer(stream: TcpStream, router: Router) {
     let mut server = http1::Builder::new();
-    server.timer(TokioTimer::new()).header_read_timeout(REQUEST).max_buf_size(MOST_BUFFERED).keep_alive(false);
+    server
+        .timer(TokioTimer::new())
+        .header_read_timeout(REQUEST)
+        .max_buf_size(MOST_BUFFERED)
+        .keep_alive(false);
     let exchange = server.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
     match timeout(CONNECTION, exchange).await {
         Ok(Ok(())) => {}
@@ -115,10 +129,15 @@ async fn answer(stream: TcpStream, router: Router) {
     }
 }
 
-/// The owner of a web page may let its name lead to this machine (DNS rebinding). The browser of a person who reads that page
-/// would then give it our answers, but it tells us the page's name.
-async fn refuse_other_names(State(own_names): State<Arc<[String]>>, request: Request, next: Next) -> Response {
-    let is_ours = |name: &[u8]| std::str::from_utf8(name).is_ok_and(|name| names_us(name, &own_names));
+/// The owner of a web page may let its name lead to this machine (DNS rebinding). The browser of a
+/// person who reads that page would then give it our answers, but it tells us the page's name.
+async fn refuse_other_names(
+    State(own_names): State<Arc<[String]>>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let is_ours =
+        |name: &[u8]| std::str::from_utf8(name).is_ok_and(|name| names_us(name, &own_names));
     if request.headers().get(header::HOST).is_none_or(|name| is_ours(name.as_bytes())) {
         return next.run(request).await;
     }
@@ -126,11 +145,16 @@ async fn refuse_other_names(State(own_names): State<Arc<[String]>>, request: Req
     (StatusCode::FORBIDDEN, hint).into_response()
 }
 
-/// What other machines may call this one: by its first name, its whole name, and its first name in each domain that a resolver's
-/// settings name. A stranger can have the first name in any other domain.
+/// What other machines may call this one: by its first name, its whole name, and its first name in
+/// each domain that a resolver's settings name. A stranger can have the first name in any other
+/// domain.
 fn own_names(name: &str, resolver: &str) -> Vec<String> {
-    let Some(first) = name.split('.').next().filter(|first| !first.is_empty()) else { return Vec::new() };
-    let lists = resolver.lines().filter_map(|line| line.strip_prefix("search ").or(line.strip_prefix("domain ")));
+    let Some(first) = name.split('.').next().filter(|first| !first.is_empty()) else {
+        return Vec::new();
+    };
+    let lists = resolver
+        .lines()
+        .filter_map(|line| line.strip_prefix("search ").or(line.strip_prefix("domain ")));
     let domains = lists.flat_map(str::split_whitespace).map(|domain| format!("{first}.{domain}"));
     domains.chain([first.to_owned(), name.to_owned()]).collect()
 }
@@ -140,7 +164,9 @@ fn names_us(host: &str, own_names: &[String]) -> bool {
     let Ok(authority) = host.parse::<Authority>() else { return false };
     let name = authority.host().trim_matches(['[', ']']);
     let is_ours = |own: &String| name.eq_ignore_ascii_case(own);
-    name.parse::<IpAddr>().is_ok() || name.eq_ignore_ascii_case("localhost") || own_names.iter().any(is_ours)
+    name.parse::<IpAddr>().is_ok()
+        || name.eq_ignore_ascii_case("localhost")
+        || own_names.iter().any(is_ours)
 }
 
 async fn metrics(State(registry): State<Registry>) -> impl IntoResponse {
@@ -172,8 +198,11 @@ mod tests {
         for host in ["127.0.0.1:8080", "[::1]:8080", "192.0.2.1", "localhost", "LocalHost:9600"] {
             assert!(names_us(host, &[]), "{host}");
         }
-        let own = own_names("box7.lan", "nameserver 192.0.2.1\nsearch lab.example.org example.org\n");
-        for host in ["box7", "box7:9600", "box7.lan", "Box7.example.org:9600", "box7.lab.example.org"] {
+        let own =
+            own_names("box7.lan", "nameserver 192.0.2.1\nsearch lab.example.org example.org\n");
+        for host in
+            ["box7", "box7:9600", "box7.lan", "Box7.example.org:9600", "box7.lab.example.org"]
+        {
             assert!(names_us(host, &own) && !names_us(host, &[]), "{host}");
         }
         for host in [
@@ -187,7 +216,10 @@ mod tests {
             "",
             "a b",
         ] {
-            assert!(!names_us(host, &own) && !names_us(host, &own_names("", "search evil.example")), "{host}");
+            assert!(
+                !names_us(host, &own) && !names_us(host, &own_names("", "search evil.example")),
+                "{host}"
+            );
         }
     }
 }

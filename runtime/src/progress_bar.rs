@@ -38,11 +38,14 @@ impl ProgressBar {
 
     /// Starts (again) with `position` of `length` done.
     pub fn start(&self, position: u64, length: u64) {
-        let figures = self.counted.map_or("{bytes}/{total_bytes} at {bytes_per_sec}".to_owned(), |counted| {
-            format!("{{pos}}/{{len}} {counted}")
-        });
+        let figures =
+            self.counted.map_or("{bytes}/{total_bytes} at {bytes_per_sec}".to_owned(), |counted| {
+                format!("{{pos}}/{{len}} {counted}")
+            });
         // Without our style the bar still works, but shows less.
-        if let Ok(style) = ProgressStyle::with_template(&format!("{{bar:40}} {figures}, {{eta}} left")) {
+        if let Ok(style) =
+            ProgressStyle::with_template(&format!("{{bar:40}} {figures}, {{eta}} left"))
+        {
             self.bar.set_style(style);
         }
         self.bar.set_length(length);

@@ -11,12 +11,14 @@ const SETTINGS: &str = include_str!("../../deploy/zenoh/router.json5");
 /// Other machines cannot reach the router; the system chooses its port.
 const LISTEN: &str = "tcp/127.0.0.1:0";
 
-/// Opens a router that lives as long as the session, and returns its endpoint. Needs a multi-thread tokio runtime.
+/// Opens a router that lives as long as the session, and returns its endpoint. Needs a multi-thread
+/// tokio runtime.
 ///
 /// # Errors
 /// The router cannot listen.
 pub async fn open_router() -> Result<(Session, String), SessionError> {
-    let wrong = |error| SessionError::Endpoint { endpoints: LISTEN.to_owned(), reason: for_people(error) };
+    let wrong =
+        |error| SessionError::Endpoint { endpoints: LISTEN.to_owned(), reason: for_people(error) };
     let session = zenoh::open(config().map_err(wrong)?).await.map_err(wrong)?;
     let endpoints = Endpoints { listen: vec![LISTEN.to_owned()], ..Endpoints::default() };
     let bound = reachable_at(&session, &endpoints).await?;

@@ -13,26 +13,29 @@ use crate::access;
 use crate::background::stay_in_background;
 use crate::endpoints::{Endpoints, SessionError, leaves_port_open};
 
-/// A frozen or disconnected process counts as gone after this time; the end of a process is noticed at once. This is half of
-/// Zenoh's default, but long enough for a machine that is busy training and misses several keep-alive messages.
+/// A frozen or disconnected process counts as gone after this time; the end of a process is noticed
+/// at once. This is half of Zenoh's default, but long enough for a machine that is busy training
+/// and misses several keep-alive messages.
 const LEASE: Duration = Duration::from_secs(5);
 /// Largest message that a client accepts, bytes: the largest snapshot (64 MiB) and what Zenoh adds.
 const MAX_SNAPSHOT_SIZE: u64 = 65 << 20;
-/// Largest fragmented message that a listening session accepts, bytes: none. Zenoh keeps each fragment until the last one has
-/// come, together with the buffer of 64 KiB in which it arrived, so fragments of one byte could fill any memory. Evaluators'
-/// messages have at most 30 KiB and need no fragments: one packet has space for 32,700 bytes on every network.
+/// Largest fragmented message that a listening session accepts, bytes: none. Zenoh keeps each
+/// fragment until the last one has come, together with the buffer of 64 KiB in which it arrived, so
+/// fragments of one byte could fill any memory. Evaluators' messages have at most 30 KiB and need
+/// no fragments: one packet has space for 32,700 bytes on every network.
 const MAX_PIECED_REQUEST: u64 = 0;
-/// Most connections of a listening session; it refuses further ones. Each is an open file, and a process may open 1024 files
-/// on many systems. The rest is for datasets, logs and metrics.
+/// Most connections of a listening session; it refuses further ones. Each is an open file, and a
+/// process may open 1024 files on many systems. The rest is for datasets, logs and metrics.
 const MAX_SESSIONS: u64 = 768;
 /// First and longest pause between two attempts to connect.
 const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
-/// How long a large message that may be dropped waits for a slow receiver. Zenoh's 50 ms are too short for a snapshot when
-/// training uses all cores; but a receiver that hangs must not delay the others for long.
+/// How long a large message that may be dropped waits for a slow receiver. Zenoh's 50 ms are too
+/// short for a snapshot when training uses all cores; but a receiver that hangs must not delay the
+/// others for long.
 const DROP_AFTER: Duration = Duration::from_millis(500);
-/// How long a message that may not be dropped waits for a receiver that does not read, before the connection is closed. Other
-/// receivers may wait meanwhile, so this is less than Zenoh's five seconds; it suffices for one packet of 64 KiB on a network
-/// of 256 kbit/s.
+/// How long a message that may not be dropped waits for a receiver that does not read, before the
+/// connection is closed. Other receivers may wait meanwhile, so this is less than Zenoh's five
+/// seconds; it suffices for one packet of 64 KiB on a network of 256 kbit/s.
 const CLOSE_AFTER: Duration = Duration::from_secs(2);
 /// A client that has no connection after this time logs it.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -41,8 +44,9 @@ const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Opens a session. Needs a multi-thread tokio runtime.
 ///
-/// A session that listens is open at once. A client is open as soon as it has a connection: it waits for a learner or router
-/// that has not started yet, until this future is dropped. If the connection is lost later, the client connects again.
+/// A session that listens is open at once. A client is open as soon as it has a connection: it
+/// waits for a learner or router that has not started yet, until this future is dropped. If the
+/// connection is lost later, the client connects again.
 pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError> {
     endpoints.check()?;
     if let Some(endpoint) = endpoints.closed_to_all() {
@@ -56,15 +60,18 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
         SessionError::Endpoint { endpoints, reason: for_people(error) }
     };
     let config = config(endpoints).map_err(wrong)?;
-    // Zenoh's future blocks its thread until there is a connection, so it gets a thread of its own. Nothing joins that thread:
-    // if this future is dropped, the process can end.
+    // Zenoh's future blocks its thread until there is a connection, so it gets a thread of its own.
+    // Nothing joins that thread: if this future is dropped, the process can end.
     let (sender, mut opened) = oneshot::channel();
     let open = move || {
         // This thread starts Zenoh's own threads, which inherit its priority.
         stay_in_background();
         drop(sender.send(zenoh::open(config).wait()));
     };
-    thread::Builder::new().name("zenoh-open".to_owned()).spawn(open).map_err(|error| wrong(error.into()))?;
+    thread::Builder::new()
+        .name("zenoh-open".to_owned())
+        .spawn(open)
+        .map_err(|error| wrong(error.into()))?;
     let opened = match timeout(PATIENCE, &mut opened).await {
         Ok(opened) => opened,
         Err(_) => {
@@ -87,7 +94,8 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
         ("mode", json!(mode)),
         ("listen/endpoints", json!(endpoints.listen)),
         ("connect/endpoints", json!(endpoints.connect)),
-        // Makes a client wait for a learner or router that has not started; by default it would give up at once.
+        // Makes a client wait for a learner or router that has not started; by default it would
+        // give up at once.
         ("connect/timeout_ms", json!(-1)),
         ("connect/exit_on_failure", json!(false)),
         ("connect/retry", json!({ "period_init_ms": retry[0], "period_max_ms": retry[1] })),
@@ -98,12 +106,21 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
             "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
             json!(DROP_AFTER.as_micros() as u64),
         ),
-        ("transport/link/tx/queue/congestion_control/block/wait_before_close", json!(CLOSE_AFTER.as_micros() as u64)),
-        ("transport/link/rx/max_message_size", json!(if listens { MAX_PIECED_REQUEST } else { MAX_SNAPSHOT_SIZE })),
+        (
+            "transport/link/tx/queue/congestion_control/block/wait_before_close",
+            json!(CLOSE_AFTER.as_micros() as u64),
+        ),
+        (
+            "transport/link/rx/max_message_size",
+            json!(if listens { MAX_PIECED_REQUEST } else { MAX_SNAPSHOT_SIZE }),
+        ),
         ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
-        // This is the only stable way to learn a port that the system chose. Clients could read the configuration there, so it
-        // is on only if needed.
-        ("adminspace/enabled", json!(endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint)))),
+        // This is the only stable way to learn a port that the system chose. Clients could read the
+        // configuration there, so it is on only if needed.
+        (
+            "adminspace/enabled",
+            json!(endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint))),
+        ),
     ];
     if let Some(certificates) = &endpoints.certificates {
         settings.push(("transport/link/tls", certificates.settings()));
@@ -134,9 +151,13 @@ pub(crate) fn for_people(error: zenoh::Error) -> String {
     plain
 }
 
-/// Where evaluators can reach `session`, which was opened with `endpoints`: the addresses at which it listens, with the ports
-/// that the system chose, or, if it does not listen, those to which it connects.
-pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Vec<String>, SessionError> {
+/// Where evaluators can reach `session`, which was opened with `endpoints`: the addresses at which
+/// it listens, with the ports that the system chose, or, if it does not listen, those to which it
+/// connects.
+pub async fn reachable_at(
+    session: &Session,
+    endpoints: &Endpoints,
+) -> Result<Vec<String>, SessionError> {
     if endpoints.listen.is_empty() {
         return Ok(endpoints.connect.clone());
     }
@@ -144,11 +165,17 @@ pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Ve
         return Ok(endpoints.listen.clone());
     }
     let about_itself = format!("@/{}/*", session.zid());
-    let replies = session.get(about_itself).timeout(SELF_QUERY_TIMEOUT).await.map_err(|_| SessionError::Unknown)?;
+    let replies = session
+        .get(about_itself)
+        .timeout(SELF_QUERY_TIMEOUT)
+        .await
+        .map_err(|_| SessionError::Unknown)?;
     let reply = replies.recv_async().await.map_err(|_| SessionError::Unknown)?;
     let sample = reply.result().map_err(|_| SessionError::Unknown)?;
-    let description: Value = serde_json::from_slice(&sample.payload().to_bytes()).map_err(|_| SessionError::Unknown)?;
-    let locators = description["locators"].as_array().into_iter().flatten().filter_map(Value::as_str);
+    let description: Value =
+        serde_json::from_slice(&sample.payload().to_bytes()).map_err(|_| SessionError::Unknown)?;
+    let locators =
+        description["locators"].as_array().into_iter().flatten().filter_map(Value::as_str);
     let bound: Vec<String> = locators.map(str::to_owned).collect();
     if bound.is_empty() { Err(SessionError::Unknown) } else { Ok(bound) }
 }
@@ -159,7 +186,8 @@ mod tests {
 
     #[test]
     fn errors_without_places() {
-        let text = "Can not listen: [In use (os error 98) at /a/src/tcp.rs:61.] at /a/src/unicast.rs:338.";
+        let text =
+            "Can not listen: [In use (os error 98) at /a/src/tcp.rs:61.] at /a/src/unicast.rs:338.";
         assert_eq!(for_people(text.into()), "Can not listen: [In use (os error 98)]");
         assert_eq!(for_people("No route to host".into()), "No route to host");
     }

@@ -1,15 +1,17 @@
-//! How many threads Zenoh, candle and rayon use. They read the number from the environment when they are first used.
+//! How many threads Zenoh, candle and rayon use. They read the number from the environment when
+//! they are first used.
 
 use std::env;
 use std::num::NonZero;
 
-/// Zenoh's threads that receive (`rx`) also do the work of its threads for connections and timers: waking another thread costs
-/// more than handling a small message. Two threads send (`tx`): while Zenoh closes the connection of a peer that does not
-/// read, one of them waits for two seconds.
-const ZENOH: (&str, &str) = ("ZENOH_RUNTIME", "(app: (handover: rx), net: (handover: rx), tx: (worker_threads: 2))");
-/// Besides Rayon's pool, candle has a pool of its own for tensors of 65,536 numbers or more, and spins while it waits for it.
-/// The learner keeps Rayon's threads awake, so the two pools would take turns on the cores, and a step would take twenty times
-/// as long.
+/// Zenoh's threads that receive (`rx`) also do the work of its threads for connections and timers:
+/// waking another thread costs more than handling a small message. Two threads send (`tx`): while
+/// Zenoh closes the connection of a peer that does not read, one of them waits for two seconds.
+const ZENOH: (&str, &str) =
+    ("ZENOH_RUNTIME", "(app: (handover: rx), net: (handover: rx), tx: (worker_threads: 2))");
+/// Besides Rayon's pool, candle has a pool of its own for tensors of 65,536 numbers or more, and
+/// spins while it waits for it. The learner keeps Rayon's threads awake, so the two pools would
+/// take turns on the cores, and a step would take twenty times as long.
 const CANDLE: (&str, &str) = ("CANDLE_NUM_THREADS", "1");
 
 /// Limits the threads of both, unless the user has set the variables.
@@ -18,7 +20,8 @@ const CANDLE: (&str, &str) = ("CANDLE_NUM_THREADS", "1");
 pub fn choose_threads() {
     for (variable, threads) in [ZENOH, CANDLE] {
         if env::var_os(variable).is_none() {
-            // SAFETY: this is the only thread, so no other thread reads the environment at the same time.
+            // SAFETY: this is the only thread, so no other thread reads the environment at the same
+            // time.
             #[allow(unsafe_code)]
             unsafe {
                 env::set_var(variable, threads);
@@ -27,8 +30,8 @@ pub fn choose_threads() {
     }
 }
 
-/// How many threads the user wants rayon to have, by RAYON_NUM_THREADS. It counts as not set if it is 0 or no number: rayon
-/// then chooses, and so may the program.
+/// How many threads the user wants rayon to have, by RAYON_NUM_THREADS. It counts as not set if it
+/// is 0 or no number: rayon then chooses, and so may the program.
 pub fn threads_asked() -> Option<NonZero<usize>> {
     env::var("RAYON_NUM_THREADS").ok()?.parse().ok()
 }

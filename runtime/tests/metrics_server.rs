@@ -11,7 +11,8 @@ use prometheus::{IntGauge, Registry};
 use quad_runtime::{Health, MetricsServer, serve_metrics};
 
 const PATIENCE: Duration = Duration::from_secs(60);
-const ANY_PORT: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
+const ANY_PORT: SocketAddr =
+    SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
 
 async fn server(health: Health) -> (MetricsServer, IntGauge) {
     let registry = Registry::new();
@@ -58,7 +59,10 @@ async fn a_strangers_name_that_leads_here_is_told_nothing() {
     let (server, _) = server(Health::default()).await;
     for path in ["/metrics", "/healthz", "/secret"] {
         let (head, body) = get_as(server.address, "evil.example".to_owned(), path).await;
-        assert!(head.starts_with("http/1.1 403") && body.starts_with("ask for this machine"), "{head}{body}");
+        assert!(
+            head.starts_with("http/1.1 403") && body.starts_with("ask for this machine"),
+            "{head}{body}"
+        );
     }
     let host = format!("localhost:{}", server.address.port());
     assert_eq!(get_as(server.address, host, "/healthz").await.1, "ok\n");
@@ -78,7 +82,8 @@ async fn ill_health_is_told_line_by_line() {
     assert!(head.starts_with("http/1.1 200"), "a sick process is still measured: {head}");
 }
 
-/// A server with a page that never comes, and a connection that asks for it, which the server bears for 15 s.
+/// A server with a page that never comes, and a connection that asks for it, which the server bears
+/// for 15 s.
 async fn server_that_bears() -> (MetricsServer, impl Fn() -> TcpStream) {
     let never = Router::new().route("/never", routing::get(std::future::pending::<()>));
     let server = serve_metrics(ANY_PORT, Registry::new(), Health::default(), never).await.unwrap();
@@ -112,8 +117,11 @@ fn assert_is_open(mut stream: &TcpStream) {
 async fn half_a_request_and_silence_are_cut_off_long_before_one_that_waits_for_its_answer() {
     let (server, bear) = server_that_bears().await;
     let whole = bear();
-    let halves = ["GET /metrics HTTP/1.1\r\nHost: localhost", "GET /met", ""].map(|sent| sends(server.address, sent));
-    tokio::task::spawn_blocking(move || halves.iter().for_each(|half| drop(ended(half)))).await.unwrap();
+    let halves = ["GET /metrics HTTP/1.1\r\nHost: localhost", "GET /met", ""]
+        .map(|sent| sends(server.address, sent));
+    tokio::task::spawn_blocking(move || halves.iter().for_each(|half| drop(ended(half))))
+        .await
+        .unwrap();
     assert_is_open(&whole);
 }
 
@@ -123,7 +131,8 @@ async fn a_hundred_connections_that_wait_keep_no_client_out() {
     let waiting: Vec<TcpStream> = (0..100).map(|_| bear()).collect();
     let (head, _) = get(server.address, "/metrics").await;
     assert!(head.starts_with("http/1.1 200"), "{head}");
-    // The first ones made room for the others: there is a bound. The client did not wait for the others.
+    // The first ones made room for the others: there is a bound. The client did not wait for the
+    // others.
     assert_is_open(&waiting[99]);
     tokio::task::spawn_blocking(move || ended(&waiting[0])).await.unwrap();
 }
@@ -132,6 +141,8 @@ async fn a_hundred_connections_that_wait_keep_no_client_out() {
 async fn an_address_in_use_is_an_error() {
     let (server, _) = server(Health::default()).await;
     let address = server.address;
-    let error = serve_metrics(address, Registry::new(), Health::default(), Router::new()).await.unwrap_err();
+    let error = serve_metrics(address, Registry::new(), Health::default(), Router::new())
+        .await
+        .unwrap_err();
     assert_eq!(error.to_string(), format!("cannot listen at {address}"));
 }

@@ -1,5 +1,6 @@
-//! Sessions over real TCP: what they refuse, and how much they take in. That learner and evaluators find each other, whichever comes
-//! first, goes or comes back, is tested with the programs (tests/tests/service).
+//! Sessions over real TCP: what they refuse, and how much they take in. That learner and evaluators
+//! find each other, whichever comes first, goes or comes back, is tested with the programs
+//! (tests/tests/service).
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::time::Duration;
@@ -30,7 +31,10 @@ async fn meeting_point() -> (Session, String) {
     let session = open_session(&endpoints).await.unwrap();
     let reachable = reachable_at(&session, &endpoints).await.unwrap();
     assert_eq!(reachable.len(), 1, "{reachable:?}");
-    assert!(reachable[0].starts_with("tcp/127.0.0.1:") && !reachable[0].ends_with(":0"), "{reachable:?}");
+    assert!(
+        reachable[0].starts_with("tcp/127.0.0.1:") && !reachable[0].ends_with(":0"),
+        "{reachable:?}"
+    );
     (session, reachable[0].clone())
 }
 
@@ -62,23 +66,36 @@ async fn a_session_that_listens_takes_in_nothing_in_several_pieces() {
     let largest_report = vec![1; 30 << 10];
     assert_eq!(ask(&evaluator, largest_report.clone()).await, largest_report);
     for size in [100_000, 1] {
-        evaluator.put("quad/run/progress/e", vec![1; size]).congestion_control(CongestionControl::Block).await.unwrap();
+        evaluator
+            .put("quad/run/progress/e", vec![1; size])
+            .congestion_control(CongestionControl::Block)
+            .await
+            .unwrap();
     }
-    let sample = timeout(PATIENCE, progress.recv_async()).await.expect("no progress arrived").unwrap();
+    let sample =
+        timeout(PATIENCE, progress.recv_async()).await.expect("no progress arrived").unwrap();
     assert_eq!(sample.payload().len(), 1, "a message in two pieces was taken in");
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_cannot_work_is_an_error_at_once() {
     let (_session, endpoint) = meeting_point().await;
-    let open = async |endpoints: Endpoints| timeout(PATIENCE, open_session(&endpoints)).await.unwrap().err().unwrap();
+    let open = async |endpoints: Endpoints| {
+        timeout(PATIENCE, open_session(&endpoints)).await.unwrap().err().unwrap()
+    };
     assert!(matches!(open(Endpoints::default()).await, SessionError::NoEndpoint));
     let taken = open(listening_at(&endpoint)).await;
     let text = taken.to_string();
-    assert!(text.contains(&endpoint) && text.contains("in use") && !text.contains(".rs:"), "{text}");
+    assert!(
+        text.contains(&endpoint) && text.contains("in use") && !text.contains(".rs:"),
+        "{text}"
+    );
     for wrong in ["127.0.0.1:7447", "udp/127.0.0.1:7447", "smoke/signals:1", "tcp", "tcp/", ""] {
         let error = open(connecting_to(wrong)).await;
-        assert!(matches!(&error, SessionError::NotAnEndpoint(endpoint) if endpoint == wrong), "{error}");
+        assert!(
+            matches!(&error, SessionError::NotAnEndpoint(endpoint) if endpoint == wrong),
+            "{error}"
+        );
         assert!(error.to_string().contains("tcp/127.0.0.1:7447"), "{error}");
     }
 }
@@ -88,13 +105,16 @@ async fn beyond_the_most_connections_no_client_comes_in_until_one_leaves() {
     const MOST: usize = 768;
     // Both ends of each connection are open files of this process.
     let limit = rustix::process::getrlimit(Resource::Nofile);
-    rustix::process::setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }).unwrap();
+    rustix::process::setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit })
+        .unwrap();
     let (learner, endpoint) = meeting_point().await;
     let _declared = declare_learner(&learner).await;
     let (come, mut there) = tokio::sync::mpsc::unbounded_channel();
     for _ in 0..MOST + 20 {
         let (endpoint, come) = (endpoint.clone(), come.clone());
-        tokio::spawn(async move { come.send(open_session(&connecting_to(&endpoint)).await.unwrap()).unwrap() });
+        tokio::spawn(async move {
+            come.send(open_session(&connecting_to(&endpoint)).await.unwrap()).unwrap()
+        });
     }
     let mut sessions = Vec::new();
     while sessions.len() < MOST {

@@ -16,18 +16,25 @@ fn each_signal_is_noticed_even_before_it_is_awaited() {
     // At once, not by another program: a second signal that comes late would end this process.
     let send = |signal| kill_process(getpid(), signal).unwrap();
     use Signal as S;
-    for [signal, other] in [[S::INT, S::TERM], [S::TERM, S::INT], [S::HUP, S::TERM], [S::USR1, S::TERM]] {
-        // A runtime each: the end of it ends the watch, to which another signal would be a further one.
+    for [signal, other] in
+        [[S::INT, S::TERM], [S::TERM, S::INT], [S::HUP, S::TERM], [S::USR1, S::TERM]]
+    {
+        // A runtime each: the end of it ends the watch, to which another signal would be a further
+        // one.
         runtime().block_on(async {
             let shutdown = shutdown_signal(LEAVE_WITHIN);
             send(signal);
-            timeout(Duration::from_secs(60), shutdown).await.unwrap_or_else(|_| panic!("{signal:?} was not noticed"));
+            timeout(Duration::from_secs(60), shutdown)
+                .await
+                .unwrap_or_else(|_| panic!("{signal:?} was not noticed"));
             // Ctrl-C reaches a script, too, which hands it on: that would end this very process.
             send(other);
             tokio::time::sleep(Duration::from_secs(1)).await;
         });
     }
-    let quiet = runtime().block_on(async { timeout(Duration::from_millis(100), shutdown_signal(LEAVE_WITHIN)).await });
+    let quiet = runtime().block_on(async {
+        timeout(Duration::from_millis(100), shutdown_signal(LEAVE_WITHIN)).await
+    });
     assert!(quiet.is_err(), "a signal of the past is no reason to leave");
     // As `nohup` does before it starts a program.
     // SAFETY: it only sets what the system does at the signal.

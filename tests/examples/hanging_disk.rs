@@ -1,5 +1,5 @@
-//! A library to be preloaded: a call never returns for files whose paths begin as [`HANGS`] says. Stands in for libc's `fsync`
-//! and `read`.
+//! A library to be preloaded: a call never returns for files whose paths begin as [`HANGS`] says.
+//! Stands in for libc's `fsync` and `read`.
 
 use std::ffi::{c_int, c_long, c_void};
 use std::fs;

@@ -1,4 +1,5 @@
-//! A library to be preloaded: files have no locks, as on Lustre without `flock`. Stands in for libc's `flock`.
+//! A library to be preloaded: files have no locks, as on Lustre without `flock`. Stands in for
+//! libc's `flock`.
 
 use std::ffi::c_int;
 

@@ -1,4 +1,5 @@
-//! A library to be preloaded: has [`Disk`] keep what a program synchronizes. Stands in for libc's `fsync` and `fdatasync`.
+//! A library to be preloaded: has [`Disk`] keep what a program synchronizes. Stands in for libc's
+//! `fsync` and `fdatasync`.
 #![allow(clippy::expect_used)]
 
 use std::ffi::{c_int, c_long};
@@ -33,7 +34,8 @@ fn synchronize(call: c_long, file: c_int) -> c_int {
     // SAFETY: both calls take a descriptor, of whatever kind, and touch no memory of the program.
     let result = unsafe { libc::syscall(call, file) } as c_int;
     if result == 0 {
-        let path = fs::read_link(Path::new("/proc/self/fd").join(file.to_string())).expect("the file is open");
+        let path = fs::read_link(Path::new("/proc/self/fd").join(file.to_string()))
+            .expect("the file is open");
         Disk::of_environment().keep(&path).expect("the disk keeps it");
     }
     result

@@ -5,13 +5,16 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Largest error, relative to the number itself or, for numbers near zero, to their tensor's root mean square.
+/// Largest error, relative to the number itself or, for numbers near zero, to their tensor's root
+/// mean square.
 const TOLERANCE: f32 = 1e-4;
-/// Largest error for numbers of a fresh seed, any of which may happen to lie close to zero. A slip shows far more.
+/// Largest error for numbers of a fresh seed, any of which may happen to lie close to zero. A slip
+/// shows far more.
 #[allow(dead_code)] // not every crate makes some
 const FRESH_TOLERANCE: f32 = 1e-2;
 
-/// The seed of folders that are made for a test. One that never changes, so that a change is what makes the test fail.
+/// The seed of folders that are made for a test. One that never changes, so that a change is what
+/// makes the test fail.
 #[allow(dead_code)] // not every crate makes some
 const FRESH_SEED: &str = "1000";
 
@@ -30,13 +33,14 @@ pub struct Golden {
     tolerance: f32,
 }
 
-/// Runs a script of the repository that needs JAX; says whether it ran. Without the Python that deploy/setup.sh --tests sets up it
-/// is skipped, unless QUAD_REQUIRE_PEERS=1 asks for it.
+/// Runs a script of the repository that needs JAX; says whether it ran. Without the Python that
+/// deploy/setup.sh --tests sets up it is skipped, unless QUAD_REQUIRE_PEERS=1 asks for it.
 #[allow(dead_code)] // not every crate runs some
 #[allow(clippy::print_stderr)] // what is skipped is said
 pub fn run(script: &str, arguments: &[&str]) -> bool {
     let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let python = std::env::var_os("QUAD_PYTHON").map_or(home.join(".deps/venv/bin/python"), PathBuf::from);
+    let python =
+        std::env::var_os("QUAD_PYTHON").map_or(home.join(".deps/venv/bin/python"), PathBuf::from);
     let has_jax = Command::new(&python).args(["-c", "import jax, safetensors"]).output();
     if !has_jax.is_ok_and(|output| output.status.success()) {
         let remedy = "deploy/setup.sh --tests installs it";
@@ -51,11 +55,13 @@ pub fn run(script: &str, arguments: &[&str]) -> bool {
     true
 }
 
-/// A folder of a variant, as committed folders are called, of the seed that GOLDEN_SEED names; `None` where make.py cannot run.
+/// A folder of a variant, as committed folders are called, of the seed that GOLDEN_SEED names;
+/// `None` where make.py cannot run.
 #[allow(dead_code)] // not every crate makes some
 pub fn fresh(variant: &str) -> Option<Golden> {
     let seed = std::env::var("GOLDEN_SEED").unwrap_or_else(|_| FRESH_SEED.to_owned());
-    let folder = std::env::temp_dir().join(format!("golden-{variant}-{seed}-{}", std::process::id()));
+    let folder =
+        std::env::temp_dir().join(format!("golden-{variant}-{seed}-{}", std::process::id()));
     if !run(MAKE, &["--seed", &seed, "--variant", variant, "--out", folder.to_str().unwrap()]) {
         return None;
     }
@@ -64,7 +70,8 @@ pub fn fresh(variant: &str) -> Option<Golden> {
     Some(Golden { tolerance: FRESH_TOLERANCE, ..golden })
 }
 
-/// The folders of one algorithm: the committed ones, or the one that GOLDEN_DIR names, which must be of that algorithm.
+/// The folders of one algorithm: the committed ones, or the one that GOLDEN_DIR names, which must
+/// be of that algorithm.
 pub fn goldens(algorithm: &str) -> Vec<Golden> {
     if let Some(folder) = std::env::var_os("GOLDEN_DIR") {
         let golden = Golden::open(folder.into());
@@ -79,11 +86,16 @@ pub fn goldens(algorithm: &str) -> Vec<Golden> {
 pub fn committed(algorithm: &str) -> Vec<Golden> {
     let of_algorithm = |golden: &Golden| golden.config["algorithm"] == algorithm;
     let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden");
-    let mut folders: Vec<_> = std::fs::read_dir(&home).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let mut folders: Vec<_> =
+        std::fs::read_dir(&home).unwrap().map(|entry| entry.unwrap().path()).collect();
     folders.retain(|folder| folder.join("config.json").exists());
     folders.sort();
     let goldens: Vec<_> = folders.into_iter().map(Golden::open).filter(of_algorithm).collect();
-    assert!(!goldens.is_empty(), "there are no golden folders of {algorithm} in {}", home.display());
+    assert!(
+        !goldens.is_empty(),
+        "there are no golden folders of {algorithm} in {}",
+        home.display()
+    );
     goldens
 }
 
@@ -115,21 +127,32 @@ impl Golden {
 
     /// An input on a device.
     pub fn input(&self, name: &str, device: &Device) -> Tensor {
-        let input = self.inputs.get(name).unwrap_or_else(|| panic!("input {name} in {}", self.folder.display()));
+        let input = self
+            .inputs
+            .get(name)
+            .unwrap_or_else(|| panic!("input {name} in {}", self.folder.display()));
         input.to_device(device).unwrap()
     }
 
     /// Asserts that numbers are those expected under this name, whatever their shape.
     pub fn close(&self, name: &str, found: &Tensor) {
-        let expected = self.expected.get(name).unwrap_or_else(|| panic!("{name} in {}", self.folder.display()));
-        let numbers = |x: &Tensor| x.to_dtype(DType::F32).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let expected = self
+            .expected
+            .get(name)
+            .unwrap_or_else(|| panic!("{name} in {}", self.folder.display()));
+        let numbers = |x: &Tensor| {
+            x.to_dtype(DType::F32).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        };
         let (found, expected) = (numbers(found), numbers(expected));
         assert_eq!(found.len(), expected.len(), "{name} in {}", self.folder.display());
         let size = (expected.iter().map(|x| x * x).sum::<f32>() / expected.len() as f32).sqrt();
         for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {
             let error = (found - expected).abs() / expected.abs().max(size).max(1e-30);
             let place = self.folder.display();
-            assert!(error <= self.tolerance, "{name} at {i} in {place}: {found}, but expected is {expected}");
+            assert!(
+                error <= self.tolerance,
+                "{name} at {i} in {place}: {found}, but expected is {expected}"
+            );
         }
     }
 }

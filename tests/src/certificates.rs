@@ -25,7 +25,9 @@ impl Certificates {
             &["monitor", "monitor"],
             &["--days", "0", "evaluator", "expired"],
         ];
-        made.iter().all(|arguments| peers::certificates(folder.path(), arguments)).then_some(Certificates { folder })
+        made.iter()
+            .all(|arguments| peers::certificates(folder.path(), arguments))
+            .then_some(Certificates { folder })
     }
 
     /// Makes an evaluator's anew, under the name that it had.
@@ -46,7 +48,8 @@ impl Certificates {
               -extfile extensions -enddate "$(date -u -d "+$1 seconds" +%Y%m%d%H%M%SZ)" -out "$2/cert.pem"
         "#;
         let arguments = ["-euc", script, "sh", &seconds.to_string(), name];
-        let output = Command::new("sh").args(arguments).current_dir(self.folder.path()).output().unwrap();
+        let output =
+            Command::new("sh").args(arguments).current_dir(self.folder.path()).output().unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 
@@ -61,19 +64,27 @@ impl Certificates {
     }
 }
 
-/// Connects with the certificate in `folder`, which is to be let in, and trusts the authority of `trusted`.
+/// Connects with the certificate in `folder`, which is to be let in, and trusts the authority of
+/// `trusted`.
 pub async fn come_in(endpoint: &str, trusted: &Path, folder: &Path) -> Session {
     let deadline = Instant::now() + PATIENCE;
     loop {
         match connect(endpoint, trusted, Some(folder)).await {
             Ok(session) => return session,
-            Err(error) => assert!(Instant::now() < deadline, "{folder:?} does not come in: {error}"),
+            Err(error) => {
+                assert!(Instant::now() < deadline, "{folder:?} does not come in: {error}")
+            }
         }
     }
 }
 
-/// Connects with the certificate in `folder`, or with none, and trusts the authority of `trusted`. Gives up soon.
-pub async fn connect(endpoint: &str, trusted: &Path, folder: Option<&Path>) -> zenoh::Result<Session> {
+/// Connects with the certificate in `folder`, or with none, and trusts the authority of `trusted`.
+/// Gives up soon.
+pub async fn connect(
+    endpoint: &str,
+    trusted: &Path,
+    folder: Option<&Path>,
+) -> zenoh::Result<Session> {
     let mut config = Config::default();
     let mut settings = vec![
         ("mode", "\"client\"".to_owned()),
@@ -85,8 +96,14 @@ pub async fn connect(endpoint: &str, trusted: &Path, folder: Option<&Path>) -> z
     ];
     if let Some(folder) = folder {
         settings.push(("transport/link/tls/enable_mtls", "true".to_owned()));
-        settings.push(("transport/link/tls/connect_certificate", format!("{:?}", folder.join("cert.pem"))));
-        settings.push(("transport/link/tls/connect_private_key", format!("{:?}", folder.join("key.pem"))));
+        settings.push((
+            "transport/link/tls/connect_certificate",
+            format!("{:?}", folder.join("cert.pem")),
+        ));
+        settings.push((
+            "transport/link/tls/connect_private_key",
+            format!("{:?}", folder.join("key.pem")),
+        ));
     }
     for (key, value) in settings {
         config.insert_json5(key, &value).unwrap();

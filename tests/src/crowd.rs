@@ -1,12 +1,14 @@
-//! Evaluators that do everything on the wire and nothing else: they claim, report progress and deliver scores that they made
-//! up. Hundreds of them fit into one test.
+//! Evaluators that do everything on the wire and nothing else: they claim, report progress and
+//! deliver scores that they made up. Hundreds of them fit into one test.
 
 use std::mem;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use quad_protocol::{Job, JobReply, Message, Name, Progress, ScoreReply, ScoreReport, encode, keys};
+use quad_protocol::{
+    Job, JobReply, Message, Name, Progress, ScoreReply, ScoreReport, encode, keys,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tokio::task::JoinSet;
@@ -49,8 +51,8 @@ struct Shared {
 }
 
 impl Crowd {
-    /// Connects `count` evaluators of `run`, each with a session of its own, to `endpoint`, where they begin to work. An episode
-    /// takes up to `episode`.
+    /// Connects `count` evaluators of `run`, each with a session of its own, to `endpoint`, where
+    /// they begin to work. An episode takes up to `episode`.
     pub async fn connect(count: usize, episode: Duration, run: &Name, endpoint: &str) -> Crowd {
         let (busy, measured) = Default::default();
         let shared = Arc::new(Shared { run: run.clone(), episode, busy, measured });
@@ -59,7 +61,8 @@ impl Crowd {
             let session = made_up::client(endpoint).await;
             let random = ChaCha8Rng::seed_from_u64(number as u64);
             let name = name(&format!("light-{number}"));
-            tasks.spawn(Member { name, session, shared: shared.clone(), random, told: None }.work());
+            tasks
+                .spawn(Member { name, session, shared: shared.clone(), random, told: None }.work());
         }
         Crowd { shared, _tasks: tasks }
     }
@@ -87,11 +90,16 @@ struct Member {
 impl Member {
     async fn work(mut self) {
         let run = self.shared.run.clone();
-        let token = self.session.liveliness().declare_token(keys::live_evaluator(&run, &self.name)).await;
+        let token =
+            self.session.liveliness().declare_token(keys::live_evaluator(&run, &self.name)).await;
         let _token = token.expect("the session is open");
         let woken = Arc::new(tokio::sync::Notify::new());
         let wake = woken.clone();
-        let snapshots = self.session.declare_subscriber(keys::weights(&run)).callback(move |_| wake.notify_one()).await;
+        let snapshots = self
+            .session
+            .declare_subscriber(keys::weights(&run))
+            .callback(move |_| wake.notify_one())
+            .await;
         let _snapshots = snapshots.expect("the session is open");
         loop {
             let claim = made_up::claim(self.name.as_str(), self.random.random(), "hopper");
@@ -104,7 +112,8 @@ impl Member {
                 }
                 Some(JobReply::Wait { milliseconds, .. }) => {
                     // A new snapshot wakes a real evaluator, too.
-                    let wait = Duration::from_millis(milliseconds).mul_f64(self.random.random_range(0.5..1.0));
+                    let wait = Duration::from_millis(milliseconds)
+                        .mul_f64(self.random.random_range(0.5..1.0));
                     timeout(wait, woken.notified()).await.ok();
                 }
                 _ => sleep(PAUSE).await,
@@ -144,7 +153,10 @@ impl Member {
             }
         };
         let mut measured = self.shared.measured.lock().unwrap();
-        let scores = report.episodes.iter().map(|episode| (report.step, episode.seed, report.weights.to_string()));
+        let scores = report
+            .episodes
+            .iter()
+            .map(|episode| (report.step, episode.seed, report.weights.to_string()));
         match answer {
             ScoreReply::Recorded { .. } => measured.acknowledged.extend(scores),
             ScoreReply::Refused { .. } => measured.refused += 1,

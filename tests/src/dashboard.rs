@@ -17,13 +17,17 @@ const VARIABLES: [(&str, &str); 2] = [("$run", ".*"), ("$__rate_interval", "1m")
 pub fn assert_every_panel_shows_data(prometheus: &Prometheus, patience: Duration) {
     for (panel, expression) in queries() {
         let what = format!("panel {panel:?} has data for {expression}");
-        eventually(&what, patience, || prometheus.query(&expression).filter(|values| !values.is_empty()));
+        eventually(&what, patience, || {
+            prometheus.query(&expression).filter(|values| !values.is_empty())
+        });
     }
 }
 
-/// The metrics that training measures, as the panels call them: by their names, without the number at the end.
+/// The metrics that training measures, as the panels call them: by their names, without the number
+/// at the end.
 pub fn metrics() -> BTreeSet<String> {
-    let is_name = |name: &str| name.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit());
+    let is_name =
+        |name: &str| name.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit());
     let titles = queries().into_iter().map(|(title, _)| title);
     let of_names = titles.filter(|title| title.split(", ").all(is_name));
     of_names.flat_map(|title| title.split(", ").map(str::to_owned).collect::<Vec<_>>()).collect()
@@ -41,7 +45,10 @@ fn queries() -> Vec<(String, String)> {
             let expression = target["expr"].as_str().expect("a target has an expression");
             let replace = |text: String, (name, value): &(&str, &str)| text.replace(name, value);
             let expression = VARIABLES.iter().fold(expression.to_owned(), replace);
-            assert!(!expression.contains('$'), "a variable that this test does not know: {expression}");
+            assert!(
+                !expression.contains('$'),
+                "a variable that this test does not know: {expression}"
+            );
             queries.push((panel["title"].as_str().unwrap_or_default().to_owned(), expression));
         }
     }

@@ -21,7 +21,8 @@ pub fn metrics(address: &str) -> Option<String> {
     get(address, "/metrics").filter(|(status, _)| *status == 200).map(|(_, body)| body)
 }
 
-/// Sum of the samples of metric `name` whose labels contain `label` (e.g. `reason="hash"`, or nothing).
+/// Sum of the samples of metric `name` whose labels contain `label` (e.g. `reason="hash"`, or
+/// nothing).
 pub fn sum(page: &str, name: &str, label: &str) -> f64 {
     let samples = page.lines().filter_map(|line| {
         let rest = line.strip_prefix(name)?;

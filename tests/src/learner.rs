@@ -35,7 +35,8 @@ impl Learner {
         eventually("the learner wrote endpoints.json", PATIENCE, || dir.read_endpoints().ok())
     }
 
-    /// Sum of the samples of `quad_learner_<name>` whose labels contain `label`; nothing if it does not answer.
+    /// Sum of the samples of `quad_learner_<name>` whose labels contain `label`; nothing if it does
+    /// not answer.
     pub fn metric(&self, name: &str, label: &str) -> Option<f64> {
         Some(http::sum(&http::metrics(&self.metrics())?, &format!("quad_learner_{name}"), label))
     }
@@ -50,7 +51,8 @@ impl Learner {
         eventually("there are scores", PATIENCE, || (self.scores().len() > count).then_some(()));
     }
 
-    /// Waits for its end, which must be a success, after which everything must have been scored once.
+    /// Waits for its end, which must be a success, after which everything must have been scored
+    /// once.
     pub fn assert_completes(&mut self, patience: Duration) {
         self.process.assert_succeeds(patience);
         self.assert_complete();
@@ -69,24 +71,31 @@ impl Learner {
         scores
     }
 
-    /// Fails unless `learner verify` finds every episode of every evaluation scored once, with the snapshot on disk.
+    /// Fails unless `learner verify` finds every episode of every evaluation scored once, with the
+    /// snapshot on disk.
     pub fn assert_complete(&self) {
         self.verify(&[]);
     }
 
     fn verify(&self, flags: &[&Path]) -> String {
         let mut verify = Command::new(binary("learner"));
-        let output =
-            verify.arg("verify").arg(&self.run_dir).args(flags).output().expect("the learner was found before");
+        let output = verify
+            .arg("verify")
+            .arg(&self.run_dir)
+            .args(flags)
+            .output()
+            .expect("the learner was found before");
         let found = String::from_utf8_lossy(&output.stdout).into_owned();
         assert!(output.status.success(), "{found}");
         found
     }
 
-    /// Fails unless snapshots, scores and the last checkpoint are those of another run, bit for bit; gives what
-    /// `learner verify` says.
+    /// Fails unless snapshots, scores and the last checkpoint are those of another run, bit for
+    /// bit; gives what `learner verify` says.
     pub fn assert_same_as(&self, other: &Learner) -> String {
-        let last = |learner: &Learner| learner.files("checkpoints").pop_last().expect("there is a checkpoint");
+        let last = |learner: &Learner| {
+            learner.files("checkpoints").pop_last().expect("there is a checkpoint")
+        };
         assert!(last(self) == last(other), "the last checkpoints differ");
         self.verify(&[Path::new("--same-as"), &other.run_dir])
     }
@@ -94,7 +103,8 @@ impl Learner {
     /// The whole files of a folder in the run's, name by name; none if it is not there.
     pub fn files(&self, folder: &str) -> BTreeMap<String, Vec<u8>> {
         let entries = fs::read_dir(self.run_dir.join(folder)).into_iter().flatten().flatten();
-        let files = entries.filter_map(|entry| Some((name_of(&entry.path())?, fs::read(entry.path()).ok()?)));
+        let files = entries
+            .filter_map(|entry| Some((name_of(&entry.path())?, fs::read(entry.path()).ok()?)));
         files.filter(|(name, _)| !name.ends_with(".partial")).collect()
     }
 

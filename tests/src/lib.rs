@@ -5,10 +5,11 @@
 //! In reading order:
 //!
 //! - [`process`]: start a program, signal it, wait for it, read what it said.
-//! - [`setting`]: how long a run is; [`system`]: a scratch folder with a tiny dataset, and what is started in it; [`learner`]: what a
-//!   learner tells and leaves in its run's folder.
+//! - [`setting`]: how long a run is; [`system`]: a scratch folder with a tiny dataset, and what is
+//!   started in it; [`learner`]: what a learner tells and leaves in its run's folder.
 //! - [`http`]: fetch a page, read a metric.
-//! - [`router`]: a Zenoh router in the test's own process; [`certificates`]: one for each role, and sessions that show them.
+//! - [`router`]: a Zenoh router in the test's own process; [`certificates`]: one for each role, and
+//!   sessions that show them.
 //! - [`made_up`]: messages that tests make up; [`crowd`]: hundreds of evaluators that only talk.
 //! - [`link`]: a connection on which things go wrong.
 //! - [`power`]: what a disk holds after a power cut; [`small_disk`]: one that is soon full.
@@ -41,7 +42,11 @@ use std::time::{Duration, Instant};
 pub const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Polls until `condition` gives something; panics after `patience`.
-pub fn eventually<T>(what: &str, patience: Duration, mut condition: impl FnMut() -> Option<T>) -> T {
+pub fn eventually<T>(
+    what: &str,
+    patience: Duration,
+    mut condition: impl FnMut() -> Option<T>,
+) -> T {
     let deadline = Instant::now() + patience;
     loop {
         if let Some(value) = condition() {

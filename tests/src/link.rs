@@ -1,4 +1,5 @@
-//! A network connection that a test can cut, freeze and slow down: it leads a program on to a port of this machine.
+//! A network connection that a test can cut, freeze and slow down: it leads a program on to a port
+//! of this machine.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -75,7 +76,8 @@ impl Link {
         Link { endpoint, state }
     }
 
-    /// Lets something go wrong for a while, a little (1 %) or much (100 %). Afterwards the connection is whole again.
+    /// Lets something go wrong for a while, a little (1 %) or much (100 %). Afterwards the
+    /// connection is whole again.
     pub fn suffer(&self, trouble: Trouble, percent: u32, a_while: Duration) {
         let state = &self.state;
         match trouble {

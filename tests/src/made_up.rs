@@ -1,10 +1,12 @@
-//! Messages that tests make up, and a client that sends them: well-formed, but no learner or evaluator of ours has sent them.
+//! Messages that tests make up, and a client that sends them: well-formed, but no learner or
+//! evaluator of ours has sent them.
 
 use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReport, decode, encode, keys,
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReport, decode,
+    encode, keys,
 };
 use quad_runtime::{Endpoints, open_session};
 use tokio::time::sleep;
@@ -20,7 +22,11 @@ pub fn name(text: &str) -> Name {
 
 /// Asks for work in one environment.
 pub fn claim(evaluator: &str, attempt: u64, environment: &str) -> JobRequest {
-    JobRequest::Claim { evaluator: name(evaluator), attempt, environments: vec![environment.to_owned()] }
+    JobRequest::Claim {
+        evaluator: name(evaluator),
+        attempt,
+        environments: vec![environment.to_owned()],
+    }
 }
 
 /// Tells of a job that was never handed out.
@@ -58,7 +64,12 @@ pub fn scores(job: &Job, evaluator: &str) -> ScoreReport {
     let hopper = environment::find("hopper").expect("hopper is known");
     let episodes = job.seeds.iter().map(|&seed| {
         let episode_return = (seed % 3000) as f64;
-        EpisodeScore { seed, episode_return, length: 300, score: hopper.normalized_score(episode_return) }
+        EpisodeScore {
+            seed,
+            episode_return,
+            length: 300,
+            score: hopper.normalized_score(episode_return),
+        }
     });
     ScoreReport::of(job, name(evaluator), name("f32"), episodes.collect())
 }
@@ -81,7 +92,9 @@ pub async fn ask<A: Message>(session: &Session, key: String, question: &impl Mes
 pub async fn claim_eventually(session: &Session, run: &Name, evaluator: &str) -> Job {
     let begin = Instant::now();
     loop {
-        if let Some(JobReply::Job(job)) = ask(session, keys::jobs(run), &claim(evaluator, 1, "hopper")).await {
+        if let Some(JobReply::Job(job)) =
+            ask(session, keys::jobs(run), &claim(evaluator, 1, "hopper")).await
+        {
             return job;
         }
         assert!(begin.elapsed() < PATIENCE, "no job for {evaluator}");

@@ -32,19 +32,34 @@ pub fn python(packages: &[&str]) -> Option<PathBuf> {
 /// Runs a script of tests/peers; gives what it printed.
 pub fn run_python(python: &Path, script: &str, arguments: &[&Path]) -> String {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("peers").join(script);
-    let output = Command::new(python).arg(&script).args(arguments).output().expect("Python was found before");
+    let output = Command::new(python)
+        .arg(&script)
+        .args(arguments)
+        .output()
+        .expect("Python was found before");
     let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{} ended with {}:\n{errors}", script.display(), output.status);
+    assert!(
+        output.status.success(),
+        "{} ended with {}:\n{errors}",
+        script.display(),
+        output.status
+    );
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
-/// Makes certificates with deploy/zenoh/certificates.sh in `folder`; false if the test is to be skipped.
+/// Makes certificates with deploy/zenoh/certificates.sh in `folder`; false if the test is to be
+/// skipped.
 pub fn certificates(folder: &Path, arguments: &[&str]) -> bool {
     if !has("openssl", &["version"], "openssl") {
         return false;
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh/certificates.sh");
-    let output = Command::new(script).arg("--in").arg(folder).args(arguments).output().expect("there is bash");
+    let output = Command::new(script)
+        .arg("--in")
+        .arg(folder)
+        .args(arguments)
+        .output()
+        .expect("there is bash");
     assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     true
 }
@@ -60,17 +75,24 @@ pub fn has_chromium() -> bool {
 }
 
 fn has(program: &str, version: &[&str], package: &str) -> bool {
-    let found = Command::new(program).args(version).output().is_ok_and(|output| output.status.success());
+    let found =
+        Command::new(program).args(version).output().is_ok_and(|output| output.status.success());
     if !found {
-        missing(program, &format!("install it with: apt-get install --no-install-recommends {package}"));
+        missing(
+            program,
+            &format!("install it with: apt-get install --no-install-recommends {package}"),
+        );
     }
     found
 }
 
-/// Whether pictures can be drawn here, as `evaluator doctor` says; if not, the test is to be skipped.
+/// Whether pictures can be drawn here, as `evaluator doctor` says; if not, the test is to be
+/// skipped.
 pub fn has_egl() -> bool {
-    let output = Command::new(binary("evaluator")).arg("doctor").output().expect("the evaluator starts");
-    let found = String::from_utf8_lossy(&output.stdout).lines().any(|line| line.contains("can be made"));
+    let output =
+        Command::new(binary("evaluator")).arg("doctor").output().expect("the evaluator starts");
+    let found =
+        String::from_utf8_lossy(&output.stdout).lines().any(|line| line.contains("can be made"));
     if !found {
         missing("EGL with Mesa's software driver", "install it with: deploy/setup.sh --tests");
     }

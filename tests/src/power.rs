@@ -1,7 +1,8 @@
 //! What a disk holds after a power cut, at worst: nothing but what was synchronized.
 //!
-//! A file has the contents of its last fsync, a folder the entries of its own last fsync, and an entry that was never
-//! synchronized itself is empty. examples/power_cut.rs, preloaded into a program, keeps such a [`Disk`] up to date.
+//! A file has the contents of its last fsync, a folder the entries of its own last fsync, and an
+//! entry that was never synchronized itself is empty. examples/power_cut.rs, preloaded into a
+//! program, keeps such a [`Disk`] up to date.
 
 use std::fs::{self, File};
 use std::io;
@@ -18,7 +19,8 @@ const KEPT: &str = "QUAD_TESTS_DISK_KEPT";
 /// A folder, and beside it what would be left of it.
 pub struct Disk {
     folder: PathBuf,
-    /// A file for each file and each folder, called by its identity: the contents, or a line for each entry.
+    /// A file for each file and each folder, called by its identity: the contents, or a line for
+    /// each entry.
     kept: PathBuf,
 }
 
@@ -33,7 +35,9 @@ impl Disk {
 
     /// The one that this program was started for by [`Disk::launcher`].
     pub fn of_environment() -> Disk {
-        let folder = |variable: &str| PathBuf::from(std::env::var_os(variable).expect("the launcher sets it"));
+        let folder = |variable: &str| {
+            PathBuf::from(std::env::var_os(variable).expect("the launcher sets it"))
+        };
         Disk { folder: folder(FOLDER), kept: folder(KEPT) }
     }
 
@@ -43,7 +47,8 @@ impl Disk {
         [preload("power_cut"), vec![set(FOLDER, &self.folder), set(KEPT, &self.kept)]].concat()
     }
 
-    /// Keeps a file or folder as it is now, if it is on this disk. Whole or not at all, whenever the program dies.
+    /// Keeps a file or folder as it is now, if it is on this disk. Whole or not at all, whenever
+    /// the program dies.
     pub fn keep(&self, path: &Path) -> io::Result<()> {
         if !path.starts_with(&self.folder) {
             return Ok(());
@@ -105,8 +110,9 @@ fn entry_line(entry: &fs::DirEntry) -> io::Result<String> {
     Ok(format!("{kind} {} {}\n", identity(&entry.path())?, entry.file_name().to_string_lossy()))
 }
 
-/// What stays the same when a file is renamed, and is another for another file. A number alone is given again, but some
-/// filesystems know no more; there, a new file that was never synchronized may be left with the contents of a former one.
+/// What stays the same when a file is renamed, and is another for another file. A number alone is
+/// given again, but some filesystems know no more; there, a new file that was never synchronized
+/// may be left with the contents of a former one.
 fn identity(path: &Path) -> io::Result<String> {
     let metadata = fs::symlink_metadata(path)?;
     let born = metadata.created().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());

@@ -17,18 +17,28 @@ fn built(path: &str) -> PathBuf {
 /// One of our programs.
 pub fn binary(name: &str) -> PathBuf {
     let path = built(name);
-    assert!(path.exists(), "{} is missing; build it with: cargo build --release --bins", path.display());
+    assert!(
+        path.exists(),
+        "{} is missing; build it with: cargo build --release --bins",
+        path.display()
+    );
     path
 }
 
-/// The words that start a program with a library that is an example of this crate, as `cargo test` builds it.
+/// The words that start a program with a library that is an example of this crate, as `cargo test`
+/// builds it.
 pub fn preload(example: &str) -> Vec<String> {
     let library = built(&format!("examples/lib{example}.so"));
-    assert!(library.exists(), "{} is missing; cargo build --release --examples makes it", library.display());
+    assert!(
+        library.exists(),
+        "{} is missing; cargo build --release --examples makes it",
+        library.display()
+    );
     vec!["env".to_owned(), format!("LD_PRELOAD={}", library.display())]
 }
 
-/// Asserts that a program ended with exit code 1, an error that has this sentence, and a hint that has that.
+/// Asserts that a program ended with exit code 1, an error that has this sentence, and a hint that
+/// has that.
 pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
     let text = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");
@@ -37,7 +47,8 @@ pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
     assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
 }
 
-/// A running program, killed when dropped. Its output goes to files; a failing test prints their ends.
+/// A running program, killed when dropped. Its output goes to files; a failing test prints their
+/// ends.
 pub struct Process {
     name: String,
     child: Child,
@@ -51,7 +62,8 @@ impl Process {
         let (log, out) = (folder.join(format!("{name}.log")), folder.join(format!("{name}.out")));
         let file = |path: &Path| File::create(path).expect("the scratch folder is writable");
         command.stdin(Stdio::null()).stdout(file(&out)).stderr(file(&log));
-        let child = command.spawn().unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"));
+        let child =
+            command.spawn().unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"));
         Process { name: name.to_owned(), child, log, out }
     }
 
@@ -68,7 +80,9 @@ impl Process {
     /// Waits for a line in its log that contains `text`, and gives the line.
     pub fn wait_for_log(&self, text: &str, patience: Duration) -> String {
         let what = format!("{:?} in the log of {}", text, self.name);
-        eventually(&what, patience, || self.log().lines().find(|line| line.contains(text)).map(str::to_owned))
+        eventually(&what, patience, || {
+            self.log().lines().find(|line| line.contains(text)).map(str::to_owned)
+        })
     }
 
     /// Sends a signal by its name, e.g. `TERM` or `KILL`.
@@ -88,7 +102,8 @@ impl Process {
     pub fn peak_memory(&self) -> Option<u64> {
         let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).ok()?;
         let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-        let kilobytes = line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number of kilobytes");
+        let kilobytes =
+            line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number of kilobytes");
         Some(kilobytes << 10)
     }
 
@@ -115,7 +130,8 @@ impl Process {
         assert!(status.success(), "{} ended with {status}", self.name);
     }
 
-    /// Tells it to leave; how it ended. It must not have taken longer than it may, by the clock that it starts with the signal.
+    /// Tells it to leave; how it ended. It must not have taken longer than it may, by the clock
+    /// that it starts with the signal.
     pub fn terminate(&mut self, patience: Duration) -> ExitStatus {
         self.signal("TERM");
         let status = self.wait(patience);
@@ -132,7 +148,13 @@ impl Drop for Process {
             for (kind, text) in [("stderr", self.log()), ("stdout", self.out())] {
                 let lines: Vec<_> = text.lines().collect();
                 let end = &lines[lines.len().saturating_sub(40)..];
-                eprintln!("--- {} {kind}, last {} of {} lines\n{}", self.name, end.len(), lines.len(), end.join("\n"));
+                eprintln!(
+                    "--- {} {kind}, last {} of {} lines\n{}",
+                    self.name,
+                    end.len(),
+                    lines.len(),
+                    end.join("\n")
+                );
             }
         }
     }

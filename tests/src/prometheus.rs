@@ -17,11 +17,14 @@ pub struct Prometheus {
     _process: Process,
 }
 
-/// Starts Debian's Prometheus with our alert rules, which scrapes the pages of each job every second.
+/// Starts Debian's Prometheus with our alert rules, which scrapes the pages of each job every
+/// second.
 pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> Prometheus {
     let configuration = scratch.path().join("prometheus.yml");
     let rules = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/prometheus/alerts.yml");
-    let mut text = format!("global:\n  evaluation_interval: 500ms\nrule_files: [{rules:?}]\nscrape_configs:\n");
+    let mut text = format!(
+        "global:\n  evaluation_interval: 500ms\nrule_files: [{rules:?}]\nscrape_configs:\n"
+    );
     for (job, pages) in jobs {
         text.push_str(&format!("- job_name: {job}\n  scrape_interval: 1s\n  scrape_timeout: 1s\n"));
         text.push_str(&format!("  static_configs:\n  - targets: {pages:?}\n"));
@@ -36,9 +39,13 @@ pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> Prometheus {
 }
 
 impl Prometheus {
-    /// The values of an expression now, one for each series that has a finite one; nothing without an answer.
+    /// The values of an expression now, one for each series that has a finite one; nothing without
+    /// an answer.
     pub fn query(&self, expression: &str) -> Option<Vec<f64>> {
-        let (_, body) = http::get(&self.address, &format!("/api/v1/query?query={}", percent_encoded(expression)))?;
+        let (_, body) = http::get(
+            &self.address,
+            &format!("/api/v1/query?query={}", percent_encoded(expression)),
+        )?;
         let answer: Value = serde_json::from_str(&body).ok()?;
         assert_eq!(answer["status"], "success", "{expression}: {answer}");
         let series = answer["data"]["result"].as_array()?;

@@ -18,7 +18,8 @@ pub struct Setting {
 }
 
 /// Four evaluations, over within a second.
-pub const SHORT: Setting = Setting { steps: 80, eval_interval: 20, episodes: 6, candidates: 2, hidden: 16, seed: 1 };
+pub const SHORT: Setting =
+    Setting { steps: 80, eval_interval: 20, episodes: 6, candidates: 2, hidden: 16, seed: 1 };
 /// A run that is still training when its test is over.
 pub const ENDLESS: Setting = Setting { steps: 100_000_000, eval_interval: 500, ..SHORT };
 /// An endless run without a snapshot to evaluate before the test is over.
@@ -27,7 +28,9 @@ pub const IDLE: Setting = Setting { eval_interval: 50_000_000, ..ENDLESS };
 impl Setting {
     /// The steps that are evaluated.
     pub fn evaluated_steps(&self) -> Vec<u64> {
-        (1..=self.steps).filter(|step| step % self.eval_interval == 0 || *step == self.steps).collect()
+        (1..=self.steps)
+            .filter(|step| step % self.eval_interval == 0 || *step == self.steps)
+            .collect()
     }
 
     /// The text of a preset.

@@ -15,7 +15,8 @@ impl SmallDisk {
     pub fn mount(path: &Path, megabytes: u32) -> Option<SmallDisk> {
         fs::create_dir_all(path).expect("the scratch folder is writable");
         let size = format!("size={megabytes}m");
-        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs"]).arg(path).output();
+        let mounted =
+            Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs"]).arg(path).output();
         let mounted = mounted.is_ok_and(|output| output.status.success());
         if !mounted {
             eprintln!("without a disk of its own: mounting a tmpfs needs the rights of root");

@@ -32,7 +32,8 @@ impl Scratch {
     /// Makes the folder inside of another.
     pub fn inside(parent: &Path) -> Scratch {
         let folder = tempfile::tempdir_in(parent).expect("there is room for a scratch folder");
-        fs::write(folder.path().join("tiny.hdf5"), &*DATASET).expect("the scratch folder is writable");
+        fs::write(folder.path().join("tiny.hdf5"), &*DATASET)
+            .expect("the scratch folder is writable");
         Scratch { folder }
     }
 
@@ -63,9 +64,15 @@ impl Scratch {
         self.learner_through(&[], run, setting, arguments)
     }
 
-    /// Starts a learner by a command line of which its own is the end, as `ip netns exec` and `env` have it. `run` may be a
-    /// path below this folder.
-    pub fn learner_through(&self, launcher: &[String], run: &str, setting: Setting, arguments: &[&str]) -> Learner {
+    /// Starts a learner by a command line of which its own is the end, as `ip netns exec` and `env`
+    /// have it. `run` may be a path below this folder.
+    pub fn learner_through(
+        &self,
+        launcher: &[String],
+        run: &str,
+        setting: Setting,
+        arguments: &[&str],
+    ) -> Learner {
         let run_dir = self.path().join(run);
         let name = run_dir.file_name().and_then(|name| name.to_str()).expect("a run has a name");
         let preset = self.preset(name, setting);
@@ -91,7 +98,12 @@ impl Scratch {
     }
 
     /// Starts an evaluator by a command line of which its own is the end.
-    pub fn evaluator_through(&self, launcher: &[String], name: &str, arguments: &[&str]) -> Evaluator {
+    pub fn evaluator_through(
+        &self,
+        launcher: &[String],
+        name: &str,
+        arguments: &[&str],
+    ) -> Evaluator {
         let mut command = through(launcher, "evaluator");
         command.args(["serve", "--name", name]).args(arguments);
         Evaluator { process: Process::start(name, self.path(), command) }
@@ -131,7 +143,8 @@ pub fn free_endpoint() -> String {
     format!("tcp/127.0.0.1:{}", free_port())
 }
 
-/// Made once, and copied: a program that another test starts meanwhile would keep HDF5's lock of the file that is being written.
+/// Made once, and copied: a program that another test starts meanwhile would keep HDF5's lock of
+/// the file that is being written.
 static DATASET: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let file = tempfile::NamedTempFile::new().expect("there is room for a dataset");
     write_hopper(file.path(), 10, 300);

@@ -1,4 +1,5 @@
-//! Windows of consecutive transitions in units in which the data has mean 0 and standard deviation 1, with the returns that follow.
+//! Windows of consecutive transitions in units in which the data has mean 0 and standard deviation
+//! 1, with the returns that follow.
 
 use super::AlgorithmError;
 use crate::context::Context;
@@ -34,8 +35,8 @@ pub(super) struct Batch {
 }
 
 impl Windows {
-    /// All windows of H steps within an episode, and those that run past the end of one that terminates; `penalty` is taken off
-    /// the last reward there.
+    /// All windows of H steps within an episode, and those that run past the end of one that
+    /// terminates; `penalty` is taken off the last reward there.
     pub fn new(
         context: &Context,
         horizon: usize,
@@ -64,7 +65,9 @@ impl Windows {
         }
         match windows.is_empty() {
             true => Err(AlgorithmError::NoWindow(horizon)),
-            false => Ok(Self { units: transitions.standard_units(), transitions, horizon, windows }),
+            false => {
+                Ok(Self { units: transitions.standard_units(), transitions, horizon, windows })
+            }
         }
     }
 
@@ -78,14 +81,18 @@ impl Windows {
         &self.units
     }
 
-    /// The windows of these numbers. After the end of an episode there are zeros, in the data's units.
+    /// The windows of these numbers. After the end of an episode there are zeros, in the data's
+    /// units.
     pub fn batch(&self, items: &[u32], device: &Device) -> Result<Batch> {
-        let windows: Vec<&Window> = items.iter().map(|item| &self.windows[*item as usize]).collect();
-        let rows: Vec<u32> = windows.iter().flat_map(|window| window.first..window.first + window.length).collect();
+        let windows: Vec<&Window> =
+            items.iter().map(|item| &self.windows[*item as usize]).collect();
+        let rows: Vec<u32> =
+            windows.iter().flat_map(|window| window.first..window.first + window.length).collect();
         let mut batch = quad_dataset::Batch::default();
         self.transitions.gather(&rows, &mut batch);
         let padded = |numbers: &[f32], width: usize| {
-            let (mut out, mut rest) = (Vec::with_capacity(items.len() * self.horizon * width), numbers);
+            let (mut out, mut rest) =
+                (Vec::with_capacity(items.len() * self.horizon * width), numbers);
             for (i, window) in windows.iter().enumerate() {
                 let (mine, others) = rest.split_at(window.length as usize * width);
                 out.extend_from_slice(mine);
@@ -95,12 +102,16 @@ impl Windows {
             out
         };
         let (o, a) = (self.transitions.observation_dim(), self.transitions.action_dim());
-        let (mut observations, mut actions) = (padded(&batch.observations, o), padded(&batch.actions, a));
-        for (affine, numbers) in [(&self.units.observations, &mut observations), (&self.units.actions, &mut actions)] {
+        let (mut observations, mut actions) =
+            (padded(&batch.observations, o), padded(&batch.actions, a));
+        for (affine, numbers) in
+            [(&self.units.observations, &mut observations), (&self.units.actions, &mut actions)]
+        {
             affine.iter().for_each(|affine| affine.to_network(numbers));
         }
         let steps = actions.chunks_exact(a).zip(observations.chunks_exact(o));
-        let numbers: Vec<f32> = steps.flat_map(|(action, state)| action.iter().chain(state)).copied().collect();
+        let numbers: Vec<f32> =
+            steps.flat_map(|(action, state)| action.iter().chain(state)).copied().collect();
         let returns: Vec<f32> = windows.iter().map(|window| window.value).collect();
         Ok(Batch {
             windows: Tensor::from_vec(numbers, (items.len(), self.horizon, a + o), device)?,

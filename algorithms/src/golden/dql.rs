@@ -3,7 +3,8 @@
 use super::*;
 use crate::algorithm::Algorithm;
 use crate::golden::{
-    Golden, batch, chain_noise, check_candidates, check_update, context, denoising, golden_tests, goldens, load, table,
+    Golden, batch, chain_noise, check_candidates, check_update, context, denoising, golden_tests,
+    goldens, load, table,
 };
 use candle_core::Device;
 
@@ -41,20 +42,29 @@ fn check(golden: &Golden, device: &Device) {
 
     let temperature = golden.config["agent"]["temperature"].as_f64().unwrap() as f32;
     let candidates = golden.count("/agent/candidates") as u32;
-    assert_eq!(choice, Choice { candidates, value: Reduce::Min, rule: Rule::Softmax { temperature } });
+    assert_eq!(
+        choice,
+        Choice { candidates, value: Reduce::Min, rule: Rule::Softmax { temperature } }
+    );
 }
 
 golden_tests!("dql", check);
 
-/// The coin of Eq. 3 falls on either side, and the chains of next actions and of the actor's own are not the same.
+/// The coin of Eq. 3 falls on either side, and the chains of next actions and of the actor's own
+/// are not the same.
 #[test]
 fn the_noise_of_a_step_is_repeatable_and_each_critic_has_its_turn() {
     let dql = start(&goldens("dql").remove(0), &Device::Cpu);
     let numbers = |x: Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     let [first, again] = [dql.noise(0).unwrap(), dql.noise(0).unwrap()];
     let next = numbers(first.next);
-    assert!(next == numbers(again.next) && numbers(first.denoising.epsilon) == numbers(again.denoising.epsilon));
+    assert!(
+        next == numbers(again.next)
+            && numbers(first.denoising.epsilon) == numbers(again.denoising.epsilon)
+    );
     assert_ne!(next, numbers(first.policy));
-    let raised = (0..1000).filter(|step| dql.noise(*step).unwrap().raised.to_vec1::<u32>().unwrap()[0] == 1).count();
+    let raised = (0..1000)
+        .filter(|step| dql.noise(*step).unwrap().raised.to_vec1::<u32>().unwrap()[0] == 1)
+        .count();
     assert!((400..600).contains(&raised), "{raised}");
 }

@@ -1,8 +1,10 @@
-//! Tests: an update of each phase against an independent implementation (tests/golden/README.md), and what the phases train.
+//! Tests: an update of each phase against an independent implementation (tests/golden/README.md),
+//! and what the phases train.
 
 use super::*;
 use crate::golden::{
-    Golden, batch, check_candidates, check_update, context, golden_tests, goldens, items, load, table,
+    Golden, batch, check_candidates, check_update, context, golden_tests, goldens, items, load,
+    table,
 };
 use candle_core::Device;
 
@@ -17,7 +19,11 @@ fn noise(golden: &Golden, device: &Device) -> Noise {
         levels: NoiseLevels::new(golden.inputs[&format!("{name}_sigma")].to_vec1().unwrap()),
         noise: golden.input(&format!("{name}_noise"), device),
     };
-    Noise { cloning: noising("bc"), policy: golden.input("policy_noise", device), trust: noising("trust") }
+    Noise {
+        cloning: noising("bc"),
+        policy: golden.input("policy_noise", device),
+        trust: noising("trust"),
+    }
 }
 
 fn check(golden: &Golden, device: &Device) {
@@ -26,7 +32,10 @@ fn check(golden: &Golden, device: &Device) {
     let (batch, noise) = (batch(golden, &dtql.context), noise(golden, device));
     if golden.expected.contains_key("policy_actions") {
         let distribution = dtql.actor.distribution(&batch.observations).unwrap();
-        golden.close("policy_actions", &distribution.draw(&noise.policy.unsqueeze(1).unwrap()).unwrap().actions);
+        golden.close(
+            "policy_actions",
+            &distribution.draw(&noise.policy.unsqueeze(1).unwrap()).unwrap().actions,
+        );
     }
     let measured = dtql.step(golden.count("/step") as u64, &batch, &noise).unwrap();
     check_update(golden, METRICS, &measured, dtql.parts().save().unwrap());
@@ -36,8 +45,10 @@ fn check(golden: &Golden, device: &Device) {
 fn check_choice(golden: &Golden, dtql: &Dtql) {
     let drawn = check_candidates(golden, dtql);
     let temperature = golden.config["agent"]["temperature"].as_f64().unwrap();
-    let (candidates, rule) =
-        (golden.count("/agent/candidates") as u32, Rule::Softmax { temperature: temperature as f32 });
+    let (candidates, rule) = (
+        golden.count("/agent/candidates") as u32,
+        Rule::Softmax { temperature: temperature as f32 },
+    );
     assert_eq!(drawn.choice, Choice { candidates, value: Reduce::Min, rule });
     let probabilities = candle_nn::ops::softmax(&(drawn.q / temperature).unwrap(), 1).unwrap();
     golden.close("select.probabilities", &probabilities);
@@ -48,10 +59,16 @@ golden_tests!("dtql", check);
 /// A copy of its state, because weights are saved as views.
 fn state(dtql: &mut Dtql) -> Vec<(String, Vec<f32>)> {
     let numbers = |x: &Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    dtql.parts().save().unwrap().iter().map(|(name, tensor)| (name.clone(), numbers(tensor))).collect()
+    dtql.parts()
+        .save()
+        .unwrap()
+        .iter()
+        .map(|(name, tensor)| (name.clone(), numbers(tensor)))
+        .collect()
 }
 
-/// Two of five steps are pre-training where the phases are 2 : 3; in these the policy and what it chooses by stay as they are.
+/// Two of five steps are pre-training where the phases are 2 : 3; in these the policy and what it
+/// chooses by stay as they are.
 #[test]
 fn the_policy_begins_to_learn_when_pre_training_ends() {
     let golden = goldens("dtql").remove(0);
@@ -64,7 +81,9 @@ fn the_policy_begins_to_learn_when_pre_training_ends() {
     for step in 0..5 {
         dtql.update(step, &items(&golden)).unwrap();
         let after = state(&mut dtql);
-        for ((name, x), (_, y)) in before.iter().zip(&after).filter(|((name, _), _)| name.ends_with("3.bias")) {
+        for ((name, x), (_, y)) in
+            before.iter().zip(&after).filter(|((name, _), _)| name.ends_with("3.bias"))
+        {
             let waits = name.contains("actor") || name.starts_with("target");
             assert_eq!(x == y, waits && step < 2, "step {step}: {name}");
         }

@@ -1,7 +1,9 @@
 //! Tests: the update against an independent implementation (tests/golden/README.md).
 
 use super::*;
-use crate::golden::{Golden, batch, check_candidates, check_update, context, golden_tests, load, table};
+use crate::golden::{
+    Golden, batch, check_candidates, check_update, context, golden_tests, load, table,
+};
 use candle_core::Device;
 
 golden_tests!("fql", check);

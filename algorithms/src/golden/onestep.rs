@@ -1,8 +1,10 @@
-//! Tests: an update of each phase against an independent implementation (tests/golden/README.md), and what it learns
-//! from.
+//! Tests: an update of each phase against an independent implementation (tests/golden/README.md),
+//! and what it learns from.
 
 use super::*;
-use crate::golden::{Golden, batch, check_actions, check_update, context, golden_tests, goldens, load, table};
+use crate::golden::{
+    Golden, batch, check_actions, check_update, context, golden_tests, goldens, load, table,
+};
 use candle_core::Device;
 use quad_dataset::{Arrays, Transitions};
 use std::sync::Arc;
@@ -19,9 +21,16 @@ fn check(golden: &Golden, device: &Device) {
     let batch = batch(golden, &onestep.context);
     let measured = match onestep.phase(step) {
         Phase::Behavior(steps) => onestep.clone_behavior(&batch, steps),
-        Phase::Critic(steps) => onestep.evaluate_behavior(&batch, &golden.input("next_actions", device), steps),
+        Phase::Critic(steps) => {
+            onestep.evaluate_behavior(&batch, &golden.input("next_actions", device), steps)
+        }
         Phase::Policy(steps) => {
-            let noise = golden.input("behavior_noise", device).transpose(0, 1).unwrap().contiguous().unwrap();
+            let noise = golden
+                .input("behavior_noise", device)
+                .transpose(0, 1)
+                .unwrap()
+                .contiguous()
+                .unwrap();
             onestep.improve(&batch, &noise, steps)
         }
     };
@@ -30,7 +39,8 @@ fn check(golden: &Golden, device: &Device) {
 
 golden_tests!("onestep", check);
 
-/// Three episodes of two steps: the first terminates, the second is cut off, the third, of one step more, continues to the end.
+/// Three episodes of two steps: the first terminates, the second is cut off, the third, of one step
+/// more, continues to the end.
 fn small_context(golden: &Golden) -> Context {
     let transitions = Transitions::of(Arrays {
         observation_dim: 1,
@@ -42,7 +52,11 @@ fn small_context(golden: &Golden) -> Context {
         terminals: vec![false, true, false, false, false, false],
         timeouts: vec![false, false, false, true, false, true],
     });
-    Context { transitions: Arc::new(transitions.unwrap()), batch_size: 2, ..context(golden, &Device::Cpu) }
+    Context {
+        transitions: Arc::new(transitions.unwrap()),
+        batch_size: 2,
+        ..context(golden, &Device::Cpu)
+    }
 }
 
 #[test]
@@ -50,7 +64,8 @@ fn it_learns_from_transitions_with_a_next_action_and_from_terminals() {
     let golden = goldens("onestep").remove(0);
     let onestep = Onestep::new(read(&table(&golden)).unwrap(), small_context(&golden)).unwrap();
     assert_eq!((onestep.items(6), &onestep.items[..]), (4, &[0, 1, 2, 4][..]));
-    let next: Vec<Vec<f32>> = onestep.context.next_actions(&onestep.items).unwrap().to_vec2().unwrap();
+    let next: Vec<Vec<f32>> =
+        onestep.context.next_actions(&onestep.items).unwrap().to_vec2().unwrap();
     assert_eq!(next, [[0.1], [0.0], [0.3], [0.5]]);
 }
 
@@ -89,7 +104,8 @@ fn a_dataset_of_single_transitions_is_refused_with_a_hint() {
     context.transitions = Arc::new(Transitions::of(arrays).unwrap());
     let refused = Onestep::new(read(&table(&golden)).unwrap(), context).err().unwrap();
     assert!(
-        refused.to_string().contains("has a next action") && refused.hint().contains("datasets inspect"),
+        refused.to_string().contains("has a next action")
+            && refused.hint().contains("datasets inspect"),
         "{refused}"
     );
 }
@@ -100,7 +116,9 @@ fn each_phase_trains_its_network_alone() {
     let mut onestep = short(&golden);
     assert_eq!(onestep.phases(), [0, 2, 3]);
     let mut before = state(&mut onestep);
-    for (step, moved) in ["behavior", "behavior", "critic", "actor", "actor"].into_iter().enumerate() {
+    for (step, moved) in
+        ["behavior", "behavior", "critic", "actor", "actor"].into_iter().enumerate()
+    {
         onestep.update(step as u64, &[0, 1]).unwrap();
         let after = state(&mut onestep);
         for (name, tensor) in &after {
@@ -112,7 +130,8 @@ fn each_phase_trains_its_network_alone() {
         }
         let last = format!("{moved}.2.bias");
         assert!(numbers(&after[&last]) != numbers(&before[&last]), "step {step}: {moved} stays");
-        let [actor, behavior] = ["actor.2.bias", "behavior.2.bias"].map(|name| numbers(&after[name]));
+        let [actor, behavior] =
+            ["actor.2.bias", "behavior.2.bias"].map(|name| numbers(&after[name]));
         let is_copy = actor.iter().zip(&behavior).all(|(x, y)| (x - y).abs() < 1e-6);
         assert_eq!(is_copy, step < 3, "step {step}");
         before = after;

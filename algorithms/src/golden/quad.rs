@@ -3,7 +3,8 @@
 use super::*;
 use crate::algorithm::Algorithm;
 use crate::golden::{
-    Golden, batch, chain_noise, check_update, context, denoising, golden_tests, goldens, load, run, table, value,
+    Golden, batch, chain_noise, check_update, context, denoising, golden_tests, goldens, load, run,
+    table, value,
 };
 use crate::hyperparameters::{NotNegative, Positive};
 use candle_core::{DType, Device};
@@ -19,8 +20,13 @@ fn start(golden: &Golden, device: &Device) -> Diffusion<Quad> {
 
 fn noise(golden: &Golden, device: &Device) -> Noise {
     let permutation = golden.inputs.get("permutation");
-    let permutation = permutation.map(|rows| rows.to_dtype(DType::U32).unwrap().to_device(device).unwrap());
-    Noise { next: chain_noise(golden, "next_noise", device), denoising: denoising(golden, device), permutation }
+    let permutation =
+        permutation.map(|rows| rows.to_dtype(DType::U32).unwrap().to_device(device).unwrap());
+    Noise {
+        next: chain_noise(golden, "next_noise", device),
+        denoising: denoising(golden, device),
+        permutation,
+    }
 }
 
 fn check(golden: &Golden, device: &Device) {
@@ -44,7 +50,8 @@ golden_tests!("quad", check);
 fn the_policy_is_of_the_target_networks() {
     for golden in goldens("quad") {
         let (_, policy) = start(&golden, &Device::Cpu).policy().unwrap();
-        let networks = ["actor.", "critic."].map(|network| policy.keys().any(|name| name.starts_with(network)));
+        let networks = ["actor.", "critic."]
+            .map(|network| policy.keys().any(|name| name.starts_with(network)));
         assert_eq!(networks, [true, true]);
         for (name, tensor) in policy {
             let [found, expected] = [&tensor, &golden.state[&format!("target_{name}")]]
@@ -57,10 +64,14 @@ fn the_policy_is_of_the_target_networks() {
 /// Line 12 of Algorithm 1: dual ascent by at most `eta.rate`, within the bounds.
 #[test]
 fn eta_moves_by_at_most_its_rate_and_stays_within_its_bounds() {
-    let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "quad").unwrap();
+    let golden = goldens("quad")
+        .into_iter()
+        .find(|golden| golden.config["agent"]["guidance"] == "quad")
+        .unwrap();
     // ε ten times as large makes a BC loss near 100, which is far above or far below the threshold.
     let moved = |threshold: f32, minimum: f32, maximum: f32| {
-        let (batch, mut noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
+        let (batch, mut noise) =
+            (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
         noise.denoising.epsilon = (noise.denoising.epsilon * 10.0).unwrap();
         let mut quad = start(&golden, &Device::Cpu);
         quad.update.config.eta = Eta {
@@ -84,7 +95,8 @@ fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
     let quad = start(&golden, &Device::Cpu);
     let numbers = |step: u64| {
         let Noise { next, denoising: Denoising { t, epsilon, .. }, .. } = quad.noise(step).unwrap();
-        let [next, epsilon] = [next, epsilon].map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+        let [next, epsilon] =
+            [next, epsilon].map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
         (next, t.to_vec1::<u32>().unwrap(), epsilon)
     };
     assert_eq!(numbers(0), numbers(0));
@@ -98,12 +110,16 @@ fn every_denoising_step_is_drawn_equally_often() {
     let golden = goldens("quad").remove(0);
     let quad = start(&golden, &Device::Cpu);
     let mut counts = vec![0; quad.networks.shape.diffusion_steps];
-    let drawn = (0..1000).flat_map(|step| quad.noise(step).unwrap().denoising.t.to_vec1::<u32>().unwrap());
+    let drawn =
+        (0..1000).flat_map(|step| quad.noise(step).unwrap().denoising.t.to_vec1::<u32>().unwrap());
     drawn.for_each(|t| counts[t as usize - 1] += 1);
     let expected = 1000 * quad.networks.context.batch_size / counts.len();
     // Six standard deviations of a binomial count.
     let room = 6.0 * (expected as f64).sqrt();
-    assert!(counts.iter().all(|count| (f64::from(*count) - expected as f64).abs() < room), "{counts:?}");
+    assert!(
+        counts.iter().all(|count| (f64::from(*count) - expected as f64).abs() < room),
+        "{counts:?}"
+    );
 }
 
 #[test]
@@ -119,17 +135,30 @@ fn golden_parts() {
             continue;
         }
         // Guidance comes from the target critics as the update has just moved them.
-        networks.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
+        networks
+            .target_critics
+            .weights_mut()
+            .load(&mut golden.expected.clone(), "target_critic.")
+            .unwrap();
         let (noisy, predicted) = networks.denoise(&batch, &noise.denoising).unwrap();
         golden.close("noisy_actions", &noisy);
-        let gradients = networks.target_critics.action_gradients(&batch.observations, &noisy).unwrap();
+        let gradients =
+            networks.target_critics.action_gradients(&batch.observations, &noisy).unwrap();
         golden.close("critic_action_gradients", &gradients);
         let predicted = predicted.detach();
         let guide = update.guide(&networks, &batch, &noisy, &predicted, &noise).unwrap();
         let mean = gradients.mean(0).unwrap().broadcast_div(&golden.expected["q_scale"]).unwrap();
-        let difference =
-            (&guide.gradient - &mean).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
-        assert!(difference < 1e-4 * mean.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap());
+        let difference = (&guide.gradient - &mean)
+            .unwrap()
+            .abs()
+            .unwrap()
+            .max_all()
+            .unwrap()
+            .to_scalar::<f32>()
+            .unwrap();
+        assert!(
+            difference < 1e-4 * mean.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap()
+        );
         golden.close("nu_squared", &guide.nu_squared);
         golden.close("sigma_squared", &guide.sigma_squared);
         golden.close("lambda", &guide.lambda);
@@ -138,7 +167,10 @@ fn golden_parts() {
 
 #[test]
 fn a_shuffle_moves_samples_among_those_of_their_denoising_step() {
-    let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "shuffled").unwrap();
+    let golden = goldens("quad")
+        .into_iter()
+        .find(|golden| golden.config["agent"]["guidance"] == "shuffled")
+        .unwrap();
     let mut quad = start(&golden, &Device::Cpu);
     quad.networks.context.batch_size = 500;
     let Noise { denoising: Denoising { t, .. }, permutation, .. } = quad.noise(0).unwrap();
@@ -153,12 +185,16 @@ fn a_shuffle_moves_samples_among_those_of_their_denoising_step() {
 
 #[test]
 fn an_infinite_temperature_is_dac() {
-    let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "quad").unwrap();
+    let golden = goldens("quad")
+        .into_iter()
+        .find(|golden| golden.config["agent"]["guidance"] == "quad")
+        .unwrap();
     let [quad, dac] = [Guidance::Quad, Guidance::Dac].map(|guidance| {
         let mut quad = start(&golden, &Device::Cpu);
         let config = &mut quad.update.config;
         (config.guidance, config.tau, config.delta) = (guidance, f32::INFINITY, Positive(1e-30));
-        let (batch, noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
+        let (batch, noise) =
+            (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
         quad.step(0, &(batch, noise)).unwrap()
     });
     assert_eq!(quad, dac);

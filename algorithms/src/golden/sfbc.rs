@@ -1,7 +1,10 @@
-//! Tests: an update of each phase against an independent implementation (tests/golden/README.md), and what it learns from.
+//! Tests: an update of each phase against an independent implementation (tests/golden/README.md),
+//! and what it learns from.
 
 use super::*;
-use crate::golden::{Golden, batch, check_update, context, golden_tests, goldens, items, load, table};
+use crate::golden::{
+    Golden, batch, check_update, context, golden_tests, goldens, items, load, table,
+};
 use quad_dataset::{Arrays, Transitions};
 use quad_policy::{Header, Precision, Weighted, load_policy};
 use std::sync::Arc;
@@ -26,7 +29,8 @@ fn check(golden: &Golden, device: &Device) {
     let batch = batch(golden, &sfbc.context);
     let measured = match sfbc.phase(step) {
         (Phase::Behavior, steps) => {
-            let t = golden.inputs["t"].to_vec1::<f32>().unwrap().into_iter().map(f64::from).collect();
+            let t =
+                golden.inputs["t"].to_vec1::<f32>().unwrap().into_iter().map(f64::from).collect();
             let noise = NoiseInTime { t, epsilon: golden.input("epsilon", device) };
             golden.close("noisy_actions", &noise.noisy(&batch.actions).unwrap());
             sfbc.clone_behavior(&batch, &noise, steps)
@@ -60,7 +64,10 @@ fn check_candidates(golden: &Golden, sfbc: &Sfbc) {
 golden_tests!("sfbc", check);
 
 /// Four episodes: of two steps, terminating; of one; of three, cut off; of one more.
-fn small(golden: &Golden, changes: impl FnOnce(&mut Config)) -> std::result::Result<Sfbc, AlgorithmError> {
+fn small(
+    golden: &Golden,
+    changes: impl FnOnce(&mut Config),
+) -> std::result::Result<Sfbc, AlgorithmError> {
     let transitions = Transitions::of(Arrays {
         observation_dim: 1,
         action_dim: 1,
@@ -75,16 +82,26 @@ fn small(golden: &Golden, changes: impl FnOnce(&mut Config)) -> std::result::Res
     config.shortest_episode = Count(2);
     changes(&mut config);
     let transitions = Arc::new(transitions.unwrap());
-    Sfbc::new(config, Context { transitions, batch_size: 2, total_steps: 20, ..context(golden, &Device::Cpu) })
+    Sfbc::new(
+        config,
+        Context { transitions, batch_size: 2, total_steps: 20, ..context(golden, &Device::Cpu) },
+    )
 }
 
 #[test]
 fn it_learns_from_episodes_that_are_long_enough() {
     let golden = goldens("sfbc").remove(0);
     let sfbc = small(&golden, |_| ()).unwrap();
-    assert_eq!((&sfbc.items[..], &sfbc.returns.episodes[..]), (&[0, 1, 3, 4, 5][..], &[0..2, 2..5][..]));
+    assert_eq!(
+        (&sfbc.items[..], &sfbc.returns.episodes[..]),
+        (&[0, 1, 3, 4, 5][..], &[0..2, 2..5][..])
+    );
     let refused = small(&golden, |config| config.shortest_episode = Count(9)).err().unwrap();
-    assert!(refused.to_string().contains("9 transitions") && refused.hint().contains("shortest_episode"), "{refused}");
+    assert!(
+        refused.to_string().contains("9 transitions")
+            && refused.hint().contains("shortest_episode"),
+        "{refused}"
+    );
 }
 
 #[test]
@@ -119,11 +136,17 @@ fn each_phase_does_its_part() {
         };
         assert_eq!(names, expected, "step {step}");
         let after = state(&sfbc);
-        let moved: Vec<bool> = before.iter().zip(&after).map(|(before, after)| before != after).collect();
-        assert_eq!(moved, [step < 6, (6..10).contains(&step) || step >= 16, step == 15], "step {step}");
+        let moved: Vec<bool> =
+            before.iter().zip(&after).map(|(before, after)| before != after).collect();
+        assert_eq!(
+            moved,
+            [step < 6, (6..10).contains(&step) || step >= 16, step == 15],
+            "step {step}"
+        );
         if step == 16 {
             // One step from where the first began, with new moments.
-            let farthest = after[1].iter().zip(&first).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
+            let farthest =
+                after[1].iter().zip(&first).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
             assert!(farthest <= 1.001 * *sfbc.config.critic_learning_rate, "{farthest}");
         }
     }

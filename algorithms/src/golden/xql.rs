@@ -2,7 +2,9 @@
 
 use super::*;
 use crate::algorithm::Algorithm;
-use crate::golden::{Golden, batch, check_actions, check_update, context, golden_tests, goldens, load, table};
+use crate::golden::{
+    Golden, batch, check_actions, check_update, context, golden_tests, goldens, load, table,
+};
 use candle_core::Device;
 
 fn check(golden: &Golden, device: &Device) {
@@ -24,7 +26,8 @@ golden_tests!("xql", check);
 #[test]
 fn the_pairs_of_a_step_are_repeatable_and_no_other_steps() {
     for golden in goldens("xql") {
-        let (config, context) = (read::<Config>(&table(&golden)).unwrap(), context(&golden, &Device::Cpu));
+        let (config, context) =
+            (read::<Config>(&table(&golden)).unwrap(), context(&golden, &Device::Cpu));
         let batch = batch(&golden, &context);
         let actions = |step| {
             let pairs = config.pairs(&context, step, &batch).unwrap();

@@ -18,9 +18,11 @@ pub(super) enum Guidance {
     None,
     /// A control: Q-gradients weighted by the same λ in all samples, the user's.
     Constant,
-    /// A control, strength without selection: weighted by the moving average of λ at the sample's denoising step.
+    /// A control, strength without selection: weighted by the moving average of λ at the sample's
+    /// denoising step.
     Mean,
-    /// A control, distribution without selection: weighted by the λ of another sample at the same denoising step.
+    /// A control, distribution without selection: weighted by the λ of another sample at the same
+    /// denoising step.
     Shuffled,
 }
 
@@ -104,9 +106,13 @@ impl Quad {
         let config: Self = read(table)?;
         check("tau", config.tau, config.tau > 0.0, "above 0 (`inf` is allowed)")?;
         match (config.guidance, config.lambda) {
-            (Guidance::Constant, None) => check("lambda", "absent", false, "given where agent.guidance is `constant`")?,
+            (Guidance::Constant, None) => {
+                check("lambda", "absent", false, "given where agent.guidance is `constant`")?
+            }
             (Guidance::Constant, _) | (_, None) => {}
-            (_, Some(lambda)) => check("lambda", *lambda, false, "absent unless agent.guidance is `constant`")?,
+            (_, Some(lambda)) => {
+                check("lambda", *lambda, false, "absent unless agent.guidance is `constant`")?
+            }
         }
         let Eta { initial, minimum, maximum, .. } = config.eta;
         check("eta.maximum", *maximum, *maximum >= *minimum, "at least eta.minimum")?;

@@ -1,4 +1,5 @@
-//! The critics' gradients at noisy actions, and how far each is trusted: by λ of Eq. 24, or by what a control has in its place.
+//! The critics' gradients at noisy actions, and how far each is trusted: by λ of Eq. 24, or by what
+//! a control has in its place.
 
 use super::config::Guidance;
 use super::{Noise, Quad};
@@ -9,7 +10,8 @@ use quad_policy::mean_and_variance;
 
 /// What the critics say about noisy actions, and how far they are trusted; all of it constants.
 pub(super) struct Guide {
-    /// ḡ: the mean over critics of ∇_a Q̂_k(s, a^t), over the mean of |Q̂_k(s, a)| (Eq. 10), `[B, a]`.
+    /// ḡ: the mean over critics of ∇_a Q̂_k(s, a^t), over the mean of |Q̂_k(s, a)| (Eq. 10), `[B,
+    /// a]`.
     pub gradient: Tensor,
     /// ν̂² after this batch (Eq. 23), `[]`.
     pub nu_squared: Tensor,
@@ -34,8 +36,10 @@ impl Quad {
         noise: &Noise,
     ) -> Result<Guide> {
         let critics = &networks.target_critics;
-        let scale = (critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
-        let gradients = critics.action_gradients(&batch.observations, noisy)?.broadcast_div(&scale)?;
+        let scale =
+            (critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
+        let gradients =
+            critics.action_gradients(&batch.observations, noisy)?.broadcast_div(&scale)?;
 
         let size = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
         let direction = predicted.broadcast_div(&size)?; // u, Eq. 21
@@ -47,15 +51,20 @@ impl Quad {
             None => spread,
         };
         let (mut lambda, delta_share) = match self.config.guidance {
-            Guidance::Quad | Guidance::Mean | Guidance::Shuffled => self.agreement(&sigma_squared, &nu_squared)?,
-            Guidance::Dac | Guidance::None => (sigma_squared.ones_like()?, nu_squared.zeros_like()?),
+            Guidance::Quad | Guidance::Mean | Guidance::Shuffled => {
+                self.agreement(&sigma_squared, &nu_squared)?
+            }
+            Guidance::Dac | Guidance::None => {
+                (sigma_squared.ones_like()?, nu_squared.zeros_like()?)
+            }
             Guidance::Constant => {
                 let lambda = self.config.lambda.map_or(1.0, |lambda| f64::from(*lambda));
                 (sigma_squared.ones_like()?.affine(lambda, 0.0)?, nu_squared.zeros_like()?)
             }
         };
         let t = &noise.denoising.t;
-        let lambda_means = self.lambda_means.as_ref().map(|before| self.followed(before, &lambda, t));
+        let lambda_means =
+            self.lambda_means.as_ref().map(|before| self.followed(before, &lambda, t));
         let lambda_means = lambda_means.transpose()?;
         if let Some(means) = &lambda_means {
             lambda = means.index_select(&(t - t.ones_like()?)?, 0)?;
@@ -75,8 +84,8 @@ impl Quad {
         Ok((denominator.recip()?.broadcast_mul(nu_squared)?, decided))
     }
 
-    /// λ's average at each t after this batch, `[T]`: the batch's mean where there is none yet (below 0), and as before where the
-    /// batch has no such t.
+    /// λ's average at each t after this batch, `[T]`: the batch's mean where there is none yet
+    /// (below 0), and as before where the batch has no such t.
     fn followed(&self, before: &Tensor, lambda: &Tensor, t: &Tensor) -> Result<Tensor> {
         let steps = Tensor::arange(1, 1 + before.elem_count() as u32, t.device())?.unsqueeze(1)?;
         let is_of = steps.broadcast_eq(&t.unsqueeze(0)?)?.to_dtype(DType::F32)?; // [T, B]

@@ -5,17 +5,20 @@ use crate::algorithm::Measured;
 use candle_core::Tensor;
 
 /// Parts of the chain t = 1…T that have a mean of their own.
-const FIFTHS: [&str; 5] = ["lambda_fifth_1", "lambda_fifth_2", "lambda_fifth_3", "lambda_fifth_4", "lambda_fifth_5"];
+const FIFTHS: [&str; 5] =
+    ["lambda_fifth_1", "lambda_fifth_2", "lambda_fifth_3", "lambda_fifth_4", "lambda_fifth_5"];
 
-/// What [`measure`] has to know of a batch: ν̂² and δ's share, `[]`; λ and σ², `[B]`; ḡ and the error ε_θ − ε, `[B, a]`. Nothing
-/// without guidance.
+/// What [`measure`] has to know of a batch: ν̂² and δ's share, `[]`; λ and σ², `[B]`; ḡ and the
+/// error ε_θ − ε, `[B, a]`. Nothing without guidance.
 pub(super) fn needed<'a>(guide: Option<&'a Guide>, error: &'a Tensor) -> Vec<&'a Tensor> {
-    let Some(Guide { nu_squared, delta_share, lambda, sigma_squared, gradient, .. }) = guide else { return Vec::new() };
+    let Some(Guide { nu_squared, delta_share, lambda, sigma_squared, gradient, .. }) = guide else {
+        return Vec::new();
+    };
     vec![nu_squared, delta_share, lambda, sigma_squared, gradient, error]
 }
 
-/// The metrics of guidance, of the numbers of [`needed`], one tensor after the other; none without guidance. `t` is each sample's, of
-/// `steps` T.
+/// The metrics of guidance, of the numbers of [`needed`], one tensor after the other; none without
+/// guidance. `t` is each sample's, of `steps` T.
 pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> Measured {
     let [nu_squared, delta_share, rows @ ..] = numbers else { return Measured::new() };
     let (lambda, rows) = rows.split_at(t.len());
@@ -24,7 +27,8 @@ pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> M
     let lambda_mean = mean(lambda.iter().copied());
     let [low, median, high] = quantiles(lambda);
     let width = gradient.len() / t.len();
-    let cosines = gradient.chunks(width).zip(error.chunks(width)).map(|(one, other)| cosine(one, other));
+    let cosines =
+        gradient.chunks(width).zip(error.chunks(width)).map(|(one, other)| cosine(one, other));
     let mut measured = vec![
         ("delta_share", *delta_share),
         ("lambda_mean", lambda_mean),

@@ -1,4 +1,5 @@
-//! What λ was in a run of QUAD, from its metrics: whether the critics' uncertainty changed the guidance.
+//! What λ was in a run of QUAD, from its metrics: whether the critics' uncertainty changed the
+//! guidance.
 
 use std::collections::BTreeMap;
 
@@ -6,26 +7,30 @@ use serde_json::json;
 
 use crate::definition::{MetricsLine, Summary};
 
-/// The first of so many parts of a run does not count: critics that have learned little agree by chance.
+/// The first of so many parts of a run does not count: critics that have learned little agree by
+/// chance.
 const PARTS: u64 = 10;
 /// A weight above this is taken for no weight.
 const ONE: f64 = 0.99;
 
-/// What λ was after the first tenth of the steps that a run has made so far. `variant` is the run's guidance. Without guidance
-/// there is nothing to say, nor where the lines hold nothing of λ.
+/// What λ was after the first tenth of the steps that a run has made so far. `variant` is the run's
+/// guidance. Without guidance there is nothing to say, nor where the lines hold nothing of λ.
 pub(super) fn of(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
-    let mut lines =
-        Vec::from_iter(lines.iter().filter(|line| line.contains_key("variance_ratio") && variant != "none"));
+    let mut lines = Vec::from_iter(
+        lines.iter().filter(|line| line.contains_key("variance_ratio") && variant != "none"),
+    );
     let step = |line: &MetricsLine| line.get("step").map_or(0, |step| *step as u64);
     let to_step = step(lines.last()?);
     let from_step = to_step / PARTS + 1;
     lines.retain(|line| step(line) >= from_step);
     let mut sums: BTreeMap<&str, (f64, u32)> = BTreeMap::new();
-    for (name, value) in lines.iter().flat_map(|line| line.iter()).filter(|(name, _)| is_told(name)) {
+    for (name, value) in lines.iter().flat_map(|line| line.iter()).filter(|(name, _)| is_told(name))
+    {
         let (sum, count) = sums.entry(name).or_default();
         (*sum, *count) = (*sum + value, *count + 1);
     }
-    let means: BTreeMap<_, _> = sums.into_iter().map(|(name, (sum, count))| (name, sum / f64::from(count))).collect();
+    let means: BTreeMap<_, _> =
+        sums.into_iter().map(|(name, (sum, count))| (name, sum / f64::from(count))).collect();
     let is_dac = lines.iter().all(|line| line.get("lambda_mean").is_some_and(|mean| *mean > ONE));
     let mut text = text(&means, from_step, to_step);
     if is_dac && variant != "dac" {
@@ -38,9 +43,11 @@ pub(super) fn of(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
 
 fn text(means: &BTreeMap<&str, f64>, from_step: u64, to_step: u64) -> String {
     let mean = |name: &str| means.get(name).copied().unwrap_or_default();
-    let [low, median, high] = [10, 50, 90].map(|percent| mean(&format!("lambda_quantile_{percent}")));
+    let [low, median, high] =
+        [10, 50, 90].map(|percent| mean(&format!("lambda_quantile_{percent}")));
     let fifth = |fifth| means.get(&*format!("lambda_fifth_{fifth}"));
-    let fifths = [1, 2, 3, 4, 5].map(|of| fifth(of).map_or_else(|| "–".to_owned(), |mean| format!("{mean:.3}")));
+    let fifths = [1, 2, 3, 4, 5]
+        .map(|of| fifth(of).map_or_else(|| "–".to_owned(), |mean| format!("{mean:.3}")));
     format!(
         "λ in steps {from_step} to {to_step}: mean {:.3}, of a batch 10 % below {low:.3}, 50 % below {median:.3}, 90 % below \
          {high:.3}; {:.1} % above {ONE}\n\

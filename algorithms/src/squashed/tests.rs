@@ -16,7 +16,8 @@ fn number(x: &Tensor) -> f64 {
     x.flatten_all().unwrap().to_vec1::<f64>().unwrap()[0]
 }
 
-/// The density integrates to 1 over the actions, and gives the mean action that tanh of normal numbers has.
+/// The density integrates to 1 over the actions, and gives the mean action that tanh of normal
+/// numbers has.
 #[test]
 fn the_density_is_that_of_the_tanh_of_a_normal_number() {
     const POINTS: usize = 200_000;
@@ -26,14 +27,22 @@ fn the_density_is_that_of_the_tanh_of_a_normal_number() {
         let column = Tensor::from_slice(&actions, (POINTS, 1), &Device::Cpu).unwrap();
         let all = |x: f64| Tensor::full(x, (POINTS, 1), &Device::Cpu).unwrap();
         let distributions = Normal { mean: all(mean), log_std: all(log_std) };
-        let densities: Vec<f64> = distributions.log_density(&column).unwrap().exp().unwrap().to_vec1().unwrap();
+        let densities: Vec<f64> =
+            distributions.log_density(&column).unwrap().exp().unwrap().to_vec1().unwrap();
         let mass: f64 = densities.iter().sum::<f64>() * width;
-        let of_actions: f64 = densities.iter().zip(&actions).map(|(p, a)| p * a).sum::<f64>() * width;
+        let of_actions: f64 =
+            densities.iter().zip(&actions).map(|(p, a)| p * a).sum::<f64>() * width;
         // The same mean over the normal number, within eight σ.
         let z = |i: usize| -8.0 + (i as f64 + 0.5) * 16.0 / POINTS as f64;
-        let weigh = |z: f64| (-0.5 * z * z).exp() / (2.0 * std::f64::consts::PI).sqrt() * 16.0 / POINTS as f64;
-        let expected: f64 = (0..POINTS).map(z).map(|z| weigh(z) * (mean + log_std.exp() * z).tanh()).sum();
-        assert!((mass - 1.0).abs() < 1e-4 && (of_actions - expected).abs() < 1e-4, "{mass} {of_actions} {expected}");
+        let weigh = |z: f64| {
+            (-0.5 * z * z).exp() / (2.0 * std::f64::consts::PI).sqrt() * 16.0 / POINTS as f64
+        };
+        let expected: f64 =
+            (0..POINTS).map(z).map(|z| weigh(z) * (mean + log_std.exp() * z).tanh()).sum();
+        assert!(
+            (mass - 1.0).abs() < 1e-4 && (of_actions - expected).abs() < 1e-4,
+            "{mass} {of_actions} {expected}"
+        );
     }
 }
 
@@ -47,7 +56,8 @@ fn a_drawn_action_has_the_density_of_a_given_one() {
     assert!((number(&log_density) - number(&again)).abs() < 1e-10);
 }
 
-/// Where tanh(u) is 1 in float32, the density is still that of u: log(1 − tanh² u) is 2·(log 2 − u) there.
+/// Where tanh(u) is 1 in float32, the density is still that of u: log(1 − tanh² u) is 2·(log 2 − u)
+/// there.
 #[test]
 fn densities_are_finite_where_actions_round_to_one() {
     let one = |x: f32| Tensor::from_slice(&[x], (1, 1), &Device::Cpu).unwrap();
@@ -64,7 +74,8 @@ fn outcome(distribution: &Normal) -> Tensor {
     let noise = Tensor::new(&[[[0.4, -1.1], [-0.6, 0.9]]], &Device::Cpu).unwrap();
     let Drawn { actions, log_density } = distribution.draw(&noise).unwrap();
     let weights = Tensor::new(&[[[1.0, -2.0], [0.5, 3.0]]], &Device::Cpu).unwrap();
-    let drawn = ((actions * weights).unwrap().sum_all().unwrap() + log_density.sum_all().unwrap()).unwrap();
+    let drawn =
+        ((actions * weights).unwrap().sum_all().unwrap() + log_density.sum_all().unwrap()).unwrap();
     (drawn + distribution.log_density(&row(&[0.2, -0.95])).unwrap().sum_all().unwrap()).unwrap()
 }
 
@@ -72,7 +83,8 @@ fn outcome(distribution: &Normal) -> Tensor {
 fn gradients_are_the_numerical_ones() {
     let (mean, log_std) = ([0.3, -0.7], [-0.4, 0.1]);
     let vars = [mean, log_std].map(|numbers| Var::from_tensor(&row(&numbers)).unwrap());
-    let distribution = Normal { mean: vars[0].as_tensor().clone(), log_std: vars[1].as_tensor().clone() };
+    let distribution =
+        Normal { mean: vars[0].as_tensor().clone(), log_std: vars[1].as_tensor().clone() };
     let gradients = outcome(&distribution).backward().unwrap();
     for (which, var) in vars.iter().enumerate() {
         let found: Vec<f64> = gradients.get(var).unwrap().flatten_all().unwrap().to_vec1().unwrap();
@@ -83,7 +95,10 @@ fn gradients_are_the_numerical_ones() {
                 number(&outcome(&normal(&numbers[0], &numbers[1])))
             };
             let expected = (moved(1e-5) - moved(-1e-5)) / 2e-5;
-            assert!((found - expected).abs() < 1e-6 * expected.abs().max(1.0), "{found} {expected}");
+            assert!(
+                (found - expected).abs() < 1e-6 * expected.abs().max(1.0),
+                "{found} {expected}"
+            );
         }
     }
 }

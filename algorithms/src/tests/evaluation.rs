@@ -7,7 +7,9 @@ fn stand_still(table: &mut toml::Table) {
     for (name, value) in table.iter_mut() {
         match value {
             toml::Value::Table(inner) => stand_still(inner),
-            _ if name.ends_with("learning_rate") || name.ends_with("ema_rate") => *value = 1e-30.into(),
+            _ if name.ends_with("learning_rate") || name.ends_with("ema_rate") => {
+                *value = 1e-30.into()
+            }
             _ if name == "rate" => *value = 0.0.into(),
             _ => {}
         }
@@ -22,12 +24,17 @@ fn an_evaluation_measures_what_an_update_measures_that_moves_nothing() {
         stand_still(&mut table);
         let mut agent = agent(definition, &table, &context(3, &Device::Cpu));
         for (number, (_, weights)) in agent.parts().networks().into_iter().enumerate() {
-            weights.change(|values| values.slice_set(&(values * (1.0 + 0.1 * number as f64))?, 0, 0)).unwrap();
+            weights
+                .change(|values| values.slice_set(&(values * (1.0 + 0.1 * number as f64))?, 0, 0))
+                .unwrap();
         }
         for step in 0..STEPS {
             let items = items(0, &agent);
-            let (updated, evaluated) = (agent.update(&items).unwrap(), agent.evaluate(&items).unwrap());
-            for ((metric, updated), evaluated) in definition.metrics.iter().zip(updated).zip(evaluated) {
+            let (updated, evaluated) =
+                (agent.update(&items).unwrap(), agent.evaluate(&items).unwrap());
+            for ((metric, updated), evaluated) in
+                definition.metrics.iter().zip(updated).zip(evaluated)
+            {
                 // TD3+BC's policy first moves in its second update.
                 let is_measured = updated.is_some() || (definition.name, step) == ("td3-bc", 0);
                 assert_eq!(evaluated.is_some(), metric.held_out && is_measured, "{metric:?}");
@@ -42,17 +49,24 @@ fn an_evaluation_measures_what_an_update_measures_that_moves_nothing() {
             }
         }
     }
-    for Definition { name, metrics, .. } in ALGORITHMS.iter().filter(|known| found.contains_key(known.name)) {
+    for Definition { name, metrics, .. } in
+        ALGORITHMS.iter().filter(|known| found.contains_key(known.name))
+    {
         let held_out = metrics.iter().filter(|metric| metric.held_out).map(|metric| metric.name);
         assert_eq!(found[name], held_out.collect(), "{name}");
     }
-    assert_eq!(found.values().filter(|names| !names.is_empty()).count(), ALGORITHMS.len() - 1, "all but SfBC");
+    assert_eq!(
+        found.values().filter(|names| !names.is_empty()).count(),
+        ALGORITHMS.len() - 1,
+        "all but SfBC"
+    );
 }
 
 #[test]
 fn an_evaluation_changes_nothing() {
     for (definition, table) in variants() {
-        let [mut measured, mut alone] = [0, 1].map(|_| agent(definition, &table, &context(3, &Device::Cpu)));
+        let [mut measured, mut alone] =
+            [0, 1].map(|_| agent(definition, &table, &context(3, &Device::Cpu)));
         for step in 0..STEPS {
             let before = measured.save().unwrap();
             let [first, _, again] = [step + 1, step, step + 1].map(|step| {
@@ -68,15 +82,18 @@ fn an_evaluation_changes_nothing() {
 
 #[test]
 fn what_a_phase_does_not_measure_is_absent() {
-    let (definition, table) = variants().into_iter().find(|(known, _)| known.name == "onestep").unwrap();
+    let (definition, table) =
+        variants().into_iter().find(|(known, _)| known.name == "onestep").unwrap();
     let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
     let mut begins = agent.phases();
     begins.push(STEPS);
-    let phases = [&["behavior_loss"][..], &["critic_loss", "q_mean"], &["actor_loss", "advantage_mean"]];
+    let phases =
+        [&["behavior_loss"][..], &["critic_loss", "q_mean"], &["actor_loss", "advantage_mean"]];
     for (number, names) in phases.into_iter().enumerate() {
         for _ in begins[number]..begins[number + 1] {
             let values = agent.update(&items(0, &agent)).unwrap();
-            let measured = definition.metrics.iter().zip(values).filter(|(_, value)| value.is_some());
+            let measured =
+                definition.metrics.iter().zip(values).filter(|(_, value)| value.is_some());
             assert_eq!(Vec::from_iter(measured.map(|(metric, _)| metric.name).take(2)), names);
         }
     }

@@ -60,14 +60,20 @@ fn a_star_stands_for_any_letters() {
 /// The tasks of `presets/tasks.toml`, and OGBench's.
 fn tasks() -> Vec<String> {
     let tasks: Table = include_str!("../../../presets/tasks.toml").parse().unwrap();
-    let named = tasks["task"].as_array().unwrap().iter().map(|task| task["name"].as_str().unwrap().to_owned());
+    let named = tasks["task"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|task| task["name"].as_str().unwrap().to_owned());
     named.chain(quad_dataset::ogbench::tasks().map(|names| names.task)).collect()
 }
 
 /// The keys of a group, those of its tables with a dot.
 fn keys(group: &Table) -> Vec<String> {
     let inner = |key: &String, value: &Value| match value {
-        Value::Table(table) => keys(table).into_iter().map(|rest| format!("{key}.{rest}")).collect(),
+        Value::Table(table) => {
+            keys(table).into_iter().map(|rest| format!("{key}.{rest}")).collect()
+        }
         _ => vec![key.clone()],
     };
     group.iter().flat_map(|(key, value)| inner(key, value)).collect()
@@ -79,10 +85,13 @@ fn in_no_file_two_patterns_are_equally_good_for_a_key() {
     for definition in ALGORITHMS {
         let values = Values::of(&definition).unwrap();
         for task in tasks() {
-            let groups: Vec<_> = values.groups.iter().filter(|(pattern, _)| fits(pattern, &task)).collect();
+            let groups: Vec<_> =
+                values.groups.iter().filter(|(pattern, _)| fits(pattern, &task)).collect();
             let keys: Vec<_> = groups
                 .iter()
-                .flat_map(|(pattern, table)| keys(table).into_iter().map(|key| (letters(pattern), key)))
+                .flat_map(|(pattern, table)| {
+                    keys(table).into_iter().map(|key| (letters(pattern), key))
+                })
                 .collect();
             let different: std::collections::BTreeSet<_> = keys.iter().collect();
             assert_eq!(different.len(), keys.len(), "{} for {}: {keys:?}", definition.name, task);

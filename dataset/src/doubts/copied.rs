@@ -1,4 +1,5 @@
-//! Actions that are numbers of the same row's observation, in whatever unit: a robot that follows them stands still.
+//! Actions that are numbers of the same row's observation, in whatever unit: a robot that follows
+//! them stands still.
 
 use std::f64::consts::PI;
 
@@ -14,12 +15,13 @@ const OFF: f64 = 0.05;
 /// The share of the steps at which it must be one.
 const SHARE: f64 = 0.9;
 
-/// One sentence on the actions that are. Only steps count at which that number moves: elsewhere, a command that was
-/// followed equals the state. The state of the next row is a command like others.
+/// One sentence on the actions that are. Only steps count at which that number moves: elsewhere, a
+/// command that was followed equals the state. The state of the next row is a command like others.
 pub(super) fn actions(recording: &Recording) -> Option<String> {
     let rows = recording.some_that_go_on();
     let (mut actions, mut observations, mut least) = (Vec::new(), Vec::new(), 1.0_f64);
-    let moving: Vec<(Vec<usize>, f64)> = (0..recording.observation_dim).map(|i| moving(recording, &rows, i)).collect();
+    let moving: Vec<(Vec<usize>, f64)> =
+        (0..recording.observation_dim).map(|i| moving(recording, &rows, i)).collect();
     for action in 0..recording.action_dim {
         let share = |i: &usize| Some((*i, share_of_copies(recording, &moving[*i], *i, action)?));
         if let Some((observation, share)) = (0..recording.observation_dim).find_map(|i| share(&i)) {
@@ -39,15 +41,24 @@ pub(super) fn actions(recording: &Recording) -> Option<String> {
     })
 }
 
-/// The rows from which a number of the observation moves by more than half of its usual step, and that step.
+/// The rows from which a number of the observation moves by more than half of its usual step, and
+/// that step.
 fn moving(recording: &Recording, rows: &[usize], i: usize) -> (Vec<usize>, f64) {
-    let step = |row: usize| f64::from(recording.observation(row + 1)[i]) - f64::from(recording.observation(row)[i]);
+    let step = |row: usize| {
+        f64::from(recording.observation(row + 1)[i]) - f64::from(recording.observation(row)[i])
+    };
     let usual = (rows.iter().map(|row| step(*row).powi(2)).sum::<f64>() / rows.len() as f64).sqrt();
     (rows.iter().copied().filter(|row| step(*row).abs() > usual / 2.0).collect(), usual)
 }
 
-/// The share of the moving rows in which the action is the observation, in one of the units, if it is large.
-fn share_of_copies(recording: &Recording, moving: &(Vec<usize>, f64), i: usize, action: usize) -> Option<f64> {
+/// The share of the moving rows in which the action is the observation, in one of the units, if it
+/// is large.
+fn share_of_copies(
+    recording: &Recording,
+    moving: &(Vec<usize>, f64),
+    i: usize,
+    action: usize,
+) -> Option<f64> {
     let (rows, usual) = moving;
     let most_others = ((1.0 - SHARE) * rows.len() as f64) as usize;
     let share = |unit: f64| {

@@ -1,4 +1,5 @@
-//! What a flag may really be that should say where a task is over: a mask or discount, a success that stays set, a time limit.
+//! What a flag may really be that should say where a task is over: a mask or discount, a success
+//! that stays set, a time limit.
 
 use super::percent;
 use crate::recording::Recording;
@@ -9,7 +10,8 @@ const FEWEST: usize = 10;
 const MOST_TERMINALS: f64 = 0.5;
 /// The largest share of rows that may come after the goal of their episode.
 pub(super) const MOST_AFTER_GOAL: f64 = 0.8;
-/// Steps after which states are as far apart as any two are 1 long, those of a robot that goes on much less.
+/// Steps after which states are as far apart as any two are 1 long, those of a robot that goes on
+/// much less.
 const RESET: f64 = 0.5;
 /// Fewest steps of a time limit, and fewest episodes that reach it: also one in this many.
 const SHORTEST_LIMIT: usize = 10;
@@ -36,18 +38,26 @@ pub(super) fn meaning(recording: &Recording) -> Option<String> {
 /// Flags that are set while states go on.
 fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
     let array = recording.terminal_array;
-    let inner = |row: &usize| recording.is_step(*row) && recording.is_step(row + 1) && !recording.timeouts[*row];
-    let (set, others): (Vec<usize>, _) = (0..recording.rows()).filter(inner).partition(|row| recording.terminals[*row]);
+    let inner = |row: &usize| {
+        recording.is_step(*row) && recording.is_step(row + 1) && !recording.timeouts[*row]
+    };
+    let (set, others): (Vec<usize>, _) =
+        (0..recording.rows()).filter(inner).partition(|row| recording.terminals[*row]);
     let terminals = recording.terminals.iter().filter(|terminal| **terminal).count();
     let again = set.iter().filter(|row| recording.terminals[**row + 1]).count();
     let is_most = terminals as f64 > MOST_TERMINALS * steps as f64;
-    if set.len() < FEWEST || !(is_most || 2 * again > terminals) || step_length(recording, &set) >= RESET {
+    if set.len() < FEWEST
+        || !(is_most || 2 * again > terminals)
+        || step_length(recording, &set) >= RESET
+    {
         return None;
     }
     let is_mask = is_most && (others.is_empty() || step_length(recording, &others) >= RESET);
     let (may, what_to_do) = match is_mask {
         true => ("a mask or a discount (1 − done) in place of the flag?", "write 1 − it"),
-        false => ("a success that stays set after the goal?", "end each episode at the first such row"),
+        false => {
+            ("a success that stays set after the goal?", "end each episode at the first such row")
+        }
     };
     Some(format!(
         "array `{array}`: says in {} of the rows that the task is over, but states go on after them; {may} {what_to_do}, or critics \
@@ -56,7 +66,8 @@ fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
     ))
 }
 
-/// Episodes that terminate after the same number of steps, and none after more, where nothing says that one was cut off.
+/// Episodes that terminate after the same number of steps, and none after more, where nothing says
+/// that one was cut off.
 fn time_limit(recording: &Recording) -> Option<String> {
     if recording.timeouts.contains(&true) {
         return None;
@@ -72,7 +83,8 @@ fn time_limit(recording: &Recording) -> Option<String> {
     let longest = lengths.iter().copied().max().filter(|longest| *longest >= SHORTEST_LIMIT)?;
     let at = lengths.iter().filter(|length| **length == longest).count();
     // Without a limit, there are more that are a little shorter.
-    let below = lengths.iter().filter(|length| (longest - longest / 10..longest).contains(*length)).count();
+    let below =
+        lengths.iter().filter(|length| (longest - longest / 10..longest).contains(*length)).count();
     let is_limit = at >= FEWEST_AT_LIMIT && at * SHARE_AT_LIMIT >= lengths.len() && at > 2 * below;
     is_limit.then(|| {
         format!(
@@ -84,7 +96,8 @@ fn time_limit(recording: &Recording) -> Option<String> {
     })
 }
 
-/// The mean squared step from these rows to the next, over that between any two rows: the median of the numbers that change.
+/// The mean squared step from these rows to the next, over that between any two rows: the median of
+/// the numbers that change.
 fn step_length(recording: &Recording, rows: &[usize]) -> f64 {
     let width = recording.observation_dim;
     let square = |x: f64| if x.is_finite() { x * x } else { 0.0 };

@@ -1,15 +1,17 @@
 //! Observations that are one row late, each the state that its row's action led to.
 //!
-//! Given a row's observation, its action should explain something of the step to the next one. In data of which every
-//! observation is a row late, it is the next row's action that does. A policy that answers to the state explains a little by
-//! its next action, too: in MuJoCo's robots up to 0.45 of what it explains by the right one.
+//! Given a row's observation, its action should explain something of the step to the next one. In
+//! data of which every observation is a row late, it is the next row's action that does. A policy
+//! that answers to the state explains a little by its next action, too: in MuJoCo's robots up to
+//! 0.45 of what it explains by the right one.
 
 use crate::recording::Recording;
 
 /// Rows that are enough to tell, and fewer than which prove nothing.
 const ROWS: usize = 4000;
 const FEWEST: usize = 200;
-/// The least share of a number's steps that late actions explain, and how much more that is than what the others do.
+/// The least share of a number's steps that late actions explain, and how much more that is than
+/// what the others do.
 const EXPLAINED: f64 = 0.5;
 const TIMES: f64 = 2.5;
 /// The least share of actions that observations do not determine.
@@ -35,21 +37,28 @@ pub(super) fn observations(recording: &Recording) -> Option<String> {
     let constant = vec![vec![1.0; rows.len()]];
     let given = basis(constant.iter().chain(&states).cloned());
     let sizes = states.iter().map(|column| square(column));
-    let steps = columns(o, &|row, i| recording.observation(row + 1)[i] - recording.observation(row)[i]);
+    let steps =
+        columns(o, &|row, i| recording.observation(row + 1)[i] - recording.observation(row)[i]);
     let steps = steps.into_iter().map(|column| without(column, &given)).zip(sizes);
-    let steps: Columns =
-        steps.filter(|(step, size)| square(step) > ROUNDING.powi(2) * size).map(|(step, _)| step).collect();
+    let steps: Columns = steps
+        .filter(|(step, size)| square(step) > ROUNDING.powi(2) * size)
+        .map(|(step, _)| step)
+        .collect();
     let own = columns(a, &|row, i| recording.action(row)[i]);
     let next = columns(a, &|row, i| recording.action(row + 1)[i]);
 
     let of_mean = basis(constant.into_iter());
-    let sum = |basis: &Columns| own.iter().map(|column| square(&without(column.clone(), basis))).sum::<f64>();
+    let sum = |basis: &Columns| {
+        own.iter().map(|column| square(&without(column.clone(), basis))).sum::<f64>()
+    };
     let [own_share, next_share] = [&own, &next].map(|actions| {
         let basis = basis(actions.iter().map(|column| without(column.clone(), &given)));
-        let explained = steps.iter().map(|step| 1.0 - square(&without(step.clone(), &basis)) / square(step));
+        let explained =
+            steps.iter().map(|step| 1.0 - square(&without(step.clone(), &basis)) / square(step));
         explained.fold(0.0, f64::max)
     });
-    let is_late = next_share > EXPLAINED.max(TIMES * own_share) && sum(&given) > FREE * sum(&of_mean);
+    let is_late =
+        next_share > EXPLAINED.max(TIMES * own_share) && sum(&given) > FREE * sum(&of_mean);
     is_late.then(|| {
         format!(
             "array `observations`: one row late? actions explain {:.0} % of the step before their row and {:.0} % of their own, as if \

@@ -1,9 +1,10 @@
-//! What can be trained on, though nothing good may come of it: each doubt is written here once, for every format, for who
-//! inspects data and for who trains on it.
+//! What can be trained on, though nothing good may come of it: each doubt is written here once, for
+//! every format, for who inspects data and for who trains on it.
 //!
-//! `ends` is what flags may really be, and `resets` whether they stand in the right row; `copied` is actions that are the
-//! state, `rest` observations that do not move, `late` such that are a row late; `rewards` and `sizes` are about the numbers.
-//! A sentence names the array, the share or number of rows, what it may be, and what to do.
+//! `ends` is what flags may really be, and `resets` whether they stand in the right row; `copied`
+//! is actions that are the state, `rest` observations that do not move, `late` such that are a row
+//! late; `rewards` and `sizes` are about the numbers. A sentence names the array, the share or
+//! number of rows, what it may be, and what to do.
 
 mod copied;
 mod ends;
@@ -39,7 +40,8 @@ pub(crate) fn of_ends(recording: &Recording) -> Vec<String> {
 pub(crate) fn of_numbers(recording: &Recording, scale: Scale, rule: RewardRule) -> Vec<String> {
     let copied = copied::actions(recording);
     let rest = rest::observations(recording);
-    let late = if copied.is_some() || rest.is_some() { None } else { late::observations(recording) };
+    let late =
+        if copied.is_some() || rest.is_some() { None } else { late::observations(recording) };
     let mut doubts = Vec::from_iter(rewards::alike(recording));
     if doubts.is_empty() {
         doubts.extend(rewards::after_goal(recording));
@@ -68,7 +70,11 @@ fn short(x: f64) -> String {
 }
 
 fn percent(part: usize, whole: usize) -> String {
-    format!("{:.3}", 100.0 * part as f64 / whole as f64).trim_end_matches('0').trim_end_matches('.').to_owned() + " %"
+    format!("{:.3}", 100.0 * part as f64 / whole as f64)
+        .trim_end_matches('0')
+        .trim_end_matches('.')
+        .to_owned()
+        + " %"
 }
 
 impl Recording {

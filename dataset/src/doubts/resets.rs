@@ -1,9 +1,10 @@
-//! Whether the rows that are said to end episodes are those after which states jump, found without knowing the robot.
+//! Whether the rows that are said to end episodes are those after which states jump, found without
+//! knowing the robot.
 //!
-//! A reset is among the longest steps of a recording, each number of an observation measured by its own usual steps. Beside
-//! a flag three steps count: that of its row, and those of the rows before and after. Where flags are right, the longest of
-//! the three is the flag's own; where flags are a row out of step, hardly ever. Where resets are no longer than other steps,
-//! nothing is said.
+//! A reset is among the longest steps of a recording, each number of an observation measured by its
+//! own usual steps. Beside a flag three steps count: that of its row, and those of the rows before
+//! and after. Where flags are right, the longest of the three is the flag's own; where flags are a
+//! row out of step, hardly ever. Where resets are no longer than other steps, nothing is said.
 
 use crate::recording::{Recording, RowKind};
 
@@ -11,7 +12,8 @@ use crate::recording::{Recording, RowKind};
 const CANDIDATES: usize = 4;
 /// Steps of which at most one can be a reset.
 const STEPS_BETWEEN_RESETS: usize = 20;
-/// Fewer resets beside the flags prove nothing, nor does a smaller share of the flags, as a crash may be a long step, too.
+/// Fewer resets beside the flags prove nothing, nor does a smaller share of the flags, as a crash
+/// may be a long step, too.
 const FEWEST: usize = 5;
 const SMALLEST_SHARE: usize = 4;
 /// One in this many resets beside the flags may be at a flag.
@@ -20,7 +22,8 @@ const EXCEPTION: usize = 10;
 /// One sentence for each kind of flag that is a row out of step with the resets.
 pub(crate) fn out_of_step(recording: &Recording) -> Vec<String> {
     let is_last = |row: usize| recording.kinds[row] == RowKind::LastState;
-    // Where episodes are groups of their own, nothing can be out of step. A last state ends its episode, not the row before.
+    // Where episodes are groups of their own, nothing can be out of step. A last state ends its
+    // episode, not the row before.
     let inner = 1..recording.rows().saturating_sub(2);
     let inner = inner.filter(|row| recording.parts.is_empty() && !is_last(row + 1));
     let ends: Vec<usize> = inner.filter(|&row| recording.ends[row] || is_last(row)).collect();
@@ -29,18 +32,22 @@ pub(crate) fn out_of_step(recording: &Recording) -> Vec<String> {
     }
     let lengths = lengths(recording);
     let longest = (CANDIDATES * ends.len()).min(lengths.len() / STEPS_BETWEEN_RESETS);
-    let limit = *lengths.clone().select_nth_unstable_by(lengths.len() - 1 - longest, f64::total_cmp).1;
-    let (timeouts, terminals): (Vec<usize>, _) = ends.iter().partition(|&&row| recording.timeouts[row]);
+    let limit =
+        *lengths.clone().select_nth_unstable_by(lengths.len() - 1 - longest, f64::total_cmp).1;
+    let (timeouts, terminals): (Vec<usize>, _) =
+        ends.iter().partition(|&&row| recording.timeouts[row]);
     let judged = [(recording.terminal_array, terminals), ("timeouts", timeouts)]
         .map(|(name, flags)| judge(name, &flags, &lengths, limit));
     judged.into_iter().flatten().collect()
 }
 
-/// Counts at which row beside a flag the reset is: a step longer than `limit`, and the longest of the three.
+/// Counts at which row beside a flag the reset is: a step longer than `limit`, and the longest of
+/// the three.
 fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<String> {
     let mut resets = [0; 3];
     for &row in flags {
-        let longest = (0..3).max_by(|&a, &b| lengths[row + a - 1].total_cmp(&lengths[row + b - 1]))?;
+        let longest =
+            (0..3).max_by(|&a, &b| lengths[row + a - 1].total_cmp(&lengths[row + b - 1]))?;
         resets[longest] += usize::from(lengths[row + longest - 1] > limit);
     }
     let [before, at, after] = resets;
@@ -48,7 +55,8 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
         true => (before, "before", "late", "up"),
         false => (after, "after", "early", "down"),
     };
-    let is_proof = beside >= FEWEST && beside * SMALLEST_SHARE >= flags.len() && at * EXCEPTION <= beside;
+    let is_proof =
+        beside >= FEWEST && beside * SMALLEST_SHARE >= flags.len() && at * EXCEPTION <= beside;
     is_proof.then(|| {
         format!(
             "array `{name}`: one row {late}, out of step with the resets: states jump at the row {side} ({beside} of {}), \
@@ -58,16 +66,18 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
     })
 }
 
-/// How long the step from each row to the next one is, squared: a sum over the numbers of an observation, each measured by
-/// the root mean square of its steps.
+/// How long the step from each row to the next one is, squared: a sum over the numbers of an
+/// observation, each measured by the root mean square of its steps.
 fn lengths(recording: &Recording) -> Vec<f64> {
     let square = |row: usize, i: usize| {
-        let apart = f64::from(recording.observation(row + 1)[i]) - f64::from(recording.observation(row)[i]);
+        let apart =
+            f64::from(recording.observation(row + 1)[i]) - f64::from(recording.observation(row)[i]);
         if apart.is_finite() { apart * apart } else { 0.0 }
     };
     let steps = 0..recording.rows().saturating_sub(1);
     let columns = 0..recording.observation_dim;
     let mean = |i: usize| steps.clone().map(|row| square(row, i)).sum::<f64>() / steps.len() as f64;
-    let moving: Vec<(usize, f64)> = columns.map(|i| (i, mean(i))).filter(|(_, mean)| *mean > 0.0).collect();
+    let moving: Vec<(usize, f64)> =
+        columns.map(|i| (i, mean(i))).filter(|(_, mean)| *mean > 0.0).collect();
     steps.clone().map(|row| moving.iter().map(|&(i, mean)| square(row, i) / mean).sum()).collect()
 }

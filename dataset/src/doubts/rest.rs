@@ -8,11 +8,14 @@ const FEWEST: usize = 20;
 /// The largest share of them at which an observation may rest: chunks of two steps have a half.
 const MOST_AT_REST: f64 = 0.4;
 
-/// One sentence, if observations rest: those of the following rows, or those that are stored as the next ones.
+/// One sentence, if observations rest: those of the following rows, or those that are stored as the
+/// next ones.
 pub(super) fn observations(recording: &Recording) -> Option<String> {
     let acts = |row: &usize| {
         let is_inner = recording.is_step(*row) && recording.is_step(row + 1);
-        is_inner && !recording.terminals[*row] && recording.action(*row) != recording.action(row + 1)
+        is_inner
+            && !recording.terminals[*row]
+            && recording.action(*row) != recording.action(row + 1)
     };
     let acting: Vec<usize> = (0..recording.rows()).filter(acts).collect();
     let at_rest = |next: &dyn Fn(usize) -> bool| {
@@ -20,7 +23,9 @@ pub(super) fn observations(recording: &Recording) -> Option<String> {
         (acting.len() >= FEWEST && count as f64 > MOST_AT_REST * acting.len() as f64)
             .then(|| percent(count, acting.len()))
     };
-    if let Some(share) = at_rest(&|row| recording.observation(row + 1) == recording.observation(row)) {
+    if let Some(share) =
+        at_rest(&|row| recording.observation(row + 1) == recording.observation(row))
+    {
         return Some(format!(
             "array `observations`: does not change in {share} of the steps between which the action does; that of a chunk's start, or \
              of a sensor slower than control? record one at each step, or keep only the rows where it is new"
@@ -28,7 +33,8 @@ pub(super) fn observations(recording: &Recording) -> Option<String> {
     }
     let width = recording.observation_dim;
     let stored = recording.next_observations.as_ref()?;
-    let share = at_rest(&|row| &stored[row * width..(row + 1) * width] == recording.observation(row))?;
+    let share =
+        at_rest(&|row| &stored[row * width..(row + 1) * width] == recording.observation(row))?;
     Some(format!(
         "array `next_observations`: is the observation of its own row in {share} of the steps; store the one after the step"
     ))

@@ -1,4 +1,5 @@
-//! Rewards that tell nothing apart, that mostly come after the goal, or of a size that methods are not made for.
+//! Rewards that tell nothing apart, that mostly come after the goal, or of a size that methods are
+//! not made for.
 
 use super::ends::MOST_AFTER_GOAL;
 use super::{percent, short};
@@ -6,11 +7,11 @@ use crate::recording::Recording;
 use crate::reward::RewardScaling;
 use crate::statistics::Extent;
 
-/// Differences that are smaller, of the rewards' size, are lost in float32 by critics, whose values are some hundred times as
-/// large.
+/// Differences that are smaller, of the rewards' size, are lost in float32 by critics, whose values
+/// are some hundred times as large.
 const ALIKE: f32 = 2e-5;
-/// The largest root mean square that nothing is said of, and the smallest largest reward. The published rules for locomotion and
-/// mazes give a root mean square of about 1.
+/// The largest root mean square that nothing is said of, and the smallest largest reward. The
+/// published rules for locomotion and mazes give a root mean square of about 1.
 const LARGEST: f64 = 30.0;
 const SMALLEST: f32 = 0.01;
 /// The share of rows after the first at the goal that must be there, too.
@@ -38,15 +39,20 @@ fn steps(recording: &Recording) -> impl Iterator<Item = (f32, bool)> {
 /// Rewards that are all alike.
 pub(super) fn alike(recording: &Recording) -> Option<String> {
     let (first, _) = steps(recording).next()?;
-    let (least, most) = steps(recording).fold((first, first), |(least, most), (x, _)| (least.min(x), most.max(x)));
+    let (least, most) =
+        steps(recording).fold((first, first), |(least, most), (x, _)| (least.min(x), most.max(x)));
     let is_finite = steps(recording).all(|(reward, _)| reward.is_finite());
     let terminals = recording.terminals.contains(&true) && first != 0.0;
     let but = if terminals { " but how soon an episode terminates" } else { "" };
-    (is_finite && most - least <= ALIKE * most.abs().max(least.abs()))
-        .then(|| format!("array `rewards`: all are alike ({first}), so nothing distinguishes good from bad{but}"))
+    (is_finite && most - least <= ALIKE * most.abs().max(least.abs())).then(|| {
+        format!(
+            "array `rewards`: all are alike ({first}), so nothing distinguishes good from bad{but}"
+        )
+    })
 }
 
-/// Rewards of two values, the higher of which an episode keeps from some step on: nearly all steps come after that one.
+/// Rewards of two values, the higher of which an episode keeps from some step on: nearly all steps
+/// come after that one.
 pub(super) fn after_goal(recording: &Recording) -> Option<String> {
     let (first, _) = steps(recording).next()?;
     let (other, _) = steps(recording).find(|(reward, _)| *reward != first)?;
@@ -82,10 +88,15 @@ pub(super) fn after_goal(recording: &Recording) -> Option<String> {
 /// Rewards that are too large or too small.
 pub(super) fn size(recording: &Recording) -> Option<String> {
     let size = RewardScaling::default().size(recording);
-    let largest = recording.transitions().map(|row| recording.rewards[row as usize].abs()).fold(0.0, f32::max);
+    let largest = recording
+        .transitions()
+        .map(|row| recording.rewards[row as usize].abs())
+        .fold(0.0, f32::max);
     let weights = match size > LARGEST {
         true => "exp(β · advantage) is then 0 or cut off",
-        false if largest > 0.0 && largest < SMALLEST => "exp(β · advantage) is then 1 for good and bad actions alike",
+        false if largest > 0.0 && largest < SMALLEST => {
+            "exp(β · advantage) is then 1 for good and bad actions alike"
+        }
         false => return None,
     };
     let returns = Extent::of(recording.episodes().iter().map(|episode| episode.sum));

@@ -4,9 +4,9 @@ use super::{named, short};
 use crate::recording::{Recording, RowKind};
 use crate::scale::Scale;
 
-/// The largest root mean square of a number of the observations that nothing is said of. Where one of a cart's four was this
-/// large, IQL's critic loss after 3,000 steps was twice that with all near 1; at three times this, fourteen times. D4RL's mazes
-/// measure 36 m.
+/// The largest root mean square of a number of the observations that nothing is said of. Where one
+/// of a cart's four was this large, IQL's critic loss after 3,000 steps was twice that with all
+/// near 1; at three times this, fourteen times. D4RL's mazes measure 36 m.
 const LARGEST: f64 = 100.0;
 /// The smallest standard deviation of a number that changes. D4RL's smallest is 0.05.
 const SMALLEST: f64 = 1e-3;
@@ -15,10 +15,12 @@ const ROUNDING: f64 = 1e-6;
 
 /// Sentences on the columns of observations and actions that are not to be scaled.
 pub(super) fn columns(recording: &Recording, scale: Scale) -> Vec<String> {
-    let Recording { observation_dim, action_dim, observations, actions, kinds, names, .. } = recording;
+    let Recording { observation_dim, action_dim, observations, actions, kinds, names, .. } =
+        recording;
     let mut doubts = Vec::new();
     if !scale.states {
-        let columns = moments(observations, *observation_dim, |row| kinds[row] == RowKind::Transition);
+        let columns =
+            moments(observations, *observation_dim, |row| kinds[row] == RowKind::Transition);
         let (large, largest) = most(&columns, |[size, _]| (size > LARGEST).then_some(size));
         doubts.extend((!large.is_empty()).then(|| {
             format!(

@@ -18,8 +18,8 @@ pub(super) const DATA_FILE: &str = "main_data.hdf5";
 /// Groups of episodes are called this and their number.
 const EPISODE: &str = "episode_";
 
-/// Where Minari keeps the dataset of this id, like `mujoco/hopper/medium-v0`: in `$MINARI_DATASETS_PATH`, or else in
-/// `~/.minari/datasets`.
+/// Where Minari keeps the dataset of this id, like `mujoco/hopper/medium-v0`: in
+/// `$MINARI_DATASETS_PATH`, or else in `~/.minari/datasets`.
 pub fn minari_folder(id: &str) -> PathBuf {
     let root = match std::env::var_os("MINARI_DATASETS_PATH") {
         Some(root) if !root.is_empty() => PathBuf::from(root),
@@ -30,7 +30,9 @@ pub fn minari_folder(id: &str) -> PathBuf {
 
 /// The data file in a dataset's folder, or in its folder `data`.
 pub(super) fn data_file(folder: &Path) -> Option<PathBuf> {
-    [folder.join(DATA_FILE), folder.join("data").join(DATA_FILE)].into_iter().find(|path| path.exists())
+    [folder.join(DATA_FILE), folder.join("data").join(DATA_FILE)]
+        .into_iter()
+        .find(|path| path.exists())
 }
 
 /// What `metadata.json` says that matters here.
@@ -51,23 +53,24 @@ impl Metadata {
     pub(super) fn read(data_file: &Path) -> Result<Self, DatasetError> {
         let path = data_file.with_file_name("metadata.json");
         match fs::read(&path) {
-            Ok(text) => {
-                serde_json::from_slice(&text).map_err(|error| DatasetError::new(path, Problem::Metadata(error)))
-            }
+            Ok(text) => serde_json::from_slice(&text)
+                .map_err(|error| DatasetError::new(path, Problem::Metadata(error))),
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(Self::default()),
             Err(error) => Err(DatasetError::new(path, Problem::Io(error))),
         }
     }
 
-    /// The environment it was recorded in: our name for it if its simulation is ours, else Gymnasium's id.
+    /// The environment it was recorded in: our name for it if its simulation is ours, else
+    /// Gymnasium's id.
     pub(super) fn environment(&self) -> Option<String> {
         let EnvironmentId { id } = serde_json::from_str(self.env_spec.as_ref()?).ok()?;
         Some(environment::find_gymnasium(&id).map_or(id, |environment| environment.name.clone()))
     }
 }
 
-/// Reads all episodes. Every step is a transition, to the observation that its episode has for the following one; a mask
-/// is 0 where `terminations` is 1. An observation that is a Dict or a Tuple becomes a row by [`parts`].
+/// Reads all episodes. Every step is a transition, to the observation that its episode has for the
+/// following one; a mask is 0 where `terminations` is 1. An observation that is a Dict or a Tuple
+/// becomes a row by [`parts`].
 pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Problem> {
     let mut recording = Recording { terminal_array: "terminations", ..Recording::default() };
     let episodes = episodes(file);
@@ -117,7 +120,9 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
 /// An array, or the arrays of a Dict or a Tuple side by side.
 fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, Problem> {
     let Some(members) = file.members(name) else { return file.numbers(name) };
-    let columns = parts(members).into_iter().map(|part| file.numbers(&format!("{name}/{part}"))?.of_rows(rows));
+    let columns = parts(members)
+        .into_iter()
+        .map(|part| file.numbers(&format!("{name}/{part}"))?.of_rows(rows));
     let columns: Vec<Array<f32>> = columns.collect::<Result<_, _>>()?;
     let row = |row: usize| columns.iter().flat_map(move |column| column.row(row));
     let values = (0..rows).flat_map(row).copied().collect();
@@ -125,10 +130,12 @@ fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, 
     Array::new(name, &[rows, width], values)
 }
 
-/// The arrays of a row in their order: those of a Dict by name, those of a Tuple by number, which Minari calls `_index_0`,
-/// `_index_1` and so on.
+/// The arrays of a row in their order: those of a Dict by name, those of a Tuple by number, which
+/// Minari calls `_index_0`, `_index_1` and so on.
 fn parts(mut names: Vec<String>) -> Vec<String> {
-    let number = |name: &String| name.strip_prefix("_index_").and_then(|number| number.parse::<usize>().ok());
+    let number = |name: &String| {
+        name.strip_prefix("_index_").and_then(|number| number.parse::<usize>().ok())
+    };
     names.sort_by_key(number); // Names without a number keep their order.
     names
 }

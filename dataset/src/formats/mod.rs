@@ -20,11 +20,14 @@ use crate::recording::Recording;
 pub use minari::minari_folder;
 pub(crate) use own::{ACTION_NAMES, LAYOUT as OWN_LAYOUT, OBSERVATION_NAMES};
 
-/// The file with a source's data: for a folder of Minari's the one that is in it, else the path itself.
+/// The file with a source's data: for a folder of Minari's the one that is in it, else the path
+/// itself.
 pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {
     let path = path.as_ref();
     match path.is_dir() {
-        true => minari::data_file(path).ok_or_else(|| DatasetError::new(path, foreign::of_folder(path))),
+        true => {
+            minari::data_file(path).ok_or_else(|| DatasetError::new(path, foreign::of_folder(path)))
+        }
         false => Ok(path.to_owned()),
     }
 }
@@ -47,10 +50,14 @@ impl Source {
         }
         let mut start = Vec::new();
         let file = File::open(path).map_err(|source| error(Problem::Io(source)))?;
-        file.take(foreign::START).read_to_end(&mut start).map_err(|source| error(Problem::Io(source)))?;
+        file.take(foreign::START)
+            .read_to_end(&mut start)
+            .map_err(|source| error(Problem::Io(source)))?;
         match &start {
             start if start.starts_with(hdf5_file::SIGNATURE) => Self::hdf5(Hdf5File::open(path)?),
-            start if start.starts_with(npz_file::SIGNATURE) => Ok(Self::OgBench(NpzFile::open(path)?)),
+            start if start.starts_with(npz_file::SIGNATURE) => {
+                Ok(Self::OgBench(NpzFile::open(path)?))
+            }
             _ => Err(error(foreign::of_start(&start))),
         }
     }
@@ -58,11 +65,15 @@ impl Source {
     fn hdf5(file: Hdf5File) -> Result<Self, DatasetError> {
         match file.attribute("layout") {
             Some(layout) if layout == own::LAYOUT => return Ok(Self::Own(file)),
-            Some(found) => return Err(DatasetError::new(file.path(), Problem::UnknownLayout { found })),
+            Some(found) => {
+                return Err(DatasetError::new(file.path(), Problem::UnknownLayout { found }));
+            }
             None => {}
         }
         let within = |group: &str| file.members(&format!("data/{group}")).unwrap_or_default();
-        if let Some(problem) = file.members("data").and_then(|members| foreign::of_group(&members, within)) {
+        if let Some(problem) =
+            file.members("data").and_then(|members| foreign::of_group(&members, within))
+        {
             return Err(DatasetError::new(file.path(), problem));
         }
         let is_minari = file.path().ends_with(minari::DATA_FILE) || file.has("episode_0");
@@ -94,11 +105,13 @@ impl Source {
         }
     }
 
-    /// Refuses another environment's recording. Environments that share their physics suit each other. OGBench's files do
-    /// not name theirs, but its mazes, whose sizes are those of D4RL's, have other starts and goals.
+    /// Refuses another environment's recording. Environments that share their physics suit each
+    /// other. OGBench's files do not name theirs, but its mazes, whose sizes are those of D4RL's,
+    /// have other starts and goals.
     pub(crate) fn check_environment(&self, asked: &EnvironmentSpec) -> Result<(), Problem> {
         let has_other_goals = asked.goal.is_some_and(|goal| goal != Goal::OfTask);
-        let maze_of_ogbench = (matches!(self, Self::OgBench(_)) && has_other_goals).then(|| OGBENCH.to_owned());
+        let maze_of_ogbench =
+            (matches!(self, Self::OgBench(_)) && has_other_goals).then(|| OGBENCH.to_owned());
         let Some(claimed) = self.environment().or(maze_of_ogbench) else { return Ok(()) };
         let simulation = environment::find(&claimed).map(EnvironmentSpec::simulation);
         match simulation == Ok(asked.simulation()) {
@@ -112,8 +125,9 @@ impl Source {
         matches!(self, Self::D4rl(file) if !file.has("timeouts"))
     }
 
-    /// Reads all of it. The environment says what a D4RL file may leave open: a time limit, and whether there is a goal. Of a
-    /// task in a maze of OGBench's come rewards and masks, whatever the file says.
+    /// Reads all of it. The environment says what a D4RL file may leave open: a time limit, and
+    /// whether there is a goal. Of a task in a maze of OGBench's come rewards and masks, whatever
+    /// the file says.
     pub(crate) fn read(
         &mut self,
         environment: Option<&EnvironmentSpec>,
@@ -136,8 +150,9 @@ impl Source {
     }
 }
 
-/// The environment that a source says it was recorded in: one of our names, or, for a Minari dataset of an environment
-/// that is not in our table, Gymnasium's id. Recordings of `evaluator collect` and Minari's datasets say it.
+/// The environment that a source says it was recorded in: one of our names, or, for a Minari
+/// dataset of an environment that is not in our table, Gymnasium's id. Recordings of `evaluator
+/// collect` and Minari's datasets say it.
 pub fn recorded_environment(path: impl AsRef<Path>) -> Result<Option<String>, DatasetError> {
     Ok(Source::open(path.as_ref())?.environment())
 }

@@ -6,12 +6,14 @@ use crate::ogbench::MazeTask;
 use crate::recording::{Recording, RowKind};
 use crate::rounding::Rounding;
 
-/// Reads `observations`, `actions`, `terminals`, `rewards` unless they follow from a `task`, and, if there, `masks`.
+/// Reads `observations`, `actions`, `terminals`, `rewards` unless they follow from a `task`, and,
+/// if there, `masks`.
 ///
-/// `terminals` mark the end of a trajectory, not of what can be gained: that is where `masks` are 0, and nowhere in a file
-/// without masks. As OGBench stores its data, the last state of a trajectory is a row of its own, so that a row at a
-/// terminal starts no transition. As its loader returns the data, either each row is a transition with its own
-/// `next_observations`, or `valids` say which rows start one.
+/// `terminals` mark the end of a trajectory, not of what can be gained: that is where `masks` are
+/// 0, and nowhere in a file without masks. As OGBench stores its data, the last state of a
+/// trajectory is a row of its own, so that a row at a terminal starts no transition. As its loader
+/// returns the data, either each row is a transition with its own `next_observations`, or `valids`
+/// say which rows start one.
 pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
@@ -39,7 +41,9 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
     let kind = |&last: &bool| if last { RowKind::LastState } else { RowKind::Transition };
     let stored: Option<&Vec<f32>> = next_observations.as_ref();
     Ok(Recording {
-        rounding: stored.map(|stored| Rounding::between(&observations.values, stored)).unwrap_or_default(),
+        rounding: stored
+            .map(|stored| Rounding::between(&observations.values, stored))
+            .unwrap_or_default(),
         observation_dim,
         action_dim: actions.width,
         observations: observations.values,

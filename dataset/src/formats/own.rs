@@ -12,9 +12,10 @@ pub(crate) const LAYOUT: &str = "transitions";
 pub(crate) const OBSERVATION_NAMES: &str = "observation_names";
 pub(crate) const ACTION_NAMES: &str = "action_names";
 
-/// Reads `observations`, `actions`, `rewards`, `next_observations`, `terminals` and, if there, `timeouts`. Every row is a
-/// transition, with the next observation that the file stores. Terminals and timeouts end an episode; without timeouts,
-/// so does a row whose next observation is not the following row's observation.
+/// Reads `observations`, `actions`, `rewards`, `next_observations`, `terminals` and, if there,
+/// `timeouts`. Every row is a transition, with the next observation that the file stores. Terminals
+/// and timeouts end an episode; without timeouts, so does a row whose next observation is not the
+/// following row's observation.
 pub(super) fn read(file: &Hdf5File) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
@@ -38,7 +39,9 @@ pub(super) fn read(file: &Hdf5File) -> Result<Recording, Problem> {
     };
     recording.ends = match file.has("timeouts") {
         true => (0..rows).map(|row| recording.terminals[row] || recording.timeouts[row]).collect(),
-        false => (0..rows).map(|row| recording.terminals[row] || recording.jumps(&next_observations, row)).collect(),
+        false => (0..rows)
+            .map(|row| recording.terminals[row] || recording.jumps(&next_observations, row))
+            .collect(),
     };
     recording.names.observations = file.names(OBSERVATION_NAMES, observation_dim)?;
     recording.names.actions = file.names(ACTION_NAMES, recording.action_dim)?;

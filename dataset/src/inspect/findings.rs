@@ -12,7 +12,11 @@ use crate::{checks, doubts};
 const LONGEST_STEP: f32 = 1.0;
 
 /// One sentence for each kind of thing.
-pub(super) fn findings(source: &Source, recording: &Recording, environment: Option<&EnvironmentSpec>) -> Vec<String> {
+pub(super) fn findings(
+    source: &Source,
+    recording: &Recording,
+    environment: Option<&EnvironmentSpec>,
+) -> Vec<String> {
     let mut findings = Vec::new();
     if source.lacks_timeouts() {
         findings.push(match environment {
@@ -31,20 +35,24 @@ pub(super) fn findings(source: &Source, recording: &Recording, environment: Opti
     }
     findings.extend(of_ends);
     let outside = checks::actions_outside(recording);
-    findings.extend(outside.map(|problem| format!("{problem}; `learner train --scale actions` trains on it")));
+    findings.extend(
+        outside.map(|problem| format!("{problem}; `learner train --scale actions` trains on it")),
+    );
     let rule = environment.map_or(RewardRule::AsIs, |environment| environment.reward);
     findings.extend(doubts::of_numbers(recording, Scale::default(), rule));
     findings
 }
 
-/// Rows inside an episode from which the place, an observation's first two numbers, is too far from the next one.
+/// Rows inside an episode from which the place, an observation's first two numbers, is too far from
+/// the next one.
 fn leaps(recording: &Recording) -> Option<String> {
     if !recording.goal {
         return None;
     }
     let leap = |&row: &usize| {
         let (from, to) = (recording.observation(row), recording.observation(row + 1));
-        let apart = from.iter().zip(to).take(2).map(|(from, to)| (to - from).powi(2)).sum::<f32>().sqrt();
+        let apart =
+            from.iter().zip(to).take(2).map(|(from, to)| (to - from).powi(2)).sum::<f32>().sqrt();
         apart > LONGEST_STEP
     };
     let mut leaps = recording.inside().filter(leap);

@@ -17,7 +17,8 @@ pub struct Histogram {
     pub from: f64,
     /// Upper edge of the last bin.
     pub to: f64,
-    /// Numbers in each bin; a single bin where all of them are equal, none where there are no numbers.
+    /// Numbers in each bin; a single bin where all of them are equal, none where there are no
+    /// numbers.
     pub counts: Vec<usize>,
 }
 
@@ -47,7 +48,12 @@ impl fmt::Display for Histogram {
             let edge = |bin: usize| self.from + (self.to - self.from) * bin as f64 / bins as f64;
             // Whatever is there shows.
             let bar = "#".repeat((count * WIDTH).div_ceil(most));
-            writeln!(f, "  {:>10.2} to {:>10.2}  {bar:<WIDTH$}  {count}", edge(bin), edge(bin + 1))?;
+            writeln!(
+                f,
+                "  {:>10.2} to {:>10.2}  {bar:<WIDTH$}  {count}",
+                edge(bin),
+                edge(bin + 1)
+            )?;
         }
         Ok(())
     }

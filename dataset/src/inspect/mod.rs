@@ -1,6 +1,7 @@
 //! What a person needs to know of a dataset before spending a day of training on it.
 //!
-//! `findings` is what looks wrong though training puts up with it, `histogram` counts, and `page` is how it all looks.
+//! `findings` is what looks wrong though training puts up with it, `histogram` counts, and `page`
+//! is how it all looks.
 
 mod findings;
 mod histogram;
@@ -21,15 +22,16 @@ use crate::statistics::Extent;
 
 pub use histogram::Histogram;
 
-/// Figures of a dataset, and what is wrong with it. Numbers that are not finite are left out of every figure; a figure of
-/// nothing is NaN, which JSON has as null.
+/// Figures of a dataset, and what is wrong with it. Numbers that are not finite are left out of
+/// every figure; a figure of nothing is NaN, which JSON has as null.
 #[derive(Debug, Serialize)]
 pub struct Inspection {
     /// The file or folder.
     pub path: PathBuf,
     /// The format it was read as: `D4RL`, `Minari`, `OGBench` or `transitions`, the custom layout.
     pub format: &'static str,
-    /// The environment that it was inspected as: the one that was asked for, or else the one that it says it is from.
+    /// The environment that it was inspected as: the one that was asked for, or else the one that
+    /// it says it is from.
     pub environment: Option<String>,
     /// Transitions to learn from.
     pub transitions: usize,
@@ -51,7 +53,8 @@ pub struct Inspection {
     pub mean_return: f64,
     /// Largest return.
     pub max_return: f64,
-    /// Smallest, mean and largest score by D4RL's reference returns, where the environment is known.
+    /// Smallest, mean and largest score by D4RL's reference returns, where the environment is
+    /// known.
     #[serde(flatten)]
     pub scores: Option<Scores>,
     /// What the source calls the numbers of an observation; empty where they have no names.
@@ -110,7 +113,8 @@ pub struct Range {
 
 impl Range {
     fn of(values: impl Iterator<Item = f32>) -> Self {
-        let Extent { min, max, .. } = Extent::of(values.map(f64::from).filter(|value| value.is_finite()));
+        let Extent { min, max, .. } =
+            Extent::of(values.map(f64::from).filter(|value| value.is_finite()));
         Self { min, max }
     }
 
@@ -135,10 +139,11 @@ impl Range {
     }
 }
 
-/// Describes a dataset of any format. Whatever is wrong with its numbers becomes a problem on the list; an error is what
-/// leaves nothing to describe, such as a file that HDF5 does not open.
+/// Describes a dataset of any format. Whatever is wrong with its numbers becomes a problem on the
+/// list; an error is what leaves nothing to describe, such as a file that HDF5 does not open.
 ///
-/// Where no environment is asked for, it is the one that the source says it was recorded in, if we know that one.
+/// Where no environment is asked for, it is the one that the source says it was recorded in, if we
+/// know that one.
 pub fn inspect(
     path: impl AsRef<Path>,
     environment: Option<&'static EnvironmentSpec>,
@@ -150,18 +155,21 @@ pub fn inspect(
     let recording = source.read(spec, spec.and_then(|spec| ogbench::maze_task(&spec.name)))?;
 
     let other = environment.and_then(|environment| source.check_environment(environment).err());
-    let refused: Vec<Problem> = other.into_iter().chain(checks::problems(&recording, spec)).collect();
+    let refused: Vec<Problem> =
+        other.into_iter().chain(checks::problems(&recording, spec)).collect();
     let findings = findings::findings(&source, &recording, spec);
 
     let episodes = recording.episodes();
     let lengths: Vec<f64> = episodes.iter().map(|episode| episode.length as f64).collect();
-    let returns: Vec<f64> = episodes.iter().map(|episode| episode.sum).filter(|sum| sum.is_finite()).collect();
+    let returns: Vec<f64> =
+        episodes.iter().map(|episode| episode.sum).filter(|sum| sum.is_finite()).collect();
     let (length, sum) = (Extent::of(lengths.iter().copied()), Extent::of(returns.iter().copied()));
     let steps: f64 = lengths.iter().sum();
     let share = |flags: &[bool]| flags.iter().filter(|&&flag| flag).count() as f64 / steps;
     let is_step = |row: usize| recording.kinds[row] != RowKind::LastState;
     let action_ranges = Range::of_columns(&recording.actions, recording.action_dim, is_step);
-    let observation_ranges = Range::of_columns(&recording.observations, recording.observation_dim, |_| true);
+    let observation_ranges =
+        Range::of_columns(&recording.observations, recording.observation_dim, |_| true);
     let reward_ranges = Range::of_columns(&recording.rewards, 1, is_step);
     Ok(Inspection {
         path: path.into(),

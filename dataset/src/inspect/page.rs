@@ -29,7 +29,8 @@ impl fmt::Display for Inspection {
             self.reward_size
         )?;
 
-        let wide = self.action_names.iter().map(|name| name.chars().count() + 1).fold(14, usize::max);
+        let wide =
+            self.action_names.iter().map(|name| name.chars().count() + 1).fold(14, usize::max);
         writeln!(f, "\n  {:<wide$}{:>12}{:>12}{:>12}", "", "min", "mean", "max")?;
         let mut row = |name: &str, [min, mean, max]: [f64; 3], digits: usize| {
             writeln!(f, "  {name:<wide$}{min:>12.digits$}{mean:>12.digits$}{max:>12.digits$}")
@@ -39,8 +40,9 @@ impl fmt::Display for Inspection {
         if let Some(scores) = &self.scores {
             row("score", [scores.min_score, scores.mean_score, scores.max_score], 2)?;
         }
-        let mut row =
-            |name: &str, range: Range| writeln!(f, "  {name:<wide$}{:>12.4}{:>12}{:>12.4}", range.min, "", range.max);
+        let mut row = |name: &str, range: Range| {
+            writeln!(f, "  {name:<wide$}{:>12.4}{:>12}{:>12.4}", range.min, "", range.max)
+        };
         row("reward", self.reward_range)?;
         row("observation", self.observation_range)?;
         row("action", self.action_range)?;
@@ -53,7 +55,11 @@ impl fmt::Display for Inspection {
         match self.problems.is_empty() {
             true => write!(f, "\nno problems found"),
             false => {
-                let verdict = if self.refused { "training refuses this dataset" } else { "it can be trained on" };
+                let verdict = if self.refused {
+                    "training refuses this dataset"
+                } else {
+                    "it can be trained on"
+                };
                 write!(f, "\nproblems ({verdict})")?;
                 self.problems.iter().try_for_each(|problem| write!(f, "\n  - {problem}"))
             }

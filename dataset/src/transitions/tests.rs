@@ -11,7 +11,8 @@ fn transitions(recording: Recording) -> Transitions {
 
 /// D4RL: 0 1 2(timeout) | 3 4(terminal) | 5 6(the last row).
 fn d4rl() -> Recording {
-    let mut recording = recording(&[Transition, Transition, Dropped, Transition, Transition, Transition, Dropped]);
+    let mut recording =
+        recording(&[Transition, Transition, Dropped, Transition, Transition, Transition, Dropped]);
     recording.timeouts[2] = true;
     recording.terminals[4] = true;
     recording.ends[2] = true;
@@ -31,8 +32,13 @@ fn episodes_end_at_timeouts_terminals_and_the_end_of_the_file() {
 #[test]
 fn a_dropped_step_gives_its_action_to_the_transition_that_leads_to_it() {
     let transitions = transitions(d4rl());
-    let actions: Vec<_> = (0..5).map(|index| transitions.next_action(index).map(|action| action[0])).collect();
-    assert_eq!(actions, [Some(0.01), Some(0.02), Some(0.04), None, Some(0.06)], "after a terminal there is none");
+    let actions: Vec<_> =
+        (0..5).map(|index| transitions.next_action(index).map(|action| action[0])).collect();
+    assert_eq!(
+        actions,
+        [Some(0.01), Some(0.02), Some(0.04), None, Some(0.06)],
+        "after a terminal there is none"
+    );
 }
 
 #[test]
@@ -59,7 +65,8 @@ fn an_episode_ends_at_the_goal_although_the_recording_goes_on() {
 
 #[test]
 fn an_episode_after_one_that_reached_its_goal_is_one_of_the_recording() {
-    let mut recording = recording(&[Transition, Transition, Dropped, Transition, Transition, Dropped]);
+    let mut recording =
+        recording(&[Transition, Transition, Dropped, Transition, Transition, Dropped]);
     recording.goal = true;
     (recording.terminals[0], recording.ends[2], recording.ends[5]) = (true, true, true);
     let transitions = transitions(recording);
@@ -92,7 +99,13 @@ fn standard_units_are_of_the_rows_that_are_learned_from() {
     let units = transitions(d4rl()).standard_units();
     let affine = units.observations.unwrap();
     // 0, 1, 3, 4 and 5: the mean of the squares is 10.2, that of the numbers 2.6.
-    assert!((affine.offset[0] - 2.6).abs() < 1e-6 && (affine.scale[0] - 3.44_f32.sqrt()).abs() < 1e-6, "{affine:?}");
+    assert!(
+        (affine.offset[0] - 2.6).abs() < 1e-6 && (affine.scale[0] - 3.44_f32.sqrt()).abs() < 1e-6,
+        "{affine:?}"
+    );
     let affine = units.actions.unwrap();
-    assert!((affine.offset[0] - 0.026).abs() < 1e-6 && (affine.scale[0] - 0.01 * 3.44_f32.sqrt()).abs() < 1e-6);
+    assert!(
+        (affine.offset[0] - 0.026).abs() < 1e-6
+            && (affine.scale[0] - 0.01 * 3.44_f32.sqrt()).abs() < 1e-6
+    );
 }

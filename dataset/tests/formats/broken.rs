@@ -1,4 +1,5 @@
-//! Files that are not what they should be: always a typed error that names file, array and row, never a panic.
+//! Files that are not what they should be: always a typed error that names file, array and row,
+//! never a panic.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,7 +7,9 @@ use std::path::{Path, PathBuf};
 use hdf5::H5Type;
 use hdf5::types::FixedAscii;
 use ndarray::ArrayViewD;
-use quad_dataset::{DatasetError, Problem, ReadOptions, RecordedRows, RewardRule, Scale, Transitions};
+use quad_dataset::{
+    DatasetError, Problem, ReadOptions, RecordedRows, RewardRule, Scale, Transitions,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tempfile::{TempDir, tempdir};
@@ -51,7 +54,9 @@ impl Subject {
         let error = self.read().err().expect("the file is broken");
         let text = error.to_string();
         let path = format!("{}: ", self.path().display());
-        text.strip_prefix(&path).unwrap_or_else(|| panic!("{text} does not start with {path}")).to_owned()
+        text.strip_prefix(&path)
+            .unwrap_or_else(|| panic!("{text} does not start with {path}"))
+            .to_owned()
     }
 }
 
@@ -80,7 +85,10 @@ fn truncated_anywhere() {
     let whole = fs::read(subject.path()).unwrap();
     for length in (97..whole.len()).step_by(97) {
         fs::write(subject.path(), &whole[..length]).unwrap();
-        assert_eq!(subject.error(), format!("cut short: {length} bytes are there of {}", whole.len()));
+        assert_eq!(
+            subject.error(),
+            format!("cut short: {length} bytes are there of {}", whole.len())
+        );
     }
 }
 
@@ -91,7 +99,13 @@ fn damaged_inside_a_compressed_array() {
     let noise: Vec<f32> = (0..ROWS * 3).map(|_| generator.random()).collect();
     let file = hdf5::File::open_rw(subject.path()).unwrap();
     file.unlink("actions").unwrap();
-    let array = file.new_dataset::<f32>().chunk((ROWS, 3)).deflate(4).shape((ROWS, 3)).create("actions").unwrap();
+    let array = file
+        .new_dataset::<f32>()
+        .chunk((ROWS, 3))
+        .deflate(4)
+        .shape((ROWS, 3))
+        .create("actions")
+        .unwrap();
     array.write(ArrayViewD::from_shape([ROWS, 3].as_slice(), &noise).unwrap()).unwrap();
     file.flush().unwrap();
     let chunk = array.chunk_info(0).unwrap();
@@ -145,7 +159,9 @@ fn an_array_that_is_not_what_it_must_be() {
         ("array `observations`, row 7: NaN is not a finite float32 (2 such rows)", &|file| {
             file.replace("observations", &[ROWS, 11], &unknown);
         }),
-        ("array `rewards`, row 19: inf is not a finite float32", &|file| file.replace("rewards", &[ROWS], &large)),
+        ("array `rewards`, row 19: inf is not a finite float32", &|file| {
+            file.replace("rewards", &[ROWS], &large)
+        }),
         ("array `actions` holds bool, but must hold numbers", &|file| {
             file.replace("actions", &[ROWS, 3], &[false; ROWS * 3]);
         }),
@@ -155,10 +171,18 @@ fn an_array_that_is_not_what_it_must_be() {
         ("must have one or two axes: rows, and the numbers in each", &|file| {
             file.replace("observations", &[ROWS, 1, 11], &half[..ROWS * 11]);
         }),
-        ("array `timeouts`, row 3: 2 is neither 0 nor 1", &|file| file.replace("timeouts", &[ROWS], &flag(2))),
-        ("array `timeouts`, row 3: -1 is neither 0 nor 1", &|file| file.replace("timeouts", &[ROWS], &flag(-1))),
-        ("array `timeouts`, row 3: 127 is neither 0 nor 1", &|file| file.replace("timeouts", &[ROWS], &flag(256))),
-        ("20 rows, of which none makes a transition", &|file| file.replace("timeouts", &[ROWS], &[true; ROWS])),
+        ("array `timeouts`, row 3: 2 is neither 0 nor 1", &|file| {
+            file.replace("timeouts", &[ROWS], &flag(2))
+        }),
+        ("array `timeouts`, row 3: -1 is neither 0 nor 1", &|file| {
+            file.replace("timeouts", &[ROWS], &flag(-1))
+        }),
+        ("array `timeouts`, row 3: 127 is neither 0 nor 1", &|file| {
+            file.replace("timeouts", &[ROWS], &flag(256))
+        }),
+        ("20 rows, of which none makes a transition", &|file| {
+            file.replace("timeouts", &[ROWS], &[true; ROWS])
+        }),
         ("`rewards` is a group of arrays, but must be an array", &|subject| {
             let file = hdf5::File::open_rw(subject.path()).unwrap();
             file.unlink("rewards").unwrap();
@@ -182,7 +206,10 @@ fn actions_outside_the_unit_box() {
     assert!(subject.read().is_ok());
     data[16..20].fill(-30.0);
     subject.replace("actions", &[ROWS, 3], &data);
-    assert_eq!(subject.error(), "array `actions`, row 5: the action -30 is outside [-1, 1] (2 such rows)");
+    assert_eq!(
+        subject.error(),
+        "array `actions`, row 5: the action -30 is outside [-1, 1] (2 such rows)"
+    );
 }
 
 #[test]
@@ -198,7 +225,10 @@ fn an_endless_episode() {
     };
     assert!(long(1000).read().is_ok(), "a single episode of as many steps as Hopper allows");
     let subject = long(1001);
-    assert_eq!(subject.error(), "1001 rows without any terminal or timeout, as if they were one endless episode");
+    assert_eq!(
+        subject.error(),
+        "1001 rows without any terminal or timeout, as if they were one endless episode"
+    );
     assert!(try_read(&long(50).path(), None).is_err());
     // Without the array, Hopper's time limit cuts it.
     hdf5::File::open_rw(subject.path()).unwrap().unlink("timeouts").unwrap();
@@ -217,7 +247,9 @@ fn a_size_that_no_such_file_can_hold() {
     let shape = [1usize << 50, 11];
     assert_eq!(
         subject.error(),
-        format!("array `observations` claims the shape {shape:?}, more than a file of {bytes} bytes can hold")
+        format!(
+            "array `observations` claims the shape {shape:?}, more than a file of {bytes} bytes can hold"
+        )
     );
 }
 

@@ -12,14 +12,16 @@ fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>
     let folder = tempdir().unwrap();
     let out = folder.path().join("reference.hdf5");
     let limit = environment.map_or(0, |environment| environment.max_episode_steps).to_string();
-    let goal = if environment.is_some_and(|environment| environment.goal.is_some()) { "1" } else { "0" };
+    let goal =
+        if environment.is_some_and(|environment| environment.goal.is_some()) { "1" } else { "0" };
     if peers(&["reference", path.to_str().unwrap(), &limit, goal, out.to_str().unwrap()]) {
         compare(path, environment, &out);
     }
 }
 
-/// Terminals, timeouts and both; double precision, as in replay files; rewards and flags of shape N × 1; flags as integers;
-/// v0, which has timeouts from the time limit; v1, which stores next observations that are not used.
+/// Terminals, timeouts and both; double precision, as in replay files; rewards and flags of shape N
+/// × 1; flags as integers; v0, which has timeouts from the time limit; v1, which stores next
+/// observations that are not used.
 #[test]
 fn every_version_follows_the_rules() {
     for variant in ["plain", "float64", "columns", "integers", "v0", "v1"] {
@@ -39,7 +41,11 @@ fn rows_that_do_not_follow_one_another_are_refused() {
     let expected = "array `next_observations`, row 0: not the observation of the row that follows, though the episode \
                     continues there (597 such rows)";
     assert!(error.to_string().ends_with(expected), "{error}");
-    assert!(error.hint().contains("`layout`") && error.hint().contains("timeouts"), "{}", error.hint());
+    assert!(
+        error.hint().contains("`layout`") && error.hint().contains("timeouts"),
+        "{}",
+        error.hint()
+    );
 }
 
 #[test]

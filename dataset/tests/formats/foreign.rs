@@ -1,5 +1,5 @@
-//! Files and folders that are not damaged, but something else: formats that are not read, and HDF5 that is not readable here or
-//! not now.
+//! Files and folders that are not damaged, but something else: formats that are not read, and HDF5
+//! that is not readable here or not now.
 
 use std::fs;
 use std::io::Write;
@@ -92,17 +92,32 @@ fn a_robomimic_file_is_named() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("low_dim.hdf5");
     let demonstration = |rewards: bool| {
-        let group = hdf5::File::create(&path).unwrap().create_group("data").unwrap().create_group("demo_0").unwrap();
-        for array in ["actions", "rewards"].into_iter().filter(|array| rewards || *array == "actions") {
+        let group = hdf5::File::create(&path)
+            .unwrap()
+            .create_group("data")
+            .unwrap()
+            .create_group("demo_0")
+            .unwrap();
+        for array in
+            ["actions", "rewards"].into_iter().filter(|array| rewards || *array == "actions")
+        {
             group.new_dataset::<f32>().shape(3).create(array).unwrap();
         }
     };
     demonstration(true);
     assert_eq!(foreign(&path), "a robomimic file");
     demonstration(false);
-    assert_eq!(foreign(&path), "a file in robomimic's layout without rewards, as Isaac Lab's recorder writes it");
+    assert_eq!(
+        foreign(&path),
+        "a file in robomimic's layout without rewards, as Isaac Lab's recorder writes it"
+    );
     let hint = error(&path).hint();
-    assert!(hint.contains("quad-convert FILE --observations KEY … --reward success-at-end --success all"), "{hint}");
+    assert!(
+        hint.contains(
+            "quad-convert FILE --observations KEY … --reward success-at-end --success all"
+        ),
+        "{hint}"
+    );
 }
 
 /// A file in D4RL's layout whose arrays `write` writes.
@@ -148,18 +163,27 @@ fn half_precision_and_lzf_are_read() {
 #[test]
 fn an_unknown_filter_is_named_with_what_rewrites_the_file() {
     let (_folder, path) = file(|file, name, values| {
-        file.new_dataset_builder().with_data(&values).chunk((100, values.ncols())).lzf().create(name).unwrap();
+        file.new_dataset_builder()
+            .with_data(&values)
+            .chunk((100, values.ncols()))
+            .lzf()
+            .create(name)
+            .unwrap();
     });
     // The number stands eight bytes before the filter's name.
     let mut bytes = fs::read(&path).unwrap();
-    let places: Vec<usize> = (8..bytes.len() - 4).filter(|&i| bytes[i..].starts_with(b"lzf\0")).collect();
+    let places: Vec<usize> =
+        (8..bytes.len() - 4).filter(|&i| bytes[i..].starts_with(b"lzf\0")).collect();
     assert_eq!(places.len(), 4);
     for (number, name) in [(32015_u16, "zstd"), (31999, "number 31999")] {
-        places.iter().for_each(|place| bytes[place - 8..place - 6].copy_from_slice(&number.to_le_bytes()));
+        places
+            .iter()
+            .for_each(|place| bytes[place - 8..place - 6].copy_from_slice(&number.to_le_bytes()));
         fs::write(&path, &bytes).unwrap();
         let error = error(&path);
-        let expected =
-            format!("array `observations` is compressed by HDF5's filter {name}, which this program cannot read");
+        let expected = format!(
+            "array `observations` is compressed by HDF5's filter {name}, which this program cannot read"
+        );
         assert!(error.to_string().ends_with(&expected), "{error}");
         assert!(error.hint().contains("python -c"), "{}", error.hint());
     }
@@ -169,9 +193,14 @@ fn an_unknown_filter_is_named_with_what_rewrites_the_file() {
 fn arrays_that_lie_elsewhere() {
     let virtually = |file: &hdf5::File, name: &str, values: Array2<f32>| {
         let builder = file.new_dataset::<f32>().shape(values.dim());
-        builder.virtual_map("other.hdf5", name, values.dim(), .., values.dim(), ..).create(name).unwrap();
+        builder
+            .virtual_map("other.hdf5", name, values.dim(), .., values.dim(), ..)
+            .create(name)
+            .unwrap();
     };
-    let link = |file: &hdf5::File, name: &str, _: Array2<f32>| file.link_external("other.hdf5", name, name).unwrap();
+    let link = |file: &hdf5::File, name: &str, _: Array2<f32>| {
+        file.link_external("other.hdf5", name, name).unwrap()
+    };
     // To a file that is there.
     let stolen = |file: &hdf5::File, name: &str, values: Array2<f32>| {
         let other = Path::new(&file.filename()).with_file_name("other.hdf5");
@@ -180,7 +209,10 @@ fn arrays_that_lie_elsewhere() {
     };
     for (_folder, path) in [file(virtually), file(link), file(stolen)] {
         let error = error(&path);
-        assert!(matches!(&error.problem, Problem::Elsewhere { array } if array == "observations"), "{error}");
+        assert!(
+            matches!(&error.problem, Problem::Elsewhere { array } if array == "observations"),
+            "{error}"
+        );
     }
 }
 
@@ -196,14 +228,20 @@ fn an_array_whose_numbers_are_another_file_s_is_not_read() {
     };
     let (_folder, path) = file(external);
     let error = error(&path);
-    assert!(matches!(&error.problem, Problem::Elsewhere { array } if array == "observations"), "{error}");
+    assert!(
+        matches!(&error.problem, Problem::Elsewhere { array } if array == "observations"),
+        "{error}"
+    );
 }
 
 #[test]
 fn a_file_whose_writer_never_closed_it() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("log.hdf5");
-    let file = hdf5::File::with_options().with_fapl(|access| access.libver_latest()).create(&path).unwrap();
+    let file = hdf5::File::with_options()
+        .with_fapl(|access| access.libver_latest())
+        .create(&path)
+        .unwrap();
     plain(&file, "observations", Array2::zeros((ROWS, 3)));
     file.flush().unwrap();
     // As the disk has it while the writer is at work.
@@ -213,11 +251,17 @@ fn a_file_whose_writer_never_closed_it() {
     drop(file);
 }
 
-/// Eight rows as OGBench stores them, the last of which is a trajectory's last state, in short numbers.
+/// Eight rows as OGBench stores them, the last of which is a trajectory's last state, in short
+/// numbers.
 fn write_archive(path: &Path, masks: [u32; 8]) {
     fn put<T: npyz::AutoSerialize>(archive: &mut ZipWriter<fs::File>, name: &str, values: Vec<T>) {
         let mut bytes = Vec::new();
-        let mut array = npyz::WriteOptions::new().default_dtype().shape(&[8]).writer(&mut bytes).begin_nd().unwrap();
+        let mut array = npyz::WriteOptions::new()
+            .default_dtype()
+            .shape(&[8])
+            .writer(&mut bytes)
+            .begin_nd()
+            .unwrap();
         array.extend(values).unwrap();
         array.finish().unwrap();
         archive.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();

@@ -11,7 +11,8 @@ use crate::{generated, hopper, peers, read, shared};
 /// Three episodes of a robot, of 4, 4 and 2 rows, whose numbers can be followed by eye.
 fn write_robot(path: &Path, spoil: impl Fn(&mut Array2<f32>, &mut Array2<f32>, &mut Array1<f32>)) {
     let mut observations = Array2::from_shape_fn((10, 3), |(i, j)| (i + j) as f32);
-    let mut actions = Array2::from_shape_fn((10, 2), |(i, j)| if j == 0 { 0.5 } else { -0.1 * i as f32 });
+    let mut actions =
+        Array2::from_shape_fn((10, 2), |(i, j)| if j == 0 { 0.5 } else { -0.1 * i as f32 });
     let mut rewards = Array1::from_shape_fn(10, |i| i as f32);
     spoil(&mut observations, &mut actions, &mut rewards);
     let file = hdf5::File::create(path).unwrap();
@@ -54,13 +55,23 @@ fn figures_are_those_of_training() {
     let Some((_folder, path)) = generated("plain") else { return };
     let inspection = inspect(&path, Some(hopper())).unwrap();
     let statistics = *read(&path, Some(hopper()), RewardRule::AsIs).statistics();
-    assert_eq!((inspection.transitions, inspection.episodes), (statistics.transitions, statistics.episodes));
+    assert_eq!(
+        (inspection.transitions, inspection.episodes),
+        (statistics.transitions, statistics.episodes)
+    );
     let ours = [inspection.min_return, inspection.mean_return, inspection.max_return];
     assert_eq!(ours, [statistics.return_min, statistics.return_mean, statistics.return_max]);
     assert_eq!(inspection.scores.as_ref().map(|scores| scores.mean_score), statistics.score_mean);
-    assert_eq!((inspection.refused, inspection.problems.len()), (false, 0), "{:?}", inspection.problems);
+    assert_eq!(
+        (inspection.refused, inspection.problems.len()),
+        (false, 0),
+        "{:?}",
+        inspection.problems
+    );
     let text = inspection.to_string();
-    for words in ["transitions   21\n", "returns of the episodes\n", "no problems found", "score  ", "####"] {
+    for words in
+        ["transitions   21\n", "returns of the episodes\n", "no problems found", "score  ", "####"]
+    {
         assert!(text.contains(words), "{words} is not in\n{text}");
     }
 }
@@ -87,7 +98,11 @@ fn everything_that_is_wrong_is_named_at_once() {
         ]
     );
     assert!(inspection.refused && inspection.to_string().contains("training refuses this dataset"));
-    assert_eq!((inspection.mean_return, inspection.max_return), (14.0, 22.0), "the third episode has no return");
+    assert_eq!(
+        (inspection.mean_return, inspection.max_return),
+        (14.0, 22.0),
+        "the third episode has no return"
+    );
     assert_eq!(inspection.observation_range.max, 11.0);
 }
 
@@ -97,7 +112,10 @@ fn an_empty_file_is_described_too() {
     let path = folder.path().join("empty.hdf5");
     let file = hdf5::File::create(&path).unwrap();
     for (name, width) in [("observations", 3), ("actions", 2), ("rewards", 1), ("terminals", 1)] {
-        file.new_dataset_builder().with_data(&Array2::<f32>::zeros((0, width))).create(name).unwrap();
+        file.new_dataset_builder()
+            .with_data(&Array2::<f32>::zeros((0, width)))
+            .create(name)
+            .unwrap();
     }
     drop(file);
     let inspection = inspect(&path, None).unwrap();
@@ -111,7 +129,10 @@ fn an_empty_file_is_described_too() {
 fn missing_timeouts_and_stored_observations_that_do_not_follow() {
     let Some((_folder, path)) = generated("v0") else { return };
     let problems = inspect(&path, Some(hopper())).unwrap().problems;
-    assert_eq!(problems, ["no array `timeouts`: an episode is taken to end after the 1000 steps of hopper"]);
+    assert_eq!(
+        problems,
+        ["no array `timeouts`: an episode is taken to end after the 1000 steps of hopper"]
+    );
     let Some((_folder, path)) = generated("v1") else { return };
     let problems = inspect(&path, Some(hopper())).unwrap().problems;
     let expected = "array `next_observations`, row 100: not the observation of the row that follows, though the episode \
@@ -145,6 +166,10 @@ fn recorded_files_are_without_problems() {
         let Some(path) = shared(&format!("data/{name}.hdf5")) else { continue };
         let inspection = inspect(&path, Some(environment::find(environment).unwrap())).unwrap();
         assert_eq!(inspection.problems, [""; 0], "{name}");
-        assert_eq!((inspection.transitions, inspection.episodes), (transitions, episodes), "{name}");
+        assert_eq!(
+            (inspection.transitions, inspection.episodes),
+            (transitions, episodes),
+            "{name}"
+        );
     }
 }

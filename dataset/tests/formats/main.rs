@@ -1,4 +1,5 @@
-//! The crate against files: its own, h5py's, Minari's, OGBench's, recorded ones where they are at hand, and broken ones.
+//! The crate against files: its own, h5py's, Minari's, OGBench's, recorded ones where they are at
+//! hand, and broken ones.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 use std::path::{Path, PathBuf};
@@ -7,7 +8,9 @@ use std::process::Command;
 use hdf5::H5Type;
 use ndarray::ArrayViewD;
 use quad_dataset::ogbench::maze_task;
-use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment};
+use quad_dataset::{
+    Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment,
+};
 use tempfile::{TempDir, tempdir};
 
 mod broken;
@@ -41,12 +44,19 @@ fn options(environment: Option<&'static EnvironmentSpec>, reward: RewardRule) ->
     ReadOptions { environment, task, reward, scale: Scale::default() }
 }
 
-fn read(path: &Path, environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> Transitions {
+fn read(
+    path: &Path,
+    environment: Option<&'static EnvironmentSpec>,
+    reward: RewardRule,
+) -> Transitions {
     Transitions::read(path, &options(environment, reward)).unwrap()
 }
 
 /// Reads a source, with its rewards as they are.
-fn try_read(path: &Path, environment: Option<&'static EnvironmentSpec>) -> Result<Transitions, DatasetError> {
+fn try_read(
+    path: &Path,
+    environment: Option<&'static EnvironmentSpec>,
+) -> Result<Transitions, DatasetError> {
     Transitions::read(path, &options(environment, RewardRule::AsIs))
 }
 
@@ -79,18 +89,30 @@ fn compare(path: &Path, environment: Option<&'static EnvironmentSpec>, reference
     assert_eq!(all(&read(path, environment, RewardRule::AsIs)).rewards, array("raw_rewards"));
 
     let ours = transitions.statistics();
-    let figures = [ours.transitions as f64, ours.episodes as f64, ours.return_mean, ours.return_min, ours.return_max];
+    let figures = [
+        ours.transitions as f64,
+        ours.episodes as f64,
+        ours.return_mean,
+        ours.return_min,
+        ours.return_max,
+    ];
     let theirs = reference.dataset("statistics").unwrap().read_raw::<f64>().unwrap();
     for (ours, theirs) in figures.iter().zip(&theirs) {
         assert!((ours - theirs).abs() <= 1e-9 * theirs.abs(), "{figures:?} against {theirs:?}");
     }
-    assert_eq!(ours.score_mean, environment.map(|environment| environment.normalized_score(ours.return_mean)));
+    assert_eq!(
+        ours.score_mean,
+        environment.map(|environment| environment.normalized_score(ours.return_mean))
+    );
 }
 
 fn assert_close(name: &str, ours: &[f32], theirs: &[f32]) {
     assert_eq!(ours.len(), theirs.len(), "{name}");
     for (i, (ours, theirs)) in ours.iter().zip(theirs).enumerate() {
-        assert!((ours - theirs).abs() <= 1e-6 * theirs.abs().max(1e-3), "{name} {i}: {ours} against {theirs}");
+        assert!(
+            (ours - theirs).abs() <= 1e-6 * theirs.abs().max(1e-3),
+            "{name} {i}: {ours} against {theirs}"
+        );
     }
 }
 
@@ -101,7 +123,8 @@ fn generated(variant: &str) -> Option<(TempDir, PathBuf)> {
     peers(&["generate", variant, path.to_str().unwrap()]).then_some((folder, path))
 }
 
-/// Runs `peers.py`; false where there is no Python to run it, unless QUAD_REQUIRE_PEERS=1 asks for one.
+/// Runs `peers.py`; false where there is no Python to run it, unless QUAD_REQUIRE_PEERS=1 asks for
+/// one.
 fn peers(arguments: &[&str]) -> bool {
     peers_in(Path::new("."), arguments)
 }
@@ -122,6 +145,10 @@ fn peers_in(folder: &Path, arguments: &[&str]) -> bool {
     let mut command = Command::new(python);
     command.arg(here.join("tests/formats/peers.py")).args(arguments);
     let output = command.current_dir(folder).env("MINARI_DATASETS_PATH", folder).output().unwrap();
-    assert!(output.status.success(), "peers.py {arguments:?}:\n{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "peers.py {arguments:?}:\n{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     true
 }

@@ -24,7 +24,10 @@ impl Root {
         self.dataset().join("data/metadata.json")
     }
 
-    fn read(&self, environment: Option<&'static EnvironmentSpec>) -> Result<Transitions, DatasetError> {
+    fn read(
+        &self,
+        environment: Option<&'static EnvironmentSpec>,
+    ) -> Result<Transitions, DatasetError> {
         try_read(&self.dataset(), environment)
     }
 
@@ -33,7 +36,12 @@ impl Root {
     }
 }
 
-fn compare_with_minari(root: &Path, id: &str, kind: &str, environment: Option<&'static EnvironmentSpec>) {
+fn compare_with_minari(
+    root: &Path,
+    id: &str,
+    kind: &str,
+    environment: Option<&'static EnvironmentSpec>,
+) {
     let folder = tempdir().unwrap();
     let out = folder.path().join("reference.hdf5");
     let arguments = ["minari-reference", kind, id, out.to_str().unwrap()];
@@ -54,12 +62,16 @@ fn observations_in_an_array() {
 
 #[test]
 fn another_simulation_is_learned_from_but_not_scored_in_ours() {
-    for (kind, id, ours) in [("antmaze", "AntMaze_UMaze-v4", "antmaze-umaze"), ("walker2d", "Walker2d-v5", "walker2d")]
+    for (kind, id, ours) in
+        [("antmaze", "AntMaze_UMaze-v4", "antmaze-umaze"), ("walker2d", "Walker2d-v5", "walker2d")]
     {
         let Some(root) = Root::new(kind) else { return };
         assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some(id));
         let error = root.read(environment::find(ours).ok()).err().unwrap();
-        assert!(error.to_string().ends_with(&format!("recorded in `{id}`, which is not `{ours}`")), "{error}");
+        assert!(
+            error.to_string().ends_with(&format!("recorded in `{id}`, which is not `{ours}`")),
+            "{error}"
+        );
         assert!(error.hint().contains("--task own-data"), "{}", error.hint());
         compare_with_minari(root.0.path(), "made/up-v0", kind, None);
     }
@@ -78,7 +90,8 @@ fn a_dict_becomes_a_row_in_alphabetical_order_and_a_tuple_in_its_own() {
 fn a_dict_in_a_dict() {
     let Some(root) = Root::new("nested") else { return };
     let error = root.read(None).err().unwrap();
-    let expected = "`episode_0/observations/achieved_goal` is a group of arrays, but must be an array";
+    let expected =
+        "`episode_0/observations/achieved_goal` is a group of arrays, but must be an array";
     assert!(error.to_string().ends_with(expected), "{error}");
     assert!(error.hint().contains("Dict") && !error.hint().contains("damaged"), "{}", error.hint());
 }
@@ -95,7 +108,10 @@ fn damaged_metadata_and_missing_episodes() {
     let Some(root) = Root::new("hopper") else { return };
     let whole = std::fs::read_to_string(root.metadata()).unwrap();
     std::fs::write(root.metadata(), &whole[..whole.len() / 2]).unwrap();
-    assert_eq!(root.error().to_string(), format!("{}: cannot be understood", root.metadata().display()));
+    assert_eq!(
+        root.error().to_string(),
+        format!("{}: cannot be understood", root.metadata().display())
+    );
 
     std::fs::write(root.metadata(), whole).unwrap();
     let data = root.dataset().join("data/main_data.hdf5");
@@ -107,7 +123,8 @@ fn damaged_metadata_and_missing_episodes() {
 /// One episode of two steps whose observations are a Tuple of eleven numbers.
 fn write_tuple(path: &Path) {
     let file = hdf5::File::create(path).unwrap();
-    let observations = file.create_group("episode_0").unwrap().create_group("observations").unwrap();
+    let observations =
+        file.create_group("episode_0").unwrap().create_group("observations").unwrap();
     for number in 0..11 {
         put(&observations, &format!("_index_{number}"), &[3, 1], &[number as f32; 3]);
     }
@@ -124,7 +141,11 @@ fn a_long_tuple_keeps_its_order_whatever_its_file_is_called() {
         let path = folder.path().join(name);
         write_tuple(&path);
         let batch = all(&try_read(&path, None).unwrap());
-        assert_eq!(batch.observations[..11], Vec::from_iter((0..11).map(|number| number as f32)), "{name}");
+        assert_eq!(
+            batch.observations[..11],
+            Vec::from_iter((0..11).map(|number| number as f32)),
+            "{name}"
+        );
         assert_eq!(batch.rewards, [1.0, 2.0]);
     }
 }

@@ -3,7 +3,9 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use quad_dataset::{DatasetError, ReadOptions, RewardRule, Scale, Transitions, environment, ogbench};
+use quad_dataset::{
+    DatasetError, ReadOptions, RewardRule, Scale, Transitions, environment, ogbench,
+};
 use tempfile::{TempDir, tempdir};
 
 use crate::{all, compare, hopper, peers, try_read};
@@ -44,8 +46,10 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
     if !peers(&["ogbench-mazes", folder.path().to_str().unwrap()]) {
         return;
     }
-    let environments: BTreeSet<String> =
-        ogbench::tasks().filter(|task| task.dataset.is_some()).map(|task| task.environment).collect();
+    let environments: BTreeSet<String> = ogbench::tasks()
+        .filter(|task| task.dataset.is_some())
+        .map(|task| task.environment)
+        .collect();
     assert_eq!(environments.len(), 11 * 6);
     for name in environments {
         let place = name.split("-singletask").next().unwrap();
@@ -54,11 +58,20 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
         let task = ogbench::maze_task(&name);
         assert_eq!(task.unwrap().start.map(|x| x as f32).to_vec(), array("start"), "{name}");
         let environment = environment::find(&name).ok();
-        let options = ReadOptions { environment, task, reward: RewardRule::Subtract1, scale: Scale::default() };
-        let transitions = Transitions::read(folder.path().join(format!("{place}.npz")), &options).unwrap();
+        let options = ReadOptions {
+            environment,
+            task,
+            reward: RewardRule::Subtract1,
+            scale: Scale::default(),
+        };
+        let transitions =
+            Transitions::read(folder.path().join(format!("{place}.npz")), &options).unwrap();
         let batch = all(&transitions);
         assert_eq!((batch.rewards, &batch.masks), (array("rewards"), &array("masks")), "{name}");
-        assert!((10..150).contains(&batch.masks.iter().filter(|mask| **mask == 0.0).count()), "{name}");
+        assert!(
+            (10..150).contains(&batch.masks.iter().filter(|mask| **mask == 0.0).count()),
+            "{name}"
+        );
         // One trajectory in six is around one of five goals; its return is 1.
         assert!((0.1..0.7).contains(&transitions.statistics().return_mean), "{name}");
     }
@@ -69,15 +82,25 @@ fn a_maze_of_ogbench_is_learned_from_but_not_scored_in_one_of_ours() {
     let Some((_folder, path)) = written("maze") else { return };
     assert!(try_read(&path, None).is_ok());
     let error = try_read(&path, environment::find("antmaze-medium").ok()).err().unwrap();
-    assert!(error.to_string().ends_with("recorded in `OGBench`, which is not `antmaze-medium`"), "{error}");
-    assert!(error.hint().contains("antmaze-large-navigate-singletask-task1-v0"), "{}", error.hint());
+    assert!(
+        error.to_string().ends_with("recorded in `OGBench`, which is not `antmaze-medium`"),
+        "{error}"
+    );
+    assert!(
+        error.hint().contains("antmaze-large-navigate-singletask-task1-v0"),
+        "{}",
+        error.hint()
+    );
 }
 
 #[test]
 fn discrete_actions() {
     let Some((_folder, path)) = written("discrete") else { return };
     let error = error(&path).to_string();
-    assert!(error.contains("array `actions` holds whole numbers, as if actions were discrete"), "{error}");
+    assert!(
+        error.contains("array `actions` holds whole numbers, as if actions were discrete"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -86,10 +109,17 @@ fn cut_short_and_damaged_inside() {
     let whole = std::fs::read(&path).unwrap();
     for length in [4, whole.len() / 2, whole.len() - 1] {
         std::fs::write(&path, &whole[..length]).unwrap();
-        assert!(error(&path).to_string().ends_with("a damaged or incomplete npz archive"), "{length} bytes");
+        assert!(
+            error(&path).to_string().ends_with("a damaged or incomplete npz archive"),
+            "{length} bytes"
+        );
     }
     let mut damaged = whole;
     damaged[300..340].fill(7);
     std::fs::write(&path, damaged).unwrap();
-    assert!(error(&path).to_string().ends_with("array `observations` cannot be read"), "{}", error(&path));
+    assert!(
+        error(&path).to_string().ends_with("array `observations` cannot be read"),
+        "{}",
+        error(&path)
+    );
 }

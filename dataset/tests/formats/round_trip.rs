@@ -17,7 +17,9 @@ struct OwnedRow([Vec<f64>; 5]);
 
 impl OwnedRow {
     fn new(i: usize) -> Self {
-        let list = |n: usize, value: &dyn Fn(f64) -> f64| (0..n).map(|j| value(j as f64)).collect::<Vec<f64>>();
+        let list = |n: usize, value: &dyn Fn(f64) -> f64| {
+            (0..n).map(|j| value(j as f64)).collect::<Vec<f64>>()
+        };
         let i = i as f64;
         Self([
             list(11, &|j| i + j / 16.0),
@@ -60,7 +62,8 @@ fn the_reader_reads_every_row_bit_for_bit_and_h5py_the_layout_of_d4rl() {
 #[test]
 fn the_file_has_its_name_only_when_it_is_finished() {
     let folder = tempdir().unwrap();
-    let (path, partial) = (folder.path().join("rows.hdf5"), folder.path().join("rows.hdf5.partial"));
+    let (path, partial) =
+        (folder.path().join("rows.hdf5"), folder.path().join("rows.hdf5.partial"));
     fs::write(&path, "an older file").unwrap();
     fs::write(&partial, "what an interrupted run left").unwrap();
 
@@ -89,13 +92,18 @@ fn a_row_that_would_spoil_the_file_is_refused_as_a_whole() {
     let short = Row { action: &[0.0; 2], ..good.row(0) };
     let error = writer.push(&short).unwrap_err();
     assert!(
-        error.to_string().ends_with("row 1 cannot be written: `actions` has 2 numbers, but must have 3"),
+        error
+            .to_string()
+            .ends_with("row 1 cannot be written: `actions` has 2 numbers, but must have 3"),
         "{error}"
     );
     for value in [f64::NAN, f64::INFINITY, 1e39] {
         let row = Row { qvel: &[0.0, 0.0, value, 0.0, 0.0, 0.0], ..good.row(0) };
         let problem = writer.push(&row).unwrap_err().problem;
-        assert!(matches!(problem, Problem::BadRow { array: "infos/qvel", row: 1, .. }), "{problem}");
+        assert!(
+            matches!(problem, Problem::BadRow { array: "infos/qvel", row: 1, .. }),
+            "{problem}"
+        );
     }
 
     writer.finish(&METADATA).unwrap();

@@ -2,22 +2,31 @@
 
 use std::path::PathBuf;
 
-use quad_dataset::{Arrays, Batch, HoldOut, Names, ReadOptions, RewardRule, Scale, Transitions, write_own};
+use quad_dataset::{
+    Arrays, Batch, HoldOut, Names, ReadOptions, RewardRule, Scale, Transitions, write_own,
+};
 use tempfile::{TempDir, tempdir};
 
 use crate::{all, assert_close, put};
 
-/// Four rows. A large number with a small spread, a small one, and one that is always the same; actions of one number from
-/// -30 to 50, and one that is always the same.
+/// Four rows. A large number with a small spread, a small one, and one that is always the same;
+/// actions of one number from -30 to 50, and one that is always the same.
 fn arrays() -> Arrays {
     let o = |a: f32, b: f32, c: f32| [1e6 + a, b, c];
     Arrays {
         observation_dim: 3,
         action_dim: 2,
-        observations: [o(0.0, 7.0, 0.1), o(2.0, -1.0, 0.1), o(3.0, 4.0, 0.1), o(7.0, 4.0, 0.1)].concat(),
+        observations: [o(0.0, 7.0, 0.1), o(2.0, -1.0, 0.1), o(3.0, 4.0, 0.1), o(7.0, 4.0, 0.1)]
+            .concat(),
         actions: vec![-30.0, 0.25, 10.0, 0.25, 0.0, 0.25, 50.0, 0.25],
         rewards: vec![1.0, 2.0, 3.0, 4.0],
-        next_observations: [o(2.0, -1.0, 0.1), o(3.0, 4.0, 0.1), o(7.0, 4.0, 0.1), o(9.0, 0.0, 0.5)].concat(),
+        next_observations: [
+            o(2.0, -1.0, 0.1),
+            o(3.0, 4.0, 0.1),
+            o(7.0, 4.0, 0.1),
+            o(9.0, 0.0, 0.5),
+        ]
+        .concat(),
         terminals: vec![false; 4],
         timeouts: vec![false, false, false, true],
     }
@@ -55,7 +64,11 @@ fn states_have_mean_0_and_deviation_1() {
     assert_close("next observations", &next_observations, &expected[3..]);
     let affine = transitions.scaling().observations.clone().unwrap();
     assert_eq!(affine.offset, [1_000_003.0, 3.5, 0.1]);
-    assert_eq!(affine.scale, [2.549_509_8, 2.872_281_3, 0.0], "a column that never changes is not seen");
+    assert_eq!(
+        affine.scale,
+        [2.549_509_8, 2.872_281_3, 0.0],
+        "a column that never changes is not seen"
+    );
 }
 
 #[test]
@@ -72,7 +85,8 @@ fn rows_that_are_not_learned_from_do_not_count() {
     let scale = Scale { states: true, ..Scale::default() };
     let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale };
     // Neither the timeout nor the last row makes a transition.
-    let affine = Transitions::read(&path, &options).unwrap().scaling().observations.clone().unwrap();
+    let affine =
+        Transitions::read(&path, &options).unwrap().scaling().observations.clone().unwrap();
     assert_eq!((affine.offset, affine.scale), (vec![1.0], vec![1.0]));
 }
 
@@ -85,7 +99,11 @@ fn actions_reach_from_least_to_largest() {
     let scaling = transitions.scaling();
     let affine = scaling.actions.clone().unwrap();
     assert_eq!((affine.offset, affine.scale), (vec![10.0, 0.25], vec![40.0, 0.0]));
-    assert_eq!((batch.observations, &scaling.observations), (arrays().observations, &None), "as they are");
+    assert_eq!(
+        (batch.observations, &scaling.observations),
+        (arrays().observations, &None),
+        "as they are"
+    );
     assert_eq!(batch.rewards, arrays().rewards);
     // What follows what is told by the numbers of the file.
     assert_eq!(transitions.episodes().len(), 1, "as without scaling");
@@ -95,7 +113,9 @@ fn actions_reach_from_least_to_largest() {
 #[test]
 fn states_alone_leave_the_range_of_actions_to_be_checked() {
     let (_folder, path) = file();
-    let error = Transitions::read(path, &options(Scale { states: true, ..Scale::default() })).err().unwrap();
+    let error = Transitions::read(path, &options(Scale { states: true, ..Scale::default() }))
+        .err()
+        .unwrap();
     assert!(error.to_string().contains("the action -30 is outside [-1, 1]"), "{error}");
 }
 
@@ -106,14 +126,26 @@ fn rewards_have_a_mean_square_of_1() {
     let transitions = Transitions::read(&path, &options(scale)).unwrap();
     let size = 7.5_f32.sqrt(); // of 1, 2, 3 and 4
     assert_eq!(transitions.scaling().rewards, Some(size));
-    assert_close("rewards", &all(&transitions).rewards, &[1.0, 2.0, 3.0, 4.0].map(|reward| reward / size));
+    assert_close(
+        "rewards",
+        &all(&transitions).rewards,
+        &[1.0, 2.0, 3.0, 4.0].map(|reward| reward / size),
+    );
     assert_eq!(transitions.statistics().return_mean, 10.0, "as they were recorded");
     // After the rule of the task.
     let rule = ReadOptions { reward: RewardRule::CenterTimes4, ..options(scale) };
     let ruled = Transitions::read(&path, &rule).unwrap();
-    assert_close("ruled", &all(&ruled).rewards, &[2.0, 6.0, 10.0, 14.0].map(|reward| reward / 84_f32.sqrt()));
+    assert_close(
+        "ruled",
+        &all(&ruled).rewards,
+        &[2.0, 6.0, 10.0, 14.0].map(|reward| reward / 84_f32.sqrt()),
+    );
     write_own(&path, Arrays { rewards: vec![0.0; 4], ..arrays() }, Names::default()).unwrap();
-    assert_eq!(Transitions::read(&path, &options(scale)).unwrap().scaling().rewards, None, "0 has no size");
+    assert_eq!(
+        Transitions::read(&path, &options(scale)).unwrap().scaling().rewards,
+        None,
+        "0 has no size"
+    );
     // What is held out is in the same unit.
     let whole = Arrays { timeouts: vec![false, true, false, true], ..arrays() };
     write_own(&path, whole, Names::default()).unwrap();

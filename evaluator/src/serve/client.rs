@@ -1,4 +1,5 @@
-//! All communication with the learner of one run: jobs, snapshots, progress; `delivery` has scores and jobs that go back.
+//! All communication with the learner of one run: jobs, snapshots, progress; `delivery` has scores
+//! and jobs that go back.
 
 mod delivery;
 
@@ -21,11 +22,13 @@ use super::snapshot::{Listener, Snapshots, is_named_by};
 use crate::metrics::Metrics;
 use delivery::Owed;
 
-/// A learner answers in milliseconds; for one that hangs or is very busy, other runs do not wait longer than this.
+/// A learner answers in milliseconds; for one that hangs or is very busy, other runs do not wait
+/// longer than this.
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Patience with a learner that sends a snapshot, which has megabytes.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
-/// Limits of the pause that a learner without work may ask for: the learner gets no flood of queries, and loses no evaluator.
+/// Limits of the pause that a learner without work may ask for: the learner gets no flood of
+/// queries, and loses no evaluator.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
 
 /// An evaluator's side of one run.
@@ -60,11 +63,14 @@ impl RunClient {
         metrics: Metrics,
     ) -> anyhow::Result<RunClient> {
         let session = found.session.clone();
-        let listener = Listener::start(&session, run.clone(), snapshots.clone(), metrics.clone()).await;
-        let listener = listener.with_context(|| format!("cannot listen to the snapshots of run {run}"))?;
+        let listener =
+            Listener::start(&session, run.clone(), snapshots.clone(), metrics.clone()).await;
+        let listener =
+            listener.with_context(|| format!("cannot listen to the snapshots of run {run}"))?;
         let (declared, key) = (session.clone(), keys::live_evaluator(&run, &evaluator));
         let token = may_block(move || declared.liveliness().declare_token(key).wait()).await;
-        let token = token.with_context(|| format!("cannot announce this evaluator in run {run}"))?;
+        let token =
+            token.with_context(|| format!("cannot announce this evaluator in run {run}"))?;
         let mut client = RunClient {
             run,
             evaluator,
@@ -84,8 +90,8 @@ impl RunClient {
         Ok(client)
     }
 
-    /// Chooses which of these processes of a learner to follow: the one that it follows already, else the one that started
-    /// first, because of two learners of one name the later one stops.
+    /// Chooses which of these processes of a learner to follow: the one that it follows already,
+    /// else the one that started first, because of two learners of one name the later one stops.
     pub fn follow(&mut self, incarnations: &BTreeSet<u64>) {
         if self.gone.take().is_some() {
             self.turn.wake(Instant::now());
@@ -99,7 +105,10 @@ impl RunClient {
 
     /// Follows the next of several processes, because this one does not answer.
     pub fn follow_next(&mut self, incarnations: &BTreeSet<u64>) {
-        let next = incarnations.range(self.incarnation.saturating_add(1)..).next().or(incarnations.first());
+        let next = incarnations
+            .range(self.incarnation.saturating_add(1)..)
+            .next()
+            .or(incarnations.first());
         if let Some(&next) = next.filter(|next| **next != self.incarnation) {
             self.turn_to(next);
         }
@@ -132,9 +141,14 @@ impl RunClient {
 
     /// Claims a job in one of these environments; `None` if there is none now.
     pub async fn claim(&mut self, environments: Vec<String>) -> anyhow::Result<Option<Job>> {
-        // The same number until there is an answer: if only the answer was lost, the learner repeats the job.
+        // The same number until there is an answer: if only the answer was lost, the learner
+        // repeats the job.
         let attempt = *self.attempt.get_or_insert_with(|| rand::rng().random());
-        let request = encode(&JobRequest::Claim { evaluator: self.evaluator.clone(), attempt, environments })?;
+        let request = encode(&JobRequest::Claim {
+            evaluator: self.evaluator.clone(),
+            attempt,
+            environments,
+        })?;
         let (run, incarnation) = (self.run.clone(), self.incarnation);
         let fitting = move |reply: &JobReply| match reply {
             JobReply::Job(job) if job.run != run => Err("other_run"),
@@ -142,11 +156,13 @@ impl RunClient {
             _ => is_from(incarnation, reply.incarnation()),
         };
         let key = keys::jobs(&self.run);
-        let answer = ask(&self.session, key, request, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
+        let answer =
+            ask(&self.session, key, request, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
         self.attempt = None;
         match answer {
             JobReply::Job(job) => {
-                self.owed = Some(Owed::Job { id: job.id, incarnation: job.incarnation, failed: None });
+                self.owed =
+                    Some(Owed::Job { id: job.id, incarnation: job.incarnation, failed: None });
                 Ok(Some(job))
             }
             JobReply::Wait { milliseconds, .. } => {
@@ -160,20 +176,24 @@ impl RunClient {
         }
     }
 
-    /// The snapshot that `job` names: the published one, or a requested one if the evaluator missed the publication.
+    /// The snapshot that `job` names: the published one, or a requested one if the evaluator missed
+    /// the publication.
     pub async fn snapshot(&self, job: &Job) -> anyhow::Result<Arc<Snapshot>> {
         if let Some(snapshot) = self.snapshots.get(job) {
             return Ok(snapshot);
         }
         let (key, wanted) = (keys::weights_at(&self.run, job.step), job.clone());
-        let fitting = move |found: &Snapshot| is_named_by(&wanted, found).then_some(()).ok_or("other_snapshot");
-        let snapshot: Snapshot = ask(&self.session, key, Vec::new(), WEIGHTS_TIMEOUT, &self.metrics, fitting).await?;
+        let fitting = move |found: &Snapshot| {
+            is_named_by(&wanted, found).then_some(()).ok_or("other_snapshot")
+        };
+        let snapshot: Snapshot =
+            ask(&self.session, key, Vec::new(), WEIGHTS_TIMEOUT, &self.metrics, fitting).await?;
         self.metrics.snapshots_received.inc();
         Ok(Arc::new(snapshot))
     }
 
-    /// Reports the progress of `job`. A lost message does no harm, because the next one contains its news. So Zenoh drops the
-    /// message if the connection is full, and this call does not wait.
+    /// Reports the progress of `job`. A lost message does no harm, because the next one contains
+    /// its news. So Zenoh drops the message if the connection is full, and this call does not wait.
     pub fn tell(&self, job: &Job, steps_done: u64, episodes_done: u32) {
         let progress = Progress {
             steps_done,

@@ -16,7 +16,8 @@ use zenoh::{Session, Wait};
 use super::query::may_block;
 use crate::metrics::Metrics;
 
-/// Most learners that an evaluator follows, over all runs and endpoints. The limit bounds memory; it is far above any use.
+/// Most learners that an evaluator follows, over all runs and endpoints. The limit bounds memory;
+/// it is far above any use.
 const MOST_LEARNERS: usize = 1024;
 /// How often the evaluator checks that a session is still open.
 const GLANCE: Duration = Duration::from_secs(10);
@@ -31,8 +32,8 @@ pub type RunKey = (usize, Name);
 pub struct Found {
     /// The session that reaches it.
     pub session: Session,
-    /// The incarnations that announce themselves, at least one: the token of a learner that was disconnected or killed may
-    /// still exist when the next one starts.
+    /// The incarnations that announce themselves, at least one: the token of a learner that was
+    /// disconnected or killed may still exist when the next one starts.
     pub incarnations: BTreeSet<u64>,
 }
 
@@ -48,13 +49,23 @@ pub struct Discovery {
 impl Discovery {
     /// Starts to watch. If nothing listens at an endpoint, it waits.
     ///
-    /// Each endpoint gets a session of its own, because a Zenoh client keeps one connection: in one session, a second endpoint
-    /// would only be a spare for the first.
-    pub fn start(endpoints: Vec<String>, certificates: Option<&Certificates>, metrics: &Metrics) -> Discovery {
+    /// Each endpoint gets a session of its own, because a Zenoh client keeps one connection: in one
+    /// session, a second endpoint would only be a spare for the first.
+    pub fn start(
+        endpoints: Vec<String>,
+        certificates: Option<&Certificates>,
+        metrics: &Metrics,
+    ) -> Discovery {
         let (found, runs) = watch::channel(Runs::new());
         let mut tasks = JoinSet::new();
         for (index, endpoint) in endpoints.into_iter().enumerate() {
-            tasks.spawn(watch_endpoint(index, endpoint, certificates.cloned(), found.clone(), metrics.clone()));
+            tasks.spawn(watch_endpoint(
+                index,
+                endpoint,
+                certificates.cloned(),
+                found.clone(),
+                metrics.clone(),
+            ));
         }
         Discovery { runs, tasks }
     }
@@ -68,7 +79,9 @@ impl Discovery {
     pub async fn failed(&mut self) -> anyhow::Error {
         match self.tasks.join_next().await {
             Some(Ok(Err(error))) => error,
-            Some(Err(error)) => anyhow::Error::new(error).context("the search for learners broke off"),
+            Some(Err(error)) => {
+                anyhow::Error::new(error).context("the search for learners broke off")
+            }
             Some(Ok(Ok(never))) => match never {},
             None => std::future::pending().await,
         }
@@ -83,17 +96,20 @@ async fn watch_endpoint(
     metrics: Metrics,
 ) -> anyhow::Result<Infallible> {
     info!(endpoint, "waiting for a learner or a router");
-    let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
+    let endpoints =
+        Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
     let session = open_session(&endpoints).await?;
     info!(endpoint, "connected");
     let told = session.clone();
     let callback = move |token: Sample| {
         found.send_if_modified(|runs| {
-            take_in(runs, (index, &told), token.kind(), token.key_expr().as_str()).unwrap_or_else(|label| {
-                metrics.rejected(label);
-                warn!(key = token.key_expr().as_str(), label, "a learner is not served");
-                false
-            })
+            take_in(runs, (index, &told), token.kind(), token.key_expr().as_str()).unwrap_or_else(
+                |label| {
+                    metrics.rejected(label);
+                    warn!(key = token.key_expr().as_str(), label, "a learner is not served");
+                    false
+                },
+            )
         });
     };
     let declared = session.clone();
@@ -102,21 +118,24 @@ async fn watch_endpoint(
         subscriber.callback(callback).wait()
     };
     let subscriber = may_block(declare).await;
-    let _subscriber = subscriber.with_context(|| format!("cannot look for learners at {endpoint}"))?;
+    let _subscriber =
+        subscriber.with_context(|| format!("cannot look for learners at {endpoint}"))?;
     loop {
         tokio::time::sleep(GLANCE).await;
         anyhow::ensure!(!session.is_closed(), "the Zenoh session closed");
     }
 }
 
-/// Records a token. Returns whether the runs have changed, or the label of the reason why it was ignored.
+/// Records a token. Returns whether the runs have changed, or the label of the reason why it was
+/// ignored.
 fn take_in(
     runs: &mut Runs,
     (index, session): (usize, &Session),
     kind: SampleKind,
     key: &str,
 ) -> Result<bool, &'static str> {
-    let (run, incarnation) = keys::run_of(key).zip(keys::incarnation_of(key)).ok_or("invalid_name")?;
+    let (run, incarnation) =
+        keys::run_of(key).zip(keys::incarnation_of(key)).ok_or("invalid_name")?;
     let learners: usize = runs.values().map(|found| found.incarnations.len()).sum();
     let place = (index, run);
     let run = &place.1;
@@ -125,7 +144,10 @@ fn take_in(
         (SampleKind::Put, Some(found)) => Ok(found.incarnations.insert(incarnation)),
         (SampleKind::Put, None) => {
             info!(%run, incarnation, "found a run");
-            runs.insert(place, Found { session: session.clone(), incarnations: BTreeSet::from([incarnation]) });
+            runs.insert(
+                place,
+                Found { session: session.clone(), incarnations: BTreeSet::from([incarnation]) },
+            );
             Ok(true)
         }
         (SampleKind::Delete, None) => Ok(false),
@@ -146,11 +168,17 @@ mod tests {
 
     #[tokio::test(flavor = "multi_thread")]
     async fn learners_are_followed_up_to_a_bound() {
-        let endpoints = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+        let endpoints =
+            Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let session = open_session(&endpoints).await.unwrap();
         let mut runs = Runs::new();
         let mut tell = |kind, run: usize, incarnation: usize| {
-            let result = take_in(&mut runs, (0, &session), kind, &format!("quad/run-{run}/live/learner/{incarnation}"));
+            let result = take_in(
+                &mut runs,
+                (0, &session),
+                kind,
+                &format!("quad/run-{run}/live/learner/{incarnation}"),
+            );
             (result, runs.len())
         };
         assert_eq!(tell(SampleKind::Put, 0, 1), (Ok(true), 1));
@@ -166,8 +194,16 @@ mod tests {
         assert_eq!(tell(SampleKind::Put, MOST_LEARNERS, 1).0, Err("too_many_runs"));
         assert_eq!(tell(SampleKind::Put, 0, 3).0, Err("too_many_runs"));
         assert_eq!(tell(SampleKind::Delete, 0, 1), (Ok(true), MOST_LEARNERS - 1));
-        assert_eq!(tell(SampleKind::Delete, 0, 2), (Ok(true), MOST_LEARNERS - 2), "the last incarnation is gone");
+        assert_eq!(
+            tell(SampleKind::Delete, 0, 2),
+            (Ok(true), MOST_LEARNERS - 2),
+            "the last incarnation is gone"
+        );
         assert_eq!(tell(SampleKind::Delete, MOST_LEARNERS, 1), (Ok(false), MOST_LEARNERS - 2));
-        assert_eq!(tell(SampleKind::Put, MOST_LEARNERS, 1), (Ok(true), MOST_LEARNERS - 1), "there is room again");
+        assert_eq!(
+            tell(SampleKind::Put, MOST_LEARNERS, 1),
+            (Ok(true), MOST_LEARNERS - 1),
+            "there is room again"
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Evaluates jobs, one at a time: loads the policy of a job, runs its episodes, reports progress to the learner.
+//! Evaluates jobs, one at a time: loads the policy of a job, runs its episodes, reports progress to
+//! the learner.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -25,7 +26,8 @@ pub struct Evaluator {
     pub environments: Arc<dyn Environments>,
     precision: Precision,
     metrics: Metrics,
-    /// The policy of the last job, with its weights and its environment, which the next job often needs again.
+    /// The policy of the last job, with its weights and its environment, which the next job often
+    /// needs again.
     policy: Option<(Hash, String, Arc<dyn Policy>)>,
     /// Reports that the evaluator is not stuck.
     pub beat: Beat,
@@ -46,9 +48,11 @@ impl Evaluator {
     /// Runs all episodes of `job`, which the learner of `client` has given out, with one snapshot.
     pub async fn evaluate(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<ScoreReport> {
         let metrics = self.metrics.clone();
-        job::check(job, self.environments.as_ref()).inspect_err(|error| metrics.rejected(error.label()))?;
+        job::check(job, self.environments.as_ref())
+            .inspect_err(|error| metrics.rejected(error.label()))?;
         let policy = {
-            // The learner grants time for this, as long as the evaluator reports that it works on it.
+            // The learner grants time for this, as long as the evaluator reports that it works on
+            // it.
             client.tell(job, 0, 0);
             let mut loading = std::pin::pin!(self.policy(job, client));
             loop {
@@ -58,38 +62,46 @@ impl Evaluator {
                 }
             }
         };
-        job::check_memory(job, policy.as_ref()).inspect_err(|error| metrics.rejected(error.label()))?;
+        job::check_memory(job, policy.as_ref())
+            .inspect_err(|error| metrics.rejected(error.label()))?;
         let arithmetic = Name::new(policy.precision().arithmetic())?;
         info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "evaluating");
-        let episodes = self.roll_out(job, policy, |steps, episodes| client.tell(job, steps, episodes)).await?;
+        let episodes =
+            self.roll_out(job, policy, |steps, episodes| client.tell(job, steps, episodes)).await?;
         Ok(ScoreReport::of(job, self.name.clone(), arithmetic, episodes))
     }
 
     /// The policy of `job`, kept from the last job or loaded from a snapshot.
     async fn policy(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<Arc<dyn Policy>> {
         let name = &job.environment;
-        if let Some((.., policy)) = self.policy.as_ref().filter(|last| (last.0, &last.1) == (job.weights, name)) {
+        if let Some((.., policy)) =
+            self.policy.as_ref().filter(|last| (last.0, &last.1) == (job.weights, name))
+        {
             return Ok(policy.clone());
         }
         // Freed before the next policy is built: an evaluator holds one policy.
         self.policy = None;
         let (snapshot, precision) = (client.snapshot(job).await?, self.precision);
         let (wanted, sizes) = (name.clone(), self.environments.sizes(name));
-        let loaded = tokio::task::spawn_blocking(move || load(&snapshot, (&wanted, sizes), precision)).await?;
-        let policy: Arc<dyn Policy> = loaded.inspect_err(|error| self.metrics.rejected(error.label()))?.into();
+        let loaded =
+            tokio::task::spawn_blocking(move || load(&snapshot, (&wanted, sizes), precision))
+                .await?;
+        let policy: Arc<dyn Policy> =
+            loaded.inspect_err(|error| self.metrics.rejected(error.label()))?.into();
         self.policy = Some((job.weights, name.clone(), policy.clone()));
         Ok(policy)
     }
 
-    /// Runs the episodes, and reports progress as long as there is any: the learner gives the job of a stuck simulation to
-    /// another evaluator.
+    /// Runs the episodes, and reports progress as long as there is any: the learner gives the job
+    /// of a stuck simulation to another evaluator.
     async fn roll_out(
         &self,
         job: &Job,
         policy: Arc<dyn Policy>,
         tell: impl Fn(u64, u32),
     ) -> anyhow::Result<Vec<EpisodeScore>> {
-        let mut running = Running::start(job, self.environments.clone(), policy, self.metrics.clone());
+        let mut running =
+            Running::start(job, self.environments.clone(), policy, self.metrics.clone());
         let mut told = 0;
         loop {
             if let Some(episodes) = running.finished_within(heartbeat(job)).await {
@@ -99,7 +111,8 @@ impl Evaluator {
             if steps > told {
                 self.beat.alive();
             }
-            // The evaluator also reports that no step is done yet: the first step of a large policy takes long.
+            // The evaluator also reports that no step is done yet: the first step of a large policy
+            // takes long.
             if steps > told || steps == 0 {
                 told = steps;
                 tell(steps, running.episodes_done());
@@ -159,7 +172,12 @@ mod tests {
             0
         }
 
-        fn act(&self, _: &[f32], _: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
+        fn act(
+            &self,
+            _: &[f32],
+            _: &mut [EpisodeState],
+            actions: &mut [f32],
+        ) -> Result<(), PolicyError> {
             let call = self.calls.fetch_add(1, Relaxed);
             let until = Instant::now() + Duration::from_secs(60);
             while call == STUCK_AT && self.is_well() && Instant::now() < until {

@@ -29,10 +29,12 @@ pub fn smallest() -> DiffusionShape {
     DiffusionShape::quad((11, 3), &MlpConfig::mish(&[1]), 1, 1)
 }
 
-/// The file of a diffusion policy for an environment, all zero, that takes the best of `candidates`.
+/// The file of a diffusion policy for an environment, all zero, that takes the best of
+/// `candidates`.
 pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8> {
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
-    let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
+    let tensors =
+        policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
     let origin = Origin { environment: environment.to_owned(), seed: 1, step: 1, episodes: 2 };
     Header::new(policy, origin).to_safetensors(&tensors).unwrap()
 }

@@ -13,8 +13,9 @@ use crate::sim::{EnvironmentError, Environments, EpisodeOutcome, Rollout};
 
 /// Most episodes of a job: each is a simulation. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
-/// Most memory of one network call, bytes: far more than the paper's few megabytes, and far less than an evaluator's container
-/// has (1 GiB, in docker-compose.yml), which also holds snapshots and the policy.
+/// Most memory of one network call, bytes: far more than the paper's few megabytes, and far less
+/// than an evaluator's container has (1 GiB, in docker-compose.yml), which also holds snapshots and
+/// the policy.
 const MAX_BYTES: u64 = 256 << 20;
 
 /// Why the evaluator does not run a job.
@@ -73,7 +74,8 @@ struct Shared {
     steps_done: AtomicU64,
 }
 
-/// A running job. Dropped before its end, it stops within one step of the batch and counts as abandoned.
+/// A running job. Dropped before its end, it stops within one step of the batch and counts as
+/// abandoned.
 pub struct Running {
     shared: Arc<Shared>,
     metrics: Metrics,
@@ -83,15 +85,28 @@ pub struct Running {
 
 impl Running {
     /// Starts the episodes of a checked job.
-    pub fn start(job: &Job, environments: Arc<dyn Environments>, policy: Arc<dyn Policy>, metrics: Metrics) -> Running {
+    pub fn start(
+        job: &Job,
+        environments: Arc<dyn Environments>,
+        policy: Arc<dyn Policy>,
+        metrics: Metrics,
+    ) -> Running {
         let shared = Arc::new(Shared::default());
         let thread = tokio::task::spawn_blocking({
             let (shared, metrics, job) = (shared.clone(), metrics.clone(), job.clone());
-            // On a thread of rayon's pool: any other thread would have to wake one, and wait for it, in each parallel part of
-            // each step.
+            // On a thread of rayon's pool: any other thread would have to wake one, and wait for
+            // it, in each parallel part of each step.
             move || {
-                let roll_out =
-                    |_: &_| roll_out(environments.as_ref(), &job, policy.as_ref(), &shared, &metrics, Job::LONGEST);
+                let roll_out = |_: &_| {
+                    roll_out(
+                        environments.as_ref(),
+                        &job,
+                        policy.as_ref(),
+                        &shared,
+                        &metrics,
+                        Job::LONGEST,
+                    )
+                };
                 rayon::scope(roll_out)
             }
         });
@@ -109,7 +124,10 @@ impl Running {
     }
 
     /// Waits up to `patience` for the end; `None` if it has not come by then.
-    pub async fn finished_within(&mut self, patience: Duration) -> Option<anyhow::Result<Vec<EpisodeScore>>> {
+    pub async fn finished_within(
+        &mut self,
+        patience: Duration,
+    ) -> Option<anyhow::Result<Vec<EpisodeScore>>> {
         let thread = self.thread.as_mut()?;
         let joined = tokio::time::timeout(patience, thread).await.ok()?;
         self.thread = None;
@@ -134,8 +152,8 @@ impl Drop for Running {
     }
 }
 
-/// Runs all episodes to their end; `None` if canceled. Fails if the policy cannot act, an environment fails, or the job takes
-/// longer than `longest`.
+/// Runs all episodes to their end; `None` if canceled. Fails if the policy cannot act, an
+/// environment fails, or the job takes longer than `longest`.
 fn roll_out(
     environments: &dyn Environments,
     job: &Job,
@@ -178,7 +196,9 @@ fn episodes(
     policy: &dyn Policy,
 ) -> Result<Rollout<EpisodeState>, EnvironmentError> {
     let make = || environments.make(&job.environment, job.environment_seed);
-    Rollout::new(make, (policy.observation_dim(), policy.action_dim()), &job.seeds, |seed| policy.begin(seed))
+    Rollout::new(make, (policy.observation_dim(), policy.action_dim()), &job.seeds, |seed| {
+        policy.begin(seed)
+    })
 }
 
 fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
@@ -215,7 +235,9 @@ mod tests {
     #[test]
     fn a_job_has_a_longest_time() {
         let (job, policy, metrics) = (job(2), policy(8, 2, 1), Metrics::new().unwrap());
-        let run = |longest| roll_out(&Simulations, &job, policy.as_ref(), &Shared::default(), &metrics, longest);
+        let run = |longest| {
+            roll_out(&Simulations, &job, policy.as_ref(), &Shared::default(), &metrics, longest)
+        };
         assert_eq!(run(Job::LONGEST).unwrap().unwrap().len(), 2);
         let error = run(Duration::ZERO).unwrap_err();
         assert!(matches!(error.downcast_ref(), Some(JobError::TooLong)), "{error}");
@@ -234,7 +256,11 @@ mod tests {
             None
         }
 
-        fn make(&self, _: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+        fn make(
+            &self,
+            _: &str,
+            environment_seed: u64,
+        ) -> Result<Box<dyn Environment>, EnvironmentError> {
             self.0.lock().unwrap().push(environment_seed);
             Simulations.make("hopper", environment_seed)
         }
@@ -243,20 +269,29 @@ mod tests {
     #[test]
     fn environments_are_made_by_the_job_s_name_and_seed() {
         let job = Job { environment: "my-robot".to_owned(), environment_seed: 5, ..job(2) };
-        assert!(matches!(check(&job, &Simulations), Err(JobError::Environment(name)) if name == "my-robot"));
+        assert!(
+            matches!(check(&job, &Simulations), Err(JobError::Environment(name)) if name == "my-robot")
+        );
         let renamed = Renamed::default();
         check(&job, &renamed).unwrap();
-        assert_eq!(check(&fixtures::job(), &renamed).map_err(|error| error.label()), Err("environment"));
+        assert_eq!(
+            check(&fixtures::job(), &renamed).map_err(|error| error.label()),
+            Err("environment")
+        );
         episodes(&renamed, &job, policy(1, 1, 1).as_ref()).unwrap();
         assert_eq!(renamed.0.into_inner().unwrap(), [5, 5]);
     }
 
-    /// A file of some megabytes asks for 66 GB: a value of each of 65,535 tiny critics for each of 256,000 candidates.
+    /// A file of some megabytes asks for 66 GB: a value of each of 65,535 tiny critics for each of
+    /// 256,000 candidates.
     #[test]
     fn the_memory_of_a_policy_is_known_before_it_is_taken() {
         assert!(check_memory(&job(10), policy(256, 10, 50).as_ref()).is_ok(), "the paper's");
         assert!(check_memory(&job(1), policy(1, 65_535, 1).as_ref()).is_ok());
         let many_critics = check_memory(&job(256), policy(1, 65_535, 1000).as_ref());
-        assert!(matches!(many_critics, Err(JobError::Memory(66_000_000_000..))), "{many_critics:?}");
+        assert!(
+            matches!(many_critics, Err(JobError::Memory(66_000_000_000..))),
+            "{many_critics:?}"
+        );
     }
 }

@@ -1,10 +1,11 @@
 //! Serving: finds runs, evaluates the snapshots that their learners publish, delivers the scores.
 //!
-//! Owns the sessions, one for each endpoint, and the state of all communication with learners, which need not last. One task
-//! on the main thread does the work in turn. A job's episodes run on a thread of their own and on rayon's, blocking calls of
-//! Zenoh on tokio's, and Zenoh's own threads decode messages. Only the command line calls this module; it uses `sim`. An
-//! evaluator that is told to leave hands its job back; the learner gives the job of a killed evaluator to another when the
-//! lease ends.
+//! Owns the sessions, one for each endpoint, and the state of all communication with learners,
+//! which need not last. One task on the main thread does the work in turn. A job's episodes run on
+//! a thread of their own and on rayon's, blocking calls of Zenoh on tokio's, and Zenoh's own
+//! threads decode messages. Only the command line calls this module; it uses `sim`. An evaluator
+//! that is told to leave hands its job back; the learner gives the job of a killed evaluator to
+//! another when the lease ends.
 //!
 //! # Layout
 //!
@@ -12,7 +13,8 @@
 //!
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
 //! - `worker`: the main loop, which serves the runs in turn; `scheduler`: chooses the next run.
-//! - `client`: all communication with the learner of one run, with `delivery` of scores; `query`: a query to a learner.
+//! - `client`: all communication with the learner of one run, with `delivery` of scores; `query`: a
+//!   query to a learner.
 //! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy from one.
 //! - `evaluate`: one job, from its policy to its scores; `job`: all of its episodes, as one batch.
 
@@ -38,8 +40,8 @@ use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_runtime::{
-    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, Role, SessionError, default_endpoint,
-    parse_endpoint,
+    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, Role, SessionError,
+    default_endpoint, parse_endpoint,
 };
 use rand::Rng;
 use tracing::{info, warn};
@@ -70,7 +72,8 @@ pub struct ServeArgs {
     /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Vec<String>,
-    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES]
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
+    /// [default: QUAD_CERTIFICATES]
     #[arg(long, value_name = "DIR")]
     pub certificates: Option<PathBuf>,
     /// Address of /metrics and /healthz; port 0 takes a free one
@@ -79,7 +82,8 @@ pub struct ServeArgs {
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
     pub name: Option<Name>,
-    /// Precision of the networks: f32, or bf16, which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16
+    /// Precision of the networks: f32, or bf16, which rounds and is faster on CPUs with AMX or
+    /// AMD's AVX512-BF16
     #[arg(long, value_name = "NAME", default_value = "f32")]
     pub precision: Precision,
 }
@@ -87,7 +91,8 @@ pub struct ServeArgs {
 /// How long the process waits for its threads at the end.
 const LEAVE: Duration = Duration::from_secs(1);
 
-/// The evaluator counts as stuck if it has made no progress for this long. It waits up to half a minute for weights.
+/// The evaluator counts as stuck if it has made no progress for this long. It waits up to half a
+/// minute for weights.
 const STUCK: Duration = Duration::from_secs(60);
 
 /// Serves these environments until a signal to end.
@@ -107,7 +112,10 @@ pub fn serve(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Re
     result
 }
 
-async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Result<()> {
+async fn serve_until_stopped(
+    args: ServeArgs,
+    environments: Arc<dyn Environments>,
+) -> anyhow::Result<()> {
     let stop = quad_runtime::shutdown_signal(quad_runtime::LEAVE_WITHIN);
     let metrics = Metrics::new().context("cannot register the metrics")?;
     let name = args.name.map_or_else(unique_name, Ok)?;
@@ -121,13 +129,15 @@ async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments
     let _server = match args.http {
         Some(address) => {
             let (registry, health) = (metrics.registry.clone(), health.clone());
-            let server = quad_runtime::serve_metrics(address, registry, health, Default::default()).await?;
+            let server =
+                quad_runtime::serve_metrics(address, registry, health, Default::default()).await?;
             info!("metrics at http://{}/metrics", server.address);
             Some(server)
         }
         None => None,
     };
-    let mut discovery = Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
+    let mut discovery =
+        Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
     let beat = health.part("worker", STUCK);
     let evaluator = Evaluator::new(name, environments, args.precision, metrics.clone(), beat);
     let worker = Worker::new(evaluator, metrics.clone(), discovery.runs());
@@ -157,8 +167,9 @@ fn endpoints(mut connect: Vec<String>, certificates: Option<&Path>) -> anyhow::R
 
 /// Gives a freed snapshot's memory back to the system at once.
 ///
-/// By default glibc learns from the first freed snapshot to serve later ones from its heaps, one per thread, which never
-/// shrink: with the paper's networks the process then has 150 MB instead of 50.
+/// By default glibc learns from the first freed snapshot to serve later ones from its heaps, one
+/// per thread, which never shrink: with the paper's networks the process then has 150 MB instead of
+/// 50.
 fn keep_heap_small() {
     // Snapshots are larger than this; what a step of a batch needs is smaller.
     const LARGE_BLOCK: i32 = 2 << 20;
@@ -169,8 +180,10 @@ fn keep_heap_small() {
 /// Host and process for readers, and a random part, because containers may share both.
 fn unique_name() -> anyhow::Result<Name> {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let host: String = host.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
+    let host: String =
+        host.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
     let host = if host.is_empty() { "evaluator" } else { &host };
     let random: u16 = rand::rng().random();
-    Name::new(format!("{host}-{}-{random:04x}", std::process::id())).context("cannot make up a name for this evaluator")
+    Name::new(format!("{host}-{}-{random:04x}", std::process::id()))
+        .context("cannot make up a name for this evaluator")
 }

@@ -21,7 +21,10 @@ pub fn load(
     if (environment.as_str(), sizes) == (wanted, wanted_sizes) {
         return Ok(policy);
     }
-    Err(JobError::OtherEnvironment { found: described(&environment, sizes), wanted: described(wanted, wanted_sizes) })
+    Err(JobError::OtherEnvironment {
+        found: described(&environment, sizes),
+        wanted: described(wanted, wanted_sizes),
+    })
 }
 
 /// An environment with its sizes.
@@ -39,10 +42,15 @@ mod tests {
 
     #[test]
     fn a_snapshot_is_loaded_only_for_its_own_environment() {
-        let label =
-            |file| load(&snapshot(file), ("hopper", Some((11, 3))), Precision::F32).err().map(|error| error.label());
-        let (observes_more, acts_more) =
-            (DiffusionShape { observation_dim: 17, ..smallest() }, DiffusionShape { action_dim: 6, ..smallest() });
+        let label = |file| {
+            load(&snapshot(file), ("hopper", Some((11, 3))), Precision::F32)
+                .err()
+                .map(|error| error.label())
+        };
+        let (observes_more, acts_more) = (
+            DiffusionShape { observation_dim: 17, ..smallest() },
+            DiffusionShape { action_dim: 6, ..smallest() },
+        );
         let hopper = file("hopper", smallest(), 1);
         assert_eq!(label(hopper.clone()), None);
         for other in [

@@ -11,7 +11,8 @@ use crate::metrics::Metrics;
 
 /// Most answers to one query that wait; one is enough, and few peers answer.
 const MOST_ANSWERS: usize = 64;
-/// Zenoh's own error where an answer has not come in time. It looks like a learner's, which it is not.
+/// Zenoh's own error where an answer has not come in time. It looks like a learner's, which it is
+/// not.
 const LATE: &[u8] = b"Timeout";
 /// Most bytes of a learner's error in a message.
 const LONGEST_ERROR: usize = 200;
@@ -29,17 +30,18 @@ pub enum AskError {
     Send { key: String, reason: String },
 }
 
-/// Runs a call of Zenoh on a thread that may block. Zenoh's `get` and declarations do all their work in the first poll of
-/// their futures. While a peer does not read, that poll blocks until Zenoh closes the connection after two seconds, and the
-/// awaiting task with it.
+/// Runs a call of Zenoh on a thread that may block. Zenoh's `get` and declarations do all their
+/// work in the first poll of their futures. While a peer does not read, that poll blocks until
+/// Zenoh closes the connection after two seconds, and the awaiting task with it.
 pub async fn may_block<T: Send + 'static>(
     call: impl FnOnce() -> zenoh::Result<T> + Send + 'static,
 ) -> anyhow::Result<T> {
     tokio::task::spawn_blocking(call).await?.map_err(|error| anyhow::anyhow!(error))
 }
 
-/// Sends `question` to every learner at `key`. Returns the first answer that can be decoded and that `fitting` accepts,
-/// without waiting for further ones; for a wrong answer `fitting` returns the label of the reason.
+/// Sends `question` to every learner at `key`. Returns the first answer that can be decoded and
+/// that `fitting` accepts, without waiting for further ones; for a wrong answer `fitting` returns
+/// the label of the reason.
 pub async fn ask<A: Message + Send + 'static>(
     session: &Session,
     key: String,
@@ -53,20 +55,27 @@ pub async fn ask<A: Message + Send + 'static>(
         let (session, metrics, key) = (session.clone(), metrics.clone(), key.clone());
         move || {
             let callback = move |reply: Reply| {
-                let is_late = reply.result().err().is_some_and(|error| *error.payload().to_bytes() == *LATE);
+                let is_late =
+                    reply.result().err().is_some_and(|error| *error.payload().to_bytes() == *LATE);
                 if !is_late && !tell.is_closed() {
                     tell.try_send(read(&reply, &metrics, &fitting)).ok();
                 }
             };
-            // All targets: the best matching target would be any peer that claims to be complete. No consolidation, which
-            // would hold answers back until every peer has answered.
+            // All targets: the best matching target would be any peer that claims to be complete.
+            // No consolidation, which would hold answers back until every peer has answered.
             let get = session.get(key).payload(question).timeout(timeout);
-            get.target(QueryTarget::All).consolidation(ConsolidationMode::None).callback(callback).wait()
+            get.target(QueryTarget::All)
+                .consolidation(ConsolidationMode::None)
+                .callback(callback)
+                .wait()
         }
     };
-    may_block(get).await.map_err(|error| AskError::Send { key: key.clone(), reason: error.to_string() })?;
+    may_block(get)
+        .await
+        .map_err(|error| AskError::Send { key: key.clone(), reason: error.to_string() })?;
     let mut unusable = None;
-    // Zenoh drops the callback, and with it the sender of the channel, after the last answer or the timeout.
+    // Zenoh drops the callback, and with it the sender of the channel, after the last answer or the
+    // timeout.
     while let Some(answer) = told.recv().await {
         match answer {
             Ok(answer) => return Ok(answer),
@@ -86,10 +95,12 @@ fn read<A: Message>(
 ) -> Result<A, String> {
     match reply.result() {
         Ok(sample) => {
-            let answer = decode_from(sample.payload().len(), sample.payload().reader()).map_err(|error| {
-                metrics.rejected(error.label());
-                error.to_string()
-            })?;
+            let answer = decode_from(sample.payload().len(), sample.payload().reader()).map_err(
+                |error| {
+                    metrics.rejected(error.label());
+                    error.to_string()
+                },
+            )?;
             fitting(&answer).map_err(|label| {
                 metrics.rejected(label);
                 format!("it is not from the learner that was asked ({label})")
@@ -116,11 +127,14 @@ mod tests {
 
     const GLANCE: Duration = Duration::from_millis(10);
 
-    /// Asks a learner that reads nothing until the task that asks lets it read on. Whether there is an answer.
+    /// Asks a learner that reads nothing until the task that asks lets it read on. Whether there is
+    /// an answer.
     async fn is_answered() -> bool {
-        let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+        let listen =
+            Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let learner = open_session(&listen).await.unwrap();
-        let (stalls, has_stalled) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicBool::new(false)));
+        let (stalls, has_stalled) =
+            (Arc::new(AtomicBool::new(true)), Arc::new(AtomicBool::new(false)));
         // Until this callback returns, the learner's session reads nothing.
         let callback = {
             let (stalls, has_stalled) = (stalls.clone(), has_stalled.clone());
@@ -137,7 +151,10 @@ mod tests {
         };
         let _jobs = learner.declare_queryable("quad/run/jobs").callback(answers).await.unwrap();
         let _flooded = learner.declare_subscriber("flood").callback(callback).await.unwrap();
-        let connect = Endpoints { connect: reachable_at(&learner, &listen).await.unwrap(), ..Endpoints::default() };
+        let connect = Endpoints {
+            connect: reachable_at(&learner, &listen).await.unwrap(),
+            ..Endpoints::default()
+        };
         let evaluator = open_session(&connect).await.unwrap();
         let reaches = async {
             while !has_stalled.load(Relaxed) {
@@ -160,7 +177,8 @@ mod tests {
         tokio::join!(asked, reads_on).0.is_ok()
     }
 
-    /// A task that waits for the peer does so until Zenoh has closed the connection, and lets nothing be read before.
+    /// A task that waits for the peer does so until Zenoh has closed the connection, and lets
+    /// nothing be read before.
     #[tokio::test(flavor = "multi_thread")]
     async fn a_peer_that_does_not_read_does_not_stop_the_task_that_asks() {
         // Where the machine is too busy, Zenoh may close it all the same.

@@ -36,7 +36,8 @@ impl Turn {
         }
     }
 
-    /// After a turn that went well: the next turn comes when every other due run had its turn, and `pause` is over.
+    /// After a turn that went well: the next turn comes when every other due run had its turn, and
+    /// `pause` is over.
     pub fn done(&mut self, now: Instant, pause: Duration) {
         *self = Turn::new(now + pause);
     }
@@ -75,7 +76,9 @@ mod tests {
         let mut now = start;
         let mut runs: Vec<_> = kinds.iter().map(|kind| (*kind, Turn::new(start), 0)).collect();
         while now - start < Duration::from_secs(600) {
-            let Some(index) = next(runs.iter().enumerate().map(|(index, run)| (index, &run.1)), now) else {
+            let Some(index) =
+                next(runs.iter().enumerate().map(|(index, run)| (index, &run.1)), now)
+            else {
                 now += Duration::from_millis(10);
                 continue;
             };

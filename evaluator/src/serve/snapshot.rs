@@ -1,4 +1,5 @@
-//! Keeps the newest snapshots. Each published snapshot is decoded and verified once, when it arrives.
+//! Keeps the newest snapshots. Each published snapshot is decoded and verified once, when it
+//! arrives.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -80,9 +81,11 @@ struct State {
 }
 
 impl Listener {
-    /// Subscribes to `quad/<run>/weights` and puts the snapshots of the [followed](Self::follow) learner into `snapshots`.
+    /// Subscribes to `quad/<run>/weights` and puts the snapshots of the [followed](Self::follow)
+    /// learner into `snapshots`.
     ///
-    /// Zenoh's receiving thread also decodes and verifies: that takes milliseconds, in which it receives no other message.
+    /// Zenoh's receiving thread also decodes and verifies: that takes milliseconds, in which it
+    /// receives no other message.
     pub async fn start(
         session: &Session,
         run: Name,
@@ -123,16 +126,20 @@ impl Listener {
     }
 }
 
-/// Decodes a snapshot of the followed learner; on failure returns the label of the reason, and a message.
+/// Decodes a snapshot of the followed learner; on failure returns the label of the reason, and a
+/// message.
 fn read(sample: &Sample, run: &Name, state: &State) -> Result<Snapshot, (&'static str, String)> {
     let payload = sample.payload();
-    let snapshot: Snapshot =
-        decode_from(payload.len(), payload.reader()).map_err(|error| (error.label(), error.to_string()))?;
+    let snapshot: Snapshot = decode_from(payload.len(), payload.reader())
+        .map_err(|error| (error.label(), error.to_string()))?;
     if snapshot.run != *run {
         return Err(("other_run", format!("it is of run {}", snapshot.run)));
     }
     if snapshot.incarnation != state.incarnation.load(Relaxed) {
-        return Err(("other_incarnation", "it is from another learner than the one that is followed".to_owned()));
+        return Err((
+            "other_incarnation",
+            "it is from another learner than the one that is followed".to_owned(),
+        ));
     }
     Ok(snapshot)
 }

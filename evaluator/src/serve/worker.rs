@@ -31,12 +31,21 @@ pub struct Worker {
 impl Worker {
     /// A worker for the runs that `found` names.
     pub fn new(evaluator: Evaluator, metrics: Metrics, found: watch::Receiver<Runs>) -> Worker {
-        Worker { evaluator, metrics, found, clients: BTreeMap::new(), snapshots: Snapshots::default() }
+        Worker {
+            evaluator,
+            metrics,
+            found,
+            clients: BTreeMap::new(),
+            snapshots: Snapshots::default(),
+        }
     }
 
-    /// Serves until `stop` is ready, and returns its result. Then hands an unfinished job back, and delivers scores that were
-    /// not acknowledged.
-    pub async fn run(mut self, stop: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
+    /// Serves until `stop` is ready, and returns its result. Then hands an unfinished job back, and
+    /// delivers scores that were not acknowledged.
+    pub async fn run(
+        mut self,
+        stop: impl Future<Output = anyhow::Result<()>>,
+    ) -> anyhow::Result<()> {
         let result = tokio::select! {
             biased;
             result = stop => result,
@@ -55,7 +64,8 @@ impl Worker {
             self.attach().await;
             self.metrics.runs.set(self.clients.len() as i64);
             let there = self.clients.iter().filter(|(_, client)| client.gone.is_none());
-            let next = scheduler::next(there.map(|(key, client)| (key, &client.turn)), Instant::now());
+            let next =
+                scheduler::next(there.map(|(key, client)| (key, &client.turn)), Instant::now());
             match next.cloned() {
                 Some(key) => self.turn(&key).await,
                 None => {
@@ -87,9 +97,13 @@ impl Worker {
     /// Starts to serve new runs.
     async fn attach(&mut self) {
         let found = self.found.borrow().clone();
-        for (key, learner) in found.iter().filter(|(key, _)| !self.clients.contains_key(*key)).collect::<Vec<_>>() {
+        for (key, learner) in
+            found.iter().filter(|(key, _)| !self.clients.contains_key(*key)).collect::<Vec<_>>()
+        {
             let (name, snapshots) = (self.evaluator.name.clone(), self.snapshots.clone());
-            match RunClient::attach(key.1.clone(), learner, name, snapshots, self.metrics.clone()).await {
+            match RunClient::attach(key.1.clone(), learner, name, snapshots, self.metrics.clone())
+                .await
+            {
                 Ok(client) => drop(self.clients.insert(key.clone(), client)),
                 Err(error) => warn!("{error:#}"),
             }
@@ -153,7 +167,8 @@ mod tests {
     #[tokio::test(flavor = "multi_thread")]
     async fn an_evaluator_without_work_is_well() {
         let (health, (_keep, found)) = (Health::default(), watch::channel(Runs::new()));
-        let (name, metrics, limit) = (Name::new("idle").unwrap(), Metrics::new().unwrap(), Duration::from_secs(1));
+        let (name, metrics, limit) =
+            (Name::new("idle").unwrap(), Metrics::new().unwrap(), Duration::from_secs(1));
         let (environments, beat) = (Arc::new(Simulations), health.part("worker", limit));
         let evaluator = Evaluator::new(name, environments, Precision::F32, metrics.clone(), beat);
         // One that says nothing is not well any more by then, and stays so.

@@ -1,4 +1,5 @@
-//! What an environment is: the interface between a policy and a simulation, in this program or in another language.
+//! What an environment is: the interface between a policy and a simulation, in this program or in
+//! another language.
 
 use quad_protocol::EpisodeScore;
 use thiserror::Error;
@@ -10,7 +11,8 @@ pub struct Step {
     pub reward: f64,
     /// The task ended the episode here: there is no future to bootstrap from.
     pub terminated: bool,
-    /// The time limit was reached here. Independent of `terminated`, as in Gymnasium: both may be true.
+    /// The time limit was reached here. Independent of `terminated`, as in Gymnasium: both may be
+    /// true.
     pub truncated: bool,
 }
 
@@ -37,15 +39,20 @@ pub trait Environments: Send + Sync {
     /// The names that learners may ask for.
     fn names(&self) -> Vec<String>;
 
-    /// The sizes of an observation and of an action, if they are known before an environment exists.
+    /// The sizes of an observation and of an action, if they are known before an environment
+    /// exists.
     fn sizes(&self, name: &str) -> Option<(usize, usize)>;
 
-    /// Makes an environment. `environment_seed` is the seed of what the environment draws once and keeps over all episodes, if
-    /// anything.
+    /// Makes an environment. `environment_seed` is the seed of what the environment draws once and
+    /// keeps over all episodes, if anything.
     ///
     /// # Errors
     /// The name is none of [`Self::names`], or the environment cannot be made.
-    fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError>;
+    fn make(
+        &self,
+        name: &str,
+        environment_seed: u64,
+    ) -> Result<Box<dyn Environment>, EnvironmentError>;
 }
 
 /// Why an environment is missing or failed.

@@ -2,22 +2,26 @@
 //!
 //! The mazes, the ant and the rules are those of D4RL's antmaze-*-v0 and antmaze-*-v2:
 //!
-//! - qpos (15): the torso's x, y, z and quaternion (w first), then hip and ankle of legs 1 to 4; qvel (14): the torso's
-//!   linear and angular velocities, then the joints'. Meters and radians, per second.
+//! - qpos (15): the torso's x, y, z and quaternion (w first), then hip and ankle of legs 1 to 4;
+//!   qvel (14): the torso's linear and angular velocities, then the joints'. Meters and radians,
+//!   per second.
 //! - Observation (29): qpos and qvel. The goal is not part of it.
-//! - Action (8): torques of hip and ankle of legs 4, 1, 2 and 3, as fractions of 30 Nm, clipped to ±1; held for 0.1 s.
-//! - An episode begins in the maze's `R` and ends in the step that brings the torso's center within 0.5 m of the goal. The
-//!   reward of that step is 1, of every other 0. Only the goal and the time limit end an episode: an ant on its back
-//!   continues.
-//! - The goal lies around the corner of cell `G`: on each axis max(0, the cell's center + U(0, 1) + U(0, 0.5)), drawn when
-//!   the table says ([`Goal`]).
+//! - Action (8): torques of hip and ankle of legs 4, 1, 2 and 3, as fractions of 30 Nm, clipped to
+//!   ±1; held for 0.1 s.
+//! - An episode begins in the maze's `R` and ends in the step that brings the torso's center within
+//!   0.5 m of the goal. The reward of that step is 1, of every other 0. Only the goal and the time
+//!   limit end an episode: an ant on its back continues.
+//! - The goal lies around the corner of cell `G`: on each axis max(0, the cell's center + U(0, 1) +
+//!   U(0, 0.5)), drawn when the table says ([`Goal`]).
 //!
-//! OGBench's antmaze-*-singletask-* differ in three things: the episode begins within 1 m, on each axis, of the center of the
-//! task's own cell; the goal is the center of another; and a step is judged where it begins, so that an episode ends one step after
-//! the ant has come there. Rewards are 1 more than OGBench's, so that a return is 0 or 1, too.
+//! OGBench's antmaze-*-singletask-* differ in three things: the episode begins within 1 m, on each
+//! axis, of the center of the task's own cell; the goal is the center of another; and a step is
+//! judged where it begins, so that an episode ends one step after the ant has come there. Rewards
+//! are 1 more than OGBench's, so that a return is 0 or 1, too.
 //!
-//! OGBench's pointmaze-*-singletask-* have a ball in place of the ant. It observes x and y. An action (2) puts it at once as much
-//! further, as fractions of 0.2 m on each axis, without any velocity; then walls push it back for 0.1 s. It is at the goal within 1 m.
+//! OGBench's pointmaze-*-singletask-* have a ball in place of the ant. It observes x and y. An
+//! action (2) puts it at once as much further, as fractions of 0.2 m on each axis, without any
+//! velocity; then walls push it back for 0.1 s. It is at the goal within 1 m.
 
 use quad_dataset::environment::Goal;
 use quad_dataset::ogbench::{self, ANT_REACH, CELL, MazeTask};
@@ -39,8 +43,11 @@ const START_NOISE: f64 = 1.0;
 /// Steps of the model that a control is held for, of 0.02 s each.
 pub(super) const FRAME_SKIP: usize = 5;
 /// How both robots begin. The ball's observation has no room for velocities.
-pub(super) const BODY: Body =
-    Body { noise: Noise::NormalVelocities(0.1), hidden_positions: 0, observed_velocity: f64::INFINITY };
+pub(super) const BODY: Body = Body {
+    noise: Noise::NormalVelocities(0.1),
+    hidden_positions: 0,
+    observed_velocity: f64::INFINITY,
+};
 
 /// What moves through a maze.
 #[derive(Clone, Copy)]
@@ -61,7 +68,8 @@ impl Robot {
     }
 }
 
-/// A maze's map, as its row in the table has it. The world's origin is the center of the cell (1, 1), which is the start.
+/// A maze's map, as its row in the table has it. The world's origin is the center of the cell (1,
+/// 1), which is the start.
 #[derive(Clone, Copy)]
 pub(super) struct Maze(pub &'static [String]);
 
@@ -76,8 +84,10 @@ impl Maze {
 
     /// The model: `robot`, which has a floor, and a box for each wall, half a cell high.
     pub fn mjcf(self, robot: &str) -> String {
-        let walls: String =
-            self.centers(b'1').map(|[x, y]| format!("<geom class=\"wall\" pos=\"{x} {y} 1\"/>\n    ")).collect();
+        let walls: String = self
+            .centers(b'1')
+            .map(|[x, y]| format!("<geom class=\"wall\" pos=\"{x} {y} 1\"/>\n    "))
+            .collect();
         robot.replacen(WALLS, walls.trim_end(), 1)
     }
 
@@ -109,7 +119,8 @@ impl Navigation {
 
 impl Task for Navigation {
     fn judge(&self, from: [f64; 2], physics: &Physics) -> (f64, bool) {
-        let place = if self.task.is_some() { from } else { [0, 1].map(|axis| physics.qpos()[axis]) };
+        let place =
+            if self.task.is_some() { from } else { [0, 1].map(|axis| physics.qpos()[axis]) };
         let [dx, dy] = [0, 1].map(|axis| place[axis] - self.goal[axis]);
         let reached = (dx * dx + dy * dy).sqrt() <= self.task.map_or(ANT_REACH, |task| task.reach);
         (f64::from(u8::from(reached)), reached)
@@ -176,11 +187,17 @@ mod tests {
         for seed in 0..200 {
             ant.reset(seed);
             assert_eq!(ant.goal(), Some(&[0.0, 0.0][..]));
-            for ([least, most], (x, center)) in starts.iter_mut().zip(ant.qpos().iter().zip([52.0, 28.0])) {
+            for ([least, most], (x, center)) in
+                starts.iter_mut().zip(ant.qpos().iter().zip([52.0, 28.0]))
+            {
                 (*least, *most) = (least.min(x - center), most.max(x - center));
             }
         }
-        assert!(starts.iter().all(|[least, most]| (-1.0..-0.95).contains(least) && (0.95..1.0).contains(most)));
+        assert!(
+            starts
+                .iter()
+                .all(|[least, most]| (-1.0..-0.95).contains(least) && (0.95..1.0).contains(most))
+        );
         let [mut qpos, qvel] = [ant.qpos().to_vec(), vec![0.0; 14]];
         qpos[..2].copy_from_slice(&[0.0, 0.51]);
         let mut step = |velocity: f64| {
@@ -197,17 +214,25 @@ mod tests {
     #[test]
     fn goals_lie_beyond_the_center_of_their_cell() {
         let seeds: Vec<u64> = (0..500).collect();
-        for (name, center) in [("umaze", [0.0, 8.0]), ("medium", [20.0, 20.0]), ("large", [32.0, 24.0])] {
+        for (name, center) in
+            [("umaze", [0.0, 8.0]), ("medium", [20.0, 20.0]), ("large", [32.0, 24.0])]
+        {
             let goals = goals(&format!("antmaze-{name}"), 0, &seeds);
             for axis in [0, 1] {
                 let beyond: Vec<f64> = goals.iter().map(|goal| goal[axis] - center[axis]).collect();
                 let mean = beyond.iter().sum::<f64>() / beyond.len() as f64;
-                let variance = beyond.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / beyond.len() as f64;
+                let variance =
+                    beyond.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / beyond.len() as f64;
                 assert!(beyond.iter().all(|x| (0.0..1.5).contains(x)));
                 assert!((mean - 0.75).abs() < 0.05, "{mean}");
-                assert!((variance - (1.0 + 0.25) / 12.0).abs() < 0.015, "{variance}: two uniform draws");
+                assert!(
+                    (variance - (1.0 + 0.25) / 12.0).abs() < 0.015,
+                    "{variance}: two uniform draws"
+                );
             }
-            let products = goals.iter().map(|goal| (goal[0] - center[0] - 0.75) * (goal[1] - center[1] - 0.75));
+            let products = goals
+                .iter()
+                .map(|goal| (goal[0] - center[0] - 0.75) * (goal[1] - center[1] - 0.75));
             assert!(products.sum::<f64>().abs() / 500.0 < 0.02, "the axes are drawn apart");
         }
     }

@@ -1,15 +1,17 @@
 //! Simulation: environments, and batches of episodes.
 //!
-//! Owns the compiled MuJoCo models, which the process shares. Everything runs on the calling thread; a rollout shares the
-//! physics among rayon's threads. `serve` and `tools` call this module; it calls neither, and knows nothing of the network.
+//! Owns the compiled MuJoCo models, which the process shares. Everything runs on the calling
+//! thread; a rollout shares the physics among rayon's threads. `serve` and `tools` call this
+//! module; it calls neither, and knows nothing of the network.
 //!
 //! # Layout
 //!
 //! In reading order:
 //!
-//! - `environment`: the traits of an environment; `simulation`: an environment that this program simulates; `physics`: drives
-//!   MuJoCo for it.
-//! - `planar` (Hopper, HalfCheetah, Walker2d), `maze`: the tasks, with the rules that D4RL's scores are defined by.
+//! - `environment`: the traits of an environment; `simulation`: an environment that this program
+//!   simulates; `physics`: drives MuJoCo for it.
+//! - `planar` (Hopper, HalfCheetah, Walker2d), `maze`: the tasks, with the rules that D4RL's scores
+//!   are defined by.
 //! - `simulations`: makes an environment by its row in the dataset crate's table.
 //! - `rollout`: many episodes as one batch, one policy call for each step.
 

@@ -17,22 +17,28 @@ use super::environment::EnvironmentError;
 /// The stream that initial states are drawn from, among those of an episode's seed.
 const RESET_STREAM: u64 = 1;
 
-/// The compiled model of a simulation. If the process does not have it yet, it is compiled from the text that `mjcf` gives.
-pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> Result<Arc<MjModel>, EnvironmentError> {
+/// The compiled model of a simulation. If the process does not have it yet, it is compiled from the
+/// text that `mjcf` gives.
+pub(super) fn model(
+    simulation: &'static str,
+    mjcf: impl FnOnce() -> String,
+) -> Result<Arc<MjModel>, EnvironmentError> {
     static MODELS: Mutex<BTreeMap<&str, Arc<MjModel>>> = Mutex::new(BTreeMap::new());
     static LOGGING: Once = Once::new();
     let mut models = MODELS.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(model) = models.get(simulation) {
         return Ok(Arc::clone(model));
     }
-    // SAFETY: every use of MuJoCo in this program starts with a compiled model, so none runs before this.
+    // SAFETY: every use of MuJoCo in this program starts with a compiled model, so none runs before
+    // this.
     LOGGING.call_once(|| unsafe { set_log_handler(log) });
     let model = MjModel::from_xml_string(&mjcf())
         .map_err(|error| EnvironmentError::Model { simulation, reason: error.to_string() })?;
     Ok(Arc::clone(models.entry(simulation).or_insert(Arc::new(model))))
 }
 
-/// Sends MuJoCo's messages to this program's log. MuJoCo's own handler appends to `MUJOCO_LOG.TXT` in the working directory.
+/// Sends MuJoCo's messages to this program's log. MuJoCo's own handler appends to `MUJOCO_LOG.TXT`
+/// in the working directory.
 fn log(message: &MjLogMessage) {
     tracing::debug!(target: "mujoco", "{}", message.subject());
 }
@@ -42,7 +48,8 @@ fn log(message: &MjLogMessage) {
 pub(super) enum Drive {
     /// Its numbers are torques, as fractions of each motor's strongest.
     Motors,
-    /// Before a step they are added to the positions, as fractions of so many meters, and velocities become 0.
+    /// Before a step they are added to the positions, as fractions of so many meters, and
+    /// velocities become 0.
     Displacement(f64),
 }
 
@@ -55,8 +62,13 @@ pub(super) struct Physics {
 
 impl Physics {
     /// A simulation that holds each control for `frame_skip` of the model's time steps.
-    pub(super) fn new(model: Arc<MjModel>, frame_skip: usize, drive: Drive) -> Result<Self, EnvironmentError> {
-        let data = MjData::try_new(model).map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
+    pub(super) fn new(
+        model: Arc<MjModel>,
+        frame_skip: usize,
+        drive: Drive,
+    ) -> Result<Self, EnvironmentError> {
+        let data = MjData::try_new(model)
+            .map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
         Ok(Self { data, frame_skip, drive })
     }
 
@@ -78,7 +90,8 @@ impl Physics {
         self.data.ctrl()
     }
 
-    /// Restarts from the model's initial state with noise drawn from `seed`; the first two positions may be given.
+    /// Restarts from the model's initial state with noise drawn from `seed`; the first two
+    /// positions may be given.
     pub(super) fn reset(&mut self, seed: u64, noise: Noise, place: Option<[f64; 2]>) {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(RESET_STREAM);
@@ -115,15 +128,19 @@ impl Physics {
 
     /// Restarts from the state that `init` makes of the model's initial `(qpos, qvel)`.
     ///
-    /// As in Gymnasium, this computes the accelerations after a reset: they warm-start the solver, so the first step depends
-    /// on them slightly.
+    /// As in Gymnasium, this computes the accelerations after a reset: they warm-start the solver,
+    /// so the first step depends on them slightly.
     fn start(&mut self, init: impl FnOnce(&mut [f64], &mut [f64])) {
         self.data.reset();
-        // SAFETY: MuJoCo allocates both arrays, separately and with these lengths, for the life of `data`.
+        // SAFETY: MuJoCo allocates both arrays, separately and with these lengths, for the life of
+        // `data`.
         let (qpos, qvel) = unsafe {
             let (nq, nv) = (self.data.qpos().len(), self.data.qvel().len());
             let raw = self.data.ffi_mut();
-            (std::slice::from_raw_parts_mut(raw.qpos, nq), std::slice::from_raw_parts_mut(raw.qvel, nv))
+            (
+                std::slice::from_raw_parts_mut(raw.qpos, nq),
+                std::slice::from_raw_parts_mut(raw.qvel, nv),
+            )
         };
         init(qpos, qvel);
         self.data.forward();
@@ -131,8 +148,8 @@ impl Physics {
 
     /// Applies `action`, clipped to ±1, for one control period.
     ///
-    /// False if the step failed: an action that is not a number is not applied; when a simulation diverges, MuJoCo replaces
-    /// the state by the initial one.
+    /// False if the step failed: an action that is not a number is not applied; when a simulation
+    /// diverges, MuJoCo replaces the state by the initial one.
     #[must_use]
     pub(super) fn step(&mut self, action: &[f32]) -> bool {
         if action.iter().any(|value| value.is_nan()) {

@@ -1,16 +1,19 @@
-//! Robots in a vertical plane, rewarded for running along x: Hopper, HalfCheetah, Walker2d, and any other with a row `planar` in
-//! the table of environments.
+//! Robots in a vertical plane, rewarded for running along x: Hopper, HalfCheetah, Walker2d, and any
+//! other with a row `planar` in the table of environments.
 //!
-//! The three are D4RL's locomotion-v2 tasks, gym's "-v2" and Gymnasium's "-v4", and differ in a model and the numbers of their
-//! rows:
+//! The three are D4RL's locomotion-v2 tasks, gym's "-v2" and Gymnasium's "-v4", and differ in a
+//! model and the numbers of their rows:
 //!
-//! - qpos: x, z and pitch of the torso, then the joints from the hip down (HalfCheetah: the back leg first; Walker2d:
-//!   the right one); qvel: their velocities. Meters and radians, per second.
+//! - qpos: x, z and pitch of the torso, then the joints from the hip down (HalfCheetah: the back
+//!   leg first; Walker2d: the right one); qvel: their velocities. Meters and radians, per second.
 //! - Observation: qpos without x, then qvel, clipped to ± `observed_velocity`.
-//! - Action: torques of the joints in that order, as fractions of the motors' strongest, clipped to ±1.
-//! - Reward: x's mean velocity over the control period, plus `alive_bonus`, minus `control_cost` · Σ a², with the clipped action.
-//!   Every step earns the bonus, also the step that ends the episode.
-//! - The episode terminates when the robot is not `healthy`, and is truncated after `max_episode_steps`.
+//! - Action: torques of the joints in that order, as fractions of the motors' strongest, clipped to
+//!   ±1.
+//! - Reward: x's mean velocity over the control period, plus `alive_bonus`, minus `control_cost` ·
+//!   Σ a², with the clipped action. Every step earns the bonus, also the step that ends the
+//!   episode.
+//! - The episode terminates when the robot is not `healthy`, and is truncated after
+//!   `max_episode_steps`.
 
 use quad_dataset::Planar;
 
@@ -25,8 +28,12 @@ pub(super) fn body(robot: &Planar) -> Body {
 impl Task for &'static Planar {
     fn judge(&self, [x, _]: [f64; 2], physics: &Physics) -> (f64, bool) {
         let velocity = (physics.qpos()[0] - x) / physics.dt();
-        let cost = self.control_cost * physics.controls().iter().map(|control| control * control).sum::<f64>();
-        let terminated = self.healthy.as_ref().is_some_and(|healthy| !healthy.contains(physics.qpos(), physics.qvel()));
+        let cost = self.control_cost
+            * physics.controls().iter().map(|control| control * control).sum::<f64>();
+        let terminated = self
+            .healthy
+            .as_ref()
+            .is_some_and(|healthy| !healthy.contains(physics.qpos(), physics.qvel()));
         (velocity + self.alive_bonus - cost, terminated)
     }
 }

@@ -8,11 +8,13 @@ use serde::Serialize;
 
 use super::environment::{Environment, EnvironmentError};
 
-/// A batch of episodes that advance together: one policy call and one control period per [`step`](Rollout::step).
+/// A batch of episodes that advance together: one policy call and one control period per
+/// [`step`](Rollout::step).
 ///
-/// Episodes that have ended leave the batch, so the policy sees only live ones. An episode's outcome is a function of its seed
-/// and the policy, whatever else is in the batch, as long as the policy treats its rows independently. For that, each episode
-/// has its own `S`: what the policy carries from step to step.
+/// Episodes that have ended leave the batch, so the policy sees only live ones. An episode's
+/// outcome is a function of its seed and the policy, whatever else is in the batch, as long as the
+/// policy treats its rows independently. For that, each episode has its own `S`: what the policy
+/// carries from step to step.
 pub struct Rollout<S> {
     /// Sizes of an observation and of an action.
     sizes: (usize, usize),
@@ -56,8 +58,9 @@ pub struct EpisodeOutcome {
 }
 
 impl<S> Rollout<S> {
-    /// Begins an episode for each seed, in an environment of its own that `make` makes. `sizes` are the policy's sizes of an
-    /// observation and of an action; `begin` makes the policy's state for the episode of a seed.
+    /// Begins an episode for each seed, in an environment of its own that `make` makes. `sizes` are
+    /// the policy's sizes of an observation and of an action; `begin` makes the policy's state for
+    /// the episode of a seed.
     ///
     /// # Errors
     ///
@@ -72,7 +75,14 @@ impl<S> Rollout<S> {
         for (index, &seed) in seeds.iter().enumerate() {
             let mut environment = make()?;
             environment.reset(seed)?;
-            live.push(Episode { environment, index, seed, episode_return: 0.0, length: 0, ended: false });
+            live.push(Episode {
+                environment,
+                index,
+                seed,
+                episode_return: 0.0,
+                length: 0,
+                ended: false,
+            });
         }
         Ok(Self {
             sizes,
@@ -89,13 +99,13 @@ impl<S> Rollout<S> {
 
     /// Advances every live episode by one control period.
     ///
-    /// Calls `select` once, with the observations of n episodes in a row, the policy's states of the same episodes, and the
-    /// buffer for their actions, which it must fill.
+    /// Calls `select` once, with the observations of n episodes in a row, the policy's states of
+    /// the same episodes, and the buffer for their actions, which it must fill.
     ///
     /// # Errors
     ///
-    /// `select` failed, and no episode has advanced; or an environment failed, or an episode's return or score does not count,
-    /// and the batch is unusable.
+    /// `select` failed, and no episode has advanced; or an environment failed, or an episode's
+    /// return or score does not count, and the batch is unusable.
     pub fn step<E: From<EnvironmentError>>(
         &mut self,
         select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), E>,
@@ -113,10 +123,16 @@ impl<S> Rollout<S> {
 
         if rayon::current_num_threads() > 1 && self.live.len() > 1 {
             let actions = self.actions.par_chunks_exact(action_dim);
-            self.live.par_iter_mut().zip(actions).try_for_each(|(episode, action)| episode.step(action))?;
+            self.live
+                .par_iter_mut()
+                .zip(actions)
+                .try_for_each(|(episode, action)| episode.step(action))?;
         } else {
             let mut actions = self.actions.chunks_exact(action_dim);
-            self.live.iter_mut().zip(&mut actions).try_for_each(|(episode, action)| episode.step(action))?;
+            self.live
+                .iter_mut()
+                .zip(&mut actions)
+                .try_for_each(|(episode, action)| episode.step(action))?;
         }
         self.environment_steps += self.live.len() as u64;
         self.collect_ended()?;
@@ -129,7 +145,10 @@ impl<S> Rollout<S> {
         for episode in &self.live {
             let observation = episode.environment.observation();
             if observation.len() != self.sizes.0 {
-                return Err(EnvironmentError::Observation { found: observation.len(), wanted: self.sizes.0 });
+                return Err(EnvironmentError::Observation {
+                    found: observation.len(),
+                    wanted: self.sizes.0,
+                });
             }
             self.observations.extend(observation.iter().map(|&value| value as f32));
         }
@@ -139,7 +158,8 @@ impl<S> Rollout<S> {
     fn collect_ended(&mut self) -> Result<(), EnvironmentError> {
         for row in (0..self.live.len()).rev() {
             if self.live[row].ended {
-                let Episode { mut environment, index, seed, episode_return, length, .. } = self.live.swap_remove(row);
+                let Episode { mut environment, index, seed, episode_return, length, .. } =
+                    self.live.swap_remove(row);
                 self.states.swap_remove(row);
                 let counted = |what, value| match EpisodeScore::counts(value) {
                     true => Ok(value),

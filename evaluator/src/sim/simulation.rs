@@ -1,7 +1,8 @@
 //! A task that this program simulates: it cannot fail, and its state can be set and read.
 //!
-//! Gymnasium does not handle two cases, which here end the episode without reward for that step: a simulation that diverges,
-//! and an action that is not a number (which is not applied). So every return is finite.
+//! Gymnasium does not handle two cases, which here end the episode without reward for that step: a
+//! simulation that diverges, and an action that is not a number (which is not applied). So every
+//! return is finite.
 
 use quad_dataset::{EnvironmentSpec, Noise};
 
@@ -10,8 +11,8 @@ use super::physics::Physics;
 
 /// The rules of a task.
 pub(super) trait Task: Send {
-    /// The reward of the step that has just been taken from where the first two positions were `from`, and whether it terminated
-    /// the episode.
+    /// The reward of the step that has just been taken from where the first two positions were
+    /// `from`, and whether it terminated the episode.
     fn judge(&self, from: [f64; 2], physics: &Physics) -> (f64, bool);
 
     /// Draws what an episode of this seed has of its own.
@@ -43,7 +44,8 @@ pub(super) struct Body {
 
 /// One simulated task, with the semantics of D4RL's files.
 ///
-/// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; a rollout rounds them to `f32` for the policy.
+/// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; a rollout rounds
+/// them to `f32` for the policy.
 pub struct Simulation {
     physics: Physics,
     body: Body,
@@ -55,13 +57,18 @@ pub struct Simulation {
 
 impl Simulation {
     /// A simulation that waits for its first [`reset`](Self::reset).
-    pub(super) fn new(physics: Physics, body: Body, task: Box<dyn Task>, spec: &'static EnvironmentSpec) -> Self {
+    pub(super) fn new(
+        physics: Physics,
+        body: Body,
+        task: Box<dyn Task>,
+        spec: &'static EnvironmentSpec,
+    ) -> Self {
         let observation = vec![0.0; spec.observation_dim];
         Self { physics, body, task, observation, steps: 0, spec }
     }
 
-    /// Starts an episode. The noise on the initial state comes from a stream of `seed`, so an episode is a function of its
-    /// seed and its actions only.
+    /// Starts an episode. The noise on the initial state comes from a stream of `seed`, so an
+    /// episode is a function of its seed and its actions only.
     pub fn reset(&mut self, seed: u64) {
         self.task.begin(seed);
         self.physics.reset(seed, self.body.noise, self.task.start(seed));
@@ -74,7 +81,8 @@ impl Simulation {
         self.start();
     }
 
-    /// Moves the goal (x and y, meters) until it is drawn again; does nothing in a task without a goal.
+    /// Moves the goal (x and y, meters) until it is drawn again; does nothing in a task without a
+    /// goal.
     pub fn set_goal(&mut self, goal: &[f64]) {
         self.task.set_goal(goal);
     }
@@ -91,7 +99,8 @@ impl Simulation {
         let from = [0, 1].map(|position| self.physics.qpos()[position]);
         let went_on = self.physics.step(action);
         self.observe();
-        let (reward, terminated) = if went_on { self.task.judge(from, &self.physics) } else { (0.0, true) };
+        let (reward, terminated) =
+            if went_on { self.task.judge(from, &self.physics) } else { (0.0, true) };
         Step { reward, terminated, truncated }
     }
 
@@ -122,7 +131,8 @@ impl Simulation {
 
     fn observe(&mut self) {
         let Body { hidden_positions, observed_velocity: limit, .. } = self.body;
-        let (positions, velocities) = self.observation.split_at_mut(self.physics.qpos().len() - hidden_positions);
+        let (positions, velocities) =
+            self.observation.split_at_mut(self.physics.qpos().len() - hidden_positions);
         positions.copy_from_slice(&self.physics.qpos()[hidden_positions..]);
         for (observed, velocity) in velocities.iter_mut().zip(self.physics.qvel()) {
             *observed = velocity.clamp(-limit, limit);

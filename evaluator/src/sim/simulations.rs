@@ -45,14 +45,19 @@ impl Kind {
     }
 }
 
-/// Makes the simulation of an environment. Simulations of one model share the compiled model, so a second one costs little.
+/// Makes the simulation of an environment. Simulations of one model share the compiled model, so a
+/// second one costs little.
 ///
-/// `environment_seed` is the seed of what the environment draws once and keeps over all episodes, if anything.
+/// `environment_seed` is the seed of what the environment draws once and keeps over all episodes,
+/// if anything.
 ///
 /// # Errors
 ///
 /// MuJoCo fails.
-pub fn make(spec: &'static EnvironmentSpec, environment_seed: u64) -> Result<Simulation, EnvironmentError> {
+pub fn make(
+    spec: &'static EnvironmentSpec,
+    environment_seed: u64,
+) -> Result<Simulation, EnvironmentError> {
     let kind = Kind::of(spec);
     let model = physics::model(kind.name, || kind.mjcf())?;
     Ok(match kind.rules {
@@ -63,8 +68,14 @@ pub fn make(spec: &'static EnvironmentSpec, environment_seed: u64) -> Result<Sim
             spec,
         ),
         Rules::Maze(maze) => {
-            let (task, drive) = (Navigation::new(maze, spec, environment_seed), Robot::of(kind.name).drive);
-            Simulation::new(Physics::new(model, maze::FRAME_SKIP, drive)?, maze::BODY, Box::new(task), spec)
+            let (task, drive) =
+                (Navigation::new(maze, spec, environment_seed), Robot::of(kind.name).drive);
+            Simulation::new(
+                Physics::new(model, maze::FRAME_SKIP, drive)?,
+                maze::BODY,
+                Box::new(task),
+                spec,
+            )
         }
     })
 }
@@ -81,8 +92,13 @@ impl Environments for Simulations {
         environment::find(name).ok().map(|spec| (spec.observation_dim, spec.action_dim))
     }
 
-    fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
-        let spec = environment::find(name).map_err(|_| EnvironmentError::NotSimulated(name.to_owned()))?;
+    fn make(
+        &self,
+        name: &str,
+        environment_seed: u64,
+    ) -> Result<Box<dyn Environment>, EnvironmentError> {
+        let spec =
+            environment::find(name).map_err(|_| EnvironmentError::NotSimulated(name.to_owned()))?;
         Ok(Box::new(make(spec, environment_seed)?))
     }
 }
@@ -100,8 +116,17 @@ mod tests {
     fn every_environment_of_the_table_is_simulated() {
         for spec in environment::all() {
             let environment = make(spec, 0).unwrap();
-            let sizes = (environment.observation().len(), environment.qpos().len(), environment.qvel().len());
-            assert_eq!(sizes, (spec.observation_dim, spec.qpos_dim, spec.qvel_dim), "{}", spec.name);
+            let sizes = (
+                environment.observation().len(),
+                environment.qpos().len(),
+                environment.qvel().len(),
+            );
+            assert_eq!(
+                sizes,
+                (spec.observation_dim, spec.qpos_dim, spec.qvel_dim),
+                "{}",
+                spec.name
+            );
         }
     }
 }

@@ -1,11 +1,13 @@
-//! Replays a recorded file one step at a time from its own states, and measures how far the simulation is from it.
+//! Replays a recorded file one step at a time from its own states, and measures how far the
+//! simulation is from it.
 
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::find;
 use quad_dataset::{
-    DatasetError, EnvironmentSpec, Problem, RecordedRows, Row, environments_of_its_sizes, recorded_environment,
+    DatasetError, EnvironmentSpec, Problem, RecordedRows, Row, environments_of_its_sizes,
+    recorded_environment,
 };
 use quad_runtime::Hint;
 use rayon::prelude::*;
@@ -13,12 +15,13 @@ use serde::Serialize;
 
 use crate::sim::{self, EnvironmentError, Simulation};
 
-/// Rewards differ if their distance is larger than this (relative to 1 or to the recorded reward, whichever is larger) and
-/// larger than that of the next observation.
+/// Rewards differ if their distance is larger than this (relative to 1 or to the recorded reward,
+/// whichever is larger) and larger than that of the next observation.
 ///
-/// Files hold float32. Rounding a state to it changes the reward of a step by 1e-6; in a rare step, where a contact begins or
-/// ends, by up to 1e-2, and a velocity by far more (row 40816 of a Walker2d file: 8e-3 and 0.17). Another reward rule changes
-/// the reward of many steps whose next observation is right.
+/// Files hold float32. Rounding a state to it changes the reward of a step by 1e-6; in a rare step,
+/// where a contact begins or ends, by up to 1e-2, and a velocity by far more (row 40816 of a
+/// Walker2d file: 8e-3 and 0.17). Another reward rule changes the reward of many steps whose next
+/// observation is right.
 const REWARD_TOLERANCE: f64 = 1e-3;
 
 /// How a file compares with the simulation.
@@ -28,8 +31,8 @@ pub struct Report {
     pub environment: &'static str,
     /// Rows replayed.
     pub transitions: usize,
-    /// Rows whose next observation is known. In a file without next_observations it is the observation of the following row,
-    /// so it is unknown where an episode ends.
+    /// Rows whose next observation is known. In a file without next_observations it is the
+    /// observation of the following row, so it is unknown where an episode ends.
     pub compared: usize,
     /// The largest error of each compared row's next observation, over its values.
     pub obs_error: ObservationError,
@@ -37,8 +40,8 @@ pub struct Report {
     pub reward_error: RewardError,
     /// Rows whose reward differs from the recorded one by more than float32 explains.
     pub rewards_differ: usize,
-    /// Rows that are terminal only in the file or only in the simulation. A terminal step at the time limit is often recorded
-    /// as a timeout only, which is no difference.
+    /// Rows that are terminal only in the file or only in the simulation. A terminal step at the
+    /// time limit is often recorded as a timeout only, which is no difference.
     pub terminals_differ: usize,
 }
 
@@ -60,7 +63,8 @@ pub struct RewardError {
     pub max: f64,
 }
 
-const OTHER_FILE: &str = "a file that can be replayed is what `evaluator collect --env hopper --out FILE` writes";
+const OTHER_FILE: &str =
+    "a file that can be replayed is what `evaluator collect --env hopper --out FILE` writes";
 const ENVIRONMENT: &str = "--env NAME says where it was recorded";
 
 /// What to do about a file that cannot be read, or lacks what a replay needs.
@@ -68,7 +72,8 @@ fn hint(error: &DatasetError) -> String {
     if let Problem::Missing { .. } = error.problem { OTHER_FILE.to_owned() } else { error.hint() }
 }
 
-/// The environment of a file: the one that it names or, if it names none, the only one of its sizes.
+/// The environment of a file: the one that it names or, if it names none, the only one of its
+/// sizes.
 ///
 /// # Errors
 /// The file cannot be read, names an unknown environment, or its sizes fit several or none.
@@ -88,7 +93,8 @@ pub fn environment_of(path: &Path) -> anyhow::Result<&'static EnvironmentSpec> {
     Err(anyhow!("{path}: {text} {names}")).hint(ENVIRONMENT)
 }
 
-/// Replays every row of the file at `path`: sets its qpos and qvel, and takes one step with its action.
+/// Replays every row of the file at `path`: sets its qpos and qvel, and takes one step with its
+/// action.
 ///
 /// # Errors
 /// The file lacks what a replay needs, or MuJoCo fails.
@@ -96,7 +102,8 @@ pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> anyhow::Result<Rep
     let rows = RecordedRows::read(path, spec).hint_of(hint)?;
     let threads = rayon::current_num_threads();
     let share = rows.len().div_ceil(threads);
-    let mut environments = (0..threads).map(|_| sim::make(spec, 0)).collect::<Result<Vec<_>, EnvironmentError>>()?;
+    let mut environments =
+        (0..threads).map(|_| sim::make(spec, 0)).collect::<Result<Vec<_>, EnvironmentError>>()?;
     let errors: Vec<RowError> = environments
         .par_iter_mut()
         .enumerate()
@@ -107,7 +114,9 @@ pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> anyhow::Result<Rep
         })
         .collect();
     let report = summarize(spec, &errors);
-    report.with_context(|| format!("{}: no rows with a next observation", path.display())).hint(OTHER_FILE)
+    report
+        .with_context(|| format!("{}: no rows with a next observation", path.display()))
+        .hint(OTHER_FILE)
 }
 
 struct RowError {
@@ -124,7 +133,11 @@ fn replay(environment: &mut Simulation, row: &Row<'_>, goal: Option<&[f64]>) -> 
     environment.set_state(row.qpos, row.qvel);
     let action: Vec<f32> = row.action.iter().map(|&value| value as f32).collect();
     let step = environment.step(&action);
-    let apart = environment.observation().iter().zip(row.next_observation).map(|(ours, theirs)| (ours - theirs).abs());
+    let apart = environment
+        .observation()
+        .iter()
+        .zip(row.next_observation)
+        .map(|(ours, theirs)| (ours - theirs).abs());
     let observation = apart.reduce(f64::max);
     let reward = (step.reward - row.reward).abs();
     let explained = (REWARD_TOLERANCE * row.reward.abs().max(1.0)).max(observation.unwrap_or(0.0));

@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use candle_core::Device;
 use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Weights};
 use quad_protocol::{
-    Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
+    Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot,
+    decode, encode, keys,
 };
 use quad_runtime::{Endpoints, open_session, reachable_at};
 use rand::SeedableRng;
@@ -41,7 +42,8 @@ pub enum Answer {
     /// No claim is answered.
     NoClaim,
     Refused,
-    /// The first time that a job is handed back goes without an answer, as if the learner were too busy for it.
+    /// The first time that a job is handed back goes without an answer, as if the learner were too
+    /// busy for it.
     LostHandBack,
 }
 
@@ -56,12 +58,14 @@ pub struct Learner {
     pub snapshot: Snapshot,
 }
 
-/// The file of a small diffusion policy for Hopper with random weights, which takes the best of so many candidates.
+/// The file of a small diffusion policy for Hopper with random weights, which takes the best of so
+/// many candidates.
 pub fn file(candidates: u32) -> Vec<u8> {
     let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[8; 3]), 2, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
-    let tensors = policy.tensors(|layout| Weights::initial(layout, &mut generator, &Device::Cpu)).unwrap();
+    let tensors =
+        policy.tensors(|layout| Weights::initial(layout, &mut generator, &Device::Cpu)).unwrap();
     let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 10, episodes: 3 };
     Header::new(policy, origin).to_safetensors(&tensors).unwrap()
 }
@@ -95,7 +99,9 @@ fn reply<M: Message>(query: &Query, message: &M) {
 fn answer_scores(query: &Query, answer: &Mutex<Answer>, new: u32) {
     let now = *answer.lock().unwrap();
     match now {
-        Answer::Recorded => reply(query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 }),
+        Answer::Recorded => {
+            reply(query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 })
+        }
         Answer::DiskFull => {
             // What a learner says that is not followed does not count, though it comes first.
             reply(query, &ScoreReply::Refused { incarnation: 99, reason: "not mine".to_owned() });
@@ -104,7 +110,10 @@ fn answer_scores(query: &Query, answer: &Mutex<Answer>, new: u32) {
         Answer::Refused => {
             reply(
                 query,
-                &ScoreReply::Refused { incarnation: INCARNATION, reason: "they are of another sum".to_owned() },
+                &ScoreReply::Refused {
+                    incarnation: INCARNATION,
+                    reason: "they are of another sum".to_owned(),
+                },
             );
         }
         Answer::Nothing | Answer::NoClaim | Answer::LostHandBack => {}
@@ -118,15 +127,23 @@ fn answer_scores(query: &Query, answer: &Mutex<Answer>, new: u32) {
 
 impl Learner {
     pub async fn start(published: Snapshot) -> Learner {
-        let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+        let listen =
+            Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let session = open_session(&listen).await.unwrap();
         let endpoint = reachable_at(&session, &listen).await.unwrap().remove(0);
-        let (heard, answer) = (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(Answer::Recorded)));
-        let learner = Learner { session, endpoint, heard, answer, job: Arc::default(), snapshot: published };
-        let (heard, job, answer, weights) =
-            (learner.heard.clone(), learner.job.clone(), learner.answer.clone(), learner.snapshot.clone());
+        let (heard, answer) =
+            (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(Answer::Recorded)));
+        let learner =
+            Learner { session, endpoint, heard, answer, job: Arc::default(), snapshot: published };
+        let (heard, job, answer, weights) = (
+            learner.heard.clone(),
+            learner.job.clone(),
+            learner.answer.clone(),
+            learner.snapshot.clone(),
+        );
         let callback = move |query: Query| {
-            let message = query.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default();
+            let message =
+                query.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default();
             let key = query.key_expr().as_str().to_owned();
             let mut heard = heard.lock().unwrap();
             if key == keys::weights_at(&name("run"), 10) {
@@ -149,7 +166,10 @@ impl Learner {
                         if matches!(*answer, Answer::LostHandBack) {
                             *answer = Answer::Recorded;
                         } else {
-                            reply(&query, &JobReply::HandedBack { incarnation: INCARNATION, accepted: true });
+                            reply(
+                                &query,
+                                &JobReply::HandedBack { incarnation: INCARNATION, accepted: true },
+                            );
                         }
                     }
                     JobRequest::Claim { attempt, .. } => {
@@ -164,7 +184,13 @@ impl Learner {
             }
         };
         let (told, progress) = (learner.heard.clone(), keys::all_progress(&name("run")));
-        learner.session.declare_queryable("quad/run/**").callback(callback).background().await.unwrap();
+        learner
+            .session
+            .declare_queryable("quad/run/**")
+            .callback(callback)
+            .background()
+            .await
+            .unwrap();
         let told = move |_| told.lock().unwrap().push(Heard::Progress);
         learner.session.declare_subscriber(progress).callback(told).background().await.unwrap();
         learner
@@ -178,7 +204,8 @@ impl Learner {
         *self.job.lock().unwrap() = Some(job);
     }
 
-    /// Starts an evaluator and announces the learner; with it, one that is dead and was started before.
+    /// Starts an evaluator and announces the learner; with it, one that is dead and was started
+    /// before.
     pub async fn evaluator(&self) -> (Evaluator, impl Sized + use<>) {
         let (evaluator, token) = self.only_evaluator().await;
         (evaluator, (token, self.announce(INCARNATION - 1).await))
@@ -219,13 +246,16 @@ impl Learner {
 }
 
 pub fn reports(heard: &[Heard]) -> Vec<ScoreReport> {
-    let report = |heard: &Heard| if let Heard::Scores(report) = heard { Some(report.clone()) } else { None };
+    let report =
+        |heard: &Heard| if let Heard::Scores(report) = heard { Some(report.clone()) } else { None };
     heard.iter().filter_map(report).collect()
 }
 
 /// Why a job was handed back first, if one was.
 pub fn handed_back(heard: &[Heard]) -> Option<Option<String>> {
-    heard.iter().find_map(|heard| if let Heard::HandedBack(failed) = heard { Some(failed.clone()) } else { None })
+    heard.iter().find_map(|heard| {
+        if let Heard::HandedBack(failed) = heard { Some(failed.clone()) } else { None }
+    })
 }
 
 pub struct Evaluator(Child);

@@ -1,5 +1,6 @@
-//! What `evaluator serve` promises a learner: which scores it delivers, what it does until they are saved, and how it leaves. The
-//! learner is made up (`learner`); the evaluator is the program, and Zenoh is real.
+//! What `evaluator serve` promises a learner: which scores it delivers, what it does until they are
+//! saved, and how it leaves. The learner is made up (`learner`); the evaluator is the program, and
+//! Zenoh is real.
 #![allow(clippy::unwrap_used)]
 
 mod learner;
@@ -45,13 +46,18 @@ async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
         learner.wait_for(|heard| (heard.len() >= 4).then_some(())).await;
         if published {
             // Not to be dropped, and on its way before the job is.
-            let put = learner.session.put(keys::weights(&name("run")), encode(&learner.snapshot).unwrap());
+            let put = learner
+                .session
+                .put(keys::weights(&name("run")), encode(&learner.snapshot).unwrap());
             put.congestion_control(CongestionControl::Block).await.unwrap();
         }
         learner.give(job.clone());
         let report = learner.wait_for_scores(1).await;
         let precision = name(&Precision::F32.arithmetic());
-        assert_eq!(report, ScoreReport::of(&job, name("one"), precision, expected(&job, &learner.snapshot.file)));
+        assert_eq!(
+            report,
+            ScoreReport::of(&job, name("one"), precision, expected(&job, &learner.snapshot.file))
+        );
         assert_eq!(learner.count(|heard| *heard == Heard::Weights), usize::from(!published));
         assert!(evaluator.leave().success());
         assert_eq!(learner.count(|heard| matches!(heard, Heard::HandedBack(_))), 0);
@@ -64,12 +70,18 @@ async fn a_claim_without_an_answer_is_the_same_claim_again() {
     learner.answer(Answer::NoClaim);
     let (_evaluator, _token) = learner.only_evaluator().await;
     let claims = |heard: &[Heard]| -> Vec<u64> {
-        heard.iter().filter_map(|heard| if let Heard::Claim(number) = heard { Some(*number) } else { None }).collect()
+        heard
+            .iter()
+            .filter_map(|heard| if let Heard::Claim(number) = heard { Some(*number) } else { None })
+            .collect()
     };
-    let first = learner.wait_for(|heard| Some(claims(heard)).filter(|claims| claims.len() >= 3)).await;
+    let first =
+        learner.wait_for(|heard| Some(claims(heard)).filter(|claims| claims.len() >= 3)).await;
     assert!(first.iter().all(|number| *number == first[0]), "{first:?}");
     learner.answer(Answer::Recorded);
-    learner.wait_for(|heard| claims(heard).iter().any(|number| *number != first[0]).then_some(())).await;
+    learner
+        .wait_for(|heard| claims(heard).iter().any(|number| *number != first[0]).then_some(()))
+        .await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -84,7 +96,8 @@ async fn scores_are_sent_again_until_the_learner_has_saved_them() {
     let heard = learner.heard.lock().unwrap();
     assert!(reports(&heard).len() > 3 && reports(&heard).iter().all(|again| *again == report));
     let is_score = |heard: &Heard| matches!(heard, Heard::Scores(_));
-    let (first, last) = (heard.iter().position(is_score).unwrap(), heard.iter().rposition(is_score).unwrap());
+    let (first, last) =
+        (heard.iter().position(is_score).unwrap(), heard.iter().rposition(is_score).unwrap());
     assert!(heard[first..last].iter().all(is_score), "nothing new is claimed meanwhile: {heard:?}");
 }
 
@@ -101,8 +114,14 @@ async fn an_evaluator_that_leaves_hands_its_job_back_unless_its_scores_may_be_sa
             // On a busy machine it is heard only after the evaluator has gone.
             learner.wait_for(handed_back).await;
         }
-        assert_eq!(learner.count(|heard| matches!(heard, Heard::HandedBack(_))), usize::from(goes_back));
-        assert!(learner.count(|heard| matches!(heard, Heard::Scores(_))) > 1, "they are sent again");
+        assert_eq!(
+            learner.count(|heard| matches!(heard, Heard::HandedBack(_))),
+            usize::from(goes_back)
+        );
+        assert!(
+            learner.count(|heard| matches!(heard, Heard::Scores(_))) > 1,
+            "they are sent again"
+        );
     }
 }
 
@@ -114,7 +133,8 @@ async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
     let (evaluator, _tokens) = learner.evaluator().await;
     learner.wait_for_scores(1).await;
     assert!(evaluator.leave().success());
-    // A learner that hangs has said nothing of the scores. When it goes on, it finds that the job is handed back.
+    // A learner that hangs has said nothing of the scores. When it goes on, it finds that the job
+    // is handed back.
     learner.answer(Answer::Nothing);
     assert_eq!(learner.wait_for(handed_back).await, None);
 }
@@ -133,7 +153,9 @@ async fn a_job_that_fails_is_handed_back_with_the_reason() {
         let told = |heard: &[Heard]| {
             heard
                 .iter()
-                .any(|heard| matches!(heard, Heard::HandedBack(Some(text)) if text.contains(reason)))
+                .any(
+                    |heard| matches!(heard, Heard::HandedBack(Some(text)) if text.contains(reason)),
+                )
                 .then_some(())
         };
         learner.wait_for(told).await;
@@ -149,7 +171,11 @@ async fn a_job_whose_scores_are_refused_is_handed_back() {
     let (_evaluator, _tokens) = learner.evaluator().await;
     let reason = learner.wait_for(handed_back).await;
     assert_eq!(reason, Some("it refused the scores: they are of another sum".to_owned()));
-    assert_eq!(learner.count(|heard| matches!(heard, Heard::Scores(_))), 1, "they are not sent again");
+    assert_eq!(
+        learner.count(|heard| matches!(heard, Heard::Scores(_))),
+        1,
+        "they are not sent again"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -159,11 +185,15 @@ async fn a_job_is_handed_back_until_the_learner_answers_and_nothing_is_claimed_b
     let (_evaluator, _token) = learner.only_evaluator().await;
     learner.give(job(&learner.snapshot));
     learner
-        .wait_for(|heard| (handed_back(heard).is_some() && matches!(heard.last(), Some(Heard::Claim(_)))).then_some(()))
+        .wait_for(|heard| {
+            (handed_back(heard).is_some() && matches!(heard.last(), Some(Heard::Claim(_))))
+                .then_some(())
+        })
         .await;
     let heard = learner.heard.lock().unwrap();
     let is_back = |heard: &Heard| matches!(heard, Heard::HandedBack(_));
-    let (first, last) = (heard.iter().position(is_back).unwrap(), heard.iter().rposition(is_back).unwrap());
+    let (first, last) =
+        (heard.iter().position(is_back).unwrap(), heard.iter().rposition(is_back).unwrap());
     assert!(first < last, "it is handed back once more: {heard:?}");
     assert!(!heard[first..last].iter().any(|heard| matches!(heard, Heard::Claim(_))), "{heard:?}");
 }

@@ -7,7 +7,8 @@ use std::sync::LazyLock;
 
 /// Rows of a tile, and registers of 16 numbers in it.
 const TILE: usize = 16;
-/// Rows of the result that are worked on together: two tiles above each other, beside two of columns.
+/// Rows of the result that are worked on together: two tiles above each other, beside two of
+/// columns.
 const ROWS: usize = 2 * TILE;
 
 /// Whether this CPU can and the kernel lets this process: registers of 8 KiB must be asked for.
@@ -44,7 +45,8 @@ struct Configuration {
 }
 
 impl Configuration {
-    /// For sums of `upper` and `lower` rows: tiles 0 to 3 are the sums, 4 and 5 the rows of `a`, 6 and 7 of `b`.
+    /// For sums of `upper` and `lower` rows: tiles 0 to 3 are the sums, 4 and 5 the rows of `a`, 6
+    /// and 7 of `b`.
     fn new(upper: usize, lower: usize) -> Self {
         let (upper, lower, all) = (upper as u8, lower as u8, TILE as u8);
         let (mut row_bytes, mut rows) = ([0; 16], [0; 16]);
@@ -54,12 +56,20 @@ impl Configuration {
     }
 }
 
-/// `c = a·b` for `m` rows and `n` columns of pairs; `b` in blocks of [`COLUMNS`] columns, one after the other.
+/// `c = a·b` for `m` rows and `n` columns of pairs; `b` in blocks of [`COLUMNS`] columns, one after
+/// the other.
 ///
 /// # Safety
-/// [`available`] must hold, `pairs` be a multiple of 16 and `n` one of [`COLUMNS`], and the three matrices must span that
-/// many elements.
-pub(super) unsafe fn multiply(m: usize, n: usize, pairs: usize, a: Strided<Pair>, b: *const Pair, c: *mut f32) {
+/// [`available`] must hold, `pairs` be a multiple of 16 and `n` one of [`COLUMNS`], and the three
+/// matrices must span that many elements.
+pub(super) unsafe fn multiply(
+    m: usize,
+    n: usize,
+    pairs: usize,
+    a: Strided<Pair>,
+    b: *const Pair,
+    c: *mut f32,
+) {
     // Blocks of nearly equal height, each of two halves of nearly equal height.
     let blocks = m.div_ceil(ROWS);
     for i in 0..blocks {
@@ -92,11 +102,20 @@ pub(super) unsafe fn multiply(m: usize, n: usize, pairs: usize, a: Strided<Pair>
 /// Two by two tiles of the result.
 ///
 /// # Safety
-/// The tiles must be configured; `a` and `c` are the first rows of upper and lower half, with distances `a_row` and
-/// `c_row` between rows in elements, and `b` is a block of `pairs` × [`COLUMNS`].
+/// The tiles must be configured; `a` and `c` are the first rows of upper and lower half, with
+/// distances `a_row` and `c_row` between rows in elements, and `b` is a block of `pairs` ×
+/// [`COLUMNS`].
 #[inline]
-unsafe fn block(pairs: usize, a: [*const Pair; 2], a_row: usize, b: *const Pair, c: [*mut f32; 2], c_row: usize) {
-    // SAFETY: reads and writes as many rows of 64 bytes as the configuration has, inside what the caller vouches for.
+unsafe fn block(
+    pairs: usize,
+    a: [*const Pair; 2],
+    a_row: usize,
+    b: *const Pair,
+    c: [*mut f32; 2],
+    c_row: usize,
+) {
+    // SAFETY: reads and writes as many rows of 64 bytes as the configuration has, inside what the
+    // caller vouches for.
     unsafe {
         asm!(
             "tilezero tmm0",

@@ -2,16 +2,18 @@
 
 use super::{Ahead, COLUMNS, LANES, Line, Pair, ROWS, Strided, amx, has_bf16};
 use std::arch::x86_64::{
-    __cpuid, __m512bh, __m512i, _MM_HINT_T0, _mm_prefetch, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps, _mm512_loadu_ps,
-    _mm512_loadu_si512, _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_store_si512,
-    _mm512_storeu_ps,
+    __cpuid, __m512bh, __m512i, _MM_HINT_T0, _mm_prefetch, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps,
+    _mm512_loadu_ps, _mm512_loadu_si512, _mm512_permutexvar_epi16, _mm512_set1_epi32,
+    _mm512_setzero_ps, _mm512_store_si512, _mm512_storeu_ps,
 };
 use std::cell::RefCell;
 
-/// Whether this CPU multiplies so, and faster than in f32: by AMX, or by AVX512-BF16, which nearly doubles the speed of
-/// AMD's CPUs but is slower than f32 on Intel's (0.6 times, where it was measured).
+/// Whether this CPU multiplies so, and faster than in f32: by AMX, or by AVX512-BF16, which nearly
+/// doubles the speed of AMD's CPUs but is slower than f32 on Intel's (0.6 times, where it was
+/// measured).
 pub(crate) fn available() -> bool {
-    const INTEL: [u32; 3] = [u32::from_le_bytes(*b"Genu"), u32::from_le_bytes(*b"ineI"), u32::from_le_bytes(*b"ntel")];
+    const INTEL: [u32; 3] =
+        [u32::from_le_bytes(*b"Genu"), u32::from_le_bytes(*b"ineI"), u32::from_le_bytes(*b"ntel")];
     let vendor = __cpuid(0);
     amx::available() || has_bf16() && [vendor.ebx, vendor.edx, vendor.ecx] != INTEL
 }
@@ -54,7 +56,8 @@ thread_local! {
     static ROUNDED: RefCell<Vec<Line<Pair>>> = RefCell::default();
 }
 
-/// The right-hand side of products, `k × n`, rounded to bfloat16: block after block of columns, and in each the pairs of `k` as rows.
+/// The right-hand side of products, `k × n`, rounded to bfloat16: block after block of columns, and
+/// in each the pairs of `k` as rows.
 pub(crate) struct Rounded {
     blocks: Vec<Line<Pair>>,
     k: usize,
@@ -62,7 +65,8 @@ pub(crate) struct Rounded {
 }
 
 impl Rounded {
-    /// Rounds a row-major matrix; `None` where this CPU cannot multiply with it, or it is not made of whole registers.
+    /// Rounds a row-major matrix; `None` where this CPU cannot multiply with it, or it is not made
+    /// of whole registers.
     pub fn new(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
         assert_eq!(matrix.len(), k * n, "the matrix's shape");
         let whole = k.is_multiple_of(COLUMNS) && n.is_multiple_of(COLUMNS);
@@ -71,7 +75,8 @@ impl Rounded {
     }
 
     /// # Safety
-    /// This CPU must be able to; both sides must be multiples of [`COLUMNS`] and the matrix of that size.
+    /// This CPU must be able to; both sides must be multiples of [`COLUMNS`] and the matrix of that
+    /// size.
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
     unsafe fn round(matrix: &[f32], k: usize, n: usize) -> Self {
         // Lane i of the lower half beside lane i of the upper one.
@@ -79,7 +84,8 @@ impl Rounded {
         let mut blocks = Vec::with_capacity(k / 2 * n / LANES);
         for j in (0..n).step_by(COLUMNS) {
             for i in 0..k {
-                // SAFETY: of the pairs' rows 2·(i/2) and the next, the left or right half of the block's columns.
+                // SAFETY: of the pairs' rows 2·(i/2) and the next, the left or right half of the
+                // block's columns.
                 blocks.push(unsafe {
                     let from = matrix.as_ptr().add(i / 2 * 2 * n + j + i % 2 * LANES);
                     let row = _mm512_permutexvar_epi16(
@@ -108,7 +114,8 @@ impl Rounded {
         let (pairs, n) = (self.k / 2, self.n);
         let mut rounded = ROUNDED.take();
         rounded.resize(m * pairs / LANES, Line([0; LANES]));
-        // SAFETY: m × k is a multiple of two registers, and whole blocks of pairs × 32 are behind each other.
+        // SAFETY: m × k is a multiple of two registers, and whole blocks of pairs × 32 are behind
+        // each other.
         unsafe {
             for (i, to) in rounded.iter_mut().enumerate() {
                 let from = a.add(i * COLUMNS);
@@ -136,15 +143,19 @@ mod tests {
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    /// The dispatched product is tested beside the others in `product`; this is about the one that is not chosen there.
+    /// The dispatched product is tested beside the others in `product`; this is about the one that
+    /// is not chosen there.
     #[test]
     fn tiles_add_up_what_registers_do() {
         if !amx::available() {
             return;
         }
         let mut generator = ChaCha8Rng::seed_from_u64(0);
-        let mut numbers = |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
-        for (m, k, n) in [(1, 32, 32), (2, 64, 96), (16, 32, 32), (17, 32, 64), (33, 96, 32), (100, 256, 64)] {
+        let mut numbers =
+            |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
+        for (m, k, n) in
+            [(1, 32, 32), (2, 64, 96), (16, 32, 32), (17, 32, 64), (33, 96, 32), (100, 256, 64)]
+        {
             let (a, b) = (numbers(m * k), numbers(k * n));
             let right = Rounded::new(&b, k, n).unwrap();
             let by = |tiles| {

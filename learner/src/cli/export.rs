@@ -50,9 +50,10 @@ impl FromStr for At {
         match text {
             "best" => Ok(Self::Best),
             "last" => Ok(Self::Last),
-            number => {
-                number.parse().map(Self::Step).map_err(|_| format!("{number} is no step, and neither best nor last"))
-            }
+            number => number
+                .parse()
+                .map(Self::Step)
+                .map_err(|_| format!("{number} is no step, and neither best nor last")),
         }
     }
 }

@@ -22,8 +22,8 @@ not compute it again.";
 /// Arguments of `learner judge`.
 #[derive(Debug, Args)]
 pub struct JudgeArgs {
-    /// Folders of runs, of which the last snapshot is judged, or snapshots, like RUN/snapshots/step_000020000.safetensors; all of runs
-    /// on the same data
+    /// Folders of runs, of which the last snapshot is judged, or snapshots, like
+    /// RUN/snapshots/step_000020000.safetensors; all of runs on the same data
     #[arg(value_name = "RUN|SNAPSHOT", required = true)]
     pub policies: Vec<PathBuf>,
     /// Discount γ of the values, from 0 to below 1
@@ -42,5 +42,9 @@ pub struct JudgeArgs {
 
 fn parse_discount(text: &str) -> Result<f32, String> {
     let gamma: f32 = text.parse().map_err(|_| format!("{text} is no number"))?;
-    if (0.0..1.0).contains(&gamma) { Ok(gamma) } else { Err(format!("{text} is not from 0 to below 1")) }
+    if (0.0..1.0).contains(&gamma) {
+        Ok(gamma)
+    } else {
+        Err(format!("{text} is not from 0 to below 1"))
+    }
 }

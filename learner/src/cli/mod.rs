@@ -42,11 +42,12 @@ pub struct Cli {
 /// What the learner can do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Train on a dataset, publish snapshots, give evaluators their jobs, and keep the run in a folder
+    /// Train on a dataset, publish snapshots, give evaluators their jobs, and keep the run in a
+    /// folder
     #[command(after_help = train::EXAMPLES)]
     Train(Box<TrainArgs>),
-    /// Train all runs of a study (tasks, methods and seeds), several at a time; the same command continues an interrupted
-    /// study
+    /// Train all runs of a study (tasks, methods and seeds), several at a time; the same command
+    /// continues an interrupted study
     #[command(after_help = sweep::EXAMPLES)]
     Sweep(SweepArgs),
     /// List tasks and algorithms, or print every value of an algorithm for a task
@@ -56,9 +57,11 @@ pub enum Command {
     Datasets(DatasetsCommand),
     /// List runs with their state, last score and size, and whether a learner is at work on them
     List(ListArgs),
-    /// Serve a web page that lists all runs, also while they train, and compares those that you tick
+    /// Serve a web page that lists all runs, also while they train, and compares those that you
+    /// tick
     Page(PageArgs),
-    /// Print scores of runs, statistics over seeds and tasks, and the paper's tables with your runs in them
+    /// Print scores of runs, statistics over seeds and tasks, and the paper's tables with your runs
+    /// in them
     Report(ReportArgs),
     /// Rank policies without a simulator, by what the data alone says of them
     #[command(after_help = judge::EXAMPLES)]
@@ -83,7 +86,8 @@ pub struct PresetsArgs {
     /// Print every value for this task, or for a preset file of your own, as a complete preset file
     #[arg(value_name = "TASK|FILE", value_parser = parse_preset, group = "what")]
     pub preset: Option<String>,
-    /// Print what each algorithm measures, in metrics.jsonl and, with quad_learner_ before the name, in Prometheus
+    /// Print what each algorithm measures, in metrics.jsonl and, with quad_learner_ before the
+    /// name, in Prometheus
     #[arg(long, group = "what")]
     pub metrics: bool,
     /// Algorithm [default: quad, or the one in the file; with --metrics all]
@@ -113,7 +117,8 @@ pub struct InspectArgs {
     /// A file or folder of any format, a name of `learner datasets list`, or minari:ID
     #[arg(value_name = "FILE|NAME")]
     pub dataset: String,
-    /// Environment that gives sizes, time limit and reference scores [default: the one that the dataset names]
+    /// Environment that gives sizes, time limit and reference scores [default: the one that the
+    /// dataset names]
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     pub env: Option<&'static EnvironmentSpec>,
     /// Print JSON instead of text
@@ -128,7 +133,8 @@ pub struct VerifyArgs {
     /// Folders of complete runs
     #[arg(value_name = "DIR", required = true)]
     pub dirs: Vec<PathBuf>,
-    /// Folder of another run of the same configuration: it must have each score and each snapshot of DIR, bit for bit
+    /// Folder of another run of the same configuration: it must have each score and each snapshot
+    /// of DIR, bit for bit
     #[arg(long, value_name = "DIR")]
     pub same_as: Option<PathBuf>,
 }
@@ -137,13 +143,15 @@ pub struct VerifyArgs {
 #[derive(Debug, Args)]
 #[command(after_help = DOCTOR_NOTE)]
 pub struct DoctorArgs {
-    /// Router that the run will join; without it, the learner checks that it can listen at its usual port
+    /// Router that the run will join; without it, the learner checks that it can listen at its
+    /// usual port
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
     /// Folder of the run, new or existing
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub run_dir: PathBuf,
-    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES]
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
+    /// [default: QUAD_CERTIFICATES]
     #[arg(long, value_name = "DIR")]
     pub certificates: Option<PathBuf>,
     /// Print a JSON array of objects with verdict, check, what and (if you can do something) hint
@@ -192,11 +200,12 @@ pub struct ReportArgs {
     /// Which evaluations make a run's score
     #[arg(long, value_enum, default_value = "last")]
     pub select: Select,
-    /// Also write one HTML file to send or to print: tables, figures, settings, data, films in the runs' folders (film.gif and
-    /// film.png), and the commands that make the runs again
+    /// Also write one HTML file to send or to print: tables, figures, settings, data, films in the
+    /// runs' folders (film.gif and film.png), and the commands that make the runs again
     #[arg(long, value_name = "FILE.html")]
     pub html: Option<PathBuf>,
-    /// Also draw learning curves, performance profiles and scores over τ into this folder, each as SVG and PNG
+    /// Also draw learning curves, performance profiles and scores over τ into this folder, each as
+    /// SVG and PNG
     #[arg(long, value_name = "DIR")]
     pub figures: Option<PathBuf>,
 }

@@ -36,7 +36,8 @@ the sweep ends within 18 s.";
 /// Arguments of `learner sweep`.
 #[derive(Debug, Args)]
 pub struct SweepArgs {
-    /// The study: axes whose values are combined, and which combinations are runs (studies/README.md)
+    /// The study: axes whose values are combined, and which combinations are runs
+    /// (studies/README.md)
     #[arg(value_name = "STUDY.toml")]
     pub study: PathBuf,
     /// Parent folder of all studies: each run has the folder DIR/STUDY/RUN
@@ -45,7 +46,8 @@ pub struct SweepArgs {
     /// Print number, name and state of each run, and start none
     #[arg(long)]
     pub list: bool,
-    /// Train only runs with this value of an axis: task=hopper-*, seed=0; repeatable: one of an axis's values, and for all axes
+    /// Train only runs with this value of an axis: task=hopper-*, seed=0; repeatable: one of an
+    /// axis's values, and for all axes
     #[arg(long, value_name = "AXIS=VALUE", value_parser = parse_assignment)]
     pub only: Vec<Table>,
     /// Change a key in all runs: steps=200; repeatable. Runs of other settings need another DIR
@@ -57,14 +59,15 @@ pub struct SweepArgs {
     /// Train only the I-th of N equal parts, e.g. 1/3, 2/3 and 3/3 on three machines
     #[arg(long, value_name = "I/N", value_parser = parse_shard)]
     pub shard: Option<Shard>,
-    /// Address of the page, /metrics and /healthz of the run that --index names [default: a free port]
+    /// Address of the page, /metrics and /healthz of the run that --index names [default: a free
+    /// port]
     #[arg(long, value_name = "ADDR:PORT", requires = "index")]
     pub http: Option<SocketAddr>,
     /// Runs at a time [default: uses three of four cores, and leaves the fourth for evaluators]
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]
     pub jobs: Option<u16>,
-    /// Number of evaluators to start; they serve all runs and log to DIR/STUDY [default: one for each
-    /// core that does not train, at least one]
+    /// Number of evaluators to start; they serve all runs and log to DIR/STUDY [default: one for
+    /// each core that does not train, at least one]
     #[arg(long, value_name = "N", conflicts_with = "connect")]
     pub evaluators: Option<usize>,
     /// Use the evaluators at this Zenoh router instead, e.g. tcp/router:7447
@@ -89,7 +92,9 @@ impl Shard {
 }
 
 fn parse_shard(text: &str) -> Result<Shard, String> {
-    let parsed = text.split_once('/').and_then(|(part, parts)| Some((part.parse().ok()?, parts.parse().ok()?)));
+    let parsed = text
+        .split_once('/')
+        .and_then(|(part, parts)| Some((part.parse().ok()?, parts.parse().ok()?)));
     match parsed {
         Some((part, parts)) if (1..=parts).contains(&part) => Ok(Shard { part: part - 1, parts }),
         _ => Err("write it like 2/3, the second of three parts".to_owned()),

@@ -4,7 +4,11 @@ use super::*;
 use clap::CommandFactory;
 
 pub(super) fn parse(arguments: &[&str]) -> Result<Cli, clap::Error> {
-    Cli::try_parse_from(["learner", "train", "--task", "hopper-demo", "--dataset", "d.hdf5"].iter().chain(arguments))
+    Cli::try_parse_from(
+        ["learner", "train", "--task", "hopper-demo", "--dataset", "d.hdf5"]
+            .iter()
+            .chain(arguments),
+    )
 }
 
 #[test]
@@ -36,7 +40,8 @@ fn wrong_command_lines_exit_with_2() {
         ("--preset", "walker", "did you mean walker2d-demo"),
         ("--algorithm", "qad", "a similar value exists: 'quad'"),
     ] {
-        let unknown = Cli::try_parse_from(["learner", "train", flag, misspelled, "--dataset", "d"]).unwrap_err();
+        let unknown = Cli::try_parse_from(["learner", "train", flag, misspelled, "--dataset", "d"])
+            .unwrap_err();
         assert!(unknown.to_string().contains(answer), "{unknown}");
     }
     assert!(Cli::try_parse_from(["learner", "train"]).unwrap_err().to_string().contains("--task"));

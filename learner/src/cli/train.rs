@@ -36,63 +36,69 @@ weights, bit for bit, as a run without interruption.";
 /// Arguments of `learner train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
-    /// The task: an environment, a dataset, and the algorithm's values for them (`learner presets` lists tasks)
+    /// The task: an environment, a dataset, and the algorithm's values for them (`learner presets`
+    /// lists tasks)
     #[arg(long, value_name = "NAME", value_parser = task_names(), hide_possible_values = true, required_unless_present = "preset")]
     task: Option<String>,
     /// The algorithm (`learner presets` lists algorithms) [default: quad]
     #[arg(long, value_name = "NAME", value_parser = algorithm_names(), hide_possible_values = true)]
     algorithm: Option<String>,
-    /// A task, as --task NAME; or a file of your own with `task`, `algorithm` and the values to change
+    /// A task, as --task NAME; or a file of your own with `task`, `algorithm` and the values to
+    /// change
     #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]
     preset: Option<String>,
-    /// The environment in which the policy acts; one that no evaluator simulates can be any name (docs/python.md) [default: the
-    /// task's]
+    /// The environment in which the policy acts; one that no evaluator simulates can be any name
+    /// (docs/python.md) [default: the task's]
     #[arg(long, value_name = "NAME")]
     env: Option<String>,
-    /// A file (`evaluator collect` records one), a name of `learner datasets list` (fetched if it is missing), or minari:ID
-    /// [default: the task's]
+    /// A file (`evaluator collect` records one), a name of `learner datasets list` (fetched if it
+    /// is missing), or minari:ID [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Option<String>,
-    /// Scale some of these: actions from their least and largest value to ±1, states to mean 0 and standard deviation 1, rewards to
-    /// a mean square of 1; the policy still takes and gives the data's own units
+    /// Scale some of these: actions from their least and largest value to ±1, states to mean 0 and
+    /// standard deviation 1, rewards to a mean square of 1; the policy still takes and gives the
+    /// data's own units
     #[arg(long, value_name = "actions,states,rewards", value_delimiter = ',', value_parser = ["actions", "states", "rewards"], hide_possible_values = true)]
     scale: Vec<String>,
-    /// Share of the episodes to keep out of training; losses and values on them are in the metrics, as held_out_… [default: the
-    /// task's, 0.1 for own-data, else 0]
+    /// Share of the episodes to keep out of training; losses and values on them are in the metrics,
+    /// as held_out_… [default: the task's, 0.1 for own-data, else 0]
     #[arg(long, value_name = "SHARE")]
     hold_out: Option<f64>,
-    /// Folder of the run; its last part names the run. If it contains a run of the same configuration, that run continues
-    /// [default: runs/TASK-VARIANT-seedSEED]
+    /// Folder of the run; its last part names the run. If it contains a run of the same
+    /// configuration, that run continues [default: runs/TASK-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
-    /// Seconds between two checkpoints; a crash loses at most the training since the last one. The learner waits longer if
-    /// saving would take 1 % of the time
+    /// Seconds between two checkpoints; a crash loses at most the training since the last one. The
+    /// learner waits longer if saving would take 1 % of the time
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = value_parser!(u64).range(..=31_536_000))]
     pub checkpoint_seconds: u64,
     /// Start a new run; a run that is already in the folder is kept under another name
     #[arg(long)]
     pub fresh: bool,
-    /// Print every value of the run, and the time, memory and disk that it will take, measured in a second; train nothing and
-    /// leave no folder. A missing dataset is fetched
+    /// Print every value of the run, and the time, memory and disk that it will take, measured in a
+    /// second; train nothing and leave no folder. A missing dataset is fetched
     #[arg(long)]
     pub dry_run: bool,
-    /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines [default:
-    /// tcp/127.0.0.1:7447, or tls/… with --certificates; a free port if that one is taken, or with --eval-interval 0]
+    /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines
+    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; a free port if that one is
+    /// taken, or with --eval-interval 0]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]
     pub listen: Option<String>,
     /// Join a Zenoh router instead, at which evaluators are found, e.g. tcp/router:7447
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
-    /// Number of evaluators to start on this machine; they end with the learner, and log to DIR/evaluator-1.log and so on
-    /// [default: one for each core that does not train, at least one; none with --listen, --connect or certificates, nor for an
-    /// environment of your own]
+    /// Number of evaluators to start on this machine; they end with the learner, and log to
+    /// DIR/evaluator-1.log and so on [default: one for each core that does not train, at least one;
+    /// none with --listen, --connect or certificates, nor for an environment of your own]
     #[arg(long, value_name = "N", conflicts_with = "certificates")]
     pub evaluators: Option<usize>,
-    /// Training threads, each of which keeps a core busy [default: RAYON_NUM_THREADS, or one per core, at most 16]
+    /// Training threads, each of which keeps a core busy [default: RAYON_NUM_THREADS, or one per
+    /// core, at most 16]
     #[arg(long, value_name = "N")]
     pub threads: Option<NonZero<usize>>,
-    /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same authority, and endpoints are
-    /// tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES, but none with --evaluators]
+    /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same
+    /// authority, and endpoints are tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES,
+    /// but none with --evaluators]
     #[arg(long, value_name = "DIR")]
     pub certificates: Option<PathBuf>,
     /// Address of the page, /metrics and /healthz; port 0 takes a free one (see DIR/endpoints.json)
@@ -101,7 +107,8 @@ pub struct TrainArgs {
     /// Train on the CPU, or on the first Nvidia GPU (with a learner that deploy/cuda.sh has built)
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
-    /// Change a hyper-parameter of the algorithm, in TOML's notation: guidance=dac, tau=0.5; repeatable
+    /// Change a hyper-parameter of the algorithm, in TOML's notation: guidance=dac, tau=0.5;
+    /// repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = |text: &str| parse_assignment(&format!("agent.{text}")))]
     agent: Vec<Table>,
     /// Change any other key: batch_size=64; repeatable
@@ -127,7 +134,8 @@ struct OverrideArgs {
     /// Seed of initial weights, batches, noise and the episodes of evaluations
     #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
     seed: Option<i64>,
-    /// Precision of forward passes without gradient: f32, or bf16, which rounds and is faster on CPUs with AMX or AVX512-BF16
+    /// Precision of forward passes without gradient: f32, or bf16, which rounds and is faster on
+    /// CPUs with AMX or AVX512-BF16
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
 }
@@ -139,8 +147,8 @@ impl TrainArgs {
         self.task.as_deref().or(self.preset.as_deref()).unwrap_or_default()
     }
 
-    /// The values that the command line changes. If it gives a value twice, `--agent` wins over `--set`, and a flag of its own
-    /// over both.
+    /// The values that the command line changes. If it gives a value twice, `--agent` wins over
+    /// `--set`, and a flag of its own over both.
     pub fn changes(&self) -> Table {
         let flags = &self.overrides;
         let number = |value: Option<i64>| value.map(Value::from);
@@ -152,7 +160,12 @@ impl TrainArgs {
             ("algorithm", self.algorithm.clone().map(Value::from)),
             ("environment", self.env.clone().map(Value::from)),
             ("dataset", self.dataset.clone().map(Value::from)),
-            ("scale", Some(&self.scale).filter(|scale| !scale.is_empty()).map(|scale| Value::from(scale.clone()))),
+            (
+                "scale",
+                Some(&self.scale)
+                    .filter(|scale| !scale.is_empty())
+                    .map(|scale| Value::from(scale.clone())),
+            ),
             ("hold_out", self.hold_out.map(Value::from)),
             ("steps", number(flags.steps)),
             ("eval_interval", number(flags.eval_interval)),

@@ -20,19 +20,33 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let fastest = if Precision::Bf16.is_available() { "bf16, by --precision bf16" } else { "f32" };
     findings.ok("precision", format!("this CPU is fastest in {fastest}"));
     hdf5(&mut findings);
-    doctor::folder(&mut findings, "run folder", &args.run_dir, "another folder is chosen by --run-dir");
+    doctor::folder(
+        &mut findings,
+        "run folder",
+        &args.run_dir,
+        "another folder is chosen by --run-dir",
+    );
     locks(&mut findings, &args.run_dir);
     match data::cache::d4rl() {
-        Ok(folder) => doctor::folder(&mut findings, "datasets", &folder, "D4RL_DATASET_DIR chooses another folder"),
-        Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
+        Ok(folder) => doctor::folder(
+            &mut findings,
+            "datasets",
+            &folder,
+            "D4RL_DATASET_DIR chooses another folder",
+        ),
+        Err(error) => {
+            findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR")
+        }
     }
     let folder = certificates_folder(args.certificates.clone());
-    let certificates = folder.and_then(|folder| doctor::certificates(&mut findings, &folder, Role::Learner));
+    let certificates =
+        folder.and_then(|folder| doctor::certificates(&mut findings, &folder, Role::Learner));
     let Some(endpoint) = &args.connect else {
         doctor::port(&mut findings, DEFAULT_PORT);
         return Ok(findings);
     };
-    let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
+    let endpoints =
+        Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
     doctor::connected(&mut findings, &endpoints, async |_, _| Ok(()))?;
     Ok(findings)
 }
@@ -54,6 +68,10 @@ fn locks(findings: &mut Findings, run_dir: &Path) {
 fn hdf5(findings: &mut Findings) {
     match quad_dataset::hdf5_library() {
         (version, true) => findings.ok("HDF5", format!("{version}, with compression")),
-        (version, false) => findings.fail("HDF5", format!("{version}, without zlib"), "install Debian's libhdf5-103-1"),
+        (version, false) => findings.fail(
+            "HDF5",
+            format!("{version}, without zlib"),
+            "install Debian's libhdf5-103-1",
+        ),
     }
 }

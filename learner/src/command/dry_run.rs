@@ -1,4 +1,5 @@
-//! `learner train --dry-run`: prints a run's values as a preset file, and its cost as comments at the top.
+//! `learner train --dry-run`: prints a run's values as a preset file, and its cost as comments at
+//! the top.
 
 use std::fs;
 use std::path::Path;

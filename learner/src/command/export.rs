@@ -33,11 +33,15 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     };
     let file = folder.read_snapshot(step)?;
     let read = || Ok((Header::<Origin>::read(&file)?, read_tensors(&file)?));
-    let (header, tensors) = read()
-        .map_err(|error: PolicyError| anyhow!("{} is not a policy: {error}", folder.snapshot_path(step).display()))?;
+    let (header, tensors) = read().map_err(|error: PolicyError| {
+        anyhow!("{} is not a policy: {error}", folder.snapshot_path(step).display())
+    })?;
     let weights = Hash::of(&file).to_string();
     if lines.iter().any(|line| line.step == step && line.weights != weights) {
-        warn!("the file has no score: that of step {step} is of other weights (learner verify {})", args.run.display());
+        warn!(
+            "the file has no score: that of step {step} is of other weights (learner verify {})",
+            args.run.display()
+        );
         report.evaluations.retain(|evaluation| evaluation.step != step);
     }
     report.judgments.retain(|judgment| judgment.weights == weights);
@@ -59,7 +63,10 @@ fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
     }
     let score = report.evaluations.iter().find(|evaluation| evaluation.step == step);
     if let Some(part) = score.filter(|score| !score.complete) {
-        warn!("the score is of {} of {} episodes, which the file says, too", part.episodes, experiment.episodes);
+        warn!(
+            "the score is of {} of {} episodes, which the file says, too",
+            part.episodes, experiment.episodes
+        );
     }
     json!({
         "run": report.run,

@@ -1,4 +1,5 @@
-//! The learner's commands, from the parsed command line to the exit code. All of them run on the main thread.
+//! The learner's commands, from the parsed command line to the exit code. All of them run on the
+//! main thread.
 
 mod doctor;
 mod dry_run;
@@ -25,7 +26,8 @@ use quad_runtime::{Hint, hinted, json, print, unfinished};
 use tracing::{info, warn};
 
 use crate::cli::{
-    Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, ListArgs, PresetsArgs, ReportArgs, VerifyArgs,
+    Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, ListArgs, PresetsArgs, ReportArgs,
+    VerifyArgs,
 };
 use crate::data::{Source, cache};
 use crate::report::{Report, draw_all, write_html};
@@ -74,13 +76,20 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     let mut of_tasks = Table::new(&header.map(|name| (name, Left)));
     for task in tasks::all().iter().filter(|task| task.is_listed) {
         let word = |key| task.word(key).unwrap_or("-");
-        of_tasks.push([&*task.name, word("environment"), word("dataset"), &task.about].map(str::to_owned));
+        of_tasks.push(
+            [&*task.name, word("environment"), word("dataset"), &task.about].map(str::to_owned),
+        );
     }
     let header = ["algorithm", "what it is", "its authors give values for", "GFLOP a step"];
     let mut of_algorithms = Table::new(&header.map(|name| (name, Left)));
     for definition in &ALGORITHMS {
         let values = Values::of(definition)?;
-        of_algorithms.push([definition.name.to_owned(), values.about, values.given.join(", "), values.gflop]);
+        of_algorithms.push([
+            definition.name.to_owned(),
+            values.about,
+            values.given.join(", "),
+            values.gflop,
+        ]);
     }
     print(&format!("{}\n{}", of_tasks.render(Style::Text), of_algorithms.render(Style::Text)))
 }
@@ -91,7 +100,9 @@ fn print_metrics(algorithm: Option<&str>) -> anyhow::Result<()> {
     let tables = ALGORITHMS.iter().filter(asked).map(|Definition { name, metrics, .. }| {
         let mut table = Table::new(&[*name, "held out", "what it is"].map(|title| (title, Left)));
         let held_out = |metric: &Metric| if metric.held_out { "yes" } else { "" };
-        metrics.iter().for_each(|it| table.push([it.name, held_out(it), it.help].map(str::to_owned)));
+        metrics
+            .iter()
+            .for_each(|it| table.push([it.name, held_out(it), it.help].map(str::to_owned)));
         table.render(Style::Text)
     });
     print(&Vec::from_iter(tables).join("\n"))
@@ -100,8 +111,12 @@ fn print_metrics(algorithm: Option<&str>) -> anyhow::Result<()> {
 fn print_preset(preset: &Preset, algorithm: Option<&str>) -> anyhow::Result<()> {
     let changes = algorithm.map(|name| ("algorithm".to_owned(), name.into()));
     let experiment = preset.resolve(&changes.into_iter().collect())?;
-    let not_given = preset.task.map(|task| hyperparameters::not_given(&experiment.definition()?, task)).transpose()?;
-    let comment = not_given.flatten().map(|sentence| format!("# {sentence}\n\n")).unwrap_or_default();
+    let not_given = preset
+        .task
+        .map(|task| hyperparameters::not_given(&experiment.definition()?, task))
+        .transpose()?;
+    let comment =
+        not_given.flatten().map(|sentence| format!("# {sentence}\n\n")).unwrap_or_default();
     print(&(comment + &toml::to_string(&experiment)?))
 }
 
@@ -129,16 +144,24 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
 fn all_readable(unreadable: usize) -> anyhow::Result<()> {
     let hint = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode is \
                 scored again";
-    if unreadable == 0 { Ok(()) } else { Err(anyhow!("{unreadable} folders cannot be read")).hint(hint) }
+    if unreadable == 0 {
+        Ok(())
+    } else {
+        Err(anyhow!("{unreadable} folders cannot be read")).hint(hint)
+    }
 }
 
 fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
     let mut all_held = true;
     for dir in &args.dirs {
-        let about = if args.dirs.len() > 1 { format!("{}: ", dir.display()) } else { String::new() };
+        let about =
+            if args.dirs.len() > 1 { format!("{}: ", dir.display()) } else { String::new() };
         let mut findings = vec![(about, verify::verify(dir)?)];
         if let Some(other) = &args.same_as {
-            findings.extend(verify::compare(dir, other)?.map(|found| (format!("with {}: ", other.display()), found)));
+            findings.extend(
+                verify::compare(dir, other)?
+                    .map(|found| (format!("with {}: ", other.display()), found)),
+            );
         }
         for (about, found) in &findings {
             print(&format!("{about}{found}"))?;
@@ -153,7 +176,11 @@ fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
     let entries = list::list(&args.dirs);
     print(&if args.json { json(&entries)? } else { list::table(&entries) })?;
     let unreadable: Vec<_> = entries.iter().filter_map(list::Entry::unreadable).collect();
-    anyhow::ensure!(unreadable.is_empty(), "some runs cannot be read:\n  {}", unreadable.join("\n  "));
+    anyhow::ensure!(
+        unreadable.is_empty(),
+        "some runs cannot be read:\n  {}",
+        unreadable.join("\n  ")
+    );
     Ok(())
 }
 
@@ -172,16 +199,20 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<()> {
 fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
     match command {
         DatasetsCommand::List => {
-            let header = [("dataset", Left), ("environment", Left), ("size", Right), ("in the cache", Left)];
+            let header =
+                [("dataset", Left), ("environment", Left), ("size", Right), ("in the cache", Left)];
             let mut table = Table::new(&header);
             for dataset in cache::list() {
                 table.push(dataset?);
             }
             let (d4rl, ogbench) = (cache::d4rl()?, cache::ogbench()?);
-            let folders = format!("cache folders: {}, and of OGBench {}", d4rl.display(), ogbench.display());
+            let folders =
+                format!("cache folders: {}, and of OGBench {}", d4rl.display(), ogbench.display());
             print(&format!("{}\n{folders}", table.render(Style::Text)))
         }
-        DatasetsCommand::Fetch { name } => print(&Source::named(name)?.obtain()?.path.display().to_string()),
+        DatasetsCommand::Fetch { name } => {
+            print(&Source::named(name)?.obtain()?.path.display().to_string())
+        }
         DatasetsCommand::Inspect(args) => inspect(args),
     }
 }

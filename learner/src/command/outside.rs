@@ -1,4 +1,5 @@
-//! What a run has besides its training: where it meets evaluators, and those that it starts on the cores that are left.
+//! What a run has besides its training: where it meets evaluators, and those that it starts on the
+//! cores that are left.
 
 use std::num::NonZero;
 use std::thread::available_parallelism;
@@ -6,8 +7,8 @@ use std::thread::available_parallelism;
 use quad_dataset::environment;
 use quad_run::config::Experiment;
 use quad_runtime::{
-    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Hint, Role, SessionError, certificates_folder,
-    default_endpoint, threads_asked,
+    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Hint, Role, SessionError,
+    certificates_folder, default_endpoint, threads_asked,
 };
 use tracing::{info, warn};
 
@@ -15,8 +16,8 @@ use crate::cli::TrainArgs;
 use crate::live::{Opening, open_network};
 use crate::local_evaluators::LocalEvaluators;
 
-/// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with one next action per state),
-/// and threads that wait for a tile keep their cores busy.
+/// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with
+/// one next action per state), and threads that wait for a tile keep their cores busy.
 const MOST_THREADS: usize = 16;
 /// For a run that needs no known port, so that several can run at a time.
 const ANY_PORT: u16 = 0;
@@ -40,8 +41,9 @@ impl Outside {
         let endpoints = endpoints(args, experiment.eval_interval)?;
         let is_default = args.listen.is_none() && args.connect.is_none();
         let cores = available_parallelism()?.get();
-        let is_alone =
-            is_default && endpoints.certificates.is_none() && environment::find(&experiment.environment).is_ok();
+        let is_alone = is_default
+            && endpoints.certificates.is_none()
+            && environment::find(&experiment.environment).is_ok();
         let (count, share) = match args.evaluators {
             _ if args.dry_run || experiment.eval_interval == 0 => (0, cores),
             Some(count) => (count, cores),
@@ -54,7 +56,8 @@ impl Outside {
         Ok(Self { endpoints, evaluators: LocalEvaluators::new(count, share)?, is_default })
     }
 
-    /// Starts to open the session. If another learner on this machine has the usual port, it takes a free one.
+    /// Starts to open the session. If another learner on this machine has the usual port, it takes
+    /// a free one.
     ///
     /// # Errors
     /// The learner cannot listen.
@@ -62,16 +65,20 @@ impl Outside {
         let mut opening = open_network(&self.endpoints).await;
         if opening.is_err() && self.is_default {
             info!("another program, perhaps a learner, has port {DEFAULT_PORT}; taking a free one");
-            self.endpoints.listen = vec![default_endpoint(self.endpoints.certificates.as_ref(), ANY_PORT)];
+            self.endpoints.listen =
+                vec![default_endpoint(self.endpoints.certificates.as_ref(), ANY_PORT)];
             opening = open_network(&self.endpoints).await;
         }
         opening.hint_of(|error| {
-            error.downcast_ref().map_or("join a router with --connect, or listen with --listen", SessionError::hint)
+            error
+                .downcast_ref()
+                .map_or("join a router with --connect, or listen with --listen", SessionError::hint)
         })
     }
 }
 
-/// Threads that train: so many as the command line or RAYON_NUM_THREADS asks for, or else one per core, up to a limit.
+/// Threads that train: so many as the command line or RAYON_NUM_THREADS asks for, or else one per
+/// core, up to a limit.
 pub(super) fn training_threads(asked: Option<NonZero<usize>>) -> usize {
     let cores = available_parallelism().map_or(1, NonZero::get);
     asked.or_else(threads_asked).map_or(cores.min(MOST_THREADS), NonZero::get)
@@ -79,7 +86,8 @@ pub(super) fn training_threads(asked: Option<NonZero<usize>>) -> usize {
 
 /// Where the learner listens or connects.
 fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
-    // Evaluators of its own have none, nor has the learner then: the variable is for other networks.
+    // Evaluators of its own have none, nor has the learner then: the variable is for other
+    // networks.
     let folder = if args.evaluators.is_some_and(|count| count > 0) {
         None
     } else {
@@ -92,7 +100,8 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> 
         (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
         (listen, _) => Vec::from_iter(listen.clone()),
     };
-    let endpoints = Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
+    let endpoints =
+        Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
     endpoints.check().hint_of(SessionError::hint)?;
     if let Some(endpoint) = endpoints.open_to_all() {
         warn!(

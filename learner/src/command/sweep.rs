@@ -10,7 +10,9 @@ use anyhow::{Context, anyhow};
 use quad_run::run::{Lock, RunDirError};
 use quad_run::status::State;
 use quad_run::table::{Style, Table};
-use quad_runtime::{Hint, SessionError, hinted, open_router, print, stay_in_background, threads_asked, unfinished};
+use quad_runtime::{
+    Hint, SessionError, hinted, open_router, print, stay_in_background, threads_asked, unfinished,
+};
 use tracing::{info, warn};
 
 use super::all_readable;
@@ -34,22 +36,28 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     let count = runs.len();
     let left: Runs = runs.into_iter().filter(|(_, state)| *state != State::Complete).collect();
     let complete = count - left.len();
-    let (unreadable, left): (Runs, Runs) = left.into_iter().partition(|(_, state)| *state == State::Unreadable);
+    let (unreadable, left): (Runs, Runs) =
+        left.into_iter().partition(|(_, state)| *state == State::Unreadable);
     let begun = left.iter().filter(|(_, state)| *state != State::NotBegun).count();
     info!("{count} runs: {complete} complete, {} to do, of which {begun} have begun", left.len());
-    let mut ended = if left.is_empty() { Ended::default() } else { work(args, &study.name, &folder, left)? };
-    ended.failed.extend(unreadable.iter().map(|(run, _)| format!("{}: its folder cannot be read", run.name)));
+    let mut ended =
+        if left.is_empty() { Ended::default() } else { work(args, &study.name, &folder, left)? };
+    ended.failed.extend(
+        unreadable.iter().map(|(run, _)| format!("{}: its folder cannot be read", run.name)),
+    );
     conclude(&folder, count, ended)
 }
 
-/// Keeps others from the study's folder, or from the whole study if this is a part of it: two sweeps of the same runs would
-/// start them twice.
+/// Keeps others from the study's folder, or from the whole study if this is a part of it: two
+/// sweeps of the same runs would start them twice.
 fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
-    fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    fs::create_dir_all(folder)
+        .with_context(|| format!("cannot make the folder {}", folder.display()))?;
     let path = folder.join("sweep.lock");
     let is_part = args.index.is_some() || args.shard.is_some() || !args.only.is_empty();
     let lock = if is_part { Lock::share(&path) } else { Lock::take(&path) };
-    let hint = "wait for its end; --list prints how far it is, --shard shares a study among machines";
+    let hint =
+        "wait for its end; --list prints how far it is, --shard shares a study among machines";
     lock.map_err(|error| match error {
         in_use @ RunDirError::InUse(_) => unfinished(in_use, hint),
         other => other.into(),
@@ -58,13 +66,16 @@ fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
 
 /// The runs that the command line selects, and their states.
 fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs> {
-    if let Some(index) = args.index.filter(|index| study.runs.iter().all(|run| run.index != *index)) {
+    if let Some(index) = args.index.filter(|index| study.runs.iter().all(|run| run.index != *index))
+    {
         return Err(hinted(anyhow!("there is no run {index}"), "--list prints them"));
     }
     let is_chosen = |(place, run): &(usize, &PlannedRun)| {
-        args.index.is_none_or(|index| run.index == index) && args.shard.is_none_or(|shard| shard.has(*place))
+        args.index.is_none_or(|index| run.index == index)
+            && args.shard.is_none_or(|shard| shard.has(*place))
     };
-    let with_state = |(_, run): (usize, &PlannedRun)| Ok((run.clone(), run.state(&folder.join(&run.name))?));
+    let with_state =
+        |(_, run): (usize, &PlannedRun)| Ok((run.clone(), run.state(&folder.join(&run.name))?));
     study.runs.iter().enumerate().filter(is_chosen).map(with_state).collect()
 }
 
@@ -87,7 +98,8 @@ struct Machine {
 }
 
 impl Machine {
-    /// The shares for `runs` runs. What the command line does not say follows from the cores that this process may use.
+    /// The shares for `runs` runs. What the command line does not say follows from the cores that
+    /// this process may use.
     fn share(args: &SweepArgs, runs: usize) -> anyhow::Result<Self> {
         let cores = available_parallelism()?.get();
         let threads = threads_asked().map_or(1, usize::from);
@@ -97,7 +109,8 @@ impl Machine {
     }
 }
 
-/// How many learners of so many threads run at a time, and how many cores that leaves for evaluators.
+/// How many learners of so many threads run at a time, and how many cores that leaves for
+/// evaluators.
 fn shares(cores: usize, threads: usize, jobs: Option<u16>, runs: usize) -> (usize, usize) {
     let jobs = jobs.map_or(cores * 3 / 4 / threads, usize::from).clamp(1, runs);
     (jobs, cores.saturating_sub(jobs.saturating_mul(threads)).max(1))
@@ -123,10 +136,12 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     let _lock = lock(args, folder)?;
     // Tasks of an array job must not write into each other's logs.
     let logs = args.index.map_or(folder.to_owned(), |_| folder.join(&left[0].0.name));
-    fs::create_dir_all(&logs).with_context(|| format!("cannot make the folder {}", logs.display()))?;
+    fs::create_dir_all(&logs)
+        .with_context(|| format!("cannot make the folder {}", logs.display()))?;
 
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
-    let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
+    let runtime =
+        runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
     let ended = runtime.block_on(async {
         let (_router, endpoint) = match args.connect.clone() {
             Some(endpoint) => (None, endpoint),
@@ -151,7 +166,8 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
 fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
     let Ended { unfinished: stopped, failed } = ended;
     if !failed.is_empty() {
-        let error = anyhow!("{} of {count} runs have failed:\n  {}", failed.len(), failed.join("\n  "));
+        let error =
+            anyhow!("{} of {count} runs have failed:\n  {}", failed.len(), failed.join("\n  "));
         return Err(error).hint("fix it and run the same command: unfinished runs continue");
     }
     if stopped > 0 {
@@ -187,9 +203,13 @@ mod tests {
         let path = path.to_str().unwrap();
         let of_shard = |shard: &str| {
             let words = ["learner", "sweep", path, "--only", "batch_size=16", "--shard", shard];
-            let Command::Sweep(args) = Cli::try_parse_from(words).unwrap().command else { panic!("{words:?}") };
+            let Command::Sweep(args) = Cli::try_parse_from(words).unwrap().command else {
+                panic!("{words:?}")
+            };
             let study = Study::read(&args.study, &args.only, &args.set).unwrap();
-            Vec::from_iter(chosen(&study, &args, folder.path()).unwrap().iter().map(|(run, _)| run.index))
+            Vec::from_iter(
+                chosen(&study, &args, folder.path()).unwrap().iter().map(|(run, _)| run.index),
+            )
         };
         assert_eq!([of_shard("1/2"), of_shard("2/2")], [vec![1, 5], vec![3]]);
     }

@@ -32,7 +32,10 @@ const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let preset = Preset::read(args.preset())?;
     let experiment = preset.resolve(&args.changes())?;
-    let named = experiment.dataset.clone().ok_or_else(|| anyhow!("preset {} names no dataset", preset.label));
+    let named = experiment
+        .dataset
+        .clone()
+        .ok_or_else(|| anyhow!("preset {} names no dataset", preset.label));
     let missing = match preset.task_name() {
         name if ogbench::is_ogbench(name) => format!(
             "its rewards come from OGBench's simulator: with quad_rl and ogbench installed, `quad-convert ogbench:{name} --out \
@@ -80,9 +83,11 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         return dry_run::estimate(&path, &config, data.training);
     }
 
-    // Zenoh and training have threads of their own; this runtime serves the metrics and the main loop.
+    // Zenoh and training have threads of their own; this runtime serves the metrics and the main
+    // loop.
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
-    let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
+    let runtime =
+        runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
     let ended = runtime.block_on(run_to_its_end(args, outside, &path, begun, name, &config, data));
     let concluded = ended.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
     // Does not wait for a thread that a broken disk blocks.
@@ -131,16 +136,26 @@ async fn run_to_its_end(
     let Split { training, held_out, .. } = data;
     let task = Task::new(environment, training.observation_dim(), training.action_dim());
     let mut agent = begin(&config.experiment, config.run.device, training)?;
-    let held_out =
-        held_out.and_then(|held_out| HeldOut::new(&config.experiment, config.run.device, held_out, &mut agent));
+    let held_out = held_out.and_then(|held_out| {
+        HeldOut::new(&config.experiment, config.run.device, held_out, &mut agent)
+    });
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
     let (tell, events) = mpsc::unbounded_channel();
-    // A later start has a larger number; the low bits distinguish two that start in the same millisecond.
-    let incarnation = Incarnation { run: name, number: now()? << 16 | u64::from(rand::random::<u16>()) };
+    // A later start has a larger number; the low bits distinguish two that start in the same
+    // millisecond.
+    let incarnation =
+        Incarnation { run: name, number: now()? << 16 | u64::from(rand::random::<u16>()) };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
-    let run = Run { incarnation: incarnation.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
+    let run = Run {
+        incarnation: incarnation.clone(),
+        config,
+        dir: &run_dir,
+        scores,
+        past,
+        checkpoint_every,
+    };
     let threads = Threads::start(run, task, (agent, held_out), &metrics, &health, &tell)?;
     threads.show_on(&live);
     let main_loop = MainLoop {
@@ -160,7 +175,12 @@ async fn run_to_its_end(
 }
 
 /// Opens or makes the run's folder, and reads what it contains.
-fn take_up(path: &Path, begun: Option<Begun>, fresh: bool, config: &RunConfig) -> anyhow::Result<(RunDir, Log, Past)> {
+fn take_up(
+    path: &Path,
+    begun: Option<Begun>,
+    fresh: bool,
+    config: &RunConfig,
+) -> anyhow::Result<(RunDir, Log, Past)> {
     match begun {
         Some(begun) if !fresh => return begun.go_on(&config.experiment),
         Some(begun) => begun.set_aside()?,
@@ -180,20 +200,25 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
     let folder = run_dir.path().display();
     let reported = match &ending {
         Ending::Complete => summarize(run_dir),
-        // The run may have failed because its disk hangs, and one that was told to stop has little time.
+        // The run may have failed because its disk hangs, and one that was told to stop has little
+        // time.
         _ => {
             let run_dir = run_dir.clone();
             within(REPORT_PATIENCE, move || summarize(&run_dir))
         }
     };
-    let kept =
-        format!("everything up to the newest checkpoint is kept in {folder}; the same command continues from there");
+    let kept = format!(
+        "everything up to the newest checkpoint is kept in {folder}; the same command continues from there"
+    );
     let error = match ending {
         Ending::Complete => return all_scored(reported?),
         Ending::Failed(error) => hinted(error, kept),
         Ending::Interrupted => {
             let steps = config.experiment.steps;
-            unfinished(anyhow!("interrupted before the end of {steps} steps and their evaluations"), kept)
+            unfinished(
+                anyhow!("interrupted before the end of {steps} steps and their evaluations"),
+                kept,
+            )
         }
         Ending::Unscored => unfinished(
             anyhow!(

@@ -1,4 +1,5 @@
-//! The folders in which D4RL and OGBench keep their files, shared with everything else that uses these.
+//! The folders in which D4RL and OGBench keep their files, shared with everything else that uses
+//! these.
 
 use std::path::{Path, PathBuf};
 
@@ -32,13 +33,16 @@ pub fn of(dataset: &NamedDataset) -> anyhow::Result<PathBuf> {
 
 fn in_home(folder: &str) -> anyhow::Result<PathBuf> {
     let home = std::env::home_dir().filter(|home| !home.as_os_str().is_empty());
-    home.map(|home| home.join(folder)).ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
+    home.map(|home| home.join(folder))
+        .ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
 }
 
-/// The catalog: name, environment, size, and what of it is in its folder already. Checksums are not computed for this.
+/// The catalog: name, environment, size, and what of it is in its folder already. Checksums are not
+/// computed for this.
 pub fn list() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
     catalog::all().iter().map(|dataset| {
-        let size = dataset.bytes.map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string());
+        let size =
+            dataset.bytes.map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string());
         let path = of(dataset)?.join(&dataset.file);
         Ok([dataset.name.clone(), dataset.environment.clone(), size, state(dataset, &path)])
     })
@@ -48,7 +52,9 @@ fn state(dataset: &NamedDataset, path: &Path) -> String {
     let found = path.metadata().map(|metadata| metadata.len());
     let part = left_of(path).into_iter().map(|(_, length)| length).max();
     match (found, part) {
-        (Ok(found), _) if dataset.bytes.is_some_and(|bytes| bytes != found) => format!("another file of {found} bytes"),
+        (Ok(found), _) if dataset.bytes.is_some_and(|bytes| bytes != found) => {
+            format!("another file of {found} bytes")
+        }
         (Ok(_), _) => "yes".to_owned(),
         (Err(_), Some(part)) => format!("{} of it", HumanBytes(part)),
         (Err(_), None) => "no".to_owned(),

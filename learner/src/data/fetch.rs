@@ -50,8 +50,12 @@ impl Fetcher {
         match verify(dataset, &path) {
             Ok(Ok(sha256)) => return Ok(LocalDataset { path, sha256 }),
             Ok(Err(mismatch)) => {
-                return Err(anyhow!("{} is not the dataset {}: {mismatch}", path.display(), dataset.name))
-                    .hint("remove it or move it away, and it will be fetched anew");
+                return Err(anyhow!(
+                    "{} is not the dataset {}: {mismatch}",
+                    path.display(),
+                    dataset.name
+                ))
+                .hint("remove it or move it away, and it will be fetched anew");
             }
             Err(error) if error.kind() == ErrorKind::NotFound => {}
             Err(error) => return Err(local(error)),
@@ -83,7 +87,10 @@ impl Fetcher {
     }
 
     fn addresses(&self, dataset: &NamedDataset) -> Vec<String> {
-        let mirror = self.mirror.iter().map(|base| format!("{}/{}", base.trim_end_matches('/'), dataset.file));
+        let mirror = self
+            .mirror
+            .iter()
+            .map(|base| format!("{}/{}", base.trim_end_matches('/'), dataset.file));
         mirror.chain(dataset.addresses.iter().cloned()).collect()
     }
 
@@ -95,7 +102,8 @@ impl Fetcher {
         partial: &mut Partial,
         progress: &ProgressBar,
     ) -> Result<String, Failure> {
-        // Without its size, nothing tells whether what is here already can be the beginning of the file.
+        // Without its size, nothing tells whether what is here already can be the beginning of the
+        // file.
         if dataset.bytes.is_none_or(|bytes| partial.length > bytes) {
             partial.clear()?;
         }
@@ -114,7 +122,9 @@ impl Fetcher {
                 (furthest, attempts) = (partial.length, ATTEMPTS);
             }
             match failure {
-                Failure::Passing(reason) if attempts > 0 => progress.say(&format!("{reason}; trying again")),
+                Failure::Passing(reason) if attempts > 0 => {
+                    progress.say(&format!("{reason}; trying again"))
+                }
                 failure => return Err(failure),
             }
             std::thread::sleep(self.pause);
@@ -133,12 +143,21 @@ fn check(dataset: &NamedDataset, partial: &mut Partial) -> Result<String, Failur
 /// The file cannot be read or written here.
 fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
     let hint = match error.kind() {
-        _ if dataset.is_ogbench() => "make the folder a link to one that you may write to and that has room",
+        _ if dataset.is_ogbench() => {
+            "make the folder a link to one that you may write to and that has room"
+        }
         ErrorKind::StorageFull => {
             "make room, or name a folder on another disk in D4RL_DATASET_DIR; what has arrived is kept and will be \
              continued"
         }
         _ => "name a folder that you may write to in D4RL_DATASET_DIR",
     };
-    hinted(Error::new(error).context(format!("cannot keep the dataset {} in {}", dataset.name, folder.display())), hint)
+    hinted(
+        Error::new(error).context(format!(
+            "cannot keep the dataset {} in {}",
+            dataset.name,
+            folder.display()
+        )),
+        hint,
+    )
 }

@@ -10,8 +10,8 @@ use quad_runtime::Hint;
 /// Reads a file or folder of transitions for an experiment.
 ///
 /// # Errors
-/// It cannot be read or learned from, or it has fewer transitions than a batch: a batch never holds one twice while there are
-/// others.
+/// It cannot be read or learned from, or it has fewer transitions than a batch: a batch never holds
+/// one twice while there are others.
 pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
     let options = ReadOptions {
         environment: environment::find(&experiment.environment).ok(),
@@ -22,7 +22,8 @@ pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
     let hold_out = HoldOut::Share { share: experiment.hold_out, seed: experiment.seed };
     let result = Transitions::read_split(path, &options, hold_out);
     let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
-    let split = result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;
+    let split =
+        result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;
     for doubt in split.training.doubts() {
         tracing::warn!("{}: {doubt}", path.display());
     }

@@ -28,7 +28,8 @@ impl Partial {
             }
         }
         let file = files::append(&path)?;
-        // Where the file system has no locks, this run continues all the same, and nothing is taken over there.
+        // Where the file system has no locks, this run continues all the same, and nothing is taken
+        // over there.
         file.try_lock().ok();
         Ok(Self { path, length: 0, file })
     }
@@ -45,7 +46,8 @@ impl Partial {
         self.file.set_len(0)
     }
 
-    /// Gives it its final name, under which there is never less than the whole file, not even after a power cut.
+    /// Gives it its final name, under which there is never less than the whole file, not even after
+    /// a power cut.
     pub fn finish(self, target: &Path) -> io::Result<()> {
         self.file.sync_all()?;
         fs::rename(&self.path, target)?;
@@ -69,7 +71,8 @@ pub fn left_of(target: &Path) -> Vec<(PathBuf, u64)> {
         let path = entry.ok()?.path();
         let rest = path.file_name()?.to_str()?.strip_prefix(&*file)?;
         let length = path.metadata().ok()?.len();
-        (rest.starts_with('.') && rest.ends_with(".partial") && length > 0).then_some((path, length))
+        (rest.starts_with('.') && rest.ends_with(".partial") && length > 0)
+            .then_some((path, length))
     };
     folder.into_iter().flatten().filter_map(length).collect()
 }

@@ -29,7 +29,8 @@ pub enum Source {
 }
 
 impl Source {
-    /// Understands what was typed. A name of the catalog comes before a file of that name; `./NAME` is the file.
+    /// Understands what was typed. A name of the catalog comes before a file of that name; `./NAME`
+    /// is the file.
     pub fn parse(text: &str) -> anyhow::Result<Self> {
         if let Some(id) = text.strip_prefix(MINARI) {
             return Ok(Self::Minari(id.to_owned()));
@@ -44,7 +45,8 @@ impl Source {
 
     /// The catalog's dataset of that name.
     pub fn named(name: &str) -> anyhow::Result<Self> {
-        const LIST: &str = "`learner datasets list` prints all names; to train on a file, give its path";
+        const LIST: &str =
+            "`learner datasets list` prints all names; to train on a file, give its path";
         let known = catalog::all().iter().map(|dataset| dataset.name.as_str());
         let nearest = did_you_mean(name, known);
         let found = catalog::find(name).map(Self::Named);
@@ -63,12 +65,14 @@ impl Source {
     /// Refuses data that the catalog says is from another simulation than that of `environment`.
     pub fn check_environment(&self, environment: &str) -> anyhow::Result<()> {
         match self.entry() {
-            Some(entry) if simulation_of(&entry.environment) != simulation_of(environment) => Err(anyhow!(
-                "{} is a dataset of {}, but the policy is for {environment}",
-                entry.name,
-                entry.environment
-            ))
-            .hint("choose a task in the dataset's environment, or another --dataset"),
+            Some(entry) if simulation_of(&entry.environment) != simulation_of(environment) => {
+                Err(anyhow!(
+                    "{} is a dataset of {}, but the policy is for {environment}",
+                    entry.name,
+                    entry.environment
+                ))
+                .hint("choose a task in the dataset's environment, or another --dataset")
+            }
             _ => Ok(()),
         }
     }

@@ -7,7 +7,8 @@ use quad_dataset::NamedDataset;
 use quad_run::files;
 use sha2::{Digest, Sha256};
 
-/// SHA-256 of a file in lower-case hexadecimal if the file is what `dataset` says, as far as that is known; else what is wrong.
+/// SHA-256 of a file in lower-case hexadecimal if the file is what `dataset` says, as far as that
+/// is known; else what is wrong.
 pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, String>> {
     let mut file = files::open_named(path)?;
     let found = file.metadata()?.len();
@@ -23,7 +24,9 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
     }
     let found = sha256(path)?;
     match &dataset.sha256 {
-        Some(expected) if *expected != found => Ok(Err(format!("its SHA-256 is {found}, but must be {expected}"))),
+        Some(expected) if *expected != found => {
+            Ok(Err(format!("its SHA-256 is {found}, but must be {expected}")))
+        }
         _ => Ok(Ok(found)),
     }
 }

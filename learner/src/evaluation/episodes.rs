@@ -6,10 +6,12 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash};
 
-/// An episode whose evaluator was lost so often is given up: the episode itself may crash evaluators.
+/// An episode whose evaluator was lost so often is given up: the episode itself may crash
+/// evaluators.
 const MOST_ATTEMPTS: u32 = 20;
-/// Lost more often than this, an episode rests before it is handed out again. One machine that fails again and again would
-/// else soon have taken all attempts, and what may pass, like a disk that snapshots are read from, gets time to.
+/// Lost more often than this, an episode rests before it is handed out again. One machine that
+/// fails again and again would else soon have taken all attempts, and what may pass, like a disk
+/// that snapshots are read from, gets time to.
 const ATTEMPTS_AT_ONCE: u32 = 3;
 const LONGEST_REST: Duration = Duration::from_secs(60);
 
@@ -19,7 +21,8 @@ pub(super) struct Evaluation {
     episodes: Vec<Episode>,
     /// Where among them a seed is.
     places: HashMap<u64, usize>,
-    /// Which of them wait, and which are given up. Complete evaluations become many, and are passed over.
+    /// Which of them wait, and which are given up. Complete evaluations become many, and are passed
+    /// over.
     waiting: BTreeSet<usize>,
     given_up: BTreeSet<usize>,
     handed_out: usize,
@@ -104,8 +107,8 @@ impl Evaluation {
         self.given_up.iter().map(|&place| self.episodes[place].seed)
     }
 
-    /// Hands out some of the episodes that wait, without those that rest; none if there are none. After a failure `few` at
-    /// most, in case the episode is its cause.
+    /// Hands out some of the episodes that wait, without those that rest; none if there are none.
+    /// After a failure `few` at most, in case the episode is its cause.
     pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2], now: Instant) -> Vec<u64> {
         let ready = self.waiting.iter().copied();
         let mut ready = ready.filter(|place| !self.episodes[*place].rests(now)).peekable();
@@ -117,8 +120,9 @@ impl Evaluation {
         places.into_iter().map(|place| self.episodes[place].seed).collect()
     }
 
-    /// Takes those of a job's episodes back that have no score yet; `lost` is when its evaluator was lost or failed, and
-    /// nothing if it handed the job back in order. Gives the seeds of those that were lost too often.
+    /// Takes those of a job's episodes back that have no score yet; `lost` is when its evaluator
+    /// was lost or failed, and nothing if it handed the job back in order. Gives the seeds of those
+    /// that were lost too often.
     pub fn take_back(&mut self, job: u64, seeds: &[u64], lost: Option<Instant>) -> Vec<u64> {
         let mut given_up = Vec::new();
         for &seed in seeds {
@@ -128,7 +132,10 @@ impl Evaluation {
                 lost.into_iter().for_each(|now| episode.lost(now));
                 let hopeless = episode.lost >= MOST_ATTEMPTS;
                 given_up.extend(hopeless.then_some(seed));
-                self.change(place, if hopeless { EpisodeState::GivenUp } else { EpisodeState::Waiting });
+                self.change(
+                    place,
+                    if hopeless { EpisodeState::GivenUp } else { EpisodeState::Waiting },
+                );
             }
         }
         given_up

@@ -38,11 +38,21 @@ impl OpenJob {
         now: Instant,
     ) -> Self {
         let (lease_until, done) = (now + patience, (0, 0));
-        Self { evaluator, attempt, step, seeds, patience, asked_again: false, handed_out: now, lease_until, done }
+        Self {
+            evaluator,
+            attempt,
+            step,
+            seeds,
+            patience,
+            asked_again: false,
+            handed_out: now,
+            lease_until,
+            done,
+        }
     }
 
-    /// Extends the lease, if the evaluator is further than before: one whose simulation hangs loses its job. Before the
-    /// first environment step the lease is short; every job has a maximum time.
+    /// Extends the lease, if the evaluator is further than before: one whose simulation hangs loses
+    /// its job. Before the first environment step the lease is short; every job has a maximum time.
     pub fn advance(&mut self, progress: &Progress, now: Instant) -> Result<(), Refusal> {
         require(progress.evaluator == self.evaluator, Refusal::Evaluator)?;
         let (steps, episodes) = (progress.steps_done, progress.episodes_done);
@@ -60,7 +70,8 @@ impl OpenJob {
 
     /// Extends the lease, until `longest` after the job was handed out.
     pub fn extend(&mut self, now: Instant, longest: Duration) {
-        self.lease_until = self.lease_until.max((now + self.patience).min(self.handed_out + longest));
+        self.lease_until =
+            self.lease_until.max((now + self.patience).min(self.handed_out + longest));
     }
 }
 

@@ -1,16 +1,18 @@
-//! The state of a run's evaluations: which episodes wait for a score, which evaluator has which, which scores came. It does no
-//! I/O.
+//! The state of a run's evaluations: which episodes wait for a score, which evaluator has which,
+//! which scores came. It does no I/O.
 //!
-//! An evaluation is a snapshot (step and hash) with a list of episode seeds. A job gives some of its episodes to one evaluator
-//! under a lease, which progress extends. When the lease ends, or the evaluator leaves, the learner gives these episodes to
-//! another evaluator, unless that has happened too often. For each (step, seed) only the first delivered score counts,
-//! whichever evaluator delivers it.
+//! An evaluation is a snapshot (step and hash) with a list of episode seeds. A job gives some of
+//! its episodes to one evaluator under a lease, which progress extends. When the lease ends, or the
+//! evaluator leaves, the learner gives these episodes to another evaluator, unless that has
+//! happened too often. For each (step, seed) only the first delivered score counts, whichever
+//! evaluator delivers it.
 //!
-//! It has no thread: the module `live` calls it behind a lock, for microseconds. The current time is an argument, so tests
-//! have a clock of their own.
+//! It has no thread: the module `live` calls it behind a lock, for microseconds. The current time
+//! is an argument, so tests have a clock of their own.
 //!
-//! In reading order: `scoreboard`, `outcomes` (its arguments and results), `episodes` (one evaluation), `jobs` (which
-//! evaluator has which episodes until when), `validate` (which reports count), `refusal` (why a report does not).
+//! In reading order: `scoreboard`, `outcomes` (its arguments and results), `episodes` (one
+//! evaluation), `jobs` (which evaluator has which episodes until when), `validate` (which reports
+//! count), `refusal` (why a report does not).
 
 mod episodes;
 mod jobs;

@@ -20,7 +20,8 @@ pub(crate) struct OtherWeights {
 pub(crate) struct Recorded {
     /// Jobs that have no episode left to score: the report's, or another's that came too late.
     pub jobs_completed: usize,
-    /// All episodes of its evaluation are scored: their scores, in the order of the evaluation's seeds.
+    /// All episodes of its evaluation are scored: their scores, in the order of the evaluation's
+    /// seeds.
     pub evaluation_completed: Option<Vec<EpisodeScore>>,
 }
 
@@ -60,6 +61,7 @@ pub(crate) struct HandedBack {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Lost {
     pub jobs: usize,
-    /// Step and seed of the episodes that are not handed out any more, because they were lost too often.
+    /// Step and seed of the episodes that are not handed out any more, because they were lost too
+    /// often.
     pub given_up: Vec<(u64, u64)>,
 }

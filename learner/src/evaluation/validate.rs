@@ -7,7 +7,8 @@ use quad_protocol::{EpisodeScore, ScoreReport};
 use super::refusal::{Refusal, require};
 use super::scoreboard::Scoreboard;
 
-/// Largest relative difference between a score and the one computed from its return; it allows for rounding only.
+/// Largest relative difference between a score and the one computed from its return; it allows for
+/// rounding only.
 const SCORE_TOLERANCE: f64 = 1e-6;
 
 /// A report that passed every check, split into new scores and scores that are recorded already.
@@ -20,8 +21,8 @@ pub(crate) struct Validated {
 }
 
 impl Scoreboard {
-    /// Checks a report against the evaluation that it is about, and says what in it is new. Changes nothing: the caller writes
-    /// the new scores down first, then calls [`record`](Self::record).
+    /// Checks a report against the evaluation that it is about, and says what in it is new. Changes
+    /// nothing: the caller writes the new scores down first, then calls [`record`](Self::record).
     pub fn validate(&self, report: &ScoreReport) -> Result<Validated, Refusal> {
         require(report.run == self.rules.run, Refusal::Run)?;
         let evaluation = self.evaluations.get(&report.step).ok_or(Refusal::Step)?;
@@ -42,8 +43,10 @@ impl Scoreboard {
 
     fn is_possible(&self, score: &EpisodeScore) -> bool {
         let task = &self.rules.task;
-        // In an environment that is not known here, the evaluator's user decides what counts as a score.
-        let expected = if task.is_normalized() { task.score(score.episode_return) } else { score.score };
+        // In an environment that is not known here, the evaluator's user decides what counts as a
+        // score.
+        let expected =
+            if task.is_normalized() { task.score(score.episode_return) } else { score.score };
         let longest = task.max_episode_steps().unwrap_or(usize::MAX);
         let length_fits = (1..=longest).contains(&(score.length as usize));
         length_fits

@@ -55,18 +55,25 @@ impl Actions {
     }
 }
 
-/// Acts in these states, given in the evaluation's units; the actions are in the data's. Each state has a seed of its own, from
-/// `seed` on.
-fn act(policy: &dyn Policy, scaling: &Scaling, observations: &[f32], seed: u64) -> anyhow::Result<Vec<f32>> {
+/// Acts in these states, given in the evaluation's units; the actions are in the data's. Each state
+/// has a seed of its own, from `seed` on.
+fn act(
+    policy: &dyn Policy,
+    scaling: &Scaling,
+    observations: &[f32],
+    seed: u64,
+) -> anyhow::Result<Vec<f32>> {
     let (o, a) = (policy.observation_dim(), policy.action_dim());
     let mut observations = observations.to_vec();
     scaling.observations.iter().for_each(|affine| affine.to_user(&mut observations));
     let states = states_at_a_time(policy);
     let mut actions = vec![0.0; observations.len() / o * a];
-    let parts = observations.par_chunks(states * o).zip(actions.par_chunks_mut(states * a)).enumerate();
+    let parts =
+        observations.par_chunks(states * o).zip(actions.par_chunks_mut(states * a)).enumerate();
     parts.try_for_each(|(part, (observations, actions))| {
         let first = seed + (part * states) as u64;
-        let mut carried = Vec::from_iter((first..).take(observations.len() / o).map(|seed| policy.begin(seed)));
+        let mut carried =
+            Vec::from_iter((first..).take(observations.len() / o).map(|seed| policy.begin(seed)));
         policy.act(observations, &mut carried, actions)
     })?;
     Ok(actions)
@@ -114,7 +121,12 @@ mod tests {
             0
         }
 
-        fn act(&self, observed: &[f32], _: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
+        fn act(
+            &self,
+            observed: &[f32],
+            _: &mut [EpisodeState],
+            actions: &mut [f32],
+        ) -> Result<(), PolicyError> {
             actions.copy_from_slice(observed);
             Ok(())
         }
@@ -122,7 +134,9 @@ mod tests {
 
     #[test]
     fn a_policy_sees_and_gives_the_datas_units_and_the_evaluation_its_own() {
-        let affine = |offset: [f32; 2], scale: [f32; 2]| Some(Affine { offset: offset.into(), scale: scale.into() });
+        let affine = |offset: [f32; 2], scale: [f32; 2]| {
+            Some(Affine { offset: offset.into(), scale: scale.into() })
+        };
         let scaling = Scaling {
             observations: affine([100.0, -3.0], [10.0, 2.0]),
             actions: affine([90.0, 0.0], [20.0, 1.0]),

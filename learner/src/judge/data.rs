@@ -1,4 +1,5 @@
-//! The data by which policies are judged: episodes to estimate values from, and those in whose states they are judged.
+//! The data by which policies are judged: episodes to estimate values from, and those in whose
+//! states they are judged.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -7,7 +8,8 @@ use anyhow::{Context as _, anyhow};
 use candle_core::Device;
 use quad_algorithms::{Context, Fqe};
 use quad_dataset::{
-    Batch, DatasetError, HoldOut, ReadOptions, RewardRule, Scale, Split, Transitions, environment, ogbench,
+    Batch, DatasetError, HoldOut, ReadOptions, RewardRule, Scale, Split, Transitions, environment,
+    ogbench,
 };
 use quad_policy::Precision;
 use quad_runtime::Hint;
@@ -23,8 +25,8 @@ const SHARE: f64 = 0.1;
 /// In how many states policies are compared with the data at most.
 const COMPARED: usize = 2000;
 
-/// Transitions in the evaluation's units: observations with mean 0 and standard deviation 1, actions from −1 to 1, rewards as they
-/// were recorded.
+/// Transitions in the evaluation's units: observations with mean 0 and standard deviation 1,
+/// actions from −1 to 1, rewards as they were recorded.
 pub(super) struct Data {
     /// SHA-256 of the file.
     pub sha256: String,
@@ -42,32 +44,48 @@ pub(super) struct Data {
 }
 
 impl Data {
-    /// The data that these policies have learned from. They are judged in every episode that one of their runs has held out: all in
-    /// the same states.
+    /// The data that these policies have learned from. They are judged in every episode that one of
+    /// their runs has held out: all in the same states.
     ///
     /// # Errors
-    /// It is not on this machine, is not what they have learned from, or they have not learned from the same in one environment.
+    /// It is not on this machine, is not what they have learned from, or they have not learned from
+    /// the same in one environment.
     pub fn of(subjects: &[Subject]) -> anyhow::Result<Self> {
         let first = subjects.first().ok_or_else(|| anyhow!("there is no policy to judge"))?;
         let of_first = &first.config.dataset;
-        if let Some(other) = subjects.iter().find(|other| other.config.dataset.sha256 != of_first.sha256) {
-            return Err(anyhow!("{} and {} have not learned from the same data", first.run, other.run))
-                .hint("judge them apart: values that come from different data do not compare");
+        if let Some(other) =
+            subjects.iter().find(|other| other.config.dataset.sha256 != of_first.sha256)
+        {
+            return Err(anyhow!(
+                "{} and {} have not learned from the same data",
+                first.run,
+                other.run
+            ))
+            .hint("judge them apart: values that come from different data do not compare");
         }
         let environment = &first.config.experiment.environment;
         let is_of_another = |other: &&Subject| other.config.experiment.environment != *environment;
         if let Some(other) = subjects.iter().find(is_of_another) {
             let (one, of_other) = (&first.run, &other.config.experiment.environment);
-            return Err(anyhow!("{one} is of the environment {environment}, {} of {of_other}", other.run))
-                .hint("judge them apart: values of different rewards do not compare");
+            return Err(anyhow!(
+                "{one} is of the environment {environment}, {} of {of_other}",
+                other.run
+            ))
+            .hint("judge them apart: values of different rewards do not compare");
         }
         let dataset = Source::Path(of_first.path.clone()).obtain();
         let dataset = dataset.hint(format!("put the data of the run {} back", first.run))?;
         if of_first.sha256.as_ref().is_some_and(|sha256| *sha256 != dataset.sha256) {
-            return Err(anyhow!("{} is not the data that {} has learned from", dataset.path.display(), first.run))
-                .hint("put a copy of that file in its place");
+            return Err(anyhow!(
+                "{} is not the data that {} has learned from",
+                dataset.path.display(),
+                first.run
+            ))
+            .hint("put a copy of that file in its place");
         }
-        let episodes = BTreeSet::from_iter(subjects.iter().flat_map(|subject| subject.held_out.iter().copied()));
+        let episodes = BTreeSet::from_iter(
+            subjects.iter().flat_map(|subject| subject.held_out.iter().copied()),
+        );
         let episodes = Vec::from_iter(episodes);
         let hold_out = match episodes.is_empty() {
             false => HoldOut::Episodes(&episodes),
@@ -93,7 +111,10 @@ impl Data {
         Ok(Self {
             sha256,
             environment,
-            first: gather(&held_out, &Vec::from_iter(held_out.recorded_episodes().iter().map(|episode| episode.start))),
+            first: gather(
+                &held_out,
+                &Vec::from_iter(held_out.recorded_episodes().iter().map(|episode| episode.start)),
+            ),
             compared: gather(&held_out, &spread(held_out.len(), COMPARED)),
             training: Arc::new(split.training),
             episodes: split.episodes,
@@ -113,18 +134,24 @@ impl Data {
         }
     }
 
-    /// The mean over the judged episodes of the discounted return, where the last step of one that was cut off counts what these
-    /// evaluations of the behavior say of it.
+    /// The mean over the judged episodes of the discounted return, where the last step of one that
+    /// was cut off counts what these evaluations of the behavior say of it.
     pub fn recorded_value(&self, behavior: &[&Fqe], gamma: f32) -> anyhow::Result<f64> {
         let (mut sum, episodes) = (0.0, self.held_out.recorded_episodes());
         for episode in &episodes {
             let steps = gather(&self.held_out, &Vec::from_iter(episode.clone()));
-            let (o, a, last) = (self.held_out.observation_dim(), self.held_out.action_dim(), steps.rewards.len() - 1);
+            let (o, a, last) = (
+                self.held_out.observation_dim(),
+                self.held_out.action_dim(),
+                steps.rewards.len() - 1,
+            );
             let mut value = f64::from(steps.rewards[last]);
             if steps.masks[last] != 0.0 {
-                let (observation, action) = (&steps.observations[last * o..], &steps.actions[last * a..]);
+                let (observation, action) =
+                    (&steps.observations[last * o..], &steps.actions[last * a..]);
                 let values = behavior.iter().map(|fqe| fqe.values(observation, action));
-                value = mean(values.collect::<candle_core::Result<Vec<_>>>()?.into_iter().flatten());
+                value =
+                    mean(values.collect::<candle_core::Result<Vec<_>>>()?.into_iter().flatten());
             }
             sum += steps.rewards[..last]
                 .iter()
@@ -134,7 +161,8 @@ impl Data {
         Ok(sum / episodes.len() as f64)
     }
 
-    /// The distance of these actions, in the data's units, from the data's at the states that are compared.
+    /// The distance of these actions, in the data's units, from the data's at the states that are
+    /// compared.
     pub fn distance(&self, actions: &[f32]) -> f64 {
         let mut of_data = self.compared.actions.clone();
         self.held_out.scaling().actions.iter().for_each(|affine| affine.to_user(&mut of_data));
@@ -142,13 +170,15 @@ impl Data {
     }
 }
 
-/// The root mean square distance of a policy's actions from the data's, `width` numbers each, in standard deviations of the
-/// data's, number by number; one that never changes counts in the others' mean deviation, or as it is. 0 is the data; 1 is as far
-/// as the mean of all its actions is.
+/// The root mean square distance of a policy's actions from the data's, `width` numbers each, in
+/// standard deviations of the data's, number by number; one that never changes counts in the
+/// others' mean deviation, or as it is. 0 is the data; 1 is as far as the mean of all its actions
+/// is.
 fn distance(of_data: &[f32], of_policy: &[f32], width: usize) -> f64 {
     let columns = (0..width).map(|column| {
-        let [data, policy] = [of_data, of_policy]
-            .map(|actions| Vec::from_iter(actions.iter().skip(column).step_by(width).map(|x| f64::from(*x))));
+        let [data, policy] = [of_data, of_policy].map(|actions| {
+            Vec::from_iter(actions.iter().skip(column).step_by(width).map(|x| f64::from(*x)))
+        });
         let middle = mean(data.iter().copied());
         // By rounding, the deviation of equal numbers might not be 0.
         let changes = data.iter().any(|x| *x != data[0]);
@@ -162,7 +192,8 @@ fn distance(of_data: &[f32], of_policy: &[f32], width: usize) -> f64 {
 }
 
 pub(super) fn mean(values: impl Iterator<Item = impl Into<f64>>) -> f64 {
-    let (count, sum) = values.fold((0.0, 0.0), |(count, sum), value| (count + 1.0, sum + value.into()));
+    let (count, sum) =
+        values.fold((0.0, 0.0), |(count, sum), value| (count + 1.0, sum + value.into()));
     sum / count
 }
 
@@ -210,7 +241,8 @@ mod tests {
         assert_eq!(distance(&[0.1; 3], &[3.1; 3], 1).round(), 3.0, "as it is where none changes");
     }
 
-    /// Of Hopper's: each has these rewards, and ends by a terminal or by a timeout, of which D4RL's last row is no transition.
+    /// Of Hopper's: each has these rewards, and ends by a terminal or by a timeout, of which D4RL's
+    /// last row is no transition.
     fn write(path: &Path, episodes: &[(&[f64], bool)]) {
         let mut writer = D4rlWriter::create(path, environment::find("hopper").unwrap()).unwrap();
         for (episode, (rewards, terminal)) in episodes.iter().enumerate() {
@@ -249,12 +281,16 @@ mod tests {
         let split = Transitions::read_split(&path, &options, HoldOut::Episodes(&[1, 2])).unwrap();
         let data = Data::of_split(split, String::new(), String::new()).unwrap();
         let units = Units { offset: 100.0, scale: 10.0, least: 0.0, most: 1000.0 };
-        let fqe = |seed| Fqe::of_behavior(FqeConfig::with_discount(0.5).unwrap(), units, data.context(seed)).unwrap();
+        let fqe = |seed| {
+            Fqe::of_behavior(FqeConfig::with_discount(0.5).unwrap(), units, data.context(seed))
+                .unwrap()
+        };
         let fqes = [0, 1].map(fqe);
         // Its fourth row is no transition, so that its third is the last one.
         let last = gather(&data.held_out, &[data.held_out.recorded_episodes()[1].end - 1]);
         assert_eq!(last.rewards, [8.0]);
-        let of_last = fqes.each_ref().map(|fqe| fqe.values(&last.observations, &last.actions).unwrap()[0]);
+        let of_last =
+            fqes.each_ref().map(|fqe| fqe.values(&last.observations, &last.actions).unwrap()[0]);
         let after = f64::from(of_last[0] + of_last[1]) / 2.0;
         let expected = (2.0 + 2.0 + 2.0 + 2.0) / 2.0 + (2.0 + 2.0 + after / 4.0) / 2.0;
         let recorded = data.recorded_value(&fqes.each_ref(), 0.5).unwrap();

@@ -92,7 +92,8 @@ impl Evaluation<'_> {
 
     /// Trains to the end. `first` are the actions in the judged episodes' first states.
     fn train(&self, fqe: &mut Fqe, seed: u64, first: &[f32]) -> anyhow::Result<Trace> {
-        let (mut trace, mut sampler) = (Trace { values: Vec::new(), losses: Vec::new() }, self.sampler(fqe, seed));
+        let (mut trace, mut sampler) =
+            (Trace { values: Vec::new(), losses: Vec::new() }, self.sampler(fqe, seed));
         let at = |note: usize| self.effort.steps * note as u64 / NOTES as u64;
         for note in 0..NOTES {
             trace.losses.push(updates(fqe, &mut sampler, at(note)..at(note + 1))?);
@@ -106,27 +107,45 @@ impl Evaluation<'_> {
         BatchSampler::new(fqe.items(), self.data.context(seed).batch_size, seed, 0)
     }
 
-    /// Does the work of all seeds at the same time. Each has its share of the cores: updates this small gain little by more.
-    fn for_each_seed<T: Send>(&self, work: impl Fn(u64) -> anyhow::Result<T> + Sync) -> anyhow::Result<Vec<T>> {
+    /// Does the work of all seeds at the same time. Each has its share of the cores: updates this
+    /// small gain little by more.
+    fn for_each_seed<T: Send>(
+        &self,
+        work: impl Fn(u64) -> anyhow::Result<T> + Sync,
+    ) -> anyhow::Result<Vec<T>> {
         let seeds = self.effort.seeds;
         let cores = thread::available_parallelism().map_or(1, NonZero::get);
-        let pool = || rayon::ThreadPoolBuilder::new().num_threads((cores / seeds as usize).max(1)).build();
+        let pool =
+            || rayon::ThreadPoolBuilder::new().num_threads((cores / seeds as usize).max(1)).build();
         let pools = (0..seeds).map(|_| pool()).collect::<Result<Vec<_>, _>>()?;
         thread::scope(|scope| {
             let work = &work;
-            let started = pools.iter().zip(0..).map(|(pool, seed)| scope.spawn(move || pool.install(|| work(seed))));
+            let started = pools
+                .iter()
+                .zip(0..)
+                .map(|(pool, seed)| scope.spawn(move || pool.install(|| work(seed))));
             let started: Vec<_> = started.collect();
-            started.into_iter().map(|thread| thread.join().map_err(|_| anyhow!("an evaluation panicked"))?).collect()
+            started
+                .into_iter()
+                .map(|thread| thread.join().map_err(|_| anyhow!("an evaluation panicked"))?)
+                .collect()
         })
     }
 }
 
 /// Does these updates, and gives their mean loss.
-fn updates(fqe: &mut Fqe, sampler: &mut BatchSampler, steps: std::ops::Range<u64>) -> anyhow::Result<f64> {
+fn updates(
+    fqe: &mut Fqe,
+    sampler: &mut BatchSampler,
+    steps: std::ops::Range<u64>,
+) -> anyhow::Result<f64> {
     let (mut sum, count) = (0.0, steps.end - steps.start);
     for step in steps {
         let measured = fqe.update(step, sampler.next_items())?;
-        sum += measured.iter().find(|(name, _)| *name == "critic_loss").map_or(0.0, |(_, loss)| f64::from(*loss));
+        sum += measured
+            .iter()
+            .find(|(name, _)| *name == "critic_loss")
+            .map_or(0.0, |(_, loss)| f64::from(*loss));
     }
     Ok(sum / count as f64)
 }
@@ -137,7 +156,10 @@ pub(super) fn estimate<'a>(traces: impl IntoIterator<Item = &'a Trace>, units: &
     for (trace, seed) in traces.into_iter().zip(0..) {
         let [(value, loss), (value_before, loss_before)] = [1, 2].map(|back| {
             let part = NOTES - back * LAST..NOTES - (back - 1) * LAST;
-            (mean(trace.values[part.clone()].iter().copied()), mean(trace.losses[part].iter().copied()))
+            (
+                mean(trace.values[part.clone()].iter().copied()),
+                mean(trace.losses[part].iter().copied()),
+            )
         });
         let beyond = BEYOND * (units.most - units.least);
         let (least, most) = (units.least - beyond, units.most + beyond);
@@ -162,9 +184,11 @@ mod tests {
 
     const UNITS: Units = Units { offset: 0.0, scale: 10.0, least: 0.0, most: 100.0 };
 
-    /// The estimate of an evaluation whose last notes have one value and loss, and those before them another.
+    /// The estimate of an evaluation whose last notes have one value and loss, and those before
+    /// them another.
     fn estimated(values: [f64; 2], losses: [f64; 2]) -> Estimate {
-        let notes = |[before, last]: [f64; 2]| [vec![before; NOTES - LAST], vec![last; LAST]].concat();
+        let notes =
+            |[before, last]: [f64; 2]| [vec![before; NOTES - LAST], vec![last; LAST]].concat();
         estimate([&Trace { values: notes(values), losses: notes(losses) }], &UNITS)
     }
 
@@ -180,7 +204,10 @@ mod tests {
             ([103.0; 2], [1.0; 2], "103.00 is beyond what rewards allow"),
         ] {
             let found = estimated(values, losses);
-            assert_eq!((found.values, found.doubts), (vec![values[1]], vec![format!("seed 0: {doubt}")]));
+            assert_eq!(
+                (found.values, found.doubts),
+                (vec![values[1]], vec![format!("seed 0: {doubt}")])
+            );
         }
     }
 }

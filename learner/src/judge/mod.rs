@@ -1,11 +1,12 @@
 //! Judges policies without a simulator: `learner judge`.
 //!
-//! It runs on its caller's thread and rayon's, owns nothing, and keeps what it finds in the runs' folders, from where reports read
-//! it. A policy's value is estimated by fitted Q evaluation ([`quad_algorithms::Fqe`]) on the episodes that its run has learned
-//! from, and read off in the first states of those that were held out.
+//! It runs on its caller's thread and rayon's, owns nothing, and keeps what it finds in the runs'
+//! folders, from where reports read it. A policy's value is estimated by fitted Q evaluation
+//! ([`quad_algorithms::Fqe`]) on the episodes that its run has learned from, and read off in the
+//! first states of those that were held out.
 //!
-//! In reading order: `subject` finds the policies, `data` has the states in which they are judged, `acting` asks a policy for its
-//! actions, `evaluation` estimates a value.
+//! In reading order: `subject` finds the policies, `data` has the states in which they are judged,
+//! `acting` asks a policy for its actions, `evaluation` estimates a value.
 
 mod acting;
 mod data;
@@ -37,12 +38,15 @@ pub(crate) struct Effort {
     pub seeds: u64,
 }
 
-/// Judges the last snapshots of runs, or single snapshots. What an earlier call has found out in this way is not computed again.
+/// Judges the last snapshots of runs, or single snapshots. What an earlier call has found out in
+/// this way is not computed again.
 ///
 /// # Errors
-/// There is nothing to judge, the policies have not learned from the same data in one environment, or a policy cannot act.
+/// There is nothing to judge, the policies have not learned from the same data in one environment,
+/// or a policy cannot act.
 pub(crate) fn judge(paths: &[PathBuf], effort: Effort) -> anyhow::Result<Ranking> {
-    let config = FqeConfig::with_discount(effort.gamma).hint("γ is between 0 and 1, 1 left out: --gamma 0.99")?;
+    let config = FqeConfig::with_discount(effort.gamma)
+        .hint("γ is between 0 and 1, 1 left out: --gamma 0.99")?;
     let subjects = subject::find(paths)?;
     let data = Data::of(&subjects)?;
     let Effort { gamma, steps, seeds } = effort;
@@ -57,18 +61,25 @@ pub(crate) fn judge(paths: &[PathBuf], effort: Effort) -> anyhow::Result<Ranking
     let (mut judged, mut left) = (Vec::new(), Vec::new());
     for subject in &subjects {
         let known = Judgment::read_all(&subject.folder)?;
-        let is_this = |one: &Judgment| one.weights == subject.weights && one.conditions == conditions;
+        let is_this =
+            |one: &Judgment| one.weights == subject.weights && one.conditions == conditions;
         match known.into_iter().find(is_this) {
             Some(known) => judged.push(known),
             None => left.push(subject),
         }
     }
     if !left.is_empty() {
-        let evaluation = Evaluation { config, units: Units::of(&data.context(0), gamma.into()), data: &data, effort };
+        let evaluation = Evaluation {
+            config,
+            units: Units::of(&data.context(0), gamma.into()),
+            data: &data,
+            effort,
+        };
         forecast(&evaluation, &left)?;
         judge_all(&evaluation, &left, &conditions, &mut judged)?;
     }
-    let [ranking] = <[Ranking; 1]>::try_from(Ranking::of(judged)).map_err(|_| anyhow::anyhow!("nothing is judged"))?;
+    let [ranking] = <[Ranking; 1]>::try_from(Ranking::of(judged))
+        .map_err(|_| anyhow::anyhow!("nothing is judged"))?;
     Ok(ranking)
 }
 
@@ -99,8 +110,11 @@ fn judge_all(
         };
         let run = subject.folder.path().display();
         info!("{number} of {}: {run} @ {} is judged", subjects.len(), subject.step);
-        // A folder that cannot be written to, such as another user's, keeps no judgment from being told.
-        judgment.keep(&subject.folder).unwrap_or_else(|error| warn!("{error}: the judgment is not kept"));
+        // A folder that cannot be written to, such as another user's, keeps no judgment from being
+        // told.
+        judgment
+            .keep(&subject.folder)
+            .unwrap_or_else(|error| warn!("{error}: the judgment is not kept"));
         judged.push(judgment);
     }
     Ok(())

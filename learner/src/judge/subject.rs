@@ -10,8 +10,7 @@ use quad_run::config::RunConfig;
 use quad_run::run::{RunDir, walk};
 use quad_runtime::Hint;
 
-const ONE: &str =
-    "what can be judged is the folder of a run, or a snapshot in it, like RUN/snapshots/step_000020000.safetensors";
+const ONE: &str = "what can be judged is the folder of a run, or a snapshot in it, like RUN/snapshots/step_000020000.safetensors";
 
 /// A policy to be judged.
 pub(super) struct Subject {
@@ -28,7 +27,8 @@ pub(super) struct Subject {
     pub held_out: BTreeSet<usize>,
 }
 
-/// The last snapshot of each run in or below a folder, and each snapshot that is named itself; a policy that is named twice, once.
+/// The last snapshot of each run in or below a folder, and each snapshot that is named itself; a
+/// policy that is named twice, once.
 ///
 /// # Errors
 /// There is no such policy, or it cannot be read.
@@ -63,11 +63,15 @@ pub(super) fn find(paths: &[PathBuf]) -> anyhow::Result<Vec<Subject>> {
 
 fn of_file(path: &Path) -> anyhow::Result<Subject> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let step = name.strip_prefix("step_").and_then(|name| name.strip_suffix(".safetensors")?.parse().ok());
+    let step =
+        name.strip_prefix("step_").and_then(|name| name.strip_suffix(".safetensors")?.parse().ok());
     let run = path.parent().and_then(Path::parent).filter(|folder| RunDir::is_occupied(folder));
     let (Some(step), Some(run)) = (step, run) else {
-        return Err(anyhow!("{} is in no run's folder, so that nothing says what it has learned from", path.display()))
-            .hint(ONE);
+        return Err(anyhow!(
+            "{} is in no run's folder, so that nothing says what it has learned from",
+            path.display()
+        ))
+        .hint(ONE);
     };
     Subject::read(RunDir::at(run), step)
 }

@@ -1,13 +1,17 @@
-//! Which evaluator has which job, and which episodes are scored: the scoreboard and the evaluators behind one lock.
+//! Which evaluator has which job, and which episodes are scored: the scoreboard and the evaluators
+//! behind one lock.
 //!
-//! Every thread may call it. It holds the lock for microseconds, never during input or output: the caller does slow work, like
-//! writing scores, between two calls.
+//! Every thread may call it. It holds the lock for microseconds, never during input or output: the
+//! caller does slow work, like writing scores, between two calls.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
-use quad_protocol::{EpisodeScore, Hash, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, episode_seeds};
+use quad_protocol::{
+    EpisodeScore, Hash, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport,
+    episode_seeds,
+};
 use quad_run::run::Earlier;
 use tracing::{debug, warn};
 
@@ -15,7 +19,9 @@ use super::evaluators::{EvaluatorAtWork, Evaluators, JobAtWork};
 use super::events::{Event, Events};
 use super::metrics::Metrics;
 use super::requests::NotAccepted;
-use crate::evaluation::{Claim, Claimed, HandedBack, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated};
+use crate::evaluation::{
+    Claim, Claimed, HandedBack, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated,
+};
 
 /// Most characters of an evaluator's error message that the learner logs.
 const LONGEST_REASON: usize = 300;
@@ -89,7 +95,11 @@ impl Coordinator {
             name: evaluator.to_string(),
             fits,
             seconds_ago: seen.map(|seen| seen.elapsed().as_secs_f64()),
-            job: state.scoreboard.job_of(evaluator).map(|(step, done, episodes)| JobAtWork { step, done, episodes }),
+            job: state.scoreboard.job_of(evaluator).map(|(step, done, episodes)| JobAtWork {
+                step,
+                done,
+                episodes,
+            }),
         });
         at_work.collect()
     }
@@ -164,9 +174,10 @@ impl Coordinator {
                 }
                 JobReply::Job(job)
             }
-            Claimed::Wait(time) => {
-                JobReply::Wait { incarnation: self.incarnation, milliseconds: time.as_millis() as u64 }
-            }
+            Claimed::Wait(time) => JobReply::Wait {
+                incarnation: self.incarnation,
+                milliseconds: time.as_millis() as u64,
+            },
         }
     }
 
@@ -195,7 +206,10 @@ impl Coordinator {
     }
 
     /// Checks reports and finds the new scores in each. Changes nothing.
-    pub fn validate<'a>(&self, reports: impl Iterator<Item = &'a ScoreReport>) -> Vec<Result<Validated, Refusal>> {
+    pub fn validate<'a>(
+        &self,
+        reports: impl Iterator<Item = &'a ScoreReport>,
+    ) -> Vec<Result<Validated, Refusal>> {
         let state = self.lock();
         reports.map(|report| state.scoreboard.validate(report)).collect()
     }
@@ -206,14 +220,24 @@ impl Coordinator {
     }
 
     /// Counts scores that are on the disk. Returns the acknowledgment of each report.
-    pub fn record<'a>(&self, reports: impl Iterator<Item = (&'a ScoreReport, &'a Validated)>) -> Vec<ScoreReply> {
+    pub fn record<'a>(
+        &self,
+        reports: impl Iterator<Item = (&'a ScoreReport, &'a Validated)>,
+    ) -> Vec<ScoreReply> {
         let mut state = self.lock();
-        let replies = reports.map(|(report, validated)| self.record_one(&mut state, report, validated)).collect();
+        let replies = reports
+            .map(|(report, validated)| self.record_one(&mut state, report, validated))
+            .collect();
         self.count(&state);
         replies
     }
 
-    fn record_one(&self, state: &mut State, report: &ScoreReport, validated: &Validated) -> ScoreReply {
+    fn record_one(
+        &self,
+        state: &mut State,
+        report: &ScoreReport,
+        validated: &Validated,
+    ) -> ScoreReply {
         let Validated { new, duplicates } = validated;
         let recorded = state.scoreboard.record(report, new);
         let evaluation = &self.metrics.evaluation;
@@ -224,7 +248,11 @@ impl Coordinator {
             self.show(report.step, &scores);
             self.events.send(Event::Evaluated { step: report.step, scores }).ok();
         }
-        ScoreReply::Recorded { incarnation: self.incarnation, new: new.len() as u32, duplicates: *duplicates }
+        ScoreReply::Recorded {
+            incarnation: self.incarnation,
+            new: new.len() as u32,
+            duplicates: *duplicates,
+        }
     }
 
     /// The answer to a report that the learner will never accept.
@@ -232,8 +260,8 @@ impl Coordinator {
         ScoreReply::Refused { incarnation: self.incarnation, reason: refusal.to_string() }
     }
 
-    /// Takes back jobs whose lease has expired, and forgets evaluators that left long ago. Returns lines for the log. Call it
-    /// several times a second.
+    /// Takes back jobs whose lease has expired, and forgets evaluators that left long ago. Returns
+    /// lines for the log. Call it several times a second.
     pub fn tick(&self) -> Vec<String> {
         let (mut state, now) = (self.lock(), Instant::now());
         let mut lines = state.evaluators.tick(now);
@@ -249,7 +277,8 @@ impl Coordinator {
     /// Reports a job that an evaluator could not run, once for each step.
     fn failed(&self, state: &mut State, step: u64, evaluator: &Name, reason: &str) {
         self.metrics.evaluation.jobs_failed.inc();
-        let reason: String = reason.chars().filter(|c| !c.is_control()).take(LONGEST_REASON).collect();
+        let reason: String =
+            reason.chars().filter(|c| !c.is_control()).take(LONGEST_REASON).collect();
         debug!(step, %evaluator, reason, "a job failed");
         if state.failures_told.insert(step) {
             self.events.send(Event::JobFailed { step, evaluator: evaluator.clone(), reason }).ok();
@@ -263,7 +292,11 @@ impl Coordinator {
 
     fn given_up(&self, state: &State, episodes: Vec<(u64, u64)>) {
         for (step, seed) in &episodes {
-            warn!(step, seed, "an episode is given up: too many evaluators were lost with it or could not do it");
+            warn!(
+                step,
+                seed,
+                "an episode is given up: too many evaluators were lost with it or could not do it"
+            );
         }
         if !episodes.is_empty() {
             self.events.send(Event::GivenUp(episodes)).ok();
@@ -281,7 +314,9 @@ impl Coordinator {
         if let Ok(step) = i64::try_from(step)
             && step >= evaluation.step.get()
         {
-            evaluation.score.set(scores.iter().map(|score| score.score).sum::<f64>() / scores.len() as f64);
+            evaluation
+                .score
+                .set(scores.iter().map(|score| score.score).sum::<f64>() / scores.len() as f64);
             evaluation.step.set(step);
         }
     }

@@ -1,5 +1,5 @@
-//! Whether the disk accepts what a thread writes. While it does not, `/healthz` and a metric say so; display and log repeat it
-//! from time to time.
+//! Whether the disk accepts what a thread writes. While it does not, `/healthz` and a metric say
+//! so; display and log repeat it from time to time.
 
 use std::time::{Duration, Instant};
 

@@ -1,4 +1,5 @@
-//! What the user sees while the learner works: a bar with figures on a terminal, plain log lines otherwise.
+//! What the user sees while the learner works: a bar with figures on a terminal, plain log lines
+//! otherwise.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -22,7 +23,8 @@ const SCORES_SHOWN: usize = 3;
 pub(crate) struct Display {
     metrics: Metrics,
     steps: u64,
-    /// Hidden if stderr is no terminal, or one that cannot draw (`TERM=dumb`). Measures the rate all the same.
+    /// Hidden if stderr is no terminal, or one that cannot draw (`TERM=dumb`). Measures the rate
+    /// all the same.
     bar: ProgressBar,
     begin: Instant,
     /// Gradient steps that were done before.
@@ -39,7 +41,9 @@ impl Display {
     pub fn start(metrics: Metrics, steps: u64) -> Self {
         let bar = ProgressBar::with_draw_target(Some(steps), ProgressDrawTarget::stderr());
         // Without our style the bar still works, but shows less.
-        if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} gradient steps\n{msg}") {
+        if let Ok(style) =
+            ProgressStyle::with_template("{bar:40} {pos}/{len} gradient steps\n{msg}")
+        {
             bar.set_style(style);
         }
         let (first, now) = (metrics.training.gradient_steps.get(), Instant::now());
@@ -82,7 +86,8 @@ impl Display {
         }
     }
 
-    /// Prints once how long training will take, if that is more than a minute: the user may have meant fewer steps.
+    /// Prints once how long training will take, if that is more than a minute: the user may have
+    /// meant fewer steps.
     fn estimate(&mut self, step: u64, now: Instant) {
         if self.estimated || now.duration_since(self.begin) < ESTIMATE || step == self.first {
             return;
@@ -90,7 +95,11 @@ impl Display {
         self.estimated = true;
         let left = self.bar.eta();
         if left > Duration::from_secs(60) {
-            self.say(&format!("{:.1} steps/s: this takes about {}", self.bar.per_sec(), HumanDuration(left)));
+            self.say(&format!(
+                "{:.1} steps/s: this takes about {}",
+                self.bar.per_sec(),
+                HumanDuration(left)
+            ));
         }
     }
 
@@ -109,7 +118,11 @@ impl Display {
             }
         }
         let shown = training.algorithm.iter().filter(|(metric, _)| !metric.label.is_empty());
-        parts.extend(shown.filter_map(|(metric, gauge)| Some(format!("{} {:.3}", metric.label, gauge.get()?))));
+        parts.extend(
+            shown.filter_map(|(metric, gauge)| {
+                Some(format!("{} {:.3}", metric.label, gauge.get()?))
+            }),
+        );
         parts.join(", ")
     }
 
@@ -120,7 +133,8 @@ impl Display {
             parts.push(format!("{pending} episodes to score"));
         }
         if !self.scores.is_empty() {
-            let scores: Vec<_> = self.scores.iter().map(|(step, mean)| format!("{mean:.1} @{step}")).collect();
+            let scores: Vec<_> =
+                self.scores.iter().map(|(step, mean)| format!("{mean:.1} @{step}")).collect();
             parts.push(format!("scores {}", scores.join(", ")));
         }
         parts.join(", ")

@@ -1,4 +1,5 @@
-//! Two learners with one run name would answer each other's evaluators, so the second learner stops.
+//! Two learners with one run name would answer each other's evaluators, so the second learner
+//! stops.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -12,10 +13,11 @@ use zenoh::sample::{Sample, SampleKind};
 
 use super::events::{Event, Events};
 
-/// Zenoh takes five seconds to remove the token of a learner that lost its connection, and longer on a busy machine.
+/// Zenoh takes five seconds to remove the token of a learner that lost its connection, and longer
+/// on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// For this long after its start, a learner ends if it sees an earlier learner of the same name. By then the tokens of
-/// learners that started together have arrived.
+/// For this long after its start, a learner ends if it sees an earlier learner of the same name. By
+/// then the tokens of learners that started together have arrived.
 const TOGETHER: Duration = Duration::from_secs(10);
 /// How often the learner looks for another one, and how long an answer may take.
 const LOOK_AGAIN: Duration = Duration::from_millis(500);
@@ -33,7 +35,10 @@ pub(crate) struct Incarnation {
 /// # Errors
 ///
 /// Another learner is still connected when the token of a dead one would be gone.
-pub(super) async fn wait_until_gone(session: &Session, incarnation: &Incarnation) -> anyhow::Result<()> {
+pub(super) async fn wait_until_gone(
+    session: &Session,
+    incarnation: &Incarnation,
+) -> anyhow::Result<()> {
     let deadline = Instant::now() + PATIENCE;
     let mut said = false;
     while let Some(other) = another(session, incarnation).await? {
@@ -41,7 +46,10 @@ pub(super) async fn wait_until_gone(session: &Session, incarnation: &Incarnation
             return Err(is_there(incarnation, other));
         }
         if !said {
-            info!("another learner of run {} was here a moment ago; waiting to see if it is gone", incarnation.run);
+            info!(
+                "another learner of run {} was here a moment ago; waiting to see if it is gone",
+                incarnation.run
+            );
             said = true;
         }
         tokio::time::sleep(LOOK_AGAIN).await;
@@ -50,10 +58,15 @@ pub(super) async fn wait_until_gone(session: &Session, incarnation: &Incarnation
 }
 
 async fn another(session: &Session, incarnation: &Incarnation) -> anyhow::Result<Option<u64>> {
-    let asked = session.liveliness().get(keys::all_incarnations(&incarnation.run)).timeout(LOOK_AGAIN).await;
+    let asked = session
+        .liveliness()
+        .get(keys::all_incarnations(&incarnation.run))
+        .timeout(LOOK_AGAIN)
+        .await;
     let replies = asked.map_err(anyhow::Error::from_boxed)?;
     while let Ok(reply) = replies.recv_async().await {
-        let found = reply.result().ok().and_then(|token| keys::incarnation_of(token.key_expr().as_str()));
+        let found =
+            reply.result().ok().and_then(|token| keys::incarnation_of(token.key_expr().as_str()));
         if let Some(other) = found.filter(|other| *other != incarnation.number) {
             return Ok(Some(other));
         }
@@ -61,8 +74,13 @@ async fn another(session: &Session, incarnation: &Incarnation) -> anyhow::Result
     Ok(None)
 }
 
-/// Ends the run if a learner appears that started a little earlier. (A later learner stops by itself.)
-pub(super) async fn watch(session: &Session, incarnation: &Incarnation, events: &Events) -> anyhow::Result<()> {
+/// Ends the run if a learner appears that started a little earlier. (A later learner stops by
+/// itself.)
+pub(super) async fn watch(
+    session: &Session,
+    incarnation: &Incarnation,
+    events: &Events,
+) -> anyhow::Result<()> {
     let (mine, events, told) = (incarnation.clone(), events.clone(), AtomicBool::new(false));
     let callback = move |token: Sample| {
         let there = token.kind() == SampleKind::Put;

@@ -12,7 +12,8 @@ use super::requests::NotAccepted;
 
 /// The metrics of an evaluator that has left are dropped this long after its last progress message.
 const FORGET_AFTER: Duration = Duration::from_secs(600);
-/// Most evaluators that the learner tracks: far above any real pool. The limit bounds the memory that made-up names take.
+/// Most evaluators that the learner tracks: far above any real pool. The limit bounds the memory
+/// that made-up names take.
 const MOST_EVALUATORS: usize = 1024;
 /// So many evaluators per period get a log line of their own; the rest are one line with a number.
 const ONE_BY_ONE: usize = 20;
@@ -54,7 +55,13 @@ pub(super) struct Evaluators {
 impl Evaluators {
     pub fn new(metrics: EvaluatorMetrics, now: Instant) -> Self {
         let news = News { since: now, told: 0, joined: 0, left: 0, lines: Vec::new() };
-        Self { metrics, present: BTreeSet::new(), asked: BTreeMap::new(), last_seen: BTreeMap::new(), news }
+        Self {
+            metrics,
+            present: BTreeSet::new(),
+            asked: BTreeMap::new(),
+            last_seen: BTreeMap::new(),
+            news,
+        }
     }
 
     /// The number of connected evaluators.
@@ -62,13 +69,14 @@ impl Evaluators {
         self.present.len()
     }
 
-    /// Whether a connected evaluator may have the run's environment. One that has not asked for a job yet may: it may be at a
-    /// long job of another run.
+    /// Whether a connected evaluator may have the run's environment. One that has not asked for a
+    /// job yet may: it may be at a long job of another run.
     pub fn any_may_fit(&self) -> bool {
         self.present.iter().any(|evaluator| self.asked.get(evaluator) != Some(&false))
     }
 
-    /// The connected evaluators: whether each is known to have the run's environment, and when its last message came.
+    /// The connected evaluators: whether each is known to have the run's environment, and when its
+    /// last message came.
     pub fn present(&self) -> impl Iterator<Item = (&Name, bool, Option<Instant>)> {
         let fits = |evaluator: &Name| self.asked.get(evaluator) == Some(&true);
         let seen = |evaluator: &Name| self.last_seen.get(evaluator).copied();
@@ -104,7 +112,9 @@ impl Evaluators {
         self.metrics.present.set(self.present.len() as i64);
         let line = match jobs {
             0 => format!("evaluator {evaluator} has left or lost its connection"),
-            _ => format!("evaluator {evaluator} has left or lost its connection; its unfinished job goes to others"),
+            _ => format!(
+                "evaluator {evaluator} has left or lost its connection; its unfinished job goes to others"
+            ),
         };
         if !self.news.tell(line) {
             self.news.left += 1;
@@ -113,7 +123,9 @@ impl Evaluators {
 
     /// Records an evaluator's progress message.
     pub fn heard(&mut self, progress: Progress, now: Instant) -> Result<(), NotAccepted> {
-        if self.last_seen.len() >= MOST_EVALUATORS && !self.last_seen.contains_key(&progress.evaluator) {
+        if self.last_seen.len() >= MOST_EVALUATORS
+            && !self.last_seen.contains_key(&progress.evaluator)
+        {
             return Err(NotAccepted::Crowd);
         }
         self.metrics.observe(&progress);
@@ -159,7 +171,8 @@ impl News {
     fn take(&mut self, now: Instant) -> Vec<String> {
         if now.duration_since(self.since) >= PERIOD {
             if self.joined + self.left > 0 {
-                self.lines.push(format!("{} more evaluators came and {} left", self.joined, self.left));
+                self.lines
+                    .push(format!("{} more evaluators came and {} left", self.joined, self.left));
             }
             (self.since, self.told, self.joined, self.left) = (now, 0, 0, 0);
         }

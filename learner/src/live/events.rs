@@ -5,8 +5,8 @@ use tokio::sync::mpsc::UnboundedSender;
 
 use crate::train::Outcome;
 
-/// The sender of events. Events that the network can cause are sent once for each step, name or period, so the queue stays
-/// short.
+/// The sender of events. Events that the network can cause are sent once for each step, name or
+/// period, so the queue stays short.
 pub(crate) type Events = UnboundedSender<Event>;
 
 /// A report to the main loop.
@@ -16,12 +16,14 @@ pub(crate) enum Event {
     Published { step: u64 },
     /// An evaluator could not run a job; its error message. Sent once for each step.
     JobFailed { step: u64, evaluator: Name, reason: String },
-    /// Episodes, by step and seed, that the learner has given up: too many evaluators were lost with them or could not run
-    /// them.
+    /// Episodes, by step and seed, that the learner has given up: too many evaluators were lost
+    /// with them or could not run them.
     GivenUp(Vec<(u64, u64)>),
-    /// Two evaluators have this name: one works on a job, the other one has asked for one meanwhile. Sent once for each name.
+    /// Two evaluators have this name: one works on a job, the other one has asked for one
+    /// meanwhile. Sent once for each name.
     SameName(Name),
-    /// All episodes of an evaluation are scored; the scores are in the order of the evaluation's seeds.
+    /// All episodes of an evaluation are scored; the scores are in the order of the evaluation's
+    /// seeds.
     Evaluated { step: u64, scores: Vec<EpisodeScore> },
     /// No gradient step will follow, and all output of training is on the disk.
     TrainingEnded(Outcome),

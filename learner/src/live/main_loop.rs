@@ -24,7 +24,8 @@ use crate::train::Outcome;
 const BEHIND: usize = 3;
 /// Time limit for closing the session, if the network hangs.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
-/// After this time a failed run gives up output that waits for the disk: the disk may be in trouble, too.
+/// After this time a failed run gives up output that waits for the disk: the disk may be in
+/// trouble, too.
 const LAST_WRITES: Duration = Duration::from_secs(15);
 
 /// How a run ended.
@@ -105,8 +106,13 @@ impl MainLoop {
         ending
     }
 
-    async fn watch(&mut self, mut online: JoinHandle<anyhow::Result<Online>>, reached: &mut Reached) -> Ending {
-        let mut shutdown = std::pin::pin!(quad_runtime::shutdown_signal(quad_runtime::LEAVE_WITHIN));
+    async fn watch(
+        &mut self,
+        mut online: JoinHandle<anyhow::Result<Online>>,
+        reached: &mut Reached,
+    ) -> Ending {
+        let mut shutdown =
+            std::pin::pin!(quad_runtime::shutdown_signal(quad_runtime::LEAVE_WITHIN));
         let mut ticker = interval(self.display.interval());
         ticker.set_missed_tick_behavior(MissedTickBehavior::Skip);
         let mut is_online = false;
@@ -162,11 +168,17 @@ impl MainLoop {
 
     fn online(&mut self, online: Online, reached: &mut Reached) -> anyhow::Result<()> {
         let (zenoh, metrics) = (online.reachable_at.join(", "), &self.metrics_address);
-        self.display
-            .say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.incarnation.run));
+        self.display.say(&format!(
+            "run {} is at {zenoh}, its metrics at http://{metrics}/metrics",
+            self.incarnation.run
+        ));
         reached.reachable_at = online.reachable_at;
         reached.wire = Some(online.wire);
-        self.evaluators.start(&reached.reachable_at, self.run_dir.path(), self.incarnation.run.as_str())
+        self.evaluators.start(
+            &reached.reachable_at,
+            self.run_dir.path(),
+            self.incarnation.run.as_str(),
+        )
     }
 
     fn trained(&self) -> String {
@@ -174,12 +186,15 @@ impl MainLoop {
             0 => "training is done".to_owned(),
             pending => {
                 let present = evaluators(self.metrics.evaluators.present.get());
-                format!("training is done; waiting for the scores of {pending} episodes ({present} here)")
+                format!(
+                    "training is done; waiting for the scores of {pending} episodes ({present} here)"
+                )
             }
         }
     }
 
-    /// Says that the evaluators are slower than the training, if that is so. A run without any says so elsewhere.
+    /// Says that the evaluators are slower than the training, if that is so. A run without any says
+    /// so elsewhere.
     fn say_if_behind(&self) -> bool {
         let waiting = self.threads.services.coordinator.evaluations_pending();
         let is_behind = waiting >= BEHIND && self.metrics.evaluators.present.get() > 0;
@@ -205,7 +220,8 @@ impl MainLoop {
         if !reached.trained {
             return Verdict::Wait;
         }
-        let verdict = reached.patience.look(self.threads.services.coordinator.any_may_fit(), Instant::now());
+        let verdict =
+            reached.patience.look(self.threads.services.coordinator.any_may_fit(), Instant::now());
         if let Verdict::Advise = verdict {
             self.display.say(&self.advice(&reached.reachable_at));
         }
@@ -214,7 +230,8 @@ impl MainLoop {
 
     /// A thread that writes and has not reported for long waits for the disk.
     fn watch_disk(&self, told: &mut Vec<Saved>) {
-        let hangs: Vec<_> = Saved::ALL.into_iter().filter(|what| self.health.is_silent(what.thread())).collect();
+        let hangs: Vec<_> =
+            Saved::ALL.into_iter().filter(|what| self.health.is_silent(what.thread())).collect();
         for what in hangs.iter().filter(|what| !told.contains(what)) {
             self.metrics.disk.trouble(*what).set(1);
             let waits = match what {
@@ -232,11 +249,16 @@ impl MainLoop {
     fn advice(&self, reachable_at: &[String]) -> String {
         match reachable_at {
             [] => {
-                format!("no router has answered at {} yet; the scores wait for it", self.endpoints.connect.join(", "))
+                format!(
+                    "no router has answered at {} yet; the scores wait for it",
+                    self.endpoints.connect.join(", ")
+                )
             }
-            [endpoint, ..] => {
-                how_to_evaluate(self.threads.services.coordinator.environment(), endpoint, self.evaluators.log())
-            }
+            [endpoint, ..] => how_to_evaluate(
+                self.threads.services.coordinator.environment(),
+                endpoint,
+                self.evaluators.log(),
+            ),
         }
     }
 }
@@ -247,10 +269,14 @@ fn tell(event: Event, display: &mut Display) {
         Event::Published { step } => format!("step {step}: snapshot handed to evaluation"),
         Event::GivenUp(episodes) => {
             let episodes = episodes.len();
-            format!("{episodes} episodes are given up: too many evaluators were lost with them or could not do them")
+            format!(
+                "{episodes} episodes are given up: too many evaluators were lost with them or could not do them"
+            )
         }
         Event::JobFailed { step, evaluator, reason } => {
-            format!("evaluator {evaluator} could not do a job of step {step}, which goes to others: {reason}")
+            format!(
+                "evaluator {evaluator} could not do a job of step {step}, which goes to others: {reason}"
+            )
         }
         Event::SameName(name) => format!(
             "two evaluators were started with --name {name}, and one of them gets no work; give each a name of its own"
@@ -272,14 +298,18 @@ fn tell(event: Event, display: &mut Display) {
     display.say(&text);
 }
 
-/// Ends the threads. Those of a failed run get limited time; meanwhile the user reads why it failed.
+/// Ends the threads. Those of a failed run get limited time; meanwhile the user reads why it
+/// failed.
 async fn end(threads: Threads, ending: &Ending) {
     let mut ended = tokio::task::spawn_blocking(|| threads.join());
     let Ending::Failed(error) = ending else { return drop(ended.await) };
     if timeout(Duration::from_secs(1), &mut ended).await.is_ok() {
         return;
     }
-    error!("{error:#}; ending as soon as the disk has taken what waits for it, in {} s at most", LAST_WRITES.as_secs());
+    error!(
+        "{error:#}; ending as soon as the disk has taken what waits for it, in {} s at most",
+        LAST_WRITES.as_secs()
+    );
     if timeout(LAST_WRITES, ended).await.is_err() {
         warn!("the disk did not take what was to be saved last");
     }

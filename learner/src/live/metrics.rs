@@ -64,7 +64,11 @@ pub(crate) struct EvaluatorMetrics {
 
 impl Metrics {
     /// Makes all metrics, in a registry that labels each with the run.
-    pub fn new(run: &Name, target_steps: u64, measured: &'static [Metric]) -> prometheus::Result<(Self, Registry)> {
+    pub fn new(
+        run: &Name,
+        target_steps: u64,
+        measured: &'static [Metric],
+    ) -> prometheus::Result<(Self, Registry)> {
         let labels = HashMap::from([("run".to_owned(), run.to_string())]);
         let registry = Registry::new_custom(None, Some(labels))?;
         registry.register(Box::new(ProcessCollector::for_self()))?;
@@ -94,7 +98,8 @@ impl EvaluationMetrics {
         let jobs = make.counters("jobs_total", "Evaluation jobs by outcome", "outcome")?;
         let missing = "Episodes that are not handed out any more, after too many failed attempts";
         Ok(Self {
-            snapshots_published: make.counter("snapshots_published_total", "Snapshots handed to evaluation")?,
+            snapshots_published: make
+                .counter("snapshots_published_total", "Snapshots handed to evaluation")?,
             snapshot_bytes: make.count("snapshot_bytes", "Size of the newest snapshot")?,
             jobs_handed_out: jobs.get_metric_with_label_values(&["handed_out"])?,
             jobs_completed: jobs.get_metric_with_label_values(&["completed"])?,
@@ -102,11 +107,18 @@ impl EvaluationMetrics {
             jobs_handed_back: jobs.get_metric_with_label_values(&["handed_back"])?,
             jobs_failed: jobs.get_metric_with_label_values(&["failed"])?,
             episodes_missing: make.count("episodes_missing", missing)?,
-            episodes_pending: make.count("episodes_pending", "Episodes of evaluations that have no score yet")?,
-            scores_recorded: make.counter("scores_recorded_total", "Episodes scored, each counted once")?,
-            scores_duplicate: make.counter("scores_duplicate_total", "Scores delivered for episodes that had one")?,
-            score: make.gauge("evaluation_score", "Mean normalized score of the newest complete evaluation")?,
-            step: make.count("evaluation_step", "Gradient step of the newest complete evaluation")?,
+            episodes_pending: make
+                .count("episodes_pending", "Episodes of evaluations that have no score yet")?,
+            scores_recorded: make
+                .counter("scores_recorded_total", "Episodes scored, each counted once")?,
+            scores_duplicate: make
+                .counter("scores_duplicate_total", "Scores delivered for episodes that had one")?,
+            score: make.gauge(
+                "evaluation_score",
+                "Mean normalized score of the newest complete evaluation",
+            )?,
+            step: make
+                .count("evaluation_step", "Gradient step of the newest complete evaluation")?,
         })
     }
 }
@@ -115,7 +127,8 @@ impl DiskMetrics {
     fn new(make: &Registrar) -> prometheus::Result<Self> {
         let trouble = "1 while the disk does not take what is to be kept, else 0";
         let metrics = Self {
-            checkpoint_step: make.count("checkpoint_step", "Gradient step of the newest checkpoint on disk")?,
+            checkpoint_step: make
+                .count("checkpoint_step", "Gradient step of the newest checkpoint on disk")?,
             checkpoint_timestamp: make
                 .gauge("checkpoint_timestamp_seconds", "When the newest checkpoint was written")?,
             checkpoint_bytes: make.count("checkpoint_bytes", "Size of the newest checkpoint")?,
@@ -141,7 +154,10 @@ impl EvaluatorMetrics {
         let seen = "When an evaluator last told its progress";
         Ok(Self {
             present: make.count("evaluators", "Evaluators present")?,
-            episodes: counts("evaluator_episodes", "Episodes run by an evaluator since it started, as it says")?,
+            episodes: counts(
+                "evaluator_episodes",
+                "Episodes run by an evaluator since it started, as it says",
+            )?,
             environment_steps: counts("evaluator_environment_steps", steps)?,
             last_seen: make.gauges("evaluator_last_seen_timestamp_seconds", seen, "evaluator")?,
         })

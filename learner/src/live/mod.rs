@@ -1,19 +1,23 @@
 //! A run at work: its threads, its main loop, and all its communication over Zenoh.
 //!
-//! The main loop ([`MainLoop`]) runs on the main thread: it reports events and decides when the run is over. The other threads
-//! report to it alone, through one queue of [`events`](Event). docs/architecture.md has a table of all threads. The module
-//! `command` starts a run; no module below calls this one.
+//! The main loop ([`MainLoop`]) runs on the main thread: it reports events and decides when the run
+//! is over. The other threads report to it alone, through one queue of [`events`](Event).
+//! docs/architecture.md has a table of all threads. The module `command` starts a run; no module
+//! below calls this one.
 //!
 //! In reading order:
 //!
-//! - `threads` starts (with `spawn`) and ends the threads; `events` are their reports to `main_loop`; `network` opens the
-//!   session meanwhile and declares everything on it, and `duplicate` looks for another learner of the same name.
-//! - `snapshots` is the thread that writes the output of training, and publishes snapshots through `weights`.
-//! - `services` assigns each kind of message to a pool of threads or to the thread `scores`, which writes scores. `requests`:
-//!   queries that wait for their answer, and why a message was not accepted.
+//! - `threads` starts (with `spawn`) and ends the threads; `events` are their reports to
+//!   `main_loop`; `network` opens the session meanwhile and declares everything on it, and
+//!   `duplicate` looks for another learner of the same name.
+//! - `snapshots` is the thread that writes the output of training, and publishes snapshots through
+//!   `weights`.
+//! - `services` assigns each kind of message to a pool of threads or to the thread `scores`, which
+//!   writes scores. `requests`: queries that wait for their answer, and why a message was not
+//!   accepted.
 //! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`.
-//! - `metrics` are for Prometheus; `disk` reports a disk that refuses writes; `display` is the terminal, `page_state` the
-//!   state for the page.
+//! - `metrics` are for Prometheus; `disk` reports a disk that refuses writes; `display` is the
+//!   terminal, `page_state` the state for the page.
 
 mod coordinator;
 mod disk;

@@ -45,14 +45,19 @@ impl Patience {
     }
 }
 
-/// A hint for a run without an evaluator that has its environment. `own` is the log of one that the learner has started.
+/// A hint for a run without an evaluator that has its environment. `own` is the log of one that the
+/// learner has started.
 pub(super) fn how_to_evaluate(name: &str, endpoint: &str, own: Option<&Path>) -> String {
     match (environment::find(name), own) {
         (Ok(_), Some(log)) => {
             let log = log.display();
-            format!("this learner's evaluators have not connected yet; if they do not, their log may say why: {log}")
+            format!(
+                "this learner's evaluators have not connected yet; if they do not, their log may say why: {log}"
+            )
         }
-        (Ok(_), None) => format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}"),
+        (Ok(_), None) => {
+            format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}")
+        }
         (Err(_), _) => format!(
             "no evaluator is here that has the environment {name}; from Python: \
              quad_rl.evaluate(\"{name}\", YOUR_ENVIRONMENT, connect=\"{endpoint}\") (docs/python.md)"
@@ -70,9 +75,17 @@ mod tests {
         let endpoint = "tcp/127.0.0.1:7447";
         let own = Some(Path::new("runs/mine/evaluator-1.log"));
         let [none, some] = [None, own].map(|own| how_to_evaluate("hopper", endpoint, own));
-        assert!(none.contains("start one with: evaluator serve --connect tcp/127.0.0.1:7447"), "{none}");
-        assert!(!some.contains("start one") && some.contains("runs/mine/evaluator-1.log"), "{some}");
-        assert!(how_to_evaluate("my-robot", endpoint, own).contains("quad_rl.evaluate(\"my-robot\""));
+        assert!(
+            none.contains("start one with: evaluator serve --connect tcp/127.0.0.1:7447"),
+            "{none}"
+        );
+        assert!(
+            !some.contains("start one") && some.contains("runs/mine/evaluator-1.log"),
+            "{some}"
+        );
+        assert!(
+            how_to_evaluate("my-robot", endpoint, own).contains("quad_rl.evaluate(\"my-robot\"")
+        );
     }
 
     #[test]

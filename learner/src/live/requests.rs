@@ -11,8 +11,8 @@ use zenoh::query::Query;
 use super::metrics::Metrics;
 use crate::evaluation::Refusal;
 
-/// Largest message to the learner, bytes; a score report of the largest job has 1.4 KB. A learner that listens receives no
-/// fragmented messages, which begin at 32,700 bytes at the earliest.
+/// Largest message to the learner, bytes; a score report of the largest job has 1.4 KB. A learner
+/// that listens receives no fragmented messages, which begin at 32,700 bytes at the earliest.
 const MOST_BYTES: usize = 30 * 1024;
 
 /// A query and its message.

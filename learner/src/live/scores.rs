@@ -1,7 +1,7 @@
 //! The thread `scores`: writes scores to the disk, then counts and acknowledges them.
 //!
-//! All reports that arrived during the last write go together, in one write and one synchronization. A slow disk delays only
-//! acknowledgments.
+//! All reports that arrived during the last write go together, in one write and one
+//! synchronization. A slow disk delays only acknowledgments.
 
 use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -44,7 +44,9 @@ impl Scores {
                 Err(RecvTimeoutError::Disconnected) => return Ok(()),
             };
             let mut reports = Vec::new();
-            for delivery in std::iter::once(first).chain(self.deliveries.try_iter()).take(MOST_TOGETHER) {
+            for delivery in
+                std::iter::once(first).chain(self.deliveries.try_iter()).take(MOST_TOGETHER)
+            {
                 match delivery {
                     Some(report) => reports.push(report),
                     None => ended = true,
@@ -57,9 +59,13 @@ impl Scores {
         Ok(())
     }
 
-    /// Handles reports together. If two of them contain the same episode, returns the second for the next round, when the
-    /// first is counted.
-    fn take_in(&mut self, reports: Vec<(Request, ScoreReport)>, beat: &Beat) -> Vec<(Request, ScoreReport)> {
+    /// Handles reports together. If two of them contain the same episode, returns the second for
+    /// the next round, when the first is counted.
+    fn take_in(
+        &mut self,
+        reports: Vec<(Request, ScoreReport)>,
+        beat: &Beat,
+    ) -> Vec<(Request, ScoreReport)> {
         let mut seen = BTreeSet::new();
         let (now, later): (Vec<_>, Vec<_>) = reports.into_iter().partition(|(_, report)| {
             let keys = || report.episodes.iter().map(|score| (report.step, score.seed));
@@ -106,7 +112,9 @@ impl Scores {
 
     /// Counts the scores of reports, which are on the disk, and answers each report.
     fn acknowledge(&self, reports: Vec<(Request, ScoreReport, Validated)>) {
-        let replies = self.coordinator.record(reports.iter().map(|(_, report, validated)| (report, validated)));
+        let replies = self
+            .coordinator
+            .record(reports.iter().map(|(_, report, validated)| (report, validated)));
         for ((request, ..), reply) in reports.into_iter().zip(replies) {
             request.reply(&reply);
         }

@@ -44,7 +44,10 @@ impl Services {
         let (deliveries, waiting) = sync_channel(MOST_WAITING);
         let answers = Pool::start("answers", ANSWER_THREADS, MOST_WAITING, &events)?;
         let weights_answers = Pool::start("weights", WEIGHTS_THREADS, MOST_WAITING, &events)?;
-        Ok((Self { coordinator, weights, deliveries, answers, weights_answers, metrics, events }, waiting))
+        Ok((
+            Self { coordinator, weights, deliveries, answers, weights_answers, metrics, events },
+            waiting,
+        ))
     }
 
     pub fn job(&self, mut request: Request) {
@@ -73,11 +76,13 @@ impl Services {
 
     pub fn weights(&self, request: Request) {
         let (weights, metrics) = (self.weights.clone(), self.metrics.clone());
-        let answer =
-            move || match keys::step_of(request.key()).ok_or(NotAccepted::NoSnapshot).and_then(|of| weights.of(of)) {
-                Ok(bytes) => request.send(bytes),
-                Err(why) => request.reject(&why, &metrics),
-            };
+        let answer = move || match keys::step_of(request.key())
+            .ok_or(NotAccepted::NoSnapshot)
+            .and_then(|of| weights.of(of))
+        {
+            Ok(bytes) => request.send(bytes),
+            Err(why) => request.reject(&why, &metrics),
+        };
         self.count_busy(self.weights_answers.give(answer));
     }
 

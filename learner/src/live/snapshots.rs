@@ -1,5 +1,5 @@
-//! The thread `snapshots`: writes the output of training to the disk, then opens the evaluation of each snapshot, then
-//! publishes the snapshot.
+//! The thread `snapshots`: writes the output of training to the disk, then opens the evaluation of
+//! each snapshot, then publishes the snapshot.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -34,8 +34,8 @@ pub(super) struct Snapshots {
 }
 
 impl Snapshots {
-    /// The thread's work, until the outbox is closed and empty. It repeats a write that the disk refuses until the disk
-    /// accepts it.
+    /// The thread's work, until the outbox is closed and empty. It repeats a write that the disk
+    /// refuses until the disk accepts it.
     pub fn run(mut self, beat: &Beat) -> anyhow::Result<()> {
         while let Some(work) = self.outbox.next(beat) {
             match self.carry_out(&work) {
@@ -76,7 +76,9 @@ impl Snapshots {
             Some(known) if *known == hash => {}
             // The step has scores already: the snapshot is neither overwritten nor published.
             Some(known) => {
-                return Err(OtherWeights { step: *step, found: hash, scored: known.to_string() }.into());
+                return Err(
+                    OtherWeights { step: *step, found: hash, scored: known.to_string() }.into()
+                );
             }
         }
         if *evaluate {

@@ -1,6 +1,6 @@
-//! Starts threads: one, or several that answer queries. An answer may block until the peer reads, or for up to two seconds, after
-//! which Zenoh closes the connection; so only threads on which no others wait send answers. The queue for these threads is
-//! bounded.
+//! Starts threads: one, or several that answer queries. An answer may block until the peer reads,
+//! or for up to two seconds, after which Zenoh closes the connection; so only threads on which no
+//! others wait send answers. The queue for these threads is bounded.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -14,7 +14,8 @@ use tracing::debug;
 
 use super::events::{Event, Events};
 
-/// Starts a thread that reports that it is alive, and when it is done. If it panics, `/healthz` says so.
+/// Starts a thread that reports that it is alive, and when it is done. If it panics, `/healthz`
+/// says so.
 pub(super) fn spawn_alive(
     name: &'static str,
     events: &Events,
@@ -28,8 +29,8 @@ pub(super) fn spawn_alive(
     })
 }
 
-/// Starts a thread. If it fails or panics, the main loop ends the run: without that thread the process would look alive and do
-/// nothing.
+/// Starts a thread. If it fails or panics, the main loop ends the run: without that thread the
+/// process would look alive and do nothing.
 pub(super) fn spawn(
     name: &'static str,
     events: &Events,
@@ -64,7 +65,12 @@ pub(super) struct Pool {
 
 impl Pool {
     /// Starts the threads, with a queue of limited length.
-    pub fn start(name: &'static str, threads: usize, most_waiting: usize, events: &Events) -> std::io::Result<Self> {
+    pub fn start(
+        name: &'static str,
+        threads: usize,
+        most_waiting: usize,
+        events: &Events,
+    ) -> std::io::Result<Self> {
         let (tasks, waiting) = sync_channel(most_waiting);
         let waiting = Arc::new(Mutex::new(waiting));
         for _ in 0..threads {
@@ -86,7 +92,8 @@ impl Pool {
     }
 }
 
-/// Waits for the next task; `None` when no more can come. One thread waits on the queue, the others on its lock.
+/// Waits for the next task; `None` when no more can come. One thread waits on the queue, the others
+/// on its lock.
 fn next(waiting: &Mutex<Receiver<Task>>) -> Option<Task> {
     waiting.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()
 }

@@ -26,10 +26,11 @@ use super::weights::Weights;
 use crate::evaluation::Rules;
 use crate::train::{HeldOut, Outbox, Training};
 
-/// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when hundreds wait.
+/// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when
+/// hundreds wait.
 const JOB_EPISODES: [usize; 2] = [5, 40];
-/// Lease of a job, which every step of its environments extends. A step of Diffuser's, which plans for each episode, takes an
-/// evaluator up to a minute; Zenoh notices a lost evaluator after 5 s.
+/// Lease of a job, which every step of its environments extends. A step of Diffuser's, which plans
+/// for each episode, takes an evaluator up to a minute; Zenoh notices a lost evaluator after 5 s.
 const LEASE: Duration = Duration::from_secs(180);
 /// A thread that answers or writes is stuck if it has not reported for this long.
 pub(crate) const STUCK: Duration = Duration::from_secs(30);
@@ -77,15 +78,22 @@ impl Threads {
         for (&step, &hash) in &known {
             coordinator.open(step, hash)?;
         }
-        let weights = Weights::new(incarnation.run, incarnation.number, dir.clone(), coordinator.clone());
+        let weights =
+            Weights::new(incarnation.run, incarnation.number, dir.clone(), coordinator.clone());
         let (services, deliveries) =
             Services::start(coordinator.clone(), weights.clone(), metrics.clone(), events.clone())?;
 
         let disk = |what| DiskStatus::new(what, &metrics.disk, events.clone());
-        let scores =
-            Scores { log: scores, deliveries, coordinator, metrics: metrics.clone(), disk: disk(Saved::Scores) };
+        let scores = Scores {
+            log: scores,
+            deliveries,
+            coordinator,
+            metrics: metrics.clone(),
+            disk: disk(Saved::Scores),
+        };
         let writer = Saved::Scores.thread();
-        let scores = spawn_alive(writer, events, health.part(writer, STUCK), move |beat| scores.run(beat))?;
+        let scores =
+            spawn_alive(writer, events, health.part(writer, STUCK), move |beat| scores.run(beat))?;
 
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         metrics.training.gradient_steps.inc_by(step);
@@ -102,7 +110,9 @@ impl Threads {
             disk: disk(Saved::Run),
         };
         let writer = Saved::Run.thread();
-        let snapshots = spawn_alive(writer, events, health.part(writer, STUCK), move |beat| snapshots.run(beat))?;
+        let snapshots = spawn_alive(writer, events, health.part(writer, STUCK), move |beat| {
+            snapshots.run(beat)
+        })?;
 
         let stop = Arc::new(AtomicBool::new(false));
         let training = Training {
@@ -116,8 +126,12 @@ impl Threads {
             outbox: outbox.clone(),
             stop: stop.clone(),
         };
-        let training =
-            spawn_alive("training", events, health.part("training", TRAINING_STUCK), move |beat| training.run(beat))?;
+        let training = spawn_alive(
+            "training",
+            events,
+            health.part("training", TRAINING_STUCK),
+            move |beat| training.run(beat),
+        )?;
         Ok(Self { services, outbox, stop, training, snapshots, scores })
     }
 
@@ -131,7 +145,8 @@ impl Threads {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    /// Ends the threads: their output is on the disk afterwards. A thread that failed has told the main loop.
+    /// Ends the threads: their output is on the disk afterwards. A thread that failed has told the
+    /// main loop.
     pub fn join(self) {
         self.stop_training();
         self.training.join().ok();

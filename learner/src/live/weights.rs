@@ -28,7 +28,14 @@ pub(super) struct Weights {
 
 impl Weights {
     pub fn new(run: Name, incarnation: u64, run_dir: RunDir, coordinator: Coordinator) -> Self {
-        Self { run, incarnation, run_dir, coordinator, session: Arc::default(), newest: Arc::default() }
+        Self {
+            run,
+            incarnation,
+            run_dir,
+            coordinator,
+            session: Arc::default(),
+            newest: Arc::default(),
+        }
     }
 
     /// Sets the session, so that later snapshots are published.
@@ -46,9 +53,11 @@ impl Weights {
         // The jobs must exist first: evaluators claim one as soon as the snapshot arrives.
         self.coordinator.open(step, hash)?;
         if let Some(session) = self.session.get() {
-            // An evaluator that does not read loses the snapshot instead of delaying others. It asks for it when it gets a
-            // job.
-            let put = session.put(keys::weights(&self.run), bytes).congestion_control(CongestionControl::Drop);
+            // An evaluator that does not read loses the snapshot instead of delaying others. It
+            // asks for it when it gets a job.
+            let put = session
+                .put(keys::weights(&self.run), bytes)
+                .congestion_control(CongestionControl::Drop);
             if let Err(error) = put.wait() {
                 debug!(%error, step, "the snapshot could not be published");
             }
@@ -73,7 +82,8 @@ impl Weights {
     }
 
     fn message(&self, step: u64, hash: Hash, file: Vec<u8>) -> anyhow::Result<ZBytes> {
-        let snapshot = Snapshot { run: self.run.clone(), incarnation: self.incarnation, step, hash, file };
+        let snapshot =
+            Snapshot { run: self.run.clone(), incarnation: self.incarnation, step, hash, file };
         Ok(encode(&snapshot).context("the snapshot cannot be sent to evaluators")?.into())
     }
 }

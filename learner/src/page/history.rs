@@ -7,12 +7,14 @@ use std::path::PathBuf;
 use quad_run::run::new_lines;
 use serde::{Serialize, Serializer};
 
-/// Most rows that are kept: more than a chart has pixels for. Even, so that pairs of rows can become one.
+/// Most rows that are kept: more than a chart has pixels for. Even, so that pairs of rows can
+/// become one.
 const MOST_ROWS: usize = 500;
 /// Significant digits that are sent.
 const DIGITS: usize = 5;
 
-/// What `metrics.jsonl` says. Of a long run each row is the mean of as many lines as it takes to keep the rows few.
+/// What `metrics.jsonl` says. Of a long run each row is the mean of as many lines as it takes to
+/// keep the rows few.
 #[derive(Debug, Serialize)]
 pub(super) struct History {
     #[serde(skip)]
@@ -48,23 +50,29 @@ impl History {
         Self { path, read: 0, stride: 1, lines: 0, names: Vec::new(), rows: Vec::new() }
     }
 
-    /// Takes in the lines that the file has more than before. A learner that went back to its checkpoint writes steps again:
-    /// what was known of them is forgotten.
+    /// Takes in the lines that the file has more than before. A learner that went back to its
+    /// checkpoint writes steps again: what was known of them is forgotten.
     ///
     /// # Errors
     /// The file cannot be read. That there is none is no error.
     pub fn refresh(&mut self) -> io::Result<()> {
         let lines = new_lines(&self.path, &mut self.read)?;
-        let lines = lines.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok());
+        let lines =
+            lines.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok());
         for mut line in lines.collect::<Vec<BTreeMap<String, Option<f64>>>>() {
-            let [step, seconds] = ["step", "seconds"].map(|name| line.remove(name).flatten().unwrap_or_default());
+            let [step, seconds] =
+                ["step", "seconds"].map(|name| line.remove(name).flatten().unwrap_or_default());
             while self.rows.pop_if(|last| last.step >= step).is_some() {
                 self.lines = self.stride;
             }
             // Later phases measure other metrics.
-            self.names.extend(line.keys().filter(|name| !self.names.contains(name)).cloned().collect::<Vec<_>>());
+            self.names.extend(
+                line.keys().filter(|name| !self.names.contains(name)).cloned().collect::<Vec<_>>(),
+            );
             self.rows.iter_mut().for_each(|row| row.values.resize(self.names.len(), (0.0, 0)));
-            let value = |name: &String| line.get(name).copied().flatten().map_or((0.0, 0), |value| (value, 1));
+            let value = |name: &String| {
+                line.get(name).copied().flatten().map_or((0.0, 0), |value| (value, 1))
+            };
             self.push(Row { step, seconds, values: self.names.iter().map(value).collect() });
         }
         Ok(())

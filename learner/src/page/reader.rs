@@ -1,4 +1,5 @@
-//! The thread that reads run folders for the page. A disk that hangs holds up this thread and no other.
+//! The thread that reads run folders for the page. A disk that hangs holds up this thread and no
+//! other.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -74,11 +75,17 @@ impl Reader {
     fn list(&mut self) -> Bytes {
         answer(&mut self.list, LIST_EVERY, || {
             let entries = list::list(std::slice::from_ref(&self.root));
-            self.dirs = entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone())).collect();
+            self.dirs =
+                entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone())).collect();
             let shown = entries.iter().map(|entry| {
                 let mut shown = json!(entry);
                 if shown["at_work"] == true {
-                    shown["page"] = json!(RunDir::at(&entry.dir).read_endpoints().ok().map(|endpoints| endpoints.page));
+                    shown["page"] = json!(
+                        RunDir::at(&entry.dir)
+                            .read_endpoints()
+                            .ok()
+                            .map(|endpoints| endpoints.page)
+                    );
                 }
                 shown
             });

@@ -25,13 +25,20 @@ fn runs(folder: &std::path::Path, names: &[&str]) {
 async fn get(root: &std::path::Path, live: Option<Live>, paths: &[&str]) -> Vec<(String, String)> {
     let pages = routes(root.to_owned(), live).unwrap();
     let any_port = ([127, 0, 0, 1], 0).into();
-    let server = serve_metrics(any_port, Default::default(), Health::default(), pages).await.unwrap();
+    let server =
+        serve_metrics(any_port, Default::default(), Health::default(), pages).await.unwrap();
     let mut answers = Vec::new();
     for path in paths {
         let mut connection = TcpStream::connect(server.address).await.unwrap();
-        connection.write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes()).await.unwrap();
+        connection
+            .write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes())
+            .await
+            .unwrap();
         let mut answer = String::new();
-        tokio::time::timeout(Duration::from_secs(60), connection.read_to_string(&mut answer)).await.unwrap().unwrap();
+        tokio::time::timeout(Duration::from_secs(60), connection.read_to_string(&mut answer))
+            .await
+            .unwrap()
+            .unwrap();
         let (head, body) = answer.split_once("\r\n\r\n").unwrap();
         answers.push((head.to_owned(), body.to_owned()));
     }
@@ -41,17 +48,25 @@ async fn get(root: &std::path::Path, live: Option<Live>, paths: &[&str]) -> Vec<
 #[tokio::test]
 async fn the_page_needs_no_other_host_and_runs_no_script_of_its_own() {
     let folder = tempfile::tempdir().unwrap();
-    let answers = get(folder.path(), None, &["/", "/page.js", "/charts.js", "/dygraph.js", "/page.css"]).await;
+    let answers =
+        get(folder.path(), None, &["/", "/page.js", "/charts.js", "/dygraph.js", "/page.css"])
+            .await;
     let [(head, page), files @ ..] = &answers[..] else { panic!() };
     assert!(
-        head.contains("script-src 'self'") && head.contains("default-src 'none'") && !head.contains("unsafe"),
+        head.contains("script-src 'self'")
+            && head.contains("default-src 'none'")
+            && !head.contains("unsafe"),
         "{head}"
     );
-    assert!(!page.contains("://") && !page.contains("<script>") && !page.contains("style="), "{page}");
+    assert!(
+        !page.contains("://") && !page.contains("<script>") && !page.contains("style="),
+        "{page}"
+    );
     assert!(files.iter().all(|(head, text)| head.starts_with("HTTP/1.1 200") && text.len() > 500));
     // Of our own scripts, none writes HTML.
-    let writes_html =
-        |text: &str| ["innerHTML", "insertAdjacent", "document.write"].iter().any(|way| text.contains(way));
+    let writes_html = |text: &str| {
+        ["innerHTML", "insertAdjacent", "document.write"].iter().any(|way| text.contains(way))
+    };
     assert!(files[..2].iter().all(|(_, text)| !writes_html(text)));
     // A whole load of the page, but for the answers.
     assert!(answers.iter().map(|(_, text)| text.len()).sum::<usize>() < 200_000);
@@ -75,7 +90,10 @@ async fn runs_are_listed_and_each_tells_its_scores_metrics_and_settings() {
         run["evaluations"],
         serde_json::json!([[2000, 11.0, 2f64.sqrt(), 2, true], [4000, 5.0, null, 1, false]])
     );
-    assert_eq!((&run["history"]["names"][0], &run["history"]["rows"][0][2]), (&"bc_loss".into(), &0.5.into()));
+    assert_eq!(
+        (&run["history"]["names"][0], &run["history"]["rows"][0][2]),
+        (&"bc_loss".into(), &0.5.into())
+    );
     assert_eq!(
         run["metrics"].as_array().unwrap().len(),
         config("run", 1).experiment.definition().unwrap().metrics.len()

@@ -18,8 +18,8 @@ use super::remake;
 use super::seeds::GroupReport;
 use super::summary::Report;
 
-/// Pictures of an episode that a run's folder may hold, with their media types and what such a file begins with:
-/// `evaluator film RUN --out RUN/film.gif`.
+/// Pictures of an episode that a run's folder may hold, with their media types and what such a file
+/// begins with: `evaluator film RUN --out RUN/film.gif`.
 const FILMS: [(&str, &str, &[u8]); 2] =
     [("film.png", "image/png", b"\x89PNG\r\n\x1a\n"), ("film.gif", "image/gif", b"GIF8")];
 /// Largest film, bytes: many times as large as any of ours.
@@ -34,7 +34,8 @@ pub fn write(path: &Path, report: &Report) -> anyhow::Result<()> {
     // By its name all that is filled in is escaped, and nothing of a run's name is taken for HTML.
     templates.add_template("report.html", include_str!("../../assets/report.html"))?;
     let page = templates.get_template("report.html")?.render(Serde(page(report)?))?;
-    files::replace(path, page.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
+    files::replace(path, page.as_bytes())
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// What the template is filled with.
@@ -62,7 +63,9 @@ fn page(report: &Report) -> anyhow::Result<Value> {
 fn films(runs: &[RunReport]) -> Vec<Value> {
     let mut films = Vec::new();
     for run in runs {
-        for (path, kind, begin) in FILMS.map(|(name, kind, begin)| (run.dir.join(name), kind, begin)) {
+        for (path, kind, begin) in
+            FILMS.map(|(name, kind, begin)| (run.dir.join(name), kind, begin))
+        {
             match film(&path, begin) {
                 Ok(bytes) => {
                     let data = format!("data:{kind};base64,{}", BASE64_STANDARD.encode(bytes));
@@ -76,15 +79,19 @@ fn films(runs: &[RunReport]) -> Vec<Value> {
     films
 }
 
-/// Reads a film. The folder may be another user's, and the report is made to be sent: no other file gets into it by a link or
-/// another name.
+/// Reads a film. The folder may be another user's, and the report is made to be sent: no other file
+/// gets into it by a link or another name.
 fn film(path: &Path, begin: &[u8]) -> io::Result<Vec<u8>> {
     let mut file = files::open(path)?;
     if file.metadata()?.len() > LARGEST {
         return Err(ErrorKind::FileTooLarge.into());
     }
     let bytes = files::rest(&mut file, 0)?;
-    if bytes.starts_with(begin) { Ok(bytes) } else { Err(io::Error::other("it is no such picture")) }
+    if bytes.starts_with(begin) {
+        Ok(bytes)
+    } else {
+        Err(io::Error::other("it is no such picture"))
+    }
 }
 
 /// Runs that differ in their seed alone: their settings are without it.
@@ -94,8 +101,10 @@ fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Value> {
         let values: BTreeSet<String> = runs.iter().filter_map(|run| value(run)).collect();
         Vec::from_iter(values).join("\n")
     };
-    let summary = |run: &RunReport| Some(format!("{}: {}", run.run, run.summary.as_ref()?.text.trim()));
-    let title = runs.iter().find_map(|run| run.summary.as_ref()).map_or("", |summary| summary.title);
+    let summary =
+        |run: &RunReport| Some(format!("{}: {}", run.run, run.summary.as_ref()?.text.trim()));
+    let title =
+        runs.iter().find_map(|run| run.summary.as_ref()).map_or("", |summary| summary.title);
     let dataset = |run: &RunReport| {
         let data = &run.config.dataset;
         let name = run.config.experiment.dataset.as_deref().unwrap_or_default();
@@ -116,7 +125,8 @@ fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Value> {
         .into_iter()
         .filter(|(_, value)| !value.is_empty())
         .map(|(name, value)| json!({ "name": name, "value": value }));
-    let mut settings = toml::Table::try_from(&runs.first().context("a group has runs")?.config.experiment)?;
+    let mut settings =
+        toml::Table::try_from(&runs.first().context("a group has runs")?.config.experiment)?;
     settings.remove("seed");
     Ok(json!({
         "title": format!("{}: {}", group.task, group.method),
@@ -132,7 +142,8 @@ fn commands(runs: &[RunReport]) -> String {
             format!("# {:?}: save the settings below as FILE.toml, and learner train --preset FILE.toml", run.dir)
         })
     };
-    let dirs: Vec<String> = runs.iter().map(|run| remake::quoted(&run.dir.to_string_lossy())).collect();
+    let dirs: Vec<String> =
+        runs.iter().map(|run| remake::quoted(&run.dir.to_string_lossy())).collect();
     let report = format!("learner report {} --html report.html", dirs.join(" "));
     runs.iter().map(command).chain([report]).collect::<Vec<_>>().join("\n")
 }

@@ -69,7 +69,9 @@ impl Picture {
     /// It cannot be drawn.
     pub fn svg(&self) -> anyhow::Result<String> {
         let mut svg = String::new();
-        let drawn = self.drawable().draw(SVGBackend::with_string(&mut svg, self.size()).into_drawing_area(), 1);
+        let drawn = self
+            .drawable()
+            .draw(SVGBackend::with_string(&mut svg, self.size()).into_drawing_area(), 1);
         drawn.map_err(|error| anyhow!("cannot draw {}: {error}", self.title))?;
         Ok(svg)
     }
@@ -79,7 +81,8 @@ impl Picture {
     /// # Errors
     /// The file cannot be written.
     pub fn write_svg(&self, path: &Path) -> anyhow::Result<()> {
-        files::replace(path, self.svg()?.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
+        files::replace(path, self.svg()?.as_bytes())
+            .with_context(|| format!("cannot write {}", path.display()))
     }
 
     /// The picture as a PNG file, of twice as many pixels.
@@ -90,8 +93,10 @@ impl Picture {
         let (width, height) = self.size();
         let (width, height) = (width * FINER, height * FINER);
         let mut pixels = vec![0; (width * height * 3) as usize];
-        let drawn =
-            self.drawable().draw(BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(), FINER);
+        let drawn = self.drawable().draw(
+            BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(),
+            FINER,
+        );
         drawn.map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))?;
         let mut file = Vec::new();
         let mut encoder = png::Encoder::new(&mut file, width, height);
@@ -102,7 +107,8 @@ impl Picture {
 
     /// Whether there is nothing to be seen in it.
     pub fn is_empty(&self) -> bool {
-        self.lines.iter().all(|line| line.points.is_empty()) && self.panels.iter().all(Self::is_empty)
+        self.lines.iter().all(|line| line.points.is_empty())
+            && self.panels.iter().all(Self::is_empty)
     }
 
     /// Columns and rows of its panels.
@@ -173,8 +179,12 @@ impl Picture {
             .light_line_style(WHITE)
             .draw()?;
         for (name, y) in &self.references {
-            let line =
-                DashedLineSeries::new([(x.start, *y), (x.end, *y)], 6 * by, 4 * by, REFERENCE.stroke_width(2 * by));
+            let line = DashedLineSeries::new(
+                [(x.start, *y), (x.end, *y)],
+                6 * by,
+                4 * by,
+                REFERENCE.stroke_width(2 * by),
+            );
             chart.draw_series(line)?.label(name).legend(legend(REFERENCE, by));
         }
         for (line, color) in self.lines.iter().zip(COLORS.iter().cycle()) {
@@ -182,7 +192,11 @@ impl Picture {
         }
         chart
             .configure_series_labels()
-            .position(if self.is_falling { SeriesLabelPosition::LowerLeft } else { SeriesLabelPosition::UpperLeft })
+            .position(if self.is_falling {
+                SeriesLabelPosition::LowerLeft
+            } else {
+                SeriesLabelPosition::UpperLeft
+            })
             .legend_area_size(26 * by)
             .label_font(font(13))
             .background_style(WHITE.mix(0.8))
@@ -196,23 +210,36 @@ impl Picture {
     fn limits(&self) -> [std::ops::Range<f64>; 2] {
         let points = || self.lines.iter().flat_map(|line| &line.points);
         let range = |values: Vec<f64>, least: f64, most: f64| {
-            values.iter().copied().fold(least, f64::min)..values.iter().copied().fold(most, f64::max)
+            values.iter().copied().fold(least, f64::min)
+                ..values.iter().copied().fold(most, f64::max)
         };
         let first = points().map(|(x, _)| *x).next().unwrap_or(0.0);
-        let x = range(points().map(|(x, _)| *x).collect(), if self.is_power { first } else { 0.0 }, first + 1e-9);
+        let x = range(
+            points().map(|(x, _)| *x).collect(),
+            if self.is_power { first } else { 0.0 },
+            first + 1e-9,
+        );
         let of_points = points().flat_map(|(_, y)| [Some(y.value), y.low, y.high]).flatten();
-        let y = range(of_points.chain(self.references.iter().map(|(_, y)| *y)).collect(), 0.0, 0.01);
+        let y =
+            range(of_points.chain(self.references.iter().map(|(_, y)| *y)).collect(), 0.0, 0.01);
         let labels = if self.is_falling { 0 } else { self.lines.len() + self.references.len() };
         let room = 1.05 + 0.05 * labels as f64;
         [x, y.start..y.start + (y.end - y.start) * room]
     }
 }
 
-fn draw_line<DB: DrawingBackend>(chart: &mut Chart<DB>, line: &Line, color: RGBColor, by: u32) -> Drawn
+fn draw_line<DB: DrawingBackend>(
+    chart: &mut Chart<DB>,
+    line: &Line,
+    color: RGBColor,
+    by: u32,
+) -> Drawn
 where
     DB::ErrorType: 'static,
 {
-    let edge = |end: fn(&Estimate) -> Option<f64>| line.points.iter().filter_map(move |(x, y)| Some((*x, end(y)?)));
+    let edge = |end: fn(&Estimate) -> Option<f64>| {
+        line.points.iter().filter_map(move |(x, y)| Some((*x, end(y)?)))
+    };
     let band: Vec<_> = edge(|y| y.high).chain(edge(|y| y.low).rev()).collect();
     if !band.is_empty() {
         chart.draw_series([Polygon::new(band, color.mix(0.15))])?;
@@ -221,7 +248,8 @@ where
     let series = LineSeries::new(points.clone(), color.stroke_width(2 * by));
     chart.draw_series(series)?.label(&line.label).legend(legend(color, by));
     let points = if points.len() > MOST_POINTS { Vec::new() } else { points };
-    chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3 * by, color.filled())))?;
+    chart
+        .draw_series(points.into_iter().map(|point| Circle::new(point, 3 * by, color.filled())))?;
     Ok(())
 }
 

@@ -5,8 +5,8 @@ use quad_run::config::tables::parse_assignment;
 use quad_run::results::RunReport;
 use quad_run::results::departures::as_given;
 
-/// `learner train` with all that decides the outcome of the run. Nothing if what the run began from is no task of this
-/// learner's, but a file of its user's, or lacks a value that its task has.
+/// `learner train` with all that decides the outcome of the run. Nothing if what the run began from
+/// is no task of this learner's, but a file of its user's, or lacks a value that its task has.
 pub fn command(run: &RunReport) -> Option<String> {
     let experiment = &run.config.experiment;
     let given = as_given(run, false).ok()?;
@@ -20,7 +20,9 @@ pub fn command(run: &RunReport) -> Option<String> {
     if experiment.environment != given.environment {
         say("--env", &experiment.environment);
     }
-    for key in differences(&ours, &theirs).filter(|key| !matches!(key.as_str(), "environment" | "seed")) {
+    for key in
+        differences(&ours, &theirs).filter(|key| !matches!(key.as_str(), "environment" | "seed"))
+    {
         say("--set", &assignment(key, ours.get(key)?));
     }
     if run.config.run.device != Default::default() {

@@ -12,22 +12,25 @@ use quad_run::results::run::{RunReport, joined};
 use quad_run::results::{Select, Spread};
 use serde::Serialize;
 
-/// Runs that differ in their seed alone: in task, data, device and every hyper-parameter they agree, and in how far they have
-/// come. The precision in which evaluators scored them may differ; it is named.
+/// Runs that differ in their seed alone: in task, data, device and every hyper-parameter they
+/// agree, and in how far they have come. The precision in which evaluators scored them may differ;
+/// it is named.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GroupReport {
     /// What they learn.
     pub task: String,
     /// Their algorithm.
     pub algorithm: String,
-    /// The variant of the algorithm: the kind of guidance for QUAD, such as `quad`, `dac` and `none`, or another algorithm's name.
+    /// The variant of the algorithm: the kind of guidance for QUAD, such as `quad`, `dac` and
+    /// `none`, or another algorithm's name.
     pub variant: String,
-    /// What tables and figures call these runs: the variant and, if other runs of it have another value of a setting, on whatever
-    /// task, that setting where it is not the task's own.
+    /// What tables and figures call these runs: the variant and, if other runs of it have another
+    /// value of a setting, on whatever task, that setting where it is not the task's own.
     pub method: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
-    /// What sources of published figures call this variant of the algorithm, if they have a row of it.
+    /// What sources of published figures call this variant of the algorithm, if they have a row of
+    /// it.
     pub methods: Vec<&'static str>,
     /// Gradient steps that were asked for.
     pub steps: u64,
@@ -41,7 +44,8 @@ pub struct GroupReport {
     pub scored_in: String,
     /// The seeds, one for each run that is counted.
     pub seeds: Vec<u64>,
-    /// The score of each of these; empty if they are not complete, or have too few evaluations for one.
+    /// The score of each of these; empty if they are not complete, or have too few evaluations for
+    /// one.
     pub scores: Vec<f64>,
     /// These runs.
     #[serde(skip)]
@@ -66,7 +70,8 @@ pub struct GroupReport {
     pub left_out: Vec<String>,
     /// The settings in which other runs of the task and algorithm differ from these.
     pub differs: Vec<String>,
-    /// How these runs depart from their authors' protocol; empty where nothing is published for the task.
+    /// How these runs depart from their authors' protocol; empty where nothing is published for the
+    /// task.
     pub departures: Vec<String>,
     /// What is published for the task.
     pub published: Vec<Published>,
@@ -78,7 +83,8 @@ impl GroupReport {
         let seeds = self.seeds.len();
         let plural = if seeds == 1 { "" } else { "s" };
         let goals = self.goals.map(|_| " with a goal each").unwrap_or_default();
-        let (steps, device, scored_in) = (self.steps_in_words(), self.device.name(), &self.scored_in);
+        let (steps, device, scored_in) =
+            (self.steps_in_words(), self.device.name(), &self.scored_in);
         format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {scored_in}")
     }
 
@@ -133,27 +139,42 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
         match groups.iter_mut().find(is_alike) {
             Some(group) => group.runs.push(run),
             None => {
-                let given = as_given(run, true).map(|given| settings::of_experiment(&given)).unwrap_or_default();
-                groups.push(Alike { method: [&run.algorithm, &run.variant], settings, given, runs: vec![run] });
+                let given = as_given(run, true)
+                    .map(|given| settings::of_experiment(&given))
+                    .unwrap_or_default();
+                groups.push(Alike {
+                    method: [&run.algorithm, &run.variant],
+                    settings,
+                    given,
+                    runs: vec![run],
+                });
             }
         }
     }
     let mut told: BTreeMap<[&str; 2], BTreeSet<&String>> = BTreeMap::new();
     for (index, one) in groups.iter().enumerate() {
         for other in groups[..index].iter().filter(|other| other.method == one.method) {
-            // Two tasks have values of their own, by which runs are of one method; any other value is a method of its own.
-            let are_own = |key: &str| one.runs[0].task != other.runs[0].task && one.has_own(key) && other.has_own(key);
+            // Two tasks have values of their own, by which runs are of one method; any other value
+            // is a method of its own.
+            let are_own = |key: &str| {
+                one.runs[0].task != other.runs[0].task && one.has_own(key) && other.has_own(key)
+            };
             let apart = differences(&one.settings, &other.settings).filter(|key| !are_own(key));
             told.entry(one.method).or_default().extend(apart);
         }
     }
     let all = groups.iter().map(|Alike { method, settings: own, given, runs }| {
-        let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
-        let changed = told.get(method).into_iter().flatten().filter(|key| given.get(**key) != own.get(**key));
+        let value = |key: &String| {
+            own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"))
+        };
+        let changed =
+            told.get(method).into_iter().flatten().filter(|key| given.get(**key) != own.get(**key));
         let called = std::iter::once(runs[0].called.clone());
         let name = Vec::from_iter(called.chain(changed.map(|key| value(key))));
-        let is_beside = |other: &&Alike| other.runs[0].task == runs[0].task && other.method[0] == method[0];
-        let beside = groups.iter().filter(is_beside).flat_map(|other| differences(own, &other.settings));
+        let is_beside =
+            |other: &&Alike| other.runs[0].task == runs[0].task && other.method[0] == method[0];
+        let beside =
+            groups.iter().filter(is_beside).flat_map(|other| differences(own, &other.settings));
         let differs = BTreeSet::from_iter(beside).into_iter().map(value).collect();
         group(runs, name.join(", "), differs, select)
     });
@@ -168,7 +189,11 @@ fn group(runs: &[&RunReport], method: String, differs: Vec<String>, select: Sele
         if !run.evaluations.iter().any(|evaluation| evaluation.complete) {
             left_out.push(format!("{dir} has no complete evaluation"));
         } else if let Some(first) = counted.iter().find(|other| other.seed == run.seed) {
-            left_out.push(format!("{dir} has seed {} like {}, which is counted", run.seed, first.dir.display()));
+            left_out.push(format!(
+                "{dir} has seed {} like {}, which is counted",
+                run.seed,
+                first.dir.display()
+            ));
         } else {
             counted.push(run);
         }
@@ -186,7 +211,8 @@ fn group(runs: &[&RunReport], method: String, differs: Vec<String>, select: Sele
     let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
     let published = published::scores(&first.task);
     let environment = environment::find(&first.config.experiment.environment).ok();
-    let has_one_goal = environment.is_some_and(|environment| environment.goal == Some(Goal::EachInstance));
+    let has_one_goal =
+        environment.is_some_and(|environment| environment.goal == Some(Goal::EachInstance));
     let unfinished = counted.iter().filter(|run| !run.is_complete());
     GroupReport {
         task: first.task.clone(),
@@ -206,11 +232,17 @@ fn group(runs: &[&RunReport], method: String, differs: Vec<String>, select: Sele
         mean_last_5: over(|run| run.mean_last_5),
         mean_last_50000_steps: over(|run| run.mean_last_50000_steps),
         best: over(|run| run.best().map(|best| best.score.mean)).filter(|_| select == Select::Best),
-        unfinished: unfinished.map(|run| format!("in {} {}", run.dir.display(), run.how_complete())).collect(),
+        unfinished: unfinished
+            .map(|run| format!("in {} {}", run.dir.display(), run.how_complete()))
+            .collect(),
         left_out,
         differs,
         dirs: runs.iter().map(|run| run.dir.clone()).collect(),
-        departures: if published.is_empty() { Vec::new() } else { departures(&counted, &scored_in, select) },
+        departures: if published.is_empty() {
+            Vec::new()
+        } else {
+            departures(&counted, &scored_in, select)
+        },
         runs: counted.into_iter().cloned().collect(),
         scored_in,
         published,

@@ -73,7 +73,8 @@ type Method<'a> = Vec<&'a GroupReport>;
 pub fn study(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>) {
     let mut scopes: Vec<Vec<Method>> = Vec::new();
     // Returns of different tasks have no common unit.
-    let is_comparable = |a: &GroupReport, b: &GroupReport| a.normalized && b.normalized || a.task == b.task;
+    let is_comparable =
+        |a: &GroupReport, b: &GroupReport| a.normalized && b.normalized || a.task == b.task;
     for group in groups.iter().filter(|group| !group.scores.is_empty()) {
         let scope = scopes.iter().position(|scope| is_comparable(scope[0][0], group));
         let scope = scope.unwrap_or_else(|| {
@@ -86,8 +87,9 @@ pub fn study(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>) {
         }
     }
     let methods = scopes.iter().flatten().map(|method| of_method(method)).collect();
-    let against_first =
-        |scope: &Vec<Method>| scope[1..].iter().filter_map(|method| compare(method, &scope[0])).collect::<Vec<_>>();
+    let against_first = |scope: &Vec<Method>| {
+        scope[1..].iter().filter_map(|method| compare(method, &scope[0])).collect::<Vec<_>>()
+    };
     let mut comparisons: Vec<Comparison> = scopes.iter().flat_map(against_first).collect();
     let p_values: Vec<f64> = comparisons.iter().filter_map(|comparison| comparison.p).collect();
     let tested = comparisons.iter_mut().filter(|comparison| comparison.p.is_some());
@@ -101,9 +103,15 @@ fn of_method(method: &Method) -> MethodReport {
     let thresholds: Vec<f64> =
         if first.normalized { (0..=120).step_by(2).map(f64::from).collect() } else { Vec::new() };
     let statistics = |drawn: &[Runs]| {
-        use statistics::{interquartile_mean, mean_of_means, median_of_means, optimality_gap, share_above};
-        let aggregates = [interquartile_mean, mean_of_means, median_of_means, optimality_gap].map(|of| of(&drawn[0]));
-        aggregates.into_iter().chain(thresholds.iter().map(|threshold| share_above(&drawn[0], *threshold))).collect()
+        use statistics::{
+            interquartile_mean, mean_of_means, median_of_means, optimality_gap, share_above,
+        };
+        let aggregates = [interquartile_mean, mean_of_means, median_of_means, optimality_gap]
+            .map(|of| of(&drawn[0]));
+        aggregates
+            .into_iter()
+            .chain(thresholds.iter().map(|threshold| share_above(&drawn[0], *threshold)))
+            .collect()
     };
     let estimates = statistics::estimates(&[&runs], statistics);
     let shares = thresholds.iter().zip(&estimates[4..]);
@@ -117,7 +125,9 @@ fn of_method(method: &Method) -> MethodReport {
         mean: estimates[1],
         median: estimates[2],
         optimality_gap: first.normalized.then_some(estimates[3]),
-        profile: shares.map(|(threshold, share)| Share { threshold: *threshold, share: *share }).collect(),
+        profile: shares
+            .map(|(threshold, share)| Share { threshold: *threshold, share: *share })
+            .collect(),
         seeds_of_a_task: [seeds().min(), seeds().max()].map(Option::unwrap_or_default),
     }
 }
@@ -125,15 +135,18 @@ fn of_method(method: &Method) -> MethodReport {
 /// Nothing if they have no task in common.
 fn compare(method: &Method, against: &Method) -> Option<Comparison> {
     let of_task = |task: &str| against.iter().copied().find(|other| other.task == task);
-    let common: Vec<_> = method.iter().filter_map(|one| Some((*one, of_task(&one.task)?))).collect();
+    let common: Vec<_> =
+        method.iter().filter_map(|one| Some((*one, of_task(&one.task)?))).collect();
     let first = common.first()?;
     let [x, y]: [Runs; 2] = [
         common.iter().map(|(one, _)| one.scores.clone()).collect(),
         common.iter().map(|(_, other)| other.scores.clone()).collect(),
     ];
-    let improvement = |drawn: &[Runs]| vec![statistics::probability_of_improvement(&drawn[0], &drawn[1])];
+    let improvement =
+        |drawn: &[Runs]| vec![statistics::probability_of_improvement(&drawn[0], &drawn[1])];
     let differences = common.iter().flat_map(|(one, other)| {
-        let of_seed = |seed: &u64| other.by_seed().find(|(known, _)| *known == seed).map(|(_, score)| *score);
+        let of_seed =
+            |seed: &u64| other.by_seed().find(|(known, _)| *known == seed).map(|(_, score)| *score);
         one.by_seed().filter_map(move |(seed, score)| Some(score - of_seed(seed)?))
     });
     let differences: Vec<f64> = differences.collect();
@@ -153,7 +166,9 @@ fn compare(method: &Method, against: &Method) -> Option<Comparison> {
 /// Both as tables, with what a reader has to know of them.
 pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Part> {
     let names = ["seeds", "IQM", "mean", "median", "optimality gap"].map(|name| (name, Right));
-    let mut table = Table::new(&[("method", Left), ("tasks", Left)].into_iter().chain(names).collect::<Vec<_>>());
+    let mut table = Table::new(
+        &[("method", Left), ("tasks", Left)].into_iter().chain(names).collect::<Vec<_>>(),
+    );
     let mut notes = format!(
         "Over tasks and seeds, in brackets the 95 % interval of the bootstrap: {RESAMPLES} times, seeds are drawn in each task \
          (Agarwal et al. 2021). The optimality gap is that of scores over 100. Only complete runs count.\n"
@@ -169,22 +184,37 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Part>
         let gap = m.optimality_gap.map_or_else(|| "-".to_owned(), |gap| gap.text(3));
         table.push([m.method.clone(), tasks, seeds, iqm, mean, median, gap]);
         if fewest < 2 {
-            notes += &format!("No interval for {}: of a single seed in a task, the spread is not known.\n", m.method);
+            notes += &format!(
+                "No interval for {}: of a single seed in a task, the spread is not known.\n",
+                m.method
+            );
         }
     }
     let mut parts = vec![Part::Words(notes), Part::Table(table)];
     if !comparisons.is_empty() {
+        let names = ["pairs", "mean difference", "p", "p (Holm)", "probability of improvement"]
+            .map(|name| (name, Right));
         let names =
-            ["pairs", "mean difference", "p", "p (Holm)", "probability of improvement"].map(|name| (name, Right));
-        let names = [("method", Left), ("against", Left), ("tasks", Right)].into_iter().chain(names);
+            [("method", Left), ("against", Left), ("tasks", Right)].into_iter().chain(names);
         let mut table = Table::new(&Vec::from_iter(names));
         for c in comparisons {
-            let number =
-                |value: Option<f64>, digits: usize| value.map_or_else(|| "-".to_owned(), |v| format!("{v:.digits$}"));
+            let number = |value: Option<f64>, digits: usize| {
+                value.map_or_else(|| "-".to_owned(), |v| format!("{v:.digits$}"))
+            };
             let [tasks, pairs] = [c.tasks.len(), c.pairs].map(|count| count.to_string());
-            let [difference, p, p_holm] = [number(c.mean_difference, 2), number(c.p, 4), number(c.p_holm, 4)];
+            let [difference, p, p_holm] =
+                [number(c.mean_difference, 2), number(c.p, 4), number(c.p_holm, 4)];
             let improvement = c.probability_of_improvement.text(2);
-            table.push([c.method.clone(), c.against.clone(), tasks, pairs, difference, p, p_holm, improvement]);
+            table.push([
+                c.method.clone(),
+                c.against.clone(),
+                tasks,
+                pairs,
+                difference,
+                p,
+                p_holm,
+                improvement,
+            ]);
         }
         parts.push(Part::Words(format!(
             "Against the method named first, in the tasks that both have: the mean difference of runs with the same task and seed, \

@@ -1,4 +1,5 @@
-//! The whole report: a table of each run, summaries over seeds, methods and tasks, and published tables with ours beside them.
+//! The whole report: a table of each run, summaries over seeds, methods and tasks, and published
+//! tables with ours beside them.
 
 use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
@@ -36,7 +37,8 @@ pub struct Report {
 }
 
 impl Report {
-    /// Reads run folders, and those below other folders. One that cannot be read keeps no other from being reported.
+    /// Reads run folders, and those below other folders. One that cannot be read keeps no other
+    /// from being reported.
     ///
     /// # Errors
     /// None of them holds a run that can be read.
@@ -56,7 +58,9 @@ impl Report {
             }
             found.extend(dirs.into_iter().filter(|dir| seen.insert(dir.clone())));
         }
-        let read = |dir: &PathBuf| RunReport::read(dir).map_err(|error| unreadable.push(format!("{error:#}"))).ok();
+        let read = |dir: &PathBuf| {
+            RunReport::read(dir).map_err(|error| unreadable.push(format!("{error:#}"))).ok()
+        };
         let runs: Vec<_> = found.iter().filter_map(read).collect();
         if runs.is_empty() {
             // What is wrong with the first, or that there is none.
@@ -68,33 +72,42 @@ impl Report {
         Ok(Self { select, runs, groups, study, comparisons, unreadable, in_full })
     }
 
-    /// Every part: a table of each run that was named itself, the summaries over seeds, methods and tasks if there are several
-    /// runs, and published tables where they have these tasks. Other styles than text leave out the single runs.
+    /// Every part: a table of each run that was named itself, the summaries over seeds, methods and
+    /// tasks if there are several runs, and published tables where they have these tasks. Other
+    /// styles than text leave out the single runs.
     pub fn render(&self, style: Style) -> String {
         let mut parts = Vec::new();
         if style == Style::Text {
-            let in_full = self.runs.iter().filter(|run| self.runs.len() == 1 || self.in_full.contains(&run.dir));
+            let in_full = self
+                .runs
+                .iter()
+                .filter(|run| self.runs.len() == 1 || self.in_full.contains(&run.dir));
             parts.extend(in_full.map(|run| Part::Words(self.table(run))));
         }
         parts.extend(self.summaries(style != Style::Text));
         parts.iter().map(|part| part.render(style)).collect::<Vec<_>>().join("\n")
     }
 
-    /// The parts but for the tables of single runs; `with_one`: also the summary over seeds of a single run.
+    /// The parts but for the tables of single runs; `with_one`: also the summary over seeds of a
+    /// single run.
     pub fn summaries(&self, with_one: bool) -> Vec<Part> {
-        let mut parts = Vec::from_iter(self.select.warning().map(|warning| Part::Words(warning.to_owned())));
+        let mut parts =
+            Vec::from_iter(self.select.warning().map(|warning| Part::Words(warning.to_owned())));
         if self.runs.len() > 1 || with_one {
             parts.extend(self.over_seeds());
         }
         if self.runs.len() > 1 && !self.study.is_empty() {
             parts.extend(study::tables(&self.study, &self.comparisons));
         }
-        let unreadable = self.unreadable.iter().map(|error| format!("Not in this report: {error}.\n"));
+        let unreadable =
+            self.unreadable.iter().map(|error| format!("Not in this report: {error}.\n"));
         parts.extend((!self.unreadable.is_empty()).then(|| Part::Words(unreadable.collect())));
         let judgments = self.runs.iter().flat_map(|run| run.judgments.iter().cloned());
         parts.extend(Ranking::of(judgments).iter().flat_map(Ranking::parts));
         parts.extend(
-            published::all_tables().into_iter().flat_map(|name| beside::table(name, &self.groups, self.select)),
+            published::all_tables()
+                .into_iter()
+                .flat_map(|name| beside::table(name, &self.groups, self.select)),
         );
         parts
     }
@@ -120,18 +133,22 @@ impl Report {
         header.extend(scores.iter().map(|name| (*name, Right)));
         header.push(("what differs from other runs of the task and algorithm", Left));
         let mut table = Table::new(&header);
-        let cell = |value: Option<Spread>| value.map_or_else(|| "-".to_owned(), Spread::text_of_both);
+        let cell =
+            |value: Option<Spread>| value.map_or_else(|| "-".to_owned(), Spread::text_of_both);
         for g in &self.groups {
             let measure = if g.normalized { "" } else { " (returns)" };
             let mut row = vec![
                 g.task.clone(),
                 g.agent.clone(),
                 g.steps_in_words(),
-                g.seeds.len().to_string() + &g.goals.map(|goals| format!(", {goals} goals")).unwrap_or_default(),
+                g.seeds.len().to_string()
+                    + &g.goals.map(|goals| format!(", {goals} goals")).unwrap_or_default(),
                 format!("{}{measure}", g.scored_in),
             ];
             row.extend(match self.select {
-                Select::Last => [g.mean_last_3, g.mean_last_5, g.mean_last_50000_steps].map(cell).to_vec(),
+                Select::Last => {
+                    [g.mean_last_3, g.mean_last_5, g.mean_last_50000_steps].map(cell).to_vec()
+                }
                 Select::Best => vec![cell(g.best)],
             });
             row.push(g.differs.join(", "));
@@ -140,7 +157,12 @@ impl Report {
         let title = "Over seeds: mean ± standard deviation of the runs, divided by n - 1 (in parentheses: by n).\n";
         let mut marked = Vec::new();
         for group in &self.groups {
-            marked.extend(group.unfinished.iter().map(|run| format!("Not complete, and in no other figure: {run}.\n")));
+            marked.extend(
+                group
+                    .unfinished
+                    .iter()
+                    .map(|run| format!("Not complete, and in no other figure: {run}.\n")),
+            );
             marked.extend(group.left_out.iter().map(|run| format!("Not counted: {run}.\n")));
         }
         let mut parts = vec![Part::Words(title.to_owned()), Part::Table(table)];

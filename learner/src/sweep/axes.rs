@@ -20,11 +20,16 @@ pub(super) fn axes(table: &Table) -> Result<Vec<Axis>, Vec<String>> {
     let (mut axes, mut wrong) = (Vec::new(), Vec::new());
     for (key, value) in tables::keys(table) {
         match value.as_array() {
-            None => wrong.push(format!("axis {key} is {value}, but must be a list: {key} = [{value}]")),
+            None => {
+                wrong.push(format!("axis {key} is {value}, but must be a list: {key} = [{value}]"))
+            }
             Some(values) if values.is_empty() => wrong.push(format!("axis {key} has no values")),
             Some(values) => {
-                let twice = values.iter().enumerate().find(|(at, value)| values[..*at].contains(value));
-                wrong.extend(twice.map(|(_, value)| format!("axis {key} has the value {value} twice")));
+                let twice =
+                    values.iter().enumerate().find(|(at, value)| values[..*at].contains(value));
+                wrong.extend(
+                    twice.map(|(_, value)| format!("axis {key} has the value {value} twice")),
+                );
                 axes.push(Axis { key, values: values.clone() });
             }
         }
@@ -36,7 +41,8 @@ pub(super) fn axes(table: &Table) -> Result<Vec<Axis>, Vec<String>> {
     if wrong.is_empty() { Ok(axes) } else { Err(wrong) }
 }
 
-/// Seeds change last: a study that is broken off has compared everything by some seeds, and further ones only add to the list.
+/// Seeds change last: a study that is broken off has compared everything by some seeds, and further
+/// ones only add to the list.
 fn rank(key: &str) -> usize {
     let order = ["seed", "task", "preset", "dataset", "algorithm", "method"];
     order.iter().position(|known| *known == key).unwrap_or(order.len())

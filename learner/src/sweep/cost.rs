@@ -29,8 +29,8 @@ pub(crate) struct Cost {
 }
 
 impl Cost {
-    /// Measures these runs, of which so much is done, from data that is on this machine. A run that cannot begin takes nothing,
-    /// which is said; its learner will say it again.
+    /// Measures these runs, of which so much is done, from data that is on this machine. A run that
+    /// cannot begin takes nothing, which is said; its learner will say it again.
     ///
     /// # Errors
     /// No thread can be started.
@@ -48,11 +48,16 @@ impl Cost {
                     one_thread.install(|| Price::measure(&run.experiment, Device::Cpu, transitions))
                 });
                 let refused = |error| warn!("the run {} cannot begin: {error:#}", run.name);
-                prices.insert(key, price.and_then(|price| price.map_err(refused).ok()).unwrap_or_default());
+                prices.insert(
+                    key,
+                    price.and_then(|price| price.map_err(refused).ok()).unwrap_or_default(),
+                );
             }
         }
         let measured = prices.values().filter(|price| price.step > 0.0).count();
-        let mean = |value: fn(&Price) -> f64| prices.values().map(value).sum::<f64>() / measured.max(1) as f64;
+        let mean = |value: fn(&Price) -> f64| {
+            prices.values().map(value).sum::<f64>() / measured.max(1) as f64
+        };
         let other = Price {
             step: mean(|price| price.step),
             snapshot: mean(|price| price.snapshot as f64) as u64,

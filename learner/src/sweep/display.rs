@@ -1,4 +1,5 @@
-//! What a person sees of a sweep: a line for each run at work and one for all on a terminal, plain log lines otherwise.
+//! What a person sees of a sweep: a line for each run at work and one for all on a terminal, plain
+//! log lines otherwise.
 
 use std::time::{Duration, Instant};
 

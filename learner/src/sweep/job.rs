@@ -23,10 +23,11 @@ use crate::local_evaluators::{not_encrypted, run_beside};
 
 /// How often it looks whether a learner has ended.
 pub(super) const GLANCE: Duration = Duration::from_millis(100);
-/// A learner that was told to stop ends within less; one that is frozen is killed. Then there is time for the evaluators to
-/// leave before the sweep must have ended.
+/// A learner that was told to stop ends within less; one that is frozen is killed. Then there is
+/// time for the evaluators to leave before the sweep must have ended.
 const LEARNERS_LEAVE: Duration = LEAVE_WITHIN.saturating_add(Duration::from_secs(2));
-/// How long a sweep that was told to end waits for what a disk has to say of a learner that has ended.
+/// How long a sweep that was told to end waits for what a disk has to say of a learner that has
+/// ended.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// What all learners of a sweep have in common.
@@ -54,7 +55,8 @@ pub(super) struct Job {
 pub(super) enum End {
     /// The run is complete.
     Complete,
-    /// It was told to stop, or no evaluator came, or another learner is at work in the run's folder.
+    /// It was told to stop, or no evaluator came, or another learner is at work in the run's
+    /// folder.
     Unfinished,
     /// With an error; what it was, and where its log is.
     Failed(String),
@@ -66,13 +68,15 @@ impl Job {
         Self { dir: study.join(&run.name), from: state.step(run.experiment.steps), run }
     }
 
-    /// Starts the learner and waits for its end; after `stop`, in which it saves a checkpoint, for no longer than it may take.
-    /// The system ends the learner with the calling thread. Other threads read and write the folder: a disk that hangs holds
-    /// up neither other runs nor Ctrl-C.
+    /// Starts the learner and waits for its end; after `stop`, in which it saves a checkpoint, for
+    /// no longer than it may take. The system ends the learner with the calling thread. Other
+    /// threads read and write the folder: a disk that hangs holds up neither other runs nor Ctrl-C.
     pub async fn see_through(self, with: Learners, stop: Receiver<bool>) -> (Self, End, Pace) {
         let begun = Pace { step: self.from, ..Pace::default() };
-        let (end, pace) =
-            self.work(with, stop).await.unwrap_or_else(|error| (End::Failed(format!("{error:#}")), begun));
+        let (end, pace) = self
+            .work(with, stop)
+            .await
+            .unwrap_or_else(|error| (End::Failed(format!("{error:#}")), begun));
         (self, end, pace)
     }
 
@@ -83,7 +87,9 @@ impl Job {
             prepared = spawn_blocking(move || job.prepare(&with)) => prepared??,
             () = told(&stop) => return Ok(unfinished),
         };
-        let mut learner = command.spawn().with_context(|| format!("{}: cannot start a learner", self.run.name))?;
+        let mut learner = command
+            .spawn()
+            .with_context(|| format!("{}: cannot start a learner", self.run.name))?;
         let status = tokio::select! {
             status = ended(&mut learner) => status,
             () = told(&stop) => {
@@ -95,19 +101,24 @@ impl Job {
             }
         };
         let (job, stopped) = (self.clone(), *stop.borrow());
-        let concluded = spawn_blocking(move || (job.conclude(status, stopped, logged), Pace::read(&job.dir)));
+        let concluded =
+            spawn_blocking(move || (job.conclude(status, stopped, logged), Pace::read(&job.dir)));
         tokio::select! {
             concluded = concluded => Ok(concluded?),
             () = async { told(&stop).await; sleep(LAST_WORDS).await } => Ok(unfinished),
         }
     }
 
-    /// Makes the run's folder. Gives the learner's command, and how many bytes earlier learners have logged.
+    /// Makes the run's folder. Gives the learner's command, and how many bytes earlier learners
+    /// have logged.
     fn prepare(&self, with: &Learners) -> anyhow::Result<(Command, u64)> {
         let Self { run, dir, .. } = self;
         let mut command = Command::new(std::env::current_exe()?);
-        command.args(["train", "--preset", &run.preset, "--connect", &with.endpoint, "--run-dir"]).arg(dir);
-        command.args(with.http.iter().flat_map(|address| ["--http".to_owned(), address.to_string()]));
+        command
+            .args(["train", "--preset", &run.preset, "--connect", &with.endpoint, "--run-dir"])
+            .arg(dir);
+        command
+            .args(with.http.iter().flat_map(|address| ["--http".to_owned(), address.to_string()]));
         for (key, value) in tables::keys(&run.changes) {
             command.args(["--set", &format!("{key}={value}")]);
         }
@@ -121,18 +132,24 @@ impl Job {
 
     /// What the learner's end means for the run. Remembers a failure in the run's folder.
     fn conclude(&self, status: io::Result<ExitStatus>, stopped: bool, logged: u64) -> End {
-        let code = status.as_ref().ok().and_then(ExitStatus::code).and_then(|code| u8::try_from(code).ok());
+        let code = status
+            .as_ref()
+            .ok()
+            .and_then(ExitStatus::code)
+            .and_then(|code| u8::try_from(code).ok());
         match code {
             Some(0) => return End::Complete,
             Some(UNFINISHED) => return End::Unfinished,
-            // It was ended before it could do as it was told; the same command continues all the same.
+            // It was ended before it could do as it was told; the same command continues all the
+            // same.
             None | Some(ENDED_AT_ONCE) if stopped => return End::Unfinished,
             _ => {}
         }
         // On a disk that takes nothing, `--list` calls it begun.
         RunDir::at(&self.dir).mark_failed(true).ok();
         let log = log(&self.dir);
-        let text = files::open(&log).and_then(|mut log| files::rest(&mut log, logged)).unwrap_or_default();
+        let text =
+            files::open(&log).and_then(|mut log| files::rest(&mut log, logged)).unwrap_or_default();
         let own = String::from_utf8_lossy(&text);
         let reason = match (error_in(&own), status) {
             (Some(error), _) => error.to_owned(),
@@ -185,7 +202,9 @@ mod tests {
             (format!("{earlier}error: a loose cable\n"), "a loose cable"),
         ] {
             fs::write(super::log(&job.dir), log).unwrap();
-            let End::Failed(said) = job.conclude(killed(), false, earlier.len() as u64) else { panic!("{reason}") };
+            let End::Failed(said) = job.conclude(killed(), false, earlier.len() as u64) else {
+                panic!("{reason}")
+            };
             assert!(said.starts_with(&format!("seed0: {reason}")), "{said}");
         }
         assert!(matches!(job.conclude(killed(), true, 0), End::Unfinished), "it was told to stop");

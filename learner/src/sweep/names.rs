@@ -6,8 +6,8 @@ use toml::Value;
 
 use super::axes::Combination;
 
-/// The name of a combination. The seed comes last, the other axes in their order. An axis of one value is in it, too, so that
-/// further values change no name.
+/// The name of a combination. The seed comes last, the other axes in their order. An axis of one
+/// value is in it, too, so that further values change no name.
 pub(super) fn name(combination: &Combination<'_>) -> String {
     let is_seed = |(key, _): &&(&str, &Value)| *key == "seed";
     let (seed, others): (Vec<_>, Vec<_>) = combination.iter().partition(is_seed);
@@ -16,10 +16,13 @@ pub(super) fn name(combination: &Combination<'_>) -> String {
 }
 
 fn part(key: &str, value: &Value, combination: &Combination<'_>) -> String {
-    let file = |text: &str| Path::new(text).file_stem().map(|stem| stem.to_string_lossy().into_owned());
+    let file =
+        |text: &str| Path::new(text).file_stem().map(|stem| stem.to_string_lossy().into_owned());
     match (key, value.as_str()) {
         ("task" | "method" | "algorithm", Some(word)) => allowed(word),
-        ("preset" | "dataset", Some(path)) if path.contains(['/', '.']) => allowed(&file(path).unwrap_or_default()),
+        ("preset" | "dataset", Some(path)) if path.contains(['/', '.']) => {
+            allowed(&file(path).unwrap_or_default())
+        }
         ("preset" | "dataset", Some(word)) => allowed(word),
         (key, Some(word)) => format!("{}-{}", short(key, combination), allowed(word)),
         (key, None) => format!("{}{}", short(key, combination), allowed(&value.to_string())),
@@ -29,7 +32,8 @@ fn part(key: &str, value: &Value, combination: &Combination<'_>) -> String {
 /// The last part of a key, unless another axis has the same.
 fn short<'a>(key: &'a str, combination: &Combination<'_>) -> &'a str {
     let last = |key: &'a str| key.rsplit('.').next().unwrap_or(key);
-    let same = combination.iter().filter(|(other, _)| other.rsplit('.').next() == Some(last(key))).count();
+    let same =
+        combination.iter().filter(|(other, _)| other.rsplit('.').next() == Some(last(key))).count();
     if same > 1 { key } else { last(key) }
 }
 

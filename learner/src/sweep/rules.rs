@@ -6,7 +6,8 @@ use toml::{Table, Value};
 
 use super::axes::Combination;
 
-/// What a study says of combinations. A rule has a value, or a list of values, for some axes; `*` stands for any letters.
+/// What a study says of combinations. A rule has a value, or a list of values, for some axes; `*`
+/// stands for any letters.
 pub(super) struct Rules<'a> {
     /// If there are any, only combinations that fit one of them are runs.
     pub only: &'a [Table],
@@ -31,14 +32,17 @@ impl Rules<'_> {
     }
 }
 
-/// The values of axes that the command line keeps to: of each axis that it names, one of those that it gives.
+/// The values of axes that the command line keeps to: of each axis that it names, one of those that
+/// it gives.
 pub(super) struct Narrower(Table);
 
 impl Narrower {
     pub fn new(only: &[Table]) -> Self {
         let mut values = Table::new();
         for (key, value) in only.iter().flat_map(tables::keys) {
-            if let Value::Array(several) = values.entry(key).or_insert_with(|| Value::Array(Vec::new())) {
+            if let Value::Array(several) =
+                values.entry(key).or_insert_with(|| Value::Array(Vec::new()))
+            {
                 several.push(value.clone());
             }
         }
@@ -65,7 +69,8 @@ fn wrong(rule: &Table, combinations: &[Combination<'_>]) -> Option<String> {
 }
 
 fn all_fit(rule: &Table, combination: &Combination<'_>) -> bool {
-    let value = |key: &str| combination.iter().find(|(axis, _)| *axis == key).map(|(_, value)| *value);
+    let value =
+        |key: &str| combination.iter().find(|(axis, _)| *axis == key).map(|(_, value)| *value);
     tables::keys(rule).iter().all(|(key, wanted)| value(key).is_some_and(|value| is(value, wanted)))
 }
 

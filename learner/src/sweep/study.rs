@@ -1,4 +1,5 @@
-//! A study's file: what its runs share, the axes, and rules; and the runs that follow from it, all of them checked.
+//! A study's file: what its runs share, the axes, and rules; and the runs that follow from it, all
+//! of them checked.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -19,11 +20,13 @@ use super::names;
 use super::rules::{Narrower, Rules};
 use crate::data::Source;
 
-/// Keys that are no keys of an experiment: the first two say what a run begins from, the third names a table of changes.
+/// Keys that are no keys of an experiment: the first two say what a run begins from, the third
+/// names a table of changes.
 const BEGIN: [&str; 2] = ["task", "preset"];
 const METHOD: &str = "method";
 
-const HELP: &str = "studies/demo.toml is an example, studies/README.md has what may stand in the file";
+const HELP: &str =
+    "studies/demo.toml is an example, studies/README.md has what may stand in the file";
 
 /// The file.
 #[derive(Deserialize)]
@@ -93,39 +96,50 @@ impl PlannedRun {
     /// A run with other settings is there.
     pub fn state(&self, dir: &Path) -> anyhow::Result<State> {
         if !RunDir::is_occupied(dir) {
-            return Ok(if RunDir::at(dir).has_failed() { State::Failed(0) } else { State::NotBegun });
+            return Ok(if RunDir::at(dir).has_failed() {
+                State::Failed(0)
+            } else {
+                State::NotBegun
+            });
         }
         let read = RunReport::scored(dir).inspect_err(|error| warn!("{error:#}"));
         let Ok(report) = read else { return Ok(State::Unreadable) };
         let (there, planned) = (&report.config.experiment, &self.experiment);
         let (old, new) = (settings::of_experiment(there), settings::of_experiment(planned));
-        let mut differences: Vec<_> = settings::differences(&old, &new).map(String::as_str).collect();
+        let mut differences: Vec<_> =
+            settings::differences(&old, &new).map(String::as_str).collect();
         if there.dataset != planned.dataset {
             differences.push("dataset");
         }
         if !differences.is_empty() {
             let (path, keys) = (dir.display(), differences.join(", "));
             let hint = "give the study's file another name, choose another folder for it, or move that folder away";
-            return Err(hinted(anyhow!("{path} has a run of other settings than the study's: {keys}"), hint));
+            return Err(hinted(
+                anyhow!("{path} has a run of other settings than the study's: {keys}"),
+                hint,
+            ));
         }
         Ok(State::of(&report)?)
     }
 }
 
 impl Study {
-    /// Reads a file and resolves every run as `learner train` would. `only` has values of axes, one of which a run must have of
-    /// each that is named; `set` has keys that all runs change.
+    /// Reads a file and resolves every run as `learner train` would. `only` has values of axes, one
+    /// of which a run must have of each that is named; `set` has keys that all runs change.
     ///
     /// # Errors
     /// Everything that is wrong in it, at once.
     pub fn read(path: &Path, only: &[Table], set: &[Table]) -> anyhow::Result<Self> {
-        let text =
-            std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display())).hint(HELP)?;
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read {}", path.display()))
+            .hint(HELP)?;
         let cannot = || format!("{} cannot be used", path.display());
         let file: File = toml::from_str(&text).with_context(cannot).hint(HELP)?;
-        let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+        let name =
+            path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
         let refuse = |Wrong { what, advice }: Wrong| {
-            let advice = advice.iter().map(String::as_str).chain([HELP]).collect::<Vec<_>>().join("; ");
+            let advice =
+                advice.iter().map(String::as_str).chain([HELP]).collect::<Vec<_>>().join("; ");
             hinted(anyhow!("{}:\n  {}", cannot(), what.join("\n  ")), advice)
         };
         let runs = file.runs(only, set).map_err(refuse)?;
@@ -144,8 +158,10 @@ impl File {
             return Err(wrong.into());
         }
         let allowed = all.into_iter().filter(|combination| rules.allow(combination)).enumerate();
-        let allowed = Vec::from_iter(allowed.filter(|(_, combination)| narrower.allows(combination)));
-        let (mut runs, mut wrong) = (Vec::<PlannedRun>::new(), BTreeMap::<String, Vec<String>>::new());
+        let allowed =
+            Vec::from_iter(allowed.filter(|(_, combination)| narrower.allows(combination)));
+        let (mut runs, mut wrong) =
+            (Vec::<PlannedRun>::new(), BTreeMap::<String, Vec<String>>::new());
         let mut advice = BTreeSet::new();
         for (index, combination) in allowed {
             let name = names::name(&combination);
@@ -163,7 +179,8 @@ impl File {
         if runs.is_empty() && wrong.is_empty() {
             return Err(vec!["the rules leave no run".to_owned()].into());
         }
-        let what: Vec<_> = wrong.into_iter().map(|(what, names)| format!("{}: {what}", some_of(&names))).collect();
+        let what: Vec<_> =
+            wrong.into_iter().map(|(what, names)| format!("{}: {what}", some_of(&names))).collect();
         if what.is_empty() { Ok(runs) } else { Err(Wrong { what, advice }) }
     }
 
@@ -174,11 +191,14 @@ impl File {
         combination: &Combination<'_>,
         set: &[Table],
     ) -> anyhow::Result<PlannedRun> {
-        Name::new(&name).hint("name long values by an axis `method`, which has a table of changes for each name")?;
+        Name::new(&name).hint(
+            "name long values by an axis `method`, which has a table of changes for each name",
+        )?;
         let mut changes = self.changes(combination, set)?;
         let begin: Vec<Value> = BEGIN.iter().filter_map(|key| changes.remove(*key)).collect();
         let [Value::String(preset)] = &begin[..] else {
-            return Err(anyhow!("it needs one of task and preset")).hint("[run] may have it, or an axis");
+            return Err(anyhow!("it needs one of task and preset"))
+                .hint("[run] may have it, or an axis");
         };
         let experiment = Preset::read(preset)?.resolve(&changes)?;
         let dataset = experiment.dataset.as_deref().ok_or_else(|| anyhow!("it names no dataset"));
@@ -187,13 +207,21 @@ impl File {
         Ok(PlannedRun { index, name, preset: preset.clone(), changes, experiment, source })
     }
 
-    /// What a combination changes: its values and those of the command line, over those of its method, over those that all
-    /// runs share.
-    fn changes(&self, combination: &Combination<'_>, command_line: &[Table]) -> anyhow::Result<Table> {
-        let method =
-            combination.iter().find(|(key, _)| *key == METHOD).map(|(_, value)| self.method(value)).transpose()?;
+    /// What a combination changes: its values and those of the command line, over those of its
+    /// method, over those that all runs share.
+    fn changes(
+        &self,
+        combination: &Combination<'_>,
+        command_line: &[Table],
+    ) -> anyhow::Result<Table> {
+        let method = combination
+            .iter()
+            .find(|(key, _)| *key == METHOD)
+            .map(|(_, value)| self.method(value))
+            .transpose()?;
         let mut changes = Table::new();
-        let tables = [(&self.run, "[run]")].into_iter().chain(method.map(|method| (method, "its method")));
+        let tables =
+            [(&self.run, "[run]")].into_iter().chain(method.map(|method| (method, "its method")));
         for (table, source) in tables.chain(command_line.iter().map(|table| (table, "--set"))) {
             for (key, value) in tables::keys(table) {
                 let twice = combination.iter().any(|(axis, _)| *axis == key);
@@ -201,15 +229,21 @@ impl File {
                 set(&mut changes, &key, value);
             }
         }
-        combination.iter().filter(|(key, _)| *key != METHOD).for_each(|(key, value)| set(&mut changes, key, value));
+        combination
+            .iter()
+            .filter(|(key, _)| *key != METHOD)
+            .for_each(|(key, value)| set(&mut changes, key, value));
         Ok(changes)
     }
 
     fn method(&self, value: &Value) -> anyhow::Result<&Table> {
         let known = || self.method.keys().map(String::as_str);
         let name = value.as_str().unwrap_or_default();
-        let hint = || format!("{}add [method.{name}], with what it changes", did_you_mean(name, known()));
-        self.method.get(name).ok_or_else(|| hinted(anyhow!("there is no table [method.{name}]"), hint()))
+        let hint =
+            || format!("{}add [method.{name}], with what it changes", did_you_mean(name, known()));
+        self.method
+            .get(name)
+            .ok_or_else(|| hinted(anyhow!("there is no table [method.{name}]"), hint()))
     }
 }
 

@@ -55,7 +55,8 @@ struct Floor {
 }
 
 impl Sweep {
-    /// Runs all, or, at a signal to end, lets those at work save what they have. Learners are the calling thread's.
+    /// Runs all, or, at a signal to end, lets those at work save what they have. Learners are the
+    /// calling thread's.
     pub async fn run(mut self) -> Ended {
         LocalSet::new().run_until(self.work()).await
     }
@@ -124,7 +125,10 @@ impl Sweep {
         let said = match end {
             End::Complete => {
                 floor.complete += 1;
-                let score = pace.score.map(|(_, score)| format!(", last score {score:.1}")).unwrap_or_default();
+                let score = pace
+                    .score
+                    .map(|(_, score)| format!(", last score {score:.1}"))
+                    .unwrap_or_default();
                 format!("{name} is complete{score}")
             }
             End::Unfinished => format!("{name} has stopped; the same command continues"),
@@ -148,8 +152,12 @@ impl Sweep {
         for (run, state) in &self.waiting {
             left += self.seconds(run, state.step(run.experiment.steps), run.experiment.steps);
         }
-        let mut all =
-            format!("{} runs complete, {} at work, {} waiting", floor.complete, lines.len(), self.waiting.len());
+        let mut all = format!(
+            "{} runs complete, {} at work, {} waiting",
+            floor.complete,
+            lines.len(),
+            self.waiting.len()
+        );
         if !floor.failed.is_empty() {
             all += &format!(", {} failed", floor.failed.len());
         }
@@ -168,6 +176,7 @@ impl Sweep {
 
 /// Reads how far the runs at work are.
 fn read(floor: &Floor) -> impl FnOnce() -> Vec<(usize, Pace)> + use<> {
-    let dirs: Vec<_> = floor.at_work.iter().map(|(index, (job, _))| (*index, job.dir.clone())).collect();
+    let dirs: Vec<_> =
+        floor.at_work.iter().map(|(index, (job, _))| (*index, job.dir.clone())).collect();
     move || dirs.into_iter().map(|(index, dir)| (index, Pace::read(&dir))).collect()
 }

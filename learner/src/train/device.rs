@@ -13,7 +13,9 @@ pub(crate) fn check(device: Device, precision: Precision) -> anyhow::Result<()> 
     match (device, precision) {
         (Device::Cpu, _) => Ok(()),
         (Device::Cuda, Precision::F32) => gpu().map(drop),
-        (Device::Cuda, _) => Err(anyhow!("on a GPU the update computes in f32 only")).hint("use --precision f32"),
+        (Device::Cuda, _) => {
+            Err(anyhow!("on a GPU the update computes in f32 only")).hint("use --precision f32")
+        }
     }
 }
 
@@ -30,7 +32,9 @@ pub(crate) fn open(device: Device) -> anyhow::Result<candle_core::Device> {
 
 fn gpu() -> anyhow::Result<candle_core::Device> {
     let hint = match cfg!(feature = "cuda") {
-        true => "does `nvidia-smi` show a GPU on this machine, and a driver for CUDA 13? --device cpu needs neither",
+        true => {
+            "does `nvidia-smi` show a GPU on this machine, and a driver for CUDA 13? --device cpu needs neither"
+        }
         false => "build a learner that can by deploy/cuda.sh, or train with --device cpu",
     };
     quad_policy::open_gpu().context("this learner cannot train on a GPU here").hint(hint)

@@ -29,11 +29,19 @@ pub(crate) struct HeldOut {
 }
 
 impl HeldOut {
-    /// For the algorithm at its beginning; none where it cannot be measured on these transitions: nothing in its table is, or
-    /// they hold nothing that it learns from.
-    pub fn new(experiment: &Experiment, device: Device, held_out: Transitions, training: &mut Agent) -> Option<Self> {
+    /// For the algorithm at its beginning; none where it cannot be measured on these transitions:
+    /// nothing in its table is, or they hold nothing that it learns from.
+    pub fn new(
+        experiment: &Experiment,
+        device: Device,
+        held_out: Transitions,
+        training: &mut Agent,
+    ) -> Option<Self> {
         if !training.metrics().iter().any(|metric| metric.held_out) {
-            info!("nothing is measured on held-out episodes: {} has no metric that is", experiment.algorithm);
+            info!(
+                "nothing is measured on held-out episodes: {} has no metric that is",
+                experiment.algorithm
+            );
             return None;
         }
         let size = (experiment.batch_size as usize).min(held_out.len());
@@ -55,7 +63,12 @@ impl HeldOut {
     pub(super) fn of(agent: Agent, size: usize, seed: u64, steps: u64) -> Self {
         let mut sampler = BatchSampler::new(agent.items(), size, seed, 0);
         let batches = (0..BATCHES).map(|_| sampler.next_items().to_vec()).collect();
-        Self { agent, batches, every: steps.div_ceil(MEASUREMENTS).next_multiple_of(STEPS_PER_ROW), has_warned: false }
+        Self {
+            agent,
+            batches,
+            every: steps.div_ceil(MEASUREMENTS).next_multiple_of(STEPS_PER_ROW),
+            has_warned: false,
+        }
     }
 
     /// Whether the row of this step has measurements, be it the run's last or not.
@@ -63,8 +76,8 @@ impl HeldOut {
         is_last || step.is_multiple_of(self.every)
     }
 
-    /// Measures with this state of the algorithm that trains: means over the batches, in the order of its metrics. Leaves out
-    /// what is not finite, and warns of the first.
+    /// Measures with this state of the algorithm that trains: means over the batches, in the order
+    /// of its metrics. Leaves out what is not finite, and warns of the first.
     ///
     /// # Errors
     /// Candle fails.

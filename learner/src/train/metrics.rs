@@ -5,18 +5,20 @@ use std::time::Duration;
 use prometheus::core::{Collector, Desc};
 use prometheus::proto::MetricFamily;
 use prometheus::{
-    Counter, Gauge, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts,
-    Registry, exponential_buckets,
+    Counter, Gauge, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge,
+    IntGaugeVec, Opts, Registry, exponential_buckets,
 };
 use quad_algorithms::Metric;
 
 use super::held_out;
 
-/// Shortest gradient step that the histogram tells apart, and how many doublings follow it: 1 ms to 2 s.
+/// Shortest gradient step that the histogram tells apart, and how many doublings follow it: 1 ms to
+/// 2 s.
 const SHORTEST_STEP: f64 = 1e-3;
 const STEP_BUCKETS: usize = 12;
 
-/// Gradient steps and what they measured. Updating one is an atomic store, so the training thread may.
+/// Gradient steps and what they measured. Updating one is an atomic store, so the training thread
+/// may.
 #[derive(Clone, Debug)]
 pub(crate) struct TrainingMetrics {
     pub gradient_steps: IntCounter,
@@ -62,22 +64,30 @@ impl Collector for MaybeGauge {
 
 impl TrainingMetrics {
     /// Makes them, for a run of so many steps whose algorithm measures that.
-    pub fn new(make: &Registrar, target_steps: u64, measured: &'static [Metric]) -> prometheus::Result<Self> {
+    pub fn new(
+        make: &Registrar,
+        target_steps: u64,
+        measured: &'static [Metric],
+    ) -> prometheus::Result<Self> {
         let target = make.count("gradient_steps_target", "Gradient steps that this run will do")?;
         target.set(i64::try_from(target_steps).unwrap_or(i64::MAX));
         let buckets = exponential_buckets(SHORTEST_STEP, 2.0, STEP_BUCKETS)?;
-        let duration = HistogramOpts::new(full("step_duration_seconds"), "Wall time of one gradient step");
+        let duration =
+            HistogramOpts::new(full("step_duration_seconds"), "Wall time of one gradient step");
         let saving = "Time that the training thread spent on copying its state and its policy instead of training";
         let gauge = |name: &str, help: &str| make.add(MaybeGauge::new(name, help));
         let gauges = measured.iter().map(|metric| Ok((metric, gauge(metric.name, metric.help)?)));
-        let help = |metric: &Metric| format!("On held-out episodes, with the weights as they are: {}", metric.help);
+        let help = |metric: &Metric| {
+            format!("On held-out episodes, with the weights as they are: {}", metric.help)
+        };
         let held_out = measured.iter().map(|metric| gauge(&held_out::name(metric), &help(metric)));
         Ok(Self {
             held_out: held_out.collect::<prometheus::Result<_>>()?,
             gradient_steps: make.counter("gradient_steps_total", "Gradient steps done")?,
             step_duration: make.add(Histogram::with_opts(duration.buckets(buckets)))?,
             saving_seconds: make.add(Counter::new(full("saving_seconds_total"), saving))?,
-            diverged: make.count("diverged", "1 once training has met a number that is not finite, else 0")?,
+            diverged: make
+                .count("diverged", "1 once training has met a number that is not finite, else 0")?,
             algorithm: gauges.collect::<prometheus::Result<_>>()?,
         })
     }
@@ -103,7 +113,10 @@ pub(crate) struct Registrar {
 }
 
 impl Registrar {
-    pub fn add<M: Collector + Clone + 'static>(&self, made: prometheus::Result<M>) -> prometheus::Result<M> {
+    pub fn add<M: Collector + Clone + 'static>(
+        &self,
+        made: prometheus::Result<M>,
+    ) -> prometheus::Result<M> {
         let metric = made?;
         self.registry.register(Box::new(metric.clone()))?;
         Ok(metric)
@@ -122,7 +135,12 @@ impl Registrar {
     }
 
     /// A counter with a label.
-    pub fn counters(&self, name: &str, help: &str, label: &str) -> prometheus::Result<IntCounterVec> {
+    pub fn counters(
+        &self,
+        name: &str,
+        help: &str,
+        label: &str,
+    ) -> prometheus::Result<IntCounterVec> {
         self.add(IntCounterVec::new(Opts::new(full(name), help), &[label]))
     }
 

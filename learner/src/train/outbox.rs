@@ -1,8 +1,8 @@
 //! The queue from training to the disk.
 //!
-//! A disk that is full or hangs delays the thread that takes from here, and not training. What waits is bounded: of
-//! checkpoints the newest, of rows so many that people miss none, of snapshots so many bytes that training continues for hours
-//! before it waits for the disk, too.
+//! A disk that is full or hangs delays the thread that takes from here, and not training. What
+//! waits is bounded: of checkpoints the newest, of rows so many that people miss none, of snapshots
+//! so many bytes that training continues for hours before it waits for the disk, too.
 
 use std::collections::VecDeque;
 use std::mem;
@@ -55,7 +55,12 @@ impl Outbox {
         let mut waiting = self.lock();
         while waiting.bytes > MOST_BYTES && !stop.load(Ordering::Relaxed) {
             beat.alive();
-            waiting = self.shared.1.wait_timeout(waiting, GLANCE).unwrap_or_else(PoisonError::into_inner).0;
+            waiting = self
+                .shared
+                .1
+                .wait_timeout(waiting, GLANCE)
+                .unwrap_or_else(PoisonError::into_inner)
+                .0;
         }
         waiting.bytes += policy.file.len();
         waiting.snapshots.push_back(policy);
@@ -86,8 +91,9 @@ impl Outbox {
         self.shared.1.notify_all();
     }
 
-    /// What is next, as soon as there is something; nothing once the outbox is closed and empty. Snapshots go before the
-    /// checkpoint: a run that is resumed from a checkpoint does not make earlier snapshots again.
+    /// What is next, as soon as there is something; nothing once the outbox is closed and empty.
+    /// Snapshots go before the checkpoint: a run that is resumed from a checkpoint does not make
+    /// earlier snapshots again.
     pub fn next(&self, beat: &Beat) -> Option<Work> {
         let mut waiting = self.lock();
         loop {
@@ -98,7 +104,12 @@ impl Outbox {
             if waiting.closed {
                 return None;
             }
-            waiting = self.shared.1.wait_timeout(waiting, beat.interval()).unwrap_or_else(PoisonError::into_inner).0;
+            waiting = self
+                .shared
+                .1
+                .wait_timeout(waiting, beat.interval())
+                .unwrap_or_else(PoisonError::into_inner)
+                .0;
         }
     }
 

@@ -28,9 +28,14 @@ impl Price {
     ///
     /// # Errors
     /// The run could not begin with these transitions, or a step fails.
-    pub fn measure(experiment: &Experiment, device: Device, transitions: Transitions) -> anyhow::Result<Self> {
+    pub fn measure(
+        experiment: &Experiment,
+        device: Device,
+        transitions: Transitions,
+    ) -> anyhow::Result<Self> {
         let mut agent = begin(experiment, device, transitions)?;
-        let mut sampler = BatchSampler::new(agent.items(), experiment.batch_size as usize, experiment.seed, 0);
+        let mut sampler =
+            BatchSampler::new(agent.items(), experiment.batch_size as usize, experiment.seed, 0);
         Ok(Self {
             step: mean_step(&mut agent, &mut sampler, experiment.steps)?,
             snapshot: agent.policy(origin(experiment))?.len() as u64,
@@ -46,10 +51,16 @@ impl Price {
 }
 
 /// Seconds of a step, in the mean over a run of so many: each phase counts by its share of them.
-pub(super) fn mean_step(agent: &mut Agent, sampler: &mut BatchSampler, steps: u64) -> Result<f64, AlgorithmError> {
+pub(super) fn mean_step(
+    agent: &mut Agent,
+    sampler: &mut BatchSampler,
+    steps: u64,
+) -> Result<f64, AlgorithmError> {
     let mut begins = agent.phases();
     begins.push(steps);
-    let phases = Vec::from_iter(begins.windows(2).map(|phase| (phase[0], phase[1])).filter(|(begin, end)| begin < end));
+    let phases = Vec::from_iter(
+        begins.windows(2).map(|phase| (phase[0], phase[1])).filter(|(begin, end)| begin < end),
+    );
     let mut seconds = 0.0;
     for (begin, end) in &phases {
         let mut step = || {

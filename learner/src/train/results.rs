@@ -28,7 +28,8 @@ pub(crate) struct Row {
     pub metrics: &'static [Metric],
     /// The means, in the order of `metrics`; none of what none of the steps measured.
     pub values: Vec<Option<f32>>,
-    /// What was measured on held-out episodes after the last of the steps, in that order; empty if nothing was.
+    /// What was measured on held-out episodes after the last of the steps, in that order; empty if
+    /// nothing was.
     pub held_out: Vec<Option<f32>>,
 }
 
@@ -66,7 +67,9 @@ impl Means {
 
     /// Takes in values in the order of the metrics, as far as they were measured.
     pub fn add(&mut self, values: &[Option<f32>]) {
-        for ((sum, count), value) in self.0.iter_mut().zip(values).filter_map(|(mean, value)| Some((mean, (*value)?))) {
+        for ((sum, count), value) in
+            self.0.iter_mut().zip(values).filter_map(|(mean, value)| Some((mean, (*value)?)))
+        {
             *sum += f64::from(value);
             *count += 1;
         }
@@ -75,7 +78,11 @@ impl Means {
     /// The means so far; begins anew.
     pub fn take(&mut self) -> Vec<Option<f32>> {
         let means = std::mem::replace(self, Self::new(self.0.len()));
-        means.0.into_iter().map(|(sum, count)| (count > 0).then(|| (sum / f64::from(count)) as f32)).collect()
+        means
+            .0
+            .into_iter()
+            .map(|(sum, count)| (count > 0).then(|| (sum / f64::from(count)) as f32))
+            .collect()
     }
 }
 

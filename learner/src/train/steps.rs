@@ -19,7 +19,8 @@ use super::results::{Means, Outcome, Row, TrainedPolicy, measured};
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
 pub(super) const STEPS_PER_ROW: u64 = 100;
-/// Least time of training that is spent between two checkpoints for each second that one takes: saving costs at most 1 %.
+/// Least time of training that is spent between two checkpoints for each second that one takes:
+/// saving costs at most 1 %.
 const TRAINING_PER_SAVING: u32 = 100;
 
 /// What is to be done.
@@ -79,7 +80,8 @@ impl TrainError {
     }
 }
 
-/// Trains until all steps are done or it is told to stop. Either way a checkpoint of the last step is handed over.
+/// Trains until all steps are done or it is told to stop. Either way a checkpoint of the last step
+/// is handed over.
 pub(crate) fn train(
     agent: &mut Agent,
     sampler: &mut BatchSampler,
@@ -93,7 +95,8 @@ pub(crate) fn train(
     while agent.step() < plan.schedule.steps {
         let begin = Instant::now();
         let step = agent.step() + 1;
-        let values = agent.update(sampler.next_items()).map_err(|source| TrainError::at(step, source))?;
+        let values =
+            agent.update(sampler.next_items()).map_err(|source| TrainError::at(step, source))?;
         check_finite(step, agent.metrics(), &values)?;
         let updated = Instant::now();
         outlets.beat.alive();
@@ -104,8 +107,16 @@ pub(crate) fn train(
         let stopped = !last && outlets.stop.load(Ordering::Relaxed);
         if step.is_multiple_of(STEPS_PER_ROW) || last || stopped {
             let seconds = plan.seconds_before + start.elapsed().as_secs_f64();
-            let mut row = Row { step, seconds, metrics: agent.metrics(), values: means.take(), held_out: Vec::new() };
-            if let Some(held_out) = held_out.as_deref_mut().filter(|held_out| held_out.is_due(step, last)) {
+            let mut row = Row {
+                step,
+                seconds,
+                metrics: agent.metrics(),
+                values: means.take(),
+                held_out: Vec::new(),
+            };
+            if let Some(held_out) =
+                held_out.as_deref_mut().filter(|held_out| held_out.is_due(step, last))
+            {
                 let values = agent.save().and_then(|state| held_out.measure(&state));
                 row.held_out = values.map_err(|source| TrainError::at(step, source))?;
                 outlets.metrics.observe_held_out(&row.held_out);
@@ -115,7 +126,8 @@ pub(crate) fn train(
         hand_over_policy(agent, plan.schedule, outlets)?;
         if last || stopped || updated >= next_checkpoint {
             let took = hand_over_state(agent, outlets)?;
-            next_checkpoint = Instant::now() + plan.checkpoint_every.max(TRAINING_PER_SAVING * took);
+            next_checkpoint =
+                Instant::now() + plan.checkpoint_every.max(TRAINING_PER_SAVING * took);
         }
         if stopped {
             return Ok(Outcome::Stopped { step });
@@ -125,20 +137,26 @@ pub(crate) fn train(
 }
 
 /// Hands over the policy if it is to be evaluated, or if it is the last.
-fn hand_over_policy(agent: &mut Agent, schedule: Schedule, outlets: &Outlets<'_>) -> Result<(), TrainError> {
+fn hand_over_policy(
+    agent: &mut Agent,
+    schedule: Schedule,
+    outlets: &Outlets<'_>,
+) -> Result<(), TrainError> {
     let (step, begin) = (agent.step(), Instant::now());
     let evaluate = schedule.is_evaluated(step);
     if evaluate || step == schedule.steps {
         debug!(step, "snapshot");
-        let file =
-            agent.policy(Origin { step, ..outlets.origin.clone() }).map_err(|source| TrainError::at(step, source))?;
+        let file = agent
+            .policy(Origin { step, ..outlets.origin.clone() })
+            .map_err(|source| TrainError::at(step, source))?;
         outlets.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
         outlets.outbox.snapshot(TrainedPolicy { step, file, evaluate }, outlets.stop, outlets.beat);
     }
     Ok(())
 }
 
-/// Hands over the whole state. Gives the time that it took to copy it, in which nothing was trained.
+/// Hands over the whole state. Gives the time that it took to copy it, in which nothing was
+/// trained.
 fn hand_over_state(agent: &mut Agent, outlets: &Outlets<'_>) -> Result<Duration, TrainError> {
     let (step, begin) = (agent.step(), Instant::now());
     let state = agent.save().map_err(|source| TrainError::at(step, source))?;
@@ -150,7 +168,9 @@ fn hand_over_state(agent: &mut Agent, outlets: &Outlets<'_>) -> Result<Duration,
 
 fn check_finite(step: u64, metrics: &[Metric], values: &[Option<f32>]) -> Result<(), TrainError> {
     match measured(metrics, values).find(|(_, value)| !value.is_finite()) {
-        Some((metric, value)) => Err(TrainError::Diverged { step, what: format!("{} is {value}", metric.name) }),
+        Some((metric, value)) => {
+            Err(TrainError::Diverged { step, what: format!("{} is {value}", metric.name) })
+        }
         None => Ok(()),
     }
 }

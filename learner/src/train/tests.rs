@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use candle_core::Device;
 use quad_algorithms::{Agent, Algorithm, Context, Definition, Measured, Metric, Parts, Reporting};
-use quad_dataset::{Arrays, BatchSampler, ReadOptions, RewardRule, Scale, Transitions, environment};
+use quad_dataset::{
+    Arrays, BatchSampler, ReadOptions, RewardRule, Scale, Transitions, environment,
+};
 use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision, Tensors};
 use quad_protocol::Origin;
 use quad_run::config::hyperparameters::algorithm as definition;
@@ -52,7 +54,12 @@ fn transitions() -> Transitions {
     write_hopper(&path, 2, 50);
     Transitions::read(
         &path,
-        &ReadOptions { environment: Some(hopper), task: None, reward: RewardRule::Locomotion, scale: Scale::default() },
+        &ReadOptions {
+            environment: Some(hopper),
+            task: None,
+            reward: RewardRule::Locomotion,
+            scale: Scale::default(),
+        },
     )
     .unwrap()
 }
@@ -83,7 +90,11 @@ fn context(total_steps: u64) -> Context {
 
 /// Evaluations at an interval, checkpoints after every step.
 fn plan(steps: u64, eval_interval: u64) -> Plan {
-    Plan { schedule: Schedule { steps, eval_interval }, checkpoint_every: Duration::ZERO, seconds_before: 0.0 }
+    Plan {
+        schedule: Schedule { steps, eval_interval },
+        checkpoint_every: Duration::ZERO,
+        seconds_before: 0.0,
+    }
 }
 
 fn run(plan: Plan, algorithm: &str, table: &toml::Table, stop: bool) -> Result {
@@ -99,7 +110,8 @@ fn run_of(
     table: &toml::Table,
     stop: bool,
 ) -> Result {
-    let mut agent = Agent::new(definition(algorithm).unwrap(), table, context(total_steps)).unwrap();
+    let mut agent =
+        Agent::new(definition(algorithm).unwrap(), table, context(total_steps)).unwrap();
     if let Some(checkpoint) = from {
         agent.load(&checkpoint.state).unwrap();
     }
@@ -118,8 +130,18 @@ fn run_agent(mut agent: Agent, mut held_out: Option<HeldOut>, plan: Plan, stop: 
     // Nothing takes what it hands over, as with a disk that hangs: training must end all the same.
     let outcome = train(&mut agent, &mut sampler, held_out.as_mut(), plan, &outlets);
     let families = make.registry.gather();
-    let gauges = families.iter().map(|family| family.name().trim_start_matches("quad_learner_").to_owned()).collect();
-    let mut result = Result { outcome, snapshots: Vec::new(), checkpoint: None, rows: Vec::new(), metrics, gauges };
+    let gauges = families
+        .iter()
+        .map(|family| family.name().trim_start_matches("quad_learner_").to_owned())
+        .collect();
+    let mut result = Result {
+        outcome,
+        snapshots: Vec::new(),
+        checkpoint: None,
+        rows: Vec::new(),
+        metrics,
+        gauges,
+    };
     outbox.close();
     while let Some(work) = outbox.next(beat) {
         match work {
@@ -151,11 +173,19 @@ fn without_evaluations_the_last_snapshot_is_kept_all_the_same() {
 fn rows_average_a_hundred_steps() {
     let result = run(plan(450, 0), "quad", &small("quad"), false);
     assert_eq!(result.outcome.unwrap(), Outcome::Completed);
-    assert_eq!(result.rows.iter().map(|row| row.step).collect::<Vec<_>>(), [100, 200, 300, 400, 450]);
+    assert_eq!(
+        result.rows.iter().map(|row| row.step).collect::<Vec<_>>(),
+        [100, 200, 300, 400, 450]
+    );
     for row in result.rows {
         let json = serde_json::to_value(&row).unwrap();
         let value = |name: &str| json[name].as_f64().unwrap();
-        assert!(value("eta") == 1.0 && (0.0..=1.0).contains(&value("lambda_mean")) && value("bc_loss") > 0.0, "{json}");
+        assert!(
+            value("eta") == 1.0
+                && (0.0..=1.0).contains(&value("lambda_mean"))
+                && value("bc_loss") > 0.0,
+            "{json}"
+        );
         assert_eq!(json.as_object().unwrap().len(), 2 + row.metrics.len(), "{json}");
     }
 }
@@ -176,34 +206,44 @@ fn training_goes_on_from_a_checkpoint_bit_for_bit() {
         for stop_at in [1, 99, 100, 250] {
             // Learning rates that decay know the end of the whole run.
             let Plan { schedule, .. } = plan(300, 100);
-            let until = Plan { schedule: Schedule { steps: stop_at, ..schedule }, ..plan(300, 100) };
+            let until =
+                Plan { schedule: Schedule { steps: stop_at, ..schedule }, ..plan(300, 100) };
             let begun = run_of(300, None, until, algorithm, &setting, false);
-            let rest = run_of(300, begun.checkpoint.as_ref(), plan(300, 100), algorithm, &setting, false);
+            let rest =
+                run_of(300, begun.checkpoint.as_ref(), plan(300, 100), algorithm, &setting, false);
             assert!(rest.checkpoint == whole.checkpoint, "after step {stop_at}");
-            let snapshots: Vec<_> = whole.snapshots.iter().copied().filter(|(step, _)| *step > stop_at).collect();
+            let snapshots: Vec<_> =
+                whole.snapshots.iter().copied().filter(|(step, _)| *step > stop_at).collect();
             assert_eq!(rest.snapshots, snapshots, "after step {stop_at}");
         }
     }
 }
 
-/// The disk hangs: of checkpoints the newest waits, of snapshots all, and of rows so many that none is missed for hours.
+/// The disk hangs: of checkpoints the newest waits, of snapshots all, and of rows so many that none
+/// is missed for hours.
 #[test]
 fn what_the_disk_does_not_take_comes_later_in_its_order() {
     let outbox = Outbox::default();
     let checkpoint = |step: u64| Checkpoint { step, state: vec![step as u8] };
-    let row = |step| results::Row { step, seconds: 0.0, metrics: &[], values: vec![], held_out: vec![] };
+    let row =
+        |step| results::Row { step, seconds: 0.0, metrics: &[], values: vec![], held_out: vec![] };
     (1..=3).for_each(|step| outbox.checkpoint(checkpoint(step)));
     (1..=3).for_each(|step| outbox.row(row(step)));
     let Some(refused) = outbox.next(&beat()) else { panic!("something waits") };
     outbox.put_back(refused);
     outbox.ended(Outcome::Completed);
-    assert!(matches!(outbox.next(&beat()), Some(Work::Checkpoint(newest)) if newest == checkpoint(3)));
+    assert!(
+        matches!(outbox.next(&beat()), Some(Work::Checkpoint(newest)) if newest == checkpoint(3))
+    );
     let Some(Work::Rows(rows)) = outbox.next(&beat()) else { panic!("rows wait") };
     outbox.row(row(4));
     outbox.put_back(Work::Rows(rows));
     let Some(Work::Rows(rows)) = outbox.next(&beat()) else { panic!("rows wait") };
     assert_eq!(rows.iter().map(|row| row.step).collect::<Vec<_>>(), [1, 2, 3, 4]);
-    assert!(matches!(outbox.next(&beat()), Some(Work::Ended(Outcome::Completed))), "the end comes last");
+    assert!(
+        matches!(outbox.next(&beat()), Some(Work::Ended(Outcome::Completed))),
+        "the end comes last"
+    );
     outbox.close();
     assert!(outbox.next(&beat()).is_none());
 }
@@ -242,7 +282,11 @@ impl Algorithm for InPhases {
     fn policy(&self) -> candle_core::Result<(PolicyConfig, Tensors)> {
         Ok((
             PolicyConfig::Gaussian {
-                shape: GaussianShape { observation_dim: 1, action_dim: 1, actor: MlpConfig::default() },
+                shape: GaussianShape {
+                    observation_dim: 1,
+                    action_dim: 1,
+                    actor: MlpConfig::default(),
+                },
             },
             Tensors::new(),
         ))
@@ -274,17 +318,26 @@ fn a_row_has_what_its_steps_measured_and_means_of_these_alone() {
     let result = run_agent(in_phases(), None, plan(300, 0), false);
     assert_eq!(result.outcome.unwrap(), Outcome::Completed);
     let rows = Vec::from_iter(result.rows.iter().map(|row| serde_json::to_value(row).unwrap()));
-    let means = |row: &Value| ["first", "second"].map(|name| row.get(name).map(|mean| mean.as_f64().unwrap()));
+    let means = |row: &Value| {
+        ["first", "second"].map(|name| row.get(name).map(|mean| mean.as_f64().unwrap()))
+    };
     assert_eq!(
         rows.iter().map(means).collect::<Vec<_>>(),
         [[Some(49.5), None], [Some(124.5), Some(174.5)], [None, Some(249.5)],]
     );
-    assert!(!result.gauges.contains("first") && result.gauges.contains("second"), "{:?}", result.gauges);
+    assert!(
+        !result.gauges.contains("first") && result.gauges.contains("second"),
+        "{:?}",
+        result.gauges
+    );
 }
 
 #[test]
 fn the_estimate_of_a_step_is_the_mean_over_all_phases() {
     let mut agent = in_phases();
     let mut sampler = BatchSampler::new(agent.items(), 4, 0, 0);
-    assert!(mean_step(&mut agent, &mut sampler, 100).unwrap() >= 0.01, "the second phase is not in it");
+    assert!(
+        mean_step(&mut agent, &mut sampler, 100).unwrap() >= 0.01,
+        "the second phase is not in it"
+    );
 }

@@ -1,4 +1,5 @@
-//! The work of the thread `training`: continues from a checkpoint, trains. The agent is made before the run's folder.
+//! The work of the thread `training`: continues from a checkpoint, trains. The agent is made before
+//! the run's folder.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -44,11 +45,17 @@ pub(crate) struct Training {
     pub stop: Arc<AtomicBool>,
 }
 
-/// The algorithm of an experiment at step 0. What it cannot learn with, or from, is refused here, before the run has a folder.
+/// The algorithm of an experiment at step 0. What it cannot learn with, or from, is refused here,
+/// before the run has a folder.
 ///
 /// # Errors
-/// The algorithm cannot start with its hyper-parameters or these transitions, or evaluators cannot be sent its policy.
-pub(crate) fn begin(experiment: &Experiment, device: Device, transitions: Transitions) -> anyhow::Result<Agent> {
+/// The algorithm cannot start with its hyper-parameters or these transitions, or evaluators cannot
+/// be sent its policy.
+pub(crate) fn begin(
+    experiment: &Experiment,
+    device: Device,
+    transitions: Transitions,
+) -> anyhow::Result<Agent> {
     let agent = algorithm(experiment, device, transitions, experiment.batch_size as usize)?;
     if experiment.eval_interval > 0 {
         check_size(agent.policy(origin(experiment))?.len())?;
@@ -87,31 +94,45 @@ impl Training {
         if let Some(Checkpoint { step, state }) = &self.checkpoint {
             let advice = "begin anew with --fresh, or continue with the version of the learner that wrote it";
             let loaded = agent.load(state).hint(advice);
-            loaded.with_context(|| format!("cannot continue from the checkpoint of step {step}"))?;
+            loaded
+                .with_context(|| format!("cannot continue from the checkpoint of step {step}"))?;
         }
         let (batch_size, origin) = (experiment.batch_size as usize, origin(&experiment));
-        let mut sampler = BatchSampler::new(agent.items(), batch_size, experiment.seed, agent.step());
-        let outlets = Outlets { metrics: &self.metrics, outbox: &self.outbox, origin: &origin, stop: &self.stop, beat };
+        let mut sampler =
+            BatchSampler::new(agent.items(), batch_size, experiment.seed, agent.step());
+        let outlets = Outlets {
+            metrics: &self.metrics,
+            outbox: &self.outbox,
+            origin: &origin,
+            stop: &self.stop,
+            beat,
+        };
         let plan = Plan {
             schedule: experiment.schedule(),
             checkpoint_every: self.checkpoint_every,
             seconds_before: self.seconds_before,
         };
-        let outcome = train(&mut agent, &mut sampler, held_out.as_mut(), plan, &outlets).map_err(|error| {
-            let diverged = matches!(error, TrainError::Diverged { .. });
-            self.metrics.diverged.set(diverged.into());
-            if diverged { hinted(error, DIVERGED) } else { error.into() }
-        })?;
+        let outcome = train(&mut agent, &mut sampler, held_out.as_mut(), plan, &outlets).map_err(
+            |error| {
+                let diverged = matches!(error, TrainError::Diverged { .. });
+                self.metrics.diverged.set(diverged.into());
+                if diverged { hinted(error, DIVERGED) } else { error.into() }
+            },
+        )?;
         self.outbox.ended(outcome);
         Ok(())
     }
 }
 
-/// Checks that evaluators can be sent a policy's file of so many bytes: fails now rather than at the first evaluation.
+/// Checks that evaluators can be sent a policy's file of so many bytes: fails now rather than at
+/// the first evaluation.
 fn check_size(bytes: usize) -> anyhow::Result<()> {
     let most = Snapshot::MOST_FILE;
     if bytes <= most {
         return Ok(());
     }
-    Err(hinted(anyhow!("the policy's file has {bytes} bytes, and evaluators can be sent at most {most}"), TOO_LARGE))
+    Err(hinted(
+        anyhow!("the policy's file has {bytes} bytes, and evaluators can be sent at most {most}"),
+        TOO_LARGE,
+    ))
 }

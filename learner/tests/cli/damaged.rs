@@ -15,12 +15,15 @@ fn a_damaged_run_is_named_and_keeps_no_other_from_being_reported() {
     }
     fs::write(folder.path().join("damaged/scores.jsonl"), "{\"step\":10}\n").unwrap();
     let page = folder.path().join("page.html");
-    let output = learner(&["report", folder.path().to_str().unwrap(), "--html", page.to_str().unwrap()]);
+    let output =
+        learner(&["report", folder.path().to_str().unwrap(), "--html", page.to_str().unwrap()]);
     let [text, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
     assert_eq!(output.status.code(), Some(1), "{said}");
     let error = "damaged/scores.jsonl, line 1, is not what a learner writes";
     assert!(
-        said.contains(error) && said.contains("error: 1 folders cannot be read") && said.contains("hint: "),
+        said.contains(error)
+            && said.contains("error: 1 folders cannot be read")
+            && said.contains("hint: "),
         "{said}"
     );
     let page = fs::read_to_string(page).unwrap().replace("&#x2f;", "/");
@@ -42,7 +45,8 @@ fn a_damaged_run_is_named_and_keeps_no_other_of_its_study_from_being_listed() {
     let output = learner(&["sweep", study.to_str().unwrap(), runs.to_str().unwrap(), "--list"]);
     let [text, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
     assert_eq!(output.status.code(), Some(1), "{said}");
-    let states: Vec<_> = text.lines().skip(1).map(|line| line.split_once("seed").unwrap().1[1..].trim()).collect();
+    let states: Vec<_> =
+        text.lines().skip(1).map(|line| line.split_once("seed").unwrap().1[1..].trim()).collect();
     assert_eq!(states, ["not begun", "cannot be read", "not begun"], "{text}");
     assert!(said.contains("seed1/config.toml, line 1, is not what a learner writes"), "{said}");
 }

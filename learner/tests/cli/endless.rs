@@ -8,7 +8,8 @@ use crate::run::Run;
 #[test]
 fn looking_at_it_costs_no_more_than_looking_at_what_it_has() {
     let folder = tempfile::tempdir().unwrap();
-    let [steps, eval_interval, episodes] = [1_000_000_000_000_000i64, 1, 1000].map(toml::Value::from);
+    let [steps, eval_interval, episodes] =
+        [1_000_000_000_000_000i64, 1, 1000].map(toml::Value::from);
     let mut run = Run::new("hopper-demo", 0).set(&[
         ("experiment.steps", steps),
         ("experiment.eval_interval", eval_interval),

@@ -18,8 +18,19 @@ fn train(folder: &Path) -> (RunDir, String) {
     let [data, run] = ["data.hdf5", "run"].map(|name| folder.join(name));
     write_dataset(&data);
     let [data, path] = [&data, &run].map(|path| path.to_str().unwrap());
-    let asked = ["train", "--task", "hopper-demo", "--dataset", data, "--run-dir", path, "--http", "127.0.0.1:0"];
-    let small = ["--set", "batch_size=8", "--agent", "actor.hidden=[8]", "--agent", "critic.hidden=[8]"];
+    let asked = [
+        "train",
+        "--task",
+        "hopper-demo",
+        "--dataset",
+        data,
+        "--run-dir",
+        path,
+        "--http",
+        "127.0.0.1:0",
+    ];
+    let small =
+        ["--set", "batch_size=8", "--agent", "actor.hidden=[8]", "--agent", "critic.hidden=[8]"];
     let sizes = ["--steps", "10", "--episodes", "2", "--eval-interval", "0"];
     printed(&[&asked[..], &small, &sizes].concat());
     let run = RunDir::at(&run);
@@ -35,7 +46,8 @@ fn score(run: &RunDir, episodes: &[(u64, u64, f64, &str)]) {
                           "precision": "f32-avx512", "evaluator": "e"});
         format!("{line}\n")
     };
-    fs::write(run.path().join("scores.jsonl"), episodes.iter().map(line).collect::<String>()).unwrap();
+    fs::write(run.path().join("scores.jsonl"), episodes.iter().map(line).collect::<String>())
+        .unwrap();
 }
 
 fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
@@ -79,10 +91,20 @@ fn a_file_has_the_score_and_judgment_of_its_own_step_and_weights() {
     let episode = |step, seed| (step, seed, if step == 5 { 30.0 } else { 20.0 }, &*weights);
     score(&run, &[episode(5, 0), episode(5, 1), episode(10, 0), episode(10, 1)]);
     STEPS.iter().for_each(|step| judge(&run, *step, *step as f64, &weights));
-    for (asked, step, expected) in [("5", 5, 30.0), ("10", 10, 20.0), ("last", 10, 20.0), ("best", 5, 30.0)] {
+    for (asked, step, expected) in
+        [("5", 5, 30.0), ("10", 10, 20.0), ("last", 10, 20.0), ("best", 5, 30.0)]
+    {
         let (score, judgment, said) = export(&run, asked);
-        assert_eq!((&score["step"], &score["score"]["mean"]), (&json!(step), &json!(expected)), "{asked}");
-        assert_eq!((&score["complete"], &judgment["distance"]), (&json!(true), &json!(step as f64)), "{asked}");
+        assert_eq!(
+            (&score["step"], &score["score"]["mean"]),
+            (&json!(step), &json!(expected)),
+            "{asked}"
+        );
+        assert_eq!(
+            (&score["complete"], &judgment["distance"]),
+            (&json!(true), &json!(step as f64)),
+            "{asked}"
+        );
         assert!(!said.contains("WARN"), "{said}");
     }
 

@@ -11,7 +11,8 @@ use crate::{learner, printed};
 fn runs_are_listed_with_how_far_they_are_and_others_with_what_is_wrong() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    let steps = [("experiment.steps", 40), ("experiment.eval_interval", 20), ("experiment.episodes", 2)];
+    let steps =
+        [("experiment.steps", 40), ("experiment.eval_interval", 20), ("experiment.episodes", 2)];
     let mut half = Run::new("hopper-demo", 3).set(&steps.map(|(key, value)| (key, value.into())));
     half.score(20, 0, 5.0, "a");
     half.score(20, 1, 7.0, "a");
@@ -29,7 +30,8 @@ fn runs_are_listed_with_how_far_they_are_and_others_with_what_is_wrong() {
     let asked = ["list", folder.path().to_str().unwrap(), "--json"];
     let listed = |arguments: &[&str]| {
         let output = learner(arguments);
-        let [text, errors] = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
+        let [text, errors] =
+            [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
         assert_eq!(output.status.code(), Some(1), "a run cannot be read: {errors}");
         (text, errors)
     };
@@ -38,7 +40,12 @@ fn runs_are_listed_with_how_far_they_are_and_others_with_what_is_wrong() {
     assert!(errors.contains("other: ") && !errors.contains("whole"), "{errors}");
     let names: Vec<_> = entries.iter().map(|entry| entry["name"].as_str().unwrap()).collect();
     assert_eq!(names, ["other", "study/half", "whole"]);
-    assert!(entries[0]["error"].as_str().unwrap().contains("config.toml, line 1, is not what a learner writes"));
+    assert!(
+        entries[0]["error"]
+            .as_str()
+            .unwrap()
+            .contains("config.toml, line 1, is not what a learner writes")
+    );
     let bytes = |name: &str| fs::metadata(path("whole").join(name)).unwrap().len();
     for (entry, key, value) in [
         (1, "state", json!("30 of 40 steps")),

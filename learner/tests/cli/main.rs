@@ -1,4 +1,5 @@
-//! `learner presets`, `list`, `report`, `export`, `verify`, `sweep` and `train --dry-run`, as a user calls them on files that a test has made up.
+//! `learner presets`, `list`, `report`, `export`, `verify`, `sweep` and `train --dry-run`, as a
+//! user calls them on files that a test has made up.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod damaged;
@@ -24,10 +25,15 @@ fn learner(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_learner")).args(arguments).output().unwrap()
 }
 
-/// As `learner`, with ten minutes, and of memory a thousandth of what a list of a trillion evaluations would take.
+/// As `learner`, with ten minutes, and of memory a thousandth of what a list of a trillion
+/// evaluations would take.
 fn bounded(arguments: &[&str]) -> Output {
     let script = "ulimit -v 8000000; exec timeout 600 \"$0\" \"$@\"";
-    Command::new("sh").args(["-c", script, env!("CARGO_BIN_EXE_learner")]).args(arguments).output().unwrap()
+    Command::new("sh")
+        .args(["-c", script, env!("CARGO_BIN_EXE_learner")])
+        .args(arguments)
+        .output()
+        .unwrap()
 }
 
 /// What a command prints that must succeed.

@@ -63,7 +63,11 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
         for network in ["actor", "critic"] {
             // B.1: three layers.
             let expected = toml::toml! { hidden = [256, 256, 256] activation = "mish" };
-            assert_eq!(value(&row, &format!("agent.{network}")), Some(expected.into()), "{name}: {network}");
+            assert_eq!(
+                value(&row, &format!("agent.{network}")),
+                Some(expected.into()),
+                "{name}: {network}"
+            );
         }
         let rate = if name.starts_with("antmaze-large") { 1e-3 } else { 3e-4 };
         for (key, expected) in [
@@ -106,7 +110,8 @@ fn tasks_beside_the_papers_have_values_that_suit_them() {
         text.parse().unwrap()
     };
     for algorithm in ["quad", "td3-bc", "idql"] {
-        let (mut new, old) = (of("antmaze-large-play-v2", algorithm), preset_of("antmaze-large-play-v0", algorithm));
+        let (mut new, old) =
+            (of("antmaze-large-play-v2", algorithm), preset_of("antmaze-large-play-v0", algorithm));
         for key in ["environment", "dataset"] {
             new.insert(key.to_owned(), old[key].clone());
         }
@@ -128,12 +133,17 @@ fn tasks_beside_the_papers_have_values_that_suit_them() {
     assert_eq!(value(&of(giant, "quad"), "agent.eta.threshold"), None);
     let wide = Value::from(vec![512; 4]);
     assert_eq!(value(&of(giant, "iql"), "agent.actor.hidden"), Some(wide));
-    for (task, rule) in [(giant, "subtract-1"), ("antsoccer-arena-stitch-singletask-v0", "subtract-1")] {
+    for (task, rule) in
+        [(giant, "subtract-1"), ("antsoccer-arena-stitch-singletask-v0", "subtract-1")]
+    {
         assert_eq!(value(&of(task, "iql"), "reward"), Some(rule.into()), "{task}");
     }
     let error = learner(&["train", "--task", "cube-single-play-singletask-task3-v0"]);
     let error = String::from_utf8(error.stderr).unwrap();
-    assert!(error.contains("`quad-convert ogbench:cube-single-play-singletask-task3-v0 --out FILE`"), "{error}");
+    assert!(
+        error.contains("`quad-convert ogbench:cube-single-play-singletask-task3-v0 --out FILE`"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -158,7 +168,11 @@ fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
         let file: Table = std::fs::read_to_string(file).unwrap().parse().unwrap();
         assert!(row.contains(file["about"].as_str().unwrap()), "{row}");
     }
-    assert!(algorithms[0].starts_with("quad ") && algorithms[0].contains(" walker2d-*-v2, antmaze-*-v0 "), "{list}");
+    assert!(
+        algorithms[0].starts_with("quad ")
+            && algorithms[0].contains(" walker2d-*-v2, antmaze-*-v0 "),
+        "{list}"
+    );
 }
 
 #[test]

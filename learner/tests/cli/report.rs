@@ -23,15 +23,25 @@ pub(super) fn report(runs: &[Run]) -> Reported {
 
 pub(super) fn report_with(runs: &[Run], flags: &[&str]) -> Reported {
     let folder = tempfile::tempdir().unwrap();
-    let paths: Vec<_> = ('a'..='z').take(runs.len()).map(|name| folder.path().join(name.to_string())).collect();
+    let paths: Vec<_> =
+        ('a'..='z').take(runs.len()).map(|name| folder.path().join(name.to_string())).collect();
     runs.iter().zip(&paths).for_each(|(run, path)| run.write(path));
     let figures = folder.path().join("figures");
     let print = |form: &[&str]| {
         let paths = paths.iter().map(|path| path.to_str().unwrap());
-        printed(&["report"].into_iter().chain(paths).chain(flags.iter().chain(form).copied()).collect::<Vec<_>>())
+        printed(
+            &["report"]
+                .into_iter()
+                .chain(paths)
+                .chain(flags.iter().chain(form).copied())
+                .collect::<Vec<_>>(),
+        )
     };
-    let json = serde_json::from_str(&print(&["--json", "--figures", figures.to_str().unwrap()])).unwrap();
-    let read = |name: fs::DirEntry| (name.file_name().into_string().unwrap(), fs::read(name.path()).unwrap());
+    let json =
+        serde_json::from_str(&print(&["--json", "--figures", figures.to_str().unwrap()])).unwrap();
+    let read = |name: fs::DirEntry| {
+        (name.file_name().into_string().unwrap(), fs::read(name.path()).unwrap())
+    };
     let figures = fs::read_dir(figures).unwrap().map(|entry| read(entry.unwrap())).collect();
     Reported { json, text: print(&[]), markdown: print(&["--markdown"]), figures }
 }
@@ -52,7 +62,9 @@ impl Reported {
     /// Asserts that both forms of the report say this.
     pub(super) fn says(&self, words: &[&str]) {
         for text in [&self.text, &self.markdown] {
-            words.iter().for_each(|words| assert!(text.contains(words), "{words} is missing in\n{text}"));
+            words
+                .iter()
+                .for_each(|words| assert!(text.contains(words), "{words} is missing in\n{text}"));
         }
     }
 
@@ -65,8 +77,8 @@ impl Reported {
     }
 }
 
-/// A run of 6,000 steps with an evaluation of two episodes every thousand: complete ones with means 2, 4, 6, 8, 10 (+ shift),
-/// each ± √2, and half of a sixth.
+/// A run of 6,000 steps with an evaluation of two episodes every thousand: complete ones with means
+/// 2, 4, 6, 8, 10 (+ shift), each ± √2, and half of a sixth.
 fn small(seed: u64, shift: f64) -> Run {
     let [steps, eval_interval, episodes] = [6000, 1000, 2].map(toml::Value::from);
     let mut run = Run::new("hopper-demo", seed).set(&[
@@ -101,7 +113,10 @@ pub(super) const HOPPER: &str = "hopper-medium-replay-v2";
 fn a_run_is_summarized_by_its_complete_evaluations_and_says_how_many_there_are() {
     let reported = report(&[small(3, 0.0)]);
     let run = &reported.json["runs"][0];
-    assert_eq!((&run["variant"], &run["seed"], &run["dataset_score"]), (&json!("quad"), &json!(3), &json!(10.7)));
+    assert_eq!(
+        (&run["variant"], &run["seed"], &run["dataset_score"]),
+        (&json!("quad"), &json!(3), &json!(10.7))
+    );
     assert_eq!((&run["mean_last_3"], &run["mean_last_5"]), (&json!(8.0), &json!(6.0)));
     assert_eq!(run["episodes_missing"], json!(1));
     let fifth = &run["evaluations"][4];
@@ -125,9 +140,14 @@ fn a_run_that_is_not_complete_is_marked_and_not_averaged_with_complete_ones() {
     complete.score(6000, 0, 12.0, "00");
     stopped.scores.truncate(4);
     let reported = report(&[complete, stopped]);
-    let [complete, stopped] = &reported.json["groups"].as_array().unwrap()[..] else { panic!("{}", reported.json) };
+    let [complete, stopped] = &reported.json["groups"].as_array().unwrap()[..] else {
+        panic!("{}", reported.json)
+    };
     assert_eq!((&complete["seeds"], &complete["reached"]), (&json!([0]), &Value::Null));
-    assert_eq!((&stopped["seeds"], &stopped["reached"], &stopped["scores"]), (&json!([1]), &json!(2000), &json!([])));
+    assert_eq!(
+        (&stopped["seeds"], &stopped["reached"], &stopped["scores"]),
+        (&json!([1]), &json!(2000), &json!([]))
+    );
     let words = "2 of 6 evaluations are complete, the last of them after 2000 of 6000 steps";
     assert!(stopped["unfinished"][0].as_str().unwrap().ends_with(words), "{stopped}");
     reported.has_row(&["Not complete, and in no other figure: ", words]);
@@ -140,10 +160,22 @@ fn a_run_that_is_not_complete_is_marked_and_not_averaged_with_complete_ones() {
 fn unlike_runs_are_no_seeds_of_each_other_and_the_report_says_what_differs() {
     for (key, value, differs) in [
         ("experiment.agent.tau", 0.5.into(), &["agent.tau = 0.1", "agent.tau = 0.5"][..]),
-        ("experiment.agent.candidates", 1.into(), &["agent.candidates = 10", "agent.candidates = 1"]),
+        (
+            "experiment.agent.candidates",
+            1.into(),
+            &["agent.candidates = 10", "agent.candidates = 1"],
+        ),
         ("run.device", "cuda".into(), &["device = cpu", "device = cuda"]),
-        ("dataset.mean_return", 21.0.into(), &["dataset.mean_return = 20.0", "dataset.mean_return = 21.0"]),
-        ("experiment.agent.eta.threshold", 1.0.into(), &["no agent.eta.threshold", "agent.eta.threshold = 1.0"]),
+        (
+            "dataset.mean_return",
+            21.0.into(),
+            &["dataset.mean_return = 20.0", "dataset.mean_return = 21.0"],
+        ),
+        (
+            "experiment.agent.eta.threshold",
+            1.0.into(),
+            &["no agent.eta.threshold", "agent.eta.threshold = 1.0"],
+        ),
         ("experiment.reward", "as-is".into(), &["reward = \"locomotion\"", "reward = \"as-is\""]),
         ("experiment.scale", vec!["states"].into(), &["scale = []", "scale = [\"states\"]"]),
         // The same file in another place.
@@ -152,8 +184,17 @@ fn unlike_runs_are_no_seeds_of_each_other_and_the_report_says_what_differs() {
     ] {
         let reported = report(&[small(0, 0.0), small(1, 0.0).set(&[(key, value)])]);
         let groups = reported.json["groups"].as_array().unwrap();
-        let found: Vec<_> = groups.iter().flat_map(|group| group["differs"].as_array().unwrap()).collect();
-        assert_eq!(found, differs.iter().map(|&words| json!(words)).collect::<Vec<_>>().iter().collect::<Vec<_>>());
+        let found: Vec<_> =
+            groups.iter().flat_map(|group| group["differs"].as_array().unwrap()).collect();
+        assert_eq!(
+            found,
+            differs
+                .iter()
+                .map(|&words| json!(words))
+                .collect::<Vec<_>>()
+                .iter()
+                .collect::<Vec<_>>()
+        );
         assert_eq!(groups.len(), 1.max(differs.len()));
         reported.says(differs);
     }
@@ -165,7 +206,11 @@ fn a_seed_counts_once_and_a_run_without_a_complete_evaluation_not_at_all() {
     unscored.scores.clear();
     let reported = report(&[small(0, 0.0), small(0, 4.0), unscored]);
     let group = reported.group();
-    assert_eq!((&group["seeds"], &group["mean_last_5"]["mean"]), (&json!([0]), &json!(6.0)), "the first is counted");
+    assert_eq!(
+        (&group["seeds"], &group["mean_last_5"]["mean"]),
+        (&json!([0]), &json!(6.0)),
+        "the first is counted"
+    );
     reported.has_row(&["Not counted: ", "b has seed 0 like "]);
     reported.has_row(&["Not counted: ", "c has no complete evaluation"]);
     assert!(reported.text.contains("no evaluation has a score yet"), "{}", reported.text);
@@ -182,7 +227,11 @@ fn the_number_of_goals_stands_beside_the_score_where_a_run_has_one() {
         "asks for 50 to 100 seeds",
     ]);
     let reported = report(&paper(HOPPER, 100_000, |_| 50.0));
-    assert!(reported.group()["goals"].is_null() && !reported.text.contains("goal"), "{}", reported.text);
+    assert!(
+        reported.group()["goals"].is_null() && !reported.text.contains("goal"),
+        "{}",
+        reported.text
+    );
 }
 
 #[test]
@@ -213,18 +262,33 @@ fn a_page_holds_all_that_is_shown_and_takes_nothing_for_html() {
     let page = fs::read_to_string(path("page.html")).unwrap().replace("&#x2f;", "/");
     assert!(!page.contains("<script") && page.contains("&lt;script&gt;alert(1)"), "{page}");
     // Nothing is fetched: neither scripts nor pictures have addresses.
-    assert!(!page.contains("href=\"http") && !page.contains("src=\"/") && !page.contains("url("), "{page}");
+    assert!(
+        !page.contains("href=\"http") && !page.contains("src=\"/") && !page.contains("url("),
+        "{page}"
+    );
     let film = "src=\"data:image/gif;base64,R0lGODlhIG9mIGEgcnVu\"";
     let command = format!("--seed 4 --run-dir {}", path("b"));
-    for words in ["<svg", film, &command, "8.50 ± 0.71 (0.50)", "steps = 6000", "100 transitions of 3 episodes"] {
+    for words in [
+        "<svg",
+        film,
+        &command,
+        "8.50 ± 0.71 (0.50)",
+        "steps = 6000",
+        "100 transitions of 3 episodes",
+    ] {
         assert!(page.contains(words), "{words} is missing in\n{page}");
     }
 }
 
 #[test]
 fn the_last_steps_of_a_run_do_not_reach_back_to_the_evaluation_before_them() {
-    let numbers = [("experiment.steps", 100_000), ("experiment.eval_interval", 10_000), ("experiment.episodes", 2)];
-    let mut run = Run::new("hopper-demo", 0).set(&numbers.map(|(key, number)| (key, number.into())));
+    let numbers = [
+        ("experiment.steps", 100_000),
+        ("experiment.eval_interval", 10_000),
+        ("experiment.episodes", 2),
+    ];
+    let mut run =
+        Run::new("hopper-demo", 0).set(&numbers.map(|(key, number)| (key, number.into())));
     for n in 1..=10 {
         (0..2).for_each(|episode| run.score(10_000 * n, episode, n as f64, "00"));
     }

@@ -11,7 +11,8 @@ use crate::printed;
 /// A run whose files can be changed before they are written.
 #[derive(Clone)]
 pub struct Run {
-    /// The run's `config.toml`, as a learner wrote it that had presets in place of tasks, and no choice of the device.
+    /// The run's `config.toml`, as a learner wrote it that had presets in place of tasks, and no
+    /// choice of the device.
     pub config: Table,
     /// The lines of its `scores.jsonl`.
     pub scores: Vec<Value>,
@@ -25,7 +26,8 @@ impl Run {
 
     /// Makes a run by another algorithm.
     pub fn by(algorithm: &str, task: &str, seed: u64) -> Self {
-        let mut experiment: Table = printed(&["presets", task, "--algorithm", algorithm]).parse().unwrap();
+        let mut experiment: Table =
+            printed(&["presets", task, "--algorithm", algorithm]).parse().unwrap();
         experiment.insert("seed".into(), (seed as i64).into());
         let run = toml::toml! { name = "r" incarnation = 1 version = "0" };
         let dataset = toml::toml! {
@@ -39,7 +41,8 @@ impl Run {
         };
         let mut config = toml::toml! { run = {} };
         config.extend(
-            [("run", run), ("dataset", dataset), ("experiment", experiment)].map(|(k, t)| (k.into(), t.into())),
+            [("run", run), ("dataset", dataset), ("experiment", experiment)]
+                .map(|(k, t)| (k.into(), t.into())),
         );
         config["run"].as_table_mut().unwrap().insert("preset".into(), task.into());
         Self { config, scores: Vec::new() }
@@ -49,7 +52,9 @@ impl Run {
     pub fn set(mut self, changes: &[(&str, toml::Value)]) -> Self {
         for (key, value) in changes {
             let (tables, key) = key.rsplit_once('.').unwrap();
-            let table = tables.split('.').fold(&mut self.config, |table, key| table[key].as_table_mut().unwrap());
+            let table = tables
+                .split('.')
+                .fold(&mut self.config, |table, key| table[key].as_table_mut().unwrap());
             table.insert((*key).to_owned(), value.clone());
         }
         self

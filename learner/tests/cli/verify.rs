@@ -9,7 +9,8 @@ use serde_json::{Value, json};
 use crate::learner;
 use crate::run::Run;
 
-/// A run that is as it should be, but for what is done to its lines: evaluations of steps 10 and 15, three episodes each.
+/// A run that is as it should be, but for what is done to its lines: evaluations of steps 10 and
+/// 15, three episodes each.
 fn write(path: &Path, change: impl FnOnce(&mut Vec<Value>)) {
     let [steps, eval_interval, episodes] = [15, 10, 3].map(toml::Value::from);
     let mut run = Run::new("hopper-demo", 4).set(&[
@@ -25,7 +26,8 @@ fn write(path: &Path, change: impl FnOnce(&mut Vec<Value>)) {
     change(&mut run.scores);
     run.write(path);
     for step in [10, 15] {
-        fs::write(path.join(format!("snapshots/step_{step:09}.safetensors")), [step as u8; 100]).unwrap();
+        fs::write(path.join(format!("snapshots/step_{step:09}.safetensors")), [step as u8; 100])
+            .unwrap();
     }
 }
 
@@ -52,7 +54,9 @@ fn each_broken_promise_is_found() {
         ("without a score (1)", |lines| drop(lines.pop())),
         ("scored twice (1)", |lines| lines.push(lines[0].clone())),
         ("no episode of this run (1)", |lines| again(lines, "seed", json!(1))),
-        ("scored with other weights than are on disk (1)", |lines| lines[2]["weights"] = lines[3]["weights"].clone()),
+        ("scored with other weights than are on disk (1)", |lines| {
+            lines[2]["weights"] = lines[3]["weights"].clone()
+        }),
         ("scored, but the snapshot is gone (1)", |lines| again(lines, "step", json!(12))),
     ];
     let folder = tempfile::tempdir().unwrap();
@@ -83,9 +87,18 @@ fn two_runs_are_compared_bit_for_bit() {
     write(&ours, |_| ());
     for (change, same, wrong) in changes {
         write(&theirs, change);
-        let found = verify(&[ours.to_str().unwrap(), "--same-as", theirs.to_str().unwrap()], wrong.is_empty());
-        assert!(found.contains(&format!("{same} of 6 episodes are compared")) && found.contains(wrong), "{found}");
-        assert!(!wrong.contains("precision") || found.contains("(f32-avx512 here, bf16-amx there)"), "{found}");
+        let found = verify(
+            &[ours.to_str().unwrap(), "--same-as", theirs.to_str().unwrap()],
+            wrong.is_empty(),
+        );
+        assert!(
+            found.contains(&format!("{same} of 6 episodes are compared")) && found.contains(wrong),
+            "{found}"
+        );
+        assert!(
+            !wrong.contains("precision") || found.contains("(f32-avx512 here, bf16-amx there)"),
+            "{found}"
+        );
     }
 }
 
@@ -100,14 +113,18 @@ fn runs_without_evaluations_are_compared_by_their_snapshots() {
         run.write(path);
         fs::write(path.join("snapshots/step_000000015.safetensors"), [7; 100]).unwrap();
     }
-    let compare = |holds| verify(&[ours.to_str().unwrap(), "--same-as", theirs.to_str().unwrap()], holds);
+    let compare =
+        |holds| verify(&[ours.to_str().unwrap(), "--same-as", theirs.to_str().unwrap()], holds);
     assert!(compare(true).contains("1 of 1 snapshots are compared"));
     let snapshot = theirs.join("snapshots/step_000000015.safetensors");
     let mut flipped = [7; 100];
     flipped[50] ^= 1;
     fs::write(&snapshot, flipped).unwrap();
     let found = compare(false);
-    assert!(found.contains("0 of 1 snapshots are compared\nsnapshots that differ (1): step 15"), "{found}");
+    assert!(
+        found.contains("0 of 1 snapshots are compared\nsnapshots that differ (1): step 15"),
+        "{found}"
+    );
     fs::remove_file(&snapshot).unwrap();
     assert!(compare(false).contains("snapshots that are not there (1): step 15"));
     fs::remove_file(ours.join("snapshots/step_000000015.safetensors")).unwrap();

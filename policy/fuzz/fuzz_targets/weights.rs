@@ -8,12 +8,13 @@ use std::path::Path;
 use candle_core::{Device, Tensor};
 use libfuzzer_sys::fuzz_target;
 use quad_policy::{
-    ActorCriticShape, Affine, Choice, DiffusionShape, GaussianShape, Header, Layout, MlpConfig, PolicyConfig,
-    Precision, Rule, Scaling, ScorePolicyShape, load_policy,
+    ActorCriticShape, Affine, Choice, DiffusionShape, GaussianShape, Header, Layout, MlpConfig,
+    PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, load_policy,
 };
 
 const STATES: usize = 2;
-/// Policies that take more memory than this for an action take much time, too: they are only loaded. Bytes.
+/// Policies that take more memory than this for an action take much time, too: they are only
+/// loaded. Bytes.
 const MOST_MEMORY: u64 = 1 << 20;
 
 /// Policies for the fuzzer to begin with, where cargo-fuzz lets it look for some.
@@ -38,13 +39,22 @@ fn write_seeds() {
     let choice = Choice { rule: Rule::Softmax { temperature: 0.5 }, ..Choice::best_of(2) };
     let squashed = file(PolicyConfig::Squashed { shape, choice }, None);
     let (actor, critic) = (layers.clone(), layers.clone());
-    let shape = ScorePolicyShape { observation_dim: 2, action_dim: 1, actor, critic, evaluations: 2 };
+    let shape =
+        ScorePolicyShape { observation_dim: 2, action_dim: 1, actor, critic, evaluations: 2 };
     let rule = Rule::Average { temperature: 0.5, actions: 2 };
-    let score = file(PolicyConfig::Score { shape, choice: Choice { rule, ..Choice::best_of(3) } }, None);
+    let score =
+        file(PolicyConfig::Score { shape, choice: Choice { rule, ..Choice::best_of(3) } }, None);
     let shape = GaussianShape { observation_dim: 2, action_dim: 1, actor: layers.clone() };
     let actions = Some(Affine { offset: vec![3.0], scale: vec![2.0] });
-    let gaussian = file(PolicyConfig::Gaussian { shape }, Some(Scaling { observations: None, actions }));
-    let drawn = [("best", best), ("nearest", nearest), ("softmax", softmax), ("squashed", squashed), ("score", score)];
+    let gaussian =
+        file(PolicyConfig::Gaussian { shape }, Some(Scaling { observations: None, actions }));
+    let drawn = [
+        ("best", best),
+        ("nearest", nearest),
+        ("softmax", softmax),
+        ("squashed", squashed),
+        ("score", score),
+    ];
     for (name, file) in drawn.into_iter().chain([("gaussian", gaussian)]) {
         fs::write(corpus.join(name), file).unwrap();
     }

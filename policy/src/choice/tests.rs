@@ -46,7 +46,8 @@ fn the_first_of_the_best_is_taken() {
     assert!(pick(&[0.0, f32::NAN, 1.0]).is_err());
 }
 
-/// So many draws of each place that its share is within 0.02 of its probability, at any size of the values.
+/// So many draws of each place that its share is within 0.02 of its probability, at any size of the
+/// values.
 #[test]
 fn softmax_draws_by_its_probabilities() {
     const DRAWS: usize = 20_000;
@@ -59,21 +60,27 @@ fn softmax_draws_by_its_probabilities() {
         (0..DRAWS).for_each(|_| counts[choice.pick(&values, &mut state).unwrap()[0]] += 1);
         let weights = [1.0, -2.0, 3.0, f64::NEG_INFINITY].map(|value| (value / 2.0).exp());
         for (count, weight) in counts.iter().zip(weights) {
-            let (share, expected) = (f64::from(*count) / DRAWS as f64, weight / weights.iter().sum::<f64>());
+            let (share, expected) =
+                (f64::from(*count) / DRAWS as f64, weight / weights.iter().sum::<f64>());
             assert!((share - expected).abs() < 0.02, "{share} for {expected} at {scale}");
         }
     }
-    let cold = Choice { rule: Rule::Softmax { temperature: f32::MIN_POSITIVE }, ..Choice::best_of(3) };
+    let cold =
+        Choice { rule: Rule::Softmax { temperature: f32::MIN_POSITIVE }, ..Choice::best_of(3) };
     assert_eq!(cold.pick(&[f32::MAX, f32::MIN, 0.0], &mut state).unwrap(), [0]);
     assert_eq!(cold.pick(&[0.0, f32::INFINITY, f32::NEG_INFINITY], &mut state).unwrap(), [1]);
 }
 
-/// Two of four: each pair as often as the two orders of drawing it say, at values that the bound does not reach.
+/// Two of four: each pair as often as the two orders of drawing it say, at values that the bound
+/// does not reach.
 #[test]
 fn several_are_drawn_without_replacement() {
     const DRAWS: usize = 20_000;
     let mut state = EpisodeState::new(4);
-    let average = |actions| Choice { rule: Rule::Average { temperature: 2.0, actions }, ..Choice::best_of(4) };
+    let average = |actions| Choice {
+        rule: Rule::Average { temperature: 2.0, actions },
+        ..Choice::best_of(4)
+    };
     let values = [1.0, -2.0, 3.0, 0.0];
     let mut counts = [[0; 4]; 4];
     for _ in 0..DRAWS {
@@ -86,20 +93,24 @@ fn several_are_drawn_without_replacement() {
     for (first, second) in (0..4).flat_map(|first| (0..4).map(move |second| (first, second))) {
         let expected = weights[first] / sum * weights[second] / (sum - weights[first]);
         let share = f64::from(counts[first][second]) / DRAWS as f64;
-        assert!(first == second || (share - expected).abs() < 0.02, "{first}, {second}: {share} for {expected}");
+        assert!(
+            first == second || (share - expected).abs() < 0.02,
+            "{first}, {second}: {share} for {expected}"
+        );
     }
     let mut all = average(9).pick(&values, &mut state).unwrap();
     all.sort_unstable();
     assert_eq!(all, [0, 1, 2, 3], "fewer candidates than are to be drawn");
 }
 
-/// The second largest value is far below the largest, which counts as no more than forty temperatures above it; so do all
-/// that exceed the bound, which are then equals.
+/// The second largest value is far below the largest, which counts as no more than forty
+/// temperatures above it; so do all that exceed the bound, which are then equals.
 #[test]
 fn values_far_above_the_others_count_as_equal() {
     const DRAWS: usize = 2_000;
     let mut state = EpisodeState::new(5);
-    let choice = Choice { rule: Rule::Average { temperature: 1.0, actions: 3 }, ..Choice::best_of(5) };
+    let choice =
+        Choice { rule: Rule::Average { temperature: 1.0, actions: 3 }, ..Choice::best_of(5) };
     let mut first = [0_u32; 5];
     for _ in 0..DRAWS {
         let drawn = choice.pick(&[1e6, 0.0, 1e3, -50.0, -1e9], &mut state).unwrap();
@@ -120,7 +131,8 @@ fn a_choice_out_of_range_is_refused() {
         let choice = Choice { rule: Rule::Average { temperature, actions: 1 }, ..choice };
         assert!(matches!(choice.check(), Err(PolicyError::Temperature(_))), "{temperature}");
     }
-    let of_none = Choice { rule: Rule::Average { temperature: 1.0, actions: 0 }, ..Choice::best_of(2) };
+    let of_none =
+        Choice { rule: Rule::Average { temperature: 1.0, actions: 0 }, ..Choice::best_of(2) };
     assert!(matches!(of_none.check(), Err(PolicyError::Range { .. })));
 }
 
@@ -128,7 +140,10 @@ fn a_choice_out_of_range_is_refused() {
 fn a_choice_says_how_many_uniform_numbers_it_takes() {
     let uniforms = |candidates, rule| Choice { rule, ..Choice::best_of(candidates) }.uniforms();
     let average = |actions| Rule::Average { temperature: 1.0, actions };
-    assert_eq!([uniforms(4, average(3)), uniforms(4, average(9)), uniforms(1, average(3))], [3, 4, 0]);
+    assert_eq!(
+        [uniforms(4, average(3)), uniforms(4, average(9)), uniforms(1, average(3))],
+        [3, 4, 0]
+    );
     let softmax = Rule::Softmax { temperature: 1.0 };
     assert_eq!([uniforms(4, softmax), uniforms(1, softmax), uniforms(4, Rule::Best)], [1, 0, 0]);
 }

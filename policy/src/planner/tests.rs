@@ -1,4 +1,5 @@
-//! Tests of acting by plans; their numbers are compared with a script's in the crate of the algorithms.
+//! Tests of acting by plans; their numbers are compared with a script's in the crate of the
+//! algorithms.
 
 use super::*;
 use crate::kind::{Header, PolicyConfig, load_policy};
@@ -14,7 +15,13 @@ fn shape(replan_every: usize) -> PlannerShape {
     PlannerShape {
         observation_dim: DIMS.0,
         action_dim: DIMS.1,
-        network: WindowConfig { horizon: 4, channels: 4, multipliers: vec![1, 4], groups: 2, attention: None },
+        network: WindowConfig {
+            horizon: 4,
+            channels: 4,
+            multipliers: vec![1, 4],
+            groups: 2,
+            attention: None,
+        },
         diffusion_steps: 3,
         guidance: Guidance { steps: 2, scale: 0.5, stop: 1 },
         replan_every,
@@ -25,7 +32,8 @@ fn shape(replan_every: usize) -> PlannerShape {
 fn file(shape: PlannerShape, plans: u32) -> Vec<u8> {
     let generator = &mut ChaCha8Rng::seed_from_u64(5);
     let policy = PolicyConfig::Planner { shape, choice: Choice::best_of(plans) };
-    let tensors = policy.tensors(|layout| Weights::initial(layout, generator, &Device::Cpu)).unwrap();
+    let tensors =
+        policy.tensors(|layout| Weights::initial(layout, generator, &Device::Cpu)).unwrap();
     Header::new(policy, ()).to_safetensors(&tensors).unwrap()
 }
 
@@ -36,7 +44,8 @@ fn policy(replan_every: usize, plans: u32) -> Box<dyn Policy> {
 /// What it does in so many steps of an episode with this observation.
 fn acts(policy: &dyn Policy, seeds: &[u64], steps: usize) -> Vec<Vec<f32>> {
     let mut states: Vec<_> = seeds.iter().map(|seed| policy.begin(*seed)).collect();
-    let observations: Vec<f32> = seeds.iter().flat_map(|seed| [*seed as f32 / 10.0; DIMS.0]).collect();
+    let observations: Vec<f32> =
+        seeds.iter().flat_map(|seed| [*seed as f32 / 10.0; DIMS.0]).collect();
     let mut step = || {
         let mut actions = vec![0.0; seeds.len() * DIMS.1];
         policy.act(&observations, &mut states, &mut actions).unwrap();
@@ -85,7 +94,10 @@ fn what_is_sampled_is_what_is_chosen_among() {
     let values = &sampled.values[6..];
     let best = (1..6).fold(0, |best, i| if values[i] > values[best] { i } else { best });
     assert_eq!(of_second[best * DIMS.1..][..DIMS.1], actions[DIMS.1..]);
-    assert!(values.iter().any(|value| *value != values[0]) && policy.value(&[0.0; 4], &[0.0; 2]).is_err());
+    assert!(
+        values.iter().any(|value| *value != values[0])
+            && policy.value(&[0.0; 4], &[0.0; 2]).is_err()
+    );
 }
 
 #[test]
@@ -94,16 +106,24 @@ fn guidance_raises_values() {
         let mut shape = shape(1);
         shape.guidance.scale = scale;
         let policy = load_policy(&file(shape, 20), Precision::F32).unwrap();
-        policy.sample(&[0.3; DIMS.0], &mut [policy.begin(0)]).unwrap().values.iter().sum::<f32>() / 20.0
+        policy.sample(&[0.3; DIMS.0], &mut [policy.begin(0)]).unwrap().values.iter().sum::<f32>()
+            / 20.0
     };
-    assert!(mean(5.0) > mean(0.0) && mean(0.0) > mean(-5.0), "{} {} {}", mean(5.0), mean(0.0), mean(-5.0));
+    assert!(
+        mean(5.0) > mean(0.0) && mean(0.0) > mean(-5.0),
+        "{} {} {}",
+        mean(5.0),
+        mean(0.0),
+        mean(-5.0)
+    );
 }
 
 #[test]
 fn the_last_denoising_steps_so_many_are_not_guided() {
     let values = |scale: f32, stop: usize| {
         let guidance = Guidance { steps: 2, scale, stop };
-        let policy = load_policy(&file(PlannerShape { guidance, ..shape(1) }, 4), Precision::F32).unwrap();
+        let policy =
+            load_policy(&file(PlannerShape { guidance, ..shape(1) }, 4), Precision::F32).unwrap();
         policy.sample(&[0.3; DIMS.0], &mut [policy.begin(0)]).unwrap().values
     };
     let unguided = values(0.0, 0);
@@ -121,7 +141,10 @@ fn a_shape_out_of_range_is_refused() {
         matches!(load_policy(&file, Precision::F32), Err(PolicyError::Range { .. }))
     };
     assert!(refused(|shape| shape.replan_every = 5) && refused(|shape| shape.replan_every = 0));
-    assert!(refused(|shape| shape.network.horizon = 3) && refused(|shape| shape.diffusion_steps = usize::MAX));
+    assert!(
+        refused(|shape| shape.network.horizon = 3)
+            && refused(|shape| shape.diffusion_steps = usize::MAX)
+    );
     assert!(refused(|shape| shape.observation_dim = 0) && !refused(|_| ()));
     let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(2) };
     assert!(matches!(policy(1, 2).with_choice(nearest), Err(PolicyError::NoValue)));

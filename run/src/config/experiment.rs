@@ -26,15 +26,19 @@ const MOST: u64 = i64::MAX as u64;
 pub struct Experiment {
     /// Environment that the data is from and the policy is evaluated in.
     pub environment: String,
-    /// What it learns from: a name, or a file. [`DatasetInfo`](super::DatasetInfo) says what was found there.
+    /// What it learns from: a name, or a file. [`DatasetInfo`](super::DatasetInfo) says what was
+    /// found there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub dataset: Option<String>,
-    /// How rewards are scaled before training; a file that does not say takes the environment's rule.
+    /// How rewards are scaled before training; a file that does not say takes the environment's
+    /// rule.
     pub reward: RewardRule,
-    /// What of the data is scaled for the networks; the snapshots have the maps, so that policies take and give the data's units.
+    /// What of the data is scaled for the networks; the snapshots have the maps, so that policies
+    /// take and give the data's units.
     #[serde(default)]
     pub scale: Scale,
-    /// Share of the episodes that is kept out of training, to measure on; 0: none. Which they are follows from the seed.
+    /// Share of the episodes that is kept out of training, to measure on; 0: none. Which they are
+    /// follows from the seed.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub hold_out: f64,
     /// Gradient steps.
@@ -60,7 +64,8 @@ fn is_zero(share: &f64) -> bool {
     *share == 0.0
 }
 
-/// For a key that is too few or too many, or of a wrong type. What serde says of it lists the keys that there are.
+/// For a key that is too few or too many, or of a wrong type. What serde says of it lists the keys
+/// that there are.
 pub(super) const KEYS: &str = "`learner presets TASK` prints every key; on the command line --set KEY=VALUE changes one, and \
                                --agent KEY=VALUE one below [agent]";
 
@@ -73,7 +78,8 @@ impl Experiment {
         hyperparameters::algorithm(&self.algorithm)
     }
 
-    /// What tells variants of the algorithm apart in the names of runs: a hyper-parameter's value, or the algorithm's name.
+    /// What tells variants of the algorithm apart in the names of runs: a hyper-parameter's value,
+    /// or the algorithm's name.
     ///
     /// # Errors
     /// As [`Self::definition`].
@@ -92,8 +98,8 @@ impl Experiment {
         Ok(known.map_or_else(|| variant.to_owned(), |known| (known.called)(variant)))
     }
 
-    /// The algorithm as people read it: its name, its variant where there are several, and counts, such as candidates, where it
-    /// has some.
+    /// The algorithm as people read it: its name, its variant where there are several, and counts,
+    /// such as candidates, where it has some.
     ///
     /// # Errors
     /// As [`Self::definition`].
@@ -124,7 +130,10 @@ impl Experiment {
             0 => "no evaluations".to_owned(),
             _ => format!("{episodes} episodes every {eval_interval}"),
         };
-        Ok(format!("{}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}", self.method()?))
+        Ok(format!(
+            "{}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}",
+            self.method()?
+        ))
     }
 
     /// Checks the numbers that are no hyper-parameters.
@@ -139,19 +148,29 @@ impl Experiment {
             ("episodes", self.episodes.into(), 1, MOST_EPISODES),
             ("batch_size", self.batch_size.into(), 1, MOST_BATCH),
         ] {
-            ensure!((least..=most).contains(&value), "{field} is {value}, but must be from {least} to {most}");
+            ensure!(
+                (least..=most).contains(&value),
+                "{field} is {value}, but must be from {least} to {most}"
+            );
         }
         let share = self.hold_out;
-        ensure!((0.0..1.0).contains(&share), "hold_out is {share}, but must be at least 0 and below 1");
+        ensure!(
+            (0.0..1.0).contains(&share),
+            "hold_out is {share}, but must be at least 0 and below 1"
+        );
         Ok(())
     }
 
     pub(super) fn validate(&self) -> anyhow::Result<()> {
         self.check_ranges()?;
-        let (Self { steps, eval_interval, .. }, evaluations) = (self, self.schedule().evaluations());
+        let (Self { steps, eval_interval, .. }, evaluations) =
+            (self, self.schedule().evaluations());
         if evaluations > MOST_EVALUATIONS {
-            let error = anyhow!("{steps} steps with an evaluation every {eval_interval} are {evaluations} evaluations");
-            return Err(error).hint(format!("choose a larger eval_interval, for at most {MOST_EVALUATIONS}"));
+            let error = anyhow!(
+                "{steps} steps with an evaluation every {eval_interval} are {evaluations} evaluations"
+            );
+            return Err(error)
+                .hint(format!("choose a larger eval_interval, for at most {MOST_EVALUATIONS}"));
         }
         let check = (self.definition()?.check)(&self.agent);
         check.with_context(|| format!("algorithm {}", self.algorithm)).hint(KEYS)

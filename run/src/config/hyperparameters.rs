@@ -8,10 +8,14 @@ use quad_runtime::hinted;
 use super::nearest::did_you_mean;
 use super::tasks::Task;
 
-/// Whether a benchmark of others, a task with a dataset of its own, has no values by the algorithm's authors.
+/// Whether a benchmark of others, a task with a dataset of its own, has no values by the
+/// algorithm's authors.
 fn lacks(values: &Values, task: &Task) -> bool {
-    // OGBench numbers its tasks apart from D4RL: a pattern like `*-v0` is not about them unless it says so.
-    let is_about = |pattern: &String| is_ogbench(pattern) == is_ogbench(&task.name) && fits(pattern, &task.name);
+    // OGBench numbers its tasks apart from D4RL: a pattern like `*-v0` is not about them unless it
+    // says so.
+    let is_about = |pattern: &String| {
+        is_ogbench(pattern) == is_ogbench(&task.name) && fits(pattern, &task.name)
+    };
     task.word("dataset").is_some() && !values.given.iter().any(is_about)
 }
 

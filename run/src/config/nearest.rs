@@ -1,7 +1,7 @@
 //! What a user probably meant by a misspelled name.
 
-/// `did you mean a, b? ` with up to three of the known names, the most similar first; nothing if none is similar. A name is
-/// similar if few letters differ, or if the word is part of it.
+/// `did you mean a, b? ` with up to three of the known names, the most similar first; nothing if
+/// none is similar. A name is similar if few letters differ, or if the word is part of it.
 pub fn did_you_mean<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> String {
     let likeness = |name| (strsim::normalized_damerau_levenshtein(word, name), name);
     let mut similar: Vec<(f64, &str)> = known.into_iter().map(likeness).collect();

@@ -1,7 +1,7 @@
 //! What a user can begin from: a task by name, or a file of the user's own.
 //!
-//! A file has keys of an experiment. It may also name a `task`, whose values hold where it says nothing, and says by
-//! `algorithm` whose values these are.
+//! A file has keys of an experiment. It may also name a `task`, whose values hold where it says
+//! nothing, and says by `algorithm` whose values these are.
 
 use std::path::Path;
 
@@ -20,7 +20,8 @@ const PRINT: &str = "`learner presets TASK` prints what such a file may have";
 
 /// A task, or a file that may change one.
 pub struct Preset {
-    /// What it is called in the names of runs: the task's name, or the file's without its folder and ending.
+    /// What it is called in the names of runs: the task's name, or the file's without its folder
+    /// and ending.
     pub label: String,
     /// The task, if there is one.
     pub task: Option<&'static Task>,
@@ -38,9 +39,11 @@ impl Preset {
             let task = tasks::named(preset)?;
             return Ok(Self { label: task.name.clone(), task: Some(task), own: Table::new() });
         }
-        let text =
-            std::fs::read_to_string(preset).with_context(|| format!("cannot read the preset {preset}")).hint(PRINT)?;
-        let mut own: Table = text.parse().with_context(|| format!("preset {preset} is not TOML")).hint(PRINT)?;
+        let text = std::fs::read_to_string(preset)
+            .with_context(|| format!("cannot read the preset {preset}"))
+            .hint(PRINT)?;
+        let mut own: Table =
+            text.parse().with_context(|| format!("preset {preset} is not TOML")).hint(PRINT)?;
         let task = own.remove("task").map(|name| tasks::named(&word(&name))).transpose();
         let stem = Path::new(preset).file_stem().and_then(|stem| stem.to_str());
         Ok(Self {
@@ -55,7 +58,8 @@ impl Preset {
         self.task.map_or(&self.label, |task| &task.name)
     }
 
-    /// The values of the task for the algorithm, the file's and then the changes laid over them, all checked.
+    /// The values of the task for the algorithm, the file's and then the changes laid over them,
+    /// all checked.
     ///
     /// # Errors
     /// There is no such algorithm, or something in the file or in the changes cannot be used.
@@ -72,15 +76,18 @@ impl Preset {
                 .hint("begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks");
         };
         if !table.contains_key("reward") {
-            let rule = named.as_str().map_or(RewardRule::AsIs, |name| match environment::find(name) {
-                Ok(spec) => spec.reward,
-                Err(_) if ogbench::maze_task(name).is_some() => RewardRule::Subtract1,
-                Err(_) => RewardRule::AsIs,
-            });
+            let rule =
+                named.as_str().map_or(RewardRule::AsIs, |name| match environment::find(name) {
+                    Ok(spec) => spec.reward,
+                    Err(_) if ogbench::maze_task(name).is_some() => RewardRule::Subtract1,
+                    Err(_) => RewardRule::AsIs,
+                });
             table.insert("reward".to_owned(), Value::try_from(rule)?);
         }
-        let experiment: Experiment =
-            table.try_into().with_context(|| format!("preset {label} cannot be used")).hint(KEYS)?;
+        let experiment: Experiment = table
+            .try_into()
+            .with_context(|| format!("preset {label} cannot be used"))
+            .hint(KEYS)?;
         experiment.validate()?;
         Ok(experiment)
     }
@@ -102,8 +109,8 @@ fn word(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
-/// Reads a preset (the name of a task, or a path that ends in `.toml`), lays changes over it, checks every range. The
-/// changes may name another `algorithm` than the preset.
+/// Reads a preset (the name of a task, or a path that ends in `.toml`), lays changes over it,
+/// checks every range. The changes may name another `algorithm` than the preset.
 ///
 /// # Errors
 /// There is no such preset, or something in it or in the changes cannot be used.

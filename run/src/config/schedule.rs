@@ -24,7 +24,8 @@ impl Schedule {
     /// The steps whose policies are evaluated, in ascending order.
     pub fn evaluated_steps(self) -> impl Iterator<Item = u64> {
         let Self { steps, eval_interval } = self;
-        let regular = (1..=steps.checked_div(eval_interval).unwrap_or(0)).map(move |n| n * eval_interval);
+        let regular =
+            (1..=steps.checked_div(eval_interval).unwrap_or(0)).map(move |n| n * eval_interval);
         let last = eval_interval > 0 && !steps.is_multiple_of(eval_interval);
         regular.chain(last.then_some(steps))
     }

@@ -1,4 +1,5 @@
-//! What decides the outcome of a run, key by key: by it a run is compared with others, and with itself when it continues.
+//! What decides the outcome of a run, key by key: by it a run is compared with others, and with
+//! itself when it continues.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +16,8 @@ pub type Settings = BTreeMap<String, String>;
 pub fn of_run(config: &RunConfig) -> Settings {
     let mut settings = of_experiment(&config.experiment);
     let mut dataset = flat(&config.dataset);
-    // The same file may lie in several places. Where the hash of its contents is known, it says all.
+    // The same file may lie in several places. Where the hash of its contents is known, it says
+    // all.
     dataset.remove("path");
     if dataset.contains_key("sha256") {
         dataset.retain(|key, _| key == "sha256");
@@ -40,5 +42,7 @@ fn flat(value: &impl Serialize) -> Settings {
 
 /// The keys at which two settings differ, in alphabetical order for each of them.
 pub fn differences<'a>(a: &'a Settings, b: &'a Settings) -> impl Iterator<Item = &'a String> {
-    a.keys().chain(b.keys().filter(|key| !a.contains_key(*key))).filter(|key| a.get(*key) != b.get(*key))
+    a.keys()
+        .chain(b.keys().filter(|key| !a.contains_key(*key)))
+        .filter(|key| a.get(*key) != b.get(*key))
 }

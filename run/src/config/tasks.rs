@@ -24,7 +24,8 @@ pub struct Task {
     /// The task of which algorithms' values are taken, if they are not its own.
     #[serde(default)]
     values: Option<String>,
-    /// Keys of an experiment that no algorithm's file changes, among them `environment`, and `dataset` if it has one.
+    /// Keys of an experiment that no algorithm's file changes, among them `environment`, and
+    /// `dataset` if it has one.
     #[serde(flatten)]
     pub keys: Table,
 }
@@ -40,8 +41,8 @@ struct Tasks {
 
 #[allow(clippy::expect_used)] // The table is part of the program; a test reads it.
 static TASKS: LazyLock<Vec<Task>> = LazyLock::new(|| {
-    let tasks: Tasks =
-        toml::from_str(include_str!("../../../presets/tasks.toml")).expect("the embedded table is valid");
+    let tasks: Tasks = toml::from_str(include_str!("../../../presets/tasks.toml"))
+        .expect("the embedded table is valid");
     tasks.task.into_iter().chain(ogbench::tasks().map(Task::from)).collect()
 });
 
@@ -52,7 +53,10 @@ impl From<TaskNames> for Task {
             None => "likewise; its data needs quad-convert",
         };
         let keys = [("environment", Some(environment)), ("dataset", dataset)];
-        let keys = keys.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?.into()))).collect();
+        let keys = keys
+            .into_iter()
+            .filter_map(|(key, value)| Some((key.to_owned(), value?.into())))
+            .collect();
         Self { name: task, about: about.to_owned(), is_listed: is_default, values: None, keys }
     }
 }

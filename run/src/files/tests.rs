@@ -5,7 +5,8 @@ use std::path::PathBuf;
 
 use super::*;
 
-/// What opens or makes a file, but for `File::create_new`, which follows no link and opens nothing that is there.
+/// What opens or makes a file, but for `File::create_new`, which follows no link and opens nothing
+/// that is there.
 const CALLS: [&str; 8] = [
     "File::create",
     "File::open",
@@ -17,16 +18,29 @@ const CALLS: [&str; 8] = [
     "fs::write",
 ];
 /// The sources of what works in run folders.
-const SOURCES: [&str; 7] = ["algorithms", "dataset", "evaluator", "learner", "python", "run", "runtime"];
+const SOURCES: [&str; 7] =
+    ["algorithms", "dataset", "evaluator", "learner", "python", "run", "runtime"];
 /// Where else there are such calls, what is in such a line, and why.
 const ALLOWED: [(&str, &str, &str); 13] = [
     ("", "\"/proc/", "the system's own"),
     ("run/src/run/lock.rs", "fs::read_to_string(HOST)", "the system's own"),
-    ("runtime/src/metrics_server.rs", "fs::read_to_string(path)", "the system's own, by their names"),
+    (
+        "runtime/src/metrics_server.rs",
+        "fs::read_to_string(path)",
+        "the system's own, by their names",
+    ),
     ("run/src/files.rs", "OpenOptions", "the one way"),
     ("run/src/files.rs", "File::open(folder)", "a folder, to synchronize it"),
-    ("run/src/config/presets.rs", "fs::read_to_string(preset)", "the user names it; it may be a pipe of a shell"),
-    ("learner/src/sweep/study.rs", "fs::read_to_string(path)", "the user names it; it may be a pipe of a shell"),
+    (
+        "run/src/config/presets.rs",
+        "fs::read_to_string(preset)",
+        "the user names it; it may be a pipe of a shell",
+    ),
+    (
+        "learner/src/sweep/study.rs",
+        "fs::read_to_string(path)",
+        "the user names it; it may be a pipe of a shell",
+    ),
     ("dataset/src/hdf5_file.rs", "File::open(path)", "data that the user names"),
     ("dataset/src/npz_file.rs", "File::open(path)", "data that the user names"),
     ("dataset/src/formats/mod.rs", "File::open(", "data that the user names"),
@@ -39,8 +53,9 @@ const ALLOWED: [(&str, &str, &str); 13] = [
 fn calls(source: &str) -> Vec<&str> {
     let is_call = |line: &&str| {
         let is_part = |c: char| c.is_alphanumeric() || c == '_';
-        let whole =
-            |at: usize, call: &str| !line[..at].ends_with(is_part) && !line[at + call.len()..].starts_with(is_part);
+        let whole = |at: usize, call: &str| {
+            !line[..at].ends_with(is_part) && !line[at + call.len()..].starts_with(is_part)
+        };
         CALLS.iter().any(|call| line.match_indices(call).any(|(at, _)| whole(at, call)))
     };
     let (code, _) = source.split_once("\nmod tests {").unwrap_or((source, ""));
@@ -54,7 +69,9 @@ fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
         let (path, name) = (entry.path(), entry.file_name().into_string().unwrap());
         match path.is_dir() {
             true if name != "tests" => sources(&path, found),
-            false if name.ends_with(".rs") && !["tests.rs", "fixtures.rs"].contains(&&*name) => found.push(path),
+            false if name.ends_with(".rs") && !["tests.rs", "fixtures.rs"].contains(&&*name) => {
+                found.push(path)
+            }
             _ => {}
         }
     }
@@ -67,18 +84,28 @@ fn no_program_opens_or_makes_a_file_in_another_way() {
     SOURCES.iter().for_each(|name| sources(&root.join(name).join("src"), &mut paths));
     assert!(paths.len() > 200, "the sources are elsewhere");
     for path in paths {
-        let (source, name) = (fs::read_to_string(&path).unwrap(), path.strip_prefix(root).unwrap().to_owned());
+        let (source, name) =
+            (fs::read_to_string(&path).unwrap(), path.strip_prefix(root).unwrap().to_owned());
         for line in calls(&source) {
-            let is_allowed = |(file, part, _): &(&str, &str, &str)| name.starts_with(file) && line.contains(part);
+            let is_allowed = |(file, part, _): &(&str, &str, &str)| {
+                name.starts_with(file) && line.contains(part)
+            };
             let allowed = ALLOWED.iter().position(is_allowed);
             let place = allowed.unwrap_or_else(|| {
-                panic!("{}: {line}\nA file in a run's folder is opened and made by quad_run::files.", name.display())
+                panic!(
+                    "{}: {line}\nA file in a run's folder is opened and made by quad_run::files.",
+                    name.display()
+                )
             });
             used[place] = true;
         }
     }
     let unused = ALLOWED.iter().zip(used).filter(|(_, used)| !used).map(|(allowed, _)| allowed);
-    assert_eq!(unused.collect::<Vec<_>>(), [] as [&(&str, &str, &str); 0], "these are allowed and not there");
+    assert_eq!(
+        unused.collect::<Vec<_>>(),
+        [] as [&(&str, &str, &str); 0],
+        "these are allowed and not there"
+    );
 }
 
 #[test]
@@ -88,7 +115,11 @@ fn each_way_to_open_a_file_is_found() {
             assert_eq!(calls(&line), [line.as_str()]);
         }
     }
-    for line in ["fs::read_dir(path)", "// fs::read(path)", "#[cfg(test)]\nmod tests {\n    fs::write(path, text)\n}"] {
+    for line in [
+        "fs::read_dir(path)",
+        "// fs::read(path)",
+        "#[cfg(test)]\nmod tests {\n    fs::write(path, text)\n}",
+    ] {
         assert_eq!(calls(line), [] as [&str; 0]);
     }
 }
@@ -101,8 +132,13 @@ fn a_path_that_the_user_names_may_be_a_link_but_no_pipe() {
     std::os::unix::fs::symlink(&file, &link).unwrap();
     std::os::unix::fs::symlink("/dev/zero", &zero).unwrap();
     assert_eq!(read_named(&link).unwrap(), b"text");
-    for refused in [read(&link), read(&zero), read_named(&zero), read(folder.path()), append(&link).map(|_| Vec::new())]
-    {
+    for refused in [
+        read(&link),
+        read(&zero),
+        read_named(&zero),
+        read(folder.path()),
+        append(&link).map(|_| Vec::new()),
+    ] {
         assert!(refused.unwrap_err().to_string().starts_with("it is a link, a pipe"));
     }
     assert_eq!(read(&folder.path().join("none")).unwrap_err().kind(), ErrorKind::NotFound);

@@ -11,8 +11,8 @@ use super::selection::Select;
 use crate::config::settings::{self, Settings, differences};
 use crate::config::{self, Experiment, hyperparameters, tasks};
 
-/// Lists where runs that differ only in their seed differ from their authors' settings. `scored_in` is the precision of
-/// their scores.
+/// Lists where runs that differ only in their seed differ from their authors' settings. `scored_in`
+/// is the precision of their scores.
 pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<String> {
     let Some(run) = runs.first() else { return Vec::new() };
     let ours = &run.config.experiment;
@@ -21,9 +21,12 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     let mut departures = Vec::new();
     if select == Select::Best {
         let last = published::last(&run.task);
-        departures.push(format!("the best evaluation of each run, not the mean of its last {last}"));
+        departures
+            .push(format!("the best evaluation of each run, not the mean of its last {last}"));
     }
-    departures.extend(ours.definition().and_then(|known| hyperparameters::not_given(&known, task)).ok().flatten());
+    departures.extend(
+        ours.definition().and_then(|known| hyperparameters::not_given(&known, task)).ok().flatten(),
+    );
     if let Some(theirs) = paper.dataset.as_deref().filter(|theirs| !is_trained_on(run, theirs)) {
         let name = ours.dataset.as_deref().unwrap_or("not named");
         departures.push(format!("dataset is {name}, not {theirs}"));
@@ -31,13 +34,16 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     let (ours, paper) = (without_seed(ours), without_seed(&paper));
     let keys: BTreeSet<&String> = differences(&ours, &paper).collect();
     for key in keys {
-        let value = |settings: &Settings| settings.get(key).cloned().unwrap_or_else(|| "absent".to_owned());
+        let value =
+            |settings: &Settings| settings.get(key).cloned().unwrap_or_else(|| "absent".to_owned());
         departures.push(format!("{key} is {}, not {}", value(&ours), value(&paper)));
     }
     if scored_in != "f32" {
         departures.push(format!("scored in {scored_in}, not in f32"));
     }
-    if let Some(least) = runs.iter().filter(|run| !run.is_complete()).min_by_key(|run| run.evaluations_complete()) {
+    if let Some(least) =
+        runs.iter().filter(|run| !run.is_complete()).min_by_key(|run| run.evaluations_complete())
+    {
         departures.push(least.how_complete());
     }
     let seeds = published::seeds(&run.task);
@@ -52,9 +58,11 @@ fn as_published(run: &RunReport) -> anyhow::Result<Experiment> {
     as_given(run, !published::methods(&run.algorithm, &run.variant).is_empty())
 }
 
-/// The values of the task for the algorithm, and for the variant of it if that is not to be a departure.
+/// The values of the task for the algorithm, and for the variant of it if that is not to be a
+/// departure.
 pub fn as_given(run: &RunReport, of_variant: bool) -> anyhow::Result<Experiment> {
-    let mut asked = toml::Table::from_iter([("algorithm".to_owned(), run.algorithm.as_str().into())]);
+    let mut asked =
+        toml::Table::from_iter([("algorithm".to_owned(), run.algorithm.as_str().into())]);
     let variant = run.config.experiment.definition()?.report.variant;
     if let Some(Variant { key, .. }) = variant.filter(|_| of_variant) {
         let agent = toml::Table::from_iter([(key.to_owned(), run.variant.as_str().into())]);

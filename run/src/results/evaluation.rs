@@ -14,7 +14,8 @@ pub struct EvaluationReport {
     pub episodes: usize,
     /// Whether these are all of them.
     pub complete: bool,
-    /// Score over the episodes: D4RL-normalized, or the return where the environment has no reference returns.
+    /// Score over the episodes: D4RL-normalized, or the return where the environment has no
+    /// reference returns.
     pub score: Spread,
     /// Mean undiscounted return.
     pub mean_return: f64,
@@ -23,10 +24,12 @@ pub struct EvaluationReport {
 }
 
 impl EvaluationReport {
-    /// The evaluation of the snapshot at `step`, of these episodes out of `expected`; none of no episodes.
+    /// The evaluation of the snapshot at `step`, of these episodes out of `expected`; none of no
+    /// episodes.
     pub(super) fn of(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<Self> {
-        let mean =
-            |value: fn(&ScoreLine) -> f64| episodes.iter().map(|line| value(line)).sum::<f64>() / episodes.len() as f64;
+        let mean = |value: fn(&ScoreLine) -> f64| {
+            episodes.iter().map(|line| value(line)).sum::<f64>() / episodes.len() as f64
+        };
         let scores: Vec<_> = episodes.iter().map(|line| line.score).collect();
         Some(Self {
             step,

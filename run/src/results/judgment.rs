@@ -1,4 +1,5 @@
-//! What `learner judge` found out about policies, without a simulator: estimates of their values, and whether these can rank them.
+//! What `learner judge` found out about policies, without a simulator: estimates of their values,
+//! and whether these can rank them.
 
 use std::fmt::Alignment::{Left, Right};
 use std::path::PathBuf;
@@ -17,10 +18,12 @@ const LOCK: &str = "judgments.lock";
 pub struct Conditions {
     /// SHA-256 of the data.
     pub dataset: String,
-    /// The environment, whose task the rewards may be of; empty where an earlier learner did not say.
+    /// The environment, whose task the rewards may be of; empty where an earlier learner did not
+    /// say.
     #[serde(default)]
     pub environment: String,
-    /// Numbers of the episodes in whose first states policies are judged, from 0 in the order of the file.
+    /// Numbers of the episodes in whose first states policies are judged, from 0 in the order of
+    /// the file.
     pub episodes: Vec<usize>,
     /// Discount γ of the values.
     pub gamma: f32,
@@ -30,7 +33,8 @@ pub struct Conditions {
     pub seeds: u64,
 }
 
-/// An estimated value: the mean over the judged episodes' first states of the discounted return from there on.
+/// An estimated value: the mean over the judged episodes' first states of the discounted return
+/// from there on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
     /// One for each seed.
@@ -40,7 +44,8 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Over the seeds; none where it is doubtful, because a number beyond all bounds has no part in a mean.
+    /// Over the seeds; none where it is doubtful, because a number beyond all bounds has no part in
+    /// a mean.
     fn spread(&self) -> Option<Spread> {
         Spread::of(&self.values).filter(|_| self.doubts.is_empty())
     }
@@ -60,19 +65,21 @@ pub struct Judgment {
     pub conditions: Conditions,
     /// Its value.
     pub estimate: Estimate,
-    /// How far its actions lie from the data's in the judged episodes: root mean square, in standard deviations of the data's.
+    /// How far its actions lie from the data's in the judged episodes: root mean square, in
+    /// standard deviations of the data's.
     pub distance: f64,
     /// Whether it has learned from none of the judged episodes.
     pub unseen: bool,
     /// The value of the behavior that recorded the data, estimated likewise.
     pub behavior: Estimate,
-    /// The behavior's value as the judged episodes have it: the mean of their discounted returns. What comes after an episode that was cut off
-    /// is taken from the estimate.
+    /// The behavior's value as the judged episodes have it: the mean of their discounted returns.
+    /// What comes after an episode that was cut off is taken from the estimate.
     pub recorded: f64,
 }
 
 impl Judgment {
-    /// The judgments of a run's snapshots that its folder has, but for those that may be of another task's rewards.
+    /// The judgments of a run's snapshots that its folder has, but for those that may be of another
+    /// task's rewards.
     ///
     /// # Errors
     /// The file cannot be read, or is not what `learner judge` writes.
@@ -86,7 +93,8 @@ impl Judgment {
         Ok(judgments)
     }
 
-    /// Keeps it in the folder, in the place of an earlier one of the same step. Waits for another process that is doing so.
+    /// Keeps it in the folder, in the place of an earlier one of the same step. Waits for another
+    /// process that is doing so.
     ///
     /// # Errors
     /// Those of [`Self::read_all`], or the file cannot be written.
@@ -115,7 +123,8 @@ pub struct Ranking {
     pub behavior: Estimate,
     /// The behavior's value, recorded.
     pub recorded: f64,
-    /// Whether the policies' values differ by more than the estimate of the behavior is off, and than other seeds would change them.
+    /// Whether the policies' values differ by more than the estimate of the behavior is off, and
+    /// than other seeds would change them.
     pub can_rank: bool,
     /// What follows from this, in words.
     pub verdict: String,
@@ -137,25 +146,42 @@ impl Ranking {
     }
 
     fn of_group(mut policies: Vec<Judgment>) -> Self {
-        let value = |judgment: &Judgment| judgment.estimate.spread().map_or(f64::NEG_INFINITY, |spread| spread.mean);
+        let value = |judgment: &Judgment| {
+            judgment.estimate.spread().map_or(f64::NEG_INFINITY, |spread| spread.mean)
+        };
         policies.sort_by(|one, other| value(other).total_cmp(&value(one)));
         let Judgment { conditions, behavior, recorded, .. } = policies[0].clone();
-        let sure = Vec::from_iter(policies.iter().filter_map(|judgment| judgment.estimate.spread()));
+        let sure =
+            Vec::from_iter(policies.iter().filter_map(|judgment| judgment.estimate.spread()));
         let (can_rank, verdict) = verdict(&sure, conditions.seeds, &behavior, recorded);
         Self { conditions, behavior, recorded, can_rank, verdict, policies }
     }
 
     /// As words and a table.
     pub fn parts(&self) -> [Part; 2] {
-        let Self { conditions: Conditions { environment, episodes, gamma, steps, seeds, .. }, policies, .. } = self;
-        let columns = [("rank", Right), ("policy", Left), ("value", Right), ("distance", Right), ("doubts", Left)];
+        let Self {
+            conditions: Conditions { environment, episodes, gamma, steps, seeds, .. },
+            policies,
+            ..
+        } = self;
+        let columns = [
+            ("rank", Right),
+            ("policy", Left),
+            ("value", Right),
+            ("distance", Right),
+            ("doubts", Left),
+        ];
         let mut table = Table::new(&columns);
         let value = |of: &Estimate| of.spread().map_or_else(|| "-".to_owned(), Spread::text);
         for (judgment, rank) in policies.iter().zip(1..) {
             let Judgment { run, step, estimate, distance, unseen, .. } = judgment;
             let mut doubts = estimate.doubts.clone();
             doubts.extend((!unseen).then(|| "has learned from some of these episodes".to_owned()));
-            let rank = if estimate.doubts.is_empty() && self.can_rank { format!("{rank}") } else { "-".to_owned() };
+            let rank = if estimate.doubts.is_empty() && self.can_rank {
+                format!("{rank}")
+            } else {
+                "-".to_owned()
+            };
             table.push([
                 rank,
                 format!("{} @ {step}", run.display()),
@@ -185,20 +211,34 @@ fn verdict(values: &[Spread], seeds: u64, behavior: &Estimate, recorded: f64) ->
         return (false, "It cannot rank them: no estimate can be relied on.".to_owned());
     };
     let Some(estimated) = behavior.spread() else {
-        return (false, "It cannot rank them: the estimate of the behavior's own value is doubtful.".to_owned());
+        return (
+            false,
+            "It cannot rank them: the estimate of the behavior's own value is doubtful.".to_owned(),
+        );
     };
     let (off, range) = ((estimated.mean - recorded).abs(), most.mean - least.mean);
     // Twice the standard error of a difference of two means over the seeds.
-    let variance = values.iter().map(|value| value.std.unwrap_or(0.0).powi(2)).sum::<f64>() / values.len() as f64;
+    let variance = values.iter().map(|value| value.std.unwrap_or(0.0).powi(2)).sum::<f64>()
+        / values.len() as f64;
     let noise = 2.0 * (2.0 * variance / seeds as f64).sqrt();
     let behind = format!(
         "the behavior's own value is estimated {off:.2} off, and by other seeds two policies differ by {noise:.2}"
     );
     let margin = off.max(noise);
     match values.len() {
-        1 => (false, format!("One value is no ranking; the behavior's own value is estimated {off:.2} off.")),
-        _ if margin >= range => (false, format!("It cannot rank them: {behind}, these by no more than {range:.2}.")),
-        _ => (true, format!("Policies whose values differ by less than {margin:.2} are not told apart: {behind}.")),
+        1 => (
+            false,
+            format!("One value is no ranking; the behavior's own value is estimated {off:.2} off."),
+        ),
+        _ if margin >= range => {
+            (false, format!("It cannot rank them: {behind}, these by no more than {range:.2}."))
+        }
+        _ => (
+            true,
+            format!(
+                "Policies whose values differ by less than {margin:.2} are not told apart: {behind}."
+            ),
+        ),
     }
 }
 

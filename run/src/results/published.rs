@@ -41,7 +41,8 @@ pub struct Remark {
 pub struct Printed {
     /// The mean over seeds.
     pub mean: f64,
-    /// What stands behind its ±, if it has one. Its source may not say which convention that follows.
+    /// What stands behind its ±, if it has one. Its source may not say which convention that
+    /// follows.
     pub std: Option<f64>,
 }
 
@@ -112,37 +113,52 @@ static SOURCES: LazyLock<[Tables; 4]> = LazyLock::new(|| {
 });
 
 /// The sources that have a task, with its scores by method.
-fn of_task(task: &str) -> impl Iterator<Item = (&'static Tables, &'static BTreeMap<String, Vec<f64>>)> {
+fn of_task(
+    task: &str,
+) -> impl Iterator<Item = (&'static Tables, &'static BTreeMap<String, Vec<f64>>)> {
     SOURCES.iter().filter_map(move |tables| Some((tables, tables.scores.get(task)?)))
 }
 
-/// What is published for a task, the paper's own method first; nothing for tasks that no source has.
+/// What is published for a task, the paper's own method first; nothing for tasks that no source
+/// has.
 pub fn scores(task: &str) -> Vec<Published> {
     let of_source = |(tables, scores): (&'static Tables, &'static BTreeMap<String, Vec<f64>>)| {
-        tables.method.iter().filter_map(move |Method { name, source, tables: of_method, .. }| {
-            let figures = scores.get(name)?;
-            let score = Printed { mean: *figures.first()?, std: figures.get(1).copied() };
-            let remarks = tables.remark.iter().filter_map(|known| known.on(name, task)).collect();
-            Some(Published { method: name, score, source, tables: of_method, protocol: &tables.protocol, remarks })
-        })
+        tables.method.iter().filter_map(
+            move |Method { name, source, tables: of_method, .. }| {
+                let figures = scores.get(name)?;
+                let score = Printed { mean: *figures.first()?, std: figures.get(1).copied() };
+                let remarks =
+                    tables.remark.iter().filter_map(|known| known.on(name, task)).collect();
+                Some(Published {
+                    method: name,
+                    score,
+                    source,
+                    tables: of_method,
+                    protocol: &tables.protocol,
+                    remarks,
+                })
+            },
+        )
     };
     of_task(task).flat_map(of_source).collect()
 }
 
-/// How many training seeds stand behind a figure for the task; a single one where nothing is published.
+/// How many training seeds stand behind a figure for the task; a single one where nothing is
+/// published.
 pub fn seeds(task: &str) -> usize {
     of_task(task).next().map_or(1, |(tables, _)| tables.seeds)
 }
 
-/// How many evaluations at a run's end have the mean that is its score. Where nothing is published, it is FQL's authors' number in
-/// OGBench, else the QUAD paper's.
+/// How many evaluations at a run's end have the mean that is its score. Where nothing is published,
+/// it is FQL's authors' number in OGBench, else the QUAD paper's.
 pub fn last(task: &str) -> usize {
     let [paper, .., of_ogbench] = &*SOURCES;
     let unpublished = if is_ogbench(task) { of_ogbench } else { paper };
     of_task(task).next().map_or(unpublished.last, |(tables, _)| tables.last)
 }
 
-/// The tables in which runs of an algorithm stand: those of the task that have the algorithm, or else the first of the task.
+/// The tables in which runs of an algorithm stand: those of the task that have the algorithm, or
+/// else the first of the task.
 pub fn tables(task: &str, algorithm: &str) -> Vec<&'static str> {
     let figures = scores(task);
     // A table has the task if one of its figures is in no other.
@@ -161,10 +177,12 @@ pub fn all_tables() -> Vec<&'static str> {
     once_each(all_methods().flat_map(|method| &method.tables).map(String::as_str))
 }
 
-/// What sources call a variant of an algorithm: several names where one has several rows, none where none has one.
+/// What sources call a variant of an algorithm: several names where one has several rows, none
+/// where none has one.
 pub fn methods(algorithm: &str, variant: &str) -> Vec<&'static str> {
     let is_it = |method: &&Method| {
-        method.algorithm.as_deref() == Some(algorithm) && method.variant.as_deref().is_none_or(|known| known == variant)
+        method.algorithm.as_deref() == Some(algorithm)
+            && method.variant.as_deref().is_none_or(|known| known == variant)
     };
     once_each(all_methods().filter(is_it).map(|method| &*method.name))
 }

@@ -32,7 +32,8 @@ pub struct RunReport {
     pub task: String,
     /// Its algorithm.
     pub algorithm: String,
-    /// The variant of the algorithm: the kind of guidance for QUAD, such as `quad`, `dac` and `none`, or another algorithm's name.
+    /// The variant of the algorithm: the kind of guidance for QUAD, such as `quad`, `dac` and
+    /// `none`, or another algorithm's name.
     pub variant: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
@@ -54,9 +55,11 @@ pub struct RunReport {
     pub mean_last_3: Option<f64>,
     /// Mean score of the last 5 complete evaluations; absent if they are fewer.
     pub mean_last_5: Option<f64>,
-    /// Mean score of the complete evaluations in the run's last 50,000 steps; absent if it has no more steps than that.
+    /// Mean score of the complete evaluations in the run's last 50,000 steps; absent if it has no
+    /// more steps than that.
     pub mean_last_50000_steps: Option<f64>,
-    /// What its algorithm says of its metrics, such as QUAD of λ, under a name of the algorithm's; absent if nothing.
+    /// What its algorithm says of its metrics, such as QUAD of λ, under a name of the algorithm's;
+    /// absent if nothing.
     #[serde(flatten)]
     pub summary: Option<Summary>,
     /// What tables and figures call the variant.
@@ -105,7 +108,8 @@ impl RunReport {
     pub fn with_scores(path: &Path) -> anyhow::Result<(Self, Vec<ScoreLine>)> {
         let (dir, config) = RunDir::open(path)?;
         let agent = config.experiment.method();
-        let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
+        let agent =
+            agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
         let names = [agent, config.experiment.variant()?.to_owned(), config.experiment.called()?];
         let (scores, judgments) = (dir.read_scores()?, Judgment::read_all(&dir)?);
         Ok((Self { judgments, ..Self::new(path, config, names, &scores) }, scores))
@@ -121,21 +125,28 @@ impl RunReport {
         let (schedule, episodes) = (experiment.schedule(), u64::from(experiment.episodes));
         let planned = by_step.iter().filter(|(step, _)| schedule.is_evaluated(**step));
         let scored: u64 = planned.map(|(_, scored)| episodes.min(scored.len() as u64)).sum();
-        let episodes_missing = schedule.evaluations().saturating_mul(episodes).saturating_sub(scored);
+        let episodes_missing =
+            schedule.evaluations().saturating_mul(episodes).saturating_sub(scored);
         let evaluations: Vec<_> = by_step
             .into_iter()
             .filter_map(|(step, episodes)| {
-                EvaluationReport::of(step, &Vec::from_iter(episodes.into_values()), experiment.episodes)
+                EvaluationReport::of(
+                    step,
+                    &Vec::from_iter(episodes.into_values()),
+                    experiment.episodes,
+                )
             })
             .collect();
-        let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).map(|e| (e.step, e.score.mean)).collect();
+        let complete: Vec<_> =
+            evaluations.iter().filter(|e| e.complete).map(|e| (e.step, e.score.mean)).collect();
         let mean = |evaluations: &[(u64, f64)]| {
             let scores: Vec<_> = evaluations.iter().map(|(_, score)| *score).collect();
             Spread::of(&scores).map(|spread| spread.mean)
         };
         let last = |count: usize| mean(&complete[complete.len().checked_sub(count)?..]);
         let final_steps = experiment.steps.checked_sub(FINAL_STEPS).filter(|start| *start > 0);
-        let in_final_steps = |start| mean(&complete[complete.partition_point(|(step, _)| *step <= start)..]);
+        let in_final_steps =
+            |start| mean(&complete[complete.partition_point(|(step, _)| *step <= start)..]);
         let normalized = environment::find(&experiment.environment).is_ok();
         let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
         Self {
@@ -164,7 +175,8 @@ impl RunReport {
         }
     }
 
-    /// Mean score of as many of the last complete evaluations as its task's published figures are of; absent if they are fewer.
+    /// Mean score of as many of the last complete evaluations as its task's published figures are
+    /// of; absent if they are fewer.
     pub fn score(&self) -> Option<f64> {
         if published::last(&self.task) == 3 { self.mean_last_3 } else { self.mean_last_5 }
     }
@@ -181,7 +193,10 @@ impl RunReport {
 
     /// The best among the evaluations of some steps; of equal ones the last.
     pub fn best_of(&self, is_one: impl Fn(u64) -> bool) -> Option<&EvaluationReport> {
-        let complete = self.evaluations.iter().filter(|evaluation| evaluation.complete && is_one(evaluation.step));
+        let complete = self
+            .evaluations
+            .iter()
+            .filter(|evaluation| evaluation.complete && is_one(evaluation.step));
         complete.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
     }
 
@@ -240,7 +255,8 @@ impl RunReport {
         let mut table = Table::new(&Vec::from_iter(header.into_iter().map(|name| (name, Right))));
         for e in &self.evaluations {
             let episodes = e.episodes.to_string() + if e.complete { "" } else { " (part)" };
-            let mut row = vec![e.step.to_string(), episodes, e.score.text(), format!("{:.1}", e.mean_length)];
+            let mut row =
+                vec![e.step.to_string(), episodes, e.score.text(), format!("{:.1}", e.mean_length)];
             if has_both {
                 row.insert(3, format!("{:.1}", e.mean_return));
             }
@@ -261,7 +277,13 @@ impl RunReport {
         }
         // Writing to a string cannot fail.
         if !self.is_complete() {
-            writeln!(text, "{} episodes have no score: {}", self.episodes_missing, self.how_complete()).ok();
+            writeln!(
+                text,
+                "{} episodes have no score: {}",
+                self.episodes_missing,
+                self.how_complete()
+            )
+            .ok();
         }
         text.push('\n');
         for (name, mean) in [
@@ -274,7 +296,11 @@ impl RunReport {
                 writeln!(text, "mean {} of the {name:19} {mean:.2}", self.measure()).ok();
             }
         }
-        text + &self.summary.as_ref().map(|summary| format!("\n{}", summary.text)).unwrap_or_default()
+        text + &self
+            .summary
+            .as_ref()
+            .map(|summary| format!("\n{}", summary.text))
+            .unwrap_or_default()
     }
 }
 

@@ -9,7 +9,8 @@ pub struct Spread {
     pub mean: f64,
     /// The sample's standard deviation, divided by n - 1; absent for a single value.
     pub std: Option<f64>,
-    /// The population's standard deviation, divided by n, which DAC's code computes; absent for a single value.
+    /// The population's standard deviation, divided by n, which DAC's code computes; absent for a
+    /// single value.
     pub population_std: Option<f64>,
 }
 
@@ -28,7 +29,11 @@ impl Spread {
 
     /// `mean ± std`, by n - 1.
     pub fn text(self) -> String {
-        format!("{:.2}{}", self.mean, self.std.map(|std| format!(" ± {std:.2}")).unwrap_or_default())
+        format!(
+            "{:.2}{}",
+            self.mean,
+            self.std.map(|std| format!(" ± {std:.2}")).unwrap_or_default()
+        )
     }
 
     /// `mean ± std (std)`, by n - 1 and by n.

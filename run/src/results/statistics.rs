@@ -1,8 +1,9 @@
-//! Statistics over runs, each beside its definition. Pure functions: what is random has a seed of its own.
+//! Statistics over runs, each beside its definition. Pure functions: what is random has a seed of
+//! its own.
 //!
-//! Those over tasks are of Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice"
-//! (NeurIPS), as its authors' library rliable computes them. Their strata are the tasks: a task counts as much as any other,
-//! however many seeds it has.
+//! Those over tasks are of Agarwal et al. 2021, "Deep reinforcement learning at the edge of the
+//! statistical precipice" (NeurIPS), as its authors' library rliable computes them. Their strata
+//! are the tasks: a task counts as much as any other, however many seeds it has.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -14,10 +15,12 @@ pub const RESAMPLES: usize = 10_000;
 const EXACT_PAIRS: usize = 16;
 const SEED: u64 = 0;
 
-/// A figure of each run of a method: a list for each task, with a value for each seed. None of them is empty.
+/// A figure of each run of a method: a list for each task, with a value for each seed. None of them
+/// is empty.
 pub type Runs<T = f64> = Vec<Vec<T>>;
 
-/// A statistic, and the ends of its 95 % interval; without these where a task has a single seed, of whose spread nothing is known.
+/// A statistic, and the ends of its 95 % interval; without these where a task has a single seed, of
+/// whose spread nothing is known.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Estimate {
     /// The statistic of the runs themselves.
@@ -31,7 +34,10 @@ pub struct Estimate {
 impl Estimate {
     /// `value [low, high]`.
     pub fn text(self, digits: usize) -> String {
-        let interval = self.low.zip(self.high).map(|(low, high)| format!(" [{low:.digits$}, {high:.digits$}]"));
+        let interval = self
+            .low
+            .zip(self.high)
+            .map(|(low, high)| format!(" [{low:.digits$}, {high:.digits$}]"));
         format!("{:.digits$}{}", self.value, interval.unwrap_or_default())
     }
 }
@@ -51,7 +57,8 @@ pub fn mean_of_means(scores: &Runs) -> f64 {
     over_tasks(scores, mean)
 }
 
-/// The median over tasks of the mean over seeds; of an even number of tasks, the mean of the two in the middle.
+/// The median over tasks of the mean over seeds; of an even number of tasks, the mean of the two in
+/// the middle.
 pub fn median_of_means(scores: &Runs) -> f64 {
     let mut means: Vec<f64> = scores.iter().map(|task| mean(task)).collect();
     means.sort_by(f64::total_cmp);
@@ -60,16 +67,20 @@ pub fn median_of_means(scores: &Runs) -> f64 {
 
 /// The mean distance to an expert's score of 100, in units of it; a score above it has none.
 pub fn optimality_gap(scores: &Runs) -> f64 {
-    over_tasks(scores, |task| task.iter().map(|score| (1.0 - score / 100.0).max(0.0)).sum::<f64>() / task.len() as f64)
+    over_tasks(scores, |task| {
+        task.iter().map(|score| (1.0 - score / 100.0).max(0.0)).sum::<f64>() / task.len() as f64
+    })
 }
 
-/// The interquartile mean (IQM): the mean of the scores of all tasks without the lowest and the highest quarter, ⌊n / 4⌋ of n.
+/// The interquartile mean (IQM): the mean of the scores of all tasks without the lowest and the
+/// highest quarter, ⌊n / 4⌋ of n.
 ///
-/// Where tasks have unequal numbers of seeds, a score weighs as much less as its task has more of them, and the quarters
-/// are those of the weight: ⌊n / 4⌋ / n of it.
+/// Where tasks have unequal numbers of seeds, a score weighs as much less as its task has more of
+/// them, and the quarters are those of the weight: ⌊n / 4⌋ / n of it.
 pub fn interquartile_mean(scores: &Runs) -> f64 {
     let weigh = |task: &Vec<f64>| 1.0 / (task.len() * scores.len()) as f64;
-    let mut weighed: Vec<_> = scores.iter().flat_map(|task| task.iter().map(|s| (*s, weigh(task)))).collect();
+    let mut weighed: Vec<_> =
+        scores.iter().flat_map(|task| task.iter().map(|s| (*s, weigh(task)))).collect();
     weighed.sort_by(|(one, _), (other, _)| one.total_cmp(other));
     let cut = (weighed.len() / 4) as f64 / weighed.len() as f64;
     let (mut below, mut sum) = (0.0f64, 0.0);
@@ -83,11 +94,14 @@ pub fn interquartile_mean(scores: &Runs) -> f64 {
 
 /// A point of the performance profile: the share of runs that score more than this.
 pub fn share_above(scores: &Runs, threshold: f64) -> f64 {
-    over_tasks(scores, |task| task.iter().filter(|score| **score > threshold).count() as f64 / task.len() as f64)
+    over_tasks(scores, |task| {
+        task.iter().filter(|score| **score > threshold).count() as f64 / task.len() as f64
+    })
 }
 
-/// The mean over tasks of P(X > Y): that a run of one method scores more than a run of another. Equal scores count half: it
-/// is the U of Mann and Whitney (1947) over the number of pairs. Both have the same tasks.
+/// The mean over tasks of P(X > Y): that a run of one method scores more than a run of another.
+/// Equal scores count half: it is the U of Mann and Whitney (1947) over the number of pairs. Both
+/// have the same tasks.
 pub fn probability_of_improvement(x: &Runs, y: &Runs) -> f64 {
     let wins = |x: f64, y: f64| if x == y { 0.5 } else { f64::from(u8::from(x > y)) };
     let of_task = |(x, y): (&Vec<f64>, &Vec<f64>)| {
@@ -97,9 +111,12 @@ pub fn probability_of_improvement(x: &Runs, y: &Runs) -> f64 {
     x.iter().zip(y).map(of_task).sum::<f64>() / x.len() as f64
 }
 
-/// Statistics of some methods' runs, with 95 % percentile intervals of the stratified bootstrap: of each method and in each task,
-/// as many seeds are drawn as there are, with replacement.
-pub fn estimates<T: Copy>(methods: &[&Runs<T>], statistics: impl Fn(&[Runs<T>]) -> Vec<f64>) -> Vec<Estimate> {
+/// Statistics of some methods' runs, with 95 % percentile intervals of the stratified bootstrap: of
+/// each method and in each task, as many seeds are drawn as there are, with replacement.
+pub fn estimates<T: Copy>(
+    methods: &[&Runs<T>],
+    statistics: impl Fn(&[Runs<T>]) -> Vec<f64>,
+) -> Vec<Estimate> {
     let mut drawn: Vec<Runs<T>> = methods.iter().map(|runs| (*runs).clone()).collect();
     let values = statistics(&drawn);
     if methods.iter().any(|runs| runs.iter().any(|task| task.len() < 2)) {
@@ -127,14 +144,16 @@ fn percentile(sorted: &[f64], share: f64) -> f64 {
     below + (above - below) * position.fract()
 }
 
-/// The two-sided p-value of paired differences whose mean would be 0 by chance: the share of all ways to choose their signs by
-/// which the mean is as far from 0 as it is (Fisher 1935, "The design of experiments", section 21). Of more than 16 pairs
-/// 10,000 ways are drawn, and the one at hand is counted with them (Phipson and Smyth 2010).
+/// The two-sided p-value of paired differences whose mean would be 0 by chance: the share of all
+/// ways to choose their signs by which the mean is as far from 0 as it is (Fisher 1935, "The design
+/// of experiments", section 21). Of more than 16 pairs 10,000 ways are drawn, and the one at hand
+/// is counted with them (Phipson and Smyth 2010).
 pub fn sign_flip_test(differences: &[f64]) -> f64 {
     // Sums of the same numbers differ in their last bits by their order.
     let extreme = differences.iter().sum::<f64>().abs() * (1.0 - 1e-12);
     let is_as_far = |is_flipped: &mut dyn FnMut(usize) -> bool| {
-        let signed = differences.iter().enumerate().map(|(pair, d)| if is_flipped(pair) { -d } else { *d });
+        let signed =
+            differences.iter().enumerate().map(|(pair, d)| if is_flipped(pair) { -d } else { *d });
         signed.sum::<f64>().abs() >= extreme
     };
     if differences.len() <= EXACT_PAIRS {
@@ -147,8 +166,9 @@ pub fn sign_flip_test(differences: &[f64]) -> f64 {
     (as_far + 1) as f64 / (RESAMPLES + 1) as f64
 }
 
-/// p-values of some comparisons, corrected for their number by Holm's procedure (1979, "A simple sequentially rejective multiple
-/// test procedure"): the i-th smallest of m is multiplied by m − i + 1, and is not below a smaller one's.
+/// p-values of some comparisons, corrected for their number by Holm's procedure (1979, "A simple
+/// sequentially rejective multiple test procedure"): the i-th smallest of m is multiplied by m − i
+/// + 1, and is not below a smaller one's.
 pub fn holm(p_values: &[f64]) -> Vec<f64> {
     let mut order: Vec<usize> = (0..p_values.len()).collect();
     order.sort_by(|one, other| p_values[*one].total_cmp(&p_values[*other]));

@@ -22,11 +22,13 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
-    /// How many a run keeps: the newest, and those that step in for it should it turn out to be damaged.
+    /// How many a run keeps: the newest, and those that step in for it should it turn out to be
+    /// damaged.
     pub const KEPT: usize = 3;
 }
 
-/// The folder `checkpoints` of a run. A file's name has the step and the beginning of the BLAKE3 hash of its contents.
+/// The folder `checkpoints` of a run. A file's name has the step and the beginning of the BLAKE3
+/// hash of its contents.
 #[derive(Clone, Debug)]
 pub(super) struct Checkpoints {
     folder: PathBuf,
@@ -48,18 +50,22 @@ impl Checkpoints {
         Ok(())
     }
 
-    /// The newest that is whole. Those that are not get another ending, so that they do not count as checkpoints any more;
-    /// those that cannot be read stay as they are.
+    /// The newest that is whole. Those that are not get another ending, so that they do not count
+    /// as checkpoints any more; those that cannot be read stay as they are.
     ///
     /// # Errors
-    /// None is whole, and one cannot be read: it may be readable later, and a run should not begin anew before.
+    /// None is whole, and one cannot be read: it may be readable later, and a run should not begin
+    /// anew before.
     pub fn newest(&self) -> Result<Option<Checkpoint>, RunDirError> {
         let mut unreadable = None;
         for path in self.files()? {
             let state = match files::read(&path) {
                 Ok(state) => state,
                 Err(error) => {
-                    warn!("{} cannot be read ({error}); the checkpoint before it is taken", path.display());
+                    warn!(
+                        "{} cannot be read ({error}); the checkpoint before it is taken",
+                        path.display()
+                    );
                     unreadable.get_or_insert(io_error("read", &path)(error));
                     continue;
                 }

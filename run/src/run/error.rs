@@ -15,8 +15,11 @@ pub enum RunDirError {
     /// Another learner works in it.
     #[error("another learner is at work in {0}")]
     InUse(PathBuf),
-    /// Files have no locks there, and a learner on another host has claimed the folder by this file.
-    #[error("files have no locks there, and {0} names another host, on which a learner is or was at work")]
+    /// Files have no locks there, and a learner on another host has claimed the folder by this
+    /// file.
+    #[error(
+        "files have no locks there, and {0} names another host, on which a learner is or was at work"
+    )]
     Claimed(PathBuf),
     /// The folder of a run at work is not there any more.
     #[error("the run's folder {0} was removed or renamed")]
@@ -47,21 +50,31 @@ impl RunDirError {
     /// What to do about it.
     pub fn hint(&self) -> &'static str {
         match self {
-            Self::Occupied(_) => "give the command again to continue that run, or choose another folder by --run-dir",
+            Self::Occupied(_) => {
+                "give the command again to continue that run, or choose another folder by --run-dir"
+            }
             Self::Gone(_) => "put it back, and give the command again to continue; or begin anew",
-            Self::Claimed(_) => "wait for the end of that learner; if it is gone, as with its host, remove that file",
+            Self::Claimed(_) => {
+                "wait for the end of that learner; if it is gone, as with its host, remove that file"
+            }
             Self::InUse(_) => "wait for its end, or choose another folder by --run-dir",
             Self::Content { .. } => {
                 "put a copy of the file in its place; --fresh renames the folder and begins anew. A line of scores.jsonl may \
                  also be taken out: its episode is scored again"
             }
-            Self::Io { action: CREATE, .. } => "choose a folder that you may write to with --run-dir DIR",
+            Self::Io { action: CREATE, .. } => {
+                "choose a folder that you may write to with --run-dir DIR"
+            }
             Self::Io { source, .. } => match source.kind() {
-                ErrorKind::NotFound | ErrorKind::NotADirectory => "is it a folder that `learner train` has written?",
+                ErrorKind::NotFound | ErrorKind::NotADirectory => {
+                    "is it a folder that `learner train` has written?"
+                }
                 ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => {
                     "see to it that you may read and write there, or choose another folder by --run-dir"
                 }
-                ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "make room on that disk (docs/operations.md)",
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+                    "make room on that disk (docs/operations.md)"
+                }
                 _ => "`learner doctor --run-dir DIR` looks at the disk",
             },
         }
@@ -73,6 +86,10 @@ pub(super) fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Err
     move |source| RunDirError::Io { action, path, source }
 }
 
-pub(super) fn content(path: &Path, line: Option<usize>, error: &dyn std::fmt::Display) -> RunDirError {
+pub(super) fn content(
+    path: &Path,
+    line: Option<usize>,
+    error: &dyn std::fmt::Display,
+) -> RunDirError {
     RunDirError::Content { path: path.to_owned(), line, reason: error.to_string() }
 }

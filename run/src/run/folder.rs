@@ -42,7 +42,8 @@ impl RunDir {
         path.join("config.toml").exists()
     }
 
-    /// Makes the folder, locks it and saves the configuration; also gives `scores.jsonl`, which holds the lock.
+    /// Makes the folder, locks it and saves the configuration; also gives `scores.jsonl`, which
+    /// holds the lock.
     ///
     /// # Errors
     /// There is a run in it, another learner is just making one, or it cannot be written to.
@@ -54,7 +55,8 @@ impl RunDir {
         let run = Self::at(path);
         let snapshots = path.join("snapshots");
         files::create_folder(&snapshots).map_err(io_error(CREATE, &snapshots))?;
-        // Of two that begin at once, only one gets past this; and scores of unknown origin are not those of a new run.
+        // Of two that begin at once, only one gets past this; and scores of unknown origin are not
+        // those of a new run.
         let scores = run.score_log()?;
         if Self::is_occupied(path) || !scores.is_empty() {
             return Err(occupied());
@@ -80,7 +82,8 @@ impl RunDir {
     /// Remembers that a run of a sweep has failed, or forgets it.
     pub fn mark_failed(&self, failed: bool) -> Result<(), RunDirError> {
         let path = self.path.join(FAILED);
-        let marked = if failed { files::replace(&path, b"") } else { files::remove_if_there(&path) };
+        let marked =
+            if failed { files::replace(&path, b"") } else { files::remove_if_there(&path) };
         marked.map_err(io_error("write", &path))
     }
 
@@ -116,7 +119,10 @@ impl RunDir {
         let source = self.path.join("config.toml");
         let text = files::read_text(&source).map_err(io_error("read", &source))?;
         let config: RunConfig = toml::from_str(&text).map_err(|error: toml::de::Error| {
-            let line = error.span().and_then(|at| text.get(..at.start)).map(|before| before.matches('\n').count() + 1);
+            let line = error
+                .span()
+                .and_then(|at| text.get(..at.start))
+                .map(|before| before.matches('\n').count() + 1);
             content(&source, line, &error.message())
         })?;
         config.experiment.check_ranges().map_err(|error| content(&source, None, &error))?;
@@ -159,10 +165,12 @@ impl RunDir {
         serde_json::from_str(&text).map_err(|error| content(&path, None, &error))
     }
 
-    /// Writes a value as indented JSON; a reader sees the old file or the new one, never half of it.
+    /// Writes a value as indented JSON; a reader sees the old file or the new one, never half of
+    /// it.
     pub fn write_json(&self, name: &str, value: &impl Serialize) -> Result<(), RunDirError> {
         let path = self.path.join(name);
-        let mut text = serde_json::to_string_pretty(value).map_err(|error| content(&path, None, &error))?;
+        let mut text =
+            serde_json::to_string_pretty(value).map_err(|error| content(&path, None, &error))?;
         text.push('\n');
         files::replace(&path, text.as_bytes()).map_err(io_error("write", &path))
     }
@@ -185,7 +193,9 @@ impl RunDir {
         match fs::create_dir(&folder) {
             // Else a power cut could take what will be in it.
             Ok(()) => files::synchronize_folder(&folder).map_err(io_error("write", &folder)),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Err(RunDirError::Gone(self.path.clone())),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                Err(RunDirError::Gone(self.path.clone()))
+            }
             // It would be written to through the link.
             Err(_) if folder.is_symlink() => Err(io_error("write", &folder)(files::no_file())),
             // There it is, or writing into it will say what is wrong.
@@ -199,7 +209,8 @@ impl RunDir {
         files::read(&path).map_err(io_error("read", &path))
     }
 
-    /// Renames a snapshot whose contents are not what was scored, so that it does not count as one any more.
+    /// Renames a snapshot whose contents are not what was scored, so that it does not count as one
+    /// any more.
     pub fn mark_damaged(&self, step: u64) -> Result<(), RunDirError> {
         let path = self.snapshot_path(step);
         fs::rename(&path, path.with_extension("damaged")).map_err(io_error("rename", &path))
@@ -209,7 +220,10 @@ impl RunDir {
     pub fn remove_partial_files(&self) {
         files::remove_partial_files(&self.path);
         let folders = ["snapshots", "checkpoints"].map(|name| self.path.join(name));
-        folders.iter().filter(|folder| !folder.is_symlink()).for_each(|folder| files::remove_partial_files(folder));
+        folders
+            .iter()
+            .filter(|folder| !folder.is_symlink())
+            .for_each(|folder| files::remove_partial_files(folder));
     }
 
     /// The gradient steps of which there are snapshots, in ascending order; a link is none.
@@ -220,15 +234,23 @@ impl RunDir {
             entries => entries.map_err(io_error("read", &folder))?,
         };
         let step = |entry: io::Result<fs::DirEntry>| {
-            let entry = entry.ok().filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()))?;
-            entry.file_name().to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok()
+            let entry =
+                entry.ok().filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()))?;
+            entry
+                .file_name()
+                .to_str()?
+                .strip_prefix("step_")?
+                .strip_suffix(".safetensors")?
+                .parse()
+                .ok()
         };
         let mut steps: Vec<u64> = entries.filter_map(step).collect();
         steps.sort_unstable();
         Ok(steps)
     }
 
-    /// Saves a state of the training, durably, and removes those that are older than the newest three.
+    /// Saves a state of the training, durably, and removes those that are older than the newest
+    /// three.
     pub fn write_checkpoint(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
         self.make_folder("checkpoints")?;
         Checkpoints::of_run(&self.path).save(checkpoint)
@@ -239,7 +261,8 @@ impl RunDir {
         Checkpoints::of_run(&self.path).newest()
     }
 
-    /// `scores.jsonl`, opened for appending and locked. Each append is synchronized, so acknowledged scores survive a crash.
+    /// `scores.jsonl`, opened for appending and locked. Each append is synchronized, so
+    /// acknowledged scores survive a crash.
     ///
     /// # Errors
     /// [`RunDirError::InUse`] if another learner works in this folder.
@@ -249,8 +272,9 @@ impl RunDir {
         Log::open(path, Some(lock))
     }
 
-    /// `metrics.jsonl`, opened for appending, without the lines after `step`: a learner that continues from there writes them
-    /// again. Also gives the seconds of training that its last line tells.
+    /// `metrics.jsonl`, opened for appending, without the lines after `step`: a learner that
+    /// continues from there writes them again. Also gives the seconds of training that its last
+    /// line tells.
     pub fn metrics_log(&self, step: u64) -> Result<(Log, f64), RunDirError> {
         #[derive(Deserialize)]
         struct Line {
@@ -269,7 +293,8 @@ impl RunDir {
         Ok((log, seconds))
     }
 
-    /// The lines of `scores.jsonl`; none if nothing was scored yet. A last line that is not complete yet is left out.
+    /// The lines of `scores.jsonl`; none if nothing was scored yet. A last line that is not
+    /// complete yet is left out.
     pub fn read_scores(&self) -> Result<Vec<ScoreLine>, RunDirError> {
         let path = self.path.join(SCORES);
         let text = match files::read_text(&path) {

@@ -38,7 +38,8 @@ pub struct ScoreLine {
     pub score: f64,
     /// BLAKE3 of the snapshot's file.
     pub weights: String,
-    /// Arithmetic that the policy was computed in, e.g. `f32-avx2` or `bf16-amx`; lines from before there was a choice do not say.
+    /// Arithmetic that the policy was computed in, e.g. `f32-avx2` or `bf16-amx`; lines from before
+    /// there was a choice do not say.
     #[serde(default)]
     pub precision: String,
     /// Who measured it.
@@ -67,7 +68,8 @@ impl ScoreLine {
     }
 }
 
-/// The lines of `metrics.jsonl` in a run folder; none if there is no such file. The last one may not be complete.
+/// The lines of `metrics.jsonl` in a run folder; none if there is no such file. The last one may
+/// not be complete.
 ///
 /// # Errors
 /// The file cannot be read.

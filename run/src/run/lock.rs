@@ -14,7 +14,8 @@ use rustix::io::Errno;
 use super::error::{RunDirError, io_error};
 use crate::files;
 
-/// A lock that another process has is tried again after this time: `learner list` takes one for microseconds.
+/// A lock that another process has is tried again after this time: `learner list` takes one for
+/// microseconds.
 const GLANCE: Duration = Duration::from_millis(10);
 /// Has the name of this host.
 const HOST: &str = "/proc/sys/kernel/hostname";
@@ -26,8 +27,9 @@ pub struct Lock {
     _claim: Option<Claim>,
 }
 
-/// Stands for a lock where files have none, as on Lustre without `flock`: a file that names the host, so that no other host
-/// takes it; and a socket, which the system gives to one process of this host, and takes back at that process's end.
+/// Stands for a lock where files have none, as on Lustre without `flock`: a file that names the
+/// host, so that no other host takes it; and a socket, which the system gives to one process of
+/// this host, and takes back at that process's end.
 #[derive(Debug)]
 struct Claim {
     path: PathBuf,
@@ -38,7 +40,8 @@ impl Lock {
     /// Locks the file at `path`, which is made if it is missing.
     ///
     /// # Errors
-    /// [`RunDirError::InUse`] if another process has it, [`RunDirError::Claimed`] if another host had it.
+    /// [`RunDirError::InUse`] if another process has it, [`RunDirError::Claimed`] if another host
+    /// had it.
     pub fn take(path: &Path) -> Result<Self, RunDirError> {
         let file = files::append(path).map_err(io_error("open", path))?;
         let again = |_| {
@@ -48,14 +51,16 @@ impl Lock {
         let claim = match file.try_lock().or_else(again) {
             Ok(()) => None,
             Err(TryLockError::WouldBlock) => return Err(in_use(path)),
-            Err(TryLockError::Error(error)) if means_no_locks(&error) => Some(Claim::make(&file, path)?),
+            Err(TryLockError::Error(error)) if means_no_locks(&error) => {
+                Some(Claim::make(&file, path)?)
+            }
             Err(TryLockError::Error(error)) => return Err(io_error("lock", path)(error)),
         };
         Ok(Self { _file: file, _claim: claim })
     }
 
-    /// Locks the file together with others who share it, against a process that wants it alone. Where files have no locks, it does
-    /// nothing.
+    /// Locks the file together with others who share it, against a process that wants it alone.
+    /// Where files have no locks, it does nothing.
     ///
     /// # Errors
     /// [`RunDirError::InUse`] if another process has it alone.
@@ -82,8 +87,8 @@ impl Lock {
         }
     }
 
-    /// Whether another process has the lock of the file alone. Where files have no locks, one that was killed may still seem
-    /// to have it.
+    /// Whether another process has the lock of the file alone. Where files have no locks, one that
+    /// was killed may still seem to have it.
     pub fn is_taken(path: &Path) -> bool {
         let Ok(file) = files::open(path) else { return false };
         match file.try_lock_shared() {
@@ -111,7 +116,9 @@ impl Claim {
             Ok(()) => {}
             // By a process of this host that was killed: the socket was free.
             Err(_) if files::read_text(&path).is_ok_and(|other| other == host) => {}
-            Err(error) if error.kind() == ErrorKind::AlreadyExists => return Err(RunDirError::Claimed(path)),
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+                return Err(RunDirError::Claimed(path));
+            }
             Err(error) => return Err(io_error("write", &path)(error)),
         }
         Ok(Self { path, _socket: socket })
@@ -124,7 +131,8 @@ impl Drop for Claim {
     }
 }
 
-/// Whether a lock was refused because files have none there: the system does not know them, or asks a server that does not.
+/// Whether a lock was refused because files have none there: the system does not know them, or asks
+/// a server that does not.
 fn means_no_locks(error: &io::Error) -> bool {
     error.kind() == ErrorKind::Unsupported || Errno::from_io_error(error) == Some(Errno::NOLCK)
 }

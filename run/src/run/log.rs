@@ -19,13 +19,14 @@ pub struct Log {
     length: u64,
     /// Whether half a line may follow them.
     torn: bool,
-    /// Lock of a file that is synchronized after each write; the run's other file has the same writer and needs none.
+    /// Lock of a file that is synchronized after each write; the run's other file has the same
+    /// writer and needs none.
     lock: Option<Lock>,
 }
 
 impl Log {
-    /// Opens or makes the file. With its lock, it is synchronized after each write. Half a line at its end, which a crash left,
-    /// is cut off.
+    /// Opens or makes the file. With its lock, it is synchronized after each write. Half a line at
+    /// its end, which a crash left, is cut off.
     ///
     /// # Errors
     /// The file cannot be opened or changed.
@@ -34,7 +35,10 @@ impl Log {
         let mut log = Self { path, file, length: 0, torn: true, lock };
         log.length = whole_lines(&log.bytes()?) as u64;
         // Lines that a killed process did not synchronize count from now on.
-        let durable = log.mend().and_then(|()| log.synchronize()).and_then(|()| files::synchronize_folder(&log.path));
+        let durable = log
+            .mend()
+            .and_then(|()| log.synchronize())
+            .and_then(|()| files::synchronize_folder(&log.path));
         durable.map_err(io_error("open", &log.path))?;
         Ok(log)
     }
@@ -48,7 +52,8 @@ impl Log {
     pub fn append<T: Serialize>(&mut self, lines: &[T]) -> Result<(), RunDirError> {
         let mut text = Vec::new();
         for line in lines {
-            serde_json::to_writer(&mut text, line).map_err(|error| content(&self.path, None, &error))?;
+            serde_json::to_writer(&mut text, line)
+                .map_err(|error| content(&self.path, None, &error))?;
             text.push(b'\n');
         }
         self.write(&text).map_err(io_error("write", &self.path))
@@ -83,8 +88,12 @@ impl Log {
     }
 
     /// Cuts off every line from the first one on that is not to be kept.
-    pub(super) fn keep_while(&mut self, mut keep: impl FnMut(&str) -> bool) -> Result<(), RunDirError> {
-        // A power cut may leave anything in a file that was not synchronized; what is no text is not kept either.
+    pub(super) fn keep_while(
+        &mut self,
+        mut keep: impl FnMut(&str) -> bool,
+    ) -> Result<(), RunDirError> {
+        // A power cut may leave anything in a file that was not synchronized; what is no text is
+        // not kept either.
         let bytes = self.bytes()?;
         let lines = bytes.split_inclusive(|&byte| byte == b'\n');
         let kept = lines.take_while(|line| std::str::from_utf8(line).is_ok_and(&mut keep));
@@ -98,8 +107,8 @@ impl Log {
     }
 }
 
-/// The whole lines that a file has beyond its first `read` bytes, which then count as read; none if it is not there. A file
-/// that has become shorter is read from its beginning.
+/// The whole lines that a file has beyond its first `read` bytes, which then count as read; none if
+/// it is not there. A file that has become shorter is read from its beginning.
 pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
     let mut file = match files::open(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),

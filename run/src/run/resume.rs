@@ -1,4 +1,5 @@
-//! A run folder that is there already: whether this learner may continue in it, and what an earlier one left.
+//! A run folder that is there already: whether this learner may continue in it, and what an earlier
+//! one left.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -43,7 +44,8 @@ pub struct Past {
     pub scores: BTreeMap<u64, Earlier>,
 }
 
-/// Opens and locks the folder if there is a run in it, to continue it or, for a `fresh` one, to set it aside.
+/// Opens and locks the folder if there is a run in it, to continue it or, for a `fresh` one, to set
+/// it aside.
 ///
 /// # Errors
 /// Another learner is at work there, or a file is not what a learner writes.
@@ -67,13 +69,15 @@ impl Begun {
         let (old, new) = (settings::of_run(begun), settings::of_run(config));
         let value = |settings: &settings::Settings, key: &String| settings.get(key).cloned();
         let line = |key: &String| {
-            let [old, new] = [&old, &new].map(|side| value(side, key).unwrap_or_else(|| "not set".to_owned()));
+            let [old, new] =
+                [&old, &new].map(|side| value(side, key).unwrap_or_else(|| "not set".to_owned()));
             format!("{key}: {old} there, {new} here")
         };
         let differences: Vec<_> = settings::differences(&old, &new).map(line).collect();
         if !differences.is_empty() {
             let (path, differences) = (self.dir.path().display(), differences.join("; "));
-            let error = anyhow!("there is a run of another configuration in {path} ({differences})");
+            let error =
+                anyhow!("there is a run of another configuration in {path} ({differences})");
             return Err(hinted(
                 error,
                 "choose another --run-dir; or --fresh, which renames that folder and begins anew",
@@ -81,7 +85,9 @@ impl Begun {
         }
         if begun.run.version != config.run.version {
             let (old, new) = (&begun.run.version, &config.run.version);
-            warn!("the run was begun by version {old}, this is {new}: its numbers may differ from here on");
+            warn!(
+                "the run was begun by version {old}, this is {new}: its numbers may differ from here on"
+            );
         }
         Ok(())
     }
@@ -122,7 +128,9 @@ impl Past {
             }
             match dir.read_snapshot(of).map(|tensors| Hash::of(&tensors)) {
                 Ok(hash) if scored.is_some_and(|scored| scored.weights != hash.to_string()) => {
-                    warn!("the snapshot of step {of} is not the one that was scored: its file is damaged");
+                    warn!(
+                        "the snapshot of step {of} is not the one that was scored: its file is damaged"
+                    );
                     dir.mark_damaged(of)?;
                 }
                 Ok(hash) => drop(snapshots.insert(of, hash)),
@@ -141,11 +149,15 @@ impl Past {
     fn summary(&self, dir: &RunDir) -> String {
         let step = self.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         let scores: usize = self.scores.values().map(|earlier| earlier.episodes.len()).sum();
-        format!("the run in {} continues after step {step}; {scores} episodes are scored", dir.path().display())
+        format!(
+            "the run in {} continues after step {step}; {scores} episodes are scored",
+            dir.path().display()
+        )
     }
 }
 
-/// The scores of each step, which all are of the same weights, with each seed once; or what is wrong with them.
+/// The scores of each step, which all are of the same weights, with each seed once; or what is
+/// wrong with them.
 fn by_step(lines: Vec<ScoreLine>) -> Result<BTreeMap<u64, Earlier>, String> {
     let mut scores: BTreeMap<u64, Earlier> = BTreeMap::new();
     let mut seen = BTreeSet::new();

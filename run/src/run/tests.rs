@@ -81,7 +81,8 @@ fn a_run_that_begins_or_goes_on_is_no_longer_called_failed() {
 fn metrics_of_steps_that_come_again_are_cut_off() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap().0;
-    let row = |step: u64| serde_json::json!({ "step": step, "seconds": step as f64 / 10.0, "eta": 1.0 });
+    let row =
+        |step: u64| serde_json::json!({ "step": step, "seconds": step as f64 / 10.0, "eta": 1.0 });
     let (mut log, seconds) = run.metrics_log(0).unwrap();
     assert_eq!(seconds, 0.0);
     log.append(&[row(100), row(200), row(300)]).unwrap();
@@ -90,8 +91,10 @@ fn metrics_of_steps_that_come_again_are_cut_off() {
     assert_eq!(seconds, 20.0);
     log.append(&[row(300)]).unwrap();
     let text = std::fs::read_to_string(run.path().join("metrics.jsonl")).unwrap();
-    let steps: Vec<_> =
-        text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["step"].clone()).collect();
+    let steps: Vec<_> = text
+        .lines()
+        .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["step"].clone())
+        .collect();
     assert_eq!(steps, [100, 200, 300]);
 }
 
@@ -123,11 +126,14 @@ fn scores_survive_a_reopened_log_and_an_unfinished_line_is_left_out() {
 #[test]
 fn no_link_is_written_through() {
     let folder = tempfile::tempdir().unwrap();
-    let [path, precious, missing] = ["a", "precious", "missing"].map(|name| folder.path().join(name));
+    let [path, precious, missing] =
+        ["a", "precious", "missing"].map(|name| folder.path().join(name));
     std::fs::write(&precious, "no line of a log").unwrap();
     let (run, log) = RunDir::create(&path, &config("a", 0)).unwrap();
     drop(log);
-    for name in ["endpoints.json.partial", "metrics.jsonl", "scores.jsonl", "failed", "judgments.json"] {
+    for name in
+        ["endpoints.json.partial", "metrics.jsonl", "scores.jsonl", "failed", "judgments.json"]
+    {
         std::fs::remove_file(path.join(name)).ok();
         symlink(&precious, path.join(name)).unwrap();
     }
@@ -141,7 +147,10 @@ fn no_link_is_written_through() {
 
     std::fs::remove_file(path.join("scores.jsonl")).unwrap();
     symlink(&missing, path.join("scores.jsonl")).unwrap();
-    assert!(run.score_log().is_err() && !missing.exists(), "not even a lock makes the file that a link names");
+    assert!(
+        run.score_log().is_err() && !missing.exists(),
+        "not even a lock makes the file that a link names"
+    );
 }
 
 /// Snapshots of another run would be overwritten, and half files of other programs removed.
@@ -157,7 +166,10 @@ fn no_folder_is_written_to_through_a_link() {
     symlink(&other, path.join("snapshots")).unwrap();
     run.remove_partial_files();
     assert!(run.write_snapshot(10, b"weights").is_err() && other.join("download.partial").exists());
-    assert_eq!(std::fs::read_to_string(other.join("step_000000010.safetensors")).unwrap(), "precious");
+    assert_eq!(
+        std::fs::read_to_string(other.join("step_000000010.safetensors")).unwrap(),
+        "precious"
+    );
 }
 
 /// A pipe that no program writes to, and a file that seems to have more bytes than any memory.
@@ -176,10 +188,12 @@ fn what_is_no_file_of_a_learners_is_not_waited_for_and_not_read() {
     let (tell, told) = channel();
     let reader = run.clone();
     std::thread::spawn(move || {
-        let refused = [20, 30].map(|step| anyhow::Error::from(reader.read_snapshot(step).unwrap_err()));
+        let refused =
+            [20, 30].map(|step| anyhow::Error::from(reader.read_snapshot(step).unwrap_err()));
         tell.send((refused.map(|error| format!("{error:#}")), reader.newest_checkpoint()))
     });
-    let ([pipe, huge], newest) = told.recv_timeout(Duration::from_secs(60)).expect("it waits for a pipe");
+    let ([pipe, huge], newest) =
+        told.recv_timeout(Duration::from_secs(60)).expect("it waits for a pipe");
     assert!(pipe.contains("a pipe") && huge.contains("too large"), "{pipe}, {huge}");
     assert_eq!(newest.unwrap().map(|checkpoint| checkpoint.step), Some(10));
 }
@@ -193,7 +207,10 @@ fn a_folder_of_snapshots_that_was_removed_is_made_again_and_a_run_that_was_remov
     std::fs::remove_dir_all(path.join("snapshots")).unwrap();
     assert_eq!(run.snapshots().unwrap(), [] as [u64; 0]);
     run.write_snapshot(10, b"weights").unwrap();
-    assert_eq!((run.snapshots().unwrap(), run.read_snapshot(10).unwrap()), (vec![10], b"weights".to_vec()));
+    assert_eq!(
+        (run.snapshots().unwrap(), run.read_snapshot(10).unwrap()),
+        (vec![10], b"weights".to_vec())
+    );
     std::fs::remove_dir_all(&path).unwrap();
     let error = run.write_snapshot(20, b"weights").unwrap_err();
     assert!(matches!(&error, RunDirError::Gone(gone) if *gone == path), "{error}");

@@ -1,4 +1,5 @@
-//! `learner verify`: reads a run's folder and nothing else, and says whether what a run promises has held.
+//! `learner verify`: reads a run's folder and nothing else, and says whether what a run promises
+//! has held.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -14,7 +15,8 @@ use crate::config::settings;
 /// Findings of one kind that are listed one by one; the others are counted.
 const LISTED: usize = 5;
 
-/// Evaluators compute in f32 or bf16, by the fastest instructions of their CPU, and each of these rounds in its own way.
+/// Evaluators compute in f32 or bf16, by the fastest instructions of their CPU, and each of these
+/// rounds in its own way.
 const OTHER_ARITHMETIC: &str =
     "not comparable, because the evaluators computed in another precision or by other instructions";
 
@@ -57,7 +59,8 @@ impl fmt::Display for Findings {
     }
 }
 
-/// Checks that each episode of each evaluation of a run is scored exactly once, with the weights that are on disk.
+/// Checks that each episode of each evaluation of a run is scored exactly once, with the weights
+/// that are on disk.
 ///
 /// # Errors
 /// There is no run in the folder, or a file cannot be read.
@@ -76,10 +79,14 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let mut seen = BTreeSet::new();
     for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
         let name = format!("step {step}, seed {seed}");
-        let hash = hashes.entry(step).or_insert_with(|| hash(&dir, step).ok().map(|hash| hash.to_string()));
+        let hash = hashes
+            .entry(step)
+            .or_insert_with(|| hash(&dir, step).ok().map(|hash| hash.to_string()));
         match hash {
             None => found.add("scored, but the snapshot is gone", name.clone()),
-            Some(hash) if *hash != weights => found.add("scored with other weights than are on disk", name.clone()),
+            Some(hash) if *hash != weights => {
+                found.add("scored with other weights than are on disk", name.clone())
+            }
             Some(_) => {}
         }
         if !(episode_return.is_finite() && score.is_finite()) {
@@ -96,10 +103,16 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     }
     let missing = found.expected - found.found;
     if missing > 0 {
-        // Counted, and only the first ones made: a run that has no end plans more than memory holds.
+        // Counted, and only the first ones made: a run that has no end plans more than memory
+        // holds.
         let unscored = |(step, seed): &(u64, u64)| !seen.contains(&(*step, *seed));
-        let all = schedule.evaluated_steps().flat_map(|step| planned(step).into_iter().map(move |seed| (step, seed)));
-        let first = all.filter(unscored).take(LISTED).map(|(step, seed)| format!("step {step}, seed {seed}"));
+        let all = schedule
+            .evaluated_steps()
+            .flat_map(|step| planned(step).into_iter().map(move |seed| (step, seed)));
+        let first = all
+            .filter(unscored)
+            .take(LISTED)
+            .map(|(step, seed)| format!("step {step}, seed {seed}"));
         found.wrong.insert("without a score", (missing, first.collect()));
     }
     Ok(found)
@@ -110,8 +123,8 @@ fn hash(dir: &RunDir, step: u64) -> Result<Hash, RunDirError> {
     Ok(Hash::of(&dir.read_snapshot(step)?))
 }
 
-/// Checks that each score and each snapshot of a run is in another run of the same configuration, too, bit for bit: what was
-/// found of scores, and of snapshots.
+/// Checks that each score and each snapshot of a run is in another run of the same configuration,
+/// too, bit for bit: what was found of scores, and of snapshots.
 ///
 /// # Errors
 /// As [`verify`].
@@ -150,7 +163,11 @@ pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> 
 
 fn compare_snapshots(dir: &RunDir, other: &RunDir) -> Result<Findings, RunDirError> {
     let (ours, theirs) = (dir.snapshots()?, other.snapshots()?);
-    let mut found = Findings { what: "snapshots are compared", expected: ours.len() as u64, ..Findings::default() };
+    let mut found = Findings {
+        what: "snapshots are compared",
+        expected: ours.len() as u64,
+        ..Findings::default()
+    };
     if ours.is_empty() {
         // Each run ends with one.
         found.add("nothing to compare", format!("{} has no snapshot", dir.path().display()));

@@ -49,7 +49,10 @@ pub fn list(dirs: &[PathBuf]) -> Vec<Entry> {
     let mut entries = Vec::new();
     for asked in dirs {
         let mut add = |dir: &Path, found: anyhow::Result<Listed>| {
-            let below = dir.strip_prefix(asked).ok().filter(|below| dirs.len() == 1 && *below != Path::new(""));
+            let below = dir
+                .strip_prefix(asked)
+                .ok()
+                .filter(|below| dirs.len() == 1 && *below != Path::new(""));
             let error = found.as_ref().err().map(|error| format!("{error:#}").replace('\n', " "));
             let name = below.unwrap_or(dir).display().to_string();
             entries.push(Entry { name, dir: dir.to_owned(), run: found.ok(), error });
@@ -88,7 +91,8 @@ impl Listed {
         let (state, newest) = (State::of(&report)?, report.newest());
         let variant = Some(&report.variant).filter(|variant| **variant != report.algorithm);
         Ok(Self {
-            method: report.algorithm.clone() + &variant.map(|variant| format!(", {variant}")).unwrap_or_default(),
+            method: report.algorithm.clone()
+                + &variant.map(|variant| format!(", {variant}")).unwrap_or_default(),
             step: state.step(report.steps),
             steps: report.steps,
             state: state.text(report.steps),

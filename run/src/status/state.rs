@@ -35,7 +35,8 @@ impl State {
     /// The folder of its snapshots cannot be read.
     pub fn of(report: &RunReport) -> Result<Self, RunDirError> {
         let (dir, experiment) = (RunDir::at(&report.dir), &report.config.experiment);
-        let trained = experiment.eval_interval > 0 || dir.snapshots()?.last() == Some(&experiment.steps);
+        let trained =
+            experiment.eval_interval > 0 || dir.snapshots()?.last() == Some(&experiment.steps);
         let step = || rows(dir.path()).last().map_or(0, |row| row.step);
         Ok(match (report.is_complete() && trained, dir.has_failed()) {
             (true, _) => Self::Complete,
@@ -88,7 +89,10 @@ impl Pace {
             _ => 0.0,
         };
         let report = RunReport::scored(dir).ok();
-        let score = report.as_ref().and_then(RunReport::newest).map(|newest| (newest.step, newest.score.mean));
+        let score = report
+            .as_ref()
+            .and_then(RunReport::newest)
+            .map(|newest| (newest.step, newest.score.mean));
         Self { step: rows.last().map_or(0, |row| row.step), rate, score }
     }
 }
@@ -115,5 +119,8 @@ fn rows(dir: &Path) -> Vec<Row> {
         files::rest(&mut file, length.saturating_sub(TAIL))
     };
     let bytes = read().unwrap_or_default();
-    bytes.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect()
+    bytes
+        .split(|byte| *byte == b'\n')
+        .filter_map(|line| serde_json::from_slice(line).ok())
+        .collect()
 }

@@ -43,7 +43,10 @@ fn a_name_changes_no_table() {
             (Style::Latex, format!("{latex} \\\\")),
         ] {
             let rendered = table.render(style);
-            assert!(rendered.lines().any(|line| line == cell), "{cell:?} is missing in {rendered:?}");
+            assert!(
+                rendered.lines().any(|line| line == cell),
+                "{cell:?} is missing in {rendered:?}"
+            );
         }
     }
 }

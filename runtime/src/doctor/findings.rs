@@ -50,7 +50,8 @@ impl Findings {
 impl fmt::Display for Findings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let lines = self.0.iter().map(|Finding { verdict, check, what, hint }| {
-            let hint = hint.as_ref().map(|hint| format!("\n      hint: {hint}")).unwrap_or_default();
+            let hint =
+                hint.as_ref().map(|hint| format!("\n      hint: {hint}")).unwrap_or_default();
             format!("{:4}  {check:11}  {what}{hint}", verdict.replace("fail", "FAIL"))
         });
         f.write_str(&lines.collect::<Vec<_>>().join("\n"))

@@ -20,12 +20,15 @@ const CONNECT: Duration = Duration::from_secs(3);
 /// Time limit of a connection with Zenoh's own handshake, and perhaps TLS's.
 const SESSION: Duration = Duration::from_secs(5);
 
-/// Checks the certificates in `folder`, which must be for `role`. Returns them if a connection can be tried with them.
+/// Checks the certificates in `folder`, which must be for `role`. Returns them if a connection can
+/// be tried with them.
 pub fn certificates(findings: &mut Findings, folder: &Path, role: Role) -> Option<Certificates> {
     let found = Certificates::check(folder, role);
     match &found {
         Err(error) => findings.fail("certificate", error.to_string(), error.hint()),
-        Ok(soon) if soon.expire_soon() => findings.warn("certificate", soon.to_string(), "make a new one before then"),
+        Ok(soon) if soon.expire_soon() => {
+            findings.warn("certificate", soon.to_string(), "make a new one before then")
+        }
         Ok(good) => findings.ok("certificate", good.to_string()),
     }
     found.ok()
@@ -34,17 +37,21 @@ pub fn certificates(findings: &mut Findings, folder: &Path, role: Role) -> Optio
 /// Checks whether a learner can listen at a port of this machine.
 pub fn port(findings: &mut Findings, port: u16) {
     match TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
-        Ok(_) => findings.ok("port", format!("tcp/127.0.0.1:{port} is free for the learner to listen at")),
+        Ok(_) => findings
+            .ok("port", format!("tcp/127.0.0.1:{port} is free for the learner to listen at")),
         Err(error) => {
-            let hint =
-                "if another learner has it, choose a free one by --listen tcp/127.0.0.1:0, or a router by --connect";
-            findings.warn("port", format!("tcp/127.0.0.1:{port} cannot be listened at: {error}"), hint);
+            let hint = "if another learner has it, choose a free one by --listen tcp/127.0.0.1:0, or a router by --connect";
+            findings.warn(
+                "port",
+                format!("tcp/127.0.0.1:{port} cannot be listened at: {error}"),
+                hint,
+            );
         }
     }
 }
 
-/// Connects to the first endpoint, by TCP alone and then with Zenoh, and does the further checks over the session if there is
-/// one.
+/// Connects to the first endpoint, by TCP alone and then with Zenoh, and does the further checks
+/// over the session if there is one.
 ///
 /// # Errors
 /// No thread can be started, or the further checks cannot be done.
@@ -67,15 +74,18 @@ pub fn connected(
 async fn connect(findings: &mut Findings, endpoints: &Endpoints) -> Option<Session> {
     let endpoint = endpoints.connect.first()?;
     let address = address_of(endpoint);
-    let reached =
-        timeout(CONNECT, TcpStream::connect(address)).await.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()));
+    let reached = timeout(CONNECT, TcpStream::connect(address))
+        .await
+        .unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()));
     if let Err(error) = reached {
         let hint = match error.kind() {
             ErrorKind::ConnectionRefused => {
                 "that machine is there, but nothing listens at this port: is the learner or router started, and does \
                  it listen for other machines, as at tcp/0.0.0.0:7447, or only at 127.0.0.1?"
             }
-            ErrorKind::TimedOut => "does a firewall drop what goes to this port, or is the address of another network?",
+            ErrorKind::TimedOut => {
+                "does a firewall drop what goes to this port, or is the address of another network?"
+            }
             _ => "is the name spelled right, and is there a network?",
         };
         findings.fail("connection", format!("{address}: {error}"), hint);
@@ -87,7 +97,9 @@ async fn connect(findings: &mut Findings, endpoints: &Endpoints) -> Option<Sessi
             return Some(session);
         }
         Ok(Err(error)) => format!("{endpoint}: {error}"),
-        Err(_) => format!("something listens at {address}, but there is no Zenoh session with it after {SESSION:?}"),
+        Err(_) => format!(
+            "something listens at {address}, but there is no Zenoh session with it after {SESSION:?}"
+        ),
     };
     let hint = "is it a learner or a Zenoh router, of the same protocol (tcp or tls), with certificates of the same authority?";
     findings.fail("connection", reason, hint);

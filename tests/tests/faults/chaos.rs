@@ -1,6 +1,8 @@
-//! Fault upon fault at random moments, and at the end a run that is, bit for bit, the one that nothing happened to.
+//! Fault upon fault at random moments, and at the end a run that is, bit for bit, the one that
+//! nothing happened to.
 //!
-//! QUAD_FAULTS says how many faults there are in the long test, and QUAD_FAULTS_SEED chooses others.
+//! QUAD_FAULTS says how many faults there are in the long test, and QUAD_FAULTS_SEED chooses
+//! others.
 
 use std::thread::sleep;
 use std::time::{Duration, Instant};
@@ -21,8 +23,14 @@ const STEPS_PER_FAULT: u64 = 12_000;
 /// Lets so many faults of those kinds happen.
 fn endure(faults: &[Fault], count: u64) {
     let steps = STEPS_PER_FAULT * count;
-    let setting =
-        Setting { steps, eval_interval: STEPS_PER_FAULT / 2, episodes: 4, candidates: 20, hidden: 64, seed: 9 };
+    let setting = Setting {
+        steps,
+        eval_interval: STEPS_PER_FAULT / 2,
+        episodes: 4,
+        candidates: 20,
+        hidden: 64,
+        seed: 9,
+    };
     let begin = Instant::now();
     let scratch = Scratch::new();
     let mut calm = scratch.learner("calm", setting);

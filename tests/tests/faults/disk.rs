@@ -14,11 +14,18 @@ use quad_tests::{PATIENCE, http};
 use zenoh::Session;
 
 /// Seconds of training, also where a step takes 50 µs: things happen in the middle of it.
-pub const SETTING: Setting =
-    Setting { steps: 40_000, eval_interval: 5_000, episodes: 4, candidates: 2, hidden: 32, seed: 2 };
+pub const SETTING: Setting = Setting {
+    steps: 40_000,
+    eval_interval: 5_000,
+    episodes: 4,
+    candidates: 2,
+    hidden: 32,
+    seed: 2,
+};
 pub const LISTEN: [&str; 4] = ["--listen", "tcp/127.0.0.1:0", "--checkpoint-seconds", "0"];
 
-/// The steps of the snapshots that are published from now on, and whether each was on the disk by then.
+/// The steps of the snapshots that are published from now on, and whether each was on the disk by
+/// then.
 async fn watch(learner: &Learner) -> (Session, Arc<Mutex<Vec<(u64, bool)>>>) {
     let session = client(&learner.endpoint()).await;
     let published = Arc::new(Mutex::new(Vec::new()));
@@ -51,19 +58,28 @@ async fn a_full_disk_delays_snapshots_scores_and_checkpoints_until_there_is_room
     learner.wait_for_scores(0);
     disk.fill();
     learner.wait_for_metric("disk_trouble", "", |trouble| trouble > 0.0);
-    let (steps, scores) = (learner.metric("gradient_steps_total", "").unwrap(), learner.scores().len());
+    let (steps, scores) =
+        (learner.metric("gradient_steps_total", "").unwrap(), learner.scores().len());
     learner.process.wait_for_log("No space left on device", PATIENCE);
     assert_unwell(&learner, "the run cannot be saved");
     // By now, snapshots have been due as well.
     let later = steps + 2.0 * setting.eval_interval as f64;
-    learner.wait_for_metric("gradient_steps_total", "", |now| now == setting.steps as f64 || now > later);
-    assert!(learner.scores().len() <= scores + 8, "a score counts as kept though there was no room for it");
+    learner.wait_for_metric("gradient_steps_total", "", |now| {
+        now == setting.steps as f64 || now > later
+    });
+    assert!(
+        learner.scores().len() <= scores + 8,
+        "a score counts as kept though there was no room for it"
+    );
 
     disk.clear();
     learner.process.wait_for_log("the run can be saved again", PATIENCE);
     learner.assert_completes(PATIENCE);
     let published = published.lock().unwrap();
-    assert!(published.len() > 2 && published.iter().all(|(_, kept)| *kept), "published before written: {published:?}");
+    assert!(
+        published.len() > 2 && published.iter().all(|(_, kept)| *kept),
+        "published before written: {published:?}"
+    );
 }
 
 #[test]
@@ -84,6 +100,10 @@ fn scores_wait_for_a_disk_that_is_full_and_that_is_told() {
     disk.clear();
     learner.process.wait_for_log("scores can be saved again", PATIENCE);
     learner.assert_completes(PATIENCE);
-    let measured = http::sum(&http::metrics(&evaluator.metrics()).unwrap(), "quad_evaluator_episodes_total", "");
+    let measured = http::sum(
+        &http::metrics(&evaluator.metrics()).unwrap(),
+        "quad_evaluator_episodes_total",
+        "",
+    );
     assert_eq!(measured, 8.0, "nothing is measured twice");
 }

@@ -26,9 +26,10 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
     assert!(next < SETTING.steps, "the training was over too soon");
     let launcher = launcher("fsync", &learner.snapshot(next));
     // After one signal it ends itself when its time is over, two end it at once.
-    for (signals, code, reason) in
-        [(1, 75, "9 s after SIGTERM something has not ended"), (2, 130, "received SIGTERM after SIGTERM")]
-    {
+    for (signals, code, reason) in [
+        (1, 75, "9 s after SIGTERM something has not ended"),
+        (2, 130, "received SIGTERM after SIGTERM"),
+    ] {
         let mut learner = scratch.learner_through(&launcher, "run", SETTING, &LISTEN);
         learner.process.wait_for_log("continues after step", PATIENCE);
         learner.wait_for_metric("gradient_steps_total", "", |steps| steps == SETTING.steps as f64);
@@ -42,7 +43,11 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
         }
         let status = learner.process.wait(PATIENCE);
         assert_eq!(status.code(), Some(code), "{status}");
-        assert!(learner.process.log().contains(reason), "after {signals} signals: {}", learner.process.log());
+        assert!(
+            learner.process.log().contains(reason),
+            "after {signals} signals: {}",
+            learner.process.log()
+        );
     }
 
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);

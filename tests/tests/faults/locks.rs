@@ -14,13 +14,19 @@ fn where_files_have_no_locks_a_folder_is_still_one_learners() {
     let [scratch, beside] = [Scratch::new(), Scratch::new()];
     let launcher = preload("no_locks");
     let folder = scratch.path().join("run");
-    let start = |from: &Scratch| from.learner_through(&launcher, folder.to_str().unwrap(), ENDLESS, &LISTEN);
+    let start = |from: &Scratch| {
+        from.learner_through(&launcher, folder.to_str().unwrap(), ENDLESS, &LISTEN)
+    };
     let mut first = start(&scratch);
     let _evaluator = scratch.evaluator("one", &first.endpoint());
     first.wait_for_scores(0);
     let mut second = start(&beside);
     assert_eq!(second.process.wait(PATIENCE).code(), Some(75), "{}", second.process.log());
-    assert!(second.process.log().contains("another learner is at work in"), "{}", second.process.log());
+    assert!(
+        second.process.log().contains("another learner is at work in"),
+        "{}",
+        second.process.log()
+    );
 
     // One that was killed on this host keeps no learner out.
     first.process.kill();
@@ -37,5 +43,8 @@ fn where_files_have_no_locks_a_folder_is_still_one_learners() {
     let mut third = start(&scratch);
     assert_eq!(third.process.wait(PATIENCE).code(), Some(1), "{}", third.process.log());
     let log = third.process.log();
-    assert!(log.contains("scores.host") && log.contains("hint: wait for the end of that learner"), "{log}");
+    assert!(
+        log.contains("scores.host") && log.contains("hint: wait for the end of that learner"),
+        "{log}"
+    );
 }

@@ -26,14 +26,16 @@ const EPISODE: Duration = Duration::from_millis(10);
 /// A score: step, seed, weights.
 type Key = (u64, u64, String);
 
-/// A learner on a disk that forgets what was not synchronized, evaluators, and a router that outlives it.
+/// A learner on a disk that forgets what was not synchronized, evaluators, and a router that
+/// outlives it.
 struct System {
     setting: Setting,
     scratch: Scratch,
     disk: Disk,
     endpoint: String,
     crowd: Crowd,
-    /// The scores that the learner has acknowledged, or that were on its disk when another one began.
+    /// The scores that the learner has acknowledged, or that were on its disk when another one
+    /// began.
     promised: BTreeSet<Key>,
     _router: Session,
     runtime: Runtime,
@@ -42,21 +44,37 @@ struct System {
 impl System {
     fn start(cuts: u64) -> System {
         let steps = STEPS_PER_CUT * cuts;
-        let setting = Setting { steps, eval_interval: 1200, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
-        // Beside the test's program: where a container keeps temporary files, its filesystem may fail when a program that
-        // writes is killed.
+        let setting =
+            Setting { steps, eval_interval: 1200, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
+        // Beside the test's program: where a container keeps temporary files, its filesystem may
+        // fail when a program that writes is killed.
         let program = std::env::current_exe().unwrap();
         let scratch = Scratch::inside(program.parent().unwrap());
-        let (disk, endpoint, runtime) = (Disk::new(scratch.path()), free_endpoint(), Runtime::new().unwrap());
+        let (disk, endpoint, runtime) =
+            (Disk::new(scratch.path()), free_endpoint(), Runtime::new().unwrap());
         let session = runtime.block_on(router(&endpoint));
         let crowd = runtime.block_on(Crowd::connect(2, EPISODE, &name("run"), &endpoint));
-        System { setting, scratch, disk, endpoint, crowd, promised: BTreeSet::new(), _router: session, runtime }
+        System {
+            setting,
+            scratch,
+            disk,
+            endpoint,
+            crowd,
+            promised: BTreeSet::new(),
+            _router: session,
+            runtime,
+        }
     }
 
     /// Its run's folder and the folder above it are not there at first.
     fn learner(&self) -> Learner {
         let arguments = ["--connect", &self.endpoint, "--checkpoint-seconds", "0"];
-        self.scratch.learner_through(&self.disk.launcher(), "disk/runs/run", self.setting, &arguments)
+        self.scratch.learner_through(
+            &self.disk.launcher(),
+            "disk/runs/run",
+            self.setting,
+            &arguments,
+        )
     }
 
     /// Lets a learner run into a random moment: mostly of its training, at times of its start.
@@ -94,7 +112,8 @@ impl System {
             assert!(left.contains(score), "{score:?} was acknowledged, but is not on the disk");
         }
         for (step, seed, weights) in left {
-            let snapshot = Hash::of(&fs::read(learner.snapshot(step)).unwrap_or_default()).to_string();
+            let snapshot =
+                Hash::of(&fs::read(learner.snapshot(step)).unwrap_or_default()).to_string();
             assert_eq!(snapshot, weights, "the snapshot of step {step}, scored with seed {seed}");
         }
     }
@@ -104,13 +123,18 @@ impl System {
         let mut learner = self.learner();
         learner.assert_completes(3 * PATIENCE);
         let mut calm = self.scratch.learner("calm", self.setting);
-        let _crowd = self.runtime.block_on(Crowd::connect(2, EPISODE, &name("calm"), &calm.endpoint()));
+        let _crowd =
+            self.runtime.block_on(Crowd::connect(2, EPISODE, &name("calm"), &calm.endpoint()));
         calm.assert_completes(3 * PATIENCE);
         learner.assert_same_as(&calm);
         // A run that is complete is so at once.
         let mut again = self.learner();
         again.process.assert_succeeds(PATIENCE);
-        assert!(again.process.out().contains("mean score of the last 3 evaluations"), "{}", again.process.out());
+        assert!(
+            again.process.out().contains("mean score of the last 3 evaluations"),
+            "{}",
+            again.process.out()
+        );
         again.assert_same_as(&calm);
     }
 }
@@ -120,8 +144,8 @@ fn keys_of(learner: &Learner) -> BTreeSet<Key> {
     scores.iter().map(|score| (score.step, score.seed, score.weights.clone())).collect()
 }
 
-/// Cuts the power of a learner at work, again and again. Before some cuts the learner is killed, and another one builds on what it
-/// left.
+/// Cuts the power of a learner at work, again and again. Before some cuts the learner is killed,
+/// and another one builds on what it left.
 fn cut_power(cuts: u64) {
     let mut system = System::start(cuts);
     let mut random = ChaCha8Rng::seed_from_u64(1);
@@ -136,10 +160,15 @@ fn cut_power(cuts: u64) {
         }
         system.cut_power(&mut learner);
         let log = learner.process.log();
-        gone_on += u64::from(log.contains("continues after step") && !log.contains("continues after step 0"));
+        gone_on += u64::from(
+            log.contains("continues after step") && !log.contains("continues after step 0"),
+        );
         assert!(!log.contains("is damaged"), "{log}");
     }
-    assert!(gone_on >= cuts / 2, "only {gone_on} of {cuts} incarnations continued from a checkpoint");
+    assert!(
+        gone_on >= cuts / 2,
+        "only {gone_on} of {cuts} incarnations continued from a checkpoint"
+    );
     assert!(!system.promised.is_empty(), "nothing was acknowledged before a power cut");
     system.finish();
 }

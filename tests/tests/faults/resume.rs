@@ -9,13 +9,18 @@ use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::Scratch;
 
 /// A few seconds of training with evaluations all along.
-const LONG: Setting = Setting { steps: 3000, eval_interval: 300, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
+const LONG: Setting =
+    Setting { steps: 3000, eval_interval: 300, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
 
 #[test]
 fn a_stopped_learner_goes_on_from_its_very_step() {
     let scratch = Scratch::new();
     let learner = |arguments: &[&str]| {
-        scratch.learner_with("run", ENDLESS, &[&["--listen", "tcp/127.0.0.1:0"], arguments].concat())
+        scratch.learner_with(
+            "run",
+            ENDLESS,
+            &[&["--listen", "tcp/127.0.0.1:0"], arguments].concat(),
+        )
     };
     let step_of = |learner: &Learner| -> u64 {
         let line = learner.process.wait_for_log("continues after step", PATIENCE);
@@ -25,7 +30,11 @@ fn a_stopped_learner_goes_on_from_its_very_step() {
     let mut first = learner(&[]);
     first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     assert_eq!(first.process.terminate(PATIENCE).code(), Some(75));
-    assert!(first.process.log().contains("the same command continues from there"), "{}", first.process.log());
+    assert!(
+        first.process.log().contains("the same command continues from there"),
+        "{}",
+        first.process.log()
+    );
 
     let mut second = learner(&[]);
     let step = step_of(&second);
@@ -45,7 +54,11 @@ fn a_stopped_learner_goes_on_from_its_very_step() {
 fn a_folder_is_of_one_configuration_and_of_one_learner_at_a_time() {
     let scratch = Scratch::new();
     let learner = |seed: &str, fresh: &[&str]| {
-        scratch.learner_with("run", ENDLESS, &[&["--listen", "tcp/127.0.0.1:0", "--seed", seed], fresh].concat())
+        scratch.learner_with(
+            "run",
+            ENDLESS,
+            &[&["--listen", "tcp/127.0.0.1:0", "--seed", seed], fresh].concat(),
+        )
     };
     let mut first = learner("1", &[]);
     first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
@@ -76,7 +89,8 @@ fn a_run_whose_folder_is_removed_ends() {
     assert!(log.contains("was removed or renamed") && log.contains("hint: put it back"), "{log}");
 }
 
-/// As if the scores were of another machine's bits. Training has to come by the step again to find out.
+/// As if the scores were of another machine's bits. Training has to come by the step again to find
+/// out.
 #[test]
 fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {
     let scratch = Scratch::new();
@@ -122,7 +136,11 @@ fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
     fs::write(&log, lines.replace(&format!("{lost}\n"), "")).unwrap();
     let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
     assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
-    for said in [&format!("without the snapshot of step {step}")[..], "but 1 episodes have no score", "hint: "] {
+    for said in [
+        &format!("without the snapshot of step {step}")[..],
+        "but 1 episodes have no score",
+        "hint: ",
+    ] {
         assert!(learner.process.log().contains(said), "{}", learner.process.log());
     }
 }

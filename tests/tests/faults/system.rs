@@ -45,7 +45,9 @@ pub enum Fault {
 pub fn all_faults() -> Vec<Fault> {
     let of = |program| {
         let links = Trouble::ALL.map(|trouble| Fault::Link(program, trouble));
-        [Fault::Kill(program), Fault::Stop(program), Fault::Freeze(program)].into_iter().chain(links)
+        [Fault::Kill(program), Fault::Stop(program), Fault::Freeze(program)]
+            .into_iter()
+            .chain(links)
     };
     let others = [Fault::RestartRouter, Fault::FillDisk, Fault::DeliverAgain];
     of(Program::Learner).chain(of(Program::Evaluator)).chain(others).collect()
@@ -135,8 +137,12 @@ impl System {
                 sleep(a_while);
                 process.signal("CONT");
             }
-            Fault::Link(Program::Learner, trouble) => self.learners_link.suffer(trouble, percent, a_while),
-            Fault::Link(Program::Evaluator, trouble) => self.evaluators[victim].1.suffer(trouble, percent, a_while),
+            Fault::Link(Program::Learner, trouble) => {
+                self.learners_link.suffer(trouble, percent, a_while)
+            }
+            Fault::Link(Program::Evaluator, trouble) => {
+                self.evaluators[victim].1.suffer(trouble, percent, a_while)
+            }
             Fault::RestartRouter => {
                 let session = self.router.take().expect("it is there");
                 session.close().wait().ok();
@@ -163,7 +169,9 @@ impl System {
 
     fn restart(&mut self, program: Program, index: usize) {
         match program {
-            Program::Learner => self.learner = learner(&self.scratch, self.setting, &self.learners_link),
+            Program::Learner => {
+                self.learner = learner(&self.scratch, self.setting, &self.learners_link)
+            }
             Program::Evaluator => {
                 let (_, link) = self.evaluators.remove(index);
                 let evaluator = self.evaluator(&link);
@@ -201,5 +209,9 @@ impl System {
 }
 
 fn learner(scratch: &Scratch, setting: Setting, link: &Link) -> Learner {
-    scratch.learner_with("run", setting, &["--connect", &link.endpoint, "--checkpoint-seconds", "1"])
+    scratch.learner_with(
+        "run",
+        setting,
+        &["--connect", &link.endpoint, "--checkpoint-seconds", "1"],
+    )
 }

@@ -1,4 +1,5 @@
-//! Which programs may come in: those with a certificate, at the router as it is shipped and at a learner that listens itself.
+//! Which programs may come in: those with a certificate, at the router as it is shipped and at a
+//! learner that listens itself.
 
 use std::path::PathBuf;
 
@@ -14,7 +15,8 @@ use zenoh::sample::SampleKind;
 
 /// What the router's certificate is for.
 pub const HOST: &str = "127.0.0.1";
-/// For so many seconds a certificate is valid that a program is to come in with, and to be sent away with.
+/// For so many seconds a certificate is valid that a program is to come in with, and to be sent
+/// away with.
 const BRIEF: u64 = 20;
 
 #[tokio::test(flavor = "multi_thread")]
@@ -22,8 +24,14 @@ async fn a_run_completes_through_the_shipped_router() {
     let Some(certificates) = Certificates::make() else { return };
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let scratch = Scratch::new();
-    let connect =
-        |role| ["--connect".to_owned(), endpoint.clone(), "--certificates".to_owned(), certificates.argument(role)];
+    let connect = |role| {
+        [
+            "--connect".to_owned(),
+            endpoint.clone(),
+            "--certificates".to_owned(),
+            certificates.argument(role),
+        ]
+    };
     let arguments = connect("evaluator");
     let _evaluator = scratch.evaluator_with("trusted", &arguments.each_ref().map(String::as_str));
     let arguments = connect("learner");
@@ -40,28 +48,43 @@ async fn a_router_whose_certificate_is_for_another_host_is_not_believed() {
     let arguments = ["--connect", &endpoint, "--certificates", &folder];
     let evaluator = scratch.evaluator_through(&launcher, "careful", &arguments);
     evaluator.process.wait_for_log("certificate not valid for name", PATIENCE);
-    assert!(!evaluator.process.log().contains("Successfully connected"), "{}", evaluator.process.log());
+    assert!(
+        !evaluator.process.log().contains("Successfully connected"),
+        "{}",
+        evaluator.process.log()
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_learner_that_listens_itself_asks_who_comes() {
     let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
-    let learner = scratch.learner_with("run", ENDLESS, &["--listen", "tls/127.0.0.1:0", "--certificates", &folder]);
+    let learner = scratch.learner_with(
+        "run",
+        ENDLESS,
+        &["--listen", "tls/127.0.0.1:0", "--certificates", &folder],
+    );
     let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
     assert!(endpoint.starts_with("tls/127.0.0.1:"), "{endpoint}");
 
-    for (name, reason) in [(None, "peer sent no certificates"), (Some("expired"), "certificate expired")] {
+    for (name, reason) in
+        [(None, "peer sent no certificates"), (Some("expired"), "certificate expired")]
+    {
         let folder = name.map(|name| certificates.of(name));
-        assert!(connect(&endpoint, &authority, folder.as_deref()).await.is_err(), "{name:?} came in");
+        assert!(
+            connect(&endpoint, &authority, folder.as_deref()).await.is_err(),
+            "{name:?} came in"
+        );
         learner.process.wait_for_log(reason, PATIENCE);
     }
 
     let folder = certificates.argument("evaluator");
-    let _evaluator = scratch.evaluator_with("trusted", &["--connect", &endpoint, "--certificates", &folder]);
+    let _evaluator =
+        scratch.evaluator_with("trusted", &["--connect", &endpoint, "--certificates", &folder]);
     learner.wait_for_scores(0);
 
-    // One that would stay connected by itself, although its certificate has expired. The other one stays.
+    // One that would stay connected by itself, although its certificate has expired. The other one
+    // stays.
     certificates.short("brief", BRIEF);
     let brief = come_in(&endpoint, &authority, &certificates.of("brief")).await;
     let key = keys::live_evaluator(&name("run"), &name("brief"));
@@ -86,14 +109,22 @@ async fn the_router_refuses_those_without_a_valid_certificate() {
         assert!(session.is_err(), "{folder:?} came in");
     }
 
-    // The other way round: a router that is not of the evaluator's authority, or only an evaluator, is not talked to.
-    assert!(connect(&endpoint, &foreign, Some(&foreign)).await.is_err(), "a foreign router was trusted");
+    // The other way round: a router that is not of the evaluator's authority, or only an evaluator,
+    // is not talked to.
+    assert!(
+        connect(&endpoint, &foreign, Some(&foreign)).await.is_err(),
+        "a foreign router was trusted"
+    );
     let (_impostor, endpoint) = protected_router(HOST, &evaluator).await;
-    assert!(connect(&endpoint, &authority, Some(&evaluator)).await.is_err(), "an evaluator passed for a router");
+    assert!(
+        connect(&endpoint, &authority, Some(&evaluator)).await.is_err(),
+        "an evaluator passed for a router"
+    );
 
     // And it says so, instead of waiting in silence.
     let (scratch, folder) = (Scratch::new(), elsewhere.argument("evaluator"));
-    let stray = scratch.evaluator_with("stray", &["--connect", &endpoint, "--certificates", &folder]);
+    let stray =
+        scratch.evaluator_with("stray", &["--connect", &endpoint, "--certificates", &folder]);
     stray.process.wait_for_log("refuses the other's certificate", PATIENCE);
     assert!(!stray.process.log().contains("connected"));
 }
@@ -103,13 +134,22 @@ async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_ba
     let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
-    let _learner = scratch.learner_with("run", IDLE, &["--connect", &endpoint, "--certificates", &folder]);
+    let _learner =
+        scratch.learner_with("run", IDLE, &["--connect", &endpoint, "--certificates", &folder]);
     let monitor = come_in(&endpoint, &certificates.of("router"), &certificates.of("monitor")).await;
-    let tokens = monitor.liveliness().declare_subscriber("quad/run/live/evaluator/*").history(true).await.unwrap();
-    let next = async || timeout(PATIENCE, tokens.recv_async()).await.expect("it comes or goes").unwrap().kind();
+    let tokens = monitor
+        .liveliness()
+        .declare_subscriber("quad/run/live/evaluator/*")
+        .history(true)
+        .await
+        .unwrap();
+    let next = async || {
+        timeout(PATIENCE, tokens.recv_async()).await.expect("it comes or goes").unwrap().kind()
+    };
     certificates.short("brief", BRIEF);
     let folder = certificates.argument("brief");
-    let evaluator = scratch.evaluator_with("brief", &["--connect", &endpoint, "--certificates", &folder]);
+    let evaluator =
+        scratch.evaluator_with("brief", &["--connect", &endpoint, "--certificates", &folder]);
     assert_eq!(next().await, SampleKind::Put);
     assert_eq!(next().await, SampleKind::Delete, "it stays after its certificate has expired");
 

@@ -49,10 +49,19 @@ fn certificates_that_do_not_do_are_refused() {
     let Some(certificates) = Certificates::make() else { return };
     let elsewhere = Certificates::make().unwrap();
     let tls = format!("tls/127.0.0.1:{}", free_port());
-    let with = |folder: &Path| evaluator(&["--connect", &tls, "--certificates", folder.to_str().unwrap()]);
+    let with =
+        |folder: &Path| evaluator(&["--connect", &tls, "--certificates", folder.to_str().unwrap()]);
     assert_refused(&with(&certificates.of("nowhere")), "nowhere/ca.pem", "certificates.sh");
-    assert_refused(&with(&certificates.of("learner")), "is a certificate for quad-learner", "this program's role");
-    assert_refused(&with(&certificates.of("expired")), "which is not now", "make a new certificate");
+    assert_refused(
+        &with(&certificates.of("learner")),
+        "is a certificate for quad-learner",
+        "this program's role",
+    );
+    assert_refused(
+        &with(&certificates.of("expired")),
+        "which is not now",
+        "make a new certificate",
+    );
     let mixed = certificates.of("mixed");
     fs::create_dir(&mixed).unwrap();
     let take = |from: &Certificates, role: &str, file: &str| {
@@ -75,12 +84,20 @@ fn no_authority_is_replaced_and_no_certificate_outlives_it() {
     let folder = certificates.of("learner").parent().unwrap().to_owned();
     let make = |days: &str| {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh/certificates.sh");
-        Command::new(script).arg("--in").arg(&folder).args(["--days", days, "evaluator", "another"]).output().unwrap()
+        Command::new(script)
+            .arg("--in")
+            .arg(&folder)
+            .args(["--days", days, "evaluator", "another"])
+            .output()
+            .unwrap()
     };
     let refused = |days: &str, because: &str, advice: &str| {
         let output = make(days);
         let said = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.code() == Some(1) && said.contains(because) && said.contains(advice), "{said}");
+        assert!(
+            output.status.code() == Some(1) && said.contains(because) && said.contains(advice),
+            "{said}"
+        );
         assert!(!folder.join("another").exists(), "a certificate was made");
     };
     refused("3651", "is not valid for 3651 more days", "ask for fewer");

@@ -1,5 +1,5 @@
-//! Floods: one client sends as much as its connection takes. The learner's memory is bounded, and evaluators are served
-//! meanwhile.
+//! Floods: one client sends as much as its connection takes. The learner's memory is bounded, and
+//! evaluators are served meanwhile.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -37,8 +37,15 @@ enum Flood {
     Downloads,
 }
 
-const FLOODS: [Flood; 7] =
-    [Flood::Progress, Flood::Claims, Flood::Reports, Flood::Garbage, Flood::Large, Flood::Evaluators, Flood::Downloads];
+const FLOODS: [Flood; 7] = [
+    Flood::Progress,
+    Flood::Claims,
+    Flood::Reports,
+    Flood::Garbage,
+    Flood::Large,
+    Flood::Evaluators,
+    Flood::Downloads,
+];
 
 /// A client that sends without a pause.
 struct Client {
@@ -49,12 +56,19 @@ struct Client {
 
 impl Client {
     async fn ask(&self, key: &str, question: Vec<u8>) {
-        self.session.get(key).payload(question).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
+        self.session
+            .get(key)
+            .payload(question)
+            .timeout(Duration::from_secs(1))
+            .callback(drop)
+            .await
+            .unwrap();
     }
 
     async fn ask_much(&self, key: &str) {
         let (much, claim) = ("x".repeat(100_000), claim("flood"));
-        let ask = |key: String| self.session.get(key).timeout(Duration::from_secs(1)).callback(drop);
+        let ask =
+            |key: String| self.session.get(key).timeout(Duration::from_secs(1)).callback(drop);
         ask(format!("{key}?{much}")).payload(claim.clone()).await.unwrap();
         ask(key.to_owned()).payload(claim.clone()).attachment(&much).await.unwrap();
         ask(key.to_owned()).payload(claim).encoding("text/plain;much").await.unwrap();
@@ -103,7 +117,8 @@ fn claim(evaluator: &str) -> Vec<u8> {
 
 /// Begins to send, until told to stop and all that a flood is are sent.
 async fn start(flood: Flood, endpoint: &str, stop: Arc<AtomicBool>) -> tokio::task::JoinHandle<()> {
-    let mut client = Client { session: made_up::client(endpoint).await, run: name("run"), tokens: Vec::new() };
+    let mut client =
+        Client { session: made_up::client(endpoint).await, run: name("run"), tokens: Vec::new() };
     tokio::spawn(async move {
         let mut number = 0;
         while !stop.load(Relaxed) || number < LEAST_MESSAGES {
@@ -134,12 +149,20 @@ async fn bear(each: Duration) {
         stop.store(true, Relaxed);
         flooding.await.unwrap();
         let growth = learner.process.peak_memory().unwrap().saturating_sub(quiet) >> 20;
-        eprintln!("{flood:?}: memory has grown by {growth} MiB at most, {} scores", learner.scores().len() - scores);
+        eprintln!(
+            "{flood:?}: memory has grown by {growth} MiB at most, {} scores",
+            learner.scores().len() - scores
+        );
         assert!(growth < MOST_GROWTH, "{flood:?} took {growth} MiB");
     }
-    learner.wait_for_metric("rejected_messages_total", "", |rejected| rejected >= LEAST_MESSAGES as f64);
+    learner.wait_for_metric("rejected_messages_total", "", |rejected| {
+        rejected >= LEAST_MESSAGES as f64
+    });
     learner.assert_scores_are_distinct();
-    assert!(!learner.process.log().contains("panicked") && !evaluator.process.log().contains("panicked"));
+    assert!(
+        !learner.process.log().contains("panicked")
+            && !evaluator.process.log().contains("panicked")
+    );
     let lines = learner.process.log().lines().count();
     assert!(lines < 1000, "{lines} lines in the log");
 }

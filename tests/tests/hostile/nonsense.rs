@@ -1,4 +1,5 @@
-//! Bytes from the wire are not trusted: what cannot be understood is counted, and the work continues.
+//! Bytes from the wire are not trusted: what cannot be understood is counted, and the work
+//! continues.
 
 use std::time::Duration;
 
@@ -32,11 +33,29 @@ fn garbage(real: &[u8]) -> Vec<Vec<u8>> {
 /// Sends each payload on every key of a run.
 async fn send_everywhere(session: &Session, payloads: impl Iterator<Item = Vec<u8>>) {
     for payload in payloads {
-        for key in ["weights", "weights/1", "weights/x", "jobs", "scores", "progress/x", "live/learner", "x"] {
+        for key in [
+            "weights",
+            "weights/1",
+            "weights/x",
+            "jobs",
+            "scores",
+            "progress/x",
+            "live/learner",
+            "x",
+        ] {
             let key = format!("quad/run/{key}");
             // A busy machine would else drop some.
-            session.put(&key, payload.clone()).congestion_control(CongestionControl::Block).await.unwrap();
-            session.get(&key).payload(payload.clone()).timeout(Duration::from_secs(1)).await.unwrap();
+            session
+                .put(&key, payload.clone())
+                .congestion_control(CongestionControl::Block)
+                .await
+                .unwrap();
+            session
+                .get(&key)
+                .payload(payload.clone())
+                .timeout(Duration::from_secs(1))
+                .await
+                .unwrap();
         }
     }
 }
@@ -52,7 +71,15 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
 
     let run = name("run");
     let replies = session.get(keys::weights_at(&run, first)).await.unwrap();
-    let snapshot = replies.recv_async().await.unwrap().into_result().unwrap().payload().to_bytes().into_owned();
+    let snapshot = replies
+        .recv_async()
+        .await
+        .unwrap()
+        .into_result()
+        .unwrap()
+        .payload()
+        .to_bytes()
+        .into_owned();
     decode::<Snapshot>(&snapshot).unwrap();
     let request = made_up::claim("client", 1, "hopper");
     let payloads = garbage(&snapshot).into_iter().chain(garbage(&encode(&request).unwrap()));
@@ -61,10 +88,15 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     let evaluator_page = evaluator.metrics();
     eventually("the evaluator counts weights that are not what they say", PATIENCE, || {
         let page = http::metrics(&evaluator_page)?;
-        (http::sum(&page, "quad_evaluator_rejected_messages_total", "reason=\"hash\"") > 0.0).then_some(())
+        (http::sum(&page, "quad_evaluator_rejected_messages_total", "reason=\"hash\"") > 0.0)
+            .then_some(())
     });
     for reason in ["empty", "not_quad", "version", "truncated", "oversized", "kind"] {
-        learner.wait_for_metric("rejected_messages_total", &format!("reason=\"{reason}\""), |count| count > 0.0);
+        learner.wait_for_metric(
+            "rejected_messages_total",
+            &format!("reason=\"{reason}\""),
+            |count| count > 0.0,
+        );
     }
 
     let count = learner.scores().len();
@@ -72,7 +104,8 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     assert!(learner.process.is_running() && evaluator.process.is_running());
     let said = evaluator.process.log().matches("ignored what was published as weights").count();
     assert_eq!(said, 1, "bad weights are logged once");
-    for (name, log) in [("learner", learner.process.log()), ("evaluator", evaluator.process.log())] {
+    for (name, log) in [("learner", learner.process.log()), ("evaluator", evaluator.process.log())]
+    {
         assert!(!log.contains("panicked"), "a thread of the {name} panicked:\n{log}");
     }
 }
@@ -84,14 +117,23 @@ async fn why_a_job_could_not_be_done_is_told_once_in_few_plain_letters() {
     let (session, run) = (made_up::client(&learner.endpoint()).await, name("run"));
     for evaluator in ["a", "b"] {
         let job = made_up::claim_eventually(&session, &run, evaluator).await;
-        let reason = format!("the policy\u{1b}[2J cannot act, says {evaluator}\n{}", "x".repeat(10_000));
-        let request = JobRequest::HandBack { evaluator: name(evaluator), job: job.id, failed: Some(reason) };
+        let reason =
+            format!("the policy\u{1b}[2J cannot act, says {evaluator}\n{}", "x".repeat(10_000));
+        let request =
+            JobRequest::HandBack { evaluator: name(evaluator), job: job.id, failed: Some(reason) };
         let reply = made_up::ask(&session, keys::jobs(&run), &request).await;
         assert!(matches!(reply, Some(JobReply::HandedBack { accepted: true, .. })), "{reply:?}");
     }
     learner.wait_for_metric("jobs_total", "outcome=\"failed\"", |failed| failed == 2.0);
     let said = learner.process.wait_for_log("could not do a job", PATIENCE);
     let (_, reason) = said.split_once("which goes to others: ").unwrap();
-    assert!(reason.starts_with("the policy[2J cannot act, says axxx") && reason.len() == 300, "{said}");
-    assert_eq!(learner.process.log().matches("could not do a job").count(), 1, "the second is not told");
+    assert!(
+        reason.starts_with("the policy[2J cannot act, says axxx") && reason.len() == 300,
+        "{said}"
+    );
+    assert_eq!(
+        learner.process.log().matches("could not do a job").count(),
+        1,
+        "the second is not told"
+    );
 }

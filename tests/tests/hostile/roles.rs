@@ -21,7 +21,8 @@ const LULL: Duration = Duration::from_millis(500);
 /// A message that only shows whether messages arrive.
 const PROBE: &str = "probe";
 
-/// Sessions with the certificates of those roles at the shipped router, which stays as long as the first part.
+/// Sessions with the certificates of those roles at the shipped router, which stays as long as the
+/// first part.
 async fn at_the_router<const N: usize>(roles: [&str; N]) -> Option<(impl Sized, [Session; N])> {
     let certificates = Certificates::make()?;
     let (router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
@@ -35,7 +36,8 @@ async fn at_the_router<const N: usize>(roles: [&str; N]) -> Option<(impl Sized, 
 /// The key that arrives next.
 async fn next(samples: &Subscriber<FifoChannelHandler<Sample>>) -> String {
     loop {
-        let sample = timeout(PATIENCE, samples.recv_async()).await.expect("nothing arrives").unwrap();
+        let sample =
+            timeout(PATIENCE, samples.recv_async()).await.expect("nothing arrives").unwrap();
         if *sample.payload().to_bytes() != *PROBE.as_bytes() {
             return sample.key_expr().to_string();
         }
@@ -84,7 +86,11 @@ async fn answers(session: &Session, key: &str) -> usize {
 #[tokio::test(flavor = "multi_thread")]
 async fn only_learners_publish_weights_and_only_evaluators_tell_progress() {
     let roles = ["learner", "evaluator", "monitor", "monitor", "evaluator"];
-    let Some((_router, [learner, evaluator, monitor, listener, receiver])) = at_the_router(roles).await else { return };
+    let Some((_router, [learner, evaluator, monitor, listener, receiver])) =
+        at_the_router(roles).await
+    else {
+        return;
+    };
     let heard = listener.declare_subscriber("quad/run/**").await.unwrap();
     let weights = receiver.declare_subscriber("quad/run/weights").await.unwrap();
     let spied = receiver.declare_subscriber("quad/run/progress/*").await.unwrap();
@@ -107,7 +113,10 @@ async fn only_learners_publish_weights_and_only_evaluators_tell_progress() {
         keys.extend(until(&heard, "quad/run/weights").await);
     }
     keys.sort();
-    assert_eq!(keys, ["progress/e", "progress/last", "weights"].map(|key| format!("quad/run/{key}")));
+    assert_eq!(
+        keys,
+        ["progress/e", "progress/last", "weights"].map(|key| format!("quad/run/{key}"))
+    );
     assert_eq!(until(&weights, "quad/run/weights").await.len(), 1);
     assert!(weights.try_recv().unwrap().is_none() && spied.try_recv().unwrap().is_none());
 }
@@ -115,9 +124,12 @@ async fn only_learners_publish_weights_and_only_evaluators_tell_progress() {
 #[tokio::test(flavor = "multi_thread")]
 async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
     let roles = ["learner", "evaluator", "monitor", "evaluator"];
-    let Some((_router, [learner, evaluator, monitor, other])) = at_the_router(roles).await else { return };
+    let Some((_router, [learner, evaluator, monitor, other])) = at_the_router(roles).await else {
+        return;
+    };
     for impostor in [&evaluator, &monitor] {
-        let _held = (answer(impostor, "quad/run/**").await, answer(impostor, "quad/run/jobs").await);
+        let _held =
+            (answer(impostor, "quad/run/**").await, answer(impostor, "quad/run/jobs").await);
         sleep(LULL).await;
         assert_eq!(answers(&other, "quad/run/jobs").await, 0, "{impostor:?}");
     }
@@ -125,11 +137,16 @@ async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
     for key in ["jobs", "scores", "weights/*"] {
         held.push(answer(&learner, &format!("quad/run/{key}")).await);
     }
-    for (key, for_evaluators, for_monitors) in [("jobs", 1, 0), ("scores", 1, 0), ("weights/7", 1, 1)] {
+    for (key, for_evaluators, for_monitors) in
+        [("jobs", 1, 0), ("scores", 1, 0), ("weights/7", 1, 1)]
+    {
         let (key, deadline) = (format!("quad/run/{key}"), Instant::now() + PATIENCE);
         for (session, expected) in [(&evaluator, for_evaluators), (&monitor, for_monitors)] {
             while answers(session, &key).await != expected {
-                assert!(Instant::now() < deadline, "{key} has not {expected} answers for {session:?}");
+                assert!(
+                    Instant::now() < deadline,
+                    "{key} has not {expected} answers for {session:?}"
+                );
             }
         }
     }
@@ -138,7 +155,10 @@ async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
 #[tokio::test(flavor = "multi_thread")]
 async fn only_learners_and_evaluators_say_that_they_are_there() {
     let roles = ["learner", "evaluator", "monitor", "monitor"];
-    let Some((_router, [learner, evaluator, monitor, listener])) = at_the_router(roles).await else { return };
+    let Some((_router, [learner, evaluator, monitor, listener])) = at_the_router(roles).await
+    else {
+        return;
+    };
     let mut held = Vec::new();
     for (session, key) in [
         (&evaluator, "quad/forged/live/learner/1"),
@@ -162,7 +182,11 @@ async fn only_learners_and_evaluators_say_that_they_are_there() {
 async fn at_a_learner_that_listens_only_evaluators_progress_passes() {
     let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
-    let learner = scratch.learner_with("run", ENDLESS, &["--listen", "tls/127.0.0.1:0", "--certificates", &folder]);
+    let learner = scratch.learner_with(
+        "run",
+        ENDLESS,
+        &["--listen", "tls/127.0.0.1:0", "--certificates", &folder],
+    );
     let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
     let connect = async |role| come_in(&endpoint, &authority, &certificates.of(role)).await;
     let (witness, asker) = (connect("monitor").await, connect("evaluator").await);

@@ -15,15 +15,27 @@ const STRANGER: &str = "QUAD_TESTS_STRANGER";
 /// The file by which the stranger learns that the learner knows it.
 const KNOWN: &str = "known";
 
-/// Asks for weights again and again, wants all that is published, and then reads nothing: the process stops itself.
+/// Asks for weights again and again, wants all that is published, and then reads nothing: the
+/// process stops itself.
 async fn read_nothing(endpoint: &str) {
     let (session, run) = (client(endpoint).await, name("run"));
     let _all = session.declare_subscriber("quad/run/**").callback(drop).await.unwrap();
-    let _token = session.liveliness().declare_token(keys::live_evaluator(&run, &name("stranger"))).await.unwrap();
+    let _token = session
+        .liveliness()
+        .declare_token(keys::live_evaluator(&run, &name("stranger")))
+        .await
+        .unwrap();
     // Without this, a busy machine might stop the process before it has sent the token.
-    eventually("the learner knows the stranger", PATIENCE, || Path::new(KNOWN).exists().then_some(()));
+    eventually("the learner knows the stranger", PATIENCE, || {
+        Path::new(KNOWN).exists().then_some(())
+    });
     for _ in 0..150 {
-        session.get(keys::weights_at(&run, ENDLESS.eval_interval)).timeout(PATIENCE).callback(drop).await.unwrap();
+        session
+            .get(keys::weights_at(&run, ENDLESS.eval_interval))
+            .timeout(PATIENCE)
+            .callback(drop)
+            .await
+            .unwrap();
     }
     let stop = format!("kill -STOP {}", std::process::id());
     Command::new("sh").args(["-c", &stop]).status().unwrap();
@@ -39,7 +51,10 @@ async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
     let _evaluator = scratch.evaluator("steady", &learner.endpoint());
     learner.wait_for_scores(0);
     let mut command = Command::new(env::current_exe().unwrap());
-    command.args(["--exact", "silence::a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots"]);
+    command.args([
+        "--exact",
+        "silence::a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots",
+    ]);
     command.env(STRANGER, learner.endpoint()).current_dir(scratch.path());
     let stranger = Process::start("stranger", scratch.path(), command);
     learner.process.wait_for_log("evaluator stranger is here", PATIENCE);
@@ -50,7 +65,11 @@ async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
     });
     // Until the learner has closed the connection; the stranger itself does nothing any more.
     let meanwhile = eventually("the stranger is gone", PATIENCE, || {
-        learner.process.log().contains("evaluator stranger has left").then(|| learner.scores().len())
+        learner
+            .process
+            .log()
+            .contains("evaluator stranger has left")
+            .then(|| learner.scores().len())
     });
     assert!(meanwhile > scored, "no evaluator was served while the stranger read nothing");
 }

@@ -1,4 +1,5 @@
-//! Prometheus's alert rules: they fire when they should, what they ask for exists, and each says what to do.
+//! Prometheus's alert rules: they fire when they should, what they ask for exists, and each says
+//! what to do.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -24,7 +25,8 @@ fn each_fires_when_it_should_and_only_then() {
         (["test", "rules"], "deploy/prometheus/alerts.test.yml"),
         (["check", "config"], "deploy/prometheus/prometheus.yml"),
     ] {
-        let output = Command::new("promtool").args(arguments).arg(repository(file)).output().unwrap();
+        let output =
+            Command::new("promtool").args(arguments).arg(repository(file)).output().unwrap();
         let text = [output.stdout, output.stderr].concat();
         assert!(output.status.success(), "{file}: {}", String::from_utf8_lossy(&text));
     }
@@ -32,12 +34,16 @@ fn each_fires_when_it_should_and_only_then() {
 
 #[test]
 fn each_is_tested_and_says_what_to_do_and_asks_for_what_is_documented() {
-    let (rules, tests) = (read("deploy/prometheus/alerts.yml"), read("deploy/prometheus/alerts.test.yml"));
+    let (rules, tests) =
+        (read("deploy/prometheus/alerts.yml"), read("deploy/prometheus/alerts.test.yml"));
     let metrics = read("docs/metrics.md");
-    let alerts: Vec<_> = rules.split("- alert: ").skip(1).filter_map(|rule| rule.split_once('\n')).collect();
+    let alerts: Vec<_> =
+        rules.split("- alert: ").skip(1).filter_map(|rule| rule.split_once('\n')).collect();
     assert!(alerts.len() > 10, "{alerts:?}");
     for (alert, rule) in alerts {
-        let said = rule.split_once("description: >-\n").map_or(0, |(_, text)| text.split_whitespace().count());
+        let said = rule
+            .split_once("description: >-\n")
+            .map_or(0, |(_, text)| text.split_whitespace().count());
         assert!(rule.contains("summary: ") && said >= 15, "{alert} says too little of what to do");
         assert!(tests.contains(&format!("alertname=\"{alert}\"")), "{alert} fires in no test");
     }
@@ -45,7 +51,9 @@ fn each_is_tested_and_says_what_to_do_and_asks_for_what_is_documented() {
     let asked: BTreeSet<&str> = words.filter(|word| word.starts_with("quad_")).collect();
     assert!(asked.len() > 8, "{asked:?}");
     for metric in asked {
-        let documented = [format!("`{metric}`"), format!("`{metric}{{")].iter().any(|name| metrics.contains(name));
+        let documented = [format!("`{metric}`"), format!("`{metric}{{")]
+            .iter()
+            .any(|name| metrics.contains(name));
         assert!(documented, "docs/metrics.md has no {metric}");
     }
 }

@@ -1,5 +1,6 @@
-//! Data that training must not touch, and places where nothing can be written: one sentence, a hint, exit code 1, and no
-//! folder left behind. What can be wrong with a file is tested beside the reader.
+//! Data that training must not touch, and places where nothing can be written: one sentence, a
+//! hint, exit code 1, and no folder left behind. What can be wrong with a file is tested beside the
+//! reader.
 
 use std::fs::{self, Permissions};
 use std::net::TcpListener;
@@ -14,8 +15,19 @@ use quad_tests::system::Scratch;
 
 fn train(scratch: &Scratch, dataset: &Path, run_dir: &Path, flags: &[&str]) -> Output {
     let mut command = Command::new(binary("learner"));
-    command.arg("train").arg("--preset").arg(scratch.preset("tiny", SHORT)).args(["--eval-interval", "0"]);
-    command.arg("--dataset").arg(dataset).arg("--run-dir").arg(run_dir).args(flags).output().unwrap()
+    command
+        .arg("train")
+        .arg("--preset")
+        .arg(scratch.preset("tiny", SHORT))
+        .args(["--eval-interval", "0"]);
+    command
+        .arg("--dataset")
+        .arg(dataset)
+        .arg("--run-dir")
+        .arg(run_dir)
+        .args(flags)
+        .output()
+        .unwrap()
 }
 
 #[test]
@@ -33,10 +45,20 @@ fn a_dataset_that_cannot_be_trained_on() {
     assert!(collect.output().unwrap().status.success());
     let run_dir = scratch.path().join("run");
     for (dataset, flags, sentence, hint) in [
-        (write("notes.hdf5", b"my notes"), &[][..], "notes.hdf5: neither an HDF5 file", "docs/data.md"),
+        (
+            write("notes.hdf5", b"my notes"),
+            &[][..],
+            "notes.hdf5: neither an HDF5 file",
+            "docs/data.md",
+        ),
         (write("half.hdf5", half), &[], "half.hdf5: cut short", "fetch or copy it again"),
         (walker, &[], "recorded in `walker2d`, which is not `hopper`", "choose a task in walker2d"),
-        (scratch.dataset(), &["--set", "batch_size=5000"], "fewer than a batch of 5000", "batch_size"),
+        (
+            scratch.dataset(),
+            &["--set", "batch_size=5000"],
+            "fewer than a batch of 5000",
+            "batch_size",
+        ),
     ] {
         let output = train(&scratch, &dataset, &run_dir, flags);
         assert_refused(&output, sentence, hint);
@@ -74,10 +96,16 @@ fn an_evaluator_that_cannot_start_says_why() {
     fs::create_dir(&programs).unwrap();
     fs::copy(binary("learner"), programs.join("learner")).unwrap();
     let evaluator = programs.join("evaluator");
-    fs::write(&evaluator, "#!/bin/sh\necho libmujoco.so: cannot open shared object file >&2; exit 127\n").unwrap();
+    fs::write(
+        &evaluator,
+        "#!/bin/sh\necho libmujoco.so: cannot open shared object file >&2; exit 127\n",
+    )
+    .unwrap();
     fs::set_permissions(&evaluator, Permissions::from_mode(0o755)).unwrap();
     let mut command = Command::new(programs.join("learner"));
-    command.args(["train", "--task", "hopper-demo", "--evaluators", "1", "--dataset"]).arg(scratch.dataset());
+    command
+        .args(["train", "--task", "hopper-demo", "--evaluators", "1", "--dataset"])
+        .arg(scratch.dataset());
     assert_refused(&command.output().unwrap(), "libmujoco.so: cannot open", "deploy/setup.sh");
 }
 
@@ -90,12 +118,25 @@ fn files_that_are_no_runs_or_presets_and_places_that_cannot_be_written() {
     fs::create_dir(path("run")).unwrap();
     fs::write(path("run/config.toml"), "name = 'x'\nlist = [\n").unwrap();
     fs::write(path("mine.toml"), "list = [\n").unwrap();
-    let wrong = format!("error: {}, line 2, is not what a learner writes: ", path("run/config.toml"));
+    let wrong =
+        format!("error: {}, line 2, is not what a learner writes: ", path("run/config.toml"));
     for (command, sentence, hint) in [
         (format!("learner report {}", path("run")), &*wrong, "put a copy"),
-        (format!("learner report {}", path("mine.toml")), "cannot read", "that `learner train` has written"),
-        (format!("learner presets {}", path("mine.toml")), "mine.toml is not TOML", "`learner presets TASK`"),
-        (format!("learner presets {}", path("missing.toml")), "missing.toml", "`learner presets TASK`"),
+        (
+            format!("learner report {}", path("mine.toml")),
+            "cannot read",
+            "that `learner train` has written",
+        ),
+        (
+            format!("learner presets {}", path("mine.toml")),
+            "mine.toml is not TOML",
+            "`learner presets TASK`",
+        ),
+        (
+            format!("learner presets {}", path("missing.toml")),
+            "missing.toml",
+            "`learner presets TASK`",
+        ),
         (format!("learner report {} --figures /proc/x", path("good")), "/proc/x", "--figures"),
         (format!("evaluator film {} --out /proc/x.gif", path("good")), "/proc/x.gif", "--out"),
         (format!("evaluator collect --env hopper --out {}", path("")), "is a directory", "--out"),
@@ -110,13 +151,22 @@ fn files_that_are_no_runs_or_presets_and_places_that_cannot_be_written() {
 
 #[test]
 fn a_recording_that_is_replayed_differently_or_not_at_all() {
-    let verify = |path: &Path| Command::new(binary("evaluator")).arg("verify-dataset").arg(path).output().unwrap();
+    let verify = |path: &Path| {
+        Command::new(binary("evaluator")).arg("verify-dataset").arg(path).output().unwrap()
+    };
     let scratch = Scratch::new();
     let made_up = verify(&scratch.dataset());
     assert_eq!(made_up.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&made_up.stdout).contains("terminals differ   2990"), "{made_up:?}");
+    assert!(
+        String::from_utf8_lossy(&made_up.stdout).contains("terminals differ   2990"),
+        "{made_up:?}"
+    );
     hdf5::File::open_rw(scratch.dataset()).unwrap().unlink("infos").unwrap();
-    assert_refused(&verify(&scratch.dataset()), "array `infos/qpos` is missing", "evaluator collect");
+    assert_refused(
+        &verify(&scratch.dataset()),
+        "array `infos/qpos` is missing",
+        "evaluator collect",
+    );
     let notes = scratch.path().join("notes.hdf5");
     fs::write(&notes, "my notes").unwrap();
     assert_refused(&verify(&notes), "neither an HDF5 file nor an npz archive", "docs/data.md");

@@ -50,15 +50,28 @@ fn more_threads_than_the_system_has_are_an_error_and_not_a_panic() {
 
 #[test]
 fn what_is_missing_is_said() {
-    refused(&["--task", "hopper-demo"], 1, &["hint:", "hopper-demo names no dataset", "--dataset FILE"]);
+    refused(
+        &["--task", "hopper-demo"],
+        1,
+        &["hint:", "hopper-demo names no dataset", "--dataset FILE"],
+    );
     refused(&["--task", "own-data"], 1, &["hint:", "own-data names no dataset", "docs/data.md"]);
-    let missing = ["--task", "hopper-demo", "--dataset", "/tmp/missing.hdf5", "--run-dir", "/tmp/missing-run"];
+    let missing = [
+        "--task",
+        "hopper-demo",
+        "--dataset",
+        "/tmp/missing.hdf5",
+        "--run-dir",
+        "/tmp/missing-run",
+    ];
     refused(&missing, 1, &["hint:", "/tmp/missing.hdf5"]);
 }
 
 /// What a command writes in a shell.
 fn shell(command: &[&str]) -> String {
-    let path = binary("learner").parent().unwrap().display().to_string() + ":" + &std::env::var("PATH").unwrap();
+    let path = binary("learner").parent().unwrap().display().to_string()
+        + ":"
+        + &std::env::var("PATH").unwrap();
     let output = Command::new(command[0]).args(&command[1..]).env("PATH", path).output().unwrap();
     assert!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap()
@@ -80,7 +93,11 @@ fn bash_completes_commands_and_arguments() {
             COMP_WORDS=({program} {typed}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
             _{program} {program} "${{COMP_WORDS[COMP_CWORD]}}" "${{COMP_WORDS[COMP_CWORD - 1]}}"; echo "${{COMPREPLY[@]}}""#
         );
-        assert_eq!(shell(&["bash", "--norc", "-euc", &script]).trim(), completed, "{program} {typed}");
+        assert_eq!(
+            shell(&["bash", "--norc", "-euc", &script]).trim(),
+            completed,
+            "{program} {typed}"
+        );
     }
 }
 
@@ -89,15 +106,22 @@ fn a_terminal_is_colored_unless_its_user_does_not_want_it() {
     let scratch = Scratch::new();
     let [data, run] = [scratch.dataset(), scratch.path().join("run")];
     let flags = "--task hopper-demo --set batch_size=8 --dry-run";
-    let train = format!("learner train {flags} --dataset {} --run-dir {}", data.display(), run.display());
-    for (setting, colored) in
-        [("NO_COLOR= TERM=xterm", true), ("NO_COLOR=1 TERM=xterm", false), ("NO_COLOR= TERM=dumb", false)]
-    {
-        let text = shell(&["script", "--quiet", "--command", &format!("{setting} {train}"), "/dev/null"]);
+    let train =
+        format!("learner train {flags} --dataset {} --run-dir {}", data.display(), run.display());
+    for (setting, colored) in [
+        ("NO_COLOR= TERM=xterm", true),
+        ("NO_COLOR=1 TERM=xterm", false),
+        ("NO_COLOR= TERM=dumb", false),
+    ] {
+        let text =
+            shell(&["script", "--quiet", "--command", &format!("{setting} {train}"), "/dev/null"]);
         assert!(text.contains(" INFO"), "{text}");
         assert_eq!(text.contains("\u{1b}["), colored, "{setting}: {text:?}");
     }
-    assert!(!shell(&["sh", "-c", &format!("{train} 2>&1")]).contains('\u{1b}'), "a pipe has no colors");
+    assert!(
+        !shell(&["sh", "-c", &format!("{train} 2>&1")]).contains('\u{1b}'),
+        "a pipe has no colors"
+    );
 }
 
 #[test]
@@ -113,8 +137,12 @@ fn a_learner_without_evaluations_waits_for_no_evaluator() {
     let [folder, other] = [&learner.run_dir, &other].map(|path| path.to_str().unwrap());
     for (folders, code) in [(&[other, folder][..], 0), (&[other], 1)] {
         let output = run("learner", &[&["report"], folders].concat());
-        let (text, said) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
+        let (text, said) =
+            (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
         assert_eq!(output.status.code(), Some(code), "{folders:?}: {said}");
-        assert!(said.contains(other) && text.contains("alone") == (code == 0), "{folders:?}: {said}{text}");
+        assert!(
+            said.contains(other) && text.contains("alone") == (code == 0),
+            "{folders:?}: {said}{text}"
+        );
     }
 }

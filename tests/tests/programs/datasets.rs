@@ -1,4 +1,5 @@
-//! Datasets by name, as they are seen on a command line. How a file is fetched is tested beside the code that does it.
+//! Datasets by name, as they are seen on a command line. How a file is fetched is tested beside the
+//! code that does it.
 
 use std::fs;
 use std::net::TcpStream;
@@ -10,8 +11,8 @@ use quad_tests::setting::SHORT;
 use quad_tests::system::{Scratch, free_port};
 use quad_tests::{PATIENCE, eventually, peers};
 
-/// Runs a learner whose cache folder is `cache`. Nothing but this machine can be reached: port 9, which is closed,
-/// is the proxy for everything else.
+/// Runs a learner whose cache folder is `cache`. Nothing but this machine can be reached: port 9,
+/// which is closed, is the proxy for everything else.
 fn learner(cache: &Path, mirror: &str, arguments: &[&str]) -> Output {
     let mut command = Command::new(binary("learner"));
     command.env("D4RL_DATASET_DIR", cache).env("QUAD_DATASETS_URL", mirror).args(arguments);
@@ -43,7 +44,8 @@ fn a_run_by_name_fetches_its_dataset_once_and_records_its_checksum() {
     serve.args(["-m", "http.server", "--bind", "127.0.0.1", &port.to_string()]).current_dir(folder);
     let server = Process::start("mirror", scratch.path(), serve);
     eventually("the mirror listens", PATIENCE, || TcpStream::connect(("127.0.0.1", port)).ok());
-    let (url, requests) = (format!("http://127.0.0.1:{port}"), || server.log().matches("GET /").count());
+    let (url, requests) =
+        (format!("http://127.0.0.1:{port}"), || server.log().matches("GET /").count());
     let preset = scratch.preset("tiny", SHORT);
     let file = cache.join("hopper_random-v2.hdf5");
     for run in ["first", "second"] {
@@ -68,7 +70,8 @@ fn a_run_by_name_fetches_its_dataset_once_and_records_its_checksum() {
     assert_eq!(requests(), 1);
 }
 
-/// Writes a file as OGBench has it: an ant that stands at the goal of the second task in a medium maze, or 2 m beside it.
+/// Writes a file as OGBench has it: an ant that stands at the goal of the second task in a medium
+/// maze, or 2 m beside it.
 const STANDING: &str = "
 import sys, numpy
 observations = numpy.zeros((120, 29), 'f4')
@@ -86,7 +89,8 @@ fn a_task_of_ogbench_is_learned_by_its_name_and_evaluated_here() {
     let (mirror, port) = (scratch.path().join("mirror"), free_port());
     fs::create_dir(&mirror).unwrap();
     let file = "antmaze-medium-navigate-v0.npz";
-    let written = Command::new(&python).args(["-c", STANDING]).arg(mirror.join(file)).status().unwrap();
+    let written =
+        Command::new(&python).args(["-c", STANDING]).arg(mirror.join(file)).status().unwrap();
     assert!(written.success());
     let mut serve = Command::new(python);
     serve.args(["-m", "http.server", "--bind", "127.0.0.1", &port.to_string()]).current_dir(mirror);
@@ -105,7 +109,17 @@ fn a_task_of_ogbench_is_learned_by_its_name_and_evaluated_here() {
         "1",
     ]);
     train.args(["--listen", &format!("tcp/127.0.0.1:{}", free_port())]);
-    train.args(["--steps", "20", "--eval-interval", "20", "--episodes", "2", "--set", "batch_size=32", "--run-dir"]);
+    train.args([
+        "--steps",
+        "20",
+        "--eval-interval",
+        "20",
+        "--episodes",
+        "2",
+        "--set",
+        "batch_size=32",
+        "--run-dir",
+    ]);
     let output = train.arg(&run).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let config = fs::read_to_string(run.join("config.toml")).unwrap();
@@ -119,7 +133,11 @@ fn a_task_of_ogbench_is_learned_by_its_name_and_evaluated_here() {
         assert!(config.lines().any(|found| found == line), "no {line} in:\n{config}");
     }
     let scores = fs::read_to_string(run.join("scores.jsonl")).unwrap();
-    assert_eq!(scores.lines().filter(|line| line.contains("\"length\":1000")).count(), 2, "{scores}");
+    assert_eq!(
+        scores.lines().filter(|line| line.contains("\"length\":1000")).count(),
+        2,
+        "{scores}"
+    );
 }
 
 #[test]
@@ -150,21 +168,35 @@ fn the_list_says_what_there_is_and_what_is_here() {
         ("hopper-medium-v2 ", "  another file of 10 bytes"),
         ("antmaze-large-diverse-v0 ", "  no"),
     ] {
-        assert!(text.lines().any(|line| line.starts_with(name) && line.ends_with(state)), "{name}:\n{text}");
+        assert!(
+            text.lines().any(|line| line.starts_with(name) && line.ends_with(state)),
+            "{name}:\n{text}"
+        );
     }
-    assert!(text.contains(&format!("\ncache folders: {}, and of OGBench ", folder.path().display())), "{text}");
+    assert!(
+        text.contains(&format!("\ncache folders: {}, and of OGBench ", folder.path().display())),
+        "{text}"
+    );
 }
 
 #[test]
 fn what_makes_no_sense_is_refused_before_anything_is_fetched() {
     let folder = tempfile::tempdir().unwrap();
     let nowhere = "http://127.0.0.1:9";
-    let train = |task, dataset| learner(folder.path(), nowhere, &["train", "--task", task, "--dataset", dataset]);
+    let train = |task, dataset| {
+        learner(folder.path(), nowhere, &["train", "--task", task, "--dataset", dataset])
+    };
     let fetch = |cache: &Path, dataset| learner(cache, nowhere, &["datasets", "fetch", dataset]);
     for (output, words) in [
         (train("hopper-demo", "hopper-medium-reply-v2"), "hopper-medium-replay-v2"),
-        (train("hopper-demo", "walker2d-medium-v2"), "is a dataset of walker2d, but the policy is for hopper"),
-        (train("hopper-demo", "data/halfcheetah_medium-v2.hdf5"), "halfcheetah-medium-v2 is a dataset of halfcheetah"),
+        (
+            train("hopper-demo", "walker2d-medium-v2"),
+            "is a dataset of walker2d, but the policy is for hopper",
+        ),
+        (
+            train("hopper-demo", "data/halfcheetah_medium-v2.hdf5"),
+            "halfcheetah-medium-v2 is a dataset of halfcheetah",
+        ),
         (train("hopper-demo", "minari:none/has-this-v0"), "minari download none/has-this-v0"),
         (fetch(folder.path(), "hoper-medium-v2"), "hopper-medium-v2"),
         (fetch(Path::new("/proc/version/cache"), "hopper-random-v2"), "/proc/version/cache"),

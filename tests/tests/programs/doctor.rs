@@ -15,7 +15,11 @@ use serde_json::Value;
 
 fn doctor(program: &str, arguments: &[&str]) -> Output {
     let mut command = Command::new(binary(program));
-    command.arg("doctor").args(arguments).env_remove("RAYON_NUM_THREADS").env_remove("QUAD_CERTIFICATES");
+    command
+        .arg("doctor")
+        .args(arguments)
+        .env_remove("RAYON_NUM_THREADS")
+        .env_remove("QUAD_CERTIFICATES");
     command.env("D4RL_DATASET_DIR", std::env::temp_dir()).output().unwrap()
 }
 
@@ -56,7 +60,10 @@ fn a_machine_that_is_well() {
     let (text, well) = findings(&doctor("learner", &["--run-dir", folder.to_str().unwrap()]));
     assert!(well, "{text}");
     // A busy disk is slow, which is worth a warning.
-    assert!(text.lines().any(|line| line.contains("  run folder ") && line.contains("GiB free")), "{text}");
+    assert!(
+        text.lines().any(|line| line.contains("  run folder ") && line.contains("GiB free")),
+        "{text}"
+    );
     assert_found(&text, "ok", "HDF5", &["with compression"]);
     assert!(!folder.exists(), "the doctor makes no folder");
 
@@ -89,7 +96,10 @@ async fn a_learner_of_another_version() {
     });
     let _queryable = queryable.await.unwrap();
     let _token = session.liveliness().declare_token(keys::live_learner(&run, 1)).await.unwrap();
-    let output = tokio::task::spawn_blocking(move || doctor("evaluator", &["--connect", &endpoint])).await.unwrap();
+    let output =
+        tokio::task::spawn_blocking(move || doctor("evaluator", &["--connect", &endpoint]))
+            .await
+            .unwrap();
     assert_found(&findings(&output).0, "FAIL", "run", &["protocol version 999", "hint: update"]);
 }
 
@@ -100,7 +110,10 @@ fn folders_that_cannot_be_written_to() {
     let scratch = Scratch::new();
     let Some(disk) = SmallDisk::mount(&scratch.path().join("disk"), 1) else { return };
     disk.fill();
-    let (text, _) = findings(&doctor("learner", &["--run-dir", scratch.path().join("disk/run").to_str().unwrap()]));
+    let (text, _) = findings(&doctor(
+        "learner",
+        &["--run-dir", scratch.path().join("disk/run").to_str().unwrap()],
+    ));
     assert_found(&text, "FAIL", "run folder", &["No space left", "hint: make room"]);
 }
 
@@ -109,7 +122,11 @@ fn folders_where_files_have_no_locks() {
     let scratch = Scratch::new();
     let [launcher, preloaded] = <[String; 2]>::try_from(preload("no_locks")).unwrap();
     let mut command = Command::new(launcher);
-    command.arg(preloaded).arg(binary("learner")).args(["doctor", "--run-dir"]).arg(scratch.path().join("run"));
+    command
+        .arg(preloaded)
+        .arg(binary("learner"))
+        .args(["doctor", "--run-dir"])
+        .arg(scratch.path().join("run"));
     let (text, _) = findings(&command.output().unwrap());
     assert_found(&text, "warn", "locks", &["have no locks in", "hint: ", "scores.host"]);
     let (text, _) = findings(&doctor("learner", &["--run-dir", scratch.path().to_str().unwrap()]));
@@ -123,7 +140,11 @@ fn folders_where_files_have_no_locks() {
 fn certificates_that_are_good_and_that_are_not() {
     let Some(certificates) = Certificates::make() else { return };
     let examine = |name: &str| {
-        findings(&doctor("learner", &["--run-dir", "/tmp/run", "--certificates", &certificates.argument(name)])).0
+        findings(&doctor(
+            "learner",
+            &["--run-dir", "/tmp/run", "--certificates", &certificates.argument(name)],
+        ))
+        .0
     };
     assert_found(&examine("learner"), "ok", "certificate", &["127.0.0.1"]);
     assert_found(&examine("evaluator"), "FAIL", "certificate", &["quad-evaluator", "hint: "]);

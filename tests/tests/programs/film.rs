@@ -14,7 +14,8 @@ use quad_tests::setting::Setting;
 use quad_tests::small_disk::SmallDisk;
 use quad_tests::system::Scratch;
 
-const SETTING: Setting = Setting { steps: 40, eval_interval: 20, episodes: 2, candidates: 3, hidden: 16, seed: 5 };
+const SETTING: Setting =
+    Setting { steps: 40, eval_interval: 20, episodes: 2, candidates: 3, hidden: 16, seed: 5 };
 
 fn film(folder: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(binary("evaluator"));
@@ -41,7 +42,9 @@ fn frames(path: &Path) -> ((u16, u16), Vec<Vec<u8>>) {
     options.set_color_output(gif::ColorOutput::RGBA);
     let mut decoder = options.read_info(BufReader::new(File::open(path).unwrap())).unwrap();
     let size = (decoder.width(), decoder.height());
-    let next = std::iter::from_fn(|| decoder.read_next_frame().unwrap().map(|frame| frame.buffer.to_vec()));
+    let next = std::iter::from_fn(|| {
+        decoder.read_next_frame().unwrap().map(|frame| frame.buffer.to_vec())
+    });
     (size, next.collect())
 }
 
@@ -60,21 +63,37 @@ fn a_film_shows_the_episode_that_is_scored() {
 
     let told = said(&film(folder, &[last, "--seed", &seed]).output().unwrap());
     let (length, episode_return) = (u64::from(score.length), score.episode_return);
-    let words = format!("seed {seed}, {length} steps, return {episode_return:.2}, {} candidates", SETTING.candidates);
+    let words = format!(
+        "seed {seed}, {length} steps, return {episode_return:.2}, {} candidates",
+        SETTING.candidates
+    );
     assert!(told.contains(&words), "{words:?} is not in {told:?}");
     let (size, frames) = frames(&folder.join("film.gif"));
     assert_eq!(size, (320, 240));
-    assert_eq!(frames.len() as u64, length.div_ceil(5) + 1, "25 a second, of steps of 0.008 s, and the last");
-    let colors = |frame: &[u8]| frame.chunks(4).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>().len();
+    assert_eq!(
+        frames.len() as u64,
+        length.div_ceil(5) + 1,
+        "25 a second, of steps of 0.008 s, and the last"
+    );
+    let colors = |frame: &[u8]| {
+        frame.chunks(4).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>().len()
+    };
     assert!(frames.iter().all(|frame| colors(frame) > 10), "each shows something");
     assert_ne!(frames.first(), frames.last());
 
     let run = first.split_once("/snapshots").unwrap().0;
-    let told = said(&film(folder, &[run, "--step", "20", "--compare", last, "--out", "two.png"]).output().unwrap());
-    let seeds: Vec<&str> = told.lines().filter_map(|line| line.split_once("seed ")?.1.split(',').next()).collect();
+    let told = said(
+        &film(folder, &[run, "--step", "20", "--compare", last, "--out", "two.png"])
+            .output()
+            .unwrap(),
+    );
+    let seeds: Vec<&str> =
+        told.lines().filter_map(|line| line.split_once("seed ")?.1.split(',').next()).collect();
     assert!(seeds.len() == 2 && seeds[0] == seeds[1], "two episodes of one seed: {told}");
     let mut picture =
-        png::Decoder::new(BufReader::new(File::open(folder.join("two.png")).unwrap())).read_info().unwrap();
+        png::Decoder::new(BufReader::new(File::open(folder.join("two.png")).unwrap()))
+            .read_info()
+            .unwrap();
     let mut pixels = vec![0; picture.output_buffer_size().unwrap()];
     let info = picture.next_frame(&mut pixels).unwrap();
     assert_eq!((info.width, info.height), (8 * 240, 2 * 240));
@@ -102,16 +121,23 @@ fn what_cannot_be_filmed_is_said_in_a_sentence() {
     let at = bytes.windows(6).position(|window| window == b"hopper").unwrap();
     fs::write(&moon, [&bytes[..at], b"onmoon", &bytes[at + 6..]].concat()).unwrap();
     refused(&[moon.to_str().unwrap()], "is a policy for another environment", "docs/python.md");
-    let without_driver = film(folder, &[snapshot]).env("__EGL_VENDOR_LIBRARY_DIRS", folder).output().unwrap();
-    assert_refused(&without_driver, "pictures need EGL", "apt-get install --no-install-recommends libegl1");
+    let without_driver =
+        film(folder, &[snapshot]).env("__EGL_VENDOR_LIBRARY_DIRS", folder).output().unwrap();
+    assert_refused(
+        &without_driver,
+        "pictures need EGL",
+        "apt-get install --no-install-recommends libegl1",
+    );
     if has_egl() {
-        let output = film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", folder).output().unwrap();
+        let output =
+            film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", folder).output().unwrap();
         assert_refused(&output, "ffmpeg cannot be started", "--out film.gif");
         assert!(!folder.join("film.mp4").exists());
     }
 }
 
-/// An ffmpeg that writes what it is fed to the file that it is told, by a name that means no option and no protocol.
+/// An ffmpeg that writes what it is fed to the file that it is told, by a name that means no option
+/// and no protocol.
 const FFMPEG: &str = "#!/bin/sh\nfor last; do :; done\ncat > \"${last#file:}\" && [ \"$last\" != \"${last#file:}\" ]\n";
 
 #[test]
@@ -129,14 +155,26 @@ fn a_film_is_whole_or_is_not_there_whatever_its_name() {
     fs::set_permissions(&ffmpeg, Permissions::from_mode(0o755)).unwrap();
     let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
     for name in ["-y.mp4", "a:b/x.mp4"] {
-        said(&film(folder, &[snapshot, &format!("--out={name}")]).env("PATH", &path).output().unwrap());
-        assert!(fs::metadata(folder.join(name)).unwrap().len() > 480 * 360 * 3, "{name} has pictures");
+        said(
+            &film(folder, &[snapshot, &format!("--out={name}")])
+                .env("PATH", &path)
+                .output()
+                .unwrap(),
+        );
+        assert!(
+            fs::metadata(folder.join(name)).unwrap().len() > 480 * 360 * 3,
+            "{name} has pictures"
+        );
     }
     let Some(disk) = SmallDisk::mount(&folder.join("disk"), 1) else { return };
     disk.fill();
     for name in ["disk/film.gif", "disk/film.png"] {
         let output = film(folder, &[snapshot, "--out", name]).output().unwrap();
         assert_refused(&output, &format!("cannot write {name}"), "has room");
-        assert_eq!(fs::read_dir(folder.join("disk")).unwrap().count(), 1, "something is left of {name}");
+        assert_eq!(
+            fs::read_dir(folder.join("disk")).unwrap().count(),
+            1,
+            "something is left of {name}"
+        );
     }
 }

@@ -14,7 +14,8 @@ fn python_reads_a_snapshot() {
     let scratch = Scratch::new();
     let mut learner = scratch.learner_with("run", SHORT, &["--eval-interval", "0"]);
     learner.process.assert_succeeds(PATIENCE);
-    let printed = peers::run_python(&python, "snapshot_shapes.py", &[&learner.snapshot(SHORT.steps)]);
+    let printed =
+        peers::run_python(&python, "snapshot_shapes.py", &[&learner.snapshot(SHORT.steps)]);
     let shapes: Value = serde_json::from_str(&printed).unwrap();
     // Hopper: 11 observations, 3 actions; 32 time features; 2 critics; 16 wide.
     for (tensor, shape) in [
@@ -41,11 +42,16 @@ fn prometheus_understands_both_metrics_pages() {
         assert_eq!(http::get(&address, "/healthz").unwrap().0, 200, "{address}");
         let page = http::metrics(&address).unwrap();
         let mut command = Command::new("promtool");
-        command.args(["check", "metrics"]).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+            .args(["check", "metrics"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped());
         let mut promtool = command.spawn().unwrap();
         promtool.stdin.take().unwrap().write_all(page.as_bytes()).unwrap();
         let output = promtool.wait_with_output().unwrap();
-        let complaints = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+        let complaints =
+            String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success() && complaints.is_empty(), "{complaints}\n{page}");
     }
 }

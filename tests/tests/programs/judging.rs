@@ -42,7 +42,8 @@ fn policies_are_judged_by_the_data_alone() {
     let first = judge(&[&quad]);
     assert!(said(&first, 0).contains("judging 1 policies takes about"), "it forecasts");
     let found = json(&judge(&[&all]));
-    let (policies, verdict) = (found["policies"].as_array().unwrap(), found["verdict"].as_str().unwrap());
+    let (policies, verdict) =
+        (found["policies"].as_array().unwrap(), found["verdict"].as_str().unwrap());
     assert_eq!(policies.len(), 2);
     assert!(verdict.contains("rank") || verdict.contains("told apart"), "{verdict}");
     for policy in policies {
@@ -53,29 +54,53 @@ fn policies_are_judged_by_the_data_alone() {
     // The episodes have rewards 0, 1, …, 48 and are cut off there.
     let exact: f64 = (0..49).map(|t| 0.99_f64.powi(t) * f64::from(t)).sum();
     let recorded = found["recorded"].as_f64().unwrap();
-    assert!((0.5 * exact..2.0 * exact).contains(&recorded), "{recorded} instead of {exact} and what comes after");
+    assert!(
+        (0.5 * exact..2.0 * exact).contains(&recorded),
+        "{recorded} instead of {exact} and what comes after"
+    );
 
     let again = judge(&[&all]);
     assert!(!said(&again, 0).contains("judging"), "nothing is computed twice");
     assert_eq!(json(&again), found);
-    for (flag, key, value) in [("--gamma", "gamma", "0.5"), ("--seeds", "seeds", "3"), ("--steps", "steps", "100")] {
-        let flags = ["--json", "--steps", "200"].into_iter().filter(|word| flag != "--steps" || *word == "--json");
-        let other = json(&learner("judge", &[&quad], &[&Vec::from_iter(flags)[..], &[flag, value]].concat()));
-        assert_eq!(other["conditions"][key], value.parse::<Value>().unwrap(), "of other conditions nothing is known");
+    for (flag, key, value) in
+        [("--gamma", "gamma", "0.5"), ("--seeds", "seeds", "3"), ("--steps", "steps", "100")]
+    {
+        let flags = ["--json", "--steps", "200"]
+            .into_iter()
+            .filter(|word| flag != "--steps" || *word == "--json");
+        let other = json(&learner(
+            "judge",
+            &[&quad],
+            &[&Vec::from_iter(flags)[..], &[flag, value]].concat(),
+        ));
+        assert_eq!(
+            other["conditions"][key],
+            value.parse::<Value>().unwrap(),
+            "of other conditions nothing is known"
+        );
     }
     let twice = json(&judge(&[&quad, &quad.join("snapshots/step_000000020.safetensors"), &all]));
-    assert_eq!(twice["policies"].as_array().unwrap().len(), 2, "a policy that is named twice counts once");
+    assert_eq!(
+        twice["policies"].as_array().unwrap().len(),
+        2,
+        "a policy that is named twice counts once"
+    );
 
     let alone = |path: &Path| json(&judge(&[path]))["policies"][0]["estimate"].clone();
-    let of =
-        |run: &Path| policies.iter().find(|policy| policy["run"] == run.to_str().unwrap()).unwrap()["estimate"].clone();
+    let of = |run: &Path| {
+        policies.iter().find(|policy| policy["run"] == run.to_str().unwrap()).unwrap()["estimate"]
+            .clone()
+    };
     assert_eq!((alone(&quad), alone(&iql)), (of(&quad), of(&iql)));
 
     let html = scratch.path().join("report.html");
     let report = learner("report", &[&all], &["--html", html.to_str().unwrap()]);
     said(&report, 0);
     for text in [String::from_utf8(report.stdout).unwrap(), fs::read_to_string(html).unwrap()] {
-        assert!(text.contains("a ranking, not a score") && text.contains("behavior, as recorded"), "{text}");
+        assert!(
+            text.contains("a ranking, not a score") && text.contains("behavior, as recorded"),
+            "{text}"
+        );
     }
 }
 
@@ -92,8 +117,13 @@ fn what_cannot_be_judged_is_said_in_a_sentence() {
     refused(&[&stray], "in no run's folder", "RUN/snapshots/step_");
     let config = iql.join("config.toml");
     let text = fs::read_to_string(&config).unwrap();
-    fs::write(&config, text.replace("environment = \"my-robot\"", "environment = \"another\"")).unwrap();
-    refused(&[&quad, &iql], "quad is of the environment my-robot, iql of another", "judge them apart");
+    fs::write(&config, text.replace("environment = \"my-robot\"", "environment = \"another\""))
+        .unwrap();
+    refused(
+        &[&quad, &iql],
+        "quad is of the environment my-robot, iql of another",
+        "judge them apart",
+    );
     let sha256 = text.split("sha256 = \"").nth(1).unwrap().split('"').next().unwrap().to_owned();
     fs::write(&config, text.replace(&sha256, &"0".repeat(64))).unwrap();
     refused(&[&quad, &iql], "have not learned from the same data", "judge them apart");
@@ -105,13 +135,19 @@ fn an_exported_policy_says_what_it_has_learned_from_and_acts_alike() {
     let scratch = tempfile::tempdir().unwrap();
     let [quad, _] = runs(scratch.path());
     let out = scratch.path().join("policy.safetensors");
-    let export = |flags: &[&str]| learner("export", &[&quad], &[&["--out", out.to_str().unwrap()], flags].concat());
+    let export = |flags: &[&str]| {
+        learner("export", &[&quad], &[&["--out", out.to_str().unwrap()], flags].concat())
+    };
     said(&export(&["--step", "20", "--license", "CC0"]), 0);
-    let [file, snapshot] =
-        [&out, &quad.join("snapshots/step_000000020.safetensors")].map(|path| fs::read(path).unwrap());
-    let (header, original) = (Header::<Origin>::read(&file).unwrap(), Header::<Origin>::read(&snapshot).unwrap());
+    let [file, snapshot] = [&out, &quad.join("snapshots/step_000000020.safetensors")]
+        .map(|path| fs::read(path).unwrap());
+    let (header, original) =
+        (Header::<Origin>::read(&file).unwrap(), Header::<Origin>::read(&snapshot).unwrap());
     assert_eq!((&header.policy, &header.origin), (&original.policy, &original.origin));
-    assert_eq!((&header.about["data"]["license"], &header.about["algorithm"]), (&"CC0".into(), &"quad".into()));
+    assert_eq!(
+        (&header.about["data"]["license"], &header.about["algorithm"]),
+        (&"CC0".into(), &"quad".into())
+    );
     assert_eq!(header.about["data"]["held_out"].as_array().unwrap().len(), 2);
     let act = |file: &[u8]| {
         let (policy, mut actions) = (load_policy(file, Precision::F32).unwrap(), vec![0.0; 2]);
@@ -120,7 +156,11 @@ fn an_exported_policy_says_what_it_has_learned_from_and_acts_alike() {
     };
     assert_eq!(act(&file), act(&snapshot));
 
-    assert_refused(&export(&["--step", "10"]), "has no snapshot after that step", "of the steps 20");
+    assert_refused(
+        &export(&["--step", "10"]),
+        "has no snapshot after that step",
+        "of the steps 20",
+    );
     assert_refused(&export(&["--step", "best"]), "with a complete evaluation", "--step N");
     let nowhere = learner("export", &[&quad], &["--out", "/nowhere/policy"]);
     assert_refused(&nowhere, "cannot export to /nowhere/policy", "");

@@ -1,4 +1,5 @@
-//! What a user gets from a command: exit codes, hints, help, files; and that none of ours is misread by the programs of others.
+//! What a user gets from a command: exit codes, hints, help, files; and that none of ours is
+//! misread by the programs of others.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 mod alerts;

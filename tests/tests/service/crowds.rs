@@ -1,5 +1,5 @@
-//! Many evaluators at one learner, behind a router. They are light: all that they say on the wire is real, but they simulate
-//! nothing, so that hundreds fit beside the learner on one machine.
+//! Many evaluators at one learner, behind a router. They are light: all that they say on the wire
+//! is real, but they simulate nothing, so that hundreds fit beside the learner on one machine.
 
 use std::process::Command;
 use std::thread::sleep;
@@ -14,15 +14,16 @@ use quad_tests::system::{Scratch, free_endpoint};
 use tokio::runtime::Runtime;
 
 /// With more episodes than any crowd can score while it is measured.
-const BUSY: Setting = Setting { eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, ..ENDLESS };
+const BUSY: Setting =
+    Setting { eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, ..ENDLESS };
 
 fn percentile(mut times: Vec<Duration>, share: f64) -> Duration {
     times.sort_unstable();
     times.get(((times.len() as f64 - 1.0) * share) as usize).copied().unwrap_or_default()
 }
 
-/// Lets so many work, with episodes of up to `episode`, for so long, at a learner that `launcher` starts; gives the slowest of
-/// a hundred claims.
+/// Lets so many work, with episodes of up to `episode`, for so long, at a learner that `launcher`
+/// starts; gives the slowest of a hundred claims.
 fn work(count: usize, episode: Duration, during: Duration, launcher: &[String]) -> Duration {
     let (scratch, endpoint, runtime) = (Scratch::new(), free_endpoint(), Runtime::new().unwrap());
     let learner = scratch.learner_through(launcher, "run", BUSY, &["--connect", &endpoint]);
@@ -35,14 +36,23 @@ fn work(count: usize, episode: Duration, during: Duration, launcher: &[String]) 
     crowd.measured();
     sleep(during);
     let measured = crowd.measured();
-    assert_eq!((measured.unanswered, measured.refused), (0, 0), "questions without an answer, and refused reports");
+    assert_eq!(
+        (measured.unanswered, measured.refused),
+        (0, 0),
+        "questions without an answer, and refused reports"
+    );
     for (kind, times) in [("claims", &measured.claims), ("reports", &measured.reports)] {
         let rate = times.len() as f64 / during.as_secs_f64();
         let [middle, p99, longest] = [0.5, 0.99, 1.0].map(|share| percentile(times.clone(), share));
         eprintln!("{rate:.0} {kind}/s, median {middle:.1?}, p99 {p99:.1?}, longest {longest:.1?}");
     }
-    let (memory, scores) = (learner.process.peak_memory().unwrap(), learner.assert_scores_are_distinct().len());
-    eprintln!("memory: {} MiB alone, {} MiB with all; {scores} scores, each once", alone >> 20, memory >> 20);
+    let (memory, scores) =
+        (learner.process.peak_memory().unwrap(), learner.assert_scores_are_distinct().len());
+    eprintln!(
+        "memory: {} MiB alone, {} MiB with all; {scores} scores, each once",
+        alone >> 20,
+        memory >> 20
+    );
     percentile(measured.claims, 0.99)
 }
 
@@ -52,10 +62,17 @@ fn a_run_whose_evaluators_are_slow_says_so_once() {
     let (scratch, runtime) = (Scratch::new(), Runtime::new().unwrap());
     let learner = scratch.learner("run", ENDLESS);
     learner.wait_for_metric("snapshots_published_total", "", |published| published > 5.0);
-    let said = || learner.process.log().matches("the evaluators are slower than the training").count();
+    let said =
+        || learner.process.log().matches("the evaluators are slower than the training").count();
     assert_eq!(said(), 0, "there is none");
-    let _crowd = runtime.block_on(Crowd::connect(1, Duration::from_secs(3600), &name("run"), &learner.endpoint()));
-    let line = learner.process.wait_for_log("the evaluators are slower than the training", PATIENCE);
+    let _crowd = runtime.block_on(Crowd::connect(
+        1,
+        Duration::from_secs(3600),
+        &name("run"),
+        &learner.endpoint(),
+    ));
+    let line =
+        learner.process.wait_for_log("the evaluators are slower than the training", PATIENCE);
     assert!(line.contains(" evaluations have no score yet"), "{line}");
     let published = learner.metric("snapshots_published_total", "").unwrap();
     learner.wait_for_metric("snapshots_published_total", "", |now| now > published + 2.0);
@@ -72,7 +89,12 @@ fn fifty_evaluators_are_served_and_each_score_counts_once() {
 fn five_hundred_evaluators_are_served() {
     // The learner has a core of its own.
     let me = std::process::id().to_string();
-    assert!(Command::new("taskset").args(["-a", "-c", "-p", "0", &me]).status().is_ok_and(|status| status.success()));
+    assert!(
+        Command::new("taskset")
+            .args(["-a", "-c", "-p", "0", &me])
+            .status()
+            .is_ok_and(|status| status.success())
+    );
     let launcher = ["taskset", "-c", "1"].map(str::to_owned);
     let slowest = work(500, Duration::from_millis(1600), Duration::from_secs(60), &launcher);
     assert!(slowest <= Duration::from_millis(100), "of a hundred claims one takes {slowest:.1?}");

@@ -38,34 +38,63 @@ fn a_stderr_that_is_never_read_holds_up_neither_the_work_nor_the_end() {
     let scratch = Scratch::new();
     let (unread, _reader) = full_pipe();
     let start = |command: &mut Command| {
-        command.stdout(Stdio::null()).stderr(unread.try_clone().unwrap()).stdin(Stdio::null()).spawn().unwrap()
+        command
+            .stdout(Stdio::null())
+            .stderr(unread.try_clone().unwrap())
+            .stdin(Stdio::null())
+            .spawn()
+            .unwrap()
     };
     let learner = |name: &str, setting, arguments: &[&str]| {
         let mut learner = Command::new(binary("learner"));
-        learner.arg("train").arg("--preset").arg(scratch.preset(name, setting)).arg("--dataset").arg(scratch.dataset());
-        learner.arg("--run-dir").arg(scratch.path().join(name)).args(["--http", "127.0.0.1:0"]).args(arguments);
+        learner
+            .arg("train")
+            .arg("--preset")
+            .arg(scratch.preset(name, setting))
+            .arg("--dataset")
+            .arg(scratch.dataset());
+        learner
+            .arg("--run-dir")
+            .arg(scratch.path().join(name))
+            .args(["--http", "127.0.0.1:0"])
+            .args(arguments);
         start(&mut learner)
     };
     // One that has to end itself is not a success.
-    assert_eq!(ends(learner("short", SHORT, &["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"])), Some(0));
+    assert_eq!(
+        ends(learner("short", SHORT, &["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"])),
+        Some(0)
+    );
     let (endpoint, run_dir) = (free_endpoint(), scratch.path().join("run"));
     let learner = learner("run", ENDLESS, &["--listen", &endpoint]);
-    let evaluator = start(Command::new(binary("evaluator")).args(["serve", "--name", "mute", "--connect", &endpoint]));
-    let scored = || std::fs::read_to_string(run_dir.join("scores.jsonl")).is_ok_and(|lines| lines.lines().count() > 20);
+    let evaluator = start(Command::new(binary("evaluator")).args([
+        "serve",
+        "--name",
+        "mute",
+        "--connect",
+        &endpoint,
+    ]));
+    let scored = || {
+        std::fs::read_to_string(run_dir.join("scores.jsonl"))
+            .is_ok_and(|lines| lines.lines().count() > 20)
+    };
     eventually("there are scores", PATIENCE, || scored().then_some(()));
     assert_eq!((leaves(evaluator), leaves(learner)), (Some(0), Some(75)));
     let checkpoints = std::fs::read_dir(run_dir.join("checkpoints")).unwrap().count();
     assert!(checkpoints > 0, "it has left without a checkpoint");
 }
 
-/// A closed session, and what Slurm sends before the end of a time limit; but not where `nohup` keeps a session's end away.
+/// A closed session, and what Slurm sends before the end of a time limit; but not where `nohup`
+/// keeps a session's end away.
 #[test]
 fn a_learner_ends_in_order_by_every_signal_that_tells_it_to() {
     let scratch = Scratch::new();
     // The tests themselves may run under `nohup`.
-    let [session, nohup] =
-        ["--default-signal=HUP", "--ignore-signal=HUP,CHLD"].map(|how| ["env", how].map(str::to_owned));
-    for (run, launcher, signal) in [("hup", &session, "HUP"), ("usr1", &session, "USR1"), ("nohup", &nohup, "TERM")] {
+    let [session, nohup] = ["--default-signal=HUP", "--ignore-signal=HUP,CHLD"]
+        .map(|how| ["env", how].map(str::to_owned));
+    for (run, launcher, signal) in
+        [("hup", &session, "HUP"), ("usr1", &session, "USR1"), ("nohup", &nohup, "TERM")]
+    {
         let listen = ["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"];
         let mut learner = scratch.learner_through(launcher, run, ENDLESS, &listen);
         learner.wait_for_scores(0);
@@ -74,8 +103,17 @@ fn a_learner_ends_in_order_by_every_signal_that_tells_it_to() {
             learner.wait_for_scores(learner.scores().len());
         }
         learner.process.signal(signal);
-        assert_eq!(learner.process.wait(PATIENCE).code(), Some(75), "{run}: {}", learner.process.log());
-        assert!(learner.process.log().contains(&format!("received SIG{signal}")), "{}", learner.process.log());
+        assert_eq!(
+            learner.process.wait(PATIENCE).code(),
+            Some(75),
+            "{run}: {}",
+            learner.process.log()
+        );
+        assert!(
+            learner.process.log().contains(&format!("received SIG{signal}")),
+            "{}",
+            learner.process.log()
+        );
         assert!(!learner.files("checkpoints").is_empty(), "{run} has left without a checkpoint");
     }
 }
@@ -86,7 +124,8 @@ async fn a_learner_that_waits_for_another_to_be_gone_hears_of_a_failure_and_leav
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let session = router(&endpoint).await;
-    let _other = session.liveliness().declare_token(keys::live_learner(&name("run"), 1)).await.unwrap();
+    let _other =
+        session.liveliness().declare_token(keys::live_learner(&name("run"), 1)).await.unwrap();
     let diverges = ["--connect", &endpoint, "--agent", "critic_learning_rate=1e30"];
     let mut learner = scratch.learner_with("run", ENDLESS, &diverges);
     assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
@@ -96,15 +135,25 @@ async fn a_learner_that_waits_for_another_to_be_gone_hears_of_a_failure_and_leav
     let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint, "--fresh"]);
     learner.process.wait_for_log("waiting to see if it is gone", PATIENCE);
     assert_eq!(learner.process.terminate(PATIENCE).code(), Some(75), "{}", learner.process.log());
-    assert!(learner.process.log().contains("the same command continues from there"), "{}", learner.process.log());
+    assert!(
+        learner.process.log().contains("the same command continues from there"),
+        "{}",
+        learner.process.log()
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_evaluator_that_leaves_in_the_middle_of_a_job_hands_it_back() {
     let scratch = Scratch::new();
     // It need not be finished, so it is as long as jobs can be.
-    let setting =
-        Setting { steps: 10_000_000, eval_interval: 10, episodes: 40, candidates: 1000, hidden: 256, ..ENDLESS };
+    let setting = Setting {
+        steps: 10_000_000,
+        eval_interval: 10,
+        episodes: 40,
+        candidates: 1000,
+        hidden: 256,
+        ..ENDLESS
+    };
     let learner = scratch.learner("run", setting);
     let behind = free_endpoint();
     let _router = router_without_scores(&behind, Some(&learner.endpoint())).await;

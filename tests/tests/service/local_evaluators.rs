@@ -44,7 +44,8 @@ fn one_command_trains_and_evaluates_also_beside_another_without_being_told_ports
     by_default.assert_completes(PATIENCE);
     learner.assert_completes(PATIENCE);
     for number in [1, 2] {
-        let log = fs::read_to_string(learner.run_dir.join(format!("evaluator-{number}.log"))).unwrap();
+        let log =
+            fs::read_to_string(learner.run_dir.join(format!("evaluator-{number}.log"))).unwrap();
         assert!(log.contains("ready to serve") && log.contains("leaving"), "{log}");
     }
 }
@@ -76,7 +77,8 @@ fn one_that_dies_is_told_with_its_log_and_started_again() {
     }
     let line = learner.process.wait_for_log("an evaluator has ended", PATIENCE);
     assert!(line.contains("signal: 9") && line.contains("evaluator-"), "{line}");
-    let others = || children(learner.process.id()).into_iter().filter(|id| !evaluators.contains(id)).count();
+    let others =
+        || children(learner.process.id()).into_iter().filter(|id| !evaluators.contains(id)).count();
     eventually("there are two others", PATIENCE, || (others() == 2).then_some(()));
     learner.wait_for_scores(learner.scores().len());
 }
@@ -86,10 +88,15 @@ async fn those_of_two_learners_at_one_router_have_names_of_their_own() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let _router = router(&endpoint).await;
-    let start = |run| scratch.learner_with(run, SHORT, &["--connect", &endpoint, "--evaluators", "1"]);
+    let start =
+        |run| scratch.learner_with(run, SHORT, &["--connect", &endpoint, "--evaluators", "1"]);
     for mut learner in ["one", "two"].map(start) {
         learner.assert_completes(PATIENCE);
-        assert!(!learner.process.log().contains("two evaluators were started"), "{}", learner.process.log());
+        assert!(
+            !learner.process.log().contains("two evaluators were started"),
+            "{}",
+            learner.process.log()
+        );
     }
     let names = ["one", "two"].map(|run| {
         let log = fs::read_to_string(scratch.path().join(run).join("evaluator-1.log")).unwrap();
@@ -102,7 +109,9 @@ async fn those_of_two_learners_at_one_router_have_names_of_their_own() {
 #[test]
 fn certificates_that_only_the_environment_names_are_for_other_networks() {
     let scratch = Scratch::new();
-    for (folder, flags) in [("/nowhere", ["--evaluators", "1"]), ("", ["--listen", "tcp/127.0.0.1:0"])] {
+    for (folder, flags) in
+        [("/nowhere", ["--evaluators", "1"]), ("", ["--listen", "tcp/127.0.0.1:0"])]
+    {
         let launcher = ["env".to_owned(), format!("QUAD_CERTIFICATES={folder}")];
         let learner = scratch.learner_through(&launcher, "run", ENDLESS, &flags);
         learner.process.wait_for_log("run run is at tcp/", PATIENCE);

@@ -11,8 +11,9 @@ use quad_tests::{PATIENCE, eventually};
 async fn of_two_learners_under_one_name_that_start_at_once_one_stops() {
     let scratches = [Scratch::new(), Scratch::new()];
     let endpoint = free_endpoint();
-    let mut learners =
-        scratches.each_ref().map(|scratch| scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]));
+    let mut learners = scratches
+        .each_ref()
+        .map(|scratch| scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]));
     // Both wait for the router, and so come together.
     std::thread::sleep(Duration::from_secs(2));
     let _session = router(&endpoint).await;
@@ -23,7 +24,10 @@ async fn of_two_learners_under_one_name_that_start_at_once_one_stops() {
     eventually("the other is evaluated", PATIENCE, || {
         learners.iter().any(|learner| !learner.scores().is_empty()).then_some(())
     });
-    let running = learners.iter_mut().filter_map(|learner| learner.process.is_running().then_some(())).count();
+    let running = learners
+        .iter_mut()
+        .filter_map(|learner| learner.process.is_running().then_some(()))
+        .count();
     assert_eq!(running, 1);
     let said = learners.iter().map(|learner| learner.process.log()).filter(|log| {
         let told = log.contains("there is another learner of run run");

@@ -10,7 +10,13 @@ use quad_tests::{PATIENCE, dashboard};
 
 /// The page as the browser has it after some seconds of its own clock.
 fn shown(address: &str) -> String {
-    let flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000", "--dump-dom"];
+    let flags = [
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--virtual-time-budget=8000",
+        "--dump-dom",
+    ];
     let output = Command::new("chromium").args(flags).arg(address).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap()
@@ -30,14 +36,23 @@ fn a_browser_shows_a_run_at_work() {
     let learner = scratch.learner_with("run", ENDLESS, &flags);
     learner.wait_for_scores(4 * ENDLESS.episodes as usize);
     let page = shown(&format!("http://{}/", learner.metrics()));
-    assert_has(&page, &["<title>run</title>", "all is well", "evaluator-1", "evaluator-2", "steps per second"]);
-    // A chart of each metric that Grafana's dashboard has, too, with its newest value for those who do not see it.
-    let metrics = dashboard::metrics();
-    assert!(metrics.len() > 10, "{metrics:?}");
-    metrics.iter().for_each(|name| assert_has(&page, &[&format!("aria-label=\"{name}, newest values: ")]));
     assert_has(
         &page,
-        &["aria-label=\"critic_loss, newest values: critic_loss ", "aria-label=\"lambda_fifth, newest values: 1 "],
+        &["<title>run</title>", "all is well", "evaluator-1", "evaluator-2", "steps per second"],
+    );
+    // A chart of each metric that Grafana's dashboard has, too, with its newest value for those who
+    // do not see it.
+    let metrics = dashboard::metrics();
+    assert!(metrics.len() > 10, "{metrics:?}");
+    metrics
+        .iter()
+        .for_each(|name| assert_has(&page, &[&format!("aria-label=\"{name}, newest values: ")]));
+    assert_has(
+        &page,
+        &[
+            "aria-label=\"critic_loss, newest values: critic_loss ",
+            "aria-label=\"lambda_fifth, newest values: 1 ",
+        ],
     );
     assert_has(&page, &["Last episodes", "episodes = 6"]);
 }
@@ -60,7 +75,9 @@ fn a_browser_compares_finished_runs() {
     let mut server = Process::start("page", scratch.path(), command);
     let line = server.wait_for_log("page: http://", PATIENCE);
     let address = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
-    let ticked = shown(&format!("{address}#%5B%22one%22%2C%22%3Cimg%20src%3Dx%20onerror%3Dalert(1)%3E%22%5D"));
+    let ticked = shown(&format!(
+        "{address}#%5B%22one%22%2C%22%3Cimg%20src%3Dx%20onerror%3Dalert(1)%3E%22%5D"
+    ));
     assert_has(
         &ticked,
         &[
@@ -76,7 +93,9 @@ fn a_browser_compares_finished_runs() {
     for end in ["", "#top", "#5", "#%"] {
         let none = shown(&format!("{address}{end}"));
         assert!(
-            none.contains("Tick runs") && none.contains("<title>2 runs") && !none.contains("newest values"),
+            none.contains("Tick runs")
+                && none.contains("<title>2 runs")
+                && !none.contains("newest values"),
             "{none}"
         );
     }

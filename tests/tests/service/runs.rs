@@ -1,4 +1,5 @@
-//! Several runs, one evaluator for all of them: it waits for them, finds them again, and loses none of their scores.
+//! Several runs, one evaluator for all of them: it waits for them, finds them again, and loses none
+//! of their scores.
 
 use std::time::Duration;
 
@@ -16,7 +17,8 @@ async fn one_evaluator_serves_two_runs_in_turn_and_survives_the_routers_restart(
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let _evaluator = scratch.evaluator("shared", &endpoint);
-    let [first, second] = ["first", "second"].map(|run| scratch.learner_with(run, ENDLESS, &["--connect", &endpoint]));
+    let [first, second] = ["first", "second"]
+        .map(|run| scratch.learner_with(run, ENDLESS, &["--connect", &endpoint]));
     let both_scored = |count: usize| {
         first.wait_for_scores(count);
         second.wait_for_scores(count);
@@ -59,7 +61,14 @@ fn an_evaluator_waits_for_its_learner_and_serves_the_next_one() {
 async fn scores_measured_while_cut_off_are_delivered_to_the_learners_next_life() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
-    let setting = Setting { steps: 10, eval_interval: 10, episodes: 20, candidates: 1000, hidden: 256, seed: 1 };
+    let setting = Setting {
+        steps: 10,
+        eval_interval: 10,
+        episodes: 20,
+        candidates: 1000,
+        hidden: 256,
+        seed: 1,
+    };
     let session = router_without_scores(&endpoint, None).await;
     let mut first = scratch.learner_with("run", setting, &["--connect", &endpoint]);
     let evaluator = scratch.evaluator("cut-off", &endpoint);
@@ -107,26 +116,35 @@ async fn evaluators_behind_a_router_are_counted_and_missed_when_they_leave() {
     }
 }
 
-/// As evaluators do that wait for long: the second report comes many times while the disk is slow to take the first.
+/// As evaluators do that wait for long: the second report comes many times while the disk is slow
+/// to take the first.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_report_that_is_delivered_many_times_at_once_counts_once() {
     let scratch = Scratch::new();
     let slow = Disk::new(scratch.path());
     let setting = Setting { eval_interval: 50_000, episodes: 40, ..ENDLESS };
-    let learner = scratch.learner_through(&slow.launcher(), "run", setting, &["--listen", "tcp/127.0.0.1:0"]);
+    let learner =
+        scratch.learner_through(&slow.launcher(), "run", setting, &["--listen", "tcp/127.0.0.1:0"]);
     let (session, run) = (client(&learner.endpoint()).await, name("run"));
     let (mut deliveries, mut episodes) = (Vec::new(), 0);
-    let jobs = [(claim_eventually(&session, &run, "a").await, 1), (claim_eventually(&session, &run, "b").await, 20)];
+    let jobs = [
+        (claim_eventually(&session, &run, "a").await, 1),
+        (claim_eventually(&session, &run, "b").await, 20),
+    ];
     for ((job, times), evaluator) in jobs.iter().zip(["a", "b"]) {
         episodes += job.seeds.len();
         for _ in 0..*times {
-            let (session, key, report) = (session.clone(), keys::scores(&run), scores(job, evaluator));
-            deliveries.push(tokio::spawn(async move { ask::<ScoreReply>(&session, key, &report).await }));
+            let (session, key, report) =
+                (session.clone(), keys::scores(&run), scores(job, evaluator));
+            deliveries
+                .push(tokio::spawn(async move { ask::<ScoreReply>(&session, key, &report).await }));
         }
     }
     let mut counted = 0;
     for delivery in deliveries {
-        let Some(ScoreReply::Recorded { new, .. }) = delivery.await.unwrap() else { panic!("refused") };
+        let Some(ScoreReply::Recorded { new, .. }) = delivery.await.unwrap() else {
+            panic!("refused")
+        };
         counted += new as usize;
     }
     assert_eq!((counted, learner.assert_scores_are_distinct().len()), (episodes, episodes));

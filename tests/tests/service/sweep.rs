@@ -50,7 +50,11 @@ impl Study {
 
     /// Waits until a run has begun to train.
     fn wait_for(&self, run: &str) {
-        let text = || fs::read_to_string(self.dir(run).join("metrics.jsonl")).ok().filter(|text| !text.is_empty());
+        let text = || {
+            fs::read_to_string(self.dir(run).join("metrics.jsonl"))
+                .ok()
+                .filter(|text| !text.is_empty())
+        };
         eventually(&format!("{run} trains"), PATIENCE, text);
     }
 
@@ -59,14 +63,24 @@ impl Study {
         let output = self.command(&["--list"]).output().unwrap();
         let text = String::from_utf8(output.stdout).unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        text.lines().skip(1).zip(RUNS).map(|(line, run)| line.split_once(run).unwrap().1.trim().to_owned()).collect()
+        text.lines()
+            .skip(1)
+            .zip(RUNS)
+            .map(|(line, run)| line.split_once(run).unwrap().1.trim().to_owned())
+            .collect()
     }
 
     /// Every episode of every run has one score, and the runs are those of another study.
     fn assert_same_as(&self, other: &Study) {
         for run in RUNS {
             let mut verify = Command::new(binary("learner"));
-            let output = verify.arg("verify").arg(self.dir(run)).arg("--same-as").arg(other.dir(run)).output().unwrap();
+            let output = verify
+                .arg("verify")
+                .arg(self.dir(run))
+                .arg("--same-as")
+                .arg(other.dir(run))
+                .output()
+                .unwrap();
             assert!(output.status.success(), "{run}: {}", String::from_utf8_lossy(&output.stdout));
         }
     }
@@ -112,7 +126,10 @@ fn a_sweep_goes_on_after_an_interruption_and_a_failed_run_ends_no_other() {
     kill("-KILL", &learner);
     assert_eq!(sweep.wait(PATIENCE).code(), Some(1), "{}", sweep.log());
     let log = sweep.log();
-    assert!(log.contains("1 of 4 runs have failed") && log.contains(&format!("{victim}/learner.log")), "{log}");
+    assert!(
+        log.contains("1 of 4 runs have failed") && log.contains(&format!("{victim}/learner.log")),
+        "{log}"
+    );
     let states = study.states();
     assert!(states[2].starts_with("failed after"), "{states:?}");
     assert_eq!([&*states[0], &states[1], &states[3]], ["complete"; 3]);
@@ -128,7 +145,9 @@ fn parts_of_a_study_are_done_by_number() {
     assert_eq!(study.states(), ["not begun", "complete", "not begun", "complete"]);
     let address = format!("127.0.0.1:{}", free_port());
     study.sweep(&["--index", "2", "--http", &address]).assert_succeeds(PATIENCE);
-    assert!(fs::read_to_string(study.dir(RUNS[2]).join("endpoints.json")).unwrap().contains(&address));
+    assert!(
+        fs::read_to_string(study.dir(RUNS[2]).join("endpoints.json")).unwrap().contains(&address)
+    );
     assert_eq!(study.states(), ["not begun", "complete", "complete", "complete"]);
     let mut sweep = study.sweep(&["--index", "0"]);
     study.wait_for(RUNS[0]);
@@ -144,7 +163,11 @@ fn a_run_of_other_settings_is_never_taken_for_one_of_the_study() {
     study.scratch.preset("tiny", Setting { steps: 4000, ..SETTING });
     let mut sweep = study.sweep(&[]);
     assert_eq!(sweep.wait(PATIENCE).code(), Some(1));
-    assert!(sweep.log().contains("has a run of other settings than the study's: steps"), "{}", sweep.log());
+    assert!(
+        sweep.log().contains("has a run of other settings than the study's: steps"),
+        "{}",
+        sweep.log()
+    );
 }
 
 /// Its runs would train, and each wait ten minutes for an evaluator.
@@ -153,7 +176,8 @@ fn a_sweep_whose_only_evaluator_is_killed_gets_another() {
     let study = Study::new();
     let mut sweep = study.sweep(&["--jobs", "1", "--evaluators", "1"]);
     study.wait_for(RUNS[0]);
-    let evaluator = eventually("there is an evaluator", PATIENCE, || child_of(&sweep, |word| word == "serve"));
+    let evaluator =
+        eventually("there is an evaluator", PATIENCE, || child_of(&sweep, |word| word == "serve"));
     kill("-KILL", &evaluator);
     sweep.assert_succeeds(PATIENCE);
     assert!(sweep.log().contains("an evaluator has ended (signal: 9"), "{}", sweep.log());
@@ -166,7 +190,9 @@ fn a_parent_that_ignores_its_childrens_ends_and_asks_for_no_thread_changes_nothi
     let command = study.command(&["--index", "0"]);
     // Not a shell's `trap`: some shells never ignore this signal.
     let mut env = Command::new("env");
-    env.args(["--ignore-signal=CHLD", "RAYON_NUM_THREADS=0"]).arg(command.get_program()).args(command.get_args());
+    env.args(["--ignore-signal=CHLD", "RAYON_NUM_THREADS=0"])
+        .arg(command.get_program())
+        .args(command.get_args());
     Process::start("sweep", study.scratch.path(), env).assert_succeeds(PATIENCE);
     assert_eq!(study.states()[0], "complete");
 }
@@ -182,13 +208,18 @@ fn two_sweeps_of_one_study_do_not_disturb_each_other() {
             let second = study.command(others).output().unwrap();
             let said = String::from_utf8_lossy(&second.stderr);
             assert_eq!(second.status.code(), Some(75), "{flags:?}, {others:?}: {said}");
-            assert!(!study.states()[run].starts_with("failed"), "{flags:?}, {others:?}: {:?}", study.states());
+            assert!(
+                !study.states()[run].starts_with("failed"),
+                "{flags:?}, {others:?}: {:?}",
+                study.states()
+            );
         }
         sweep.terminate(PATIENCE);
     }
 }
 
-/// Slurm queues a task again by this exit code, so neither a slow disk nor a learner that has only begun may change it.
+/// Slurm queues a task again by this exit code, so neither a slow disk nor a learner that has only
+/// begun may change it.
 #[test]
 fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
     let study = Study::new();
@@ -220,5 +251,8 @@ fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
     sweep.signal("TERM");
     assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
     let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
-    assert!(log.contains("received SIGTERM") && log.contains("the same command continues"), "{log}");
+    assert!(
+        log.contains("received SIGTERM") && log.contains("the same command continues"),
+        "{log}"
+    );
 }

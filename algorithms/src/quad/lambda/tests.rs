@@ -6,7 +6,8 @@ const LAMBDA: [f32; 7] = [0.2, 0.995, 0.5, 0.9, 1.0, 0.3, 0.4];
 const T: [u32; 7] = [1, 2, 3, 1, 7, 3, 4];
 
 fn close(found: &[f32], expected: &[f32]) {
-    let is_close = found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6);
+    let is_close =
+        found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6);
     assert!(found.len() == expected.len() && is_close, "{found:?}, but expected is {expected:?}");
 }
 
@@ -30,8 +31,15 @@ fn a_batch_is_measured_in_one_pass() {
     let found = measure(&numbers, &[1, 2], 2, 0.1);
     let value = |name: &str| found.iter().find(|(known, _)| *known == name).unwrap().1;
     // σ²/(ν̂² + δ); the mean of the cosine 0.6 and, of a gradient that is 0, of 0.
-    let names = ["delta_share", "lambda_mean", "lambda_above_99_share", "variance_ratio", "guidance_cosine"];
+    let names = [
+        "delta_share",
+        "lambda_mean",
+        "lambda_above_99_share",
+        "variance_ratio",
+        "guidance_cosine",
+    ];
     close(&names.map(value), &[0.25, 0.7475, 0.5, 0.4, 0.3]);
-    let fifths = Vec::from_iter(found.into_iter().filter(|(name, _)| name.starts_with("lambda_fifth")));
+    let fifths =
+        Vec::from_iter(found.into_iter().filter(|(name, _)| name.starts_with("lambda_fifth")));
     assert_eq!(fifths, [("lambda_fifth_1", 0.995), ("lambda_fifth_3", 0.5)]);
 }

@@ -30,7 +30,8 @@ fn a_run_whose_lambda_stays_near_one_is_called_dac() {
 
 #[test]
 fn lambda_is_summarized_after_the_first_tenth() {
-    let Summary { text, json, .. } = of(&lines(|number| if number % 2 == 0 { 0.5 } else { 0.75 }), "quad").unwrap();
+    let Summary { text, json, .. } =
+        of(&lines(|number| if number % 2 == 0 { 0.5 } else { 0.75 }), "quad").unwrap();
     for words in [
         "steps 201 to 2000: mean 0.625, of a batch 10 % below 0.125",
         "50.0 % above 0.99",
@@ -39,12 +40,22 @@ fn lambda_is_summarized_after_the_first_tenth() {
     ] {
         assert!(text.contains(words), "{words} is missing in\n{text}");
     }
-    assert_eq!((&json["from_step"], &json["to_step"], &json["is_dac"]), (&json!(201), &json!(2000), &json!(false)));
-    assert!((json["lambda_mean"].as_f64().unwrap() - 0.625).abs() < 1e-12 && json.get("bc_loss").is_none(), "{json}");
+    assert_eq!(
+        (&json["from_step"], &json["to_step"], &json["is_dac"]),
+        (&json!(201), &json!(2000), &json!(false))
+    );
+    assert!(
+        (json["lambda_mean"].as_f64().unwrap() - 0.625).abs() < 1e-12
+            && json.get("bc_loss").is_none(),
+        "{json}"
+    );
 }
 
 #[test]
 fn a_run_without_lambda_has_no_summary_of_it() {
     let other = MetricsLine::from([("step".to_owned(), 100.0), ("critic_loss".to_owned(), 1.0)]);
-    assert_eq!((of(&[], "quad"), of(&[other], "quad"), of(&lines(|_| 0.0), "none")), (None, None, None));
+    assert_eq!(
+        (of(&[], "quad"), of(&[other], "quad"), of(&lines(|_| 0.0), "none")),
+        (None, None, None)
+    );
 }

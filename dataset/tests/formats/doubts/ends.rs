@@ -9,7 +9,10 @@ fn a_mask_or_a_discount_in_place_of_the_flag() {
         cart.terminals.iter_mut().for_each(|terminal| *terminal = !*terminal);
         let doubt = cart.doubt(own);
         assert!(doubt.starts_with("array `terminals`: says in 9"), "{doubt}");
-        assert!(doubt.contains("a mask or a discount (1 − done) in place of the flag? write 1 − it"), "{doubt}");
+        assert!(
+            doubt.contains("a mask or a discount (1 − done) in place of the flag? write 1 − it"),
+            "{doubt}"
+        );
         // Of episodes that are all cut off, the mask is 1 everywhere.
         cart.terminals.fill(true);
         assert!(cart.doubt(own).starts_with("array `terminals`: says in 100 % of the rows"));
@@ -29,7 +32,11 @@ fn a_success_that_stays_set() {
             }
         }
         let doubt = cart.doubt(own);
-        assert!(doubt.contains("a success that stays set after the goal? end each episode at the first"), "{doubt}");
+        assert!(
+            doubt
+                .contains("a success that stays set after the goal? end each episode at the first"),
+            "{doubt}"
+        );
     }
 }
 
@@ -43,8 +50,10 @@ fn a_time_limit_in_place_of_the_end() {
         cart.terminals = terminals.iter().zip(&limits).map(|(one, other)| *one || *other).collect();
         cart.timeouts.fill(false);
         let doubt = cart.doubt(own);
-        let expected =
-            format!("array `terminals`: {} of 30 episodes that terminate do so after exactly 60 steps", count(&limits));
+        let expected = format!(
+            "array `terminals`: {} of 30 episodes that terminate do so after exactly 60 steps",
+            count(&limits)
+        );
         assert!(doubt.starts_with(&expected) && doubt.contains("set `timeouts` there"), "{doubt}");
     }
 }
@@ -58,17 +67,24 @@ fn rows_after_the_goal() {
         number = if cart.terminals[row] || cart.timeouts[row] { 0 } else { number + 1 };
     }
     let doubt = cart.doubt(true);
-    assert!(doubt.starts_with("array `rewards`: 90.6") && doubt.contains("few lead to it"), "{doubt}");
+    assert!(
+        doubt.starts_with("array `rewards`: 90.6") && doubt.contains("few lead to it"),
+        "{doubt}"
+    );
     assert_eq!(cart.doubt(false), doubt);
     // A fall costs something, and most rows are before it.
-    cart.rewards.iter_mut().zip(&cart.terminals).for_each(|(reward, fall)| *reward = f32::from(!fall));
+    cart.rewards
+        .iter_mut()
+        .zip(&cart.terminals)
+        .for_each(|(reward, fall)| *reward = f32::from(!fall));
     assert_eq!(cart.doubts(true), [""; 0]);
 }
 
 #[test]
 fn flags_that_are_a_row_out_of_step_with_the_resets() {
     type Flags = fn(&mut Cart) -> &mut Vec<bool>;
-    let (terminals, timeouts): (Flags, Flags) = (|cart| &mut cart.terminals, |cart| &mut cart.timeouts);
+    let (terminals, timeouts): (Flags, Flags) =
+        (|cart| &mut cart.terminals, |cart| &mut cart.timeouts);
     for (flags, name) in [(terminals, "terminals"), (timeouts, "timeouts")] {
         for own in [false, true] {
             let mut cart = Cart::new(false);

@@ -1,5 +1,6 @@
-//! Data that can be trained on, though nothing good would come of it: a cart whose state moves a little at each step and jumps
-//! at a reset, or a mass that is pushed to the origin, with one fault in each file.
+//! Data that can be trained on, though nothing good would come of it: a cart whose state moves a
+//! little at each step and jumps at a reset, or a mass that is pushed to the origin, with one fault
+//! in each file.
 
 mod ends;
 mod numbers;
@@ -58,21 +59,30 @@ fn made(
     cart
 }
 
-/// A place and velocities in a plane, pushed to the origin with some noise, each step so long; at rest there, the task is over.
+/// A place and velocities in a plane, pushed to the origin with some noise, each step so long; at
+/// rest there, the task is over.
 fn mass(steps: usize, seconds: f32) -> Cart {
-    let reset = |random: &mut ChaCha8Rng| [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0), 0.0, 0.0];
+    let reset = |random: &mut ChaCha8Rng| {
+        [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0), 0.0, 0.0]
+    };
     made(steps, reset, |random, [x, y, vx, vy]| {
         let noise = [0; 2].map(|_| random.random_range(-0.5_f32..0.5));
-        let action = [-x - 1.5 * vx + noise[0], -y - 1.5 * vy + noise[1]].map(|push| push.clamp(-1.0, 1.0));
-        let next = [x + seconds * vx, y + seconds * vy, vx + seconds * action[0], vy + seconds * action[1]];
+        let action =
+            [-x - 1.5 * vx + noise[0], -y - 1.5 * vy + noise[1]].map(|push| push.clamp(-1.0, 1.0));
+        let next = [
+            x + seconds * vx,
+            y + seconds * vy,
+            vx + seconds * action[0],
+            vy + seconds * action[1],
+        ];
         let distance = next[0].hypot(next[1]);
         (action, next, -distance, distance < 0.03)
     })
 }
 
 impl Cart {
-    /// 30 episodes; every third one terminates, the others are cut off. Where states are `kept`, a new episode begins where the
-    /// last one ended.
+    /// 30 episodes; every third one terminates, the others are cut off. Where states are `kept`, a
+    /// new episode begins where the last one ended.
     fn new(kept: bool) -> Self {
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let mut draw = |scale: f32| scale * random.random_range(-1.0..1.0);
@@ -103,7 +113,11 @@ impl Cart {
         let (file, rows) = (hdf5::File::create(path).unwrap(), self.rewards.len());
         if own {
             let layout: hdf5::types::VarLenUnicode = "transitions".parse().unwrap();
-            file.new_attr::<hdf5::types::VarLenUnicode>().create("layout").unwrap().write_scalar(&layout).unwrap();
+            file.new_attr::<hdf5::types::VarLenUnicode>()
+                .create("layout")
+                .unwrap()
+                .write_scalar(&layout)
+                .unwrap();
             put(&file, "next_observations", &[rows, O], &self.next_observations);
         }
         put(&file, "observations", &[rows, O], &self.observations);
@@ -120,7 +134,8 @@ impl Cart {
         }
     }
 
-    /// What `inspect` says of it in the custom layout, whether or not it can be trained on as it is.
+    /// What `inspect` says of it in the custom layout, whether or not it can be trained on as it
+    /// is.
     fn doubts_of_inspect(&self) -> Vec<String> {
         self.doubts_of_inspect_in(true)
     }
@@ -139,7 +154,8 @@ impl Cart {
         doubts[0].clone()
     }
 
-    /// What is said of it in each layout, by `inspect` and by who trains on it, who both say the same.
+    /// What is said of it in each layout, by `inspect` and by who trains on it, who both say the
+    /// same.
     fn doubts(&self, own: bool) -> Vec<String> {
         let folder = tempdir().unwrap();
         let path = folder.path().join("cart.hdf5");

@@ -46,29 +46,30 @@ fn next_observations_that_are_the_rows_own() {
     let mut cart = mass(60, 0.1);
     cart.next_observations = cart.observations.clone();
     let doubts = cart.doubts_of_inspect();
-    assert!(
-        doubts
-            .iter()
-            .any(|doubt| doubt.starts_with("array `next_observations`: is the observation of its own row in 100 %"))
-    );
+    assert!(doubts.iter().any(|doubt| {
+        doubt.starts_with("array `next_observations`: is the observation of its own row in 100 %")
+    }));
 }
 
 #[test]
 fn actions_that_are_the_state() {
-    for (unit, own) in [(1.0, false), (1.0, true), (100.0, true), (180.0 / std::f32::consts::PI, true)] {
+    for (unit, own) in
+        [(1.0, false), (1.0, true), (100.0, true), (180.0 / std::f32::consts::PI, true)]
+    {
         let mut cart = mass(60, 0.1);
         let (actions, observations) = (&mut cart.actions, &cart.observations);
         for (action, observation) in actions.chunks_exact_mut(2).zip(observations.chunks_exact(O)) {
             action.copy_from_slice(&[unit * observation[1], unit * observation[0]]);
         }
         let doubts = cart.doubts_of_inspect_in(own);
-        let expected =
-            "array `actions`: columns 0, 1 copied from columns 1, 0 of the same row's observation (in 100.0 %";
+        let expected = "array `actions`: columns 0, 1 copied from columns 1, 0 of the same row's observation (in 100.0 %";
         assert!(doubts.iter().any(|doubt| doubt.starts_with(expected)), "{doubts:?}");
     }
     // The state of the next row is a command like others.
     let mut cart = mass(60, 0.1);
-    for (action, next) in cart.actions.chunks_exact_mut(2).zip(cart.next_observations.chunks_exact(O)) {
+    for (action, next) in
+        cart.actions.chunks_exact_mut(2).zip(cart.next_observations.chunks_exact(O))
+    {
         action.copy_from_slice(&next[..2]);
     }
     assert!(!cart.doubts_of_inspect().iter().any(|doubt| doubt.contains("copied")));
@@ -93,7 +94,10 @@ fn observations_that_are_a_row_late() {
         for own in [false, true] {
             assert_eq!(sound.doubts(own), [""; 0]);
             let doubts = late.doubts_of_inspect_in(own);
-            assert!(doubts.iter().any(|doubt| doubt.starts_with("array `observations`: one row late?")), "{doubts:?}");
+            assert!(
+                doubts.iter().any(|doubt| doubt.starts_with("array `observations`: one row late?")),
+                "{doubts:?}"
+            );
         }
     }
 }

@@ -31,7 +31,12 @@ fn constant_velocity() {
         |random| [random.random_range(-1.0..1.0), 0.7, random.random_range(-1.0..1.0), -0.3],
         |random, [x, vx, y, vy]| {
             let next = [x + 0.01 * vx, vx, y + 0.01 * vy, vy];
-            ([random.random_range(-1.0..1.0), random.random_range(-1.0..1.0)], next, -next[0].abs(), false)
+            (
+                [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0)],
+                next,
+                -next[0].abs(),
+                false,
+            )
         },
     );
     nothing_is_said("constant velocity", &cart);
@@ -49,7 +54,8 @@ fn rewards_at_the_goal_alone() {
 
 #[test]
 fn episodes_of_one_step() {
-    let context = |random: &mut rand_chacha::ChaCha8Rng| [0; O].map(|_| random.random_range(-1.0_f32..1.0));
+    let context =
+        |random: &mut rand_chacha::ChaCha8Rng| [0; O].map(|_| random.random_range(-1.0_f32..1.0));
     for stays in [false, true] {
         let mut cart = Cart::default();
         for seed in 0..20 {
@@ -63,7 +69,12 @@ fn episodes_of_one_step() {
                 },
                 |random, state| {
                     let action = [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0)];
-                    (action, if stays { state } else { context(random) }, action[0] * state[0], true)
+                    (
+                        action,
+                        if stays { state } else { context(random) },
+                        action[0] * state[0],
+                        true,
+                    )
                 },
             );
             cart.observations.extend(one.observations);
@@ -103,7 +114,13 @@ fn files_with_one_fault_each() {
         ("discount-as-done", &["array `terminals`: says in 98.099 % of the rows"][..]),
         ("frozen-observations", &["array `observations`: does not change in 9"]),
         ("constant-columns", &["array `actions`, row 0: the action -11.667108 is outside"]),
-        ("degrees-newtons", &["array `rewards`: of size 221.4", "array `observations`: far from ±1 in columns 2, 3"]),
+        (
+            "degrees-newtons",
+            &[
+                "array `rewards`: of size 221.4",
+                "array `observations`: far from ±1 in columns 2, 3",
+            ],
+        ),
         ("rewards-all-one", &["array `rewards`: all are alike"]),
         ("timeouts-one-row-late", &["array `timeouts`: one row late"]),
         ("one-observation-near-a-million", &["array `observations`: far from ±1 in column 4"]),

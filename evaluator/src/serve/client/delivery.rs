@@ -9,7 +9,8 @@ use super::super::query::{AskError, ask};
 use super::{ANSWER_TIMEOUT, RunClient, is_from};
 use crate::metrics::JobOutcome;
 
-/// How long a leaving evaluator tries to deliver its scores; it tries half as long to hand a job back.
+/// How long a leaving evaluator tries to deliver its scores; it tries half as long to hand a job
+/// back.
 const LEAVE: Duration = Duration::from_secs(2);
 /// A leaving evaluator delivers scores again this long after the learner answered with an error.
 const AGAIN: Duration = Duration::from_millis(100);
@@ -35,14 +36,15 @@ impl RunClient {
         self.owed = Some(Owed::Scores(report));
     }
 
-    /// Delivers the kept scores to the learner process that this evaluator follows, or hands a failed job back to it. Keeps
-    /// them after an error.
+    /// Delivers the kept scores to the learner process that this evaluator follows, or hands a
+    /// failed job back to it. Keeps them after an error.
     pub async fn deliver(&mut self, timeout: Duration) -> anyhow::Result<()> {
         let Some(Owed::Scores(report)) = &self.owed else { return self.hand_back(timeout).await };
         let incarnation = self.incarnation;
         let fitting = move |reply: &ScoreReply| is_from(incarnation, reply.incarnation());
         let key = keys::scores(&self.run);
-        let answer = ask(&self.session, key, encode(report)?, timeout, &self.metrics, fitting).await?;
+        let answer =
+            ask(&self.session, key, encode(report)?, timeout, &self.metrics, fitting).await?;
         let (run, step) = (&self.run, report.step);
         match answer {
             ScoreReply::Recorded { new, duplicates, .. } => {
@@ -65,7 +67,8 @@ impl RunClient {
         }
     }
 
-    /// Hands back the claimed job, which this evaluator could not run; [`deliver`](Self::deliver) does so if there is no answer.
+    /// Hands back the claimed job, which this evaluator could not run; [`deliver`](Self::deliver)
+    /// does so if there is no answer.
     pub async fn fail(&mut self, reason: &str) {
         self.metrics.job(JobOutcome::Failed);
         self.return_job(Some(reason.chars().take(LONGEST_REASON).collect()));
@@ -80,8 +83,9 @@ impl RunClient {
         let mut answered = false;
         while matches!(self.owed, Some(Owed::Scores(_))) {
             let Err(error) = self.deliver(LEAVE / 2).await else { return };
-            // A learner that answers has received the scores, and may still save them; if it could not, it says why. If the
-            // evaluator handed the job back now, others would run it again.
+            // A learner that answers has received the scores, and may still save them; if it could
+            // not, it says why. If the evaluator handed the job back now, others would run it
+            // again.
             let unusable = matches!(error.downcast_ref(), Some(AskError::Unusable { .. }));
             answered |= unusable;
             if !unusable || Instant::now() + AGAIN > until {
@@ -101,8 +105,12 @@ impl RunClient {
     /// Owes the job itself from now on; its scores are dropped.
     fn return_job(&mut self, reason: Option<String>) {
         self.owed = self.owed.take().map(|owed| match owed {
-            Owed::Job { id, incarnation, failed } => Owed::Job { id, incarnation, failed: reason.or(failed) },
-            Owed::Scores(report) => Owed::Job { id: report.job, incarnation: report.incarnation, failed: reason },
+            Owed::Job { id, incarnation, failed } => {
+                Owed::Job { id, incarnation, failed: reason.or(failed) }
+            }
+            Owed::Scores(report) => {
+                Owed::Job { id: report.job, incarnation: report.incarnation, failed: reason }
+            }
         });
     }
 
@@ -114,11 +122,17 @@ impl RunClient {
             JobReply::HandedBack { incarnation: of, .. } => is_from(incarnation, *of),
             _ => Err("unexpected"),
         };
-        let request = encode(&JobRequest::HandBack { evaluator: self.evaluator.clone(), job, failed })?;
-        match ask(&self.session, keys::jobs(&self.run), request, timeout, &self.metrics, fitting).await {
-            Ok(JobReply::HandedBack { accepted: true, .. }) => info!(run = %self.run, "a job was handed back"),
+        let request =
+            encode(&JobRequest::HandBack { evaluator: self.evaluator.clone(), job, failed })?;
+        match ask(&self.session, keys::jobs(&self.run), request, timeout, &self.metrics, fitting)
+            .await
+        {
+            Ok(JobReply::HandedBack { accepted: true, .. }) => {
+                info!(run = %self.run, "a job was handed back")
+            }
             Err(error) if incarnation == self.incarnation => return Err(error.into()),
-            // Where another learner is followed by now, the one that gave the job may be gone, and is not waited for.
+            // Where another learner is followed by now, the one that gave the job may be gone, and
+            // is not waited for.
             Ok(_) | Err(_) => {}
         }
         self.owed = None;

@@ -12,7 +12,10 @@ pub struct LinearPolicy {
 impl LinearPolicy {
     /// The policy that never moves.
     pub fn zero(observation_dim: usize, action_dim: usize) -> Self {
-        let normalizer = Normalizer { mean: vec![0.0; observation_dim], inverse_deviation: vec![1.0; observation_dim] };
+        let normalizer = Normalizer {
+            mean: vec![0.0; observation_dim],
+            inverse_deviation: vec![1.0; observation_dim],
+        };
         Self { weights: vec![0.0; action_dim * observation_dim], normalizer }
     }
 
@@ -88,7 +91,10 @@ impl Moments {
             let deviation = (squares / (self.count - 1.0).max(1.0)).sqrt();
             if deviation > 1e-7 { 1.0 / deviation } else { 1.0 }
         };
-        Normalizer { mean: self.mean.clone(), inverse_deviation: self.squares.iter().map(inverse).collect() }
+        Normalizer {
+            mean: self.mean.clone(),
+            inverse_deviation: self.squares.iter().map(inverse).collect(),
+        }
     }
 }
 

@@ -1,9 +1,9 @@
 //! Records a dataset of mediocre behavior, so that a new machine needs no download.
 //!
-//! Following the recipe in an environment's row, `search` trains `linear` policies, and `record` mixes episodes of all of them, from
-//! the first to the last, into one file in D4RL's layout. The result resembles D4RL's "medium-replay", the replay buffer of a
-//! learning policy. The file is a function of the number of transitions and the seed; the number of threads does not change
-//! it.
+//! Following the recipe in an environment's row, `search` trains `linear` policies, and `record`
+//! mixes episodes of all of them, from the first to the last, into one file in D4RL's layout. The
+//! result resembles D4RL's "medium-replay", the replay buffer of a learning policy. The file is a
+//! function of the number of transitions and the seed; the number of threads does not change it.
 
 mod linear;
 mod record;
@@ -20,7 +20,8 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 const OUT: &str = "--out names a file in a folder that you may write in";
-const MUJOCO: &str = "deploy/setup.sh installs the version of MuJoCo that this program was built for";
+const MUJOCO: &str =
+    "deploy/setup.sh installs the version of MuJoCo that this program was built for";
 
 /// The streams of the file's seed: one for recording, the next ones for the searches.
 const RECORD_STREAM: u64 = 0;
@@ -48,9 +49,12 @@ pub struct Summary {
 /// It cannot; the text lists the possible environments.
 pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
     let found = find(name).map_err(|_| format!("there is no environment `{name}`"));
-    let found = found.and_then(|spec| recipe(spec).map(|_| spec).map_err(|error| error.to_string()));
+    let found =
+        found.and_then(|spec| recipe(spec).map(|_| spec).map_err(|error| error.to_string()));
     let possible = all().iter().filter(|spec| recipe(spec).is_ok()).map(|spec| spec.name.as_str());
-    found.map_err(|error| format!("{error}; what can be recorded is {}", possible.collect::<Vec<_>>().join(", ")))
+    found.map_err(|error| {
+        format!("{error}; what can be recorded is {}", possible.collect::<Vec<_>>().join(", "))
+    })
 }
 
 fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {
@@ -64,14 +68,26 @@ fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {
 ///
 /// # Errors
 /// The environment has no recipe, MuJoCo fails, or the file cannot be written.
-pub fn collect(spec: &'static EnvironmentSpec, path: &Path, transitions: usize, seed: u64) -> anyhow::Result<Summary> {
+pub fn collect(
+    spec: &'static EnvironmentSpec,
+    path: &Path,
+    transitions: usize,
+    seed: u64,
+) -> anyhow::Result<Summary> {
     let start = Instant::now();
     let recipe = recipe(spec)?;
     let mut writer = D4rlWriter::create(path, spec).hint(OUT)?;
 
     let random = |index| stream(seed, RECORD_STREAM + 1 + index);
     let policies = search::train(spec, recipe, transitions, random).hint(MUJOCO)?;
-    let mut scores = record::record(spec, recipe, &policies, transitions, stream(seed, RECORD_STREAM), &mut writer)?;
+    let mut scores = record::record(
+        spec,
+        recipe,
+        &policies,
+        transitions,
+        stream(seed, RECORD_STREAM),
+        &mut writer,
+    )?;
     let rows = writer.rows();
     let (algorithm, iteration) =
         ("augmented random search, all iterations, with action noise", policies.len() as i64 - 1);

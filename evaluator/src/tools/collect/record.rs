@@ -11,22 +11,23 @@ use super::linear::LinearPolicy;
 use super::{MUJOCO, OUT};
 use crate::sim::{self, EnvironmentError, Simulation, Step};
 
-/// Each episode adds Gaussian noise to its actions (which span ±1). Its standard deviation is drawn uniformly from this range:
-/// enough to show the effects of other actions in a state, up to more than most gaits survive.
+/// Each episode adds Gaussian noise to its actions (which span ±1). Its standard deviation is drawn
+/// uniformly from this range: enough to show the effects of other actions in a state, up to more
+/// than most gaits survive.
 const NOISE: std::ops::Range<f64> = 0.1..0.5;
 
 /// Episodes run at a time, in parallel.
 const ROUND: usize = 32;
 
-/// After simulating this many times the wanted transitions, the recorder takes any episode: a search that never got good has
-/// none for the upper bands.
+/// After simulating this many times the wanted transitions, the recorder takes any episode: a
+/// search that never got good has none for the upper bands.
 const PATIENCE: usize = 4;
 
 /// The stream of an episode's seed for the noise of actions.
 const NOISE_STREAM: u64 = 3;
 
-/// Records whole episodes, each of a policy drawn from `policies`, until there are `transitions` rows. Returns each episode's
-/// normalized score.
+/// Records whole episodes, each of a policy drawn from `policies`, until there are `transitions`
+/// rows. Returns each episode's normalized score.
 pub fn record(
     spec: &'static EnvironmentSpec,
     recipe: &Recipe,
@@ -35,7 +36,8 @@ pub fn record(
     mut random: ChaCha8Rng,
     writer: &mut D4rlWriter,
 ) -> anyhow::Result<Vec<f64>> {
-    let recorders = (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, EnvironmentError>>();
+    let recorders =
+        (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, EnvironmentError>>();
     let mut recorders = recorders.hint(MUJOCO)?;
     let mixture = &recipe.mixture;
     let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
@@ -47,9 +49,11 @@ pub fn record(
         // An episode beyond the end of the highest unfilled band is useless.
         let patient = simulated <= PATIENCE * transitions;
         let highest = room.iter().rposition(|&room| room > 0.0).filter(|_| patient);
-        let ceiling = highest.and_then(|band| mixture.get(band + 1)).map_or(f64::INFINITY, |&(from, _)| from);
-        let tasks: Vec<(&LinearPolicy, u64)> =
-            (0..ROUND).map(|_| (&policies[random.random_range(0..policies.len())], random.random())).collect();
+        let ceiling =
+            highest.and_then(|band| mixture.get(band + 1)).map_or(f64::INFINITY, |&(from, _)| from);
+        let tasks: Vec<(&LinearPolicy, u64)> = (0..ROUND)
+            .map(|_| (&policies[random.random_range(0..policies.len())], random.random()))
+            .collect();
         recorders
             .par_iter_mut()
             .zip(tasks)
@@ -76,7 +80,8 @@ pub fn record(
 struct Recorder {
     spec: &'static EnvironmentSpec,
     environment: Simulation,
-    /// (steps + 1) × observation_dim, also the next two fields: from the state before the first step to that after the last.
+    /// (steps + 1) × observation_dim, also the next two fields: from the state before the first
+    /// step to that after the last.
     observations: Vec<f64>,
     qpos: Vec<f64>,
     qvel: Vec<f64>,
@@ -124,7 +129,10 @@ impl Recorder {
             self.steps.push(step);
             self.episode_return += step.reward;
             self.keep_state();
-            if step.terminated || step.truncated || self.spec.normalized_score(self.episode_return) > ceiling {
+            if step.terminated
+                || step.truncated
+                || self.spec.normalized_score(self.episode_return) > ceiling
+            {
                 return;
             }
         }
@@ -146,7 +154,8 @@ impl Recorder {
             writer.push(&Row {
                 observation: &self.observations[i * observation_dim..][..observation_dim],
                 action: &self.actions[i * action_dim..][..action_dim],
-                next_observation: &self.observations[(i + 1) * observation_dim..][..observation_dim],
+                next_observation: &self.observations[(i + 1) * observation_dim..]
+                    [..observation_dim],
                 reward: step.reward,
                 terminal: step.terminated,
                 timeout: step.truncated && !step.terminated,

@@ -1,9 +1,10 @@
 //! Augmented random search: learns behavior in seconds, without a gradient.
 //!
-//! ARS V2-t of Mania, Guy and Recht, "Simple random search of static linear policies is competitive for reinforcement
-//! learning" (2018). It perturbs the weights of a linear policy in random directions, forwards and backwards, and moves along
-//! the better directions by how much better they are. It normalizes observations by all that it has seen, and leaves the bonus
-//! for being alive out of the objective, in which standing still would be a local optimum.
+//! ARS V2-t of Mania, Guy and Recht, "Simple random search of static linear policies is competitive
+//! for reinforcement learning" (2018). It perturbs the weights of a linear policy in random
+//! directions, forwards and backwards, and moves along the better directions by how much better
+//! they are. It normalizes observations by all that it has seen, and leaves the bonus for being
+//! alive out of the objective, in which standing still would be a local optimum.
 
 use quad_dataset::{EnvironmentSpec, Recipe};
 use quad_runtime::ProgressBar;
@@ -26,11 +27,12 @@ const STEP_SIZE: f64 = 0.02;
 /// Subtracted from each step's reward.
 const ALIVE_BONUS: f64 = 1.0;
 
-/// The searches take no more steps for more transitions: with these most of them move well, after a minute on two cores.
+/// The searches take no more steps for more transitions: with these most of them move well, after a
+/// minute on two cores.
 const MOST_TRANSITIONS: u64 = 100_000;
 
-/// Trains for as many steps as the recipe has for `transitions`. Returns the policies of all iterations; `random` makes a
-/// generator for each search.
+/// Trains for as many steps as the recipe has for `transitions`. Returns the policies of all
+/// iterations; `random` makes a generator for each search.
 pub fn train(
     spec: &'static EnvironmentSpec,
     recipe: &Recipe,
@@ -48,7 +50,8 @@ pub fn train(
         let score = spec.normalized_score(search.recent_return());
         let steps = search.environment_steps;
         let number = format!("search {} of {}", index + 1, recipe.searches);
-        progress.say(&format!("training, {number}: normalized score {score:.1} after {steps} steps"));
+        progress
+            .say(&format!("training, {number}: normalized score {score:.1} after {steps} steps"));
         policies.extend(search.policies);
     }
     Ok(policies)
@@ -105,8 +108,8 @@ impl Search {
         })
     }
 
-    /// Iterates until it has taken `environment_steps`, to the end of the last iteration; calls `advance` with the number
-    /// taken.
+    /// Iterates until it has taken `environment_steps`, to the end of the last iteration; calls
+    /// `advance` with the number taken.
     fn run(&mut self, environment_steps: u64, advance: impl Fn(u64)) {
         while self.environment_steps < environment_steps {
             self.iterate();
@@ -122,24 +125,34 @@ impl Search {
 
     /// One iteration.
     ///
-    /// Trials run in parallel, but the search draws random numbers and sums results in the order of the trials, so the result
-    /// does not depend on the number of threads.
+    /// Trials run in parallel, but the search draws random numbers and sums results in the order of
+    /// the trials, so the result does not depend on the number of threads.
     fn iterate(&mut self) {
         let normal = StandardNormal;
         let directions: Vec<Vec<f64>> = (0..DIRECTIONS)
-            .map(|_| (0..self.policy.weights.len()).map(|_| normal.sample(&mut self.random)).collect())
+            .map(|_| {
+                (0..self.policy.weights.len()).map(|_| normal.sample(&mut self.random)).collect()
+            })
             .collect();
         let seeds: Vec<u64> = (0..self.trials.len()).map(|_| self.random.random()).collect();
 
-        for (trial, (direction, sign)) in
-            self.trials.iter_mut().zip(directions.iter().flat_map(|direction| [(direction, 1.0), (direction, -1.0)]))
+        for (trial, (direction, sign)) in self
+            .trials
+            .iter_mut()
+            .zip(directions.iter().flat_map(|direction| [(direction, 1.0), (direction, -1.0)]))
         {
             trial.policy.normalizer = self.policy.normalizer.clone();
-            for ((weight, center), delta) in trial.policy.weights.iter_mut().zip(&self.policy.weights).zip(direction) {
+            for ((weight, center), delta) in
+                trial.policy.weights.iter_mut().zip(&self.policy.weights).zip(direction)
+            {
                 *weight = center + sign * PERTURBATION * delta;
             }
         }
-        self.trials.par_iter_mut().zip(&seeds).with_max_len(1).for_each(|(trial, &seed)| trial.run(seed));
+        self.trials
+            .par_iter_mut()
+            .zip(&seeds)
+            .with_max_len(1)
+            .for_each(|(trial, &seed)| trial.run(seed));
         for trial in &self.trials {
             self.moments.merge(&trial.moments);
             self.environment_steps += trial.steps;
@@ -155,7 +168,8 @@ impl Search {
         pairs.truncate(BEST);
         let returns: Vec<f64> = pairs.iter().flat_map(|pair| [pair.0, pair.1]).collect();
         let mean = returns.iter().sum::<f64>() / returns.len() as f64;
-        let variance = returns.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / returns.len() as f64;
+        let variance =
+            returns.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / returns.len() as f64;
         let rate = STEP_SIZE / (BEST as f64 * variance.sqrt().max(1e-6));
         for (forwards, backwards, direction) in pairs {
             for (weight, delta) in self.policy.weights.iter_mut().zip(direction) {
@@ -164,7 +178,10 @@ impl Search {
         }
         self.policy.normalizer = self.moments.normalizer();
         self.policies.push(self.policy.clone());
-        self.returns.push(self.trials.iter().map(|trial| trial.episode_return).sum::<f64>() / self.trials.len() as f64);
+        self.returns.push(
+            self.trials.iter().map(|trial| trial.episode_return).sum::<f64>()
+                / self.trials.len() as f64,
+        );
     }
 }
 

@@ -19,13 +19,14 @@ libgl1-mesa-dri";
 
 /// Film an episode of a saved policy: an animation, a video or a strip of pictures
 ///
-/// The episode is one on which the run evaluates the snapshot, so its return equals the one in the run (with the same
-/// arithmetic). The caption shows the gradient step, the environment step, the return so far, and the number of candidates
-/// among which the policy chooses.
+/// The episode is one on which the run evaluates the snapshot, so its return equals the one in the
+/// run (with the same arithmetic). The caption shows the gradient step, the environment step, the
+/// return so far, and the number of candidates among which the policy chooses.
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct FilmArgs {
-    /// A snapshot, or the folder of a run: then the snapshot with the best complete evaluation, or the newest if there is none
+    /// A snapshot, or the folder of a run: then the snapshot with the best complete evaluation, or
+    /// the newest if there is none
     #[arg(value_name = "SNAPSHOT|RUN")]
     pub subject: PathBuf,
     /// The snapshot of this gradient step, if a run's folder is given
@@ -34,11 +35,12 @@ pub struct FilmArgs {
     /// Another snapshot or run to show beside the first, in an episode of the same seed
     #[arg(long, value_name = "SNAPSHOT|RUN")]
     pub compare: Option<PathBuf>,
-    /// Seed of the episode, as in scores.jsonl and `evaluator score --json` [default: the first on which the run evaluates the
-    /// snapshot]
+    /// Seed of the episode, as in scores.jsonl and `evaluator score --json` [default: the first on
+    /// which the run evaluates the snapshot]
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
-    /// File to write: .gif (320 × 240), .mp4 (480 × 360, by ffmpeg) or .png (eight pictures in a row)
+    /// File to write: .gif (320 × 240), .mp4 (480 × 360, by ffmpeg) or .png (eight pictures in a
+    /// row)
     #[arg(long, value_name = "FILE", default_value = "film.gif", value_parser = output)]
     pub out: Output,
 }

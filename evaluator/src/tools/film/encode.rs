@@ -57,11 +57,13 @@ fn strip(pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     Ok(file)
 }
 
-/// All pictures have the colors of the first: with a palette for each picture, the floor would flicker.
+/// All pictures have the colors of the first: with a palette for each picture, the floor would
+/// flicker.
 fn animation(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     let first = pictures.next().context("there is no picture")?;
     let (width, height) = (first.width as u16, first.height() as u16);
-    let rgba: Vec<u8> = first.rgb.chunks_exact(3).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
+    let rgba: Vec<u8> =
+        first.rgb.chunks_exact(3).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
     let colors = NeuQuant::new(SAMPLE, COLORS, &rgba);
     let nearest = |rgb: &[u8]| colors.index_of(&[rgb[0], rgb[1], rgb[2], 255]) as u8;
     let mut encoder = Encoder::new(Vec::new(), width, height, &colors.color_map_rgb())?;
@@ -83,7 +85,8 @@ fn video(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::R
         .args(["-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pixel_format", "rgb24"])
         .args(["-video_size", &size, "-framerate", &(1.0 / seconds).to_string(), "-i", "pipe:0"])
         .args(["-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"])
-        // Without this, ffmpeg takes a path that begins with - for an option, and one with a colon for a protocol.
+        // Without this, ffmpeg takes a path that begins with - for an option, and one with a colon
+        // for a protocol.
         .arg([OsStr::new("file:"), path.as_os_str()].join(OsStr::new("")))
         .stdin(Stdio::piped())
         .spawn()
@@ -113,7 +116,11 @@ mod tests {
     /// Pictures of one color each, of which the one with number `broken` cannot be drawn.
     fn pictures(broken: u8) -> impl Iterator<Item = anyhow::Result<Picture>> {
         let picture = |color| Picture { width: 64, rgb: vec![color; 3 * 64 * 48] };
-        (0..9).map(move |number| if number == broken { bail!("no light") } else { Ok(picture(20 * number)) })
+        (0..9).map(
+            move |number| {
+                if number == broken { bail!("no light") } else { Ok(picture(20 * number)) }
+            },
+        )
     }
 
     #[test]
@@ -123,9 +130,13 @@ mod tests {
         fs::write(&precious, "precious").unwrap();
         for (name, format) in [("film.gif", Format::Gif), ("film.png", Format::Png)] {
             let output = Output { path: folder.path().join(name), format };
-            std::os::unix::fs::symlink(&precious, output.path.with_added_extension("partial")).unwrap();
+            std::os::unix::fs::symlink(&precious, output.path.with_added_extension("partial"))
+                .unwrap();
             write(&output, 0.04, pictures(9)).unwrap();
-            assert!(fs::read_to_string(&precious).unwrap() == "precious" && !output.path.is_symlink(), "{name}");
+            assert!(
+                fs::read_to_string(&precious).unwrap() == "precious" && !output.path.is_symlink(),
+                "{name}"
+            );
         }
     }
 
@@ -134,16 +145,25 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         for (name, format) in [("film.gif", Format::Gif), ("film.png", Format::Png)] {
             let output = Output { path: folder.path().join(name), format };
-            let unnamed = pictures(9).inspect(|_| assert!(!output.path.exists(), "{name} is half-made"));
+            let unnamed =
+                pictures(9).inspect(|_| assert!(!output.path.exists(), "{name} is half-made"));
             write(&output, 0.04, unnamed).unwrap();
             let whole = fs::read(&output.path).unwrap();
             for broken in [0, 5] {
                 let error = write(&output, 0.04, pictures(broken)).unwrap_err();
-                assert_eq!(format!("{error:#}"), "no light", "{name}: nothing is wrong with the file");
+                assert_eq!(
+                    format!("{error:#}"),
+                    "no light",
+                    "{name}: nothing is wrong with the file"
+                );
                 assert!(fs::read(&output.path).unwrap() == whole, "{name} was changed");
             }
             fs::remove_file(&output.path).unwrap();
-            assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "something is left of {name}");
+            assert_eq!(
+                fs::read_dir(folder.path()).unwrap().count(),
+                0,
+                "something is left of {name}"
+            );
         }
     }
 }

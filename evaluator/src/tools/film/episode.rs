@@ -31,12 +31,16 @@ pub struct Episode {
 }
 
 impl Episode {
-    /// Plays the episode of a seed; without one, of the first seed on which the run evaluates the subject. `environment_seed`
-    /// is the seed of what the environment draws once for all episodes.
+    /// Plays the episode of a seed; without one, of the first seed on which the run evaluates the
+    /// subject. `environment_seed` is the seed of what the environment draws once for all episodes.
     ///
     /// # Errors
     /// The policy cannot act.
-    pub fn play(subject: &Subject, seed: Option<u64>, environment_seed: u64) -> anyhow::Result<Self> {
+    pub fn play(
+        subject: &Subject,
+        seed: Option<u64>,
+        environment_seed: u64,
+    ) -> anyhow::Result<Self> {
         let seed = seed.unwrap_or_else(|| episode_seeds(subject.seed, subject.step, 1)[0]);
         let (told, poses) = channel();
         let watched = || -> Result<Box<dyn Environment>, EnvironmentError> {
@@ -44,16 +48,26 @@ impl Episode {
             Ok(Box::new(Watched { simulation, episode_return: 0.0, told: told.clone() }))
         };
         subject.roll_out(watched, &[seed])?;
-        let choice = subject.policy.choice().map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string());
+        let choice = subject
+            .policy
+            .choice()
+            .map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string());
         Ok(Self { seed, poses: poses.try_iter().collect(), gradient_step: subject.step, choice })
     }
 
     /// Both columns of the caption after `steps` steps; later than the end, those of the end.
     pub fn caption(&self, steps: usize) -> [String; 2] {
         let Self { gradient_step, choice, .. } = self;
-        let step = if steps < self.length() { steps.to_string() } else { format!("{}, end", self.length()) };
+        let step = if steps < self.length() {
+            steps.to_string()
+        } else {
+            format!("{}, end", self.length())
+        };
         let episode_return = self.pose(steps).episode_return;
-        [format!("trained {gradient_step}\nstep {step}"), format!("return {episode_return:.1}\n{choice}")]
+        [
+            format!("trained {gradient_step}\nstep {step}"),
+            format!("return {episode_return:.1}\n{choice}"),
+        ]
     }
 
     /// The pose after `steps` steps; later than the end, the last pose.
@@ -77,7 +91,11 @@ struct Watched {
 impl Watched {
     fn tell(&self) {
         let goal = self.simulation.goal().and_then(|goal| goal.try_into().ok());
-        let pose = Pose { qpos: self.simulation.qpos().to_vec(), goal, episode_return: self.episode_return };
+        let pose = Pose {
+            qpos: self.simulation.qpos().to_vec(),
+            goal,
+            episode_return: self.episode_return,
+        };
         // The receiver outlives the rollout.
         let _ = self.told.send(pose);
     }

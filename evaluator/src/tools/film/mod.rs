@@ -1,9 +1,11 @@
 //! `evaluator film`: films what a saved policy does.
 //!
-//! `args`: the arguments; `run_folder`: chooses a snapshot of a run; `episode`: plays it and keeps its poses; `stage`: draws
-//! them, with the OpenGL of `gl`; `output`: the file and the layout of its pictures; `encode`: writes `picture`s to the file.
+//! `args`: the arguments; `run_folder`: chooses a snapshot of a run; `episode`: plays it and keeps
+//! its poses; `stage`: draws them, with the OpenGL of `gl`; `output`: the file and the layout of
+//! its pictures; `encode`: writes `picture`s to the file.
 //!
-//! A second model with colors draws the pictures after the episode, so the simulation does not depend on them.
+//! A second model with colors draws the pictures after the episode, so the simulation does not
+//! depend on them.
 
 mod args;
 mod encode;
@@ -31,8 +33,8 @@ use stage::Stage;
 /// Makes the film. Returns the text to print.
 ///
 /// # Errors
-/// A file that is no policy of an environment that this program simulates, no OpenGL, no ffmpeg, or a file that cannot be
-/// written.
+/// A file that is no policy of an environment that this program simulates, no OpenGL, no ffmpeg, or
+/// a file that cannot be written.
 pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     let first = subject(&args.subject, args.step)?;
     let mut subjects = vec![first];
@@ -41,7 +43,8 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     }
     let (spec, environment_seed) = (subjects[0].spec, subjects[0].seed);
     if let Some(other) = subjects.iter().find(|subject| subject.spec.name != spec.name) {
-        let error = anyhow!("{} is for {}, not for {}", other.path.display(), other.spec.name, spec.name);
+        let error =
+            anyhow!("{} is for {}, not for {}", other.path.display(), other.spec.name, spec.name);
         return Err(error).hint("only policies for one environment can be compared");
     }
     let format = args.out.format;
@@ -56,7 +59,8 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     let last = episodes.iter().map(Episode::length).max().unwrap_or(0);
     let steps = steps(format, last, control_period);
     info!("drawing {} pictures", steps.len());
-    let draw = |&step| stage.draw(&episodes, step).with_context(|| format!("cannot draw step {step}"));
+    let draw =
+        |&step| stage.draw(&episodes, step).with_context(|| format!("cannot draw step {step}"));
     let pictures = steps.iter().map(draw);
     encode::write(&args.out, control_period * stride(control_period) as f64, pictures)?;
     Ok(summary(args, &subjects, &episodes))

@@ -66,18 +66,26 @@ impl Layout {
 
     /// Width and height of the picture of several episodes, pixels.
     pub fn size(self, episodes: usize) -> (usize, usize) {
-        if self.stacked { (self.width, self.height * episodes) } else { (self.width * episodes, self.height) }
+        if self.stacked {
+            (self.width, self.height * episodes)
+        } else {
+            (self.width * episodes, self.height)
+        }
     }
 
     /// The part of the episode with this index: left, bottom, width and height, pixels.
     pub fn view(self, place: usize, episodes: usize) -> [usize; 4] {
-        let (left, bottom) =
-            if self.stacked { (0, (episodes - 1 - place) * self.height) } else { (place * self.width, 0) };
+        let (left, bottom) = if self.stacked {
+            (0, (episodes - 1 - place) * self.height)
+        } else {
+            (place * self.width, 0)
+        };
         [left, bottom, self.width, self.height]
     }
 }
 
-/// The steps after which a picture of an episode of `last` steps is taken: about 25 a second, and the last one.
+/// The steps after which a picture of an episode of `last` steps is taken: about 25 a second, and
+/// the last one.
 pub fn steps(format: Format, last: usize, control_period: f64) -> Vec<usize> {
     match format {
         Format::Png => (0..STRIP).map(|picture| picture * last / (STRIP - 1)).collect(),
@@ -103,7 +111,10 @@ mod tests {
         assert_eq!(film.size(2), (640, 240));
         assert_eq!([0, 1].map(|place| film.view(place, 2)), [[0, 0, 320, 240], [320, 0, 320, 240]]);
         assert_eq!(strip.size(2), (240, 480));
-        assert_eq!([0, 1].map(|place| strip.view(place, 2)), [[0, 240, 240, 240], [0, 0, 240, 240]]);
+        assert_eq!(
+            [0, 1].map(|place| strip.view(place, 2)),
+            [[0, 240, 240, 240], [0, 0, 240, 240]]
+        );
     }
 
     #[test]

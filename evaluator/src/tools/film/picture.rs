@@ -1,6 +1,7 @@
 //! A picture in memory.
 
-/// A picture: rows from the top, in them pixels from the left, of three bytes (red, green, blue) each.
+/// A picture: rows from the top, in them pixels from the left, of three bytes (red, green, blue)
+/// each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
     /// Pixels in a row.

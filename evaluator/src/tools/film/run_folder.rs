@@ -7,11 +7,11 @@ use quad_run::results::RunReport;
 use quad_run::run::RunDir;
 use quad_runtime::Hint;
 
-const RUN: &str =
-    "name a file like RUN/snapshots/step_000020000.safetensors, or the folder RUN that `learner train` made";
+const RUN: &str = "name a file like RUN/snapshots/step_000020000.safetensors, or the folder RUN that `learner train` made";
 
-/// The snapshot that `path` names: the file itself or, in a run's folder, the snapshot of `step`; without a step, of the snapshots
-/// that are still there, the one with the best complete evaluation, or the newest.
+/// The snapshot that `path` names: the file itself or, in a run's folder, the snapshot of `step`;
+/// without a step, of the snapshots that are still there, the one with the best complete
+/// evaluation, or the newest.
 ///
 /// # Errors
 /// There is no such snapshot.
@@ -19,9 +19,8 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
     if !path.is_dir() {
         return match step {
             None => Ok(path.to_owned()),
-            Some(_) => {
-                Err(anyhow!("{} is not the folder of a run", path.display())).hint("--step is for a run's folder")
-            }
+            Some(_) => Err(anyhow!("{} is not the folder of a run", path.display()))
+                .hint("--step is for a run's folder"),
         };
     }
     let run = RunDir::at(path);
@@ -30,8 +29,11 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
         Some(step) => step,
         None => {
             let report = RunReport::scored(path).hint(RUN)?;
-            let best = report.best_of(|step| steps.contains(&step)).map(|evaluation| evaluation.step);
-            best.or(steps.last().copied()).with_context(|| format!("{} has no snapshot", path.display())).hint(RUN)?
+            let best =
+                report.best_of(|step| steps.contains(&step)).map(|evaluation| evaluation.step);
+            best.or(steps.last().copied())
+                .with_context(|| format!("{} has no snapshot", path.display()))
+                .hint(RUN)?
         }
     };
     let found = steps.contains(&step).then(|| run.snapshot_path(step));
@@ -87,7 +89,8 @@ mod tests {
         fs::write(run.join("scores.jsonl"), lines(&[(10, 1, 99.0)])).unwrap();
         assert_eq!(snapshot(run, None).unwrap(), file(30));
         let scores = [(10, 1, 5.0), (10, 2, 7.0), (20, 3, 9.0), (20, 4, 1.0), (30, 5, 99.0)];
-        fs::write(run.join("scores.jsonl"), lines(&scores) + "{\"step\":30,\"seed\":6,\"re").unwrap();
+        fs::write(run.join("scores.jsonl"), lines(&scores) + "{\"step\":30,\"seed\":6,\"re")
+            .unwrap();
         assert_eq!(snapshot(run, None).unwrap(), file(10), "of step 30 an episode is missing");
         assert_eq!(snapshot(run, Some(20)).unwrap(), file(20));
         assert!(snapshot(run, Some(25)).is_err());

@@ -3,7 +3,9 @@
 use mujoco_rs::wrappers::mj_data::MjData;
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtGeom, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::mj_rendering::{MjrContext, MjrRectangle, MjtFont, MjtGridPos};
-use mujoco_rs::wrappers::mj_visualization::{MjtRndFlag, MjvCamera, MjvOption, MjvPerturb, MjvScene};
+use mujoco_rs::wrappers::mj_visualization::{
+    MjtRndFlag, MjvCamera, MjvOption, MjvPerturb, MjvScene,
+};
 use quad_dataset::EnvironmentSpec;
 
 use super::episode::{Episode, Pose};
@@ -12,7 +14,8 @@ use super::output::Layout;
 use super::picture::Picture;
 use crate::sim::{self, EnvironmentError};
 
-/// Parts that only a camera sees, which the simulation's model leaves out. The light follows the robot.
+/// Parts that only a camera sees, which the simulation's model leaves out. The light follows the
+/// robot.
 const LOOKS: &str = r#"
   <statistic extent="4"/>
   <visual>
@@ -38,7 +41,8 @@ const GOAL_RADIUS: f64 = 0.5;
 const CELL: f64 = 4.0;
 /// Space in a scene for geometries beyond the model's: the goal, and what MuJoCo adds.
 const MORE: usize = 100;
-/// The largest vertical angle of a free camera is 45°: at this many times its height, an object is fully visible.
+/// The largest vertical angle of a free camera is 45°: at this many times its height, an object is
+/// fully visible.
 const WHOLE: f64 = 1.25;
 /// The share of a view's height that the caption takes.
 const CAPTION: f64 = 0.2;
@@ -69,7 +73,8 @@ impl Stage {
         let mut scene = MjvScene::new(&model, model.geom_size().len() + MORE);
         // MuJoCo draws shadows only around one robot; shadows of a whole maze would be in pieces.
         scene.flags_mut()[MjtRndFlag::mjRND_SHADOW as usize] = u8::from(camera.trackbodyid >= 0);
-        let data = MjData::try_new(model).map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
+        let data = MjData::try_new(model)
+            .map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
         Ok(Self { context, scene, data, camera, layout, _gl: gl })
     }
 
@@ -79,7 +84,8 @@ impl Stage {
     /// The pixels cannot be read.
     pub fn draw(&mut self, episodes: &[Episode], steps: usize) -> anyhow::Result<Picture> {
         for (place, episode) in episodes.iter().enumerate() {
-            let [left, bottom, width, height] = self.layout.view(place, episodes.len()).map(|pixels| pixels as i32);
+            let [left, bottom, width, height] =
+                self.layout.view(place, episodes.len()).map(|pixels| pixels as i32);
             let view = MjrRectangle::new(left, bottom, width, height);
             self.pose(episode.pose(steps));
             self.scene.render(&view, &self.context);
@@ -89,25 +95,44 @@ impl Stage {
         }
         let (width, height) = self.layout.size(episodes.len());
         let mut rgb = vec![0; width * height * 3];
-        self.context.read_pixels(Some(&mut rgb), None, &MjrRectangle::new(0, 0, width as i32, height as i32))?;
+        self.context.read_pixels(
+            Some(&mut rgb),
+            None,
+            &MjrRectangle::new(0, 0, width as i32, height as i32),
+        )?;
         Ok(Picture { width, rgb }.flipped())
     }
 
     fn pose(&mut self, pose: &Pose) {
         self.data.qpos_mut().copy_from_slice(&pose.qpos);
         self.data.forward();
-        self.scene.update(&mut self.data, &MjvOption::default(), &MjvPerturb::default(), &mut self.camera);
+        self.scene.update(
+            &mut self.data,
+            &MjvOption::default(),
+            &MjvPerturb::default(),
+            &mut self.camera,
+        );
         if let Some([x, y]) = pose.goal {
             let (size, at) = ([GOAL_RADIUS; 3], [x, y, GOAL_RADIUS]);
             // SAFETY: it has no material, texture or object, and there is space for it.
-            unsafe { self.scene.create_geom(MjtGeom::mjGEOM_SPHERE, Some(size), Some(at), None, Some(GOAL)) };
+            unsafe {
+                self.scene.create_geom(
+                    MjtGeom::mjGEOM_SPHERE,
+                    Some(size),
+                    Some(at),
+                    None,
+                    Some(GOAL),
+                )
+            };
         }
     }
 }
 
-/// The model of an environment with the parts that only a camera sees, for pictures of a size (width, height).
+/// The model of an environment with the parts that only a camera sees, for pictures of a size
+/// (width, height).
 fn model(spec: &EnvironmentSpec, (width, height): (usize, usize)) -> anyhow::Result<MjModel> {
-    let looks = LOOKS.replace("{width}", &width.to_string()).replace("{height}", &height.to_string());
+    let looks =
+        LOOKS.replace("{width}", &width.to_string()).replace("{height}", &height.to_string());
     let mjcf = sim::mjcf(spec).replacen("<worldbody>", &looks, 1);
     let mjcf = mjcf.replacen(r#"<geom name="floor""#, r#"<geom name="floor" material="floor""#, 1);
     let mut model = MjModel::from_xml_string(&mjcf)?;
@@ -121,7 +146,8 @@ fn paint(model: &mut MjModel) {
     let last = bodies.iter().copied().max().unwrap_or(1);
     for (geom, body) in bodies.into_iter().enumerate() {
         let share = (body - 1) as f32 / (last - 1).max(1) as f32;
-        let [red, green, blue] = [0, 1, 2].map(|i| ROBOT[0][i] + share * (ROBOT[1][i] - ROBOT[0][i]));
+        let [red, green, blue] =
+            [0, 1, 2].map(|i| ROBOT[0][i] + share * (ROBOT[1][i] - ROBOT[0][i]));
         model.geom_rgba_mut()[geom] = if body == 0 { WALL } else { [red, green, blue, 1.0] };
     }
     if let Some(floor) = model.name_to_id(MjtObjBase::mjOBJ_GEOM, "floor") {
@@ -130,14 +156,22 @@ fn paint(model: &mut MjModel) {
     }
 }
 
-/// Beside the robot, moving with it; in a maze, above all walls. `aspect` is a view's width over its height.
+/// Beside the robot, moving with it; in a maze, above all walls. `aspect` is a view's width over
+/// its height.
 fn camera(model: &MjModel, aspect: f64) -> MjvCamera {
     let walls: Vec<[f64; 3]> = (0..model.geom_size().len())
-        .filter(|&geom| model.geom_bodyid()[geom] == 0 && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX)
+        .filter(|&geom| {
+            model.geom_bodyid()[geom] == 0 && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX
+        })
         .map(|geom| model.geom_pos()[geom])
         .collect();
     let torso = model.name_to_id(MjtObjBase::mjOBJ_BODY, "torso").unwrap_or(1);
-    let beside = MjvCamera { azimuth: 90.0, elevation: -10.0, distance: 4.0, ..MjvCamera::new_tracking(torso) };
+    let beside = MjvCamera {
+        azimuth: 90.0,
+        elevation: -10.0,
+        distance: 4.0,
+        ..MjvCamera::new_tracking(torso)
+    };
     let bounds = |axis: usize| {
         let fold = |most: fn(f64, f64) -> f64| walls.iter().map(|wall| wall[axis]).reduce(most);
         fold(f64::min).zip(fold(f64::max))
@@ -147,7 +181,13 @@ fn camera(model: &MjModel, aspect: f64) -> MjvCamera {
     let [width, height] = [east - west, north - south].map(|between| between + CELL);
     let seen = (height / (1.0 - CAPTION)).max(width / aspect);
     let lookat = [center[0], center[1] + seen * CAPTION / 2.0, 0.0];
-    MjvCamera { lookat, azimuth: 90.0, elevation: -80.0, distance: WHOLE * seen, ..MjvCamera::default() }
+    MjvCamera {
+        lookat,
+        azimuth: 90.0,
+        elevation: -80.0,
+        distance: WHOLE * seen,
+        ..MjvCamera::default()
+    }
 }
 
 #[cfg(test)]

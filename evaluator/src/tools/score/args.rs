@@ -27,8 +27,9 @@ RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
 /// Score saved policies (snapshots of any run) on this machine
 ///
-/// A snapshot names its environment and the episodes on which its run evaluates it. Without other options the policy runs
-/// these episodes, so its scores equal those of the run (with the same arithmetic).
+/// A snapshot names its environment and the episodes on which its run evaluates it. Without other
+/// options the policy runs these episodes, so its scores equal those of the run (with the same
+/// arithmetic).
 #[derive(Args, Debug, Default)]
 #[command(after_help = AFTER_HELP)]
 pub struct ScoreArgs {
@@ -38,12 +39,13 @@ pub struct ScoreArgs {
     /// Episodes per snapshot [default: as many as the run's]
     #[arg(long, value_name = "N", value_parser = value_parser!(u32).range(1..=MOST_EPISODES))]
     pub episodes: Option<u32>,
-    /// Actions sampled per state, of which the policy takes one; several numbers, like 1,10, are scored on the same episodes
-    /// [default: the snapshot's]
+    /// Actions sampled per state, of which the policy takes one; several numbers, like 1,10, are
+    /// scored on the same episodes [default: the snapshot's]
     #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = value_parser!(u32).range(1..=MOST_CANDIDATES))]
     pub candidates: Vec<u32>,
-    /// How the policy chooses among the sampled actions: best, softmax:TEMPERATURE (a draw), average:TEMPERATURE:ACTIONS (the
-    /// mean of so many draws) or nearest (to a value function) [default: the snapshot's]
+    /// How the policy chooses among the sampled actions: best, softmax:TEMPERATURE (a draw),
+    /// average:TEMPERATURE:ACTIONS (the mean of so many draws) or nearest (to a value function)
+    /// [default: the snapshot's]
     #[arg(long, value_name = "RULE")]
     pub rule: Option<Rule>,
     /// How the critics' values of an action are combined: mean or min [default: the snapshot's]
@@ -55,7 +57,8 @@ pub struct ScoreArgs {
     /// Environment to act in [default: the run's]
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     pub env: Option<&'static EnvironmentSpec>,
-    /// Precision of the networks: f32, or bf16, which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16
+    /// Precision of the networks: f32, or bf16, which rounds and is faster on CPUs with AMX or
+    /// AMD's AVX512-BF16
     #[arg(long, value_name = "NAME", default_value = "f32")]
     pub precision: Precision,
     /// Print a JSON array with every episode

@@ -23,25 +23,35 @@ const BATCH: usize = 16;
 /// Scores the policies of the command line. Returns the text to print.
 ///
 /// # Errors
-/// A file that is no policy of an environment that this program simulates (then nothing is scored), or a policy that cannot
-/// act.
+/// A file that is no policy of an environment that this program simulates (then nothing is scored),
+/// or a policy that cannot act.
 pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
     if !args.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
-    let subjects = args.snapshots.iter().map(|path| Subject::read(path, args)).collect::<anyhow::Result<Vec<_>>>()?;
+    let subjects = args
+        .snapshots
+        .iter()
+        .map(|path| Subject::read(path, args))
+        .collect::<anyhow::Result<Vec<_>>>()?;
     info!("scoring {} policies", subjects.len());
     let subjects: Vec<Subject> = subjects.into_iter().flatten().collect();
-    let scored = subjects.par_iter().with_max_len(1).map(measure).collect::<anyhow::Result<Vec<Scored>>>()?;
+    let scored = subjects
+        .par_iter()
+        .with_max_len(1)
+        .map(measure)
+        .collect::<anyhow::Result<Vec<Scored>>>()?;
     Ok(if args.json { quad_runtime::json(&scored)? } else { table(&scored) })
 }
 
-/// Runs a policy's episodes. An episode's result depends on neither its batch nor the number of threads.
+/// Runs a policy's episodes. An episode's result depends on neither its batch nor the number of
+/// threads.
 fn measure(subject: &Subject) -> anyhow::Result<Scored> {
     let Subject { path, weights, spec, seed, step, episodes, policy } = subject;
     let batch = |seeds: &[u64]| subject.roll_out(|| Simulations.make(&spec.name, *seed), seeds);
     let seeds = episode_seeds(*seed, *step, *episodes);
-    let batches = seeds.par_chunks(BATCH).with_max_len(1).map(batch).collect::<anyhow::Result<Vec<_>>>()?;
+    let batches =
+        seeds.par_chunks(BATCH).with_max_len(1).map(batch).collect::<anyhow::Result<Vec<_>>>()?;
     let scored = Scored {
         snapshot: path.clone(),
         weights: weights.to_string(),

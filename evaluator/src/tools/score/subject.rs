@@ -15,7 +15,8 @@ use crate::sim::{Environment, EnvironmentError, EpisodeOutcome, Rollout};
 
 const ONE: &str = "what can be scored is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this \
                    version writes them";
-const OTHER_ENVIRONMENT: &str = "in an environment of your own it acts from Python (docs/python.md)";
+const OTHER_ENVIRONMENT: &str =
+    "in an environment of your own it acts from Python (docs/python.md)";
 const OTHER_CHOICE: &str = "score it without --candidates, --rule and --value";
 const RANGE: &str = "--episodes takes the place of what the file says";
 
@@ -38,18 +39,22 @@ pub struct Subject {
 }
 
 impl Subject {
-    /// Reads a file, and takes from it what the command line does not say. Returns its policy once for each way to choose that
-    /// the command line asks for.
+    /// Reads a file, and takes from it what the command line does not say. Returns its policy once
+    /// for each way to choose that the command line asks for.
     ///
     /// # Errors
     ///
-    /// The file is no policy, or the policy cannot act in the environment or cannot choose in this way.
+    /// The file is no policy, or the policy cannot act in the environment or cannot choose in this
+    /// way.
     pub fn read(path: &Path, args: &ScoreArgs) -> anyhow::Result<Vec<Self>> {
         let name = path.display();
-        let file = files::read_named(path).with_context(|| format!("cannot read {name}")).hint(ONE)?;
+        let file =
+            files::read_named(path).with_context(|| format!("cannot read {name}")).hint(ONE)?;
         let policy = load_policy(&file, args.precision);
         let policy = policy.with_context(|| format!("{name} is not a saved policy")).hint(ONE)?;
-        let header = Header::read(&file).with_context(|| format!("{name} is not a snapshot of a run")).hint(ONE)?;
+        let header = Header::read(&file)
+            .with_context(|| format!("{name} is not a snapshot of a run"))
+            .hint(ONE)?;
         let Origin { environment, seed, step, episodes } = header.origin;
         let spec = match args.env {
             Some(spec) => spec,
@@ -67,7 +72,8 @@ impl Subject {
         }
         let choosing = |choice| {
             let policy = subject.policy.with_choice(choice);
-            let policy = policy.with_context(|| format!("{name} cannot be scored so")).hint(OTHER_CHOICE)?;
+            let policy =
+                policy.with_context(|| format!("{name} cannot be scored so")).hint(OTHER_CHOICE)?;
             Ok(Self { path: path.clone(), weights, policy, spec, seed, step, episodes })
         };
         choices.into_iter().map(choosing).collect()
@@ -113,11 +119,15 @@ impl Subject {
     }
 }
 
-/// The ways to choose that the command line asks for, completed from the policy's `own`. None if it asks for none.
+/// The ways to choose that the command line asks for, completed from the policy's `own`. None if it
+/// asks for none.
 fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
     let own = own.unwrap_or(Choice::best_of(1));
-    let of =
-        |candidates| Choice { candidates, rule: args.rule.unwrap_or(own.rule), value: args.value.unwrap_or(own.value) };
+    let of = |candidates| Choice {
+        candidates,
+        rule: args.rule.unwrap_or(own.rule),
+        value: args.value.unwrap_or(own.value),
+    };
     match args.candidates.as_slice() {
         [] if args.rule.is_none() && args.value.is_none() => Vec::new(),
         [] => vec![of(own.candidates)],
@@ -139,6 +149,9 @@ mod tests {
         let asked = ScoreArgs { rule: Some(rule), ..ScoreArgs::default() };
         assert_eq!(choices(&asked, Some(own)), [Choice { rule, ..own }]);
         let asked = ScoreArgs { candidates: vec![1, 10], ..ScoreArgs::default() };
-        assert_eq!(choices(&asked, Some(own)), [1, 10].map(|candidates| Choice { candidates, ..own }));
+        assert_eq!(
+            choices(&asked, Some(own)),
+            [1, 10].map(|candidates| Choice { candidates, ..own })
+        );
     }
 }

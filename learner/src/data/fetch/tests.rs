@@ -50,7 +50,11 @@ fn dataset(addresses: &[&Server]) -> NamedDataset {
 
 /// Tries again after milliseconds where the real one waits for seconds.
 fn fetcher(silence: u64) -> Fetcher {
-    Fetcher { client: client(Duration::from_secs(silence)), pause: Duration::from_millis(2), mirror: None }
+    Fetcher {
+        client: client(Duration::from_secs(silence)),
+        pause: Duration::from_millis(2),
+        mirror: None,
+    }
 }
 
 fn fetch(dataset: &NamedDataset, folder: &TempDir) -> anyhow::Result<LocalDataset> {
@@ -58,12 +62,14 @@ fn fetch(dataset: &NamedDataset, folder: &TempDir) -> anyhow::Result<LocalDatase
 }
 
 fn files(folder: &TempDir) -> Vec<String> {
-    let names = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    let names = fs::read_dir(folder.path())
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap());
     names.collect()
 }
 
-/// Fetches from a server with these answers, into a folder where an interrupted run has left a part; the file must be right
-/// in the end. Where each request wanted to start.
+/// Fetches from a server with these answers, into a folder where an interrupted run has left a
+/// part; the file must be right in the end. Where each request wanted to start.
 fn requests(silence: u64, left: &[u8], answers: &[Answer]) -> Vec<Option<usize>> {
     let (folder, server) = (TempDir::new().unwrap(), Server::start(&content(), answers));
     if !left.is_empty() {
@@ -78,16 +84,23 @@ fn requests(silence: u64, left: &[u8], answers: &[Answer]) -> Vec<Option<usize>>
 
 #[test]
 fn a_broken_connection_is_continued_where_it_broke() {
-    let other_part = "206 Partial Content\r\nContent-Range: bytes 0-200007/200008\r\nContent-Length: 200008";
+    let other_part =
+        "206 Partial Content\r\nContent-Range: bytes 0-200007/200008\r\nContent-Length: 200008";
     let there = Server::start(&content(), &[Send(70_000), WHOLE]);
     let redirect = || status(&format!("302 Found\r\nLocation: {}", there.url));
     for (answers, expected) in [
         (vec![Send(70_000), Send(50_000), WHOLE], vec![None, Some(70_000), Some(120_000)]),
-        (vec![Send(50_000); 5], vec![None, Some(50_000), Some(100_000), Some(150_000), Some(200_000)]),
+        (
+            vec![Send(50_000); 5],
+            vec![None, Some(50_000), Some(100_000), Some(150_000), Some(200_000)],
+        ),
         (vec![redirect(), redirect()], vec![None, Some(70_000)]),
         // Servers that cannot continue.
         (vec![Send(70_000), page(content())], vec![None, Some(70_000)]),
-        (vec![Send(70_000), Other(other_part.to_owned(), content()), WHOLE], vec![None, Some(70_000), None]),
+        (
+            vec![Send(70_000), Other(other_part.to_owned(), content()), WHOLE],
+            vec![None, Some(70_000), None],
+        ),
         (vec![Send(70_000), status("416 No"), WHOLE], vec![None, Some(70_000), None]),
     ] {
         assert_eq!(requests(60, &[], &answers), expected, "{answers:?}");
@@ -97,7 +110,10 @@ fn a_broken_connection_is_continued_where_it_broke() {
 
 #[test]
 fn a_silent_server_is_left_and_asked_again() {
-    assert_eq!(requests(5, &[], &[Stall(1_000), Stall(0), WHOLE]), [None, Some(1_000), Some(1_000)]);
+    assert_eq!(
+        requests(5, &[], &[Stall(1_000), Stall(0), WHOLE]),
+        [None, Some(1_000), Some(1_000)]
+    );
 }
 
 #[test]
@@ -117,7 +133,9 @@ fn what_an_interrupted_run_has_left_is_continued_if_it_fits() {
 fn what_is_not_the_file_is_refused_and_deleted() {
     let sign_in = || page(b"<!DOCTYPE html><title>Sign in</title>".to_vec());
     let chunk = |bytes: Vec<u8>| {
-        let body = [format!("{:x}\r\n", bytes.len()).into_bytes(), bytes, b"\r\n0\r\n\r\n".to_vec()].concat();
+        let body =
+            [format!("{:x}\r\n", bytes.len()).into_bytes(), bytes, b"\r\n0\r\n\r\n".to_vec()]
+                .concat();
         Other("200 OK\r\nTransfer-Encoding: chunked".to_owned(), body)
     };
     let known = dataset(&[]);
@@ -136,8 +154,14 @@ fn what_is_not_the_file_is_refused_and_deleted() {
         let (folder, server) = (TempDir::new().unwrap(), Server::start(&content(), &[answer]));
         let dataset = NamedDataset { addresses: vec![server.url.clone()], ..dataset.clone() };
         let error = fetch(&dataset, &folder).unwrap_err().to_string();
-        assert!(error.contains(&server.url) && error.contains(words), "{words} is missing in {error}");
-        assert!(!folder.path().join("file.hdf5").exists() && server.requests().len() >= count, "{error}");
+        assert!(
+            error.contains(&server.url) && error.contains(words),
+            "{words} is missing in {error}"
+        );
+        assert!(
+            !folder.path().join("file.hdf5").exists() && server.requests().len() >= count,
+            "{error}"
+        );
         assert!(count > 1 || server.requests().len() == 1, "asking again would not help: {error}");
     }
 }
@@ -145,7 +169,8 @@ fn what_is_not_the_file_is_refused_and_deleted() {
 #[test]
 fn an_answer_without_the_file_leads_to_the_next_address() {
     for (code, requests) in [("404 No", 1), ("403 No", 1), ("500 No", 4), ("429 No", 4)] {
-        let (bad, good) = (Server::start(&[], &[status(code)]), Server::start(&content(), &[WHOLE]));
+        let (bad, good) =
+            (Server::start(&[], &[status(code)]), Server::start(&content(), &[WHOLE]));
         fetch(&dataset(&[&bad, &good]), &TempDir::new().unwrap()).unwrap();
         assert_eq!((bad.requests().len(), good.requests().len()), (requests, 1), "{code}");
     }
@@ -153,8 +178,11 @@ fn an_answer_without_the_file_leads_to_the_next_address() {
 
 #[test]
 fn a_mirror_is_asked_first_and_what_it_gave_is_kept() {
-    for (answers, others) in [(vec![WHOLE], vec![]), (vec![Send(70_000), status("500 No")], vec![Some(70_000)])] {
-        let (mirror, other) = (Server::start(&content(), &answers), Server::start(&content(), &[WHOLE]));
+    for (answers, others) in
+        [(vec![WHOLE], vec![]), (vec![Send(70_000), status("500 No")], vec![Some(70_000)])]
+    {
+        let (mirror, other) =
+            (Server::start(&content(), &answers), Server::start(&content(), &[WHOLE]));
         let fetcher = Fetcher { mirror: Some(mirror.url.replace("file.hdf5", "")), ..fetcher(60) };
         fetcher.fetch(&dataset(&[&other]), TempDir::new().unwrap().path()).unwrap();
         assert_eq!(other.requests(), others);

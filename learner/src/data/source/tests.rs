@@ -18,9 +18,14 @@ fn a_word_is_a_name_a_path_or_neither() {
 
 #[test]
 fn the_tasks_datasets_are_known_and_of_their_environments() {
-    let resolved = tasks::all().iter().map(|task| resolve(&task.name, &toml::Table::new()).unwrap());
+    let resolved =
+        tasks::all().iter().map(|task| resolve(&task.name, &toml::Table::new()).unwrap());
     let named: Vec<_> = resolved.filter(|experiment| experiment.dataset.is_some()).collect();
-    assert_eq!(named.len(), 15 + 6 + 24 * 6, "the rows of the paper's table, version 2's mazes, OGBench's");
+    assert_eq!(
+        named.len(),
+        15 + 6 + 24 * 6,
+        "the rows of the paper's table, version 2's mazes, OGBench's"
+    );
     for experiment in named {
         let source = Source::parse(&experiment.dataset.unwrap()).unwrap();
         assert!(matches!(source, Source::Named(_)), "{source:?}");

@@ -7,8 +7,12 @@ fn jobs_go_out_oldest_step_first_and_no_episode_twice() {
     let mut bench = Bench::new();
     let jobs = ["a", "b", "c", "d"].map(|evaluator| bench.job(evaluator, 0));
     let handed_out: Vec<_> = jobs.iter().map(|job| (job.step, job.seeds.clone())).collect();
-    let expected =
-        [(1000, vec![1, 2, 3, 4, 5]), (1000, vec![6, 7]), (2000, vec![11, 12, 13, 14, 15]), (2000, vec![16, 17])];
+    let expected = [
+        (1000, vec![1, 2, 3, 4, 5]),
+        (1000, vec![6, 7]),
+        (2000, vec![11, 12, 13, 14, 15]),
+        (2000, vec![16, 17]),
+    ];
     assert_eq!(handed_out, expected);
     assert_eq!((jobs[0].weights, jobs[2].weights), (hash(1000), hash(2000)));
     assert_eq!((jobs[0].incarnation, jobs[0].environment_seed), (INCARNATION, 5));
@@ -21,7 +25,8 @@ fn an_evaluator_without_the_environment_gets_nothing() {
     let mut bench = Bench::new();
     for environments in [vec![], vec!["ant".to_owned()]] {
         let now = bench.at(0);
-        let claim = Claim { evaluator: &name("a"), attempt: 1, environments: &environments, present: 0 };
+        let claim =
+            Claim { evaluator: &name("a"), attempt: 1, environments: &environments, present: 0 };
         assert!(matches!(bench.board.claim(claim, now), Claimed::Wait(_)));
     }
 }
@@ -39,7 +44,8 @@ fn a_claim_that_is_repeated_gets_the_same_job_and_another_one_waits() {
     assert_eq!(bench.job("a", 10).seeds, first.seeds);
 }
 
-/// One of them works and the other asks. An evaluator that asks for another job, and works on none, has only lost word of it.
+/// One of them works and the other asks. An evaluator that asks for another job, and works on none,
+/// has only lost word of it.
 #[test]
 fn two_of_one_name_are_known_by_what_both_do() {
     let mut bench = Bench::new();
@@ -48,7 +54,11 @@ fn two_of_one_name_are_known_by_what_both_do() {
     bench.claim("a", 0, 2);
     assert_eq!(bench.progress(&progress(&job, "a", 2), 2), Ok(false), "the same claim once more");
     bench.claim("a", 7, 3);
-    assert_eq!(bench.progress(&progress(&job, "a", 2), 3), Err(Refusal::NotAdvanced), "it does not work");
+    assert_eq!(
+        bench.progress(&progress(&job, "a", 2), 3),
+        Err(Refusal::NotAdvanced),
+        "it does not work"
+    );
     assert_eq!(bench.progress(&progress(&job, "a", 3), 4), Ok(true));
     bench.deliver(&full_report(&job, "a")).unwrap();
     let next = bench.job("a", 5);
@@ -80,14 +90,21 @@ fn the_more_episodes_wait_the_more_are_in_a_job() {
         jobs.map(|job| job.seeds.len())
     };
     assert_eq!(sizes(&mut bench, 1), [20; 3], "never more than these");
-    assert_eq!(sizes(&mut bench, 4), [14, 12, 11], "half of a share of the 114, of the 100 that are left, …");
+    assert_eq!(
+        sizes(&mut bench, 4),
+        [14, 12, 11],
+        "half of a share of the 114, of the 100 that are left, …"
+    );
     assert_eq!(sizes(&mut bench, 11), [5; 3]);
 
     // An evaluator that is lost may have been lost of one of them.
     bench.present = 1;
     assert_eq!(bench.job("a", 0).seeds.len(), 20);
     bench.gone("a", 0);
-    assert_eq!(["b", "c", "d", "e", "f"].map(|evaluator| bench.job(evaluator, 0).seeds.len()), [5, 5, 5, 5, 20]);
+    assert_eq!(
+        ["b", "c", "d", "e", "f"].map(|evaluator| bench.job(evaluator, 0).seeds.len()),
+        [5, 5, 5, 5, 20]
+    );
 }
 
 #[test]
@@ -123,7 +140,11 @@ fn episodes_that_take_every_evaluator_with_them_are_given_up() {
     for attempt in 1..=20 {
         // As late as the episode rests.
         let later = 60 * attempt;
-        assert_eq!((bench.job("a", later).seeds, given_up.len()), (Vec::from_iter(1..=5), 0), "attempt {attempt}");
+        assert_eq!(
+            (bench.job("a", later).seeds, given_up.len()),
+            (Vec::from_iter(1..=5), 0),
+            "attempt {attempt}"
+        );
         given_up = bench.gone("a", later).given_up;
     }
     let expected = Vec::from_iter((1..=5).map(|seed| (1000, seed)));
@@ -136,8 +157,8 @@ fn episodes_that_take_every_evaluator_with_them_are_given_up() {
     assert_eq!(bench.board.missing(), expected[1..]);
 }
 
-/// A machine that crashes under another name each time, as a container that is restarted does; or a snapshot that cannot be
-/// read, or a policy that cannot act, which every evaluator says.
+/// A machine that crashes under another name each time, as a container that is restarted does; or a
+/// snapshot that cannot be read, or a policy that cannot act, which every evaluator says.
 #[test]
 fn an_episode_that_fails_again_and_again_is_given_up_but_not_soon() {
     for hands_back in [false, true] {
@@ -177,14 +198,19 @@ fn a_machine_that_fails_again_and_again_does_not_keep_others_from_the_end() {
 #[test]
 fn scores_of_an_earlier_life_count_and_other_weights_are_found_out() {
     let earlier = Earlier { weights: hash(3000).to_string(), episodes: vec![score(22, 400.0)] };
-    let whole = Earlier { weights: hash(4000).to_string(), episodes: vec![score(32, 1.0), score(31, 2.0)] };
+    let whole =
+        Earlier { weights: hash(4000).to_string(), episodes: vec![score(32, 1.0), score(31, 2.0)] };
     let mut bench = Bench::after([(3000, earlier), (4000, whole)].into());
     let pending = bench.board.pending();
     assert_eq!(bench.board.add_evaluation(3000, hash(3000), &[21, 22, 23]), Ok(None));
     assert_eq!(bench.board.pending(), pending + 2);
     let complete = bench.board.add_evaluation(4000, hash(4000), &[31, 32]).unwrap().unwrap();
     assert_eq!(complete, [score(31, 2.0), score(32, 1.0)]);
-    assert_eq!(bench.board.add_evaluation(4000, hash(4000), &[31, 32]), Ok(None), "asked for again");
+    assert_eq!(
+        bench.board.add_evaluation(4000, hash(4000), &[31, 32]),
+        Ok(None),
+        "asked for again"
+    );
     let error = bench.board.add_evaluation(3000, hash(1), &[21, 22, 23]).unwrap_err();
     assert_eq!((error.step, error.found, error.scored), (3000, hash(1), hash(3000).to_string()));
 }

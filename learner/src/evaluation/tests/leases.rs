@@ -7,7 +7,11 @@ fn a_lease_that_runs_out_gives_the_unscored_episodes_to_the_next() {
     let mut bench = Bench::new();
     let lost = bench.job("a", 0);
     bench.deliver(&report(&lost, "a", vec![score(2, 0.0)])).unwrap();
-    assert_eq!([bench.expire(9), bench.expire(10), bench.expire(10)], [0, 1, 0], "in time, and only once");
+    assert_eq!(
+        [bench.expire(9), bench.expire(10), bench.expire(10)],
+        [0, 1, 0],
+        "in time, and only once"
+    );
     let next = bench.job("b", 10);
     assert_eq!((next.step, next.seeds), (1000, vec![1, 3, 4, 5, 6]));
     assert_ne!(next.id, lost.id);
@@ -34,13 +38,18 @@ fn progress_that_does_not_advance_extends_nothing() {
     bench.progress(&first, 5).unwrap();
     assert_eq!(bench.progress(&first, 9), Err(Refusal::NotAdvanced), "the same once more");
     assert_eq!(bench.progress(&progress(&job, "a", 99), 9), Err(Refusal::NotAdvanced));
-    assert_eq!(bench.progress(&progress(&job, "a", 0), 9), Err(Refusal::NotAdvanced), "it has begun");
+    assert_eq!(
+        bench.progress(&progress(&job, "a", 0), 9),
+        Err(Refusal::NotAdvanced),
+        "it has begun"
+    );
     let ended = Progress { episodes_done: 1, ..progress(&job, "a", 100) };
     bench.progress(&ended, 14).unwrap();
     assert_eq!((bench.expire(23), bench.expire(24)), (0, 1));
 }
 
-/// While it fetches the weights an evaluator has nothing to show. It has a minute for that, then it must begin.
+/// While it fetches the weights an evaluator has nothing to show. It has a minute for that, then it
+/// must begin.
 #[test]
 fn an_evaluator_may_prepare_for_a_while() {
     let mut bench = Bench::new();
@@ -55,7 +64,8 @@ fn an_evaluator_may_prepare_for_a_while() {
     assert_eq!((bench.expire(68), bench.expire(69)), (0, 1));
 }
 
-/// The disk is full: an evaluator that has delivered its scores has done all that it can, and delivers them again.
+/// The disk is full: an evaluator that has delivered its scores has done all that it can, and
+/// delivers them again.
 #[test]
 fn scores_that_cannot_be_saved_keep_their_job() {
     let mut bench = Bench::new();

@@ -57,7 +57,12 @@ impl Bench {
         let now = self.at(seconds);
         let environments = ["ant".to_owned(), "hopper".to_owned()];
         self.board.claim(
-            Claim { evaluator: &name(evaluator), attempt, environments: &environments, present: self.present },
+            Claim {
+                evaluator: &name(evaluator),
+                attempt,
+                environments: &environments,
+                present: self.present,
+            },
             now,
         )
     }
@@ -111,7 +116,12 @@ fn name(text: &str) -> Name {
 /// An episode of Hopper.
 fn score(seed: u64, episode_return: f64) -> EpisodeScore {
     let hopper = quad_dataset::environment::find("hopper").unwrap();
-    EpisodeScore { seed, episode_return, length: 100, score: hopper.normalized_score(episode_return) }
+    EpisodeScore {
+        seed,
+        episode_return,
+        length: 100,
+        score: hopper.normalized_score(episode_return),
+    }
 }
 
 /// Some of a job's scores.
@@ -126,5 +136,10 @@ fn full_report(job: &Job, evaluator: &str) -> ScoreReport {
 
 /// Progress of a job after this many environment steps.
 fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
-    Progress { steps_done, environment_steps: 10, episodes: 1, ..Progress::of(job, name(evaluator)) }
+    Progress {
+        steps_done,
+        environment_steps: 10,
+        episodes: 1,
+        ..Progress::of(job, name(evaluator))
+    }
 }

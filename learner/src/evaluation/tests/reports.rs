@@ -12,7 +12,8 @@ fn scores_complete_a_job_and_an_evaluation_once() {
     assert_eq!(bench.board.pending(), 9);
 
     let (_, recorded) = bench.deliver(&full_report(&second, "b")).unwrap();
-    let seeds: Vec<_> = recorded.evaluation_completed.unwrap().iter().map(|score| score.seed).collect();
+    let seeds: Vec<_> =
+        recorded.evaluation_completed.unwrap().iter().map(|score| score.seed).collect();
     assert_eq!(seeds, Vec::from_iter(1..=7), "in the order of the evaluation's seeds");
     assert_eq!(bench.job("a", 1).step, 2000, "an evaluator that has delivered gets the next");
 }
@@ -44,19 +45,25 @@ fn the_first_score_of_an_episode_stays() {
 fn a_job_may_be_delivered_in_parts() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
-    let (_, recorded) = bench.deliver(&report(&job, "a", vec![score(1, 0.0), score(3, 0.0)])).unwrap();
+    let (_, recorded) =
+        bench.deliver(&report(&job, "a", vec![score(1, 0.0), score(3, 0.0)])).unwrap();
     assert_eq!(recorded.jobs_completed, 0);
     assert_eq!(bench.board.pending(), 12);
     let (validated, recorded) = bench.deliver(&full_report(&job, "a")).unwrap();
     assert_eq!((validated.new.len(), validated.duplicates, recorded.jobs_completed), (3, 2, 1));
 }
 
-/// An older incarnation of the learner handed the job out, or to another evaluator, or the job is not known any more.
+/// An older incarnation of the learner handed the job out, or to another evaluator, or the job is
+/// not known any more.
 #[test]
 fn any_lifes_report_is_welcome_if_step_weights_and_seeds_fit() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
-    let earlier = ScoreReport { incarnation: INCARNATION - 1, job: 99, ..report(&job, "b", vec![score(6, 0.0)]) };
+    let earlier = ScoreReport {
+        incarnation: INCARNATION - 1,
+        job: 99,
+        ..report(&job, "b", vec![score(6, 0.0)])
+    };
     assert_eq!(bench.deliver(&earlier).unwrap().0.new.len(), 1, "an episode that waits");
     let other = ScoreReport { job: 77, ..full_report(&job, "c") };
     let (validated, recorded) = bench.deliver(&other).unwrap();
@@ -73,7 +80,11 @@ fn the_first_delivery_counts_when_a_lost_evaluator_comes_back() {
     bench.expire(10);
     let again = bench.job("b", 10);
     let (validated, recorded) = bench.deliver(&full_report(&lost, "a")).unwrap();
-    assert_eq!((validated.new.len(), recorded.jobs_completed), (5, 1), "late, but the first; b's is over");
+    assert_eq!(
+        (validated.new.len(), recorded.jobs_completed),
+        (5, 1),
+        "late, but the first; b's is over"
+    );
     assert!(matches!(bench.job("c", 11).seeds[..], [6, 7]), "nothing of it is handed out again");
     let (validated, recorded) = bench.deliver(&full_report(&again, "b")).unwrap();
     assert_eq!((validated.duplicates, recorded.jobs_completed), (5, 0));
@@ -85,7 +96,8 @@ fn a_report_that_fits_no_evaluation_is_refused() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
     let good = full_report(&job, "a");
-    let with_episode = |episode: EpisodeScore| ScoreReport { episodes: vec![episode], ..good.clone() };
+    let with_episode =
+        |episode: EpisodeScore| ScoreReport { episodes: vec![episode], ..good.clone() };
     let twice = ScoreReport { episodes: vec![score(1, 0.0), score(1, 0.0)], ..good.clone() };
     let cases = [
         (ScoreReport { run: name("other"), ..good.clone() }, Refusal::Run),

@@ -19,18 +19,21 @@ fn many_that_come_and_go_are_told_in_one_line_and_bounded() {
         evaluators.left(&name(number), 0);
     }
     assert_eq!(evaluators.tick(now).len(), ONE_BY_ONE, "the period is not over");
-    let more = format!("{} more evaluators came and {MOST_EVALUATORS} left", MOST_EVALUATORS - ONE_BY_ONE);
+    let more =
+        format!("{} more evaluators came and {MOST_EVALUATORS} left", MOST_EVALUATORS - ONE_BY_ONE);
     assert_eq!(evaluators.tick(now + PERIOD), [more]);
     evaluators.joined(name(7)).unwrap();
     assert_eq!(evaluators.tick(now + PERIOD), ["evaluator e-7 is here"], "a new period");
 }
 
-/// A run that is trained waits for an evaluator which is at a long job of another run, and not for one that can do nothing here.
+/// A run that is trained waits for an evaluator which is at a long job of another run, and not for
+/// one that can do nothing here.
 #[test]
 fn an_evaluator_may_do_the_work_until_it_asks_for_other_work() {
     let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), 1, &[]).unwrap();
     let mut evaluators = Evaluators::new(metrics.evaluators, Instant::now());
-    let fits = |evaluators: &Evaluators| evaluators.present().map(|(_, fits, _)| fits).collect::<Vec<_>>();
+    let fits =
+        |evaluators: &Evaluators| evaluators.present().map(|(_, fits, _)| fits).collect::<Vec<_>>();
     evaluators.asks(&name(1), true);
     assert!(!evaluators.any_may_fit(), "it is not here");
     evaluators.joined(name(1)).unwrap();

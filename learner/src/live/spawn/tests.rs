@@ -18,7 +18,10 @@ fn a_thread_that_fails_or_panics_tells_the_main_loop_why() {
         }
     };
     let panicked = failed(|| panic!("a test's own {}", "panic"));
-    assert!(panicked.contains("`scores` panicked") && panicked.contains("a test's own panic"), "{panicked}");
+    assert!(
+        panicked.contains("`scores` panicked") && panicked.contains("a test's own panic"),
+        "{panicked}"
+    );
     assert_eq!(failed(|| Err(anyhow!("no such thing"))), "no such thing");
 
     let health = Health::default();

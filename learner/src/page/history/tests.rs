@@ -9,8 +9,11 @@ use super::*;
 
 /// A line of each of these hundreds of steps.
 fn lines(numbers: impl IntoIterator<Item = u64>) -> String {
-    let line =
-        |n| json!({ "step": 100 * n, "seconds": 2 * n, "loss": 1.0 / n as f64, "eta": n % 2 }).to_string() + "\n";
+    let line = |n| {
+        json!({ "step": 100 * n, "seconds": 2 * n, "loss": 1.0 / n as f64, "eta": n % 2 })
+            .to_string()
+            + "\n"
+    };
     numbers.into_iter().map(line).collect()
 }
 
@@ -28,8 +31,12 @@ fn new_lines_are_added_and_half_a_line_waits() {
     let (first, second) = (lines(1..=3), lines([4]));
     fs::write(&path, first + &second[..9]).unwrap();
     history.refresh().unwrap();
-    let expected = json!([[100.0, 2.0, 1.0, 1.0], [200.0, 4.0, 0.0, 0.5], [300.0, 6.0, 1.0, 0.33333]]);
-    assert_eq!((&shown(&history)["names"], &shown(&history)["rows"]), (&json!(["eta", "loss"]), &expected));
+    let expected =
+        json!([[100.0, 2.0, 1.0, 1.0], [200.0, 4.0, 0.0, 0.5], [300.0, 6.0, 1.0, 0.33333]]);
+    assert_eq!(
+        (&shown(&history)["names"], &shown(&history)["rows"]),
+        (&json!(["eta", "loss"]), &expected)
+    );
     let mut file = fs::OpenOptions::new().append(true).open(&path).unwrap();
     file.write_all(&second.as_bytes()[9..]).unwrap();
     history.refresh().unwrap();
@@ -57,13 +64,22 @@ fn a_run_that_went_back_to_its_checkpoint_is_shown_as_it_went_on() {
 fn what_was_not_measured_at_a_step_leaves_its_other_numbers_and_other_steps_alone() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("metrics.jsonl");
-    let lines = ["\"loss\":1.0", "\"loss\":2.0,\"held_out_loss\":8.0", "\"loss\":null,\"held_out_loss\":4.0"];
-    let lines = (1..).zip(lines).map(|(step, rest)| format!("{{\"step\":{step},\"seconds\":{step}.0,{rest}}}\n"));
+    let lines = [
+        "\"loss\":1.0",
+        "\"loss\":2.0,\"held_out_loss\":8.0",
+        "\"loss\":null,\"held_out_loss\":4.0",
+    ];
+    let lines = (1..)
+        .zip(lines)
+        .map(|(step, rest)| format!("{{\"step\":{step},\"seconds\":{step}.0,{rest}}}\n"));
     fs::write(&path, lines.collect::<String>()).unwrap();
     let mut history = History::of(path);
     history.refresh().unwrap();
     let expected = json!([[1.0, 1.0, 1.0, null], [2.0, 2.0, 2.0, 8.0], [3.0, 3.0, null, 4.0]]);
-    assert_eq!((&shown(&history)["names"], &shown(&history)["rows"]), (&json!(["loss", "held_out_loss"]), &expected));
+    assert_eq!(
+        (&shown(&history)["names"], &shown(&history)["rows"]),
+        (&json!(["loss", "held_out_loss"]), &expected)
+    );
     let mut rows = history.rows.into_iter();
     let mut first = rows.next().unwrap();
     rows.for_each(|row| first.join(&row));
@@ -113,8 +129,12 @@ fn what_a_line_does_not_have_is_nothing() {
     let mut history = History::of(path.clone());
     fs::write(&path, Vec::from_iter((1..=2).map(|n| line(n).to_string() + "\n")).concat()).unwrap();
     history.refresh().unwrap();
-    assert_eq!((&shown(&history)["names"], &shown(&history)["rows"][1]), (&json!(["first"]), &json!([2.0, 1.0, 1.0])));
-    fs::write(&path, Vec::from_iter((1..=2100).map(|n| line(n).to_string() + "\n")).concat()).unwrap();
+    assert_eq!(
+        (&shown(&history)["names"], &shown(&history)["rows"][1]),
+        (&json!(["first"]), &json!([2.0, 1.0, 1.0]))
+    );
+    fs::write(&path, Vec::from_iter((1..=2100).map(|n| line(n).to_string() + "\n")).concat())
+        .unwrap();
     history.refresh().unwrap();
     let shown = shown(&history);
     assert_eq!(shown["names"], json!(["first", "both", "second", "third"]));
@@ -130,7 +150,8 @@ fn what_a_line_does_not_have_is_nothing() {
 
 #[test]
 fn numbers_have_five_digits() {
-    let numbers = [0.0, 1.0, -2.345_678_9, 12_345_678.9, 1.234_567_8e-20, 3.0e-320, f64::NAN, f64::INFINITY];
+    let numbers =
+        [0.0, 1.0, -2.345_678_9, 12_345_678.9, 1.234_567_8e-20, 3.0e-320, f64::NAN, f64::INFINITY];
     let expected = [Some(0.0), Some(1.0), Some(-2.3457), Some(12_346_000.0), Some(1.2346e-20)];
     assert_eq!(numbers[..5].iter().map(|number| rounded(*number)).collect::<Vec<_>>(), expected);
     assert!(rounded(numbers[5]).is_some_and(|tiny| tiny < 1e-300));

@@ -8,16 +8,27 @@ use super::*;
 fn what_is_no_finite_number_is_left_out_of_a_picture() {
     let huge = [1e200, 1e308, -1e308, f64::INFINITY, f64::NEG_INFINITY, f64::NAN];
     let estimate = |value: f64| Estimate { value, low: Some(-value), high: Some(value * value) };
-    let points = |number: f64| [(number, estimate(1.0)), (1.0, estimate(number)), (2.0, estimate(3.0))];
+    let points =
+        |number: f64| [(number, estimate(1.0)), (1.0, estimate(number)), (2.0, estimate(3.0))];
     let line = |number: f64| Line { label: "a line".to_owned(), points: points(number).to_vec() };
     for is_power in [false, true] {
         let lines = huge.into_iter().map(line).collect();
-        let references = huge.into_iter().map(|number| ("a reference".to_owned(), number)).collect();
-        let picture = Picture { title: "a picture".to_owned(), is_power, references, lines, ..Picture::default() };
+        let references =
+            huge.into_iter().map(|number| ("a reference".to_owned(), number)).collect();
+        let picture = Picture {
+            title: "a picture".to_owned(),
+            is_power,
+            references,
+            lines,
+            ..Picture::default()
+        };
         let (tell, drawn) = std::sync::mpsc::channel();
         std::thread::spawn(move || tell.send(picture.svg().unwrap()));
         let svg = drawn.recv_timeout(Duration::from_secs(60)).expect("an axis has no end");
-        assert!(svg.contains("a line") && svg.contains("a reference") && !svg.contains("NaN"), "{svg}");
+        assert!(
+            svg.contains("a line") && svg.contains("a reference") && !svg.contains("NaN"),
+            "{svg}"
+        );
     }
 }
 

@@ -21,9 +21,14 @@ fn command_for(experiment: Experiment) -> Option<String> {
 
 /// What a learner trains that a shell starts with it.
 fn made_by(command: &str) -> Experiment {
-    let words = process::Command::new("sh").args(["-c", &format!("printf '%s\\n' {command}")]).output().unwrap();
+    let words = process::Command::new("sh")
+        .args(["-c", &format!("printf '%s\\n' {command}")])
+        .output()
+        .unwrap();
     let words = String::from_utf8(words.stdout).unwrap();
-    let Command::Train(train) = Cli::try_parse_from(words.lines()).unwrap().command else { panic!("{command}") };
+    let Command::Train(train) = Cli::try_parse_from(words.lines()).unwrap().command else {
+        panic!("{command}")
+    };
     assert!(train.run_dir.as_ref().is_some_and(|dir| dir.ends_with("it's a run")), "{command}");
     Preset::read(train.preset()).unwrap().resolve(&train.changes()).unwrap()
 }
@@ -41,7 +46,9 @@ fn a_shell_that_is_given_the_command_makes_the_same_run() {
         let command = command_for(experiment.clone()).unwrap();
         assert_eq!(made_by(&command), experiment, "{command}");
     }
-    let plain = command_for(resolve("hopper-demo", &toml! { agent = { guidance = "dac" } }).unwrap()).unwrap();
+    let plain =
+        command_for(resolve("hopper-demo", &toml! { agent = { guidance = "dac" } }).unwrap())
+            .unwrap();
     assert!(plain.contains(" --set agent.guidance=dac "), "{plain}");
 }
 

@@ -9,8 +9,9 @@ fn read(rest: &str) -> anyhow::Result<Study> {
 
 /// A file with these axes and rules, read with these flags.
 fn read_as(rest: &str, only: &[&str], set: &[&str]) -> anyhow::Result<Study> {
-    let [only, set] =
-        [only, set].map(|words| Vec::from_iter(words.iter().map(|word| tables::parse_assignment(word).unwrap())));
+    let [only, set] = [only, set].map(|words| {
+        Vec::from_iter(words.iter().map(|word| tables::parse_assignment(word).unwrap()))
+    });
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("mine.toml");
     let text = "about = 'a question'\nrun = { dataset = 'x.hdf5', steps = 7 }\n";
@@ -26,12 +27,17 @@ const METHODS: &str = "[method.none]\nagent.guidance = 'none'\n[method.iql]\nalg
 
 #[test]
 fn every_combination_is_a_run_and_seeds_change_last() {
-    let study =
-        read(&format!("axes = {{ seed = [0, 3], task = ['hopper-demo'], method = ['none', 'iql'] }}\n{METHODS}"))
-            .unwrap();
+    let study = read(&format!(
+        "axes = {{ seed = [0, 3], task = ['hopper-demo'], method = ['none', 'iql'] }}\n{METHODS}"
+    ))
+    .unwrap();
     let names: Vec<_> = study.runs.iter().map(|run| (run.index, &*run.name)).collect();
-    let expected =
-        ["hopper-demo-none-seed0", "hopper-demo-iql-seed0", "hopper-demo-none-seed3", "hopper-demo-iql-seed3"];
+    let expected = [
+        "hopper-demo-none-seed0",
+        "hopper-demo-iql-seed0",
+        "hopper-demo-none-seed3",
+        "hopper-demo-iql-seed3",
+    ];
     assert_eq!(names, Vec::from_iter(expected.into_iter().enumerate()));
     let last = &study.runs[3].experiment;
     assert_eq!((&*last.algorithm, last.seed, last.steps), ("iql", 3, 7));
@@ -50,7 +56,8 @@ fn a_run_is_what_its_command_line_would_be() {
     let mut changes = Table::new();
     words.for_each(|word| tables::merge(&mut changes, tables::parse_assignment(&word).unwrap()));
     assert_eq!(quad_run::config::resolve(&run.preset, &changes).unwrap(), run.experiment);
-    let two = "[axes]\ntask = ['hopper-demo']\nagent.actor.hidden = [[8]]\nagent.critic.hidden = [[9]]\n";
+    let two =
+        "[axes]\ntask = ['hopper-demo']\nagent.actor.hidden = [[8]]\nagent.critic.hidden = [[9]]\n";
     assert_eq!(names(two), ["hopper-demo-agent.actor.hidden8-agent.critic.hidden9"]);
 }
 
@@ -60,7 +67,10 @@ fn rules_choose_combinations() {
     let with = |rules: &str| names(&format!("{axes}{METHODS}{rules}"));
     assert_eq!(with("").len(), 8);
     let except = with("[[except]]\nmethod = 'none'\nagent.tau = 1\n[[except]]\ntask = 'walker*'\n");
-    assert_eq!(except, ["hopper-demo-none-tau0.5", "hopper-demo-dac-tau0.5", "hopper-demo-dac-tau1.0"]);
+    assert_eq!(
+        except,
+        ["hopper-demo-none-tau0.5", "hopper-demo-dac-tau0.5", "hopper-demo-dac-tau1.0"]
+    );
     let only = with(
         "[[only]]\ntask = 'w*-demo'\nmethod = ['dac', 'none']\nagent.tau = 0.5\n[[only]]\ntask = 'hopper-demo'\nagent.tau = 1\n",
     );
@@ -82,7 +92,10 @@ fn all_that_is_wrong_is_told_at_once() {
     refused("axes = {}", &["no axis"]);
     refused("axes = { seed = [0] }", &["seed0: it needs one of task and preset"]);
     refused("axis = { seed = [0] }", &["unknown field `axis`"]);
-    refused(&format!("axes = {{ {task}, seed = [-1], agent.tua = [2] }}"), &["hopper-demo-tua2-seed-1: "]);
+    refused(
+        &format!("axes = {{ {task}, seed = [-1], agent.tua = [2] }}"),
+        &["hopper-demo-tua2-seed-1: "],
+    );
     refused(
         "axes = { task = ['hoper-demo', 'own-data'], seed = [0] }",
         &["hoper-demo-seed0: there is no task", "did you mean hopper-demo"],
@@ -91,8 +104,14 @@ fn all_that_is_wrong_is_told_at_once() {
         &format!("axes = {{ {task}, method = ['nine'] }}\n{METHODS}"),
         &["no table [method.nine]", "did you mean none"],
     );
-    refused(&format!("axes = {{ {task}, steps = [5] }}"), &["steps is an axis, and [run] has it, too"]);
-    refused(&format!("axes = {{ {task}, dataset = ['a/b.hdf5', 'c/b.npz'] }}"), &["dataset is an axis"]);
+    refused(
+        &format!("axes = {{ {task}, steps = [5] }}"),
+        &["steps is an axis, and [run] has it, too"],
+    );
+    refused(
+        &format!("axes = {{ {task}, dataset = ['a/b.hdf5', 'c/b.npz'] }}"),
+        &["dataset is an axis"],
+    );
     refused(
         &format!(
             "axes = {{ {task}, scale = [['states'], ['states', 'actions', 'states']], agent.actor.hidden = [[{}]] }}",
@@ -103,14 +122,20 @@ fn all_that_is_wrong_is_told_at_once() {
     let rules = format!("[axes]\n{task}\nseed = [1]\n[[only]]\nsede = 1\n[[except]]\nseed = 2\n");
     refused(&rules, &["names sede, which is no axis", "[[except]] fits no combination: seed = 2"]);
     refused(&format!("[axes]\n{task}\n[[except]]\ntask = '*'\n"), &["the rules leave no run"]);
-    refused(&format!("axes = {{ {task}, agent.nu_ema_rate = [0.5, '0.5'] }}"), &["hopper-demo-nu_ema_rate-0.5"]);
+    refused(
+        &format!("axes = {{ {task}, agent.nu_ema_rate = [0.5, '0.5'] }}"),
+        &["hopper-demo-nu_ema_rate-0.5"],
+    );
 }
 
 #[test]
 fn the_command_line_keeps_to_some_runs_and_changes_all_of_them() {
-    let axes =
-        format!("[axes]\ntask = ['hopper-demo', 'walker2d-demo']\nmethod = ['none', 'iql']\nseed = [0, 1]\n{METHODS}");
-    let study = read_as(&axes, &["task=hopper-*", "seed=1", "seed=2"], &["steps=9", "agent.gamma=0.5"]).unwrap();
+    let axes = format!(
+        "[axes]\ntask = ['hopper-demo', 'walker2d-demo']\nmethod = ['none', 'iql']\nseed = [0, 1]\n{METHODS}"
+    );
+    let study =
+        read_as(&axes, &["task=hopper-*", "seed=1", "seed=2"], &["steps=9", "agent.gamma=0.5"])
+            .unwrap();
     let runs = study.runs.iter().map(|run| (run.index, &*run.name, run.experiment.steps));
     let runs = Vec::from_iter(runs);
     assert_eq!(runs, [(4, "hopper-demo-none-seed1", 9), (5, "hopper-demo-iql-seed1", 9)]);
@@ -128,17 +153,22 @@ fn a_run_of_other_data_is_never_taken_for_one_of_the_study() {
     for (dataset, is_its) in [("x.hdf5", true), ("y.hdf5", false)] {
         let path = folder.path().join(dataset);
         let mut config = crate::fixtures::config("run", 0);
-        config.experiment = Experiment { dataset: Some(dataset.to_owned()), ..study.runs[0].experiment.clone() };
+        config.experiment =
+            Experiment { dataset: Some(dataset.to_owned()), ..study.runs[0].experiment.clone() };
         RunDir::create(&path, &config).unwrap();
         match study.runs[0].state(&path) {
             Ok(state) => assert_eq!((state, is_its), (State::Begun(0), true)),
-            Err(error) => assert!(!is_its && error.to_string().ends_with("than the study's: dataset"), "{error}"),
+            Err(error) => assert!(
+                !is_its && error.to_string().ends_with("than the study's: dataset"),
+                "{error}"
+            ),
         }
     }
 }
 
-/// How many runs studies have: Table 1 without two methods in mazes, Table 2's two on seven tasks, five values of τ, and what is
-/// compared today: seven methods with eight seeds in six mazes and with five tables of an arm.
+/// How many runs studies have: Table 1 without two methods in mazes, Table 2's two on seven tasks,
+/// five values of τ, and what is compared today: seven methods with eight seeds in six mazes and
+/// with five tables of an arm.
 #[test]
 fn studies_are_what_papers_train() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../studies");
@@ -163,6 +193,7 @@ fn the_example_of_the_documentation_is_a_study() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("example.toml");
     std::fs::write(&path, example.split_once("```").unwrap().0).unwrap();
-    // Of 3 tasks, 2 methods, 2 values of τ and 3 seeds, without dac in the maze, and with one τ for dac.
+    // Of 3 tasks, 2 methods, 2 values of τ and 3 seeds, without dac in the maze, and with one τ for
+    // dac.
     assert_eq!(Study::read(&path, &[], &[]).unwrap().runs.len(), (2 * (1 + 2) + 2) * 3);
 }

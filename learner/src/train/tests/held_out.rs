@@ -2,8 +2,8 @@
 
 use super::*;
 
-/// An agent of this algorithm, of such batches, over 30 other transitions than those that are learned from, whose first reward is
-/// as given.
+/// An agent of this algorithm, of such batches, over 30 other transitions than those that are
+/// learned from, whose first reward is as given.
 fn beside(algorithm: &str, batch_size: usize, reward: f32) -> Agent {
     let (n, context) = (30, context(250));
     let (o, a) = (context.transitions.observation_dim(), context.transitions.action_dim());
@@ -18,23 +18,32 @@ fn beside(algorithm: &str, batch_size: usize, reward: f32) -> Agent {
         terminals: vec![false; n],
         timeouts: (1..=n).map(|row| row == n).collect(),
     };
-    let context = Context { transitions: Arc::new(Transitions::of(arrays).unwrap()), batch_size, ..context };
+    let context =
+        Context { transitions: Arc::new(Transitions::of(arrays).unwrap()), batch_size, ..context };
     Agent::new(definition(algorithm).unwrap(), &small(algorithm), context).unwrap()
 }
 
-/// By the weights of the moment, in whatever order batches are taken, and without a trace in what is trained.
+/// By the weights of the moment, in whatever order batches are taken, and without a trace in what
+/// is trained.
 #[test]
 fn held_out_episodes_are_measured_and_not_learned_from() {
     for algorithm in ["quad", "iql"] {
-        let agent = || Agent::new(definition(algorithm).unwrap(), &small(algorithm), context(20)).unwrap();
+        let agent =
+            || Agent::new(definition(algorithm).unwrap(), &small(algorithm), context(20)).unwrap();
         let ([mut alone, mut measured], mut held_out) =
             ([agent(), agent()], HeldOut::of(beside(algorithm, 8, 1.0), 8, 0, 20));
         let mut before = Vec::new();
         for _ in 0..5 {
-            assert_eq!(alone.update(&[0, 1, 2, 3]).unwrap(), measured.update(&[0, 1, 2, 3]).unwrap());
+            assert_eq!(
+                alone.update(&[0, 1, 2, 3]).unwrap(),
+                measured.update(&[0, 1, 2, 3]).unwrap()
+            );
             let state = measured.save().unwrap();
             let values = held_out.measure(&state).unwrap();
-            assert!(values != before && values == held_out.measure(&state).unwrap(), "{algorithm}: {values:?}");
+            assert!(
+                values != before && values == held_out.measure(&state).unwrap(),
+                "{algorithm}: {values:?}"
+            );
 
             let mut sampler = BatchSampler::new(30, 8, 0, 0);
             let batches = Vec::from_iter((0..4).map(|_| sampler.next_items().to_vec()));
@@ -43,11 +52,16 @@ fn held_out_episodes_are_measured_and_not_learned_from() {
                 let mut fresh = beside(algorithm, 8, 1.0);
                 fresh.load(&state).unwrap();
                 let values = fresh.evaluate(batch).unwrap();
-                sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += f64::from(value.unwrap_or_default()));
+                sums.iter_mut()
+                    .zip(values)
+                    .for_each(|(sum, value)| *sum += f64::from(value.unwrap_or_default()));
             }
             for ((metric, value), sum) in measured.metrics().iter().zip(&values).zip(sums) {
                 assert_eq!(value.is_some(), metric.held_out, "{metric:?}");
-                assert!(value.is_none_or(|value| (f64::from(value) - sum / 4.0).abs() < 1e-6), "{metric:?}: {value:?}");
+                assert!(
+                    value.is_none_or(|value| (f64::from(value) - sum / 4.0).abs() < 1e-6),
+                    "{metric:?}: {value:?}"
+                );
             }
             before = values;
         }
@@ -64,14 +78,24 @@ fn an_outlier_in_a_held_out_episode_costs_the_metrics_that_it_is_in() {
     for (row, step) in result.rows.iter().zip([100, 200, 250]) {
         let json = serde_json::to_value(row).unwrap();
         let has = |name: &str| json.get(name).is_some();
-        assert_eq!((row.step, has("held_out_value_loss"), has("held_out_critic_loss")), (step, true, false), "{json}");
+        assert_eq!(
+            (row.step, has("held_out_value_loss"), has("held_out_critic_loss")),
+            (step, true, false),
+            "{json}"
+        );
         assert!(has("critic_loss") && !json.to_string().contains("null"), "{json}");
     }
     let has = |name: &str| result.gauges.contains(name);
-    assert!(has("critic_loss") && has("held_out_value_loss") && !has("held_out_critic_loss"), "{:?}", result.gauges);
+    assert!(
+        has("critic_loss") && has("held_out_value_loss") && !has("held_out_critic_loss"),
+        "{:?}",
+        result.gauges
+    );
     assert_eq!(result.metrics.diverged.get(), 0);
     let without = run_agent(agent(), None, plan(250, 0), false);
-    assert!(without.checkpoint == result.checkpoint && !without.gauges.contains("held_out_value_loss"));
+    assert!(
+        without.checkpoint == result.checkpoint && !without.gauges.contains("held_out_value_loss")
+    );
 }
 
 /// A row has measurements or has none: it does not repeat those of another.

@@ -10,8 +10,14 @@ fn values(given: &[&str]) -> Values {
 
 #[test]
 fn only_benchmarks_of_others_can_lack_their_authors_values() {
-    for (task, expected) in [("hopper-medium-v2", false), ("antmaze-umaze-v0", false), ("hopper-demo", false)] {
-        assert_eq!(lacks(&values(&["*-v2", "antmaze-*"]), tasks::named(task).unwrap()), expected, "{task}");
+    for (task, expected) in
+        [("hopper-medium-v2", false), ("antmaze-umaze-v0", false), ("hopper-demo", false)]
+    {
+        assert_eq!(
+            lacks(&values(&["*-v2", "antmaze-*"]), tasks::named(task).unwrap()),
+            expected,
+            "{task}"
+        );
     }
     let of_ogbench = "antmaze-giant-stitch-singletask-task5-v0";
     for (given, task, expected) in [
@@ -20,7 +26,11 @@ fn only_benchmarks_of_others_can_lack_their_authors_values() {
         ("antmaze-*-singletask-*", of_ogbench, false),
         ("antmaze-*-singletask-*", "antmaze-umaze-v0", true),
     ] {
-        assert_eq!(lacks(&values(&[given]), tasks::named(task).unwrap()), expected, "{given} for {task}");
+        assert_eq!(
+            lacks(&values(&[given]), tasks::named(task).unwrap()),
+            expected,
+            "{given} for {task}"
+        );
     }
 }
 

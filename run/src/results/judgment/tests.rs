@@ -32,30 +32,41 @@ fn judgment(run: &str, values: &[f64], behavior: f64) -> Judgment {
 
 fn ranked(judgments: &[Judgment]) -> (Vec<String>, bool, String) {
     let [ranking] = <[Ranking; 1]>::try_from(Ranking::of(judgments.to_vec())).ok().unwrap();
-    (ranking.policies.iter().map(|one| one.run.display().to_string()).collect(), ranking.can_rank, ranking.verdict)
+    (
+        ranking.policies.iter().map(|one| one.run.display().to_string()).collect(),
+        ranking.can_rank,
+        ranking.verdict,
+    )
 }
 
 #[test]
 fn the_best_comes_first_and_what_diverged_is_told_but_not_averaged() {
     let mut diverged = judgment("diverged", &[1e9, 12.0], 10.5);
     diverged.estimate.doubts.push("beyond what rewards allow".to_owned());
-    let judgments = [judgment("low", &[9.0, 9.2], 10.5), diverged, judgment("high", &[13.0, 14.0], 10.5)];
+    let judgments =
+        [judgment("low", &[9.0, 9.2], 10.5), diverged, judgment("high", &[13.0, 14.0], 10.5)];
     // Of the deviations 0.71 and 0.14 the root mean square is 0.51, twice that 1.02.
     let (order, can_rank, verdict) = ranked(&judgments);
     assert_eq!((order, can_rank), (["high", "low", "diverged"].map(str::to_owned).to_vec(), true));
     assert!(verdict.contains("less than 1.02") && verdict.contains("0.50 off"), "{verdict}");
-    let text = Ranking::of(judgments.to_vec())[0].parts().map(|part| part.render(Style::Text)).concat();
+    let text =
+        Ranking::of(judgments.to_vec())[0].parts().map(|part| part.render(Style::Text)).concat();
     assert!(text.contains("a ranking, not a score") && text.contains("13.50 ± 0.71"), "{text}");
     assert!(!text.contains("500000006") && text.contains("beyond what rewards allow"), "{text}");
 }
 
 #[test]
 fn what_the_behavior_s_estimate_misses_by_more_is_not_ranked() {
-    let (_, can_rank, verdict) = ranked(&[judgment("a", &[9.0], 14.0), judgment("b", &[12.0], 14.0)]);
+    let (_, can_rank, verdict) =
+        ranked(&[judgment("a", &[9.0], 14.0), judgment("b", &[12.0], 14.0)]);
     assert!(!can_rank && verdict.contains("4.00 off") && verdict.contains("3.00"), "{verdict}");
     assert!(ranked(&[judgment("a", &[8.0, 10.0], 10.0), judgment("b", &[12.0, 14.0], 10.0)]).1);
-    let (_, can_rank, verdict) = ranked(&[judgment("a", &[8.0, 12.0], 10.0), judgment("b", &[12.0, 14.0], 10.0)]);
-    assert!(!can_rank && verdict.contains("no more than 3.00"), "the seeds differ as much: {verdict}");
+    let (_, can_rank, verdict) =
+        ranked(&[judgment("a", &[8.0, 12.0], 10.0), judgment("b", &[12.0, 14.0], 10.0)]);
+    assert!(
+        !can_rank && verdict.contains("no more than 3.00"),
+        "the seeds differ as much: {verdict}"
+    );
     let mut doubtful = judgment("a", &[9.0], 10.0);
     doubtful.behavior.doubts.push("it moves".to_owned());
     assert!(!ranked(&[doubtful.clone(), doubtful]).1);
@@ -68,7 +79,10 @@ fn judgments_of_other_conditions_are_apart() {
     others[0].conditions.gamma = 0.9;
     others[1].conditions.environment = "another arm".to_owned();
     for other in others {
-        assert_eq!(Ranking::of([judgment("a", &[1.0], 10.0), other, judgment("b", &[2.0], 10.0)]).len(), 2);
+        assert_eq!(
+            Ranking::of([judgment("a", &[1.0], 10.0), other, judgment("b", &[2.0], 10.0)]).len(),
+            2
+        );
     }
 }
 
@@ -80,7 +94,10 @@ fn a_judgment_takes_the_place_of_an_earlier_one_of_its_step() {
         Judgment { step, ..judgment("run", &[value], 10.0) }.keep(&run).unwrap();
     }
     let kept = Judgment::read_all(&run).unwrap();
-    assert_eq!(Vec::from_iter(kept.iter().map(|one| (one.step, one.estimate.values[0]))), [(20, 2.0), (40, 3.0)]);
+    assert_eq!(
+        Vec::from_iter(kept.iter().map(|one| (one.step, one.estimate.values[0]))),
+        [(20, 2.0), (40, 3.0)]
+    );
 }
 
 #[test]

@@ -6,11 +6,13 @@ fn paper() -> &'static Tables {
     &SOURCES[0]
 }
 
-/// The columns of Tables 1 and 2 add up to the totals that the paper gives; quad.toml names the three that do not.
+/// The columns of Tables 1 and 2 add up to the totals that the paper gives; quad.toml names the
+/// three that do not.
 #[test]
 fn columns_add_up_to_the_totals_of_the_paper() {
     let total = |method: &str, figure: usize, maze: bool| {
-        let tasks = paper().scores.iter().filter(|(preset, _)| preset.starts_with("antmaze") == maze);
+        let tasks =
+            paper().scores.iter().filter(|(preset, _)| preset.starts_with("antmaze") == maze);
         let figures = tasks.filter_map(|(_, scores)| scores.get(method)?.get(figure));
         (figures.sum::<f64>() * 10.0).round() / 10.0
     };
@@ -28,9 +30,14 @@ fn columns_add_up_to_the_totals_of_the_paper() {
         ("DAC", 836.4, 459.9),
         ("QUAD", 842.8, 489.0),
     ] {
-        assert_eq!([total(method, 0, false), total(method, 0, true)], [locomotion, antmaze], "{method}");
+        assert_eq!(
+            [total(method, 0, false), total(method, 0, true)],
+            [locomotion, antmaze],
+            "{method}"
+        );
     }
-    let table_2 = [0, 1].map(|figure| total("DAC-Rep", figure, false) + total("DAC-Rep", figure, true));
+    let table_2 =
+        [0, 1].map(|figure| total("DAC-Rep", figure, false) + total("DAC-Rep", figure, true));
     assert_eq!(table_2.map(|total| (total * 10.0).round() / 10.0), [511.8, 58.1]);
 }
 
@@ -74,10 +81,16 @@ fn a_run_stands_in_the_tables_that_have_its_algorithm() {
     assert_eq!(tables("hopper-medium-v2", "idql"), paper[..1], "which has the task");
     for algorithm in ["fql", "quad"] {
         assert_eq!(tables("antmaze-umaze-v2", algorithm), ["D4RL's mazes of version 2"]);
-        assert_eq!(tables("cube-single-play-singletask-v0", algorithm), ["OGBench's default tasks"]);
+        assert_eq!(
+            tables("cube-single-play-singletask-v0", algorithm),
+            ["OGBench's default tasks"]
+        );
     }
     assert_eq!(tables("hopper-demo", "quad"), [""; 0]);
-    assert_eq!(["hopper-medium-v2", "hopper-demo", "cube-single-play-singletask-v0"].map(last), [5, 5, 3]);
+    assert_eq!(
+        ["hopper-medium-v2", "hopper-demo", "cube-single-play-singletask-v0"].map(last),
+        [5, 5, 3]
+    );
 }
 
 #[test]
@@ -85,15 +98,20 @@ fn every_remark_is_on_a_figure_and_says_something_else_than_it() {
     for source in &*SOURCES {
         for known in &source.remark {
             for method in &known.methods {
-                let figures = source.scores.iter().filter(|(_, scores)| scores.contains_key(method));
+                let figures =
+                    source.scores.iter().filter(|(_, scores)| scores.contains_key(method));
                 assert!(
                     figures.clone().any(|(task, _)| known.on(method, task).is_some()),
                     "{method}: {}",
                     known.reason
                 );
                 for (task, instead) in &known.instead {
-                    let printed = source.scores.get(task).and_then(|scores| scores.get(method)?.first());
-                    assert!(printed.is_some_and(|printed| printed != instead), "{method}, {task}: {instead}");
+                    let printed =
+                        source.scores.get(task).and_then(|scores| scores.get(method)?.first());
+                    assert!(
+                        printed.is_some_and(|printed| printed != instead),
+                        "{method}, {task}: {instead}"
+                    );
                 }
             }
         }

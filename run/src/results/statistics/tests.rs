@@ -34,7 +34,8 @@ fn is_close(one: f64, other: f64) -> bool {
     (one - other).abs() <= 1e-12 * other.abs().max(1.0)
 }
 
-/// The ends of both have noise of their own: with 10,000 resamples of roughly normal statistics about 1 % of the width.
+/// The ends of both have noise of their own: with 10,000 resamples of roughly normal statistics
+/// about 1 % of the width.
 fn agree(estimate: Estimate, value: f64, low: f64, high: f64) {
     assert!(is_close(estimate.value, value), "{estimate:?} {value}");
     for (ours, theirs) in [(estimate.low, low), (estimate.high, high)] {
@@ -47,7 +48,9 @@ fn estimates_are_those_of_rliable() {
     let known = known();
     for method in known.methods.values() {
         let of = |drawn: &[Runs]| {
-            [interquartile_mean, mean_of_means, median_of_means, optimality_gap].map(|of| of(&drawn[0])).to_vec()
+            [interquartile_mean, mean_of_means, median_of_means, optimality_gap]
+                .map(|of| of(&drawn[0]))
+                .to_vec()
         };
         for (index, estimate) in estimates(&[&method.scores], of).into_iter().enumerate() {
             agree(estimate, method.values[index], method.low[index], method.high[index]);
@@ -67,11 +70,14 @@ fn the_same_scores_give_the_same_interval_and_a_single_seed_gives_none() {
     let of = |runs: Runs| estimates(&[&runs], |drawn| vec![mean_of_means(&drawn[0])])[0];
     let runs = vec![vec![1.0, 2.0, 4.0], vec![3.0, 5.0]];
     assert_eq!(of(runs.clone()), of(runs));
-    assert_eq!(of(vec![vec![1.0, 2.0], vec![3.0]]), Estimate { value: 2.25, low: None, high: None });
+    assert_eq!(
+        of(vec![vec![1.0, 2.0], vec![3.0]]),
+        Estimate { value: 2.25, low: None, high: None }
+    );
 }
 
-/// With nine scores, ⌊9 / 4⌋ / 9 of the weight is cut at either end: two of equal weight. With six and three of them in
-/// two tasks, one of the first weighs 1/12 and one of the second 1/6.
+/// With nine scores, ⌊9 / 4⌋ / 9 of the weight is cut at either end: two of equal weight. With six
+/// and three of them in two tasks, one of the first weighs 1/12 and one of the second 1/6.
 #[test]
 fn the_interquartile_mean_weighs_tasks_alike() {
     let nine = vec![vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 100.0]];
@@ -90,7 +96,8 @@ fn sign_flips_give_the_p_values_of_scipy_and_drawn_ones_are_near_them() {
     for (count, p_value) in (1..).zip(&known.p_values) {
         assert!(is_close(sign_flip_test(&known.differences[..count].concat()), *p_value));
     }
-    // Of 17 differences the ways are drawn. Of eight pairs of opposite ones and one alone, the sum is as near to 0 as it can be.
+    // Of 17 differences the ways are drawn. Of eight pairs of opposite ones and one alone, the sum
+    // is as near to 0 as it can be.
     assert_eq!(sign_flip_test(&[1.0; 17]), 1.0 / 10_001.0);
     let balanced: Vec<f64> = (0..17).map(|index| if index % 2 == 0 { 1.0 } else { -1.0 }).collect();
     assert_eq!(sign_flip_test(&balanced), 1.0);

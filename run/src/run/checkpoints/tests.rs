@@ -17,7 +17,10 @@ fn the_newest_are_kept_and_a_damaged_one_falls_back_to_the_one_before() {
         assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(step)));
     }
     let files = checkpoints.files().unwrap();
-    assert_eq!(files.iter().map(|file| step(file).unwrap()).collect::<Vec<_>>(), [1_000_000_000, 200, 10]);
+    assert_eq!(
+        files.iter().map(|file| step(file).unwrap()).collect::<Vec<_>>(),
+        [1_000_000_000, 200, 10]
+    );
 
     // Torn, then a flipped bit, then gone; and what a crash leaves beside them.
     fs::write(&files[0], &checkpoint(0).state[..500]).unwrap();
@@ -27,7 +30,11 @@ fn the_newest_are_kept_and_a_damaged_one_falls_back_to_the_one_before() {
     fs::write(&files[1], bytes).unwrap();
     fs::write(checkpoints.folder.join("step_000000300_00.safetensors.partial"), "half").unwrap();
     assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(10)));
-    assert_eq!(checkpoints.files().unwrap(), files[2..], "damaged ones do not take the place of good ones");
+    assert_eq!(
+        checkpoints.files().unwrap(),
+        files[2..],
+        "damaged ones do not take the place of good ones"
+    );
     fs::remove_file(&files[2]).unwrap();
     assert_eq!(checkpoints.newest().unwrap(), None);
 }
@@ -41,7 +48,10 @@ fn one_that_cannot_be_read_falls_back_and_does_not_count_as_none() {
     let unreadable = checkpoints.folder.join("step_000000300_00.safetensors");
     fs::create_dir_all(&unreadable).unwrap();
     let error = checkpoints.newest().unwrap_err();
-    assert!(matches!(error, RunDirError::Io { action: "read", ref path, .. } if *path == unreadable), "{error}");
+    assert!(
+        matches!(error, RunDirError::Io { action: "read", ref path, .. } if *path == unreadable),
+        "{error}"
+    );
     checkpoints.save(&checkpoint(200)).unwrap();
     assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(200)));
     assert!(unreadable.exists());

@@ -29,12 +29,14 @@ impl Server {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let url = format!("http://{}/file.hdf5", listener.local_addr().unwrap());
         let requests = Arc::new(Mutex::new(Vec::new()));
-        let (content, mut answers, log) = (content.to_owned(), VecDeque::from(answers.to_owned()), requests.clone());
+        let (content, mut answers, log) =
+            (content.to_owned(), VecDeque::from(answers.to_owned()), requests.clone());
         std::thread::spawn(move || {
             while let Ok((stream, _)) = listener.accept() {
                 let start = read_request(&stream);
                 log.lock().unwrap().push(start);
-                let answer = if answers.len() > 1 { answers.pop_front() } else { answers.front().cloned() };
+                let answer =
+                    if answers.len() > 1 { answers.pop_front() } else { answers.front().cloned() };
                 let content = content.clone();
                 // The client may leave at any time.
                 std::thread::spawn(move || reply(stream, start, &content, answer.unwrap()).ok());
@@ -50,22 +52,33 @@ impl Server {
 }
 
 fn read_request(stream: &TcpStream) -> Option<usize> {
-    let lines = BufReader::new(stream).lines().map_while(Result::ok).take_while(|line| !line.is_empty());
-    let start =
-        |line: String| line.to_ascii_lowercase().strip_prefix("range: bytes=")?.trim_end_matches('-').parse().ok();
+    let lines =
+        BufReader::new(stream).lines().map_while(Result::ok).take_while(|line| !line.is_empty());
+    let start = |line: String| {
+        line.to_ascii_lowercase().strip_prefix("range: bytes=")?.trim_end_matches('-').parse().ok()
+    };
     lines.filter_map(start).last()
 }
 
-fn reply(mut stream: TcpStream, start: Option<usize>, content: &[u8], answer: Answer) -> std::io::Result<()> {
+fn reply(
+    mut stream: TcpStream,
+    start: Option<usize>,
+    content: &[u8],
+    answer: Answer,
+) -> std::io::Result<()> {
     let rest = &content[start.unwrap_or(0)..];
     let head = match start {
         None => "200 OK".to_owned(),
-        Some(start) => format!("206 Partial Content\r\nContent-Range: bytes {start}-{}/*", content.len() - 1),
+        Some(start) => {
+            format!("206 Partial Content\r\nContent-Range: bytes {start}-{}/*", content.len() - 1)
+        }
     };
     let head = format!("{head}\r\nContent-Length: {}", rest.len());
     let is_silent = matches!(answer, Answer::Stall(_));
     let (head, body) = match answer {
-        Answer::Send(count) | Answer::Stall(count) => (head, rest[..count.min(rest.len())].to_owned()),
+        Answer::Send(count) | Answer::Stall(count) => {
+            (head, rest[..count.min(rest.len())].to_owned())
+        }
         Answer::Other(head, body) => (head, body),
     };
     write!(stream, "HTTP/1.1 {head}\r\nConnection: close\r\n\r\n")?;
