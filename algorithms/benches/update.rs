@@ -10,10 +10,11 @@ use quad_algorithms::{ALGORITHMS, Agent, Context, Definition, Values};
 use quad_dataset::{Arrays, Transitions};
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_kernels::product::{Matrix::RowMajor, by_gemm};
-use quad_policy::{
-    Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision,
-    Weighted, Weights, open_gpu,
+use quad_nn::{
+    Adam, AdamStep, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weighted, Weights,
+    open_gpu,
 };
+use quad_policy::DiffusionShape;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -232,9 +233,7 @@ fn parts_of(
     bench(group, "critic step", || regress(&critics));
     let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
     let gradient = regress(&critics)?.copy()?;
-    bench(group, "critic optimizer", || {
-        critic_adam.descend(critics.weights_mut(), &gradient, step)
-    });
+    bench(group, "critic optimizer", || critic_adam.apply(critics.weights_mut(), &gradient, step));
     bench(group, "critic EMA", || {
         target_critics.weights_mut().ema_update(critics.weights(), 0.005)
     });
@@ -256,7 +255,7 @@ fn parts_of(
     });
     let gradient = clone(&actor)?.copy()?;
     bench(group, "actor optimizer and EMA", || {
-        actor_adam.descend(actor.weights_mut(), &gradient, step)?;
+        actor_adam.apply(actor.weights_mut(), &gradient, step)?;
         target_actor.weights_mut().ema_update(actor.weights(), 0.005)
     });
     Ok(())

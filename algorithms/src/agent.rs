@@ -9,7 +9,8 @@ use crate::parts::Parts;
 use crate::pool::run_awake;
 use candle_core::Device;
 use quad_dataset::Names;
-use quad_policy::{Header, PolicyError, Scaling, read_header, read_tensors, write_tensors};
+use quad_nn::Scaling;
+use quad_policy::{Header, PolicyError, read_header, read_tensors, write_tensors};
 use serde::{Deserialize, Serialize};
 
 /// Key of the counters in the metadata of a saved state.

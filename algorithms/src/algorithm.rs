@@ -2,7 +2,8 @@
 //! named parts, and its errors.
 
 use candle_core::{Result, Tensor};
-use quad_policy::{PolicyConfig, PolicyError, Tensors};
+use quad_nn::Tensors;
+use quad_policy::{PolicyConfig, PolicyError};
 
 use super::parts::Parts;
 

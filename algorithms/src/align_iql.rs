@@ -13,17 +13,19 @@ use super::algorithm::{Loss, Measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::Denoising;
-use super::diffusion::{Diffusion, Networks, Update};
-use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Quantile, Rate, Share};
+use super::diffusion::{Diffusion, DiffusionUpdate, Networks};
+use super::hyperparameters::{
+    Candidates, Count, NotNegative, OpenUnit, Positive, Rate, UnitInterval,
+};
 use super::iql::expectile_loss;
 use super::parts::Parts;
 use super::replay::Computed;
-use super::trained::{Trained, ensemble};
+use super::train_state::{TrainState, ensemble};
 use candle_core::{Device, Result, Tensor};
-use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, MlpConfig, Reduce,
-    Reverse, Rule, Tensors, Weighted, cosine_decay,
+use quad_nn::{
+    AdamStep, Ensemble, EnsembleShape, MlpConfig, Reverse, Tensors, Weighted, cosine_decay,
 };
+use quad_policy::{Aggregate, Choice, DiffusionPolicy, DiffusionShape, Rule};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
@@ -60,9 +62,9 @@ pub(super) struct Config {
     /// Denoising steps T.
     diffusion_steps: Count,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     /// The expectile τ of the value function.
-    expectile: Quantile,
+    expectile: OpenUnit,
     actor_learning_rate: Positive,
     critic_learning_rate: Positive,
     value_learning_rate: Positive,
@@ -82,7 +84,7 @@ pub(super) struct AlignIql {
     /// How the policy chooses.
     rule: Rule,
     /// V.
-    value: Trained<Ensemble>,
+    value: TrainState<Ensemble>,
 }
 
 impl Config {
@@ -141,7 +143,7 @@ impl AlignIql {
     }
 }
 
-impl Update for AlignIql {
+impl DiffusionUpdate for AlignIql {
     type Noise = Denoising;
 
     fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Denoising> {
@@ -164,17 +166,17 @@ impl Update for AlignIql {
     ) -> Result<Computed> {
         let bc_loss = bc_loss(networks, batch, noise)?;
         let Networks { actor, target_actor, .. } = networks;
-        actor.descend_as_set(&bc_loss.value)?;
-        target_actor.follow(&actor.network, *self.config.actor_ema_rate)?;
+        actor.apply_as_set(&bc_loss.value)?;
+        target_actor.soft_update(&actor.network, *self.config.actor_ema_rate)?;
 
         let q = smaller(&networks.target_critics.values(&batch.observations, &batch.actions)?)?;
         let value_loss = self.value_loss(batch, &q)?;
-        self.value.descend_as_set(&value_loss.value)?;
+        self.value.apply_as_set(&value_loss.value)?;
 
         let critic_loss = self.critic_loss(networks, batch, &q)?;
         let Networks { critics, target_critics, .. } = networks;
-        critics.descend_as_set(&critic_loss.value)?;
-        target_critics.follow(&critics.network, *self.config.ema_rate)?;
+        critics.apply_as_set(&critic_loss.value)?;
+        target_critics.soft_update(&critics.network, *self.config.ema_rate)?;
         Computed::new(&[bc_loss, value_loss, critic_loss], &[])
     }
 
@@ -201,7 +203,7 @@ impl Update for AlignIql {
         let value = (self.rule == Rule::Nearest).then_some(&self.value.network);
         let tensors = DiffusionPolicy::tensors(target_actor, target_critics, value)?;
         Ok((
-            Choice { candidates: *self.config.candidates, value: Reduce::Min, rule: self.rule },
+            Choice { candidates: *self.config.candidates, value: Aggregate::Min, rule: self.rule },
             tensors,
         ))
     }

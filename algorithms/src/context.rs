@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::{Batch, Transitions};
-use quad_policy::Precision;
+use quad_nn::Precision;
 
 use super::replay::Inputs;
 

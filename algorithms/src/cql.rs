@@ -12,15 +12,14 @@ use super::algorithm::{Algorithm, AlgorithmError, Loss, Measured, largest, measu
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::normal;
-use super::hyperparameters::{Count, Finite, Positive, Rate, Share, Steps};
+use super::hyperparameters::{Count, Finite, Positive, Rate, Steps, UnitInterval};
 use super::parts::Parts;
 use super::random::{Purpose, stream};
 use super::squashed::{Normal, Squashed};
-use super::trained::{Trained, ensemble, learned, scale_last_layer};
+use super::train_state::{TrainState, ensemble, learned, scale_last_layer};
 use candle_core::{Result, Tensor};
-use quad_policy::{
-    AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, Weights,
-};
+use quad_nn::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Tensors, Weighted, Weights};
+use quad_policy::PolicyConfig;
 use rand::Rng;
 use serde::Deserialize;
 
@@ -61,7 +60,7 @@ struct Config {
     actor: MlpConfig,
     critic: MlpConfig,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     /// Weight w of the gap in the critics' loss, the paper's α.
     weight: Positive,
     /// Gap to which α' drives the critics; without it there is no α'.
@@ -127,12 +126,12 @@ struct Cql {
     context: Context,
     actor: Squashed,
     /// Q_1 and Q_2, and their EMA Q̂.
-    critics: Trained<Ensemble>,
+    critics: TrainState<Ensemble>,
     target_critics: Ensemble,
     /// log α, `[1]`.
-    log_alpha: Trained<Weights>,
+    log_alpha: TrainState<Weights>,
     /// log α', `[1]`.
-    log_alpha_prime: Option<Trained<Weights>>,
+    log_alpha_prime: Option<TrainState<Weights>>,
 }
 
 impl Cql {
@@ -187,16 +186,16 @@ impl Cql {
         let next = self.actor.constant_distribution(&batch.next_observations)?;
         // The policy, and α so that the entropy is −(dimensions of an action).
         let (actor_loss, log_density) = self.actor_loss(step, batch, &current, noise)?;
-        self.actor.descend(&actor_loss.value, slow)?;
+        self.actor.minimize(&actor_loss.value, slow)?;
         let excess = (log_density - self.context.action_dim() as f64)?;
         self.log_alpha
-            .descend(&(self.log_alpha.network.values().sum_all()? * excess)?.neg()?, slow)?;
+            .minimize(&(self.log_alpha.network.values().sum_all()? * excess)?.neg()?, slow)?;
 
         let (critic_loss, gap) = self.critic_loss(batch, &current.detach(), &next, noise)?;
         let (weight, alpha_prime) = self.weight(&gap.detach(), fast)?;
         let conservative = (gap * weight)?;
-        self.critics.descend(&(&critic_loss.value + (conservative * CRITICS as f64)?)?, fast)?;
-        self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
+        self.critics.minimize(&(&critic_loss.value + (conservative * CRITICS as f64)?)?, fast)?;
+        self.target_critics.soft_update(&self.critics.network, *self.config.ema_rate)?;
         measured(&[actor_loss, critic_loss.with("alpha_prime", alpha_prime)])
     }
 
@@ -307,7 +306,7 @@ impl Cql {
         let alpha_prime =
             learned.network.values().exp()?.clamp(0.0, MOST_ALPHA_PRIME)?.sum_all()?;
         let excess = ((gap - f64::from(*threshold))? * weight)?;
-        learned.descend(&(&alpha_prime * excess)?.neg()?, adam)?;
+        learned.minimize(&(&alpha_prime * excess)?.neg()?, adam)?;
         let alpha_prime = alpha_prime.detach();
         Ok(((&alpha_prime * weight)?, Some(alpha_prime)))
     }

@@ -2,7 +2,7 @@
 
 use super::replay::Inputs;
 use candle_core::{Device, Result, Shape, Tensor};
-use quad_policy::{ContinuousNoise, Schedule};
+use quad_nn::{ContinuousNoise, Schedule};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 

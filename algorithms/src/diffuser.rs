@@ -14,15 +14,18 @@ use super::algorithm::{AgentError, Algorithm, AlgorithmError, Loss, Measured, ch
 use super::context::Context;
 use super::definition::{Definition, Metric, Reporting, metrics, read};
 use super::denoising::normal;
-use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
+use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Steps, UnitInterval};
 use super::parts::Parts;
 use super::random::{Purpose, stream};
-use super::trained::{Trained, initial};
+use super::train_state::{TrainState, initial};
 use candle_core::{Result, Tensor};
 use candle_nn::loss::mse;
+use quad_nn::{
+    AdamStep, Layout, Schedule, Tensors, TrajectoryConfig, TrajectoryError, TrajectoryModel,
+    TrajectoryValue, Weighted, Weights,
+};
 use quad_policy::{
-    AdamStep, Choice, Guidance, Layout, Planner, PlannerShape, PolicyConfig, Schedule, Tensors,
-    Weighted, Weights, WindowConfig, WindowError, WindowModel, WindowValue, with_first_state,
+    Choice, DiffuserPolicy, DiffuserShape, PolicyConfig, ValueGuidance, with_first_state,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -51,11 +54,11 @@ const METRICS: &[Metric] = &metrics! {
 #[serde(deny_unknown_fields)]
 struct Config {
     /// Both networks.
-    network: WindowConfig,
+    network: TrajectoryConfig,
     /// Denoising steps T.
     diffusion_steps: Count,
     /// Discount γ of returns.
-    gamma: Share,
+    gamma: UnitInterval,
     /// Taken off the reward of a step that terminates an episode.
     terminal_penalty: NotNegative,
     /// Weight of the first action in the model's loss.
@@ -70,7 +73,7 @@ struct Config {
     ema_every: Steps,
     /// … and are copies before this.
     ema_start: u64,
-    guidance: Guidance,
+    guidance: ValueGuidance,
     /// Plans that an evaluated policy draws in each state.
     candidates: Candidates,
     /// Steps that it takes by one plan.
@@ -79,11 +82,12 @@ struct Config {
 
 impl Config {
     fn check(&self) -> std::result::Result<(), AgentError> {
-        let network = |WindowError { field, value, range }| check(field, value, false, range).err();
+        let network =
+            |TrajectoryError { field, value, range }| check(field, value, false, range).err();
         if let Some(error) = self.network.check().err().and_then(network) {
             return Err(error);
         }
-        let (replan, Guidance { steps, scale, .. }) = (*self.replan_every, self.guidance);
+        let (replan, ValueGuidance { steps, scale, .. }) = (*self.replan_every, self.guidance);
         check("replan_every", replan, replan <= self.network.horizon, "at most the horizon")?;
         check(
             "guidance.steps",
@@ -111,11 +115,11 @@ struct Diffuser {
     schedule: Schedule,
     /// Weights of the model's loss, `[H, a + o]`.
     weights: Tensor,
-    model: Trained<WindowModel>,
-    value: Trained<WindowValue>,
+    model: TrainState<TrajectoryModel>,
+    value: TrainState<TrajectoryValue>,
     /// Their EMAs, which plan.
-    target_model: WindowModel,
-    target_value: WindowValue,
+    target_model: TrajectoryModel,
+    target_value: TrajectoryValue,
 }
 
 /// A network that learns, and the constant one that follows it.
@@ -124,10 +128,10 @@ fn networks<N: Weighted>(
     of: impl Fn(Weights) -> N,
     context: &Context,
     number: u64,
-) -> Result<(Trained<N>, N)> {
+) -> Result<(TrainState<N>, N)> {
     let weights = initial(layout, context, number)?;
     let target = of(weights.copy()?);
-    Ok((Trained::new(of(weights), 0.0)?, target))
+    Ok((TrainState::new(of(weights), 0.0)?, target))
 }
 
 impl Diffuser {
@@ -140,12 +144,12 @@ impl Diffuser {
         let mut weights = vec![1.0; network.horizon * (a + o)];
         weights[..a].fill(*config.first_action_weight);
         weights[a..a + o].fill(0.0);
-        let of_model = |weights| WindowModel::new(network.clone(), weights);
-        let of_value = |weights| WindowValue::new(network.clone(), weights);
+        let of_model = |weights| TrajectoryModel::new(network.clone(), weights);
+        let of_value = |weights| TrajectoryValue::new(network.clone(), weights);
         let (model, target_model) =
-            networks(&WindowModel::layout(network, a + o), of_model, &context, 0)?;
+            networks(&TrajectoryModel::layout(network, a + o), of_model, &context, 0)?;
         let (value, target_value) =
-            networks(&WindowValue::layout(network, a + o), of_value, &context, 1)?;
+            networks(&TrajectoryValue::layout(network, a + o), of_value, &context, 1)?;
         Ok(Self {
             schedule: Schedule::cosine(*config.diffusion_steps),
             weights: Tensor::from_vec(weights, (network.horizon, a + o), &context.device)?,
@@ -185,18 +189,18 @@ impl Diffuser {
         let rate = if step < self.config.ema_start { 1.0 } else { *self.config.ema_rate };
 
         let model_loss = self.model_loss(batch, &noisy, noise)?;
-        self.model.descend(&model_loss.value, adam)?;
+        self.model.minimize(&model_loss.value, adam)?;
         if follow {
-            self.target_model.follow(&self.model.network, rate)?;
+            self.target_model.soft_update(&self.model.network, rate)?;
         }
         if step >= *self.config.value_updates {
             return measured(&[model_loss]);
         }
 
         let value_loss = self.value_loss(batch, &noisy, noise)?;
-        self.value.descend(&value_loss.value, adam)?;
+        self.value.minimize(&value_loss.value, adam)?;
         if follow {
-            self.target_value.follow(&self.value.network, rate)?;
+            self.target_value.soft_update(&self.value.network, rate)?;
         }
         measured(&[model_loss, value_loss])
     }
@@ -247,7 +251,7 @@ impl Algorithm for Diffuser {
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let shape = PlannerShape {
+        let shape = DiffuserShape {
             observation_dim: self.context.observation_dim(),
             action_dim: self.context.action_dim(),
             network: self.config.network.clone(),
@@ -256,9 +260,12 @@ impl Algorithm for Diffuser {
             replan_every: *self.config.replan_every,
             units: self.windows.units().clone(),
         };
-        let tensors = Planner::tensors(&self.target_model, &self.target_value)?;
+        let tensors = DiffuserPolicy::tensors(&self.target_model, &self.target_value)?;
         Ok((
-            PolicyConfig::Planner { shape, choice: Choice::best_of(*self.config.candidates) },
+            PolicyConfig::DiffuserPolicy {
+                shape,
+                choice: Choice::best_of(*self.config.candidates),
+            },
             tensors,
         ))
     }

@@ -1,5 +1,5 @@
 //! What algorithms share that train a diffusion policy and critics: their networks with the EMAs,
-//! and everything that is no equation. An algorithm of this kind is its [`Update`].
+//! and everything that is no equation. An algorithm of this kind is its [`DiffusionUpdate`].
 
 use super::algorithm::{Algorithm, Measured};
 use super::context::{Context, Minibatch};
@@ -7,11 +7,10 @@ use super::denoising::{Denoising, normal};
 use super::parts::Parts;
 use super::random::{Purpose, stream};
 use super::replay::{Computed, Inputs, Replay};
-use super::trained::{Trained, ensemble, initial};
+use super::train_state::{TrainState, ensemble, initial};
 use candle_core::{Device, Result, Tensor};
-use quad_policy::{
-    Choice, DiffusionShape, Ensemble, NoisePredictor, PolicyConfig, Tensors, Weighted,
-};
+use quad_nn::{Ensemble, NoisePredictor, Tensors, Weighted};
+use quad_policy::{Choice, DiffusionShape, PolicyConfig};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -20,10 +19,10 @@ pub(super) struct Networks {
     pub context: Context,
     pub shape: DiffusionShape,
     /// ε_θ and its EMA.
-    pub actor: Trained<NoisePredictor>,
+    pub actor: TrainState<NoisePredictor>,
     pub target_actor: NoisePredictor,
     /// Q_1..Q_K and their EMA Q̂.
-    pub critics: Trained<Ensemble>,
+    pub critics: TrainState<Ensemble>,
     pub target_critics: Ensemble,
 }
 
@@ -38,7 +37,7 @@ impl Networks {
         let actor = NoisePredictor::new(shape.actor(), weights, context.precision);
         let critics = ensemble(shape.critics(), &context, 1)?;
         Ok(Self {
-            actor: Trained::new(actor, actor_decay)?,
+            actor: TrainState::new(actor, actor_decay)?,
             target_actor,
             target_critics: critics.network.copy()?,
             critics,
@@ -77,7 +76,7 @@ impl Networks {
 
 /// The equations of one algorithm: its hyper-parameters, with what its updates change beside the
 /// networks.
-pub(super) trait Update: Send {
+pub(super) trait DiffusionUpdate: Send {
     /// The random numbers of one update.
     type Noise: Inputs + Send;
 
@@ -124,7 +123,7 @@ pub(super) trait Update: Send {
 }
 
 /// Such an algorithm in the middle of a run.
-pub(super) struct Diffusion<U: Update> {
+pub(super) struct Diffusion<U: DiffusionUpdate> {
     pub update: U,
     pub networks: Networks,
     replay: Replay<(Minibatch, U::Noise)>,
@@ -132,7 +131,7 @@ pub(super) struct Diffusion<U: Update> {
     next: Option<(u64, U::Noise)>,
 }
 
-impl<U: Update> Diffusion<U> {
+impl<U: DiffusionUpdate> Diffusion<U> {
     pub fn new(networks: Networks, update: U) -> Self {
         Self { update, networks, replay: Replay::default(), next: None }
     }
@@ -159,7 +158,7 @@ impl<U: Update> Diffusion<U> {
     }
 }
 
-impl<U: Update> Algorithm for Diffusion<U> {
+impl<U: DiffusionUpdate> Algorithm for Diffusion<U> {
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
         let noise = match self.next.take() {
             Some((of, noise)) if of == step => noise,

@@ -12,15 +12,13 @@ use super::algorithm::{Loss, largest, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::Denoising;
-use super::diffusion::{Diffusion, Networks, Update};
-use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
+use super::diffusion::{Diffusion, DiffusionUpdate, Networks};
+use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Steps, UnitInterval};
 use super::replay::{Computed, Inputs};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::loss::mse;
-use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, MlpConfig, Reduce, Reverse, Rule, Tensors,
-    Weighted,
-};
+use quad_nn::{AdamStep, MlpConfig, Reverse, Tensors, Weighted};
+use quad_policy::{Aggregate, Choice, DiffusionPolicy, DiffusionShape, Rule};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
@@ -57,7 +55,7 @@ struct Config {
     /// Denoising steps T.
     diffusion_steps: Count,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     /// Strength η of Q beside cloning.
     eta: NotNegative,
     /// Next actions sampled per next state for the target, S; of several, each critic's largest
@@ -156,7 +154,7 @@ fn q_loss(networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Tenso
     raised.mean_all()?.neg()? / other.abs()?.mean_all()?.detach()
 }
 
-impl Update for Config {
+impl DiffusionUpdate for Config {
     type Noise = Noise;
 
     fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Noise> {
@@ -186,10 +184,10 @@ impl Update for Config {
         noise: &Noise,
     ) -> Result<Computed> {
         let critic_loss = self.critic_loss(networks, batch, noise)?;
-        let critic_norm = networks.critics.descend_as_set(&critic_loss.value)?;
+        let critic_norm = networks.critics.apply_as_set(&critic_loss.value)?;
         let actor_loss = self.actor_loss(networks, batch, noise)?;
-        let actor_norm = networks.actor.descend_as_set(&actor_loss.value)?;
-        networks.target_critics.follow(&networks.critics.network, *self.ema_rate)?;
+        let actor_norm = networks.actor.apply_as_set(&actor_loss.value)?;
+        networks.target_critics.soft_update(&networks.critics.network, *self.ema_rate)?;
         let critic_loss = critic_loss.with("critic_gradient_norm", critic_norm);
         Computed::new(&[critic_loss, actor_loss.with("actor_gradient_norm", actor_norm)], &[])
     }
@@ -201,7 +199,7 @@ impl Update for Config {
 
     fn end(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
         if step.is_multiple_of(*self.actor_ema_every) && step >= self.actor_ema_start {
-            networks.target_actor.follow(&networks.actor.network, *self.actor_ema_rate)?;
+            networks.target_actor.soft_update(&networks.actor.network, *self.actor_ema_rate)?;
         }
         Ok(())
     }
@@ -212,6 +210,6 @@ impl Update for Config {
         let tensors =
             DiffusionPolicy::tensors(&networks.actor.network, &networks.target_critics, None)?;
         let rule = Rule::Softmax { temperature: *self.temperature };
-        Ok((Choice { candidates: *self.candidates, value: Reduce::Min, rule }, tensors))
+        Ok((Choice { candidates: *self.candidates, value: Aggregate::Min, rule }, tensors))
     }
 }

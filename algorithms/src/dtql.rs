@@ -14,19 +14,21 @@ use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::normal;
 use super::gaussian::log_density;
-use super::hyperparameters::{Candidates, NotNegative, Positive, Quantile, Rate, Share, Steps};
+use super::hyperparameters::{
+    Candidates, NotNegative, OpenUnit, Positive, Rate, Steps, UnitInterval,
+};
 use super::iql::expectile_loss;
 use super::parts::Parts;
 use super::phases;
 use super::random::{Purpose, stream};
 use super::squashed::{Normal, Squashed};
-use super::trained::{Trained, ensemble, initial};
+use super::train_state::{TrainState, ensemble, initial};
 use candle_core::{Result, Tensor};
-use quad_policy::{
-    ActorCriticShape, AdamStep, Choice, Denoiser, DenoiserShape, Ensemble, EnsembleShape,
-    MlpConfig, NoiseLevels, PolicyConfig, Reduce, Rule, SquashedActor, Tensors, Weighted,
-    cosine_decay,
+use quad_nn::{
+    AdamStep, Denoiser, DenoiserShape, Ensemble, EnsembleShape, MlpConfig, NoiseLevels, Tensors,
+    Weighted, cosine_decay,
 };
+use quad_policy::{ActorCriticShape, Aggregate, Choice, PolicyConfig, Rule, SquashedActor};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
@@ -69,9 +71,9 @@ struct Config {
     critic: MlpConfig,
     value: MlpConfig,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     /// The expectile τ of the value function.
-    expectile: Quantile,
+    expectile: OpenUnit,
     /// Strength α of the trust region beside Q.
     alpha: NotNegative,
     /// Strength of −log π_θ(a|s) at the data's actions.
@@ -121,13 +123,13 @@ struct Dtql {
     config: Config,
     context: Context,
     /// μ_φ.
-    diffusion: Trained<Denoiser>,
+    diffusion: TrainState<Denoiser>,
     /// π_θ.
     actor: Squashed,
     /// V.
-    value: Trained<Ensemble>,
+    value: TrainState<Ensemble>,
     /// Q_1 and Q_2, and their EMA, by which the policy chooses when it acts.
-    critics: Trained<Ensemble>,
+    critics: TrainState<Ensemble>,
     target_critics: Ensemble,
 }
 
@@ -145,7 +147,7 @@ impl Dtql {
         };
         let critics = ensemble(shape(CRITICS, action_dim, &config.critic), &context, 1)?;
         Ok(Self {
-            diffusion: Trained::new(diffusion, 0.0)?,
+            diffusion: TrainState::new(diffusion, 0.0)?,
             actor: Squashed::new(&config.actor, SquashedActor::LOG_STD, None, &context, 0)?,
             value: ensemble(shape(1, 0, &config.value), &context, 2)?,
             target_critics: critics.network.copy()?,
@@ -176,16 +178,16 @@ impl Dtql {
         let adam = AdamStep::after(step, rate);
         let of_values = AdamStep { rate: *self.config.critic_learning_rate * decay, ..adam };
         let [value_loss, critic_loss] = self.value_losses(batch)?;
-        self.value.descend(&value_loss.value, of_values)?;
-        self.critics.descend(&critic_loss.value, of_values)?;
+        self.value.minimize(&value_loss.value, of_values)?;
+        self.critics.minimize(&critic_loss.value, of_values)?;
         let bc_loss = self.bc_loss(batch, &noise.cloning)?;
-        self.diffusion.descend(&bc_loss.value, adam)?;
+        self.diffusion.minimize(&bc_loss.value, adam)?;
         let mut losses = vec![value_loss, critic_loss, bc_loss];
         if step >= pretraining {
             let actor_loss = self.actor_loss(batch, noise)?;
             self.actor
-                .descend(&actor_loss.value, AdamStep { count: step - pretraining + 1, ..adam })?;
-            self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
+                .minimize(&actor_loss.value, AdamStep { count: step - pretraining + 1, ..adam })?;
+            self.target_critics.soft_update(&self.critics.network, *self.config.ema_rate)?;
             losses.push(actor_loss);
         }
         let mut measured = measured(&losses)?;
@@ -303,7 +305,7 @@ impl Algorithm for Dtql {
             critics: CRITICS,
         };
         let rule = Rule::Softmax { temperature: **temperature };
-        let choice = Choice { candidates: **candidates, value: Reduce::Min, rule };
+        let choice = Choice { candidates: **candidates, value: Aggregate::Min, rule };
         let tensors = ActorCriticShape::tensors(&self.actor.network.network, &self.target_critics)?;
         Ok((PolicyConfig::Squashed { shape, choice }, tensors))
     }

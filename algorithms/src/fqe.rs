@@ -13,11 +13,11 @@ mod golden;
 use super::algorithm::{AgentError, AlgorithmError, Loss, Measured, measured};
 use super::context::{Context, Minibatch};
 use super::definition::read;
-use super::hyperparameters::{NotNegative, Positive, Rate, Share};
+use super::hyperparameters::{NotNegative, Positive, Rate, UnitInterval};
 use super::parts::Parts;
-use super::trained::{Trained, initial};
+use super::train_state::{TrainState, initial};
 use candle_core::{Device, Result, Tensor};
-use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Weighted};
+use quad_nn::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Weighted};
 use serde::Deserialize;
 
 const SETTINGS: &str = "
@@ -33,7 +33,7 @@ ema_rate = 1e-2
 pub struct FqeConfig {
     critic: MlpConfig,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     learning_rate: Positive,
     /// What each step takes off the weights, relative to them and to its rate.
     weight_decay: NotNegative,
@@ -108,7 +108,7 @@ pub struct Fqe {
     /// a' of each transition of the data, `[N, a]`.
     next_actions: Tensor,
     /// Q, and its EMA Q̂; both in the network's units.
-    critic: Trained<Ensemble>,
+    critic: TrainState<Ensemble>,
     target_critic: Ensemble,
 }
 
@@ -168,7 +168,7 @@ impl Fqe {
         };
         let network =
             Ensemble::new(shape.clone(), initial(&shape.layout(), &context, 0)?, context.precision);
-        let critic = Trained::new(network, *config.weight_decay)?;
+        let critic = TrainState::new(network, *config.weight_decay)?;
         Ok(Self {
             target_critic: critic.network.copy()?,
             critic,
@@ -186,8 +186,8 @@ impl Fqe {
     /// # Errors
     /// Candle fails.
     pub fn begin_with(&mut self, other: &Fqe) -> Result<()> {
-        self.critic.network.follow(&other.critic.network, 1.0)?;
-        self.target_critic.follow(&other.target_critic, 1.0)
+        self.critic.network.soft_update(&other.critic.network, 1.0)?;
+        self.target_critic.soft_update(&other.target_critic, 1.0)
     }
 
     /// How many items updates draw from.
@@ -213,8 +213,8 @@ impl Fqe {
         let loss =
             self.critic.network.squared_error(&batch.observations, &batch.actions, &of_network)?;
         let loss = Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?);
-        self.critic.descend(&loss.value, AdamStep::after(step, *self.config.learning_rate))?;
-        self.target_critic.follow(&self.critic.network, *self.config.ema_rate)?;
+        self.critic.minimize(&loss.value, AdamStep::after(step, *self.config.learning_rate))?;
+        self.target_critic.soft_update(&self.critic.network, *self.config.ema_rate)?;
         measured(&[loss])
     }
 

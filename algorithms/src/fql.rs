@@ -11,15 +11,13 @@ use super::algorithm::{Algorithm, Loss, Measured, measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::normal;
-use super::hyperparameters::{Candidates, Count, Positive, Rate, Share};
+use super::hyperparameters::{Candidates, Count, Positive, Rate, UnitInterval};
 use super::parts::Parts;
 use super::random::{Purpose, stream};
-use super::trained::{Trained, ensemble};
+use super::train_state::{TrainState, ensemble};
 use candle_core::{Result, Tensor};
-use quad_policy::{
-    ActorCriticShape, AdamStep, Choice, Ensemble, EnsembleShape, Gradients, MlpConfig,
-    OneStepActor, PolicyConfig, Reduce, Rule, Tensors, Weighted,
-};
+use quad_nn::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, Tensors, Weighted};
+use quad_policy::{ActorCriticShape, Aggregate, Choice, OneStepActor, PolicyConfig, Rule};
 use rand::Rng;
 use serde::Deserialize;
 
@@ -52,9 +50,9 @@ struct Config {
     actor: MlpConfig,
     critic: MlpConfig,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     /// Whether the critics' target takes their mean or the smaller.
-    target: Reduce,
+    target: Aggregate,
     /// Weight α of the distance between the one-step policy and the flow.
     alpha: Positive,
     /// Whether Q is divided by its mean size in the policy's loss.
@@ -73,10 +71,10 @@ struct Fql {
     config: Config,
     context: Context,
     /// The velocity v(s, x, t), a network of s and [x, t].
-    flow: Trained<Ensemble>,
+    flow: TrainState<Ensemble>,
     /// The one-step policy π(s, z).
-    actor: Trained<Ensemble>,
-    critics: Trained<Ensemble>,
+    actor: TrainState<Ensemble>,
+    critics: TrainState<Ensemble>,
     target_critics: Ensemble,
 }
 
@@ -112,10 +110,10 @@ impl Fql {
         let adam = AdamStep::after(step, *self.config.learning_rate);
         let [critic_loss, bc_loss, actor_loss] = self.losses(batch, noise)?;
         let gradients = Gradients::of(&actor_loss.value)?;
-        self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
-        self.critics.descend(&critic_loss.value, adam)?;
-        self.flow.descend(&bc_loss.value, adam)?;
-        self.actor.descend_along(&gradients, adam)?;
+        self.target_critics.soft_update(&self.critics.network, *self.config.ema_rate)?;
+        self.critics.minimize(&critic_loss.value, adam)?;
+        self.flow.minimize(&bc_loss.value, adam)?;
+        self.actor.apply_gradients(&gradients, adam)?;
         measured(&[critic_loss, bc_loss, actor_loss])
     }
 
@@ -142,8 +140,8 @@ impl Fql {
             .sample(&batch.next_observations, noise)?;
         let values = self.target_critics.values(&batch.next_observations, &actions)?;
         let q = match self.config.target {
-            Reduce::Mean => values.mean(0)?,
-            Reduce::Min => smaller(&values)?,
+            Aggregate::Mean => values.mean(0)?,
+            Aggregate::Min => smaller(&values)?,
         };
         batch.target(*self.config.gamma, &q)
     }

@@ -2,14 +2,12 @@
 //! of a network, its log σ the same in all states.
 
 use candle_core::{Result, Tensor};
-use quad_policy::{
-    AdamStep, Ensemble, GaussianPolicy, GaussianShape, Gradients, MlpConfig, PolicyConfig, Tensors,
-    Weights, gaussian_mean,
-};
+use quad_nn::{AdamStep, Ensemble, Gradients, MlpConfig, Tensors, Weights};
+use quad_policy::{GaussianPolicy, GaussianShape, PolicyConfig, gaussian_mean};
 
 use super::context::Context;
 use super::parts::Parts;
-use super::trained::{Trained, ensemble, learned};
+use super::train_state::{TrainState, ensemble, learned};
 
 /// Bounds of log σ.
 const LOG_STD: (f32, f32) = (-5.0, 2.0);
@@ -18,9 +16,9 @@ const LOG_STD: (f32, f32) = (-5.0, 2.0);
 pub(super) struct Gaussian {
     shape: GaussianShape,
     /// The mean is its tanh.
-    mean: Trained<Ensemble>,
+    mean: TrainState<Ensemble>,
     /// log σ, `[a]`.
-    log_std: Trained<Weights>,
+    log_std: TrainState<Weights>,
 }
 
 impl Gaussian {
@@ -42,10 +40,10 @@ impl Gaussian {
     }
 
     /// Moves mean and log σ down a loss `[]`.
-    pub fn descend(&mut self, loss: &Tensor, step: AdamStep) -> Result<()> {
+    pub fn minimize(&mut self, loss: &Tensor, step: AdamStep) -> Result<()> {
         let gradients = Gradients::of(loss)?;
-        self.mean.descend_along(&gradients, step)?;
-        self.log_std.descend_along(&gradients, step)?;
+        self.mean.apply_gradients(&gradients, step)?;
+        self.log_std.apply_gradients(&gradients, step)?;
         Ok(())
     }
 

@@ -12,10 +12,12 @@ use super::denoising::Denoising;
 use super::parts::Parts;
 use candle_core::{Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
+use quad_nn::{
+    Ensemble, EnsembleShape, Layout, NoisePredictor, Precision, Reverse, Schedule, Tensors,
+    Weights, open_gpu,
+};
 use quad_policy::{
-    Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, OneStepActor, PolicyConfig,
-    Precision, Reverse, Schedule, SquashedActor, Tensors, Weights, load_policy, open_gpu,
-    read_tensors,
+    Choice, Header, OneStepActor, PolicyConfig, SquashedActor, load_policy, read_tensors,
 };
 pub(super) use reader::{Golden, MAKE, goldens, run};
 

@@ -44,7 +44,7 @@ checked!(
 );
 checked!(
     /// Within [0, 1]: a discount.
-    Share(f32), |x| (0.0..=1.0).contains(&x), "in [0, 1]"
+    UnitInterval(f32), |x| (0.0..=1.0).contains(&x), "in [0, 1]"
 );
 checked!(
     /// Within (0, 1]: the rate of an average.
@@ -52,7 +52,7 @@ checked!(
 );
 checked!(
     /// Between 0 and 1.
-    Quantile(f32), |x| x > 0.0 && x < 1.0, "between 0 and 1"
+    OpenUnit(f32), |x| x > 0.0 && x < 1.0, "between 0 and 1"
 );
 checked!(
     /// A number of things: networks, samples, denoising steps.

@@ -1,19 +1,18 @@
 //! What IQL and its kin share: they never ask for the value of an action that is not in the data.
 //! V(s) is fitted to the target critics' smaller value, a Gaussian policy is cloned from the data
 //! with weights, and twin critics move toward r + γ·V(s'). An algorithm of this kind is its
-//! [`Losses`].
+//! [`ImplicitLosses`].
 
 use super::algorithm::{AgentError, Algorithm, Loss, Measured, measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{self, Metric, metrics};
 use super::gaussian::Gaussian;
-use super::hyperparameters::{Positive, Rate, Share};
+use super::hyperparameters::{Positive, Rate, UnitInterval};
 use super::parts::Parts;
-use super::trained::{Trained, ensemble};
+use super::train_state::{TrainState, ensemble};
 use candle_core::{DType, Result, Tensor};
-use quad_policy::{
-    AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, cosine_decay,
-};
+use quad_nn::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Tensors, Weighted, cosine_decay};
+use quad_policy::PolicyConfig;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
@@ -44,7 +43,7 @@ pub(super) const fn table(helps: Helps) -> [Metric; 9] {
         actor_loss ["actor loss"] held_out: helps.actor_loss;
         advantage_mean held_out: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).";
         weight_mean held_out: "Mean over the batch of the weights in the actor's loss.";
-        clipped_share held_out: "Share of the batch, 0 to 1, whose weight is clipped at 100.";
+        clipped_share held_out: "UnitInterval of the batch, 0 to 1, whose weight is clipped at 100.";
         learning_rate: helps.learning_rate;
     }
 }
@@ -56,7 +55,7 @@ pub(super) struct Common {
     critic: MlpConfig,
     value: MlpConfig,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     actor_learning_rate: Positive,
     critic_learning_rate: Positive,
     value_learning_rate: Positive,
@@ -70,7 +69,7 @@ pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> std::result::Res
 }
 
 /// The equations of one algorithm; its hyper-parameters hold them.
-pub(super) trait Losses: Send {
+pub(super) trait ImplicitLosses: Send {
     fn common(&self) -> &Common;
 
     /// The loss `[]` that V is moved down, of `q`, the smaller Q̂(s, a), and `v`, V(s); both `[B]`.
@@ -107,14 +106,14 @@ pub(super) struct InSample<L> {
     pub losses: L,
     pub context: Context,
     /// V.
-    value: Trained<Ensemble>,
+    value: TrainState<Ensemble>,
     /// Q_1 and Q_2, and their EMA Q̂.
-    critics: Trained<Ensemble>,
+    critics: TrainState<Ensemble>,
     target_critics: Ensemble,
     actor: Gaussian,
 }
 
-impl<L: Losses> InSample<L> {
+impl<L: ImplicitLosses> InSample<L> {
     pub fn new(losses: L, context: Context) -> Result<Self> {
         let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
         let shape = |members, action_dim, layers: &MlpConfig| EnsembleShape {
@@ -136,7 +135,7 @@ impl<L: Losses> InSample<L> {
         })
     }
 
-    /// Update number `step`; `pairs` are what [`Losses::pairs`] gives.
+    /// Update number `step`; `pairs` are what [`ImplicitLosses::pairs`] gives.
     pub fn step(
         &mut self,
         step: u64,
@@ -153,7 +152,7 @@ impl<L: Losses> InSample<L> {
                 value_loss = self.value_loss(&fitted)?;
             }
             let adam = AdamStep::after(step * steps + i, *common.value_learning_rate);
-            self.value.descend(&value_loss.value, adam)?;
+            self.value.minimize(&value_loss.value, adam)?;
         }
 
         let actor_loss = self.actor_loss(batch, &q)?;
@@ -163,12 +162,12 @@ impl<L: Losses> InSample<L> {
             1.0
         };
         let rate = *common.actor_learning_rate * decay;
-        self.actor.descend(&actor_loss.value, AdamStep::after(step, rate))?;
+        self.actor.minimize(&actor_loss.value, AdamStep::after(step, rate))?;
 
         let critic_loss = self.critic_loss(batch)?;
         self.critics
-            .descend(&critic_loss.value, AdamStep::after(step, *common.critic_learning_rate))?;
-        self.target_critics.follow(&self.critics.network, *common.ema_rate)?;
+            .minimize(&critic_loss.value, AdamStep::after(step, *common.critic_learning_rate))?;
+        self.target_critics.soft_update(&self.critics.network, *common.ema_rate)?;
 
         let mut measured = measured(&[value_loss, actor_loss, critic_loss])?;
         measured.push(("learning_rate", rate));
@@ -226,7 +225,7 @@ impl<L: Losses> InSample<L> {
     }
 }
 
-impl<L: Losses> Algorithm for InSample<L> {
+impl<L: ImplicitLosses> Algorithm for InSample<L> {
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
         let batch = self.context.batch(items)?;
         let pairs = self.losses.pairs(&self.context, step, &batch)?;

@@ -8,8 +8,8 @@
 mod golden;
 
 use super::definition::{Definition, Metric, Reporting};
-use super::hyperparameters::{Positive, Quantile};
-use super::in_sample::{COSINE, Common, Helps, InSample, Losses, read, table};
+use super::hyperparameters::{OpenUnit, Positive};
+use super::in_sample::{COSINE, Common, Helps, ImplicitLosses, InSample, read, table};
 use candle_core::{DType, Result, Tensor};
 use serde::Deserialize;
 
@@ -38,7 +38,7 @@ struct Config {
     #[serde(flatten)]
     common: Common,
     /// The expectile τ of the value function.
-    expectile: Quantile,
+    expectile: OpenUnit,
     /// Inverse temperature β of the advantages.
     temperature: Positive,
 }
@@ -50,7 +50,7 @@ pub(super) fn expectile_loss(u: &Tensor, expectile: f32) -> Result<Tensor> {
     (side * u.sqr()?)?.mean_all()
 }
 
-impl Losses for Config {
+impl ImplicitLosses for Config {
     fn common(&self) -> &Common {
         &self.common
     }

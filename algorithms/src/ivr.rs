@@ -11,7 +11,7 @@ mod golden;
 
 use super::definition::{Definition, Metric, Reporting, Variant};
 use super::hyperparameters::Positive;
-use super::in_sample::{COSINE, Common, Helps, InSample, Losses, read, scale_down, table};
+use super::in_sample::{COSINE, Common, Helps, ImplicitLosses, InSample, read, scale_down, table};
 use candle_core::{Result, Tensor};
 use serde::Deserialize;
 
@@ -81,7 +81,7 @@ impl Config {
     }
 }
 
-impl Losses for Config {
+impl ImplicitLosses for Config {
     fn common(&self) -> &Common {
         &self.common
     }

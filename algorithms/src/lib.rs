@@ -39,7 +39,7 @@ mod sfbc;
 mod squashed;
 mod td3;
 mod td3bc;
-mod trained;
+mod train_state;
 mod values;
 mod xql;
 

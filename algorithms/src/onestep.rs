@@ -12,13 +12,14 @@ use super::algorithm::{Algorithm, AlgorithmError, Loss, Measured, measured};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::gaussian::{first_half, log_density};
-use super::hyperparameters::{Count, Positive, Rate, Share, Steps};
+use super::hyperparameters::{Count, Positive, Rate, Steps, UnitInterval};
 use super::parts::Parts;
 use super::phases;
 use super::random::{Purpose, stream};
-use super::trained::{Trained, ensemble};
+use super::train_state::{TrainState, ensemble};
 use candle_core::{DType, Result, Tensor};
-use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted};
+use quad_nn::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Tensors, Weighted};
+use quad_policy::PolicyConfig;
 use rand_distr::{Distribution, StandardNormal};
 use serde::Deserialize;
 
@@ -55,7 +56,7 @@ struct Config {
     behavior: MlpConfig,
     critic: MlpConfig,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     /// Inverse temperature of the advantages.
     temperature: Positive,
     /// Actions of β, over which the mean of Q is the state's value.
@@ -90,12 +91,12 @@ struct Onestep {
     /// The transitions to learn from.
     items: Vec<u32>,
     /// β.
-    behavior: Trained<Ensemble>,
+    behavior: TrainState<Ensemble>,
     /// Q, and its EMA Q̂.
-    critic: Trained<Ensemble>,
+    critic: TrainState<Ensemble>,
     target_critic: Ensemble,
     /// π. Until its phase it is β, and its optimizer is new.
-    actor: Trained<Ensemble>,
+    actor: TrainState<Ensemble>,
 }
 
 impl Onestep {
@@ -156,8 +157,8 @@ impl Onestep {
     /// First phase: β toward the data's actions, and π with it.
     fn clone_behavior(&mut self, batch: &Minibatch, steps: u64) -> Result<Measured> {
         let loss = self.behavior_loss(batch)?;
-        self.behavior.descend(&loss.value, self.adam(steps))?;
-        self.actor.network.follow(&self.behavior.network, 1.0)?; // all the way
+        self.behavior.minimize(&loss.value, self.adam(steps))?;
+        self.actor.network.soft_update(&self.behavior.network, 1.0)?; // all the way
         measured(&[loss])
     }
 
@@ -177,9 +178,9 @@ impl Onestep {
         steps: u64,
     ) -> Result<Measured> {
         let loss = self.critic_loss(batch, next_actions)?;
-        self.critic.descend(&loss.value, self.adam(steps))?;
+        self.critic.minimize(&loss.value, self.adam(steps))?;
         if (steps + 1).is_multiple_of(*self.config.ema_every) {
-            self.target_critic.follow(&self.critic.network, *self.config.ema_rate)?;
+            self.target_critic.soft_update(&self.critic.network, *self.config.ema_rate)?;
         }
         measured(&[loss])
     }
@@ -196,7 +197,7 @@ impl Onestep {
     /// Third phase: the policy.
     fn improve(&mut self, batch: &Minibatch, noise: &Tensor, steps: u64) -> Result<Measured> {
         let loss = self.actor_loss(batch, noise)?;
-        self.actor.descend(&loss.value, self.adam(steps))?;
+        self.actor.minimize(&loss.value, self.adam(steps))?;
         measured(&[loss])
     }
 

@@ -1,9 +1,10 @@
 //! An algorithm's state as a list of named parts, by which it is saved and loaded.
 
 use candle_core::{Device, Result, Tensor};
-use quad_policy::{Adam, Layout, PolicyError, Tensors, Weighted, Weights, take};
+use quad_nn::{Adam, Layout, Tensors, Weighted, Weights, take};
+use quad_policy::PolicyError;
 
-use super::trained::Trained;
+use super::train_state::TrainState;
 
 /// Writes other numbers over those of a tensor `[]` or `[n]`.
 pub(super) fn write(tensor: &Tensor, numbers: &Tensor) -> Result<()> {
@@ -35,9 +36,9 @@ impl<'a> Parts<'a> {
     pub(super) fn trained<N: Weighted>(
         mut self,
         name: &'static str,
-        trained: &'a mut Trained<N>,
+        trained: &'a mut TrainState<N>,
     ) -> Self {
-        let Trained { network, adam } = trained;
+        let TrainState { network, adam } = trained;
         self.0.push((name, Part::Adam(adam, network.weights().layout().clone())));
         self.weights(name, network.weights_mut())
     }

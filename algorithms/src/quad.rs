@@ -16,7 +16,7 @@ use super::algorithm::{Loss, Measured, largest};
 use super::context::{Context, Minibatch};
 use super::definition::{Axis, Definition, Reporting, Variant};
 use super::denoising::Denoising;
-use super::diffusion::{Diffusion, Networks, Update};
+use super::diffusion::{Diffusion, DiffusionUpdate, Networks};
 use super::parts::{Parts, write};
 use super::replay::{Computed, Inputs};
 use candle_core::{Device, Result, Tensor};
@@ -24,10 +24,8 @@ use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
 use guidance::Guide;
 use metrics::METRICS;
-use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Reverse, Tensors, Weighted, cosine_decay,
-    mean_and_variance,
-};
+use quad_nn::{AdamStep, Reverse, Tensors, Weighted, cosine_decay, mean_and_variance};
+use quad_policy::{Choice, DiffusionPolicy, DiffusionShape};
 use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
@@ -174,7 +172,7 @@ impl Quad {
     }
 }
 
-impl Update for Quad {
+impl DiffusionUpdate for Quad {
     type Noise = Noise;
 
     fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Noise> {
@@ -206,8 +204,8 @@ impl Update for Quad {
     ) -> Result<Computed> {
         let critic_loss = self.critic_loss(networks, batch, noise)?;
         let Networks { critics, target_critics, .. } = networks;
-        let critic_gradient_norm = critics.descend_as_set(&critic_loss.value)?;
-        target_critics.follow(&critics.network, *self.config.ema_rate)?;
+        let critic_gradient_norm = critics.apply_as_set(&critic_loss.value)?;
+        target_critics.soft_update(&critics.network, *self.config.ema_rate)?;
 
         let ActorLoss { loss: actor_loss, noisy, error, guide } =
             self.actor_loss(networks, batch, noise)?;
@@ -221,7 +219,7 @@ impl Update for Quad {
             }
         }
         let actor = &mut networks.actor;
-        let actor_gradient_norm = actor.descend_as_set(&actor_loss.value)?;
+        let actor_gradient_norm = actor.apply_as_set(&actor_loss.value)?;
 
         // Line 12: dual ascent on η, with the actor as it is now.
         if let Some(threshold) = self.config.eta.threshold
@@ -251,7 +249,7 @@ impl Update for Quad {
     /// Line 12, too: the actor's EMA.
     fn end(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
         if step.is_multiple_of(*self.config.actor_ema_every) && step > self.config.actor_ema_start {
-            networks.target_actor.follow(&networks.actor.network, *self.config.ema_rate)?;
+            networks.target_actor.soft_update(&networks.actor.network, *self.config.ema_rate)?;
         }
         Ok(())
     }

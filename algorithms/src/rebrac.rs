@@ -6,7 +6,7 @@
 use super::algorithm::smaller;
 use super::definition::{Definition, Metric, Reporting, metrics};
 use super::hyperparameters::NotNegative;
-use super::td3::{Common, Near, Td3, read};
+use super::td3::{BcRegularizer, Common, Td3, read};
 use candle_core::{Result, Tensor};
 use serde::Deserialize;
 
@@ -39,7 +39,7 @@ struct Config {
     critic_penalty: NotNegative,
 }
 
-impl Near for Config {
+impl BcRegularizer for Config {
     const FIRST: u64 = 0;
     const LAGS: bool = true;
 

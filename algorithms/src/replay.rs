@@ -4,7 +4,7 @@
 
 use super::algorithm::{Loss, Measured, joined, scalars};
 use candle_core::{Device, Result, Tensor};
-use quad_policy::{Recording, overwrite};
+use quad_nn::{CudaGraph, overwrite};
 use std::thread::{ThreadId, current};
 
 /// Tensors that each update has of its own, always as many and in the same shapes.
@@ -61,7 +61,7 @@ struct Kept<I> {
     inputs: I,
     computed: Computed,
     /// None before the second update.
-    recording: Option<Recording>,
+    recording: Option<CudaGraph>,
     /// What is recorded reads constants that belong to this thread.
     thread: ThreadId,
 }
@@ -88,7 +88,7 @@ impl<I: Inputs> Replay<I> {
         let thread = current().id();
         let Some(mut kept) = self.0.take().filter(|kept| kept.thread == thread) else {
             let inputs = inputs.on(device)?;
-            let computed = Recording::rehearse(device, || work(&inputs))?;
+            let computed = CudaGraph::rehearse(device, || work(&inputs))?;
             self.0 = Some(Kept { inputs, computed, recording: None, thread });
             return Ok(());
         };
@@ -104,7 +104,7 @@ impl<I: Inputs> Replay<I> {
         let record = || computed.numbers.slice_set(&work(inputs)?.numbers, 0, 0);
         let mut recorded = match recording.take() {
             Some(recorded) => recorded,
-            None => Recording::of(device, record)?,
+            None => CudaGraph::of(device, record)?,
         };
         recorded.replay()?;
         *recording = Some(recorded);

@@ -12,18 +12,16 @@ use super::algorithm::{AgentError, Algorithm, AlgorithmError, Loss, Measured, ch
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read};
 use super::denoising::{NoiseInTime, normal};
-use super::hyperparameters::{Candidates, Count, Positive, Share, Steps};
+use super::hyperparameters::{Candidates, Count, Positive, Steps, UnitInterval};
 use super::parts::Parts;
 use super::phases;
 use super::random::{Purpose, stream};
 use super::returns::Returns;
-use super::trained::{Trained, ensemble, initial};
+use super::train_state::{TrainState, ensemble, initial};
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::Batch;
-use quad_policy::{
-    AdamStep, Choice, DpmSolver, Ensemble, MlpConfig, PolicyConfig, Reduce, Rule, ScoreNetwork,
-    ScorePolicy, ScorePolicyShape, ScoreShape, Tensors,
-};
+use quad_nn::{AdamStep, DpmSolver, Ensemble, MlpConfig, ScoreNetwork, ScoreShape, Tensors};
+use quad_policy::{Aggregate, Choice, PolicyConfig, Rule, ScorePolicy, ScorePolicyShape};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::Deserialize;
@@ -59,7 +57,7 @@ struct Config {
     actor: MlpConfig,
     critic: MlpConfig,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     /// Evaluations of the score network for an action.
     evaluations: Count,
     /// Actions of the clone, of whose values V is made, and the temperature of its softmax.
@@ -121,8 +119,8 @@ struct Sfbc {
     items: Vec<u32>,
     returns: Returns,
     /// ε_θ.
-    actor: Trained<ScoreNetwork>,
-    critic: Trained<Ensemble>,
+    actor: TrainState<ScoreNetwork>,
+    critic: TrainState<Ensemble>,
 }
 
 impl Sfbc {
@@ -152,7 +150,7 @@ impl Sfbc {
         let frequencies = ScoreShape::frequencies(&mut stream(context.seed, Purpose::Weights, 2))?;
         let weights = initial(&shape.actor().layout(), &context, 0)?;
         Ok(Self {
-            actor: Trained::new(ScoreNetwork::new(shape.actor(), weights, frequencies), 0.0)?,
+            actor: TrainState::new(ScoreNetwork::new(shape.actor(), weights, frequencies), 0.0)?,
             critic: first_critic(&shape, &context)?,
             solver: DpmSolver::new(shape.evaluations),
             returns: Returns::new(rows.rewards, episodes, *config.gamma)?,
@@ -200,7 +198,7 @@ impl Sfbc {
         let noisy = noise.noisy(&batch.actions)?;
         let predicted = self.actor.network.predict(&batch.observations, &noisy, &noise.t)?;
         let loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
-        self.actor.descend(&loss, AdamStep::after(steps, *self.config.actor_learning_rate))?;
+        self.actor.minimize(&loss, AdamStep::after(steps, *self.config.actor_learning_rate))?;
         measured(&[Loss::new("bc_loss", loss)])
     }
 
@@ -221,7 +219,7 @@ impl Sfbc {
             self.returns.targets.index_select(&items, 0)?.to_device(&self.context.device)?;
         let loss =
             self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        self.critic.descend(&loss, AdamStep::after(steps, *self.config.critic_learning_rate))?;
+        self.critic.minimize(&loss, AdamStep::after(steps, *self.config.critic_learning_rate))?;
         measured(&[Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?)])
     }
 
@@ -273,7 +271,7 @@ impl Sfbc {
 }
 
 /// A critic at its beginning.
-fn first_critic(shape: &ScorePolicyShape, context: &Context) -> Result<Trained<Ensemble>> {
+fn first_critic(shape: &ScorePolicyShape, context: &Context) -> Result<TrainState<Ensemble>> {
     ensemble(shape.critic(), context, 1)
 }
 
@@ -318,7 +316,7 @@ impl Algorithm for Sfbc {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let rule =
             Rule::Average { temperature: *self.config.temperature, actions: *self.config.averaged };
-        let choice = Choice { candidates: *self.config.candidates, value: Reduce::Mean, rule };
+        let choice = Choice { candidates: *self.config.candidates, value: Aggregate::Mean, rule };
         let tensors = ScorePolicy::tensors(&self.actor.network, &self.critic.network)?;
         Ok((PolicyConfig::Score { shape: self.shape.clone(), choice }, tensors))
     }

@@ -3,22 +3,21 @@
 //! a gradient, and their densities have the tanh's Jacobian.
 
 use candle_core::{Result, Tensor};
-use quad_policy::{
-    AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, Weights,
-};
+use quad_nn::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, Tensors, Weights};
+use quad_policy::PolicyConfig;
 
 use super::context::Context;
 use super::gaussian::first_half;
 use super::parts::Parts;
-use super::trained::{Trained, ensemble, learned};
+use super::train_state::{TrainState, ensemble, learned};
 
 /// A squashed Gaussian policy in training.
 pub(super) struct Squashed {
     layers: MlpConfig,
     /// Mean and x of each state, `[n, 2a]`.
-    pub network: Trained<Ensemble>,
+    pub network: TrainState<Ensemble>,
     /// c₁ and c₂ where log σ is c₁·x + c₂; else it is x.
-    map: Option<Trained<Weights>>,
+    map: Option<TrainState<Weights>>,
     /// Bounds of log σ.
     bounds: (f32, f32),
 }
@@ -74,11 +73,11 @@ impl Squashed {
     }
 
     /// Moves all that is learned down a loss `[]`.
-    pub fn descend(&mut self, loss: &Tensor, step: AdamStep) -> Result<()> {
+    pub fn minimize(&mut self, loss: &Tensor, step: AdamStep) -> Result<()> {
         let gradients = Gradients::of(loss)?;
-        self.network.descend_along(&gradients, step)?;
+        self.network.apply_gradients(&gradients, step)?;
         if let Some(map) = &mut self.map {
-            map.descend_along(&gradients, step)?;
+            map.apply_gradients(&gradients, step)?;
         }
         Ok(())
     }

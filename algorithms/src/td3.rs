@@ -1,6 +1,6 @@
 //! What TD3+BC and ReBRAC share: TD3 (Fujimoto, van Hoof and Meger 2018), whose deterministic
 //! policy also stays near the data's actions. Critics move in every step, the policy and the
-//! targets in every second or so. An algorithm of this kind is its [`Near`].
+//! targets in every second or so. An algorithm of this kind is its [`BcRegularizer`].
 
 use super::algorithm::{
     AgentError, Algorithm, AlgorithmError, Loss, Measured, joined, measured, smaller,
@@ -8,15 +8,13 @@ use super::algorithm::{
 use super::context::{Context, Minibatch};
 use super::definition;
 use super::denoising::normal;
-use super::hyperparameters::{NotNegative, Positive, Rate, Share, Steps};
+use super::hyperparameters::{NotNegative, Positive, Rate, Steps, UnitInterval};
 use super::parts::{Parts, write};
 use super::random::{Purpose, stream};
-use super::trained::{Trained, ensemble};
+use super::train_state::{TrainState, ensemble};
 use candle_core::{DType, Result, Tensor};
-use quad_policy::{
-    AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, MlpConfig, PolicyConfig,
-    Tensors, Weighted, gaussian_mean,
-};
+use quad_nn::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Tensors, Weighted};
+use quad_policy::{GaussianPolicy, GaussianShape, PolicyConfig, gaussian_mean};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
@@ -29,7 +27,7 @@ pub(super) struct Common {
     actor: MlpConfig,
     critic: MlpConfig,
     /// Discount γ.
-    gamma: Share,
+    gamma: UnitInterval,
     /// Standard deviation of the noise in the targets' actions, and its largest size.
     target_noise: NotNegative,
     target_noise_limit: NotNegative,
@@ -47,7 +45,7 @@ pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> std::result::Res
 }
 
 /// How one algorithm keeps its policy near the data's actions; its hyper-parameters hold it.
-pub(super) trait Near: Send {
+pub(super) trait BcRegularizer: Send {
     /// The first step in which the policy moves.
     const FIRST: u64;
     /// Whether the target policy follows the policy that was there before its step.
@@ -73,15 +71,15 @@ pub(super) struct Td3<N> {
     /// The transitions to learn from, where not all are.
     items: Option<Vec<u32>>,
     /// π is the tanh of this.
-    actor: Trained<Ensemble>,
+    actor: TrainState<Ensemble>,
     target_actor: Ensemble,
-    critics: Trained<Ensemble>,
+    critics: TrainState<Ensemble>,
     target_critics: Ensemble,
     /// What the policy's last step measured: `actor_loss` and `bc_loss`.
     of_actor: Tensor,
 }
 
-impl<N: Near> Td3<N> {
+impl<N: BcRegularizer> Td3<N> {
     pub fn new(near: N, context: Context) -> std::result::Result<Self, AlgorithmError> {
         let items = near.penalty().map(|_| context.items_with_next_action());
         if items.as_ref().is_some_and(Vec::is_empty) {
@@ -120,21 +118,21 @@ impl<N: Near> Td3<N> {
         let Common { actor_every, ema_rate, actor_learning_rate, critic_learning_rate, .. } =
             self.near.common();
         let mut losses = vec![self.critic_loss(batch, noise, next)?];
-        self.critics.descend(&losses[0].value, AdamStep::after(step, **critic_learning_rate))?;
+        self.critics.minimize(&losses[0].value, AdamStep::after(step, **critic_learning_rate))?;
         let first = N::FIRST % **actor_every;
         if step % **actor_every == first {
             let [actor_loss, bc_loss] = self.actor_losses(batch)?;
             if N::LAGS {
-                self.target_actor.follow(&self.actor.network, **ema_rate)?;
+                self.target_actor.soft_update(&self.actor.network, **ema_rate)?;
             }
-            self.actor.descend(
+            self.actor.minimize(
                 &actor_loss,
                 AdamStep::after(step / **actor_every, **actor_learning_rate),
             )?;
             if !N::LAGS {
-                self.target_actor.follow(&self.actor.network, **ema_rate)?;
+                self.target_actor.soft_update(&self.actor.network, **ema_rate)?;
             }
-            self.target_critics.follow(&self.critics.network, **ema_rate)?;
+            self.target_critics.soft_update(&self.critics.network, **ema_rate)?;
             write(&self.of_actor, &joined(&[&actor_loss, &bc_loss])?.detach())?;
         }
         if step >= first {
@@ -158,7 +156,7 @@ impl<N: Near> Td3<N> {
         Ok(Loss::new("critic_loss", (loss * CRITICS as f64)?).with("q_mean", targets.mean_all()?))
     }
 
-    /// What [`Near::actor_loss`] gives.
+    /// What [`BcRegularizer::actor_loss`] gives.
     fn actor_losses(&self, batch: &Minibatch) -> Result<[Tensor; 2]> {
         let actions = gaussian_mean(&self.actor.network, &batch.observations)?;
         let q = self.critics.network.detach().values(&batch.observations, &actions)?;
@@ -199,7 +197,7 @@ fn actor_shape(common: &Common, context: &Context) -> GaussianShape {
     GaussianShape { observation_dim, action_dim, actor: common.actor.clone() }
 }
 
-impl<N: Near> Algorithm for Td3<N> {
+impl<N: BcRegularizer> Algorithm for Td3<N> {
     fn items(&self, transitions: usize) -> usize {
         self.items.as_ref().map_or(transitions, Vec::len)
     }
@@ -239,7 +237,7 @@ pub(super) mod golden {
     use candle_core::Device;
 
     /// Checks an update against a golden folder.
-    pub fn check<N: Near + DeserializeOwned>(
+    pub fn check<N: BcRegularizer + DeserializeOwned>(
         golden: &Golden,
         device: &Device,
         metrics: &[definition::Metric],

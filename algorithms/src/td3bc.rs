@@ -4,7 +4,7 @@
 
 use super::definition::{Definition, Metric, Reporting, metrics};
 use super::hyperparameters::Positive;
-use super::td3::{Common, Near, Td3, read};
+use super::td3::{BcRegularizer, Common, Td3, read};
 use candle_core::{Result, Tensor};
 use serde::Deserialize;
 
@@ -35,7 +35,7 @@ struct Config {
     weight: Positive,
 }
 
-impl Near for Config {
+impl BcRegularizer for Config {
     const FIRST: u64 = 1;
     const LAGS: bool = false;
 

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use candle_core::Device;
 use quad_dataset::{Arrays, Transitions};
-use quad_policy::Precision;
+use quad_nn::Precision;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

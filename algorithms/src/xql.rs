@@ -11,7 +11,7 @@ mod golden;
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting};
 use super::hyperparameters::{Count, NotNegative, Positive};
-use super::in_sample::{Common, Helps, InSample, Losses, read, scale_down, table};
+use super::in_sample::{Common, Helps, ImplicitLosses, InSample, read, scale_down, table};
 use super::random::{Purpose, stream};
 use candle_core::{Result, Tensor};
 use rand::Rng;
@@ -105,7 +105,7 @@ impl Config {
     }
 }
 
-impl Losses for Config {
+impl ImplicitLosses for Config {
     fn common(&self) -> &Common {
         &self.common
     }

@@ -7,9 +7,10 @@ use candle_core::Device;
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use quad_dataset::environment;
 use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations, make};
+use quad_nn::{Layout, Weights};
 use quad_policy::{
-    Choice, DiffusionShape, EpisodeState, Header, Layout, MlpConfig, Policy, PolicyConfig,
-    Precision, Weights, load_policy,
+    Choice, DiffusionShape, EpisodeState, Header, MlpConfig, Policy, PolicyConfig, Precision,
+    load_policy,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -6,10 +6,10 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use candle_core::{DType, Device, Tensor};
+use quad_nn::{Attention, TrajectoryConfig};
 use quad_policy::{
-    ActorCriticShape, Attention, Choice, DiffusionShape, GaussianShape, Guidance, Header,
-    MlpConfig, PlannerShape, Policy, PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape,
-    WindowConfig, load_policy,
+    ActorCriticShape, Choice, DiffuserShape, DiffusionShape, GaussianShape, Header, MlpConfig,
+    Policy, PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, ValueGuidance, load_policy,
 };
 
 /// What is not counted, such as the embedding of each denoising step: little of what an evaluator
@@ -80,17 +80,17 @@ fn score(widths: &[usize], candidates: u32) -> Box<dyn Policy> {
     loaded(PolicyConfig::Score { shape, choice: Choice::best_of(candidates) })
 }
 
-fn planner(network: WindowConfig, plans: u32) -> Box<dyn Policy> {
-    let shape = PlannerShape {
+fn planner(network: TrajectoryConfig, plans: u32) -> Box<dyn Policy> {
+    let shape = DiffuserShape {
         observation_dim: 11,
         action_dim: 3,
         network,
         diffusion_steps: 3,
-        guidance: Guidance { steps: 1, scale: 0.1, stop: 0 },
+        guidance: ValueGuidance { steps: 1, scale: 0.1, stop: 0 },
         replan_every: 1,
         units: Scaling::default(),
     };
-    loaded(PolicyConfig::Planner { shape, choice: Choice::best_of(plans) })
+    loaded(PolicyConfig::DiffuserPolicy { shape, choice: Choice::best_of(plans) })
 }
 
 /// A planner's networks with eight groups.
@@ -99,8 +99,8 @@ fn windows(
     channels: usize,
     multipliers: &[usize],
     attention: Option<Attention>,
-) -> WindowConfig {
-    WindowConfig { horizon, channels, multipliers: multipliers.to_vec(), groups: 8, attention }
+) -> TrajectoryConfig {
+    TrajectoryConfig { horizon, channels, multipliers: multipliers.to_vec(), groups: 8, attention }
 }
 
 #[test]

@@ -1,6 +1,9 @@
 //! What can be wrong with a policy.
 
-use crate::kind::VERSION;
+use quad_nn::NetworkError;
+
+/// The version that writes policies.
+pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Weights that are not what they should be, or that lead to no action.
 #[derive(Debug, thiserror::Error)]
@@ -54,35 +57,19 @@ pub enum PolicyError {
     /// It is to choose by a value function, but has none.
     #[error("the rule `nearest` takes a value function, which this policy does not have")]
     NoValue,
-    /// A tensor is missing.
-    #[error("the weights lack the tensor {0:?}")]
-    Missing(String),
+    /// The weights do not fit, or a network fails.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
     /// A tensor that no network has.
     #[error("the weights hold a tensor {0:?} that this policy does not have")]
     Unexpected(String),
-    /// A tensor of the wrong element type or shape.
-    #[error("tensor {name:?} has type and shape {found}, expected {expected}")]
-    Shape {
-        /// Its name.
-        name: String,
-        /// What it is.
-        found: String,
-        /// What the policy has.
-        expected: String,
-    },
-    /// A NaN or an infinity among the weights.
-    #[error("tensor {0:?} holds a number that is not finite")]
-    NotFinite(String),
     /// A NaN on the way to an action.
     #[error("{0} is not a number (NaN)")]
     NotANumber(&'static str),
-    /// A tensor cannot be computed or moved.
+    /// Candle cannot compute or move a tensor.
     #[error("candle failed")]
     Candle(#[from] candle_core::Error),
 }
-
-/// Widest layer and most critics that are believed.
-pub(crate) const MOST: usize = u16::MAX as usize;
 
 /// Checks that a number of a shape is from 1 to `most`.
 pub(crate) fn check_range(

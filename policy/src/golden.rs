@@ -4,19 +4,14 @@
 #[path = "../../tests/golden/golden.rs"]
 mod reader;
 
-use crate::choice::{Choice, Reduce, Rule};
-use crate::diffusion::{DiffusionPolicy, DiffusionShape};
-use crate::ensemble::Ensemble;
 use crate::error::PolicyError;
-use crate::kind::{Header, PolicyConfig, load_policy};
-use crate::mlp_config::MlpConfig;
-use crate::noise_predictor::NoisePredictor;
+use crate::file::{Header, PolicyConfig, load_policy};
+use crate::kinds::diffusion::{DiffusionPolicy, DiffusionShape};
 use crate::policy::{Policy, Sampled};
-use crate::precision::Precision;
-use crate::schedule::Reverse;
-use crate::weights::{Layout, Tensors, Weights};
+use crate::sampling::choice::{Aggregate, Choice, Rule};
 use candle_core::{Device, Tensor};
 use quad_kernels::scaling::Scaling;
+use quad_nn::{Ensemble, Layout, MlpConfig, NoisePredictor, Precision, Reverse, Tensors, Weights};
 use reader::{Golden, goldens};
 
 fn layers(golden: &Golden, pointer: &str) -> MlpConfig {
@@ -187,7 +182,7 @@ fn a_shape_out_of_range_is_refused() {
 
 #[test]
 fn the_file_s_rule_chooses_unless_another_is_asked_for() {
-    let best = Choice { value: Reduce::Min, ..Choice::best_of(8) };
+    let best = Choice { value: Aggregate::Min, ..Choice::best_of(8) };
     let nearest = Choice { rule: Rule::Nearest, ..best };
     let act = |policy: &dyn Policy| first_action(policy, [0.5; 4]).unwrap();
     // A value above that of all actions: the nearest is the best. Below: the worst.
@@ -215,7 +210,7 @@ fn the_file_s_rule_chooses_unless_another_is_asked_for() {
 /// value, which `value` gives, too.
 #[test]
 fn what_is_sampled_is_what_is_chosen_among() {
-    for value in [Reduce::Mean, Reduce::Min] {
+    for value in [Aggregate::Mean, Aggregate::Min] {
         let policy = policy(Choice { value, ..Choice::best_of(6) }, 1.0, None).unwrap();
         let observations: Vec<f32> = (0..12).map(|i| (i as f32).sin()).collect();
         let begin = || [7, 8, 9].map(|seed| policy.begin(seed));

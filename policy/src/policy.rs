@@ -1,9 +1,9 @@
 //! What any policy can do, whatever its kind.
 
-use crate::choice::Choice;
-use crate::episode::EpisodeState;
 use crate::error::PolicyError;
-use crate::precision::Precision;
+use crate::sampling::choice::Choice;
+use crate::sampling::episode::EpisodeState;
+use quad_nn::Precision;
 
 /// A trained policy, ready to act.
 pub trait Policy: Send + Sync {
@@ -78,7 +78,7 @@ pub trait Policy: Send + Sync {
     }
 
     /// What the critics say of n actions, each in a state of its own: n numbers, by the choice's
-    /// [`Reduce`](crate::Reduce), in units of the return that they were trained for.
+    /// [`Aggregate`](crate::Aggregate), in units of the return that they were trained for.
     ///
     /// `observations` is `n × observation_dim`, `actions` `n × action_dim`, n at least 1.
     ///
@@ -94,6 +94,6 @@ pub trait Policy: Send + Sync {
 pub struct Sampled {
     /// The actions, `n × candidates × action_dim`, in the order in which they were drawn.
     pub actions: Vec<f32>,
-    /// The value of each action, `n × candidates`, by the choice's [`Reduce`](crate::Reduce).
+    /// The value of each action, `n × candidates`, by the choice's [`Aggregate`](crate::Aggregate).
     pub values: Vec<f32>,
 }

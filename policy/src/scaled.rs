@@ -1,12 +1,11 @@
 //! A policy that is asked in its user's units, though its networks have learned in their own.
 
-use crate::choice::Choice;
-use crate::episode::EpisodeState;
 use crate::error::PolicyError;
 use crate::policy::{Policy, Sampled};
-use crate::precision::Precision;
-use crate::shape::bytes;
+use crate::sampling::choice::Choice;
+use crate::sampling::episode::EpisodeState;
 use quad_kernels::scaling::{Affine, Scaling};
+use quad_nn::{Precision, bytes};
 use std::borrow::Cow;
 use std::sync::Arc;
 
@@ -122,8 +121,8 @@ impl Policy for Scaled {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use crate::file::{Header, load_policy};
     use crate::golden::file_of;
-    use crate::kind::{Header, load_policy};
 
     fn affine(offset: &[f32], scale: &[f32]) -> Option<Affine> {
         Some(Affine { offset: offset.to_vec(), scale: scale.to_vec() })

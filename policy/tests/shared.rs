@@ -6,9 +6,8 @@ use std::thread;
 use std::time::Duration;
 
 use candle_core::{DType, Device, Tensor};
-use quad_policy::{
-    Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Precision, load_policy,
-};
+use quad_nn::{MlpConfig, Precision};
+use quad_policy::{Choice, DiffusionShape, Header, PolicyConfig, load_policy};
 use rayon::prelude::*;
 
 /// Policies, each asked by all threads at once.

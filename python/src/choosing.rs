@@ -5,7 +5,7 @@ use std::sync::Arc;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use quad_policy::{Choice, Policy, Reduce};
+use quad_policy::{Aggregate, Choice, Policy};
 
 use crate::error::of_policy;
 
@@ -48,8 +48,8 @@ pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn 
 pub fn as_dictionary(py: Python<'_>, choice: Choice) -> PyResult<Bound<'_, PyDict>> {
     let rule = choice.rule.to_string();
     let value = match choice.value {
-        Reduce::Mean => "mean",
-        Reduce::Min => "min",
+        Aggregate::Mean => "mean",
+        Aggregate::Min => "min",
     };
     let dictionary = PyDict::new(py);
     dictionary.set_item("candidates", choice.candidates)?;

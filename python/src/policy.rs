@@ -268,7 +268,7 @@ impl PyPolicy {
             PolicyConfig::OneStep { .. } => "one-step",
             PolicyConfig::Gaussian { .. } => "gaussian",
             PolicyConfig::Score { .. } => "score",
-            PolicyConfig::Planner { .. } => "planner",
+            PolicyConfig::DiffuserPolicy { .. } => "planner",
         }
     }
 

@@ -5,7 +5,7 @@ use super::AlgorithmError;
 use crate::context::Context;
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::Transitions;
-use quad_policy::Scaling;
+use quad_nn::Scaling;
 use std::sync::Arc;
 
 /// The windows of a dataset.

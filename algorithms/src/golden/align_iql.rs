@@ -30,7 +30,7 @@ fn check_choice(golden: &Golden, align_iql: &Diffusion<AlignIql>) {
     let candidates = golden.count("/agent/candidates") as u32;
     assert_eq!(
         drawn.choice,
-        Choice { candidates, value: Reduce::Min, rule: align_iql.update.rule }
+        Choice { candidates, value: Aggregate::Min, rule: align_iql.update.rule }
     );
     let index = match &drawn.v {
         Some(v) => {

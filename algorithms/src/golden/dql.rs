@@ -44,7 +44,7 @@ fn check(golden: &Golden, device: &Device) {
     let candidates = golden.count("/agent/candidates") as u32;
     assert_eq!(
         choice,
-        Choice { candidates, value: Reduce::Min, rule: Rule::Softmax { temperature } }
+        Choice { candidates, value: Aggregate::Min, rule: Rule::Softmax { temperature } }
     );
 }
 

@@ -49,7 +49,7 @@ fn check_choice(golden: &Golden, dtql: &Dtql) {
         golden.count("/agent/candidates") as u32,
         Rule::Softmax { temperature: temperature as f32 },
     );
-    assert_eq!(drawn.choice, Choice { candidates, value: Reduce::Min, rule });
+    assert_eq!(drawn.choice, Choice { candidates, value: Aggregate::Min, rule });
     let probabilities = candle_nn::ops::softmax(&(drawn.q / temperature).unwrap(), 1).unwrap();
     golden.close("select.probabilities", &probabilities);
 }

@@ -5,7 +5,7 @@ use super::*;
 use crate::definition::{Metric, metrics};
 use crate::golden::{Golden, check_update, context, golden_tests, items, load, table};
 use quad_dataset::{Arrays, Transitions};
-use quad_policy::Precision;
+use quad_nn::Precision;
 use std::sync::Arc;
 
 const METRICS: &[Metric] = &metrics! { q_mean: ""; critic_loss: ""; };

@@ -6,7 +6,8 @@ use crate::golden::{
     Golden, batch, check_update, context, golden_tests, goldens, items, load, table,
 };
 use quad_dataset::{Arrays, Transitions};
-use quad_policy::{Header, Precision, Weighted, load_policy};
+use quad_nn::{Precision, Weighted};
+use quad_policy::{Header, load_policy};
 use std::sync::Arc;
 
 fn config(golden: &Golden) -> Config {
@@ -18,7 +19,7 @@ fn start(golden: &Golden, device: &Device) -> Sfbc {
     // Slower frequencies than a run has.
     let (shape, frequencies) = (sfbc.shape.actor(), golden.input("frequencies", &Device::Cpu));
     let weights = initial(&shape.layout(), &sfbc.context, 0).unwrap();
-    sfbc.actor = Trained::new(ScoreNetwork::new(shape, weights, frequencies), 0.0).unwrap();
+    sfbc.actor = TrainState::new(ScoreNetwork::new(shape, weights, frequencies), 0.0).unwrap();
     load(golden, sfbc.parts());
     sfbc
 }
@@ -52,7 +53,7 @@ fn check_candidates(golden: &Golden, sfbc: &Sfbc) {
     load_policy(&file, Precision::F32).unwrap();
     let PolicyConfig::Score { choice, .. } = policy else { panic!("{policy:?}") };
     let rule = Rule::Average { temperature: 0.1, actions: 3 };
-    assert_eq!(choice, Choice { candidates: 6, value: Reduce::Mean, rule });
+    assert_eq!(choice, Choice { candidates: 6, value: Aggregate::Mean, rule });
     let device = &sfbc.context.device;
     let observations = golden.input("select_observations", device);
     let noise = golden.input("select_noise", device).flatten(0, 1).unwrap();

@@ -2,8 +2,8 @@
 
 use crate::algorithm::{AgentError, check};
 use crate::definition::read;
-use crate::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
-use quad_policy::MlpConfig;
+use crate::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Steps, UnitInterval};
+use quad_nn::MlpConfig;
 use serde::Deserialize;
 
 /// What pulls the policy away from the data.
@@ -65,7 +65,7 @@ pub(super) struct Quad {
     /// Denoising steps T.
     pub diffusion_steps: Count,
     /// Discount γ.
-    pub gamma: Share,
+    pub gamma: UnitInterval,
     /// Pessimism ρ of the lower confidence bound (Eq. 20).
     pub rho: NotNegative,
     /// What guides the actor.
@@ -75,7 +75,7 @@ pub(super) struct Quad {
     /// Stabilizer δ of Eq. 24, on the scale of squared normalized Q-gradients.
     pub delta: Positive,
     /// λ of guidance `constant`, and only of it.
-    pub lambda: Option<Share>,
+    pub lambda: Option<UnitInterval>,
     /// Next actions sampled per next state for the target, S.
     pub samples: Count,
     /// How their values are combined.

@@ -6,7 +6,7 @@ use super::{Noise, Quad};
 use crate::context::Minibatch;
 use crate::diffusion::Networks;
 use candle_core::{DType, Result, Tensor};
-use quad_policy::mean_and_variance;
+use quad_nn::mean_and_variance;
 
 /// What the critics say about noisy actions, and how far they are trusted; all of it constants.
 pub(super) struct Guide {

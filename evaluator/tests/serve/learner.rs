@@ -5,7 +5,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use candle_core::Device;
-use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Weights};
+use quad_nn::Weights;
+use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig};
 use quad_protocol::{
     Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot,
     decode, encode, keys,

@@ -37,5 +37,5 @@ fn gpu() -> anyhow::Result<candle_core::Device> {
         }
         false => "build a learner that can by deploy/cuda.sh, or train with --device cpu",
     };
-    quad_policy::open_gpu().context("this learner cannot train on a GPU here").hint(hint)
+    quad_nn::open_gpu().context("this learner cannot train on a GPU here").hint(hint)
 }

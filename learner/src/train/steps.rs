@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use quad_algorithms::{Agent, AlgorithmError, Metric};
 use quad_dataset::BatchSampler;
-use quad_policy::PolicyError;
+use quad_policy::{NetworkError, PolicyError};
 use quad_protocol::Origin;
 use quad_run::config::Schedule;
 use quad_run::run::Checkpoint;
@@ -72,7 +72,7 @@ pub(crate) enum TrainError {
 impl TrainError {
     fn at(step: u64, source: AlgorithmError) -> Self {
         match source {
-            AlgorithmError::Policy(error @ PolicyError::NotFinite(_)) => {
+            AlgorithmError::Policy(error @ PolicyError::Network(NetworkError::NotFinite(_))) => {
                 Self::Diverged { step, what: error.to_string() }
             }
             source => Self::Update { step, source },

@@ -10,7 +10,8 @@ use quad_algorithms::{Agent, Algorithm, Context, Definition, Measured, Metric, P
 use quad_dataset::{
     Arrays, BatchSampler, ReadOptions, RewardRule, Scale, Transitions, environment,
 };
-use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision, Tensors};
+use quad_nn::Tensors;
+use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision};
 use quad_protocol::Origin;
 use quad_run::config::hyperparameters::algorithm as definition;
 use quad_run::config::{Schedule, resolve};

@@ -7,10 +7,8 @@ use std::path::Path;
 
 use candle_core::{Device, Tensor};
 use libfuzzer_sys::fuzz_target;
-use quad_policy::{
-    ActorCriticShape, Affine, Choice, DiffusionShape, GaussianShape, Header, Layout, MlpConfig,
-    PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, load_policy,
-};
+use quad_nn::{Affine, Layout, MlpConfig, Precision, Scaling};
+use quad_policy::{ActorCriticShape, Choice, DiffusionShape, GaussianShape, Header, PolicyConfig, Rule, ScorePolicyShape, load_policy};
 
 const STATES: usize = 2;
 /// Policies that take more memory than this for an action take much time, too: they are only

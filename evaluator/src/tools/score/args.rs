@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, value_parser};
 use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
-use quad_policy::{Choice, Precision, Reduce, Rule};
+use quad_policy::{Aggregate, Choice, Precision, Rule};
 
 /// Most episodes: far above any use, but few enough for memory.
 pub const MOST_EPISODES: i64 = 10_000;
@@ -50,7 +50,7 @@ pub struct ScoreArgs {
     pub rule: Option<Rule>,
     /// How the critics' values of an action are combined: mean or min [default: the snapshot's]
     #[arg(long, value_name = "NAME")]
-    pub value: Option<Reduce>,
+    pub value: Option<Aggregate>,
     /// Seed from which, with the snapshot's step, the episodes' seeds follow [default: the run's]
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,

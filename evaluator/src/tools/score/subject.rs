@@ -137,13 +137,13 @@ fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
 
 #[cfg(test)]
 mod tests {
-    use quad_policy::{Reduce, Rule};
+    use quad_policy::{Aggregate, Rule};
 
     use super::*;
 
     #[test]
     fn what_the_command_line_does_not_say_is_as_the_policy_has_it() {
-        let own = Choice { value: Reduce::Min, ..Choice::best_of(7) };
+        let own = Choice { value: Aggregate::Min, ..Choice::best_of(7) };
         let rule = Rule::Softmax { temperature: 0.5 };
         assert!(choices(&ScoreArgs::default(), Some(own)).is_empty());
         let asked = ScoreArgs { rule: Some(rule), ..ScoreArgs::default() };

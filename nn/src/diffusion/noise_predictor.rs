@@ -1,0 +1,156 @@
+//! The noise predictor ε_θ(a^t, s, t) and the sampler that denoises with it.
+
+use crate::diffusion::sampler::{Parts, Sample};
+use crate::diffusion::schedule::Schedule;
+use crate::layers::mlp::Mlp;
+use crate::layers::operation::OnCpu;
+use crate::layers::packed::Packing;
+use crate::layers::plain;
+use crate::precision::Precision;
+use crate::shape::{NoiseShape, TIME_FEATURES};
+use crate::weighted::weighted;
+use crate::weights::Weights;
+use candle_core::{DType, Result, Tensor, bail};
+use std::sync::{Arc, OnceLock};
+
+/// A noise predictor and its weights.
+pub struct NoisePredictor {
+    parts: Arc<Parts>,
+    weights: Weights,
+    packing: Packing,
+}
+
+/// cos(x·f_k), then sin(x·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7.
+pub(crate) fn sinusoids(x: f64) -> impl Iterator<Item = f32> {
+    let half = TIME_FEATURES / 2;
+    let angle = move |k: usize| x * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp();
+    (0..half)
+        .map(move |k| angle(k).cos())
+        .chain((0..half).map(move |k| angle(k).sin()))
+        .map(|x| x as f32)
+}
+
+/// The sinusoids of t = 1..T.
+fn time_features(steps: usize) -> Vec<f32> {
+    (1..=steps).flat_map(|t| sinusoids(t as f64)).collect()
+}
+
+weighted!(NoisePredictor, parts.trunk);
+
+impl NoisePredictor {
+    /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
+    pub fn new(shape: NoiseShape, weights: Weights, precision: Precision) -> Self {
+        let parts = Parts {
+            time: Mlp::new(shape.time_layers(), "time."),
+            trunk: Mlp::new(shape.trunk_layers(), "trunk."),
+            schedule: Schedule::variance_preserving(shape.diffusion_steps, shape.reverse),
+            features: time_features(shape.diffusion_steps),
+            features_tensor: OnceLock::new(),
+            shape,
+        };
+        Self { parts: Arc::new(parts), weights, packing: Packing::new(precision) }
+    }
+
+    /// Its shape.
+    pub fn shape(&self) -> &NoiseShape {
+        &self.parts.shape
+    }
+
+    /// The noise schedule that it was made for.
+    pub fn schedule(&self) -> &Schedule {
+        &self.parts.schedule
+    }
+
+    /// The sinusoids of all t, `[T, 16]`, where the weights are.
+    fn features(&self) -> Result<Tensor> {
+        let Parts { features, shape, features_tensor, .. } = &*self.parts;
+        if let Some(tensor) = features_tensor.get() {
+            return Ok(tensor.clone());
+        }
+        let device = self.weights.values().device();
+        let tensor = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), device)?;
+        Ok(features_tensor.get_or_init(|| tensor).clone())
+    }
+
+    /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`.
+    /// Differentiable in weights, observations and actions.
+    pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
+        let Parts { time, trunk, .. } = &*self.parts;
+        let embedding = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
+        let embedding =
+            embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
+        trunk.forward(&self.weights, &[observations, actions, &embedding])?.squeeze(0)
+    }
+
+    /// Makes constants of the weights; they share the memory of this network.
+    pub fn detach(&self) -> Self {
+        let (parts, weights) = (self.parts.clone(), self.weights.detach());
+        Self { parts, weights, packing: Packing::new(self.packing.precision) }
+    }
+
+    /// Draws actions by the whole reverse process (DDPM).
+    ///
+    /// `observations` is `[n, o]`; `noise` is `[T, rows, a]`, standard normal, where equally many
+    /// consecutive rows share an observation: first a^T, then the noise of the reverse steps from t
+    /// = T down to 2. Gives `[rows, a]`, through which no gradient flows.
+    pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        if !self.parts.trunk.is_fast(&self.weights) {
+            return self.detach().composed_sample(observations, noise);
+        }
+        self.check_noise(observations, noise)?;
+        let packed = self.packing.kernels(&self.parts.trunk, &self.weights)?;
+        let operation = OnCpu(Sample { parts: self.parts.clone(), packed });
+        let weights = self.weights.values().detach();
+        weights.apply_op3_no_bwd(&observations.contiguous()?, &noise.contiguous()?, &operation)
+    }
+
+    /// [`Self::sample`] with the embeddings of all t computed once, and one operation for a reverse
+    /// step on a GPU.
+    fn composed_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        self.check_noise(observations, noise)?;
+        let Parts { time, trunk, .. } = &*self.parts;
+        let (steps, rows, _) = noise.dims3()?;
+        let embeddings = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
+        let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
+        let mut actions = noise.get(0)?;
+        for t in (1..=steps).rev() {
+            let embedding = embeddings.get(t - 1)?.broadcast_left(rows)?.contiguous()?;
+            let epsilon =
+                trunk.forward(&self.weights, &[&observations, &actions, &embedding])?.squeeze(0)?;
+            let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
+            actions = self.schedule().constant_reverse(t, &actions, &epsilon, z.as_ref())?;
+        }
+        Ok(actions)
+    }
+
+    /// [`Self::sample`], but differentiable in the weights, through every reverse step; slower.
+    pub fn sample_with_gradient(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        self.check_noise(observations, noise)?;
+        let (steps, rows, _) = noise.dims3()?;
+        let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
+        let mut actions = noise.get(0)?;
+        for t in (1..=steps).rev() {
+            let all = Tensor::full(t as u32, rows, noise.device())?;
+            let epsilon = self.predict(&observations, &actions, &all)?;
+            let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
+            actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
+        }
+        Ok(actions)
+    }
+
+    fn check_noise(&self, observations: &Tensor, noise: &Tensor) -> Result<()> {
+        let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } = self.parts.shape;
+        let ((states, o), (steps, rows, a)) = (observations.dims2()?, noise.dims3()?);
+        let fits = states > 0
+            && rows > 0
+            && rows.is_multiple_of(states)
+            && (o, a) == (observation_dim, action_dim);
+        if !fits || steps != diffusion_steps {
+            bail!(
+                "a noise predictor of {:?} got {states} × {o} and noise {steps} × {rows} × {a}",
+                self.parts.shape
+            );
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,216 @@
+//! The variance-preserving noise schedule and one step of the reverse process.
+
+use candle_core::{Device, Result, Tensor};
+#[cfg(feature = "cuda")]
+use quad_kernels::cuda::{ReverseStep, reverse};
+use serde::{Deserialize, Serialize};
+
+/// How a reverse step is made of a predicted noise.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Reverse {
+    /// x_0 is clipped to ±1, the noise's variance is 1 - α_t (DAC).
+    #[default]
+    ClipClean,
+    /// x_0 is clipped to ±1, the variance is the posterior's, (1 - α_t)(1 - ᾱ_{t-1})/(1 - ᾱ_t)
+    /// (Diffusion-QL).
+    Posterior,
+    /// x_0 is not clipped, but the outcome is, noise and all; the variance is 1 - α_t (IDQL,
+    /// AlignIQL).
+    ClipSample,
+}
+
+/// Constants of the diffusion over t = 1..T (Eq. 3–5; DAC's "vp" schedule).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Schedule {
+    steps: Vec<Step>,
+    reverse: Reverse,
+}
+
+/// Coefficients of one t.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Step {
+    /// sqrt(ᾱ_t).
+    signal: f32,
+    /// sqrt(1 - ᾱ_t).
+    deviation: f32,
+    /// Factor of the clipped x_0 in the posterior's mean.
+    from_clean: f32,
+    /// Factor of x_t in the posterior's mean.
+    from_noisy: f32,
+    /// Standard deviation of the noise, 0 at t = 1.
+    noise: f32,
+}
+
+impl Schedule {
+    /// β_t = 1 - exp(-0.1/T - 0.5·(10 - 0.1)·(2t - 1)/T²) for t = 1..T.
+    pub fn variance_preserving(steps: usize, reverse: Reverse) -> Self {
+        let total = steps as f64;
+        let alpha = |t: usize| {
+            (-0.1 / total - 0.5 * (10.0 - 0.1) * (2 * t - 1) as f64 / (total * total)).exp()
+        };
+        Self::of(steps, reverse, alpha)
+    }
+
+    /// ᾱ_t = f(t/T)/f(0) with f(x) = cos²(π/2·(x + 0.008)/1.008), each β_t at most 0.999 (Nichol
+    /// and Dhariwal 2021); the variance of a reverse step is the posterior's.
+    pub fn cosine(steps: usize) -> Self {
+        let falls = |t: usize| {
+            ((t as f64 / steps as f64 + 0.008) / 1.008 * std::f64::consts::FRAC_PI_2).cos().powi(2)
+        };
+        Self::of(steps, Reverse::Posterior, |t| (falls(t) / falls(t - 1)).max(0.001))
+    }
+
+    /// The schedule with these α_t for t = 1..T.
+    fn of(steps: usize, reverse: Reverse, alpha: impl Fn(usize) -> f64) -> Self {
+        let mut before = 1.0; // ᾱ_{t-1}
+        let step = |t: usize| {
+            let alpha = alpha(t);
+            let alpha_bar = before * alpha;
+            let shrink = match reverse {
+                Reverse::Posterior => (1.0 - before) / (1.0 - alpha_bar),
+                Reverse::ClipClean | Reverse::ClipSample => 1.0,
+            };
+            let step = Step {
+                signal: alpha_bar.sqrt() as f32,
+                deviation: (1.0 - alpha_bar).sqrt() as f32,
+                from_clean: (before.sqrt() * (1.0 - alpha) / (1.0 - alpha_bar)) as f32,
+                from_noisy: (alpha.sqrt() * (1.0 - before) / (1.0 - alpha_bar)) as f32,
+                noise: if t == 1 { 0.0 } else { ((1.0 - alpha) * shrink).sqrt() as f32 },
+            };
+            before = alpha_bar;
+            step
+        };
+        Self { steps: (1..=steps).map(step).collect(), reverse }
+    }
+
+    /// The variance of the noise of a reverse step, 0 at t = 1.
+    pub fn variance(&self, t: usize) -> f32 {
+        self.steps[t - 1].noise.powi(2)
+    }
+
+    /// x_t → x_{t-1} where the clean x_0 is predicted rather than the noise: the posterior's mean,
+    /// plus noise `z` for t > 1. All of one shape.
+    pub fn reverse_to_clean(
+        &self,
+        t: usize,
+        x: &Tensor,
+        clean: &Tensor,
+        z: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        let Step { from_clean, from_noisy, noise, .. } = self.steps[t - 1];
+        let mean = ((clean * f64::from(from_clean))? + (x * f64::from(from_noisy))?)?;
+        match z {
+            Some(z) if t > 1 => mean + (z * f64::from(noise))?,
+            _ => Ok(mean),
+        }
+    }
+
+    /// sqrt(ᾱ_t) and sqrt(1 - ᾱ_t) for each t in 1..=T, `[B, width]` each, a row for each t with
+    /// its number in all columns; the second is also the guidance weight w(t).
+    pub fn noising(&self, t: &[u32], width: usize, device: &Device) -> Result<(Tensor, Tensor)> {
+        let rows = |of: fn(&Step) -> f32| {
+            let numbers =
+                t.iter().flat_map(|t| std::iter::repeat_n(of(&self.steps[*t as usize - 1]), width));
+            Tensor::from_vec(numbers.collect(), (t.len(), width), device)
+        };
+        Ok((rows(|step| step.signal)?, rows(|step| step.deviation)?))
+    }
+
+    /// x_0 as a predicted noise ε has it, (x_t - sqrt(1 - ᾱ_t)·ε)/sqrt(ᾱ_t), clipped to [-1, 1]
+    /// unless samples are; all `[rows, a]`.
+    pub fn clean(&self, t: usize, x: &Tensor, epsilon: &Tensor) -> Result<Tensor> {
+        let Step { signal, deviation, .. } = self.steps[t - 1];
+        let clean = ((x - (epsilon * f64::from(deviation))?)? * f64::from(1.0 / signal))?;
+        if self.reverse == Reverse::ClipSample { Ok(clean) } else { clean.clamp(-1f32, 1f32) }
+    }
+
+    /// x_t → x_{t-1}: the posterior's mean plus noise for t > 1. All `[rows, a]`, and
+    /// differentiable.
+    ///
+    /// `epsilon` is the predicted noise, `z` standard normal.
+    pub fn reverse(
+        &self,
+        t: usize,
+        x: &Tensor,
+        epsilon: &Tensor,
+        z: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        let next = self.reverse_to_clean(t, x, &self.clean(t, x, epsilon)?, z)?;
+        if self.reverse == Reverse::ClipSample { next.clamp(-1f32, 1f32) } else { Ok(next) }
+    }
+
+    /// [`Self::reverse`] of constants: on a GPU one operation.
+    pub(crate) fn constant_reverse(
+        &self,
+        t: usize,
+        x: &Tensor,
+        epsilon: &Tensor,
+        z: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        #[cfg(feature = "cuda")]
+        if x.device().is_cuda() {
+            return self.reverse_on_gpu(t, x, epsilon, z);
+        }
+        self.reverse(t, x, epsilon, z)
+    }
+
+    #[cfg(feature = "cuda")]
+    fn reverse_on_gpu(
+        &self,
+        t: usize,
+        x: &Tensor,
+        epsilon: &Tensor,
+        z: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        use crate::gpu::tensors::{read, tensor};
+        let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
+        let (clean_bound, bound) = self.bounds();
+        let noise = if z.is_some() { noise } else { 0.0 };
+        let step = ReverseStep {
+            deviation,
+            scale: 1.0 / signal,
+            clean_bound,
+            from_clean,
+            from_noisy,
+            noise,
+            bound,
+        };
+        let candle_core::Device::Cuda(device) = x.device() else {
+            candle_core::bail!("a tensor is not on the GPU")
+        };
+        let stream = device.cuda_stream();
+        let (x, epsilon) = (x.contiguous()?, epsilon.contiguous()?);
+        let z = z.unwrap_or(&epsilon).contiguous()?;
+        let next = read(&x, |x| {
+            read(&epsilon, |epsilon| {
+                read(&z, |z| {
+                    reverse(&stream, [x, epsilon, z], step).map_err(candle_core::Error::wrap)
+                })
+            })
+        })?;
+        tensor(next, x.shape(), &x)
+    }
+
+    /// Bounds of the predicted x_0 and of the outcome.
+    fn bounds(&self) -> (f32, f32) {
+        if self.reverse == Reverse::ClipSample {
+            (f32::INFINITY, 1.0)
+        } else {
+            (1.0, f32::INFINITY)
+        }
+    }
+
+    /// [`Self::reverse`] on slices; `z` is not read at t = 1.
+    pub(crate) fn reverse_in_place(&self, t: usize, x: &mut [f32], epsilon: &[f32], z: &[f32]) {
+        let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
+        let scale = 1.0 / signal;
+        let (clean_bound, bound) = self.bounds();
+        for (i, (x, epsilon)) in x.iter_mut().zip(epsilon).enumerate() {
+            let clean = ((*x - deviation * epsilon) * scale).clamp(-clean_bound, clean_bound);
+            let mean = from_clean * clean + from_noisy * *x;
+            let next = if t > 1 { mean + noise * z[i] } else { mean };
+            *x = next.clamp(-bound, bound);
+        }
+    }
+}

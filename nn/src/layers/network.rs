@@ -1,0 +1,284 @@
+//! One network on one tile of rows: hidden layers with a norm, if they have one, and an activation
+//! each, and a linear output; forward and backward.
+//!
+//! Forward passes that nothing is kept of take the first layer apart: the state's part is computed
+//! once per state, whatever number of actions is tried in it, and the action's few columns are
+//! fused with the activation.
+
+use crate::layers::flat::{Layers, TILE};
+use crate::layers::workspace::{Activations, Workspace};
+use crate::precision::Precision;
+use quad_kernels::Buffer;
+use quad_kernels::activation::{activate, activate_with_slope, multiply};
+use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
+use quad_kernels::norm::{kept, normalize, normalize_backward, shift_rows};
+use quad_kernels::product::{Packed, product, product_transposed};
+
+/// Rows of a tile that are worked on together in a task whose products are rounded: these are so
+/// fast that activations must be in the nearest cache.
+const BLOCK: usize = 32;
+/// Most inputs whose gradients are sums of products, one by one.
+const NARROW: usize = 16;
+
+/// One member of the networks in a vector of weights.
+#[derive(Clone, Copy)]
+pub(crate) struct Network<'a> {
+    pub weights: &'a [f32],
+    pub layers: &'a Layers,
+    pub member: usize,
+    /// The kernels between hidden layers as their products read them, if they were packed.
+    pub packed: Option<&'a [Packed]>,
+}
+
+/// What a tile of rows is fed: `repeat` consecutive rows share a row of `base`.
+#[derive(Clone, Copy)]
+pub(crate) struct Input<'a> {
+    /// State part of the first pre-activation, from [`Network::first_part`].
+    pub base: &'a [f32],
+    pub repeat: usize,
+    /// Added to each row of the first pre-activation (bias and all else that the tile shares).
+    pub shift: &'a [f32],
+    /// `rows × a`, behind the state among the inputs; a may be 0.
+    pub actions: &'a [f32],
+    /// The first kernel's rows that multiply them: `a × width`.
+    pub kernel: &'a [f32],
+}
+
+impl<'a> Network<'a> {
+    pub fn kernel(&self, layer: usize) -> &'a [f32] {
+        self.layers.kernel(self.weights, layer, self.member)
+    }
+
+    pub fn bias(&self, layer: usize) -> &'a [f32] {
+        self.layers.bias(self.weights, layer, self.member)
+    }
+
+    /// Scale and shift of a layer's norm, if it has one.
+    fn norm(&self, layer: usize) -> Option<[&'a [f32]; 2]> {
+        self.layers.norm(self.weights, layer, self.member)
+    }
+
+    /// The last layer's number.
+    fn last(&self) -> usize {
+        self.layers.count() - 1
+    }
+
+    /// Width of the first hidden layer.
+    pub fn width(&self) -> usize {
+        self.layers.shape(0).1
+    }
+
+    /// Rows of the first kernel, those that multiply some of the inputs.
+    pub fn first_kernel(&self, from: usize, count: usize) -> &'a [f32] {
+        let width = self.width();
+        &self.kernel(0)[from * width..(from + count) * width]
+    }
+
+    /// `out[states × width] = x · kernel`, for the first `inputs` of the inputs, without the bias.
+    pub fn first_part(&self, x: &[f32], inputs: usize, out: &mut [f32]) {
+        product(x, self.first_kernel(0, inputs), out, inputs, self.width());
+    }
+
+    /// The output layer's kernel as `outputs × width`.
+    fn output_rows<'b>(&self, transposed: &'b mut Buffer) -> &'b [f32]
+    where
+        'a: 'b,
+    {
+        let (kernel, (width, outputs)) = (self.kernel(self.last()), self.layers.shape(self.last()));
+        if outputs == 1 {
+            return kernel;
+        }
+        let rows = transposed.sized(kernel.len());
+        for h in 0..width {
+            for j in 0..outputs {
+                rows[j * width + h] = kernel[h * outputs + j];
+            }
+        }
+        rows
+    }
+
+    /// The kernels between hidden layers, packed; `None` where products are as fast without.
+    pub fn pack(&self, precision: Precision) -> Option<Vec<Packed>> {
+        let pack = |layer| {
+            let (kernel, (inputs, outputs)) = (self.kernel(layer), self.layers.shape(layer));
+            let rounded = match precision {
+                Precision::F32 => None,
+                Precision::Bf16 => Packed::rounded(kernel, inputs, outputs),
+            };
+            rounded.or_else(|| Packed::new(kernel, inputs, outputs))
+        };
+        (1..self.last()).map(pack).collect()
+    }
+
+    /// `out[rows × outputs]` of a tile.
+    pub fn forward(&self, input: Input<'_>, work: &mut Workspace, out: &mut [f32]) {
+        let (outputs, width, last) = (self.layers.outputs(), self.width(), self.last());
+        let action_dim = input.kernel.len() / width;
+        let [x, y] = &mut work.pair;
+        let output = self.output_rows(&mut work.output);
+        let rounded = self.packed.is_some_and(|kernels| kernels.iter().any(Packed::is_rounded));
+        let block = if rounded { BLOCK } else { TILE };
+        let states = (block / input.repeat).max(1);
+        let rows = states * input.repeat;
+        for (i, (base, out)) in
+            input.base.chunks(states * width).zip(out.chunks_mut(rows * outputs)).enumerate()
+        {
+            let count = out.len() / outputs;
+            let actions = &input.actions[i * rows * action_dim..][..count * action_dim];
+            let Input { repeat, shift, kernel, .. } = input;
+            let first = FirstLayer { base, repeat, shift, actions, kernel };
+            let out_of_first = x.sized(count * width);
+            match self.norm(0) {
+                Some([scale, shift]) if !self.layers.norm_after => {
+                    first_layer(None, &first, out_of_first);
+                    let room = work.not_kept.sized(kept(count, width));
+                    normalize(out_of_first, None, scale, self.layers.epsilon(), room);
+                    activate(self.layers.activation, out_of_first, shift);
+                }
+                _ => {
+                    first_layer(Some(self.layers.activation), &first, out_of_first);
+                    self.normalize_after(0, out_of_first, || {
+                        work.not_kept.sized(kept(count, width))
+                    });
+                }
+            }
+            for layer in 1..last {
+                let (inputs, width) = self.layers.shape(layer);
+                let (x, y) = if layer % 2 == 1 { (&mut *x, &mut *y) } else { (&mut *y, &mut *x) };
+                let (x, y) = (x.sized(count * inputs), y.sized(count * width));
+                match self.packed {
+                    Some(kernels) => kernels[layer - 1].product(x, y),
+                    None => product(x, self.kernel(layer), y, inputs, width),
+                }
+                let bias = self.normalize(layer, y, || work.not_kept.sized(kept(count, width)));
+                activate(self.layers.activation, y, bias);
+                self.normalize_after(layer, y, || work.not_kept.sized(kept(count, width)));
+            }
+            let width = self.layers.shape(last).0;
+            let x = if last % 2 == 1 { &mut *x } else { &mut *y };
+            dots(x.sized(count * width), output, self.bias(last), out, width);
+        }
+    }
+
+    /// `forward` of whole rows `rows × inputs` that leaves activations and slopes behind for
+    /// `backward`.
+    pub fn forward_saving(
+        &self,
+        input: &[f32],
+        left: &mut Activations<'_>,
+        work: &mut Workspace,
+        out: &mut [f32],
+    ) {
+        let last = self.last();
+        for layer in 0..last {
+            let (inputs, width) = self.layers.shape(layer);
+            let (before, here) = left.x.split_at_mut(layer);
+            let x = before.last().map_or(input, |x| &**x);
+            product(x, self.kernel(layer), here[0], inputs, width);
+            let bias = self.normalize(layer, here[0], || left.norm[layer]);
+            activate_with_slope(self.layers.activation, here[0], bias, left.slope[layer]);
+            self.normalize_after(layer, here[0], || left.norm[layer]);
+        }
+        dots(
+            left.x[last - 1],
+            self.output_rows(&mut work.output),
+            self.bias(last),
+            out,
+            self.layers.shape(last).0,
+        );
+    }
+
+    /// Adds the bias of a layer that has a norm before its activation, and normalizes. Gives what
+    /// is to be added before the activation.
+    fn normalize<'b>(
+        &self,
+        layer: usize,
+        x: &mut [f32],
+        keep: impl FnOnce() -> &'b mut [f32],
+    ) -> &'a [f32] {
+        let bias = self.bias(layer);
+        match self.norm(layer) {
+            Some([scale, shift]) if !self.layers.norm_after => {
+                normalize(x, Some(bias), scale, self.layers.epsilon(), keep());
+                shift
+            }
+            _ => bias,
+        }
+    }
+
+    /// Normalizes what follows the activation of a layer that has a norm there.
+    fn normalize_after<'b>(
+        &self,
+        layer: usize,
+        x: &mut [f32],
+        keep: impl FnOnce() -> &'b mut [f32],
+    ) {
+        if let Some([scale, shift]) = self.norm(layer).filter(|_| self.layers.norm_after) {
+            normalize(x, None, scale, self.layers.epsilon(), keep());
+            shift_rows(x, shift);
+        }
+    }
+
+    /// Turns the slopes of a tile into the gradients δ before each activation and norm, given that
+    /// of the output.
+    pub fn backward(
+        &self,
+        output_gradient: &[f32],
+        left: &mut Activations<'_>,
+        work: &mut Workspace,
+    ) {
+        let last = self.last();
+        let Activations { slope, norm, .. } = left;
+        let after = self.layers.norm_after;
+        let mut through_norm = |layer: usize, here: bool, delta: &mut [f32]| {
+            if let Some([scale, _]) = self.norm(layer).filter(|_| here) {
+                normalize_backward(delta, scale, norm[layer]);
+            }
+        };
+        let output = self.output_rows(&mut work.output);
+        let (top, width) = (&mut *slope[last - 1], self.layers.shape(last).0);
+        if self.layers.norm && after {
+            let temporary = work.pair[0].sized(top.len());
+            temporary.fill(1.0);
+            scale_by_combination(temporary, output_gradient, output, width);
+            through_norm(last - 1, true, temporary);
+            multiply(top, temporary);
+        } else {
+            scale_by_combination(top, output_gradient, output, width);
+            through_norm(last - 1, true, top);
+        }
+        for layer in (1..last).rev() {
+            let (inputs, width) = self.layers.shape(layer);
+            let (below, above) = slope.split_at_mut(layer);
+            let (below, above) = (&mut *below[layer - 1], &*above[0]);
+            let temporary = work.pair[0].sized(below.len());
+            product_transposed(above, self.kernel(layer), temporary, inputs, width);
+            through_norm(layer - 1, after, temporary);
+            multiply(below, temporary);
+            through_norm(layer - 1, !after, below);
+        }
+    }
+
+    /// After `backward`: the gradient of the inputs `from .. from + count`, `rows × count`.
+    pub fn input_gradient(&self, first: &[f32], (from, count): (usize, usize), out: &mut [f32]) {
+        match count {
+            // A library's product is slow at few columns.
+            0..=NARROW => dots(
+                first,
+                self.first_kernel(from, count),
+                &[0.0; NARROW][..count],
+                out,
+                self.width(),
+            ),
+            _ => {
+                product_transposed(first, self.first_kernel(from, count), out, count, self.width())
+            }
+        }
+    }
+}
+
+/// Rows `from .. from + count` (or fewer, at the end) of a matrix with `width` columns.
+pub(crate) fn rows_of(matrix: &[f32], from: usize, count: usize, width: usize) -> &[f32] {
+    let end = ((from + count) * width).min(matrix.len());
+    &matrix[from * width..end]
+}

@@ -1,0 +1,172 @@
+//! What a forward pass leaves behind for its backward pass, and the weights' gradient made of it.
+
+use crate::layers::flat::{LayerMut, Layers, TILE};
+use crate::layers::workspace::Activations;
+use quad_kernels::Buffer;
+use quad_kernels::activation::column_sums;
+use quad_kernels::norm::kept;
+use quad_kernels::product::outer_rows;
+use rayon::prelude::*;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Activations of all hidden layers of all members, and their slopes, each `members × rows ×
+/// width`; on the backward pass the gradients before the activations take the slopes' place.
+#[derive(Default)]
+pub(crate) struct SavedActivations {
+    x: Vec<Buffer>,
+    slope: Vec<Buffer>,
+    /// What norms keep, tile after tile as if each were full; none without a norm.
+    norm: Vec<Buffer>,
+    widths: Vec<usize>,
+    members: usize,
+    rows: usize,
+}
+
+/// A tile of some rows of one member.
+pub(crate) struct Tile<'a> {
+    pub member: usize,
+    /// Place among the member's tiles.
+    pub index: usize,
+    pub activations: Activations<'a>,
+    /// `rows × outputs`.
+    pub out: &'a mut [f32],
+}
+
+impl SavedActivations {
+    /// Makes room.
+    pub fn resize(&mut self, layers: &Layers, rows: usize) {
+        (self.widths, self.members, self.rows) = (layers.hidden().to_vec(), layers.members, rows);
+        self.x.resize_with(self.widths.len(), Buffer::default);
+        self.slope.resize_with(self.widths.len(), Buffer::default);
+        self.norm.resize_with(if layers.norm { self.widths.len() } else { 0 }, Buffer::default);
+    }
+
+    /// Cuts everything into tiles, beside `out`, which is `members × rows × outputs`.
+    pub fn tiles<'a>(&'a mut self, out: &'a mut [f32]) -> Vec<Tile<'a>> {
+        let (members, rows) = (self.members, self.rows);
+        let cut = |all: &'a mut [f32]| {
+            let width = all.len() / (members * rows);
+            all.chunks_mut(rows * width).flat_map(move |member| member.chunks_mut(TILE * width))
+        };
+        let each_member = rows.div_ceil(TILE);
+        let tile = |(i, out)| {
+            let activations = Activations { x: Vec::new(), slope: Vec::new(), norm: Vec::new() };
+            Tile { member: i / each_member, index: i % each_member, activations, out }
+        };
+        let mut tiles: Vec<_> = cut(out).enumerate().map(tile).collect();
+        for ((x, slope), width) in self.x.iter_mut().zip(&mut self.slope).zip(&self.widths) {
+            let len = members * rows * width;
+            for ((tile, x), slope) in
+                tiles.iter_mut().zip(cut(x.sized(len))).zip(cut(slope.sized(len)))
+            {
+                tile.activations.x.push(x);
+                tile.activations.slope.push(slope);
+            }
+        }
+        for (layer, (norm, width)) in self.norm.iter_mut().zip(&self.widths).enumerate() {
+            let full = kept(TILE, *width);
+            for (tile, norm) in tiles
+                .iter_mut()
+                .zip(norm.sized(members * each_member * full).chunks_exact_mut(full))
+            {
+                let rows = tile.activations.x[layer].len() / width;
+                tile.activations.norm.push(&mut norm[..kept(rows, *width)]);
+            }
+        }
+        tiles
+    }
+
+    fn of_member<'a>(&self, buffer: &'a Buffer, layer: usize, member: usize) -> &'a [f32] {
+        let len = self.rows * self.widths[layer];
+        &buffer.first(self.members * len)[member * len..][..len]
+    }
+
+    /// The gradient before a member's first activation, `rows × width`, after the backward pass.
+    pub fn first_delta(&self, member: usize) -> &[f32] {
+        self.of_member(&self.slope[0], 0, member)
+    }
+
+    /// After the backward pass: the gradients of these layers. `input` is `rows × inputs`,
+    /// `output_gradient` `members × rows × outputs`.
+    pub fn weight_gradients(
+        &self,
+        layers: Vec<LayerMut<'_>>,
+        input: &[f32],
+        output_gradient: &[f32],
+    ) {
+        layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias, norm }| {
+            let x = match layer {
+                0 => input,
+                _ => self.of_member(&self.x[layer - 1], layer - 1, member),
+            };
+            let columns = bias.len();
+            let gradient = match self.slope.get(layer) {
+                Some(delta) => self.of_member(delta, layer, member),
+                None => &output_gradient[member * self.rows * columns..][..self.rows * columns],
+            };
+            let inputs = kernel.len() / columns;
+            // One network alone would leave threads idle.
+            let rows = if self.members == 1 { inputs.min(TILE) } else { inputs };
+            kernel.par_chunks_mut(rows * columns).enumerate().for_each(|(i, kernel)| {
+                outer_rows(x, gradient, kernel, (i * rows, inputs), columns);
+            });
+            column_sums(gradient, bias);
+            for (i, out) in norm.into_iter().flatten().enumerate() {
+                self.add_up_norms(layer, member, i, out);
+            }
+        });
+    }
+
+    /// The gradient of a norm's scales (0) or shifts (1), of which each tile has a part.
+    fn add_up_norms(&self, layer: usize, member: usize, which: usize, out: &mut [f32]) {
+        let (tiles, full, width) = (self.rows.div_ceil(TILE), kept(TILE, out.len()), out.len());
+        let kept = self.norm[layer].first(self.members * tiles * full);
+        out.fill(0.0);
+        for tile in kept[member * tiles * full..][..tiles * full].chunks_exact(full) {
+            out.iter_mut().zip(&tile[which * width..]).for_each(|(sum, x)| *sum += x);
+        }
+    }
+}
+
+/// Memory that is used again: fresh memory of such sizes would cost as much as the arithmetic.
+pub(crate) struct Pool<T>(Arc<Mutex<Vec<T>>>);
+
+impl<T> Default for Pool<T> {
+    fn default() -> Self {
+        Self(Arc::default())
+    }
+}
+
+impl<T> Clone for Pool<T> {
+    fn clone(&self) -> Self {
+        Self(self.0.clone())
+    }
+}
+
+impl<T: Default> Pool<T> {
+    /// One that is lent until it is dropped.
+    pub fn lend(&self) -> Lent<T> {
+        let lent = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
+        Lent { lent: Mutex::new(lent), home: self.clone() }
+    }
+}
+
+/// What a pool has lent.
+pub(crate) struct Lent<T: Default> {
+    lent: Mutex<T>,
+    home: Pool<T>,
+}
+
+impl<T: Default> Lent<T> {
+    /// Access to it, of one at a time.
+    pub fn lock(&self) -> MutexGuard<'_, T> {
+        self.lent.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<T: Default> Drop for Lent<T> {
+    fn drop(&mut self) {
+        let lent = std::mem::take(self.lent.get_mut().unwrap_or_else(PoisonError::into_inner));
+        self.home.0.lock().unwrap_or_else(PoisonError::into_inner).push(lent);
+    }
+}

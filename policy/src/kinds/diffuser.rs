@@ -1,0 +1,280 @@
+//! The planner: it denoises windows of actions and states that begin with the state that it is in,
+//! pulls them toward large returns on the way, and takes the first actions of the one that its
+//! value network likes best (Janner et al. 2022, Algorithm 1).
+
+use crate::error::{PolicyError, check_numbers, check_range};
+use crate::kinds::planning::{CHUNK, Planning};
+use crate::policy::{Policy, Sampled};
+use crate::sampling::choice::{Choice, Rule};
+use crate::sampling::episode::EpisodeState;
+use quad_kernels::scaling::Scaling;
+use quad_nn::{
+    MAX_DIM, Precision, Tensors, TrajectoryConfig, TrajectoryError, TrajectoryModel,
+    TrajectoryValue, Weighted, Weights, bytes,
+};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// Most denoising steps that are believed, and most steps of guidance in each.
+const MOST_STEPS: usize = 1000;
+/// Before the names of the networks' tensors.
+pub(crate) const MODEL: &str = "model.";
+pub(crate) const VALUE: &str = "value.";
+
+/// What a planner is beside its weights.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DiffuserShape {
+    /// Numbers in an observation s.
+    pub observation_dim: usize,
+    /// Numbers in an action a.
+    pub action_dim: usize,
+    /// Both networks.
+    pub network: TrajectoryConfig,
+    /// Denoising steps T.
+    pub diffusion_steps: usize,
+    /// How plans are pulled toward large returns.
+    pub guidance: ValueGuidance,
+    /// Steps of an episode that are taken by one plan, from 1 to the horizon.
+    pub replan_every: usize,
+    /// The units in which the networks see observations and actions, beside those of the file's own
+    /// scaling.
+    pub units: Scaling,
+}
+
+/// How plans are pulled toward large returns.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ValueGuidance {
+    /// Steps along the value's gradient in each denoising step.
+    pub steps: usize,
+    /// What the gradient is multiplied by, beside the variance of the denoising step.
+    pub scale: f32,
+    /// The last denoising steps, so many, have none.
+    pub stop: usize,
+}
+
+impl DiffuserShape {
+    /// Numbers of a step in a window: [action, state].
+    pub fn width(&self) -> usize {
+        self.action_dim + self.observation_dim
+    }
+
+    fn check(&self) -> Result<(), PolicyError> {
+        check_range("observation_dim", self.observation_dim, MAX_DIM)?;
+        check_range("action_dim", self.action_dim, MAX_DIM)?;
+        self.network
+            .check()
+            .map_err(|TrajectoryError { field, value, .. }| PolicyError::Range { field, value })?;
+        check_range("diffusion_steps", self.diffusion_steps, MOST_STEPS)?;
+        check_range("guidance.steps", self.guidance.steps, MOST_STEPS)?;
+        check_range("replan_every", self.replan_every, self.network.horizon)
+    }
+
+    /// Numbers that are kept of a window while a gradient is taken: those of the networks' layers,
+    /// some of them unfolded, with their gradients.
+    fn numbers(&self) -> u128 {
+        let TrajectoryConfig { horizon, attention, .. } = &self.network;
+        let levels = self.network.lengths().into_iter().zip(self.network.widths());
+        let of_blocks =
+            levels.map(|(steps, wide)| 100 * steps * wide.max(self.width())).sum::<usize>();
+        let inner = attention.map_or(0, |of| of.heads * of.width * (16 * horizon + 4 * of.width));
+        (of_blocks + inner * 2 * self.network.multipliers.len()) as u128
+    }
+}
+
+/// A planner, in its networks' units.
+pub struct DiffuserPolicy {
+    shape: DiffuserShape,
+    choice: Choice,
+    /// Shared with those that choose in another way.
+    planning: Arc<Planning>,
+}
+
+impl DiffuserPolicy {
+    /// The tensors of a planner of these networks, as they are named in a file.
+    pub fn tensors(
+        model: &TrajectoryModel,
+        value: &TrajectoryValue,
+    ) -> candle_core::Result<Tensors> {
+        let mut tensors = model.weights().tensors(MODEL)?;
+        tensors.extend(value.weights().tensors(VALUE)?);
+        Ok(tensors)
+    }
+
+    pub(crate) fn load(
+        shape: DiffuserShape,
+        choice: Choice,
+        tensors: &mut Tensors,
+    ) -> Result<Self, PolicyError> {
+        shape.check()?;
+        let (config, width) = (&shape.network, shape.width());
+        let model = Weights::take(TrajectoryModel::layout(config, width), tensors, MODEL)?;
+        let value = Weights::take(TrajectoryValue::layout(config, width), tensors, VALUE)?;
+        let (model, value) = (
+            TrajectoryModel::new(config.clone(), model),
+            TrajectoryValue::new(config.clone(), value),
+        );
+        let planning = Arc::new(Planning::new(shape.clone(), model, value));
+        Self { shape, choice, planning }.choosing(choice)
+    }
+
+    /// Makes a policy of the same networks that chooses by `choice`.
+    fn choosing(&self, choice: Choice) -> Result<Self, PolicyError> {
+        choice.check()?;
+        match choice.rule {
+            Rule::Nearest => Err(PolicyError::NoValue),
+            _ => Ok(Self { shape: self.shape.clone(), choice, planning: self.planning.clone() }),
+        }
+    }
+
+    /// Plans in states with these observations. Gives the first actions of all plans, `states ×
+    /// plans × replan_every · action_dim`, and their values, `states × plans`.
+    fn plan(
+        &self,
+        observations: &[f32],
+        states: &mut [&mut EpisodeState],
+    ) -> Result<(Vec<f32>, Vec<f32>), PolicyError> {
+        let (n, steps) = (states.len(), self.shape.diffusion_steps);
+        let row = self.choice.candidates as usize * self.shape.network.horizon * self.shape.width();
+        let mut noise = vec![0.0; steps * n * row];
+        for (i, state) in states.iter_mut().enumerate() {
+            for step in 0..steps {
+                state.fill_normal(&mut noise[(step * n + i) * row..][..row]);
+            }
+        }
+        let planned = self.planning.plan(observations, &noise)?;
+        check_numbers("an action of a plan", &planned.0)?;
+        check_numbers("the value of a plan", &planned.1)?;
+        Ok(planned)
+    }
+
+    /// Numbers of the actions that are taken of a plan.
+    fn taken(&self) -> usize {
+        self.shape.replan_every * self.shape.action_dim
+    }
+}
+
+/// The states that have no plan, with their observations side by side.
+fn without_plan<'a>(
+    observations: &[f32],
+    states: &'a mut [EpisodeState],
+) -> (Vec<f32>, Vec<&'a mut EpisodeState>) {
+    let each = observations.chunks_exact(observations.len() / states.len());
+    let lacking = each.zip(states).filter(|(_, state)| state.memory.is_empty());
+    let (observations, states): (Vec<&[f32]>, _) = lacking.unzip();
+    (observations.concat(), states)
+}
+
+/// The value of the plan that a state has, and the action that comes next in it, which is then
+/// done.
+fn next_of_plan(state: &mut EpisodeState, action_dim: usize) -> (f32, Vec<f32>) {
+    let value = state.memory[0];
+    let action = state.memory.drain(1..=action_dim).collect();
+    if state.memory.len() == 1 {
+        state.memory.clear();
+    }
+    (value, action)
+}
+
+impl Policy for DiffuserPolicy {
+    fn observation_dim(&self) -> usize {
+        self.shape.observation_dim
+    }
+
+    fn action_dim(&self) -> usize {
+        self.shape.action_dim
+    }
+
+    fn precision(&self) -> Precision {
+        Precision::F32
+    }
+
+    fn choice(&self) -> Option<Choice> {
+        Some(self.choice)
+    }
+
+    fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
+        Ok(Box::new(self.choosing(choice)?))
+    }
+
+    fn memory(&self, states: usize) -> u64 {
+        let rows = states as u128 * u128::from(self.choice.candidates);
+        let window = (self.shape.network.horizon * self.shape.width()) as u128;
+        let drawn =
+            rows * (window * self.shape.diffusion_steps as u128 + 2 * self.taken() as u128 + 2);
+        let observations = 2 * (states * self.shape.observation_dim) as u128;
+        bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape.numbers())
+    }
+
+    fn noise(&self) -> Vec<usize> {
+        let plans = self.choice.candidates as usize;
+        vec![self.shape.diffusion_steps, plans, self.shape.network.horizon, self.shape.width()]
+    }
+
+    /// In a state that has a plan left, its next action; else that of a new plan.
+    fn act(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError> {
+        let (plans, taken) = (self.choice.candidates as usize, self.taken());
+        let (lacking, mut planning) = without_plan(observations, states);
+        if !planning.is_empty() {
+            let (planned, values) = self.plan(&lacking, &mut planning)?;
+            let of_each = planned.chunks_exact(plans * taken).zip(values.chunks_exact(plans));
+            for (state, (planned, values)) in planning.into_iter().zip(of_each) {
+                let chosen = self.choice.pick(values, state)?;
+                // The value, then the actions: of one plan, or the mean of some.
+                let number = |of: &dyn Fn(usize) -> f32| {
+                    chosen.iter().map(|plan| of(*plan)).sum::<f32>() / chosen.len() as f32
+                };
+                state.memory.push(number(&|plan| values[plan]));
+                state.memory.extend((0..taken).map(|i| number(&|plan| planned[plan * taken + i])));
+            }
+        }
+        for (action, state) in actions.chunks_exact_mut(self.shape.action_dim).zip(states) {
+            action.copy_from_slice(&next_of_plan(state, action.len()).1);
+        }
+        Ok(())
+    }
+
+    /// In a state that has a plan left, as often as there are plans its next action and the plan's
+    /// value; else the first action and the value of each new plan.
+    fn sample(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+    ) -> Result<Sampled, PolicyError> {
+        let (plans, action_dim) = (self.choice.candidates as usize, self.shape.action_dim);
+        let (lacking, mut planning) = without_plan(observations, states);
+        let (planned, drawn) = match planning.is_empty() {
+            true => (Vec::new(), Vec::new()),
+            false => self.plan(&lacking, &mut planning)?,
+        };
+        let mut new = planned.chunks_exact(plans * self.taken()).zip(drawn.chunks_exact(plans));
+        let mut sampled = Sampled { actions: Vec::new(), values: Vec::new() };
+        for state in states {
+            // Both of states without a plan, in their order, and of the others.
+            match if state.memory.is_empty() { new.next() } else { None } {
+                Some((planned, values)) => {
+                    let firsts =
+                        planned.chunks_exact(self.taken()).flat_map(|plan| &plan[..action_dim]);
+                    sampled.actions.extend(firsts);
+                    sampled.values.extend_from_slice(values);
+                }
+                None => {
+                    let (value, action) = next_of_plan(state, action_dim);
+                    sampled.actions.extend(action.repeat(plans));
+                    sampled.values.extend(std::iter::repeat_n(value, plans));
+                }
+            }
+        }
+        Ok(sampled)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests;

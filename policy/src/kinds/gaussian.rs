@@ -1,0 +1,103 @@
+//! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is
+//! sampled.
+
+use crate::error::{PolicyError, check_numbers, check_range};
+use crate::policy::Policy;
+use crate::sampling::episode::EpisodeState;
+use candle_core::{Device, Result, Tensor};
+use quad_nn::{
+    Ensemble, EnsembleShape, MAX_DIM, MlpConfig, Precision, Tensors, Weighted, bytes, read,
+};
+use serde::{Deserialize, Serialize};
+
+/// Before the names of the network's tensors.
+const ACTOR: &str = "actor.";
+
+/// The shape of a Gaussian policy's network.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GaussianShape {
+    /// Numbers in an observation s.
+    pub observation_dim: usize,
+    /// Numbers in an action a.
+    pub action_dim: usize,
+    /// Its hidden layers.
+    pub actor: MlpConfig,
+}
+
+impl GaussianShape {
+    /// Shape of the network whose tanh is the mean.
+    pub fn actor(&self) -> EnsembleShape {
+        let Self { observation_dim, action_dim, .. } = *self;
+        let layers = self.actor.clone();
+        EnsembleShape { members: 1, observation_dim, action_dim: 0, layers, outputs: action_dim }
+    }
+}
+
+/// A policy that does what its network says.
+pub struct GaussianPolicy {
+    shape: GaussianShape,
+    actor: Ensemble,
+}
+
+/// The mean of the policy with this network: `observations [n, o]` → `[n, a]`, each number in (-1,
+/// 1).
+pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> {
+    actor.state_outputs(observations)?.squeeze(0)?.tanh()
+}
+
+impl GaussianPolicy {
+    /// The tensors of a policy with this network, as they are named in a file.
+    pub fn tensors(actor: &Ensemble) -> Result<Tensors> {
+        actor.weights().tensors(ACTOR)
+    }
+
+    pub(crate) fn load(
+        shape: GaussianShape,
+        tensors: &mut Tensors,
+    ) -> std::result::Result<Self, PolicyError> {
+        check_range("observation_dim", shape.observation_dim, MAX_DIM)?;
+        check_range("action_dim", shape.action_dim, MAX_DIM)?;
+        let actor = Ensemble::take(shape.actor(), tensors, ACTOR, Precision::F32)?;
+        Ok(Self { shape, actor })
+    }
+}
+
+impl Policy for GaussianPolicy {
+    fn observation_dim(&self) -> usize {
+        self.shape.observation_dim
+    }
+
+    fn action_dim(&self) -> usize {
+        self.shape.action_dim
+    }
+
+    fn precision(&self) -> Precision {
+        Precision::F32
+    }
+
+    fn memory(&self, states: usize) -> u64 {
+        let GaussianShape { observation_dim, action_dim, .. } = self.shape;
+        let states = states as u128;
+        bytes(
+            self.shape.actor().memory(states, 1)
+                + states * (observation_dim + 2 * action_dim) as u128,
+        )
+    }
+
+    fn act(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> std::result::Result<(), PolicyError> {
+        let observations = Tensor::from_slice(
+            observations,
+            (states.len(), self.shape.observation_dim),
+            &Device::Cpu,
+        )?;
+        let means = gaussian_mean(&self.actor, &observations)?;
+        read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
+        check_numbers("an action", actions)
+    }
+}

@@ -1,0 +1,10 @@
+//! Kinds of policy, one file each.
+
+pub(crate) mod actor_critic;
+pub(crate) mod diffuser;
+pub(crate) mod diffusion;
+pub(crate) mod gaussian;
+pub(crate) mod one_step;
+pub(crate) mod planning;
+pub(crate) mod score;
+pub(crate) mod squashed;
