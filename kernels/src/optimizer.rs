@@ -82,9 +82,10 @@ pub fn norm(x: &[f32]) -> f32 {
     squares.iter().map(|x| f64::from(*x)).sum::<f64>().sqrt() as f32
 }
 
-/// Adam's step number `count` along a gradient g that is first multiplied by `scale`: m = β1·m + (1
-/// - β1)·g, v = β2·v + (1 - β2)·g², p -= rate · m/(1 - β1^count) / (√(v/(1 - β2^count)) + ε) +
-/// rate·decay·p.
+/// Adam's step number `count` along the gradient g = `scale`·`gradient`:
+///
+/// m = β1·m + (1 − β1)·g, v = β2·v + (1 − β2)·g²,
+/// p = p − rate·m/(1 − β1^count) / (√(v/(1 − β2^count)) + ε) − rate·decay·p.
 pub fn adam(
     parameters: &mut [f32],
     (first, second): (&mut [f32], &mut [f32]),
