@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# How fast this machine trains and evaluates, beside its own peaks and beside JAX, and each kernel beside a library's:
-# prints the tables of docs/performance.md and kernels/benches/README.md.
+# Benchmarks training and evaluation on this machine against its peak rates and JAX, and each kernel against a library's.
+# Prints the tables of docs/performance.md and kernels/benches/README.md.
 #
-#   deploy/bench.sh [ROUNDS]              five rounds if not said otherwise, of two or three minutes each; on an idle machine
+#   deploy/bench.sh [ROUNDS]              [default: 5] rounds of two or three minutes each, on an idle machine
 #   deploy/bench.sh ROUNDS algorithms     only the gradient steps of all algorithms
 #
-# QUAD_INSTRUCTIONS=avx2 keeps all of them but JAX's products to what a CPU without AVX-512 has.
+# QUAD_INSTRUCTIONS=avx2 disables AVX-512 in everything but JAX's products.
 # Criterion's own reports are in target/criterion afterwards, every figure in target/bench.json.
 set -euo pipefail
 cd "$(dirname "$0")/.."

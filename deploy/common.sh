@@ -1,5 +1,4 @@
-# What the scripts of this folder share; to be sourced from the repository's folder. A script
-# that does so answers --help.
+# Shared by the scripts of this folder, which source it from the repository's folder. It also answers --help.
 # shellcheck shell=bash
 
 DEPS=$PWD/.deps

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds the learner for an Nvidia GPU: target/release/learner, which then knows `learner train --device cuda`.
+# Builds target/release/learner with support for Nvidia GPUs (`learner train --device cuda`).
 #
 #   deploy/cuda.sh                 cargo build --release --locked -p quad-learner --features cuda
 #   deploy/cuda.sh COMMAND ...     another cargo command in the same environment, e.g.
@@ -14,7 +14,7 @@ cd "$(dirname "$0")/.."
 TOOLKIT=$DEPS/cuda
 
 fetch_toolkit() {
-  # The copy is made last: where it equals what is wanted, all of it is in place.
+  # The copy is made last, so an equal copy means a complete installation.
   ! cmp -s deploy/cuda.txt "$TOOLKIT/cuda.txt" || return 0
   [ "$(uname -m)" = x86_64 ] ||
     die "deploy/cuda.txt has wheels for x86_64 only" "install Nvidia's CUDA toolkit and put its nvcc on PATH"
@@ -36,8 +36,8 @@ fetch_toolkit() {
   mv "$fetched" "$TOOLKIT"
 }
 
-# The driver's library comes with the driver, so it is missing where there is no GPU. To link against, a stand-in does, all
-# of whose functions say CUDA_ERROR_STUB_LIBRARY. The learner looks for the real one whenever it starts.
+# Without a GPU there is no driver library to link against, so the build links a stub whose functions all return
+# CUDA_ERROR_STUB_LIBRARY. The learner loads the real library when it starts.
 link_driver() {
   local driver stand_in=$TOOLKIT/lib/stubs/libcuda.so
   driver=$(PATH=$PATH:/sbin ldconfig -p | awk '$1 == "libcuda.so.1" { print $NF; exit }')

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh.
 #
-# Sets up what is missing, builds, records the dataset if it is not there, trains, and ends with the run's table, its learning
-# curve, where OpenGL is installed a film of its best snapshot, and a report of all that as one HTML file. Run again, it skips what is done: a run that was interrupted
-# continues where it was. Ctrl-C stops everything.
+# Installs what is missing, builds, records the dataset, trains, and ends with the run's table, learning curve, a film of its
+# best snapshot (where OpenGL is installed) and an HTML report. Run again, it skips finished steps and resumes an interrupted
+# run. Ctrl-C stops everything.
 #
-#   deploy/demo.sh [--fresh]        --fresh: begin another run; the one that is there is kept under another name
+#   deploy/demo.sh [--fresh]        --fresh: start a new run, and keep the old one under another name
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . deploy/common.sh
@@ -43,7 +43,7 @@ if [ "$status" -ne 0 ]; then
   exit "$status"
 fi
 touch "$RUN/complete"
-# A machine that draws no pictures lacks packages, which the evaluator names.
+# Rendering needs packages, which the evaluator names.
 if told=$($BIN/evaluator film "$RUN" --out "$RUN/film.gif" 2>&1); then
   echo "$told"
 elif install=$(grep -o 'apt-get install .*egl.*' <<<"$told"); then
@@ -51,5 +51,5 @@ elif install=$(grep -o 'apt-get install .*egl.*' <<<"$told"); then
 else
   echo "$told" >&2
 fi
-# All of it in one file, for a browser.
+# One HTML file with all results.
 $BIN/learner report "$RUN" --html "$RUN/report.html" >/dev/null

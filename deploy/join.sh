@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Makes this machine an evaluator: sets up what is missing, builds, and serves the learners that it finds at ENDPOINT.
+# Makes this machine an evaluator: installs what is missing, builds, and serves the learners at ENDPOINT.
 #
 #   deploy/join.sh ENDPOINT [CERTIFICATES]    e.g.  deploy/join.sh tcp/192.0.2.10:7447
 #                                                   deploy/join.sh tls/192.0.2.10:7447 ~/box7
 #
-# ENDPOINT is where a learner listens (`learner train --listen`) or its router. CERTIFICATES is the folder that was made for
-# this machine by deploy/zenoh/certificates.sh [default: QUAD_CERTIFICATES, or none]. Ctrl-C leaves; no scores get lost.
+# ENDPOINT is the address of a learner (`learner train --listen`) or of its router. CERTIFICATES is the folder that
+# deploy/zenoh/certificates.sh made for this machine [default: QUAD_CERTIFICATES, or none]. Ctrl-C stops; no score is lost.
 set -euo pipefail
 CERTIFICATES=${2:-${QUAD_CERTIFICATES:-}}
 if [ -n "$CERTIFICATES" ]; then
-  # As the caller sees it.
+  # Relative to the caller's folder.
   QUAD_CERTIFICATES=$(realpath -- "$CERTIFICATES")
   export QUAD_CERTIFICATES
 fi

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""How far `learner judge` can be relied on: trains five algorithms on each file, judges them, and compares with true scores.
+"""Measures how reliable `learner judge` is: trains five algorithms on each file, judges them, and compares with true scores.
 
     python3 deploy/judged.py [--seeds 0 1 2] [--programs target/release] FILE...
 

@@ -1,5 +1,5 @@
-"""Prints the licenses of all that is compiled into the programs and the Python module, each text once; to be run in the
-repository's folder. Where a package carries no text, it prints which license its manifest names."""
+"""Prints the licenses of everything compiled into the programs and the Python module, each text once. Run it in the
+repository's folder. For a package without a license text it prints the license that its manifest names."""
 
 import json
 import pathlib
@@ -9,12 +9,12 @@ import subprocess
 COMMAND = "metadata --format-version 1 --locked --filter-platform x86_64-unknown-linux-gnu --features"
 FEATURES = "quad-learner/static,quad-evaluator/static,quad-python/static"
 PROGRAMS = {"quad-learner", "quad-evaluator", "quad-python"}
-# C that a crate compiles, with the license of its own.
+# C sources that a crate compiles, under their own licenses.
 WITHIN = {"hdf5-metno-src": ["ext/hdf5/LICENSE"], "libz-sys": ["src/zlib/LICENSE"]}
 
 
 def linked(metadata):
-    """The packages that the programs are linked with; not what only builds them."""
+    """The packages linked into the programs, without build dependencies."""
     nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
     packages = {package["id"]: package for package in metadata["packages"]}
     found, todo = set(), [key for key, package in packages.items() if package["name"] in PROGRAMS]

@@ -8,7 +8,7 @@ TOOLS=$DEPS/wheel
 STAGE=$DEPS/portable
 
 fetch_tools() {
-  # The copy is made last: where it equals what is wanted, all of it is in place.
+  # The copy is made last, so an equal copy means a complete installation.
   ! cmp -s deploy/wheel.txt "$TOOLS/wheel.txt" || return 0
   say "installing the tools of deploy/wheel.txt in .deps/wheel, some 0.5 GB"
   rm -rf "$TOOLS"
@@ -26,7 +26,7 @@ fetch_tools() {
   cp deploy/wheel.txt "$TOOLS"
 }
 
-# A target folder of its own: cargo compiles anew for another linker.
+# A separate target folder: another linker makes cargo compile everything again.
 set_environment() {
   export PATH="$TOOLS/bin:$PATH" CARGO_TARGET_DIR=$PWD/target/portable
   export CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_LINKER=$TOOLS/bin/zig-cc CC=$TOOLS/bin/zig-cc CXX=$TOOLS/bin/zig-c++

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# For the person who makes a release: runs the commands that README.md and docs/ name, each as the first one on a fresh machine. That is a
-# clean clone of HEAD in a container of rust:1.95-bookworm: what is not committed is not there, nor any package or crate.
+# Release check: runs every command that README.md and docs/ name, each as the first one on a fresh machine. That is a clean
+# clone of HEAD in a container of rust:1.95-bookworm, without uncommitted files, packages or crates.
 #
 #   deploy/release-check.sh [NAME ...]      all of NAMES below, in turn, or those
 #
@@ -15,7 +15,7 @@ cd "$(dirname "$0")/.."
 
 IMAGE=rust:1.95-bookworm
 VOLUME=quad-release-check
-# In this order each kind of build is first made after the smallest setup.
+# In this order, each kind of build first runs after the smallest setup.
 NAMES=(wheel tarball test-python build develop install-learner install-evaluator join certificates demo results bench test cuda)
 LOGS=$DEPS/release-check
 

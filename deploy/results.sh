@@ -1,17 +1,16 @@
 #!/usr/bin/env bash
-# What the algorithms learn in the demonstration's setting from some files: trains each on each, scores their last five
-# snapshots on the same episodes, and prints one table (Markdown) of all that was ever trained this way.
+# Trains algorithms on datasets in the demonstration's setting, scores the last five snapshots of each run on the same
+# episodes, and prints one Markdown table of all runs under runs/results.
 #
 #   deploy/results.sh [--seeds "0 1 2"] [--methods "bc quad iql"] [--candidates 1,10] FILE...
 #
 #   deploy/results.sh data/hopper-demo.hdf5          the demonstration's own file, which is recorded if it is not there
 #   deploy/results.sh --methods "bc dac quad" --candidates 1,10 walker2d*.hdf5
 #
-# A method is the name of an algorithm, or of one of QUAD's variants: bc (behavior cloning) and dac. With --candidates policies
-# that draw several actions are scored with so many of them, else as their algorithm has it.
+# A method is the name of an algorithm, or of one of QUAD's variants: bc (behavior cloning) and dac. --candidates sets how
+# many actions a policy that draws several draws; the default is the algorithm's.
 # A file's name begins with its environment: hopper, halfcheetah, walker2d, antmaze_umaze or antmaze_medium. Runs go to
-# runs/results. What is done already is skipped, so it can be interrupted and run in pieces. One run per core at a time,
-# each on one thread.
+# runs/results. Finished runs are skipped, so the script can be interrupted. One run per core at a time, each on one thread.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . deploy/common.sh

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Puts in place what cargo does not: Debian packages, and libmujoco in .deps/mujoco.
+# Installs the dependencies that cargo does not: Debian packages, and libmujoco in .deps/mujoco.
 #
-#   deploy/setup.sh            what building and running needs
-#   deploy/setup.sh --venv     also what makes virtual environments of Python
-#   deploy/setup.sh --tests    also what the tests need: Python packages in .deps/venv, Prometheus in .deps/prometheus
+#   deploy/setup.sh            dependencies of building and running
+#   deploy/setup.sh --venv     also python3-venv
+#   deploy/setup.sh --tests    also the tests' dependencies: Python packages in .deps/venv, Prometheus in .deps/prometheus
 #
-# Installs only what is missing, so that it may be run again at any time. For Debian 12 or newer and Ubuntu 24.04 or newer.
+# Installs only what is missing. For Debian 12 or newer and Ubuntu 24.04 or newer.
 # Packages need root or sudo; everything else goes into .deps, which git ignores.
 set -euo pipefail
 cd "$(dirname "$0")/.."

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Tests the whole system as `docker compose up` runs it, from the images on. All containers are healthy, none is root's, a learner
-# that crashes is started again, and every episode is scored once. Then the same with docker-compose.tls.yml on top: evaluators
-# without a certificate of ours have no part in the run. Half an hour; needs Docker, openssl, and root to give certificates away.
+# Tests the system as `docker compose up` runs it, images included: all containers are healthy and none runs as root, a crashed
+# learner restarts, and every episode is scored once. Then the same with docker-compose.tls.yml, where evaluators without our
+# certificates are refused. Takes half an hour; needs Docker, openssl, and root to change the owner of certificates.
 #
 # Base images come from a registry or, where there is none, from the script that QUAD_STAND_INS names: it makes stand-ins.
 set -euo pipefail

@@ -1,16 +1,16 @@
 #!/usr/bin/env bash
-# Sets up what is missing, builds and runs every test but the long ones (CONTRIBUTING.md). None is skipped for want of a program
-# to compare with; those that need rights (mounts) or recorded files say so where they are skipped. Arguments go to `cargo test`.
+# Installs what is missing, builds, and runs all tests but the long ones (CONTRIBUTING.md). No test is skipped because a peer
+# (Gymnasium, Prometheus, …) is missing; tests that need mounts or recorded files say when they skip. Arguments go to `cargo test`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 deploy/setup.sh --tests
-# Where setup.sh unpacked Prometheus, if the machine has none of its own.
+# setup.sh unpacks Prometheus there if the machine has none.
 export PATH="$PATH:$PWD/.deps/prometheus" QUAD_REQUIRE_PEERS=1
-# Also the programs, which a test of the whole system starts even if it is the only one.
+# Tests of the whole system start the programs.
 cargo build --release --locked --bins
 cargo test --release --locked --workspace --no-run "$@"
-# The disk is to be done with what was built: tests kill programs that wait for it, and say so if it takes too long.
+# Flush the build to disk first, because tests measure how long programs wait for the disk.
 sync
 SECONDS=0
 cargo test --release --locked --workspace "$@"

@@ -9,7 +9,7 @@ cd "$(dirname "$0")/.."
 . deploy/common.sh
 . deploy/portable.sh
 
-# What maturin packs beside the module; git ignores both.
+# maturin packs these folders beside the module; git ignores both.
 DATA=python/quad_rl._quad_rl.data
 LICENSES=python/licenses
 
@@ -20,7 +20,7 @@ cp -r "$STAGE/bin" "$DATA/scripts"
 cp -r "$STAGE/lib" "$DATA/data"
 cp -r "$STAGE/licenses" "$LICENSES"
 say "building the Python module"
-# Its own check knows no libmujoco beside the module; ours is check_glibc.
+# maturin's own check rejects libmujoco beside the module; check_glibc replaces it.
 maturin build --quiet --manifest-path python/Cargo.toml --release --locked --features static \
   --compatibility "manylinux_${GLIBC/./_}" --auditwheel skip --out "$SCRATCH"
 wheel=$(echo "$SCRATCH"/*.whl)

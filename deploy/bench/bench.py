@@ -84,7 +84,7 @@ def results(bench, names):
     before = written()
     subprocess.run([*command, *quick, names], check=True, capture_output=True)
     for estimates, time in written().items():
-        # What has not changed ran before: another benchmark, or one of a name that there is no more.
+        # An unchanged file is from an earlier run: another benchmark, or one that was renamed.
         if before.get(estimates) != time:
             median = json.loads(estimates.read_text())["median"]["point_estimate"] / 1e9
             yield json.loads(estimates.with_name("benchmark.json").read_text()), median

@@ -25,7 +25,7 @@ BIN = Path("target/release")
 EVALUATORS = 4
 # A hundred times as often as the task is evaluated, so that a short run shows some snapshots.
 EVAL_INTERVAL = 200
-# Of a spell, before it counts: evaluators start, or leave.
+# Seconds at the start of a phase that do not count, while evaluators start or leave.
 SETTLE = 3
 TASK = ["--task", "hopper-medium-replay-v2", "--agent", "samples=1"]
 CORES = sorted(os.sched_getaffinity(0))

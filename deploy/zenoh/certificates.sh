@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes the certificates by which routers, learners and evaluators know each other, and the authority that signs them.
+# Makes certificates for routers, learners and evaluators, and the authority that signs them.
 #
 #   deploy/zenoh/certificates.sh [--in DIR] [--days N] ROLE NAME [HOST...]
 #
@@ -7,12 +7,12 @@
 #   deploy/zenoh/certificates.sh learner learner
 #   deploy/zenoh/certificates.sh evaluator box7
 #
-# ROLE is what the certificate entitles to:
+# ROLE decides what the certificate allows:
 #   router     others connect to it, at one of HOST...
 #   learner    publishes weights, answers jobs and scores; with HOST..., evaluators may also connect to it directly
 #   evaluator  claims jobs and delivers scores
 #   monitor    reads, and changes nothing
-# HOST is a name or an address just as endpoints spell it; localhost and 127.0.0.1 are always added.
+# HOST is a name or an address, spelled as in endpoints; localhost and 127.0.0.1 are always added.
 #
 # The result is the folder DIR/NAME with ca.pem, cert.pem and key.pem, for `--certificates` of learner and evaluator: copy
 # it to the machine that it is for. Made again, it is renewed. The authority is DIR/ca, made when it is missing: its key
@@ -31,7 +31,7 @@ DIR=certificates DAYS=365
 while [[ ${1:-} == --* ]]; do
   [ $# -ge 2 ] || wrong "$1 needs a value"
   case $1 in
-    # As the caller sees it.
+    # Relative to the caller's folder.
     --in) case $2 in /*) DIR=$2 ;; *) DIR=$FROM/$2 ;; esac ;;
     --days) DAYS=$2 ;;
     *) wrong "there is no option $1" ;;
@@ -58,7 +58,7 @@ esac
   wrong "the name $WHO is not made of 1 to 64 letters, digits, dots, dashes or underscores"
 [ "$WHO" != ca ] || wrong "the name ca is the authority's"
 [[ $DAYS =~ ^[0-9]{1,5}$ ]] || wrong "--days takes a number of days, not $DAYS"
-DAYS=$((10#$DAYS)) # 089 is no number to a shell
+DAYS=$((10#$DAYS)) # a leading 0 would mean octal
 command -v openssl >/dev/null || die "openssl is not there" "install it: apt-get install --no-install-recommends openssl"
 
 umask 077
@@ -70,14 +70,14 @@ new_key() { # new_key FILE: on the curve that every TLS library has
 }
 
 if [ ! -e "$DIR/ca/key.pem" ] || [ ! -e "$DIR/ca/ca.pem" ]; then
-  # The owners of certificates trust the authority that signed them, and would refuse what another one signs.
+  # A new authority would invalidate every certificate that the old one signed.
   for made in "$DIR"/*/ca.pem "$DIR/ca/key.pem"; do
     [ ! -e "$made" ] || die "$made is there, but not the whole authority: $DIR/ca/ca.pem and $DIR/ca/key.pem" \
       "if they are kept elsewhere, put them back while this runs; for another authority, which no program trusts yet, move $DIR away"
   done
   mkdir -p "$SCRATCH/ca"
   new_key "$SCRATCH/ca/key.pem"
-  # Its name is its own, so that programs can tell one authority from another before they connect.
+  # A unique name, so that programs can tell authorities apart before they connect.
   try "is the disk full?" openssl req -x509 -new -key "$SCRATCH/ca/key.pem" -days 3650 -out "$SCRATCH/ca/ca.pem" \
     -subj "/O=QUAD/CN=QUAD authority $(openssl rand -hex 4)" \
     -addext "basicConstraints=critical,CA:TRUE,pathlen:0" -addext "keyUsage=critical,keyCertSign"
