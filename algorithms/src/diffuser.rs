@@ -262,10 +262,7 @@ impl Algorithm for Diffuser {
         };
         let tensors = DiffuserPolicy::tensors(&self.target_model, &self.target_value)?;
         Ok((
-            PolicyConfig::DiffuserPolicy {
-                shape,
-                choice: Choice::best_of(*self.config.candidates),
-            },
+            PolicyConfig::Diffuser { shape, choice: Choice::best_of(*self.config.candidates) },
             tensors,
         ))
     }

@@ -90,7 +90,7 @@ fn planner(network: TrajectoryConfig, plans: u32) -> Box<dyn Policy> {
         replan_every: 1,
         units: Scaling::default(),
     };
-    loaded(PolicyConfig::DiffuserPolicy { shape, choice: Choice::best_of(plans) })
+    loaded(PolicyConfig::Diffuser { shape, choice: Choice::best_of(plans) })
 }
 
 /// A planner's networks with eight groups.

@@ -126,7 +126,7 @@ pub fn activate(
         Some(Activation::Silu) => 2,
         Some(Activation::Tanh) => 3,
         Some(Activation::Gelu) => 4,
-        None => 4,
+        None => 5,
     };
     let kernels = kernels(stream)?;
     // SAFETY: the kernel writes every number.

@@ -2,10 +2,11 @@
 
 use crate::error::{PolicyError, VERSION};
 use crate::kinds::actor_critic::ActorCriticShape;
-use crate::kinds::diffuser::{self, DiffuserPolicy, DiffuserShape};
+use crate::kinds::diffuser::{self, DiffuserPolicy};
 use crate::kinds::diffusion::{ACTOR, CRITIC, DiffusionPolicy, DiffusionShape, VALUE};
 use crate::kinds::gaussian::{GaussianPolicy, GaussianShape};
 use crate::kinds::one_step::OneStepActor;
+use crate::kinds::planner::DiffuserShape;
 use crate::kinds::score::{FREQUENCIES, ScorePolicy, ScorePolicyShape};
 use crate::kinds::squashed::SquashedActor;
 use crate::policy::Policy;
@@ -68,7 +69,8 @@ pub enum PolicyConfig {
         choice: Choice,
     },
     /// The first actions of one of several plans.
-    DiffuserPolicy {
+    #[serde(rename = "planner")]
+    Diffuser {
         /// What it is beside its weights.
         shape: DiffuserShape,
         /// Which plan it is.
@@ -110,7 +112,7 @@ impl PolicyConfig {
                 let frequencies = Tensor::ones(ScoreShape::FREQUENCIES, DType::F32, &Device::Cpu)?;
                 tensors.insert(FREQUENCIES.to_owned(), frequencies);
             }
-            Self::DiffuserPolicy { shape, .. } => {
+            Self::Diffuser { shape, .. } => {
                 add(diffuser::MODEL, TrajectoryModel::layout(&shape.network, shape.width()))?;
                 add(diffuser::VALUE, TrajectoryValue::layout(&shape.network, shape.width()))?;
             }
@@ -220,7 +222,7 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
         PolicyConfig::Score { shape, choice } => {
             Box::new(ScorePolicy::load(shape, choice, &mut tensors, precision)?)
         }
-        PolicyConfig::DiffuserPolicy { shape, choice } => {
+        PolicyConfig::Diffuser { shape, choice } => {
             let units = shape.units.clone();
             scaled(Box::new(DiffuserPolicy::load(shape, choice, &mut tensors)?), Some(units))?
         }

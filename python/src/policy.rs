@@ -268,7 +268,7 @@ impl PyPolicy {
             PolicyConfig::OneStep { .. } => "one-step",
             PolicyConfig::Gaussian { .. } => "gaussian",
             PolicyConfig::Score { .. } => "score",
-            PolicyConfig::DiffuserPolicy { .. } => "planner",
+            PolicyConfig::Diffuser { .. } => "planner",
         }
     }
 

@@ -6,7 +6,7 @@ use crate::golden::{Golden, check_update, golden_tests, load, table};
 use candle_core::Device;
 use quad_dataset::{Arrays, Transitions};
 use quad_nn::{Precision, Scaling};
-use quad_policy::{Planning, read_tensors};
+use quad_policy::{Planner, read_tensors};
 use std::sync::Arc;
 
 /// Episodes of so many transitions, numbered through; every second terminates.
@@ -60,7 +60,7 @@ fn check_plans(golden: &Golden, diffuser: &Diffuser) {
     let (policy, tensors) = diffuser.policy().unwrap();
     let file = quad_policy::Header::new(policy.clone(), ());
     let mut tensors = read_tensors(&file.to_safetensors(&tensors).unwrap()).unwrap();
-    let PolicyConfig::DiffuserPolicy { shape, choice } = policy else { panic!("{policy:?}") };
+    let PolicyConfig::Diffuser { shape, choice } = policy else { panic!("{policy:?}") };
     assert_eq!(choice, Choice::best_of(golden.count("/agent/candidates") as u32));
     let mut weights =
         |layout: Layout, prefix: &str| Weights::take(layout, &mut tensors, prefix).unwrap();
@@ -73,8 +73,7 @@ fn check_plans(golden: &Golden, diffuser: &Diffuser) {
         network.clone(),
         weights(TrajectoryValue::layout(&network, width), "value."),
     );
-    let planning =
-        Planning::new(DiffuserShape { units: Scaling::default(), ..shape }, model, value);
+    let planning = Planner::new(DiffuserShape { units: Scaling::default(), ..shape }, model, value);
     let numbers =
         |name| golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap();
     let (actions, values) =

@@ -1,94 +1,24 @@
-//! The planner: it denoises windows of actions and states that begin with the state that it is in,
-//! pulls them toward large returns on the way, and takes the first actions of the one that its
-//! value network likes best (Janner et al. 2022, Algorithm 1).
+//! Diffuser's policy: it plans from the current state and executes the first actions of the plan
+//! with the largest value (Janner et al. 2022, Algorithm 1).
 
-use crate::error::{PolicyError, check_numbers, check_range};
-use crate::kinds::planning::{CHUNK, Planning};
+use crate::error::{PolicyError, check_numbers};
+use crate::kinds::planner::{CHUNK, DiffuserShape, Planner};
 use crate::policy::{Policy, Sampled};
 use crate::sampling::choice::{Choice, Rule};
 use crate::sampling::episode::EpisodeState;
-use quad_kernels::scaling::Scaling;
-use quad_nn::{
-    MAX_DIM, Precision, Tensors, TrajectoryConfig, TrajectoryError, TrajectoryModel,
-    TrajectoryValue, Weighted, Weights, bytes,
-};
-use serde::{Deserialize, Serialize};
+use quad_nn::{Precision, Tensors, TrajectoryModel, TrajectoryValue, Weighted, Weights, bytes};
 use std::sync::Arc;
 
-/// Most denoising steps that are believed, and most steps of guidance in each.
-const MOST_STEPS: usize = 1000;
 /// Before the names of the networks' tensors.
 pub(crate) const MODEL: &str = "model.";
 pub(crate) const VALUE: &str = "value.";
-
-/// What a planner is beside its weights.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct DiffuserShape {
-    /// Numbers in an observation s.
-    pub observation_dim: usize,
-    /// Numbers in an action a.
-    pub action_dim: usize,
-    /// Both networks.
-    pub network: TrajectoryConfig,
-    /// Denoising steps T.
-    pub diffusion_steps: usize,
-    /// How plans are pulled toward large returns.
-    pub guidance: ValueGuidance,
-    /// Steps of an episode that are taken by one plan, from 1 to the horizon.
-    pub replan_every: usize,
-    /// The units in which the networks see observations and actions, beside those of the file's own
-    /// scaling.
-    pub units: Scaling,
-}
-
-/// How plans are pulled toward large returns.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ValueGuidance {
-    /// Steps along the value's gradient in each denoising step.
-    pub steps: usize,
-    /// What the gradient is multiplied by, beside the variance of the denoising step.
-    pub scale: f32,
-    /// The last denoising steps, so many, have none.
-    pub stop: usize,
-}
-
-impl DiffuserShape {
-    /// Numbers of a step in a window: [action, state].
-    pub fn width(&self) -> usize {
-        self.action_dim + self.observation_dim
-    }
-
-    fn check(&self) -> Result<(), PolicyError> {
-        check_range("observation_dim", self.observation_dim, MAX_DIM)?;
-        check_range("action_dim", self.action_dim, MAX_DIM)?;
-        self.network
-            .check()
-            .map_err(|TrajectoryError { field, value, .. }| PolicyError::Range { field, value })?;
-        check_range("diffusion_steps", self.diffusion_steps, MOST_STEPS)?;
-        check_range("guidance.steps", self.guidance.steps, MOST_STEPS)?;
-        check_range("replan_every", self.replan_every, self.network.horizon)
-    }
-
-    /// Numbers that are kept of a window while a gradient is taken: those of the networks' layers,
-    /// some of them unfolded, with their gradients.
-    fn numbers(&self) -> u128 {
-        let TrajectoryConfig { horizon, attention, .. } = &self.network;
-        let levels = self.network.lengths().into_iter().zip(self.network.widths());
-        let of_blocks =
-            levels.map(|(steps, wide)| 100 * steps * wide.max(self.width())).sum::<usize>();
-        let inner = attention.map_or(0, |of| of.heads * of.width * (16 * horizon + 4 * of.width));
-        (of_blocks + inner * 2 * self.network.multipliers.len()) as u128
-    }
-}
 
 /// A planner, in its networks' units.
 pub struct DiffuserPolicy {
     shape: DiffuserShape,
     choice: Choice,
     /// Shared with those that choose in another way.
-    planning: Arc<Planning>,
+    planner: Arc<Planner>,
 }
 
 impl DiffuserPolicy {
@@ -115,8 +45,8 @@ impl DiffuserPolicy {
             TrajectoryModel::new(config.clone(), model),
             TrajectoryValue::new(config.clone(), value),
         );
-        let planning = Arc::new(Planning::new(shape.clone(), model, value));
-        Self { shape, choice, planning }.choosing(choice)
+        let planner = Arc::new(Planner::new(shape.clone(), model, value));
+        Self { shape, choice, planner }.choosing(choice)
     }
 
     /// Makes a policy of the same networks that chooses by `choice`.
@@ -124,7 +54,7 @@ impl DiffuserPolicy {
         choice.check()?;
         match choice.rule {
             Rule::Nearest => Err(PolicyError::NoValue),
-            _ => Ok(Self { shape: self.shape.clone(), choice, planning: self.planning.clone() }),
+            _ => Ok(Self { shape: self.shape.clone(), choice, planner: self.planner.clone() }),
         }
     }
 
@@ -143,7 +73,7 @@ impl DiffuserPolicy {
                 state.fill_normal(&mut noise[(step * n + i) * row..][..row]);
             }
         }
-        let planned = self.planning.plan(observations, &noise)?;
+        let planned = self.planner.plan(observations, &noise)?;
         check_numbers("an action of a plan", &planned.0)?;
         check_numbers("the value of a plan", &planned.1)?;
         Ok(planned)

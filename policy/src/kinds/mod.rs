@@ -5,6 +5,6 @@ pub(crate) mod diffuser;
 pub(crate) mod diffusion;
 pub(crate) mod gaussian;
 pub(crate) mod one_step;
-pub(crate) mod planning;
+pub(crate) mod planner;
 pub(crate) mod score;
 pub(crate) mod squashed;

@@ -3,8 +3,10 @@
 
 use super::*;
 use crate::file::{Header, PolicyConfig, load_policy};
+use crate::kinds::planner::ValueGuidance;
 use candle_core::Device;
-use quad_kernels::scaling::Affine;
+use quad_kernels::scaling::{Affine, Scaling};
+use quad_nn::TrajectoryConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -31,7 +33,7 @@ fn shape(replan_every: usize) -> DiffuserShape {
 
 fn file(shape: DiffuserShape, plans: u32) -> Vec<u8> {
     let generator = &mut ChaCha8Rng::seed_from_u64(5);
-    let policy = PolicyConfig::DiffuserPolicy { shape, choice: Choice::best_of(plans) };
+    let policy = PolicyConfig::Diffuser { shape, choice: Choice::best_of(plans) };
     let tensors =
         policy.tensors(|layout| Weights::initial(layout, generator, &Device::Cpu)).unwrap();
     Header::new(policy, ()).to_safetensors(&tensors).unwrap()
@@ -136,7 +138,7 @@ fn a_shape_out_of_range_is_refused() {
     let refused = |change: fn(&mut DiffuserShape)| {
         let mut shape = shape(2);
         change(&mut shape);
-        let policy = PolicyConfig::DiffuserPolicy { shape, choice: Choice::best_of(1) };
+        let policy = PolicyConfig::Diffuser { shape, choice: Choice::best_of(1) };
         let file = Header::new(policy, ()).to_safetensors(&Tensors::new()).unwrap();
         matches!(load_policy(&file, Precision::F32), Err(PolicyError::Range { .. }))
     };
@@ -146,6 +148,8 @@ fn a_shape_out_of_range_is_refused() {
             && refused(|shape| shape.diffusion_steps = usize::MAX)
     );
     assert!(refused(|shape| shape.observation_dim = 0) && !refused(|_| ()));
+    let header = Header::<()>::read(&file(shape(1), 1)).unwrap();
+    assert_eq!(serde_json::to_value(header.policy).unwrap()["kind"], "planner");
     let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(2) };
     assert!(matches!(policy(1, 2).with_choice(nearest), Err(PolicyError::NoValue)));
 }

@@ -1,16 +1,84 @@
-//! Plans: windows `[action, state] × H`, denoised together from their first state on, and guided by
-//! the gradient of their value.
+//! Diffuser's planner: it denoises trajectories `[action, state] × H` from a given first state,
+//! guided by the gradient of their value.
 
-use crate::error::PolicyError;
-use crate::kinds::diffuser::{DiffuserShape, ValueGuidance};
+use crate::error::{PolicyError, check_range};
 use candle_core::{Device, Error, Result, Tensor, Var};
-use quad_nn::{Schedule, TrajectoryModel, TrajectoryValue, read};
+use quad_kernels::scaling::Scaling;
+use quad_nn::{
+    MAX_DIM, Schedule, TrajectoryConfig, TrajectoryError, TrajectoryModel, TrajectoryValue, read,
+};
+use serde::{Deserialize, Serialize};
+
+/// Bound of the denoising steps, and of the steps of guidance in each.
+const MOST_STEPS: usize = 1000;
 
 /// Windows that are worked on together; what a gradient takes is kept of so many at most.
 pub(crate) const CHUNK: usize = 32;
 
-/// A planner's networks, and what it plans with.
-pub struct Planning {
+/// What a planner is beside its weights.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DiffuserShape {
+    /// Numbers in an observation s.
+    pub observation_dim: usize,
+    /// Numbers in an action a.
+    pub action_dim: usize,
+    /// Both networks.
+    pub network: TrajectoryConfig,
+    /// Denoising steps T.
+    pub diffusion_steps: usize,
+    /// How plans are pulled toward large returns.
+    pub guidance: ValueGuidance,
+    /// Steps of an episode that are taken by one plan, from 1 to the horizon.
+    pub replan_every: usize,
+    /// The units in which the networks see observations and actions, beside those of the file's own
+    /// scaling.
+    pub units: Scaling,
+}
+
+/// How plans are pulled toward large returns.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ValueGuidance {
+    /// Steps along the value's gradient in each denoising step.
+    pub steps: usize,
+    /// What the gradient is multiplied by, beside the variance of the denoising step.
+    pub scale: f32,
+    /// The last denoising steps, so many, have none.
+    pub stop: usize,
+}
+
+impl DiffuserShape {
+    /// Numbers of a step in a window: [action, state].
+    pub fn width(&self) -> usize {
+        self.action_dim + self.observation_dim
+    }
+
+    pub(crate) fn check(&self) -> std::result::Result<(), PolicyError> {
+        check_range("observation_dim", self.observation_dim, MAX_DIM)?;
+        check_range("action_dim", self.action_dim, MAX_DIM)?;
+        self.network
+            .check()
+            .map_err(|TrajectoryError { field, value, .. }| PolicyError::Range { field, value })?;
+        check_range("diffusion_steps", self.diffusion_steps, MOST_STEPS)?;
+        check_range("guidance.steps", self.guidance.steps, MOST_STEPS)?;
+        check_range("replan_every", self.replan_every, self.network.horizon)
+    }
+
+    /// Numbers that are kept of a window while a gradient is taken: those of the networks' layers,
+    /// some of them unfolded, with their gradients.
+    pub(crate) fn numbers(&self) -> u128 {
+        let TrajectoryConfig { horizon, attention, .. } = &self.network;
+        let levels = self.network.lengths().into_iter().zip(self.network.widths());
+        let of_blocks =
+            levels.map(|(steps, wide)| 100 * steps * wide.max(self.width())).sum::<usize>();
+        let inner = attention.map_or(0, |of| of.heads * of.width * (16 * horizon + 4 * of.width));
+        (of_blocks + inner * 2 * self.network.multipliers.len()) as u128
+    }
+}
+
+/// Diffuser's networks and noise schedule.
+pub struct Planner {
     shape: DiffuserShape,
     schedule: Schedule,
     model: TrajectoryModel,
@@ -30,7 +98,7 @@ pub fn with_first_state(windows: &Tensor, states: &Tensor) -> Result<Tensor> {
     Tensor::cat(&[&first, &windows.narrow(1, 1, horizon - 1)?], 1)
 }
 
-impl Planning {
+impl Planner {
     /// The networks are those of the shape.
     pub fn new(shape: DiffuserShape, model: TrajectoryModel, value: TrajectoryValue) -> Self {
         Self { schedule: Schedule::cosine(shape.diffusion_steps), shape, model, value }
