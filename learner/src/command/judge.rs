@@ -1,18 +1,14 @@
-//! `learner judge`: ranks policies by what the data alone says of them.
+//! `learner judge`: ranks policies by the data alone.
 
 use quad_run::table::{Part, Style};
 use quad_runtime::{json, print};
 
 use crate::cli::JudgeArgs;
-use crate::judge::{Effort, judge};
+use crate::judge::{Budget, judge};
 
-/// Judges, and prints the ranking.
-///
-/// # Errors
-/// Those of [`judge`].
 pub fn run(args: &JudgeArgs) -> anyhow::Result<()> {
     let JudgeArgs { policies, gamma, steps, seeds, json: as_json } = args;
-    let ranking = judge(policies, Effort { gamma: *gamma, steps: *steps, seeds: *seeds })?;
+    let ranking = judge(policies, *gamma, Budget { steps: *steps, seeds: *seeds })?;
     let text = |part: Part| part.render(Style::Text);
     print(&if *as_json { json(&ranking)? } else { ranking.parts().map(text).join("\n") })
 }

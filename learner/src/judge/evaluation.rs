@@ -1,6 +1,7 @@
-//! The estimate of a policy's value, and what makes it doubtful.
+//! Estimates of values by fitted Q evaluation, and reasons to doubt them.
 
 use std::num::NonZero;
+use std::ops::Range;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -9,78 +10,79 @@ use quad_algorithms::{AlgorithmError, Fqe, FqeConfig, Units};
 use quad_dataset::BatchSampler;
 use quad_run::results::Estimate;
 use quad_runtime::Hint;
+use rayon::ThreadPoolBuilder;
 
-use super::Effort;
-use super::acting::Actions;
+use super::actions::Actions;
 use super::data::{Data, mean};
 
-/// How often an evaluation notes where it is. Its result is the mean of the last [`LAST`] notes.
-const NOTES: usize = 20;
+/// Points of a learning curve. The estimate is the mean of the last [`LAST`].
+const POINTS: usize = 20;
 const LAST: usize = 4;
-/// Updates by which the time of the others is foretold.
+/// Updates that are timed to forecast all of them.
 const TIMED: u64 = 50;
-/// How far an estimate may still move, in standard deviations of the data's returns.
-const SETTLED: f64 = 0.1;
-/// How much larger than before the loss may be at the end.
-const GROWN: f64 = 2.0;
-/// How far beyond what rewards allow an estimate may be, relative to the range that they allow.
-const BEYOND: f64 = 0.02;
+/// Largest change of a converged estimate, in standard deviations of the data's returns.
+const CONVERGED: f64 = 0.1;
+/// Largest growth of the loss at the end.
+const GROWTH: f64 = 2.0;
+/// Tolerance of an estimate's bounds, relative to their distance.
+const TOLERANCE: f64 = 0.02;
 
-/// How values are estimated.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Budget {
+    /// Gradient steps of an evaluation.
+    pub steps: u64,
+    /// Evaluations of each policy.
+    pub seeds: u64,
+}
+
 pub(super) struct Evaluation<'a> {
     pub config: FqeConfig,
     pub units: Units,
     pub data: &'a Data,
-    pub effort: Effort,
+    pub budget: Budget,
 }
 
-/// Where an evaluation was, note by note.
-pub(super) struct Trace {
+pub(super) struct LearningCurve {
     /// Mean value of the judged episodes' first states.
     values: Vec<f64>,
-    /// Mean loss since the note before.
+    /// Mean loss since the point before.
     losses: Vec<f64>,
 }
 
 impl Evaluation<'_> {
-    /// Evaluates the behavior that recorded the data, once for each seed.
-    ///
-    /// # Errors
-    /// The data does not say what it did, or candle fails.
-    pub fn of_behavior(&self) -> anyhow::Result<Vec<(Fqe, Trace)>> {
+    /// Evaluates the behavior policy, once for each seed.
+    pub fn of_behavior(&self) -> anyhow::Result<Vec<(Fqe, LearningCurve)>> {
         self.for_each_seed(|seed| {
             let mut fqe = self.behavior(seed)?;
-            let trace = self.train(&mut fqe, seed, &self.data.first.actions)?;
-            Ok((fqe, trace))
+            let curve = self.train(&mut fqe, seed, &self.data.first.actions)?;
+            Ok((fqe, curve))
         })
     }
 
-    /// Evaluates a policy, once for each seed, beginning with what is known of the behavior.
-    ///
-    /// # Errors
-    /// Candle fails.
-    pub fn of_policy(&self, actions: &Actions, behavior: &[&Fqe]) -> anyhow::Result<Vec<Trace>> {
+    /// Evaluates a policy, once for each seed, starting from the behavior policy's networks.
+    pub fn of_policy(
+        &self,
+        actions: &Actions,
+        behavior: &[Fqe],
+    ) -> anyhow::Result<Vec<LearningCurve>> {
         self.for_each_seed(|seed| {
-            let context = self.data.context(seed);
-            let mut fqe = Fqe::new(self.config.clone(), self.units, context, actions.next.clone())?;
-            fqe.begin_with(behavior[seed as usize])?;
+            let (config, context) = (self.config.clone(), self.data.context(seed));
+            let mut fqe = Fqe::new(config, self.units, context, actions.next.clone())?;
+            fqe.begin_with(&behavior[seed as usize])?;
             self.train(&mut fqe, seed, &actions.first)
         })
     }
 
-    /// How long an evaluation takes with all its seeds, by a few updates.
-    ///
-    /// # Errors
-    /// Those of [`Self::of_behavior`].
+    /// Estimates how long an evaluation with all its seeds takes.
     pub fn time(&self) -> anyhow::Result<Duration> {
         let times = self.for_each_seed(|seed| {
             let mut fqe = self.behavior(seed)?;
-            // The first ones also fetch memory.
             let mut sampler = self.sampler(&fqe, seed);
+            // Warm-up: the first updates also allocate memory.
             updates(&mut fqe, &mut sampler, 0..TIMED)?;
             let begin = Instant::now();
             updates(&mut fqe, &mut sampler, TIMED..2 * TIMED)?;
-            Ok(begin.elapsed().mul_f64(self.effort.steps as f64 / TIMED as f64))
+            Ok(begin.elapsed().mul_f64(self.budget.steps as f64 / TIMED as f64))
         })?;
         Ok(times.into_iter().max().unwrap_or_default())
     }
@@ -90,86 +92,74 @@ impl Evaluation<'_> {
         Fqe::of_behavior(self.config.clone(), self.units, context).hint_of(AlgorithmError::hint)
     }
 
-    /// Trains to the end. `first` are the actions in the judged episodes' first states.
-    fn train(&self, fqe: &mut Fqe, seed: u64, first: &[f32]) -> anyhow::Result<Trace> {
-        let (mut trace, mut sampler) =
-            (Trace { values: Vec::new(), losses: Vec::new() }, self.sampler(fqe, seed));
-        let at = |note: usize| self.effort.steps * note as u64 / NOTES as u64;
-        for note in 0..NOTES {
-            trace.losses.push(updates(fqe, &mut sampler, at(note)..at(note + 1))?);
-            trace.values.push(mean(fqe.values(&self.data.first.observations, first)?.into_iter()));
+    /// `first`: actions in the judged episodes' first states.
+    fn train(&self, fqe: &mut Fqe, seed: u64, first: &[f32]) -> anyhow::Result<LearningCurve> {
+        let mut curve = LearningCurve { values: Vec::new(), losses: Vec::new() };
+        let mut sampler = self.sampler(fqe, seed);
+        let step = |point: usize| self.budget.steps * point as u64 / POINTS as u64;
+        for point in 0..POINTS {
+            curve.losses.push(updates(fqe, &mut sampler, step(point)..step(point + 1))?);
+            curve.values.push(mean(fqe.values(&self.data.first.observations, first)?));
         }
-        Ok(trace)
+        Ok(curve)
     }
 
-    /// The batches of an evaluation, from its beginning.
     fn sampler(&self, fqe: &Fqe, seed: u64) -> BatchSampler {
         BatchSampler::new(fqe.items(), self.data.context(seed).batch_size, seed, 0)
     }
 
-    /// Does the work of all seeds at the same time. Each has its share of the cores: updates this
-    /// small gain little by more.
+    /// Runs all seeds in parallel, each on its share of the cores: updates this small gain little
+    /// by more.
     fn for_each_seed<T: Send>(
         &self,
         work: impl Fn(u64) -> anyhow::Result<T> + Sync,
     ) -> anyhow::Result<Vec<T>> {
-        let seeds = self.effort.seeds;
         let cores = thread::available_parallelism().map_or(1, NonZero::get);
-        let pool =
-            || rayon::ThreadPoolBuilder::new().num_threads((cores / seeds as usize).max(1)).build();
-        let pools = (0..seeds).map(|_| pool()).collect::<Result<Vec<_>, _>>()?;
+        let share = (cores / self.budget.seeds as usize).max(1);
+        let work = &work;
         thread::scope(|scope| {
-            let work = &work;
-            let started = pools
-                .iter()
-                .zip(0..)
-                .map(|(pool, seed)| scope.spawn(move || pool.install(|| work(seed))));
-            let started: Vec<_> = started.collect();
-            started
-                .into_iter()
-                .map(|thread| thread.join().map_err(|_| anyhow!("an evaluation panicked"))?)
-                .collect()
+            let mut threads = Vec::new();
+            for seed in 0..self.budget.seeds {
+                let pool = ThreadPoolBuilder::new().num_threads(share).build()?;
+                threads.push(scope.spawn(move || pool.install(|| work(seed))));
+            }
+            let join = |thread: thread::ScopedJoinHandle<anyhow::Result<T>>| {
+                thread.join().map_err(|_| anyhow!("an evaluation panicked"))?
+            };
+            threads.into_iter().map(join).collect()
         })
     }
 }
 
-/// Does these updates, and gives their mean loss.
-fn updates(
-    fqe: &mut Fqe,
-    sampler: &mut BatchSampler,
-    steps: std::ops::Range<u64>,
-) -> anyhow::Result<f64> {
+/// Mean loss of these updates.
+fn updates(fqe: &mut Fqe, sampler: &mut BatchSampler, steps: Range<u64>) -> anyhow::Result<f64> {
     let (mut sum, count) = (0.0, steps.end - steps.start);
     for step in steps {
-        let measured = fqe.update(step, sampler.next_items())?;
-        sum += measured
-            .iter()
-            .find(|(name, _)| *name == "critic_loss")
-            .map_or(0.0, |(_, loss)| f64::from(*loss));
+        let metrics = fqe.update(step, sampler.next_items())?;
+        let loss = metrics.iter().find(|(name, _)| *name == "critic_loss");
+        sum += loss.map_or(0.0, |(_, loss)| f64::from(*loss));
     }
     Ok(sum / count as f64)
 }
 
-/// What the evaluations of one policy say of its value.
-pub(super) fn estimate<'a>(traces: impl IntoIterator<Item = &'a Trace>, units: &Units) -> Estimate {
+/// The estimate from one learning curve per seed.
+pub(super) fn estimate(curves: &[LearningCurve], units: &Units) -> Estimate {
     let mut estimate = Estimate { values: Vec::new(), doubts: Vec::new() };
-    for (trace, seed) in traces.into_iter().zip(0..) {
-        let [(value, loss), (value_before, loss_before)] = [1, 2].map(|back| {
-            let part = NOTES - back * LAST..NOTES - (back - 1) * LAST;
-            (
-                mean(trace.values[part.clone()].iter().copied()),
-                mean(trace.losses[part].iter().copied()),
-            )
-        });
-        let beyond = BEYOND * (units.most - units.least);
-        let (least, most) = (units.least - beyond, units.most + beyond);
+    let tolerance = TOLERANCE * (units.most - units.least);
+    let bounds = units.least - tolerance..=units.most + tolerance;
+    for (seed, LearningCurve { values, losses }) in curves.iter().enumerate() {
+        let last = |points: &[f64]| mean(points[POINTS - LAST..].iter().copied());
+        let before =
+            |points: &[f64]| mean(points[POINTS - 2 * LAST..POINTS - LAST].iter().copied());
+        let (value, value_before) = (last(values), before(values));
+        let (loss, loss_before) = (last(losses), before(losses));
         let mut doubt = |text: String| estimate.doubts.push(format!("seed {seed}: {text}"));
-        if !(least..=most).contains(&value) {
+        if !bounds.contains(&value) {
             doubt(format!("{value:.2} is beyond what rewards allow"));
-        } else if (value - value_before).abs() > SETTLED * units.scale {
+        } else if (value - value_before).abs() > CONVERGED * units.scale {
             doubt(format!("still moves, from {value_before:.2} to {value:.2}"));
         }
-        if loss > GROWN * loss_before {
+        if loss > GROWTH * loss_before {
             doubt(format!("the loss grows, from {loss_before:.3} to {loss:.3}"));
         }
         estimate.values.push(value);
@@ -182,32 +172,23 @@ pub(super) fn estimate<'a>(traces: impl IntoIterator<Item = &'a Trace>, units: &
 mod tests {
     use super::*;
 
-    const UNITS: Units = Units { offset: 0.0, scale: 10.0, least: 0.0, most: 100.0 };
-
-    /// The estimate of an evaluation whose last notes have one value and loss, and those before
-    /// them another.
-    fn estimated(values: [f64; 2], losses: [f64; 2]) -> Estimate {
-        let notes =
-            |[before, last]: [f64; 2]| [vec![before; NOTES - LAST], vec![last; LAST]].concat();
-        estimate([&Trace { values: notes(values), losses: notes(losses) }], &UNITS)
-    }
-
     #[test]
-    fn an_estimate_is_where_it_ends_and_doubtful_where_it_is_not_settled() {
-        let settled = estimated([50.5, 50.0], [1.0, 1.5]);
-        assert_eq!((settled.values, settled.doubts), (vec![50.0], vec![]));
+    fn estimates_that_have_not_converged_are_doubted() {
+        let units = Units { offset: 0.0, scale: 10.0, least: 0.0, most: 100.0 };
         for (values, losses, doubt) in [
-            ([50.0, 52.0], [1.0; 2], "still moves, from 50.00 to 52.00"),
-            ([52.0, 50.0], [1.0; 2], "still moves, from 52.00 to 50.00"),
-            ([50.0; 2], [1.0, 3.0], "the loss grows, from 1.000 to 3.000"),
-            ([-3.0; 2], [1.0; 2], "-3.00 is beyond what rewards allow"),
-            ([103.0; 2], [1.0; 2], "103.00 is beyond what rewards allow"),
+            ([50.5, 50.0], [1.0, 1.5], None),
+            ([50.0, 52.0], [1.0; 2], Some("still moves, from 50.00 to 52.00")),
+            ([52.0, 50.0], [1.0; 2], Some("still moves, from 52.00 to 50.00")),
+            ([50.0; 2], [1.0, 3.0], Some("the loss grows, from 1.000 to 3.000")),
+            ([-3.0; 2], [1.0; 2], Some("-3.00 is beyond what rewards allow")),
+            ([103.0; 2], [1.0; 2], Some("103.00 is beyond what rewards allow")),
         ] {
-            let found = estimated(values, losses);
-            assert_eq!(
-                (found.values, found.doubts),
-                (vec![values[1]], vec![format!("seed 0: {doubt}")])
-            );
+            let points =
+                |[before, last]: [f64; 2]| [vec![before; POINTS - LAST], vec![last; LAST]].concat();
+            let curve = LearningCurve { values: points(values), losses: points(losses) };
+            let found = estimate(&[curve], &units);
+            assert_eq!(found.values, [values[1]]);
+            assert_eq!(found.doubts, Vec::from_iter(doubt.map(|doubt| format!("seed 0: {doubt}"))));
         }
     }
 }

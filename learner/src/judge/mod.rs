@@ -1,135 +1,115 @@
-//! Judges policies without a simulator: `learner judge`.
+//! Off-policy evaluation: ranks policies without a simulator (`learner judge`).
 //!
-//! It runs on its caller's thread and rayon's, owns nothing, and keeps what it finds in the runs'
-//! folders, from where reports read it. A policy's value is estimated by fitted Q evaluation
-//! ([`quad_algorithms::Fqe`]) on the episodes that its run has learned from, and read off in the
-//! first states of those that were held out.
+//! The value of a policy is estimated by fitted Q evaluation ([`quad_algorithms::Fqe`]) on the
+//! episodes that its run has trained on, and averaged over the first states of held-out episodes.
+//! Judgments are saved in the runs' folders, where reports read them.
 //!
-//! In reading order: `subject` finds the policies, `data` has the states in which they are judged,
-//! `acting` asks a policy for its actions, `evaluation` estimates a value.
+//! In reading order: `snapshots` finds the policies, `data` reads the dataset, `actions` runs a
+//! policy in all states, `evaluation` estimates a value.
 
-mod acting;
+mod actions;
 mod data;
 mod evaluation;
-mod subject;
+mod snapshots;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use anyhow::Context;
 use quad_algorithms::{FqeConfig, Units};
 use quad_run::results::{Conditions, Judgment, Ranking};
 use quad_runtime::Hint;
 use tracing::{info, warn};
 
-use acting::Actions;
+use actions::Actions;
 use data::Data;
+pub(crate) use evaluation::Budget;
 use evaluation::{Evaluation, estimate};
-use subject::Subject;
+use snapshots::Snapshot;
 
-/// How thoroughly policies are judged.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Effort {
-    /// Discount γ.
-    pub gamma: f32,
-    /// Gradient steps of an evaluation.
-    pub steps: u64,
-    /// Evaluations of each policy.
-    pub seeds: u64,
-}
-
-/// Judges the last snapshots of runs, or single snapshots. What an earlier call has found out in
-/// this way is not computed again.
-///
-/// # Errors
-/// There is nothing to judge, the policies have not learned from the same data in one environment,
-/// or a policy cannot act.
-pub(crate) fn judge(paths: &[PathBuf], effort: Effort) -> anyhow::Result<Ranking> {
-    let config = FqeConfig::with_discount(effort.gamma)
-        .hint("γ is between 0 and 1, 1 left out: --gamma 0.99")?;
-    let subjects = subject::find(paths)?;
-    let data = Data::of(&subjects)?;
-    let Effort { gamma, steps, seeds } = effort;
+/// Judges the last snapshots of runs, or single snapshots. Judgments that the folders have under
+/// the same conditions are not computed again.
+pub(crate) fn judge(paths: &[PathBuf], gamma: f32, budget: Budget) -> anyhow::Result<Ranking> {
+    let config =
+        FqeConfig::with_discount(gamma).hint("γ is between 0 and 1, 1 left out: --gamma 0.99")?;
+    let snapshots = snapshots::find(paths)?;
+    let data = Data::read(&snapshots)?;
     let conditions = Conditions {
         dataset: data.sha256.clone(),
         environment: data.environment.clone(),
         episodes: data.episodes.clone(),
         gamma,
-        steps,
-        seeds,
+        steps: budget.steps,
+        seeds: budget.seeds,
     };
-    let (mut judged, mut left) = (Vec::new(), Vec::new());
-    for subject in &subjects {
-        let known = Judgment::read_all(&subject.folder)?;
-        let is_this =
-            |one: &Judgment| one.weights == subject.weights && one.conditions == conditions;
-        match known.into_iter().find(is_this) {
-            Some(known) => judged.push(known),
-            None => left.push(subject),
+    let (mut judgments, mut remaining) = (Vec::new(), Vec::new());
+    for snapshot in &snapshots {
+        let known = Judgment::read_all(&snapshot.folder)?
+            .into_iter()
+            .find(|known| known.weights == snapshot.weights && known.conditions == conditions);
+        match known {
+            Some(known) => judgments.push(known),
+            None => remaining.push(snapshot),
         }
     }
-    if !left.is_empty() {
-        let evaluation = Evaluation {
-            config,
-            units: Units::of(&data.context(0), gamma.into()),
-            data: &data,
-            effort,
-        };
-        forecast(&evaluation, &left)?;
-        judge_all(&evaluation, &left, &conditions, &mut judged)?;
+    if !remaining.is_empty() {
+        let units = Units::of(&data.context(0), gamma.into());
+        let evaluation = Evaluation { config, units, data: &data, budget };
+        forecast(&evaluation, &remaining)?;
+        judge_all(&evaluation, &remaining, &conditions, &mut judgments)?;
     }
-    let [ranking] = <[Ranking; 1]>::try_from(Ranking::of(judged))
-        .map_err(|_| anyhow::anyhow!("nothing is judged"))?;
-    Ok(ranking)
+    Ranking::of(judgments).pop().context("nothing is judged")
 }
 
 fn judge_all(
     evaluation: &Evaluation<'_>,
-    subjects: &[&Subject],
+    snapshots: &[&Snapshot],
     conditions: &Conditions,
-    judged: &mut Vec<Judgment>,
+    judgments: &mut Vec<Judgment>,
 ) -> anyhow::Result<()> {
     let data = evaluation.data;
-    let behaviors = evaluation.of_behavior()?;
-    let fqes = Vec::from_iter(behaviors.iter().map(|(fqe, _)| fqe));
-    let recorded = data.recorded_value(&fqes, evaluation.effort.gamma)?;
-    let behavior = estimate(behaviors.iter().map(|(_, trace)| trace), &evaluation.units);
-    for (subject, number) in subjects.iter().zip(1..) {
-        let actions = Actions::of(&*subject.policy, data)?;
-        let traces = evaluation.of_policy(&actions, &fqes)?;
+    let (fqes, curves): (Vec<_>, Vec<_>) = evaluation.of_behavior()?.into_iter().unzip();
+    let recorded = data.recorded_value(&fqes, conditions.gamma)?;
+    let behavior = estimate(&curves, &evaluation.units);
+    for (snapshot, number) in snapshots.iter().zip(1..) {
+        let Snapshot { folder, step, policy, .. } = snapshot;
+        let actions = Actions::of(&**policy, data)?;
+        let curves = evaluation.of_policy(&actions, &fqes)?;
         let judgment = Judgment {
-            run: subject.folder.path().to_owned(),
-            step: subject.step,
-            weights: subject.weights.clone(),
+            run: folder.path().to_owned(),
+            step: *step,
+            weights: snapshot.weights.clone(),
             conditions: conditions.clone(),
-            estimate: estimate(&traces, &evaluation.units),
-            distance: data.distance(&actions.at_states),
-            unseen: subject.held_out == BTreeSet::from_iter(data.episodes.iter().copied()),
+            estimate: estimate(&curves, &evaluation.units),
+            distance: data.distance(&actions.compared),
+            unseen: snapshot.held_out == BTreeSet::from_iter(data.episodes.iter().copied()),
             behavior: behavior.clone(),
             recorded,
         };
-        let run = subject.folder.path().display();
-        info!("{number} of {}: {run} @ {} is judged", subjects.len(), subject.step);
-        // A folder that cannot be written to, such as another user's, keeps no judgment from being
-        // told.
-        judgment
-            .keep(&subject.folder)
-            .unwrap_or_else(|error| warn!("{error}: the judgment is not kept"));
-        judged.push(judgment);
+        let (run, count) = (folder.path().display(), snapshots.len());
+        info!("{number} of {count}: {run} @ {step} is judged");
+        // A folder of another user's cannot be written to; its judgment is printed all the same.
+        if let Err(error) = judgment.keep(folder) {
+            warn!("{error}: the judgment is not kept");
+        }
+        judgments.push(judgment);
     }
     Ok(())
 }
 
-/// Says how long it will take, by the time that a little of it takes.
-fn forecast(evaluation: &Evaluation<'_>, subjects: &[&Subject]) -> anyhow::Result<()> {
-    let asking = subjects.iter().map(|subject| Actions::time(&*subject.policy, evaluation.data));
-    let acting = asking.sum::<anyhow::Result<Duration>>()?;
-    let evaluating = evaluation.time()? * (subjects.len() as u32 + 1);
+/// Logs how long it will take, extrapolated from a few states and updates.
+fn forecast(evaluation: &Evaluation<'_>, snapshots: &[&Snapshot]) -> anyhow::Result<()> {
+    let mut acting = Duration::ZERO;
+    for snapshot in snapshots {
+        acting += Actions::time(&*snapshot.policy, evaluation.data)?;
+    }
+    let evaluating = evaluation.time()? * (snapshots.len() as u32 + 1);
     let minutes = |time: Duration| format!("{:.1}", time.as_secs_f64() / 60.0);
     let (all, acting) = (minutes(acting + evaluating), minutes(acting));
     info!(
         "judging {} policies takes about {all} minutes, {acting} of them to ask the policies for actions",
-        subjects.len()
+        snapshots.len()
     );
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! The metrics of a run that may be going on, thinned to what a picture can show.
+//! The metrics of a run over its steps, averaged to as many rows as a chart can show.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -7,71 +7,65 @@ use std::path::PathBuf;
 use quad_run::run::new_lines;
 use serde::{Serialize, Serializer};
 
-/// Most rows that are kept: more than a chart has pixels for. Even, so that pairs of rows can
-/// become one.
-const MOST_ROWS: usize = 500;
-/// Significant digits that are sent.
-const DIGITS: usize = 5;
+/// More than a chart has pixels for. Even, so that pairs of rows can be merged.
+const MAX_ROWS: usize = 500;
+const SIGNIFICANT_DIGITS: usize = 5;
 
-/// What `metrics.jsonl` says. Of a long run each row is the mean of as many lines as it takes to
-/// keep the rows few.
+/// The contents of `metrics.jsonl`. A row is the mean of `stride` lines.
 #[derive(Debug, Serialize)]
 pub(super) struct History {
     #[serde(skip)]
     path: PathBuf,
-    /// Bytes of the file that are taken in.
+    /// Bytes of the file that were read.
     #[serde(skip)]
-    read: u64,
-    /// Lines of the file behind a whole row.
+    offset: u64,
     #[serde(skip)]
     stride: usize,
-    /// Lines behind the last row.
+    /// Lines in the last row.
     #[serde(skip)]
     lines: usize,
-    /// The metrics so far.
     names: Vec<String>,
     rows: Vec<Row>,
 }
 
-/// Means of each metric over some lines.
 #[derive(Debug)]
 struct Row {
-    /// The last of these steps.
+    /// Step and training time of the last line.
     step: f64,
-    /// Seconds of training up to it.
     seconds: f64,
-    /// The sum of each metric, in the order of the names, and how many lines have it.
+    /// Sum and count of each metric's values, in the order of the names.
     values: Vec<(f64, u32)>,
 }
 
 impl History {
-    /// History of the file, of which nothing is read yet.
     pub fn of(path: PathBuf) -> Self {
-        Self { path, read: 0, stride: 1, lines: 0, names: Vec::new(), rows: Vec::new() }
+        Self { path, offset: 0, stride: 1, lines: 0, names: Vec::new(), rows: Vec::new() }
     }
 
-    /// Takes in the lines that the file has more than before. A learner that went back to its
-    /// checkpoint writes steps again: what was known of them is forgotten.
-    ///
-    /// # Errors
-    /// The file cannot be read. That there is none is no error.
+    /// Reads the file's new lines. A resumed learner repeats the steps since its checkpoint: they
+    /// replace the earlier ones.
     pub fn refresh(&mut self) -> io::Result<()> {
-        let lines = new_lines(&self.path, &mut self.read)?;
-        let lines =
-            lines.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok());
-        for mut line in lines.collect::<Vec<BTreeMap<String, Option<f64>>>>() {
-            let [step, seconds] =
-                ["step", "seconds"].map(|name| line.remove(name).flatten().unwrap_or_default());
+        let bytes = new_lines(&self.path, &mut self.offset)?;
+        for line in bytes.split(|byte| *byte == b'\n') {
+            let Ok(line) = serde_json::from_slice(line) else { continue };
+            let mut line: BTreeMap<String, Option<f64>> = line;
+            let mut take = |name| line.remove(name).flatten().unwrap_or_default();
+            let (step, seconds) = (take("step"), take("seconds"));
             while self.rows.pop_if(|last| last.step >= step).is_some() {
                 self.lines = self.stride;
             }
-            // Later phases measure other metrics.
-            self.names.extend(
-                line.keys().filter(|name| !self.names.contains(name)).cloned().collect::<Vec<_>>(),
-            );
-            self.rows.iter_mut().for_each(|row| row.values.resize(self.names.len(), (0.0, 0)));
-            let value = |name: &String| {
-                line.get(name).copied().flatten().map_or((0.0, 0), |value| (value, 1))
+            // Later training phases have other metrics.
+            for name in line.keys() {
+                if !self.names.contains(name) {
+                    self.names.push(name.clone());
+                }
+            }
+            for row in &mut self.rows {
+                row.values.resize(self.names.len(), (0.0, 0));
+            }
+            let value = |name| match line.get(name) {
+                Some(Some(value)) => (*value, 1),
+                _ => (0.0, 0),
             };
             self.push(Row { step, seconds, values: self.names.iter().map(value).collect() });
         }
@@ -83,13 +77,13 @@ impl History {
             && let Some(last) = self.rows.last_mut()
         {
             self.lines += 1;
-            last.join(&line);
+            last.merge(&line);
             return;
         }
-        if self.rows.len() == MOST_ROWS {
-            let mut pairs = std::mem::take(&mut self.rows).into_iter();
-            while let (Some(mut first), Some(second)) = (pairs.next(), pairs.next()) {
-                first.join(&second);
+        if self.rows.len() == MAX_ROWS {
+            let mut rows = std::mem::take(&mut self.rows).into_iter();
+            while let (Some(mut first), Some(second)) = (rows.next(), rows.next()) {
+                first.merge(&second);
                 self.rows.push(first);
             }
             self.stride *= 2;
@@ -100,17 +94,16 @@ impl History {
 }
 
 impl Row {
-    /// Also covers what follows.
-    fn join(&mut self, next: &Self) {
+    fn merge(&mut self, next: &Self) {
         (self.step, self.seconds) = (next.step, next.seconds);
-        for ((sum, count), (more, lines)) in self.values.iter_mut().zip(&next.values) {
-            *sum += more;
-            *count += lines;
+        for ((sum, count), (value, more)) in self.values.iter_mut().zip(&next.values) {
+            *sum += value;
+            *count += more;
         }
     }
 }
 
-/// As `[step, seconds, value …]`.
+/// `[step, seconds, mean, …]`, null where a metric was not measured.
 impl Serialize for Row {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let means = self.values.iter().map(|(sum, count)| sum / f64::from(*count));
@@ -118,9 +111,10 @@ impl Serialize for Row {
     }
 }
 
-/// The number with few digits; nothing if it is not finite.
+/// None if it is not finite.
 fn rounded(value: f64) -> Option<f64> {
-    format!("{value:.*e}", DIGITS - 1).parse().ok().filter(|rounded: &f64| rounded.is_finite())
+    let text = format!("{value:.*e}", SIGNIFICANT_DIGITS - 1);
+    text.parse().ok().filter(|rounded: &f64| rounded.is_finite())
 }
 
 #[cfg(test)]

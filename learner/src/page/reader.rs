@@ -1,13 +1,12 @@
-//! The thread that reads run folders for the page. A disk that hangs holds up this thread and no
-//! other.
+//! The thread that reads run folders for the page. A hanging disk blocks no other thread.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::slice;
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
-use quad_algorithms::Metric;
 use quad_run::results::RunReport;
 use quad_run::run::RunDir;
 use quad_run::status::list;
@@ -17,100 +16,94 @@ use tokio::sync::oneshot;
 
 use super::history::History;
 
-/// However often browsers ask, a run is read no more often than this.
-const RUN_EVERY: Duration = Duration::from_secs(1);
-/// And the list of runs.
-const LIST_EVERY: Duration = Duration::from_secs(5);
-/// Most runs whose history is kept in memory.
-const MOST_KEPT: usize = 64;
-/// Episodes that are shown.
+/// Lifetime of cached answers.
+const RUN_LIFETIME: Duration = Duration::from_secs(1);
+const LIST_LIFETIME: Duration = Duration::from_secs(5);
+/// Runs whose history is kept in memory.
+const MAX_RUNS: usize = 64;
 const EPISODES: usize = 20;
 
-/// What a browser asks for.
-pub(super) enum Question {
-    /// All runs.
+pub(super) enum Query {
+    /// The list of runs.
     Runs,
     /// The run of this name in the list.
     Run(String),
 }
 
-/// A question, and where its answer goes: JSON, or nothing if there is no such run.
-pub(super) type Asked = (Question, oneshot::Sender<Option<Bytes>>);
+/// A query and the channel for its answer: JSON, or nothing if there is no such run.
+pub(super) type Request = (Query, oneshot::Sender<Option<Bytes>>);
 
-/// The runs in or below a folder.
 pub(super) struct Reader {
     root: PathBuf,
-    list: Kept,
-    /// Folders of the runs, by the name in the list.
+    list: Cache,
+    /// Folders by name in the list.
     dirs: HashMap<String, PathBuf>,
-    runs: HashMap<String, (RunPage, Kept)>,
+    runs: HashMap<String, (RunPage, Cache)>,
 }
 
-/// The newest answer to a question, and when it was made.
-type Kept = Option<(Instant, Bytes)>;
+#[derive(Default)]
+struct Cache(Option<(Instant, Bytes)>);
 
-/// The answer that is kept, unless it is as old as that: then it is made anew.
-fn answer(kept: &mut Kept, every: Duration, make: impl FnOnce() -> Value) -> Bytes {
-    let young = kept.take().filter(|(made, _)| made.elapsed() < every);
-    kept.insert(young.unwrap_or_else(|| (Instant::now(), make().to_string().into()))).1.clone()
+impl Cache {
+    fn get(&mut self, lifetime: Duration, read: impl FnOnce() -> Value) -> Bytes {
+        let fresh = self.0.take().filter(|(made, _)| made.elapsed() < lifetime);
+        let answer = fresh.unwrap_or_else(|| (Instant::now(), read().to_string().into()));
+        self.0.insert(answer).1.clone()
+    }
 }
 
 impl Reader {
     pub fn new(root: PathBuf) -> Self {
-        Self { root, list: None, dirs: HashMap::new(), runs: HashMap::new() }
+        Self { root, list: Cache::default(), dirs: HashMap::new(), runs: HashMap::new() }
     }
 
-    /// Answers until the web server is gone.
-    pub fn run(mut self, questions: &Receiver<Asked>) {
+    /// Answers until the web server is dropped.
+    pub fn run(mut self, requests: &Receiver<Request>) {
         stay_in_background();
-        while let Ok((question, tell)) = questions.recv() {
-            let found = match question {
-                Question::Runs => Some(self.list()),
-                Question::Run(name) => self.of_run(name),
+        while let Ok((query, tx)) = requests.recv() {
+            let answer = match query {
+                Query::Runs => Some(self.list()),
+                Query::Run(name) => self.run_page(name),
             };
-            tell.send(found).ok();
+            tx.send(answer).ok();
         }
     }
 
     fn list(&mut self) -> Bytes {
-        answer(&mut self.list, LIST_EVERY, || {
-            let entries = list::list(std::slice::from_ref(&self.root));
-            self.dirs =
-                entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone())).collect();
-            let shown = entries.iter().map(|entry| {
-                let mut shown = json!(entry);
-                if shown["at_work"] == true {
-                    shown["page"] = json!(
-                        RunDir::at(&entry.dir)
-                            .read_endpoints()
-                            .ok()
-                            .map(|endpoints| endpoints.page)
-                    );
+        self.list.get(LIST_LIFETIME, || {
+            let entries = list::list(slice::from_ref(&self.root));
+            let dirs = entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone()));
+            self.dirs = dirs.collect();
+            let with_page = |entry: &list::Entry| {
+                let mut json = json!(entry);
+                if json["at_work"] == true {
+                    let endpoints = RunDir::at(&entry.dir).read_endpoints();
+                    json["page"] = json!(endpoints.ok().map(|endpoints| endpoints.page));
                 }
-                shown
-            });
-            shown.collect()
+                json
+            };
+            entries.iter().map(with_page).collect()
         })
     }
 
-    fn of_run(&mut self, name: String) -> Option<Bytes> {
+    fn run_page(&mut self, name: String) -> Option<Bytes> {
         if !self.dirs.contains_key(&name) {
             self.list();
         }
         let dir = self.dirs.get(&name)?;
-        if self.runs.len() >= MOST_KEPT && !self.runs.contains_key(&name) {
+        if self.runs.len() >= MAX_RUNS && !self.runs.contains_key(&name) {
             self.runs.clear();
         }
-        let (run, kept) = self.runs.entry(name).or_insert_with(|| (RunPage::of(dir), None));
+        let (run, cache) =
+            self.runs.entry(name).or_insert_with(|| (RunPage::of(dir), Cache::default()));
         let read = || run.read().unwrap_or_else(|error| json!({ "error": format!("{error:#}") }));
-        Some(answer(kept, RUN_EVERY, read))
+        Some(cache.get(RUN_LIFETIME, read))
     }
 }
 
-/// What the page shows of a run.
 struct RunPage {
     dir: PathBuf,
-    /// When the run began whose history this is.
+    /// Start time of the run whose history this is.
     started: u64,
     history: History,
 }
@@ -123,23 +116,17 @@ impl RunPage {
     fn read(&mut self) -> anyhow::Result<Value> {
         let (report, scores) = RunReport::with_scores(&self.dir)?;
         let config = &report.config;
-        // By --fresh, another run takes the folder of one that was looked at.
+        // After --fresh, another run has the folder.
         if self.started != config.run.started {
             *self = Self { started: config.run.started, ..Self::of(&self.dir) };
         }
         self.history.refresh()?;
-        let metric = |metric: &Metric| json!({ "name": metric.name, "help": metric.help });
-        let metrics: Value = config.experiment.definition()?.metrics.iter().map(metric).collect();
-        let evaluations = report.evaluations.iter().map(|evaluation| {
-            json!([
-                evaluation.step,
-                evaluation.score.mean,
-                evaluation.score.std,
-                evaluation.episodes,
-                evaluation.complete
-            ])
-        });
-        let newest = &scores[scores.len().saturating_sub(EPISODES)..];
+        let metrics = config.experiment.definition()?.metrics;
+        let metrics = metrics.iter().map(|it| json!({ "name": it.name, "help": it.help }));
+        let evaluations = report
+            .evaluations
+            .iter()
+            .map(|it| json!([it.step, it.score.mean, it.score.std, it.episodes, it.complete]));
         Ok(json!({
             "run": report.run,
             "task": report.task,
@@ -150,10 +137,10 @@ impl RunPage {
             "dataset_score": report.dataset_score,
             "dataset": config.dataset.summary(),
             "settings": toml::to_string(config)?,
-            "metrics": metrics,
+            "metrics": Value::from_iter(metrics),
             "history": &self.history,
             "evaluations": Value::from_iter(evaluations),
-            "episodes": newest,
+            "episodes": &scores[scores.len().saturating_sub(EPISODES)..],
         }))
     }
 }

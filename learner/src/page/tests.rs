@@ -1,28 +1,21 @@
-//! Tests of `page/mod.rs`: what a browser is answered.
+//! Tests of `page/mod.rs`: answers of the web server.
 
+use std::fs;
+use std::path::Path;
 use std::time::Duration;
 
 use quad_run::run::RunDir;
 use quad_runtime::{Health, serve_metrics};
-use serde_json::Value;
+use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
+use tokio::time::timeout;
 
 use super::*;
 use crate::fixtures::{config, line};
 
-/// Runs in folders below one.
-fn runs(folder: &std::path::Path, names: &[&str]) {
-    for name in names {
-        let (_, mut scores) = RunDir::create(&folder.join(name), &config("run", 1)).unwrap();
-        scores.append(&[line(2000, 1, 10.0), line(2000, 2, 12.0), line(4000, 1, 5.0)]).unwrap();
-        let metrics = "{\"step\":100,\"seconds\":1.0,\"bc_loss\":0.5}\n";
-        std::fs::write(folder.join(name).join("metrics.jsonl"), metrics).unwrap();
-    }
-}
-
-/// The status line and headers, and the body, of an answer.
-async fn get(root: &std::path::Path, live: Option<Live>, paths: &[&str]) -> Vec<(String, String)> {
+/// Head and body of each answer.
+async fn get(root: &Path, live: Option<Live>, paths: &[&str]) -> Vec<(String, String)> {
     let pages = routes(root.to_owned(), live).unwrap();
     let any_port = ([127, 0, 0, 1], 0).into();
     let server =
@@ -30,15 +23,11 @@ async fn get(root: &std::path::Path, live: Option<Live>, paths: &[&str]) -> Vec<
     let mut answers = Vec::new();
     for path in paths {
         let mut connection = TcpStream::connect(server.address).await.unwrap();
-        connection
-            .write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes())
-            .await
-            .unwrap();
+        let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n");
+        connection.write_all(request.as_bytes()).await.unwrap();
         let mut answer = String::new();
-        tokio::time::timeout(Duration::from_secs(60), connection.read_to_string(&mut answer))
-            .await
-            .unwrap()
-            .unwrap();
+        let read = connection.read_to_string(&mut answer);
+        timeout(Duration::from_secs(60), read).await.unwrap().unwrap();
         let (head, body) = answer.split_once("\r\n\r\n").unwrap();
         answers.push((head.to_owned(), body.to_owned()));
     }
@@ -46,66 +35,52 @@ async fn get(root: &std::path::Path, live: Option<Live>, paths: &[&str]) -> Vec<
 }
 
 #[tokio::test]
-async fn the_page_needs_no_other_host_and_runs_no_script_of_its_own() {
+async fn the_page_needs_no_other_host_and_has_no_inline_script() {
     let folder = tempfile::tempdir().unwrap();
-    let answers =
-        get(folder.path(), None, &["/", "/page.js", "/charts.js", "/dygraph.js", "/page.css"])
-            .await;
+    let paths = ["/", "/page.js", "/charts.js", "/dygraph.js", "/page.css"];
+    let answers = get(folder.path(), None, &paths).await;
     let [(head, page), files @ ..] = &answers[..] else { panic!() };
-    assert!(
-        head.contains("script-src 'self'")
-            && head.contains("default-src 'none'")
-            && !head.contains("unsafe"),
-        "{head}"
-    );
-    assert!(
-        !page.contains("://") && !page.contains("<script>") && !page.contains("style="),
-        "{page}"
-    );
+    assert!(head.contains("script-src 'self'") && head.contains("default-src 'none'"), "{head}");
+    assert!(!head.contains("unsafe"), "{head}");
+    for inline in ["://", "<script>", "style="] {
+        assert!(!page.contains(inline), "{page}");
+    }
     assert!(files.iter().all(|(head, text)| head.starts_with("HTTP/1.1 200") && text.len() > 500));
-    // Of our own scripts, none writes HTML.
-    let writes_html = |text: &str| {
-        ["innerHTML", "insertAdjacent", "document.write"].iter().any(|way| text.contains(way))
-    };
-    assert!(files[..2].iter().all(|(_, text)| !writes_html(text)));
-    // A whole load of the page, but for the answers.
+    for writes_html in ["innerHTML", "insertAdjacent", "document.write"] {
+        assert!(files[..2].iter().all(|(_, text)| !text.contains(writes_html)));
+    }
     assert!(answers.iter().map(|(_, text)| text.len()).sum::<usize>() < 200_000);
 }
 
 #[tokio::test]
-async fn runs_are_listed_and_each_tells_its_scores_metrics_and_settings() {
+async fn the_api_has_runs_with_scores_metrics_and_settings() {
     let folder = tempfile::tempdir().unwrap();
-    runs(folder.path(), &["a", "b/c"]);
-    let answers = get(
-        folder.path(),
-        None,
-        &["/api/runs", "/api/run/b%2Fc", "/api/run/nonsense", "/api/run/..%2Fb%2Fc", "/api/live"],
-    )
-    .await;
-    let json = |index: usize| serde_json::from_str::<Value>(&answers[index].1).unwrap();
-    let names: Vec<_> = json(0).as_array().unwrap().iter().map(|run| run["name"].clone()).collect();
-    assert_eq!(names, ["a", "b/c"]);
-    let run = json(1);
-    assert_eq!(
-        run["evaluations"],
-        serde_json::json!([[2000, 11.0, 2f64.sqrt(), 2, true], [4000, 5.0, null, 1, false]])
-    );
-    assert_eq!(
-        (&run["history"]["names"][0], &run["history"]["rows"][0][2]),
-        (&"bc_loss".into(), &0.5.into())
-    );
-    assert_eq!(
-        run["metrics"].as_array().unwrap().len(),
-        config("run", 1).experiment.definition().unwrap().metrics.len()
-    );
-    assert!(run["settings"].as_str().unwrap().contains("[experiment.agent]"));
+    for name in ["a", "b/c"] {
+        let dir = folder.path().join(name);
+        let (_, mut scores) = RunDir::create(&dir, &config("run", 1)).unwrap();
+        scores.append(&[line(2000, 1, 10.0), line(2000, 2, 12.0), line(4000, 1, 5.0)]).unwrap();
+        let metrics = "{\"step\":100,\"seconds\":1.0,\"bc_loss\":0.5}\n";
+        fs::write(dir.join("metrics.jsonl"), metrics).unwrap();
+    }
+    let missing = ["/api/run/nonsense", "/api/run/..%2Fb%2Fc", "/api/live"];
+    let paths = [&["/api/runs", "/api/run/b%2Fc"][..], &missing].concat();
+    let answers = get(folder.path(), None, &paths).await;
     assert!(answers[2..].iter().all(|(head, _)| head.starts_with("HTTP/1.1 404")), "{answers:?}");
+    let [list, run] = [0, 1].map(|index| serde_json::from_str::<Value>(&answers[index].1).unwrap());
+    let names = list.as_array().unwrap().iter().map(|run| &run["name"]);
+    assert_eq!(Vec::from_iter(names), ["a", "b/c"]);
+    let evaluations = json!([[2000, 11.0, 2f64.sqrt(), 2, true], [4000, 5.0, null, 1, false]]);
+    assert_eq!(run["evaluations"], evaluations);
+    assert_eq!(run["history"], json!({ "names": ["bc_loss"], "rows": [[100.0, 1.0, 0.5]] }));
+    let metrics = config("run", 1).experiment.definition().unwrap().metrics;
+    assert_eq!(run["metrics"].as_array().unwrap().len(), metrics.len());
+    assert!(run["settings"].as_str().unwrap().contains("[experiment.agent]"));
 }
 
 #[tokio::test]
-async fn a_learner_says_what_it_does_at_the_moment() {
+async fn the_api_has_the_learners_state() {
     let folder = tempfile::tempdir().unwrap();
-    let live: Live = Arc::new(|| serde_json::json!({ "step": 7 }));
+    let live: Live = Arc::new(|| json!({ "step": 7 }));
     let answers = get(folder.path(), Some(live), &["/api/live"]).await;
     assert_eq!(answers[0].1, "{\"step\":7}");
 }

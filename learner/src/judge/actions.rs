@@ -1,0 +1,133 @@
+//! The actions of a policy in all states that its judgment needs.
+
+use std::time::{Duration, Instant};
+
+use quad_dataset::Batch;
+use quad_policy::{Policy, Scaling};
+use rayon::prelude::*;
+
+use super::data::Data;
+
+/// States per call of a policy, fewer if they take more than [`MEMORY`].
+const STATES: usize = 256;
+/// Bytes.
+const MEMORY: u64 = 1 << 28;
+/// First seed of the actions in judged episodes, beyond those of the training states.
+const JUDGED: u64 = 1 << 32;
+
+pub(super) struct Actions {
+    /// a' at the s' of each training transition, `[N, a]`, scaled.
+    pub next: Vec<f32>,
+    /// At the first state of each judged episode, `[episodes, a]`, scaled.
+    pub first: Vec<f32>,
+    /// At the compared states, `[states, a]`, in the data's units.
+    pub compared: Vec<f32>,
+}
+
+impl Actions {
+    pub fn of(policy: &dyn Policy, data: &Data) -> anyhow::Result<Self> {
+        let scaling = data.training.scaling();
+        let mut training = Batch::default();
+        data.training.gather(&Vec::from_iter(0..data.training.len() as u32), &mut training);
+        Ok(Self {
+            next: scaled(scaling, act(policy, scaling, &training.next_observations, 0)?),
+            first: scaled(scaling, act(policy, scaling, &data.first.observations, JUDGED)?),
+            compared: act(policy, scaling, &data.compared.observations, 2 * JUDGED)?,
+        })
+    }
+
+    /// Estimates how long [`Self::of`] takes, by a few states.
+    pub fn time(policy: &dyn Policy, data: &Data) -> anyhow::Result<Duration> {
+        let all = data.training.len() + data.first.size + data.compared.size;
+        let timed = data.compared.size.min(STATES);
+        let observations = &data.compared.observations[..timed * policy.observation_dim()];
+        let begin = Instant::now();
+        act(policy, data.training.scaling(), observations, 0)?;
+        Ok(begin.elapsed().mul_f64(all as f64 / timed as f64))
+    }
+}
+
+/// Actions `[n, a]` in the data's units, at scaled observations `[n, o]`. State i has seed + i.
+fn act(
+    policy: &dyn Policy,
+    scaling: &Scaling,
+    observations: &[f32],
+    seed: u64,
+) -> anyhow::Result<Vec<f32>> {
+    let (o, a) = (policy.observation_dim(), policy.action_dim());
+    let mut observations = observations.to_vec();
+    scaling.observations.iter().for_each(|affine| affine.to_user(&mut observations));
+    let mut actions = vec![0.0; observations.len() / o * a];
+    let mut states = STATES;
+    while states > 1 && policy.memory(states) > MEMORY {
+        states /= 2;
+    }
+    let chunks = observations.par_chunks(states * o).zip(actions.par_chunks_mut(states * a));
+    chunks.enumerate().try_for_each(|(chunk, (observations, actions))| {
+        let seeds = (seed + (chunk * states) as u64..).take(observations.len() / o);
+        let mut episodes = Vec::from_iter(seeds.map(|seed| policy.begin(seed)));
+        policy.act(observations, &mut episodes, actions)
+    })?;
+    Ok(actions)
+}
+
+/// From the data's units to [−1, 1].
+fn scaled(scaling: &Scaling, mut actions: Vec<f32>) -> Vec<f32> {
+    scaling.actions.iter().for_each(|affine| affine.to_network(&mut actions));
+    actions.iter_mut().for_each(|action| *action = action.clamp(-1.0, 1.0));
+    actions
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use quad_policy::{Affine, EpisodeState, PolicyError, Precision};
+
+    use super::*;
+
+    /// Its actions are its observations.
+    struct Echo;
+
+    impl Policy for Echo {
+        fn observation_dim(&self) -> usize {
+            2
+        }
+
+        fn action_dim(&self) -> usize {
+            2
+        }
+
+        fn precision(&self) -> Precision {
+            Precision::F32
+        }
+
+        fn memory(&self, _: usize) -> u64 {
+            0
+        }
+
+        fn act(
+            &self,
+            observations: &[f32],
+            _: &mut [EpisodeState],
+            actions: &mut [f32],
+        ) -> Result<(), PolicyError> {
+            actions.copy_from_slice(observations);
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn policies_act_in_the_datas_units() {
+        let affine = |offset: [f32; 2], scale: [f32; 2]| {
+            Some(Affine { offset: offset.into(), scale: scale.into() })
+        };
+        let scaling = Scaling {
+            observations: affine([100.0, -3.0], [10.0, 2.0]),
+            actions: affine([90.0, 0.0], [20.0, 1.0]),
+            ..Scaling::default()
+        };
+        let actions = act(&Echo, &scaling, &[0.0, 0.0, -1.5, 2.0], 0).unwrap();
+        assert_eq!(actions, [100.0, -3.0, 85.0, 1.0]);
+        assert_eq!(scaled(&scaling, actions), [0.5, -1.0, -0.25, 1.0]);
+    }
+}

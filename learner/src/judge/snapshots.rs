@@ -1,0 +1,92 @@
+//! Finds the snapshots to judge, by the paths of runs or of files.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, anyhow};
+use quad_policy::{Policy, Precision, load_policy};
+use quad_protocol::Hash;
+use quad_run::config::RunConfig;
+use quad_run::run::{RunDir, walk};
+use quad_runtime::Hint;
+
+const HELP: &str = "what can be judged is the folder of a run, or a snapshot in it, like RUN/snapshots/step_000020000.safetensors";
+
+pub(super) struct Snapshot {
+    pub folder: RunDir,
+    pub config: RunConfig,
+    pub step: u64,
+    /// BLAKE3 of the file.
+    pub weights: String,
+    pub policy: Box<dyn Policy>,
+    /// Episodes that the run has not trained on.
+    pub held_out: BTreeSet<usize>,
+}
+
+/// The last snapshot of each run in or below a folder, and each snapshot that is named itself;
+/// duplicates once.
+pub(super) fn find(paths: &[PathBuf]) -> anyhow::Result<Vec<Snapshot>> {
+    let mut snapshots = Vec::new();
+    for path in paths {
+        if path.is_file() {
+            snapshots.push(of_file(path)?);
+            continue;
+        }
+        let mut unreadable = None;
+        let runs = walk(path, &mut |path, error| unreadable = Some((path.to_owned(), error)));
+        if runs.is_empty() {
+            return match unreadable {
+                Some((path, error)) => {
+                    Err(error).with_context(|| format!("cannot read {}", path.display()))
+                }
+                None => Err(anyhow!("there is no run in {}", path.display())),
+            }
+            .hint(HELP);
+        }
+        for run in runs {
+            let folder = RunDir::at(&run);
+            let Some(step) = folder.snapshots()?.pop() else {
+                return Err(anyhow!("the run in {} has no snapshot yet", run.display()))
+                    .hint("train it further, or leave it out");
+            };
+            snapshots.push(Snapshot::read(folder, step)?);
+        }
+    }
+    let mut seen = BTreeSet::new();
+    snapshots.retain(|snapshot| seen.insert(snapshot.weights.clone()));
+    Ok(snapshots)
+}
+
+fn of_file(path: &Path) -> anyhow::Result<Snapshot> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let number = name.strip_prefix("step_").and_then(|name| name.strip_suffix(".safetensors"));
+    let step = number.and_then(|number| number.parse().ok());
+    let run = path.parent().and_then(Path::parent).filter(|folder| RunDir::is_occupied(folder));
+    match (step, run) {
+        (Some(step), Some(run)) => Snapshot::read(RunDir::at(run), step),
+        _ => Err(anyhow!(
+            "{} is in no run's folder, so that nothing says what it has learned from",
+            path.display()
+        ))
+        .hint(HELP),
+    }
+}
+
+impl Snapshot {
+    fn read(folder: RunDir, step: u64) -> anyhow::Result<Self> {
+        let config = folder.read_config()?;
+        let file = folder.read_snapshot(step)?;
+        let path = folder.snapshot_path(step);
+        let policy = load_policy(&file, Precision::F32)
+            .map_err(|error| anyhow!("{} is not a policy: {error}", path.display()))
+            .hint(HELP)?;
+        Ok(Self {
+            step,
+            weights: Hash::of(&file).to_string(),
+            policy,
+            held_out: config.dataset.held_out.iter().copied().collect(),
+            config,
+            folder,
+        })
+    }
+}
