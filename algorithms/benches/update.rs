@@ -49,7 +49,7 @@ struct Experiment {
 fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment {
     let definition =
         ALGORITHMS.into_iter().find(|known| known.name == algorithm).expect("an algorithm");
-    let mut values = Values::of(&definition).expect("its values").for_task(Some(task));
+    let mut values = Values::of(&definition).for_task(Some(task));
     let Some(toml::Value::Table(mut agent)) = values.remove("agent") else {
         panic!("no values for {task}")
     };

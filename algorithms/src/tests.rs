@@ -227,7 +227,7 @@ fn a_nan_is_never_dropped() {
 fn a_hyper_parameter_that_is_refused_is_named() {
     for definition in ALGORITHMS {
         let Some(toml::Value::Table(agent)) =
-            Values::of(&definition).unwrap().for_task(None).remove("agent")
+            Values::of(&definition).for_task(None).remove("agent")
         else {
             panic!("{} has no values", definition.name)
         };

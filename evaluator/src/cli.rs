@@ -113,7 +113,7 @@ impl Cli {
             Command::Doctor(args) => {
                 let findings = doctor::examine(&args)?;
                 print(&if args.json { json(&findings)? } else { findings.to_string() })?;
-                findings.verdict()
+                Ok(findings.verdict()?)
             }
             Command::Completions { shell } => {
                 let mut script = Vec::new();

@@ -1,36 +1,23 @@
-//! Errors of Rust as Python's exceptions, with their causes and a hint.
+//! Errors of Rust as Python's exceptions.
 
 use std::error::Error;
 
 use pyo3::PyErr;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use quad_policy::PolicyError;
+use quad_runtime::one_line;
 
-/// An error and what caused it, in one line.
-fn chain(error: &dyn Error) -> String {
-    let (mut text, mut source) = (error.to_string(), error.source());
-    while let Some(error) = source {
-        let reason = error.to_string();
-        // Some messages hold their cause already.
-        if !text.ends_with(&reason) {
-            text = format!("{text}: {reason}");
-        }
-        source = error.source();
-    }
-    text
-}
-
-/// A ValueError that says what to do.
+/// A ValueError with a hint.
 pub fn with_hint(error: &dyn Error, hint: &str) -> PyErr {
-    PyValueError::new_err(format!("{}\nhint: {hint}", chain(error)))
+    PyValueError::new_err(format!("{}\nhint: {hint}", one_line(error)))
 }
 
-/// RuntimeError where arithmetic fails, ValueError for what was asked for.
+/// A RuntimeError where arithmetic fails, else a ValueError.
 pub fn of_policy(error: &PolicyError) -> PyErr {
     match error {
         PolicyError::Candle(_) | PolicyError::NotANumber(_) => {
-            PyRuntimeError::new_err(chain(error))
+            PyRuntimeError::new_err(one_line(error))
         }
-        _ => PyValueError::new_err(chain(error)),
+        _ => PyValueError::new_err(one_line(error)),
     }
 }

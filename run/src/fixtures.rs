@@ -1,7 +1,7 @@
 //! What tests write into run folders; the learner's have them, too.
 
 use quad_run::config::{RunConfig, resolve};
-use quad_run::run::ScoreLine;
+use quad_run::folder::ScoreLine;
 use serde_json::json;
 
 /// The configuration of a run with two episodes an evaluation.

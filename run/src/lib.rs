@@ -6,7 +6,7 @@
 //!
 //! - [`status`]: how far runs are, and a list of all runs.
 //! - [`results`]: a run's scores, summarized, and the paper's.
-//! - [`run`]: a run's folder.
+//! - [`folder`]: a run's folder.
 //! - [`config`]: a run's settings.
 //! - [`table`]: a table as text, Markdown, LaTeX and CSV.
 //! - [`files`]: how every program opens and makes files in a run's folder.
@@ -20,7 +20,7 @@ pub mod config;
 pub mod files;
 #[cfg(test)]
 mod fixtures;
+pub mod folder;
 pub mod results;
-pub mod run;
 pub mod status;
 pub mod table;

@@ -15,23 +15,23 @@ pub enum Style {
     Latex,
 }
 
-/// A part of a report.
+/// A paragraph or a table of a report.
 #[derive(Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Part {
+pub enum Block {
     /// Lines of text.
-    Words(String),
+    Text(String),
     /// A table.
     Table(Table),
 }
 
-impl Part {
-    /// The part as text.
+impl Block {
+    /// The block in a style.
     pub fn render(&self, style: Style) -> String {
         match (self, style) {
             (Self::Table(table), _) => table.render(style),
-            (Self::Words(text), Style::Text | Style::Markdown) => text.clone(),
-            (Self::Words(text), Style::Latex) => {
+            (Self::Text(text), Style::Text | Style::Markdown) => text.clone(),
+            (Self::Text(text), Style::Latex) => {
                 text.lines().map(|line| format!("{}\n\n", latex(line))).collect()
             }
         }

@@ -16,7 +16,7 @@ pub struct Health {
 impl Health {
     /// Adds a part of the process that will report at least every `limit` while it is alive. The
     /// part counts as alive from this call on.
-    pub fn part(&self, name: impl Into<String>, limit: Duration) -> Beat {
+    pub fn register(&self, name: impl Into<String>, limit: Duration) -> Heartbeat {
         let part = Arc::new(Part {
             name: name.into(),
             limit,
@@ -25,7 +25,7 @@ impl Health {
             state: Mutex::new(State { ending: Ending::Running, trouble: None }),
         });
         self.parts.lock().unwrap_or_else(PoisonError::into_inner).push(part.clone());
-        Beat { part }
+        Heartbeat { part }
     }
 
     /// What is wrong, one line per problem; empty if all is well.
@@ -46,14 +46,14 @@ impl Health {
     }
 }
 
-/// A part's handle to report its health. If it is dropped without [`finish`](Beat::finish), as by a
+/// A part's handle to report its health. If it is dropped without [`finish`](Heartbeat::finish), as by a
 /// panic, the part counts as broken.
 #[derive(Debug)]
-pub struct Beat {
+pub struct Heartbeat {
     part: Arc<Part>,
 }
 
-impl Beat {
+impl Heartbeat {
     /// Reports that the part is alive. This reads the clock and stores an atomic, so a thread may
     /// call it as often as it likes.
     pub fn alive(&self) {
@@ -71,7 +71,7 @@ impl Beat {
 
     /// Reports a problem of a part that is alive, like a full disk; `None` when the problem is
     /// over.
-    pub fn set_trouble(&self, trouble: Option<String>) {
+    pub fn set_problem(&self, trouble: Option<String>) {
         self.part.state().trouble = trouble;
     }
 
@@ -81,7 +81,7 @@ impl Beat {
     }
 }
 
-impl Drop for Beat {
+impl Drop for Heartbeat {
     fn drop(&mut self) {
         let mut state = self.part.state();
         if state.ending == Ending::Running {
@@ -156,7 +156,7 @@ mod tests {
     fn a_part_that_falls_silent_is_named_until_it_is_back() {
         let health = Health::default();
         assert!(health.problems().is_empty(), "no parts, no problems");
-        let (scores, _other) = (health.part("scores", SHORT), health.part("other", LONG));
+        let (scores, _other) = (health.register("scores", SHORT), health.register("other", LONG));
         assert!(health.problems().is_empty());
         let later = Instant::now() + 2 * SHORT;
         let problems = health.clone().problems_at(later);
@@ -171,9 +171,9 @@ mod tests {
     #[test]
     fn a_part_that_is_done_may_be_silent_and_one_that_broke_off_may_not() {
         let health = Health::default();
-        health.part("done", SHORT).finish();
+        health.register("done", SHORT).finish();
         assert!(health.problems_at(Instant::now() + 2 * SHORT).is_empty());
-        let beat = health.part("training", LONG);
+        let beat = health.register("training", LONG);
         let panicked = std::thread::spawn(move || {
             beat.alive();
             panic!("on purpose");
@@ -185,10 +185,10 @@ mod tests {
     #[test]
     fn trouble_is_told_as_long_as_it_lasts() {
         let health = Health::default();
-        let beat = health.part("checkpoints", LONG);
-        beat.set_trouble(Some("the disk is full since 12:00".to_owned()));
+        let beat = health.register("checkpoints", LONG);
+        beat.set_problem(Some("the disk is full since 12:00".to_owned()));
         assert_eq!(health.problems(), ["checkpoints: the disk is full since 12:00"]);
-        beat.set_trouble(None);
+        beat.set_problem(None);
         assert!(health.problems().is_empty());
     }
 }

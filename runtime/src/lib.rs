@@ -1,20 +1,12 @@
-//! What learner and evaluator share as long-running programs.
+//! Services that learner and evaluator share.
 //!
 //! # Layout
 //!
-//! In reading order, which follows a process from start to end:
-//!
-//! - `logging`: which log lines a program writes, and where to.
-//! - `endpoints`: where learner and evaluators meet; `certificates`: how they show their roles;
-//!   `access`: what each role may do; `session`: the connection over Zenoh; `router`: a meeting
-//!   point of many learners on one machine.
-//! - `threads`, `background`: limit the processor time that the network takes.
-//! - `health`: whether the parts of a process still do their work.
-//! - `metrics_server`: `/metrics` and `/healthz`.
-//! - `shutdown`: the signals that end a process.
-//! - `exit`: how a program shows a result or an error to the user, and its exit code.
-//! - `progress_bar`: shows how far a task is.
-//! - [`doctor`]: checks of a machine, before a run starts on it.
+//! In reading order, from the start of a process to its end: `logging`; `endpoints`, `certificates`,
+//! `access` and `session`, the connection over Zenoh; `router`, a meeting point of the learners on one
+//! machine; `threads` and `background`, limits on processor time; `health` and `metrics_server`;
+//! `shutdown`, the signals; `exit`, errors and exit codes; `progress_bar`; [`doctor`], checks of a
+//! machine.
 
 mod access;
 mod background;
@@ -35,12 +27,12 @@ pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role, certificates_folder};
 pub use endpoints::{DEFAULT_PORT, Endpoints, SessionError, default_endpoint, parse_endpoint};
 pub use exit::{
-    ENDED_AT_ONCE, Hint, UNFINISHED, clean, error_in, hinted, hints, json, print, run_main,
-    unfinished,
+    ENDED_AT_ONCE, FAILURE_FILE, Hint, UNFINISHED, clean, hinted, hints, json, one_line, print,
+    run_main, unfinished,
 };
-pub use health::{Beat, Health};
+pub use health::{Health, Heartbeat};
 pub use logging::{Logging, init_logging};
-pub use metrics_server::{MetricsServer, serve_metrics};
+pub use metrics_server::{ListenError, MetricsServer, serve_metrics};
 pub use progress_bar::ProgressBar;
 pub use router::open_router;
 pub use session::{open_session, reachable_at};

@@ -1,12 +1,11 @@
 //! Serves `/metrics`, `/healthz` and the pages of a program.
 
 use std::collections::VecDeque;
-use std::fs;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
+use std::{fs, io};
 
-use anyhow::Context;
 use axum::Router;
 use axum::extract::{Request, State};
 use axum::http::uri::Authority;
@@ -23,28 +22,47 @@ use tokio::task::{AbortHandle, JoinHandle, JoinSet};
 use tokio::time::timeout;
 use tracing::{debug, warn};
 
-use crate::exit::Hint;
 use crate::health::Health;
 
-/// A request is a few lines in one packet. The server closes a connection whose request is
-/// incomplete after this time.
+/// Time limit of a request, which is a few lines in one packet.
 const REQUEST: Duration = Duration::from_secs(3);
-/// A connection serves one request, and lasts at most this long, however slowly its client reads.
+/// Time limit of a connection, which serves one request.
 const CONNECTION: Duration = Duration::from_secs(15);
 /// Most connections at a time. A further connection ends the oldest, so that idle clients do not
 /// keep others out.
 const MOST_CONNECTIONS: usize = 64;
-/// Bytes of a connection's request that the server buffers; hyper takes no fewer.
+/// Bytes of a request that the server buffers; hyper takes no fewer.
 const MOST_BUFFERED: usize = 8 << 10;
 /// Pause after a connection could not be accepted, most likely because too many files are open.
 const RETRY: Duration = Duration::from_secs(1);
 
-/// Serves as long as this value lives.
+/// The server cannot listen at its address.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot listen at {address}")]
+pub struct ListenError {
+    address: SocketAddr,
+    source: io::Error,
+}
+
+impl ListenError {
+    /// Tells the user how to fix it.
+    pub fn hint(&self) -> &'static str {
+        "another program may listen there: choose another address, or port 0 for a free one"
+    }
+}
+
+/// A server, which ends when this is dropped.
 #[derive(Debug)]
 pub struct MetricsServer {
-    /// Where the server listens; if port 0 was asked for, with the port that the system chose.
+    /// The server's address, with the port that the system chose for port 0.
     pub address: SocketAddr,
     task: JoinHandle<()>,
+}
+
+impl Drop for MetricsServer {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
 }
 
 /// Serves over HTTP at `address`: `/metrics` with the metrics of `registry` in Prometheus's text
@@ -56,30 +74,22 @@ pub struct MetricsServer {
 ///
 /// The server cuts off clients that send or read slowly, or hold idle connections; they cost a
 /// bounded amount of memory.
-///
-/// # Errors
-/// The server cannot listen at the address.
 pub async fn serve_metrics(
     address: SocketAddr,
     registry: Registry,
     health: Health,
     pages: Router,
-) -> anyhow::Result<MetricsServer> {
-    let listener =
-        TcpListener::bind(address).await.with_context(|| format!("cannot listen at {address}"));
-    let listener = listener.hint(
-        "another program may listen there: choose another address, or port 0 for a free one",
-    )?;
-    let address = listener.local_addr()?;
+) -> Result<MetricsServer, ListenError> {
+    let refused = |source| ListenError { address, source };
+    let listener = TcpListener::bind(address).await.map_err(refused)?;
+    let address = listener.local_addr().map_err(refused)?;
     let metrics = get(metrics).with_state(registry);
-    let [name, resolver] = ["/proc/sys/kernel/hostname", "/etc/resolv.conf"].map(|path| {
-        if address.ip().is_loopback() {
-            String::new()
-        } else {
-            fs::read_to_string(path).unwrap_or_default()
-        }
-    });
-    let own_names: Arc<[String]> = own_names(name.trim(), &resolver).into();
+    let own_names: Arc<[String]> = if address.ip().is_loopback() {
+        Arc::default()
+    } else {
+        let read = |path| fs::read_to_string(path).unwrap_or_default();
+        own_names(read("/proc/sys/kernel/hostname").trim(), &read("/etc/resolv.conf")).into()
+    };
     let router = Router::new()
         .route("/metrics", metrics)
         .route("/healthz", get(healthz).with_state(health))
@@ -129,15 +139,14 @@ async fn answer(stream: TcpStream, router: Router) {
     }
 }
 
-/// The owner of a web page may let its name lead to this machine (DNS rebinding). The browser of a
-/// person who reads that page would then give it our answers, but it tells us the page's name.
+/// Refuses requests that name another host. Without this, a web page whose name leads to this machine
+/// (DNS rebinding) could read our answers in the browser of a person who visits it.
 async fn refuse_other_names(
     State(own_names): State<Arc<[String]>>,
     request: Request,
     next: Next,
 ) -> Response {
-    let is_ours =
-        |name: &[u8]| std::str::from_utf8(name).is_ok_and(|name| names_us(name, &own_names));
+    let is_ours = |name: &[u8]| str::from_utf8(name).is_ok_and(|name| names_us(name, &own_names));
     if request.headers().get(header::HOST).is_none_or(|name| is_ours(name.as_bytes())) {
         return next.run(request).await;
     }
@@ -145,9 +154,8 @@ async fn refuse_other_names(
     (StatusCode::FORBIDDEN, hint).into_response()
 }
 
-/// What other machines may call this one: by its first name, its whole name, and its first name in
-/// each domain that a resolver's settings name. A stranger can have the first name in any other
-/// domain.
+/// Names of this machine for others: its first name, its full name, and its first name in each
+/// domain that the resolver searches. In other domains, the first name may be a stranger's.
 fn own_names(name: &str, resolver: &str) -> Vec<String> {
     let Some(first) = name.split('.').next().filter(|first| !first.is_empty()) else {
         return Vec::new();
@@ -183,43 +191,38 @@ async fn healthz(State(health): State<Health>) -> (StatusCode, String) {
     }
 }
 
-impl Drop for MetricsServer {
-    fn drop(&mut self) {
-        self.task.abort();
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::{names_us, own_names};
 
     #[test]
-    fn by_which_names_a_request_may_ask() {
-        for host in ["127.0.0.1:8080", "[::1]:8080", "192.0.2.1", "localhost", "LocalHost:9600"] {
-            assert!(names_us(host, &[]), "{host}");
-        }
-        let own =
-            own_names("box7.lan", "nameserver 192.0.2.1\nsearch lab.example.org example.org\n");
-        for host in
-            ["box7", "box7:9600", "box7.lan", "Box7.example.org:9600", "box7.lab.example.org"]
-        {
-            assert!(names_us(host, &own) && !names_us(host, &[]), "{host}");
-        }
-        for host in [
-            "evil.example",
-            "box7.evil.example",
-            "box7.org",
-            ":9600",
-            "localhost.evil.example",
-            "127.0.0.1.evil.example:80",
-            "user@evil.example",
-            "",
-            "a b",
+    fn names_of_this_machine() {
+        let resolver = "nameserver 192.0.2.1\nsearch lab.example.org example.org\n";
+        let own = own_names("box7.lan", resolver);
+        for (host, anywhere, on_box7) in [
+            ("127.0.0.1:8080", true, true),
+            ("[::1]:8080", true, true),
+            ("192.0.2.1", true, true),
+            ("localhost", true, true),
+            ("LocalHost:9600", true, true),
+            ("box7", false, true),
+            ("box7:9600", false, true),
+            ("box7.lan", false, true),
+            ("Box7.example.org:9600", false, true),
+            ("box7.lab.example.org", false, true),
+            ("evil.example", false, false),
+            ("box7.evil.example", false, false),
+            ("box7.org", false, false),
+            (":9600", false, false),
+            ("localhost.evil.example", false, false),
+            ("127.0.0.1.evil.example:80", false, false),
+            ("user@evil.example", false, false),
+            ("", false, false),
+            ("a b", false, false),
         ] {
-            assert!(
-                !names_us(host, &own) && !names_us(host, &own_names("", "search evil.example")),
-                "{host}"
-            );
+            let nameless = own_names("", "search evil.example");
+            assert_eq!(names_us(host, &nameless), anywhere, "{host}");
+            assert_eq!(names_us(host, &own), on_box7, "{host}");
         }
     }
 }

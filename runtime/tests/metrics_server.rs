@@ -72,9 +72,9 @@ async fn a_strangers_name_that_leads_here_is_told_nothing() {
 async fn ill_health_is_told_line_by_line() {
     let health = Health::default();
     let (server, _) = server(health.clone()).await;
-    let scores = health.part("scores", Duration::from_secs(3600));
-    scores.set_trouble(Some("the disk is full".to_owned()));
-    drop(health.part("training", Duration::from_secs(3600)));
+    let scores = health.register("scores", Duration::from_secs(3600));
+    scores.set_problem(Some("the disk is full".to_owned()));
+    drop(health.register("training", Duration::from_secs(3600)));
     let (head, body) = get(server.address, "/healthz").await;
     assert!(head.starts_with("http/1.1 503"), "{head}");
     assert_eq!(body, "scores: the disk is full\ntraining: it ended before its work was done\n");

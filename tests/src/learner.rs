@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use quad_run::run::{RunDir, RunEndpoints, ScoreLine};
+use quad_run::folder::{RunDir, RunEndpoints, ScoreLine};
 
 use crate::process::{Process, binary};
 use crate::{PATIENCE, eventually, http};

@@ -83,7 +83,7 @@ fn keys(group: &Table) -> Vec<String> {
 #[test]
 fn in_no_file_two_patterns_are_equally_good_for_a_key() {
     for definition in ALGORITHMS {
-        let values = Values::of(&definition).unwrap();
+        let values = Values::of(&definition);
         for task in tasks() {
             let groups: Vec<_> =
                 values.groups.iter().filter(|(pattern, _)| fits(pattern, &task)).collect();

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use quad_policy::{Policy, Precision};
 use quad_protocol::{EpisodeScore, Hash, Job, Name, ScoreReport};
-use quad_runtime::Beat;
+use quad_runtime::Heartbeat;
 use tracing::info;
 
 use super::client::RunClient;
@@ -30,7 +30,7 @@ pub struct Evaluator {
     /// needs again.
     policy: Option<(Hash, String, Arc<dyn Policy>)>,
     /// Reports that the evaluator is not stuck.
-    pub beat: Beat,
+    pub beat: Heartbeat,
 }
 
 impl Evaluator {
@@ -40,7 +40,7 @@ impl Evaluator {
         environments: Arc<dyn Environments>,
         precision: Precision,
         metrics: Metrics,
-        beat: Beat,
+        beat: Heartbeat,
     ) -> Evaluator {
         Evaluator { name, environments, precision, metrics, policy: None, beat }
     }
@@ -195,7 +195,7 @@ mod tests {
     async fn a_job_is_well_as_long_as_it_advances() {
         let health = Health::default();
         let (name, metrics) = (Name::new("evaluator").unwrap(), Metrics::new().unwrap());
-        let beat = health.part("worker", LIMIT);
+        let beat = health.register("worker", LIMIT);
         let evaluator = Evaluator::new(name, Arc::new(Simulations), Precision::F32, metrics, beat);
         let [noticed, recovered] = [false; 2].map(AtomicBool::new);
         let policy = Arc::new(Sleeper { calls: AtomicU32::new(0), health, noticed, recovered });

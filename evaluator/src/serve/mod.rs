@@ -40,8 +40,8 @@ use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_runtime::{
-    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, Role, SessionError,
-    default_endpoint, parse_endpoint,
+    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, ListenError, Role,
+    SessionError, default_endpoint, parse_endpoint, serve_metrics,
 };
 use rand::Rng;
 use tracing::{info, warn};
@@ -129,8 +129,9 @@ async fn serve_until_stopped(
     let _server = match args.http {
         Some(address) => {
             let (registry, health) = (metrics.registry.clone(), health.clone());
-            let server =
-                quad_runtime::serve_metrics(address, registry, health, Default::default()).await?;
+            let server = serve_metrics(address, registry, health, Default::default())
+                .await
+                .hint_of(ListenError::hint)?;
             info!("metrics at http://{}/metrics", server.address);
             Some(server)
         }
@@ -138,7 +139,7 @@ async fn serve_until_stopped(
     };
     let mut discovery =
         Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
-    let beat = health.part("worker", STUCK);
+    let beat = health.register("worker", STUCK);
     let evaluator = Evaluator::new(name, environments, args.precision, metrics.clone(), beat);
     let worker = Worker::new(evaluator, metrics.clone(), discovery.runs());
     let end = async {

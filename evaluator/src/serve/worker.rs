@@ -169,7 +169,7 @@ mod tests {
         let (health, (_keep, found)) = (Health::default(), watch::channel(Runs::new()));
         let (name, metrics, limit) =
             (Name::new("idle").unwrap(), Metrics::new().unwrap(), Duration::from_secs(1));
-        let (environments, beat) = (Arc::new(Simulations), health.part("worker", limit));
+        let (environments, beat) = (Arc::new(Simulations), health.register("worker", limit));
         let evaluator = Evaluator::new(name, environments, Precision::F32, metrics.clone(), beat);
         // One that says nothing is not well any more by then, and stays so.
         let stop = async {

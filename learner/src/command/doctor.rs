@@ -3,7 +3,7 @@
 use std::path::{Path, absolute};
 
 use quad_policy::Precision;
-use quad_run::run::Lock;
+use quad_run::folder::Lock;
 use quad_runtime::doctor::{self, Findings};
 use quad_runtime::{DEFAULT_PORT, Endpoints, Role, certificates_folder};
 
@@ -47,7 +47,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     };
     let endpoints =
         Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
-    doctor::connected(&mut findings, &endpoints, async |_, _| Ok(()))?;
+    doctor::connected(&mut findings, &endpoints, async |_, _| anyhow::Ok(()))?;
     Ok(findings)
 }
 

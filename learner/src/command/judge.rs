@@ -1,6 +1,6 @@
 //! `learner judge`: ranks policies by the data alone.
 
-use quad_run::table::{Part, Style};
+use quad_run::table::{Block, Style};
 use quad_runtime::{json, print};
 
 use crate::cli::JudgeArgs;
@@ -9,6 +9,6 @@ use crate::judge::{Budget, judge};
 pub fn run(args: &JudgeArgs) -> anyhow::Result<()> {
     let JudgeArgs { policies, gamma, steps, seeds, json: as_json } = args;
     let ranking = judge(policies, *gamma, Budget { steps: *steps, seeds: *seeds })?;
-    let text = |part: Part| part.render(Style::Text);
+    let text = |part: Block| part.render(Style::Text);
     print(&if *as_json { json(&ranking)? } else { ranking.parts().map(text).join("\n") })
 }

@@ -17,9 +17,8 @@ use clap::CommandFactory;
 use clap_complete::Shell;
 use quad_algorithms::{ALGORITHMS, Definition, Metric, Values};
 use quad_dataset::{DatasetError, environment};
-use quad_run::config::hyperparameters;
-use quad_run::config::{Preset, tasks};
-use quad_run::run::{RunDirError, verify};
+use quad_run::config::{ConfigError, Preset, hyperparameters, tasks};
+use quad_run::folder::{RunDirError, verify};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, hinted, json, print, unfinished};
@@ -67,7 +66,10 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
 
 fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     if let Some(preset) = &args.preset {
-        return print_preset(&Preset::read(preset)?, args.algorithm.as_deref());
+        return print_preset(
+            &Preset::read(preset).hint_of(ConfigError::hint)?,
+            args.algorithm.as_deref(),
+        );
     }
     if args.metrics {
         return print_metrics(args.algorithm.as_deref());
@@ -75,7 +77,7 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     let header = ["task", "environment", "dataset", "what it is"];
     let mut of_tasks = Table::new(&header.map(|name| (name, Left)));
     for task in tasks::all().iter().filter(|task| task.is_listed) {
-        let word = |key| task.word(key).unwrap_or("-");
+        let word = |key| task.text(key).unwrap_or("-");
         of_tasks.push(
             [&*task.name, word("environment"), word("dataset"), &task.about].map(str::to_owned),
         );
@@ -83,7 +85,7 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     let header = ["algorithm", "what it is", "its authors give values for", "GFLOP a step"];
     let mut of_algorithms = Table::new(&header.map(|name| (name, Left)));
     for definition in &ALGORITHMS {
-        let values = Values::of(definition)?;
+        let values = Values::of(definition);
         of_algorithms.push([
             definition.name.to_owned(),
             values.about,
@@ -110,13 +112,10 @@ fn print_metrics(algorithm: Option<&str>) -> anyhow::Result<()> {
 
 fn print_preset(preset: &Preset, algorithm: Option<&str>) -> anyhow::Result<()> {
     let changes = algorithm.map(|name| ("algorithm".to_owned(), name.into()));
-    let experiment = preset.resolve(&changes.into_iter().collect())?;
-    let not_given = preset
-        .task
-        .map(|task| hyperparameters::not_given(&experiment.definition()?, task))
-        .transpose()?;
-    let comment =
-        not_given.flatten().map(|sentence| format!("# {sentence}\n\n")).unwrap_or_default();
+    let experiment = preset.resolve(&changes.into_iter().collect()).hint_of(ConfigError::hint)?;
+    let definition = experiment.definition()?;
+    let not_given = preset.task.and_then(|task| hyperparameters::not_given(&definition, task));
+    let comment = not_given.map(|sentence| format!("# {sentence}\n\n")).unwrap_or_default();
     print(&(comment + &toml::to_string(&experiment)?))
 }
 
@@ -193,7 +192,7 @@ fn completions(shell: Shell) -> anyhow::Result<()> {
 fn examine(args: &DoctorArgs) -> anyhow::Result<()> {
     let findings = doctor::examine(args)?;
     print(&if args.json { json(&findings)? } else { findings.to_string() })?;
-    findings.verdict()
+    Ok(findings.verdict()?)
 }
 
 fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {

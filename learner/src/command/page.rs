@@ -1,7 +1,9 @@
 //! `learner page`: serves the page of all runs until it is told to stop.
 
 use anyhow::anyhow;
-use quad_runtime::{Health, LEAVE_WITHIN, hinted, serve_metrics, shutdown_signal};
+use quad_runtime::{
+    Health, Hint, LEAVE_WITHIN, ListenError, hinted, serve_metrics, shutdown_signal,
+};
 use tracing::info;
 
 use crate::cli::PageArgs;
@@ -15,7 +17,9 @@ pub fn show(args: &PageArgs) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(async {
         let page = routes(args.runs.clone(), None)?;
-        let server = serve_metrics(args.http, Default::default(), Health::default(), page).await?;
+        let server = serve_metrics(args.http, Default::default(), Health::default(), page)
+            .await
+            .hint_of(ListenError::hint)?;
         info!("page: http://{}/ shows the runs in {folder}; Ctrl-C ends it", server.address);
         shutdown_signal(LEAVE_WITHIN).await;
         Ok(())

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::thread::available_parallelism;
 
 use anyhow::{Context, anyhow};
-use quad_run::run::{Lock, RunDirError};
+use quad_run::folder::{Lock, RunDirError};
 use quad_run::status::State;
 use quad_run::table::{Style, Table};
 use quad_runtime::{

@@ -9,10 +9,14 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{Split, Task, environment, ogbench};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_run::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
+use quad_run::config::{
+    ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters,
+};
+use quad_run::folder::{ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
-use quad_run::run::{self, Begun, Log, Past, RunDir};
-use quad_runtime::{Health, Hint, hinted, print, stay_in_background, unfinished};
+use quad_runtime::{
+    Health, Hint, ListenError, hinted, print, serve_metrics, stay_in_background, unfinished,
+};
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
@@ -30,8 +34,8 @@ const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Trains; a run that does not complete is an error.
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
-    let preset = Preset::read(args.preset())?;
-    let experiment = preset.resolve(&args.changes())?;
+    let preset = Preset::read(args.preset()).hint_of(ConfigError::hint)?;
+    let experiment = preset.resolve(&args.changes()).hint_of(ConfigError::hint)?;
     let named = experiment
         .dataset
         .clone()
@@ -50,7 +54,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         None => default_run_dir(&preset.label, &experiment)?,
     };
     let name = run_name(&path)?;
-    let begun = run::open(&path, args.fresh)?;
+    let begun = ExistingRun::open(&path, args.fresh)?;
     let outside = Outside::new(args, &experiment)?;
 
     device::check(args.device, experiment.precision)?;
@@ -60,12 +64,12 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let data = load(&dataset.path, &experiment)?;
     let config = run_config(args, &name, preset.task_name(), experiment, dataset, &data)?;
     if let Some(begun) = &begun {
-        begun.check_same(&config)?;
+        begun.check_same_config(&config)?;
     }
     info!("{}", config.dataset.summary());
     info!("{}", config.experiment.summary()?);
     if let Some(task) = preset.task
-        && let Some(warning) = hyperparameters::not_given(&config.experiment.definition()?, task)?
+        && let Some(warning) = hyperparameters::not_given(&config.experiment.definition()?, task)
     {
         warn!("{warning}");
     }
@@ -88,7 +92,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime =
         runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
-    let ended = runtime.block_on(run_to_its_end(args, outside, &path, begun, name, &config, data));
+    let ended = runtime.block_on(run_to_end(args, outside, &path, begun, name, &config, data));
     let concluded = ended.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
     // Does not wait for a thread that a broken disk blocks.
     runtime.shutdown_background();
@@ -115,11 +119,11 @@ fn record_hint(Experiment { environment: name, .. }: &Experiment) -> String {
     format!("name a file as `dataset`, on the command line by --dataset FILE; {other}")
 }
 
-async fn run_to_its_end(
+async fn run_to_end(
     args: &TrainArgs,
     mut outside: Outside,
     path: &Path,
-    begun: Option<Begun>,
+    begun: Option<ExistingRun>,
     name: Name,
     config: &RunConfig,
     data: Split,
@@ -130,7 +134,9 @@ async fn run_to_its_end(
     let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
     let telling = live.clone();
     let page = page::routes(path.to_owned(), Some(Arc::new(move || telling.tell())))?;
-    let server = quad_runtime::serve_metrics(args.http, registry, health.clone(), page).await?;
+    let server = serve_metrics(args.http, registry, health.clone(), page)
+        .await
+        .hint_of(ListenError::hint)?;
     info!("page: http://{}/", server.address);
     let Experiment { environment, .. } = &config.experiment;
     let Split { training, held_out, .. } = data;
@@ -141,8 +147,8 @@ async fn run_to_its_end(
     });
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
-    let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
-    let (tell, events) = mpsc::unbounded_channel();
+    let (run_dir, scores, past) = open_or_create(path, begun, args.fresh, config)?;
+    let (tx, events) = mpsc::unbounded_channel();
     // A later start has a larger number; the low bits distinguish two that start in the same
     // millisecond.
     let incarnation =
@@ -156,7 +162,7 @@ async fn run_to_its_end(
         past,
         checkpoint_every,
     };
-    let threads = Threads::start(run, task, (agent, held_out), &metrics, &health, &tell)?;
+    let threads = Threads::start(run, task, (agent, held_out), &metrics, &health, &tx)?;
     threads.show_on(&live);
     let main_loop = MainLoop {
         incarnation,
@@ -167,7 +173,7 @@ async fn run_to_its_end(
         endpoints: outside.endpoints,
         events,
         threads,
-        beat: health.part("main", STUCK),
+        beat: health.register("main", STUCK),
         health,
         evaluators: outside.evaluators,
     };
@@ -175,19 +181,19 @@ async fn run_to_its_end(
 }
 
 /// Opens or makes the run's folder, and reads what it contains.
-fn take_up(
+fn open_or_create(
     path: &Path,
-    begun: Option<Begun>,
+    begun: Option<ExistingRun>,
     fresh: bool,
     config: &RunConfig,
-) -> anyhow::Result<(RunDir, Log, Past)> {
+) -> anyhow::Result<(RunDir, Log, ResumePoint)> {
     match begun {
-        Some(begun) if !fresh => return begun.go_on(&config.experiment),
+        Some(begun) if !fresh => return Ok(begun.resume(&config.experiment)?),
         Some(begun) => begun.set_aside()?,
         None => {}
     }
     let (run_dir, scores) = RunDir::create(path, config)?;
-    Ok((run_dir, scores, Past::default()))
+    Ok((run_dir, scores, ResumePoint::default()))
 }
 
 /// Milliseconds since 1970.
@@ -250,9 +256,9 @@ fn within<T: Send + 'static>(
     patience: Duration,
     work: impl FnOnce() -> anyhow::Result<T> + Send + 'static,
 ) -> anyhow::Result<T> {
-    let (tell, told) = std::sync::mpsc::channel();
-    std::thread::spawn(move || tell.send(work()));
-    told.recv_timeout(patience).unwrap_or_else(|_| Err(anyhow!("it took longer than {patience:?}")))
+    let (tx, rx) = std::sync::mpsc::channel();
+    std::thread::spawn(move || tx.send(work()));
+    rx.recv_timeout(patience).unwrap_or_else(|_| Err(anyhow!("it took longer than {patience:?}")))
 }
 
 fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
@@ -260,9 +266,9 @@ fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     let mut text = String::new();
     if !report.evaluations.is_empty() {
         run_dir.write_json("report.json", &report)?;
-        let picture = run_dir.learning_curve();
+        let picture = run_dir.path().join("learning_curve.svg");
         of_run(&report).write_svg(&picture)?;
-        text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
+        text = format!("\n{}\nlearning curve: {}\n", report.text(), picture.display());
     }
     print(&format!("{text}run folder: {}", run_dir.path().display()))?;
     Ok(report)

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
-use quad_run::run::Earlier;
+use quad_run::folder::SavedScores;
 
 use super::episodes::Evaluation;
 use super::jobs::{OpenJob, OpenJobs};
@@ -51,13 +51,13 @@ pub(crate) struct Scoreboard {
     next_job: u64,
     /// Scores of an earlier incarnation, by step, whose evaluation has not been asked for in this
     /// one.
-    earlier: BTreeMap<u64, Earlier>,
+    earlier: BTreeMap<u64, SavedScores>,
 }
 
 impl Scoreboard {
     /// Without evaluations. The scores of an `earlier` incarnation count as soon as the evaluation
     /// of their step is asked for.
-    pub fn new(rules: Rules, earlier: BTreeMap<u64, Earlier>) -> Self {
+    pub fn new(rules: Rules, earlier: BTreeMap<u64, SavedScores>) -> Self {
         Self {
             rules,
             evaluations: BTreeMap::new(),

@@ -7,7 +7,7 @@ use anyhow::{Context, anyhow};
 use quad_policy::{Policy, Precision, load_policy};
 use quad_protocol::Hash;
 use quad_run::config::RunConfig;
-use quad_run::run::{RunDir, walk};
+use quad_run::folder::{RunDir, walk};
 use quad_runtime::Hint;
 
 const HELP: &str = "what can be judged is the folder of a run, or a snapshot in it, like RUN/snapshots/step_000020000.safetensors";

@@ -12,7 +12,7 @@ use quad_protocol::{
     EpisodeScore, Hash, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport,
     episode_seeds,
 };
-use quad_run::run::Earlier;
+use quad_run::folder::SavedScores;
 use tracing::{debug, warn};
 
 use super::evaluators::{EvaluatorAtWork, Evaluators, JobAtWork};
@@ -63,7 +63,7 @@ impl Coordinator {
     pub fn new(
         rules: Rules,
         plan: EvaluationPlan,
-        earlier: BTreeMap<u64, Earlier>,
+        earlier: BTreeMap<u64, SavedScores>,
         metrics: Metrics,
         events: Events,
     ) -> Self {

@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use prometheus::IntGauge;
-use quad_runtime::Beat;
+use quad_runtime::Heartbeat;
 use tracing::warn;
 
 use super::events::{Event, Events, Saved};
@@ -30,9 +30,9 @@ impl DiskStatus {
     }
 
     /// Records that the disk refused a write.
-    pub fn refused(&mut self, beat: &Beat, error: &str) {
+    pub fn refused(&mut self, beat: &Heartbeat, error: &str) {
         let (now, what) = (Instant::now(), self.what);
-        beat.set_trouble(Some(format!("{} cannot be saved: {error}", what.name())));
+        beat.set_problem(Some(format!("{} cannot be saved: {error}", what.name())));
         self.gauge.set(1);
         let (since, said) = self.trouble.get_or_insert_with(|| {
             self.events.send(Event::DiskTrouble(what, error.to_owned())).ok();
@@ -45,8 +45,8 @@ impl DiskStatus {
     }
 
     /// Records that the disk accepted a write.
-    pub fn well(&mut self, beat: &Beat) {
-        beat.set_trouble(None);
+    pub fn well(&mut self, beat: &Heartbeat) {
+        beat.set_problem(None);
         // The main loop sets the gauge, too, while this thread hangs.
         self.gauge.set(0);
         if self.trouble.take().is_some() {

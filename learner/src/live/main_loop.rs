@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+use quad_run::folder::RunDir;
 use quad_run::results::Spread;
-use quad_run::run::RunDir;
-use quad_runtime::{Beat, Endpoints, Health};
+use quad_runtime::{Endpoints, Health, Heartbeat};
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval, timeout};
@@ -55,7 +55,7 @@ pub(crate) struct MainLoop {
     pub display: Display,
     pub health: Health,
     /// Reports that this loop is alive. It is not if a full pipe blocks its output.
-    pub beat: Beat,
+    pub beat: Heartbeat,
     /// The evaluators that it starts.
     pub evaluators: LocalEvaluators,
 }

@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use quad_protocol::keys;
-use quad_run::run::{RunDir, RunEndpoints};
+use quad_run::folder::{RunDir, RunEndpoints};
 use quad_runtime::{Endpoints, SessionError};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;

@@ -7,8 +7,8 @@ use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 
 use quad_protocol::ScoreReport;
-use quad_run::run::{Log, ScoreLine};
-use quad_runtime::Beat;
+use quad_run::folder::{Log, ScoreLine};
+use quad_runtime::Heartbeat;
 
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
@@ -34,7 +34,7 @@ pub(super) struct Scores {
 
 impl Scores {
     /// The thread's work, until the last report.
-    pub fn run(mut self, beat: &Beat) -> anyhow::Result<()> {
+    pub fn run(mut self, beat: &Heartbeat) -> anyhow::Result<()> {
         let mut ended = false;
         while !ended {
             beat.alive();
@@ -64,7 +64,7 @@ impl Scores {
     fn take_in(
         &mut self,
         reports: Vec<(Request, ScoreReport)>,
-        beat: &Beat,
+        beat: &Heartbeat,
     ) -> Vec<(Request, ScoreReport)> {
         let mut seen = BTreeSet::new();
         let (now, later): (Vec<_>, Vec<_>) = reports.into_iter().partition(|(_, report)| {
@@ -93,7 +93,7 @@ impl Scores {
     }
 
     /// Writes the new scores of reports, and answers each report.
-    fn write(&mut self, reports: Vec<(Request, ScoreReport, Validated)>, beat: &Beat) {
+    fn write(&mut self, reports: Vec<(Request, ScoreReport, Validated)>, beat: &Heartbeat) {
         let of = |(_, report, validated): &(_, ScoreReport, Validated)| {
             validated.new.iter().map(|score| ScoreLine::new(report, score)).collect::<Vec<_>>()
         };

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use quad_protocol::Hash;
-use quad_run::run::{Checkpoint, Log, RunDir, RunDirError};
-use quad_runtime::{Beat, hinted};
+use quad_run::folder::{Checkpoint, Log, RunDir, RunDirError};
+use quad_runtime::{Heartbeat, hinted};
 use tracing::debug;
 
 use super::disk::DiskStatus;
@@ -36,7 +36,7 @@ pub(super) struct Snapshots {
 impl Snapshots {
     /// The thread's work, until the outbox is closed and empty. It repeats a write that the disk
     /// refuses until the disk accepts it.
-    pub fn run(mut self, beat: &Beat) -> anyhow::Result<()> {
+    pub fn run(mut self, beat: &Heartbeat) -> anyhow::Result<()> {
         while let Some(work) = self.outbox.next(beat) {
             match self.carry_out(&work) {
                 Ok(()) => {

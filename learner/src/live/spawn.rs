@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use anyhow::anyhow;
-use quad_runtime::{Beat, stay_in_background};
+use quad_runtime::{Heartbeat, stay_in_background};
 use tracing::debug;
 
 use super::events::{Event, Events};
@@ -19,8 +19,8 @@ use super::events::{Event, Events};
 pub(super) fn spawn_alive(
     name: &'static str,
     events: &Events,
-    beat: Beat,
-    work: impl FnOnce(&Beat) -> anyhow::Result<()> + Send + 'static,
+    beat: Heartbeat,
+    work: impl FnOnce(&Heartbeat) -> anyhow::Result<()> + Send + 'static,
 ) -> std::io::Result<JoinHandle<()>> {
     spawn(name, events, move || {
         work(&beat)?;

@@ -9,7 +9,7 @@ use std::time::Duration;
 use quad_algorithms::Agent;
 use quad_dataset::Task;
 use quad_run::config::{Experiment, RunConfig};
-use quad_run::run::{Earlier, Log, Past, RunDir};
+use quad_run::folder::{Log, ResumePoint, RunDir, SavedScores};
 use quad_runtime::Health;
 
 use super::coordinator::{Coordinator, EvaluationPlan};
@@ -46,7 +46,7 @@ pub(crate) struct Run<'a> {
     /// The run's scores, open for appending.
     pub scores: Log,
     /// What earlier processes of this run have reached.
-    pub past: Past,
+    pub past: ResumePoint,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
 }
@@ -72,7 +72,7 @@ impl Threads {
         events: &Events,
     ) -> anyhow::Result<Self> {
         let Run { incarnation, config, dir, scores, past, checkpoint_every } = run;
-        let Past { checkpoint, snapshots: known, scores: earlier } = past;
+        let ResumePoint { checkpoint, snapshots: known, scores: earlier } = past;
         let experiment = &config.experiment;
         let coordinator = coordinator(&incarnation, experiment, task, earlier, metrics, events);
         for (&step, &hash) in &known {
@@ -92,8 +92,9 @@ impl Threads {
             disk: disk(Saved::Scores),
         };
         let writer = Saved::Scores.thread();
-        let scores =
-            spawn_alive(writer, events, health.part(writer, STUCK), move |beat| scores.run(beat))?;
+        let scores = spawn_alive(writer, events, health.register(writer, STUCK), move |beat| {
+            scores.run(beat)
+        })?;
 
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         metrics.training.gradient_steps.inc_by(step);
@@ -110,7 +111,7 @@ impl Threads {
             disk: disk(Saved::Run),
         };
         let writer = Saved::Run.thread();
-        let snapshots = spawn_alive(writer, events, health.part(writer, STUCK), move |beat| {
+        let snapshots = spawn_alive(writer, events, health.register(writer, STUCK), move |beat| {
             snapshots.run(beat)
         })?;
 
@@ -129,7 +130,7 @@ impl Threads {
         let training = spawn_alive(
             "training",
             events,
-            health.part("training", TRAINING_STUCK),
+            health.register("training", TRAINING_STUCK),
             move |beat| training.run(beat),
         )?;
         Ok(Self { services, outbox, stop, training, snapshots, scores })
@@ -162,7 +163,7 @@ fn coordinator(
     incarnation: &Incarnation,
     experiment: &Experiment,
     task: Task,
-    earlier: BTreeMap<u64, Earlier>,
+    earlier: BTreeMap<u64, SavedScores>,
     metrics: &Metrics,
     events: &Events,
 ) -> Coordinator {

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use anyhow::Context;
 use quad_protocol::{Hash, Name, Snapshot, encode, keys};
-use quad_run::run::RunDir;
+use quad_run::folder::RunDir;
 use tracing::debug;
 use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;

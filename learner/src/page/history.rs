@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 
-use quad_run::run::new_lines;
+use quad_run::folder::new_lines;
 use serde::{Serialize, Serializer};
 
 /// More than a chart has pixels for. Even, so that pairs of rows can be merged.

@@ -7,8 +7,8 @@ use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
+use quad_run::folder::RunDir;
 use quad_run::results::RunReport;
-use quad_run::run::RunDir;
 use quad_run::status::list;
 use quad_runtime::stay_in_background;
 use serde_json::{Value, json};

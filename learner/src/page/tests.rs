@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
-use quad_run::run::RunDir;
+use quad_run::folder::RunDir;
 use quad_runtime::{Health, serve_metrics};
 use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};

@@ -4,7 +4,7 @@ use std::fmt::Alignment::{Left, Right};
 
 use quad_run::results::published::{self, Published, Remark, once_each};
 use quad_run::results::{Select, Spread};
-use quad_run::table::{Part, Table};
+use quad_run::table::{Block, Table};
 
 use super::seeds::GroupReport;
 
@@ -13,7 +13,7 @@ type Figure<'a> = (&'a str, &'a Published);
 
 /// A table, in its rows the tasks that some of these runs have learned, with what stands behind
 /// each figure below it; nothing without such runs.
-pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Part> {
+pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
     let is_in =
         |group: &&GroupReport| published::tables(&group.task, &group.algorithm).contains(&name);
     let groups: Vec<&GroupReport> = groups.iter().filter(is_in).collect();
@@ -67,7 +67,7 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Part> {
         "{name}. Ours: mean ± standard deviation over seeds, divided by n - 1 (in parentheses: by n); a run's score is {score}. \
          {protocol}\n"
     );
-    vec![Part::Words(title), Part::Table(table), Part::Words(notes.text(&figures, select))]
+    vec![Block::Text(title), Block::Table(table), Block::Text(notes.text(&figures, select))]
 }
 
 /// What stands behind figures: of ours numbered, of others' with letters.

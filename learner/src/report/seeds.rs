@@ -8,7 +8,7 @@ use quad_run::config::Device;
 use quad_run::config::settings::{self, Settings, differences};
 use quad_run::results::departures::{as_given, departures};
 use quad_run::results::published::{self, Published};
-use quad_run::results::run::{RunReport, joined};
+use quad_run::results::{RunReport, joined};
 use quad_run::results::{Select, Spread};
 use serde::Serialize;
 
@@ -169,7 +169,7 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
         };
         let changed =
             told.get(method).into_iter().flatten().filter(|key| given.get(**key) != own.get(**key));
-        let called = std::iter::once(runs[0].called.clone());
+        let called = std::iter::once(runs[0].label.clone());
         let name = Vec::from_iter(called.chain(changed.map(|key| value(key))));
         let is_beside =
             |other: &&Alike| other.runs[0].task == runs[0].task && other.method[0] == method[0];

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
 
 use quad_run::results::statistics::{self, Estimate, RESAMPLES, Runs};
-use quad_run::table::{Part, Table};
+use quad_run::table::{Block, Table};
 use serde::Serialize;
 
 use super::seeds::GroupReport;
@@ -164,7 +164,7 @@ fn compare(method: &Method, against: &Method) -> Option<Comparison> {
 }
 
 /// Both as tables, with what a reader has to know of them.
-pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Part> {
+pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Block> {
     let names = ["seeds", "IQM", "mean", "median", "optimality gap"].map(|name| (name, Right));
     let mut table = Table::new(
         &[("method", Left), ("tasks", Left)].into_iter().chain(names).collect::<Vec<_>>(),
@@ -190,7 +190,7 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Part>
             );
         }
     }
-    let mut parts = vec![Part::Words(notes), Part::Table(table)];
+    let mut parts = vec![Block::Text(notes), Block::Table(table)];
     if !comparisons.is_empty() {
         let names = ["pairs", "mean difference", "p", "p (Holm)", "probability of improvement"]
             .map(|name| (name, Right));
@@ -216,13 +216,13 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Part>
                 improvement,
             ]);
         }
-        parts.push(Part::Words(format!(
+        parts.push(Block::Text(format!(
             "Against the method named first, in the tasks that both have: the mean difference of runs with the same task and seed, \
              its p-value by sign flips (Fisher 1935), corrected for {} comparisons (Holm 1979), and the probability that a run \
              scores more than one of the other.\n",
             comparisons.len()
         )));
-        parts.push(Part::Table(table));
+        parts.push(Block::Table(table));
     }
     parts
 }

@@ -6,9 +6,9 @@ use std::fmt::Alignment::{Left, Right};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use quad_run::folder::walk;
 use quad_run::results::{Ranking, RunReport, Select, Spread, published};
-use quad_run::run::walk;
-use quad_run::table::{Part, Style, Table};
+use quad_run::table::{Block, Style, Table};
 use serde::Serialize;
 use tracing::warn;
 
@@ -82,7 +82,7 @@ impl Report {
                 .runs
                 .iter()
                 .filter(|run| self.runs.len() == 1 || self.in_full.contains(&run.dir));
-            parts.extend(in_full.map(|run| Part::Words(self.table(run))));
+            parts.extend(in_full.map(|run| Block::Text(self.table(run))));
         }
         parts.extend(self.summaries(style != Style::Text));
         parts.iter().map(|part| part.render(style)).collect::<Vec<_>>().join("\n")
@@ -90,9 +90,9 @@ impl Report {
 
     /// The parts but for the tables of single runs; `with_one`: also the summary over seeds of a
     /// single run.
-    pub fn summaries(&self, with_one: bool) -> Vec<Part> {
+    pub fn summaries(&self, with_one: bool) -> Vec<Block> {
         let mut parts =
-            Vec::from_iter(self.select.warning().map(|warning| Part::Words(warning.to_owned())));
+            Vec::from_iter(self.select.warning().map(|warning| Block::Text(warning.to_owned())));
         if self.runs.len() > 1 || with_one {
             parts.extend(self.over_seeds());
         }
@@ -101,7 +101,7 @@ impl Report {
         }
         let unreadable =
             self.unreadable.iter().map(|error| format!("Not in this report: {error}.\n"));
-        parts.extend((!self.unreadable.is_empty()).then(|| Part::Words(unreadable.collect())));
+        parts.extend((!self.unreadable.is_empty()).then(|| Block::Text(unreadable.collect())));
         let judgments = self.runs.iter().flat_map(|run| run.judgments.iter().cloned());
         parts.extend(Ranking::of(judgments).iter().flat_map(Ranking::parts));
         parts.extend(
@@ -118,10 +118,10 @@ impl Report {
             let (step, measure, mean) = (best.step, run.measure(), best.score.mean);
             format!("mean {measure} of the best evaluation, after {step} steps: {mean:.2}\n")
         });
-        run.table() + &best.unwrap_or_default()
+        run.text() + &best.unwrap_or_default()
     }
 
-    fn over_seeds(&self) -> Vec<Part> {
+    fn over_seeds(&self) -> Vec<Block> {
         let scores: &[_] = match self.select {
             Select::Last => &["last 3", "last 5", "last 50000 steps"],
             Select::Best => &["best evaluation"],
@@ -165,8 +165,8 @@ impl Report {
             );
             marked.extend(group.left_out.iter().map(|run| format!("Not counted: {run}.\n")));
         }
-        let mut parts = vec![Part::Words(title.to_owned()), Part::Table(table)];
-        parts.extend((!marked.is_empty()).then(|| Part::Words(marked.concat())));
+        let mut parts = vec![Block::Text(title.to_owned()), Block::Table(table)];
+        parts.extend((!marked.is_empty()).then(|| Block::Text(marked.concat())));
         parts
     }
 }

@@ -9,10 +9,9 @@ use std::time::Duration;
 
 use anyhow::Context;
 use quad_run::config::tables;
-use quad_run::files;
-use quad_run::run::RunDir;
+use quad_run::folder::RunDir;
 use quad_run::status::{Pace, State};
-use quad_runtime::{ENDED_AT_ONCE, LEAVE_WITHIN, UNFINISHED, error_in};
+use quad_runtime::{ENDED_AT_ONCE, FAILURE_FILE, LEAVE_WITHIN, UNFINISHED};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::sync::watch::Receiver;
 use tokio::task::spawn_blocking;
@@ -83,7 +82,7 @@ impl Job {
     async fn work(&self, with: Learners, stop: Receiver<bool>) -> anyhow::Result<(End, Pace)> {
         let unfinished = (End::Unfinished, Pace { step: self.from, ..Pace::default() });
         let job = self.clone();
-        let (mut command, logged) = tokio::select! {
+        let mut command = tokio::select! {
             prepared = spawn_blocking(move || job.prepare(&with)) => prepared??,
             () = told(&stop) => return Ok(unfinished),
         };
@@ -102,16 +101,15 @@ impl Job {
         };
         let (job, stopped) = (self.clone(), *stop.borrow());
         let concluded =
-            spawn_blocking(move || (job.conclude(status, stopped, logged), Pace::read(&job.dir)));
+            spawn_blocking(move || (job.conclude(status, stopped), Pace::read(&job.dir)));
         tokio::select! {
             concluded = concluded => Ok(concluded?),
             () = async { told(&stop).await; sleep(LAST_WORDS).await } => Ok(unfinished),
         }
     }
 
-    /// Makes the run's folder. Gives the learner's command, and how many bytes earlier learners
-    /// have logged.
-    fn prepare(&self, with: &Learners) -> anyhow::Result<(Command, u64)> {
+    /// Makes the run's folder and the learner's command.
+    fn prepare(&self, with: &Learners) -> anyhow::Result<Command> {
         let Self { run, dir, .. } = self;
         let mut command = Command::new(std::env::current_exe()?);
         command
@@ -124,14 +122,17 @@ impl Job {
         }
         command.env("RAYON_NUM_THREADS", with.threads.to_string());
         not_encrypted(&mut command, &with.endpoint);
+        let folder = RunDir::at(dir);
+        command.env(FAILURE_FILE, folder.failure_path());
         fs::create_dir_all(dir)
             .and_then(|()| run_beside(&mut command, &log(dir)))
             .with_context(|| format!("{}: cannot write to {}", run.name, dir.display()))?;
-        Ok((command, fs::metadata(log(dir)).map_or(0, |log| log.len())))
+        folder.clear_failure()?;
+        Ok(command)
     }
 
-    /// What the learner's end means for the run. Remembers a failure in the run's folder.
-    fn conclude(&self, status: io::Result<ExitStatus>, stopped: bool, logged: u64) -> End {
+    /// Translates the learner's end. Marks a failed run in its folder.
+    fn conclude(&self, status: io::Result<ExitStatus>, stopped: bool) -> End {
         let code = status
             .as_ref()
             .ok()
@@ -145,18 +146,18 @@ impl Job {
             None | Some(ENDED_AT_ONCE) if stopped => return End::Unfinished,
             _ => {}
         }
-        // On a disk that takes nothing, `--list` calls it begun.
-        RunDir::at(&self.dir).mark_failed(true).ok();
-        let log = log(&self.dir);
-        let text =
-            files::open(&log).and_then(|mut log| files::rest(&mut log, logged)).unwrap_or_default();
-        let own = String::from_utf8_lossy(&text);
-        let reason = match (error_in(&own), status) {
-            (Some(error), _) => error.to_owned(),
-            (None, Ok(status)) => format!("the learner ended by {status}"),
-            (None, Err(error)) => format!("the learner is lost: {error}"),
-        };
-        End::Failed(format!("{}: {reason} ({})", self.run.name, log.display()))
+        let dir = RunDir::at(&self.dir);
+        let left = dir.failure().filter(|reason| !reason.is_empty());
+        let reason = left.unwrap_or_else(|| {
+            let reason = match status {
+                Ok(status) => format!("the learner ended by {status}"),
+                Err(error) => format!("the learner is lost: {error}"),
+            };
+            // On a full disk, `--list` shows the run as begun.
+            dir.mark_failed(&reason).ok();
+            reason
+        });
+        End::Failed(format!("{}: {reason} ({})", self.run.name, log(&self.dir).display()))
     }
 }
 
@@ -187,7 +188,7 @@ mod tests {
     use crate::sweep::Study;
 
     #[test]
-    fn a_learner_is_not_blamed_for_what_an_earlier_one_has_logged() {
+    fn the_reason_of_a_failure() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("mine.toml");
         let text = "about = 'x'\nrun = { task = 'hopper-demo', dataset = 'x.hdf5' }\naxes = { seed = [0] }";
@@ -195,18 +196,17 @@ mod tests {
         let run = Study::read(&file, &[], &[]).unwrap().runs.remove(0);
         let job = Job::new(run, State::NotBegun, folder.path());
         fs::create_dir_all(&job.dir).unwrap();
-        let earlier = "error: the disk is full\n";
         let killed = || Ok(ExitStatus::from_raw(9));
-        for (log, reason) in [
-            (earlier.to_owned(), "the learner ended by signal: 9"),
-            (format!("{earlier}error: a loose cable\n"), "a loose cable"),
-        ] {
-            fs::write(super::log(&job.dir), log).unwrap();
-            let End::Failed(said) = job.conclude(killed(), false, earlier.len() as u64) else {
-                panic!("{reason}")
-            };
+        for (failure, reason) in
+            [(None, "the learner ended by signal: 9"), (Some("a loose cable"), "a loose cable")]
+        {
+            let dir = RunDir::at(&job.dir);
+            dir.clear_failure().unwrap();
+            failure.map(|failure| dir.mark_failed(failure).unwrap());
+            let End::Failed(said) = job.conclude(killed(), false) else { panic!("{reason}") };
             assert!(said.starts_with(&format!("seed0: {reason}")), "{said}");
+            assert_eq!(dir.failure().as_deref(), Some(reason));
         }
-        assert!(matches!(job.conclude(killed(), true, 0), End::Unfinished), "it was told to stop");
+        assert!(matches!(job.conclude(killed(), true), End::Unfinished), "it was told to stop");
     }
 }

@@ -6,11 +6,11 @@ use std::path::Path;
 
 use anyhow::{Context, anyhow, ensure};
 use quad_protocol::Name;
-use quad_run::config::{Experiment, Preset, did_you_mean, settings, tables};
+use quad_run::config::{ConfigError, Experiment, Preset, did_you_mean, settings, tables};
+use quad_run::folder::RunDir;
 use quad_run::results::RunReport;
-use quad_run::run::RunDir;
 use quad_run::status::State;
-use quad_runtime::{Hint, hinted, hints};
+use quad_runtime::{Hint, hinted, hints, one_line};
 use serde::Deserialize;
 use toml::{Table, Value};
 use tracing::warn;
@@ -96,13 +96,9 @@ impl PlannedRun {
     /// A run with other settings is there.
     pub fn state(&self, dir: &Path) -> anyhow::Result<State> {
         if !RunDir::is_occupied(dir) {
-            return Ok(if RunDir::at(dir).has_failed() {
-                State::Failed(0)
-            } else {
-                State::NotBegun
-            });
+            return Ok(RunDir::at(dir).failure().map_or(State::NotBegun, |_| State::Failed(0)));
         }
-        let read = RunReport::scored(dir).inspect_err(|error| warn!("{error:#}"));
+        let read = RunReport::scored(dir).inspect_err(|error| warn!("{}", one_line(error)));
         let Ok(report) = read else { return Ok(State::Unreadable) };
         let (there, planned) = (&report.config.experiment, &self.experiment);
         let (old, new) = (settings::of_experiment(there), settings::of_experiment(planned));
@@ -200,7 +196,9 @@ impl File {
             return Err(anyhow!("it needs one of task and preset"))
                 .hint("[run] may have it, or an axis");
         };
-        let experiment = Preset::read(preset)?.resolve(&changes)?;
+        let experiment = Preset::read(preset)
+            .and_then(|preset| preset.resolve(&changes))
+            .hint_of(ConfigError::hint)?;
         let dataset = experiment.dataset.as_deref().ok_or_else(|| anyhow!("it names no dataset"));
         let source = Source::parse(dataset.hint("add to [run] a line dataset = \"FILE\"")?)?;
         source.check_environment(&experiment.environment)?;

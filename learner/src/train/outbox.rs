@@ -10,8 +10,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use quad_run::run::Checkpoint;
-use quad_runtime::Beat;
+use quad_run::folder::Checkpoint;
+use quad_runtime::Heartbeat;
 
 use super::results::{Outcome, Row, TrainedPolicy};
 
@@ -51,7 +51,7 @@ struct Waiting {
 
 impl Outbox {
     /// Leaves a policy. Waits if far too many wait already, unless training is to `stop`.
-    pub fn snapshot(&self, policy: TrainedPolicy, stop: &AtomicBool, beat: &Beat) {
+    pub fn snapshot(&self, policy: TrainedPolicy, stop: &AtomicBool, beat: &Heartbeat) {
         let mut waiting = self.lock();
         while waiting.bytes > MOST_BYTES && !stop.load(Ordering::Relaxed) {
             beat.alive();
@@ -94,7 +94,7 @@ impl Outbox {
     /// What is next, as soon as there is something; nothing once the outbox is closed and empty.
     /// Snapshots go before the checkpoint: a run that is resumed from a checkpoint does not make
     /// earlier snapshots again.
-    pub fn next(&self, beat: &Beat) -> Option<Work> {
+    pub fn next(&self, beat: &Heartbeat) -> Option<Work> {
         let mut waiting = self.lock();
         loop {
             beat.alive();

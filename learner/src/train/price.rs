@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use quad_algorithms::{Agent, AlgorithmError};
 use quad_dataset::{BatchSampler, Transitions};
 use quad_run::config::{Device, Experiment};
-use quad_run::run::Checkpoint;
+use quad_run::folder::Checkpoint;
 
 use super::training::{begin, origin};
 

@@ -8,8 +8,8 @@ use quad_dataset::BatchSampler;
 use quad_policy::{NetworkError, PolicyError};
 use quad_protocol::Origin;
 use quad_run::config::Schedule;
-use quad_run::run::Checkpoint;
-use quad_runtime::Beat;
+use quad_run::folder::Checkpoint;
+use quad_runtime::Heartbeat;
 use tracing::debug;
 
 use super::held_out::HeldOut;
@@ -45,7 +45,7 @@ pub(crate) struct Outlets<'a> {
     /// Set by the main loop to end training early.
     pub stop: &'a AtomicBool,
     /// Told after every step.
-    pub beat: &'a Beat,
+    pub beat: &'a Heartbeat,
 }
 
 /// Why training cannot continue.

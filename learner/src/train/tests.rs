@@ -15,8 +15,8 @@ use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision};
 use quad_protocol::Origin;
 use quad_run::config::hyperparameters::algorithm as definition;
 use quad_run::config::{Schedule, resolve};
-use quad_run::run::Checkpoint;
-use quad_runtime::{Beat, Health};
+use quad_run::folder::Checkpoint;
+use quad_runtime::{Health, Heartbeat};
 use serde_json::Value;
 
 use super::held_out::HeldOut;
@@ -44,8 +44,8 @@ struct Result {
     gauges: BTreeSet<String>,
 }
 
-fn beat() -> Beat {
-    Health::default().part("training", Duration::from_secs(60))
+fn beat() -> Heartbeat {
+    Health::default().register("training", Duration::from_secs(60))
 }
 
 fn transitions() -> Transitions {

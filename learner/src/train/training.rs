@@ -10,8 +10,8 @@ use quad_algorithms::{Agent, AlgorithmError, Context as Learning};
 use quad_dataset::{BatchSampler, Transitions};
 use quad_protocol::{Origin, Snapshot};
 use quad_run::config::{Device, Experiment};
-use quad_run::run::Checkpoint;
-use quad_runtime::{Beat, Hint, hinted};
+use quad_run::folder::Checkpoint;
+use quad_runtime::{Heartbeat, Hint, hinted};
 
 use super::device;
 use super::held_out::HeldOut;
@@ -89,7 +89,7 @@ pub(super) fn origin(experiment: &Experiment) -> Origin {
 
 impl Training {
     /// The thread's work. How training ended comes last in the outbox, unless it failed.
-    pub fn run(self, beat: &Beat) -> anyhow::Result<()> {
+    pub fn run(self, beat: &Heartbeat) -> anyhow::Result<()> {
         let Self { experiment, mut agent, mut held_out, .. } = self;
         if let Some(Checkpoint { step, state }) = &self.checkpoint {
             let advice = "begin anew with --fresh, or continue with the version of the learner that wrote it";

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use quad_policy::Header;
 use quad_protocol::{Hash, Origin};
+use quad_run::folder::RunDir;
 use quad_run::results::{Conditions, Estimate, Judgment};
-use quad_run::run::RunDir;
 use serde_json::{Value, json};
 
 use crate::{learner, printed, write_dataset};

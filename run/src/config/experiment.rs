@@ -1,23 +1,20 @@
 //! One experiment, every value of which is checked.
 
-use anyhow::{Context, anyhow, ensure};
 use quad_algorithms::{Definition, Reporting, Variant};
 use quad_dataset::{RewardRule, Scale};
 use quad_policy::Precision;
-use quad_runtime::Hint;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
+use super::error::ConfigError;
 use super::hyperparameters;
 use super::schedule::Schedule;
 
-/// Most episodes in one evaluation: far above any use.
+/// Upper bounds, far above any use; each evaluation keeps a snapshot.
 const MOST_EPISODES: u64 = 10_000;
-/// Most transitions in a batch: far above any use, too.
 const MOST_BATCH: u64 = 1 << 20;
-/// Most evaluations in a run: far above any use. Each keeps a snapshot.
 const MOST_EVALUATIONS: u64 = 1_000_000;
-/// TOML's integers are 64 bits with a sign, so larger ones could not be saved with the run.
+/// The largest integer of TOML, in which a run's settings are saved.
 const MOST: u64 = i64::MAX as u64;
 
 /// Everything that decides the outcome of a run, apart from the contents of the dataset.
@@ -26,28 +23,26 @@ const MOST: u64 = i64::MAX as u64;
 pub struct Experiment {
     /// Environment that the data is from and the policy is evaluated in.
     pub environment: String,
-    /// What it learns from: a name, or a file. [`DatasetInfo`](super::DatasetInfo) says what was
-    /// found there.
+    /// Name or path of the dataset. [`DatasetInfo`](super::DatasetInfo) describes its contents.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub dataset: Option<String>,
-    /// How rewards are scaled before training; a file that does not say takes the environment's
-    /// rule.
+    /// Scaling of rewards before training; by default the environment's rule.
     pub reward: RewardRule,
-    /// What of the data is scaled for the networks; the snapshots have the maps, so that policies
-    /// take and give the data's units.
+    /// Columns that are normalized for the networks. Snapshots contain the maps, so policies take
+    /// and return the data's units.
     #[serde(default)]
     pub scale: Scale,
-    /// Share of the episodes that is kept out of training, to measure on; 0: none. Which they are
-    /// follows from the seed.
+    /// Fraction of the episodes that is kept out of training and measured on. The seed decides
+    /// which episodes these are.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub hold_out: f64,
     /// Gradient steps.
     pub steps: u64,
-    /// Gradient steps between two evaluations; 0: none at all.
+    /// Gradient steps between two evaluations; 0 turns evaluations off.
     pub eval_interval: u64,
     /// Episodes per evaluation.
     pub episodes: u32,
-    /// Seed of initial weights, batches, noise and the evaluations' episodes.
+    /// Seed of initial weights, batches, noise and evaluation episodes.
     pub seed: u64,
     /// Transitions per gradient step, B.
     pub batch_size: u32,
@@ -56,7 +51,7 @@ pub struct Experiment {
     pub precision: Precision,
     /// Name of the learning algorithm.
     pub algorithm: String,
-    /// Its hyper-parameters.
+    /// Hyper-parameters of the algorithm.
     pub agent: Table,
 }
 
@@ -64,46 +59,28 @@ fn is_zero(share: &f64) -> bool {
     *share == 0.0
 }
 
-/// For a key that is too few or too many, or of a wrong type. What serde says of it lists the keys
-/// that there are.
-pub(super) const KEYS: &str = "`learner presets TASK` prints every key; on the command line --set KEY=VALUE changes one, and \
-                               --agent KEY=VALUE one below [agent]";
-
 impl Experiment {
     /// The algorithm.
-    ///
-    /// # Errors
-    /// There is none of that name.
-    pub fn definition(&self) -> anyhow::Result<Definition> {
+    pub fn definition(&self) -> Result<Definition, ConfigError> {
         hyperparameters::algorithm(&self.algorithm)
     }
 
-    /// What tells variants of the algorithm apart in the names of runs: a hyper-parameter's value,
-    /// or the algorithm's name.
-    ///
-    /// # Errors
-    /// As [`Self::definition`].
-    pub fn variant(&self) -> anyhow::Result<&str> {
+    /// The variant of the algorithm, as names of runs have it: a hyper-parameter's value, or the
+    /// algorithm's name.
+    pub fn variant(&self) -> Result<&str, ConfigError> {
         let variant = self.definition()?.report.variant;
         let value = variant.and_then(|variant| self.agent.get(variant.key)).and_then(Value::as_str);
         Ok(value.unwrap_or(&self.algorithm))
     }
 
-    /// What tables and figures call the variant.
-    ///
-    /// # Errors
-    /// As [`Self::definition`].
-    pub fn called(&self) -> anyhow::Result<String> {
+    /// The variant's label in tables and figures.
+    pub fn label(&self) -> Result<String, ConfigError> {
         let (known, variant) = (self.definition()?.report.variant, self.variant()?);
         Ok(known.map_or_else(|| variant.to_owned(), |known| (known.called)(variant)))
     }
 
-    /// The algorithm as people read it: its name, its variant where there are several, and counts,
-    /// such as candidates, where it has some.
-    ///
-    /// # Errors
-    /// As [`Self::definition`].
-    pub fn method(&self) -> anyhow::Result<String> {
+    /// Name, variant and counts of the algorithm: `quad, guidance dac, 10 candidates`.
+    pub fn method(&self) -> Result<String, ConfigError> {
         let Reporting { variant, counts, .. } = self.definition()?.report;
         let mut method = self.algorithm.clone();
         if let Some(Variant { key, .. }) = variant {
@@ -115,32 +92,24 @@ impl Experiment {
         Ok(method)
     }
 
-    /// How many gradient steps there are, and which are evaluated.
+    /// The gradient steps and evaluations.
     pub fn schedule(&self) -> Schedule {
         Schedule { steps: self.steps, eval_interval: self.eval_interval }
     }
 
-    /// The figures that tell runs apart, in one line.
-    ///
-    /// # Errors
-    /// As [`Self::definition`].
-    pub fn summary(&self) -> anyhow::Result<String> {
+    /// The values that distinguish runs, in one line.
+    pub fn summary(&self) -> Result<String, ConfigError> {
         let Self { steps, eval_interval, episodes, seed, batch_size, .. } = self;
+        let method = self.method()?;
         let evaluations = match eval_interval {
             0 => "no evaluations".to_owned(),
             _ => format!("{episodes} episodes every {eval_interval}"),
         };
-        Ok(format!(
-            "{}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}",
-            self.method()?
-        ))
+        Ok(format!("{method}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}"))
     }
 
     /// Checks the numbers that are no hyper-parameters.
-    ///
-    /// # Errors
-    /// One of them is not in its range.
-    pub(crate) fn check_ranges(&self) -> anyhow::Result<()> {
+    pub(crate) fn check_ranges(&self) -> Result<(), ConfigError> {
         for (field, value, least, most) in [
             ("steps", self.steps, 1, MOST),
             ("eval_interval", self.eval_interval, 0, MOST),
@@ -148,32 +117,29 @@ impl Experiment {
             ("episodes", self.episodes.into(), 1, MOST_EPISODES),
             ("batch_size", self.batch_size.into(), 1, MOST_BATCH),
         ] {
-            ensure!(
-                (least..=most).contains(&value),
-                "{field} is {value}, but must be from {least} to {most}"
-            );
+            if !(least..=most).contains(&value) {
+                let (value, range) = (value.to_string(), format!("from {least} to {most}"));
+                return Err(ConfigError::OutOfRange { field, value, range });
+            }
         }
-        let share = self.hold_out;
-        ensure!(
-            (0.0..1.0).contains(&share),
-            "hold_out is {share}, but must be at least 0 and below 1"
-        );
+        if !(0.0..1.0).contains(&self.hold_out) {
+            let (value, range) = (self.hold_out.to_string(), "at least 0 and below 1".to_owned());
+            return Err(ConfigError::OutOfRange { field: "hold_out", value, range });
+        }
         Ok(())
     }
 
-    pub(super) fn validate(&self) -> anyhow::Result<()> {
+    pub(super) fn validate(&self) -> Result<(), ConfigError> {
         self.check_ranges()?;
-        let (Self { steps, eval_interval, .. }, evaluations) =
-            (self, self.schedule().evaluations());
+        let (steps, interval) = (self.steps, self.eval_interval);
+        let evaluations = self.schedule().evaluations();
         if evaluations > MOST_EVALUATIONS {
-            let error = anyhow!(
-                "{steps} steps with an evaluation every {eval_interval} are {evaluations} evaluations"
-            );
-            return Err(error)
-                .hint(format!("choose a larger eval_interval, for at most {MOST_EVALUATIONS}"));
+            let most = MOST_EVALUATIONS;
+            return Err(ConfigError::Evaluations { steps, interval, evaluations, most });
         }
-        let check = (self.definition()?.check)(&self.agent);
-        check.with_context(|| format!("algorithm {}", self.algorithm)).hint(KEYS)
+        let algorithm = || self.algorithm.clone();
+        (self.definition()?.check)(&self.agent)
+            .map_err(|source| ConfigError::Hyperparameters { algorithm: algorithm(), source })
     }
 }
 

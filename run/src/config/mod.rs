@@ -1,17 +1,11 @@
-//! The settings of a run: an algorithm's values for a task, changed by the command line, resolved
-//! once and checked.
+//! Settings of a run: an algorithm's values for a task, changed by the command line, and checked.
 //!
-//! Owns the embedded tasks and the format of a run's `config.toml`. It has no state and no thread:
-//! every module above may call it, from any thread. The hyper-parameters are checked by their
-//! algorithm, in [`quad_algorithms`].
-//!
-//! In reading order: `tasks` are the tasks, `hyperparameters` an algorithm's values for them,
-//! `presets` the task or file from which a user starts; `experiment` is all of that, resolved;
-//! `run_config` is the content of `config.toml`; `schedule` tells which steps are evaluated;
-//! `settings` compares two runs key by key; `device`, `nearest` and `tables` are small parts of
-//! these.
+//! In reading order: `tasks`; `hyperparameters`, an algorithm's values for them; `presets`, a task
+//! or a file; `experiment`, all of that resolved; `run_config`, the contents of `config.toml`;
+//! `schedule`, the evaluated steps; `settings`, which compares runs key by key.
 
 mod device;
+mod error;
 mod experiment;
 pub mod hyperparameters;
 mod nearest;
@@ -23,9 +17,9 @@ pub mod tables;
 pub mod tasks;
 
 pub use device::Device;
+pub use error::ConfigError;
 pub use experiment::Experiment;
 pub use nearest::did_you_mean;
-pub use presets::Preset;
-pub use presets::resolve;
+pub use presets::{Preset, resolve};
 pub use run_config::{DatasetInfo, RunConfig, RunInfo};
 pub use schedule::Schedule;

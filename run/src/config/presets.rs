@@ -1,119 +1,109 @@
-//! What a user can begin from: a task by name, or a file of the user's own.
+//! Presets: a task by name, or a file of the user's own.
 //!
-//! A file has keys of an experiment. It may also name a `task`, whose values hold where it says
-//! nothing, and says by `algorithm` whose values these are.
+//! A file has keys of an experiment. It may name a `task`, whose values apply where the file has
+//! none, and the `algorithm`.
 
 use std::path::Path;
 
-use anyhow::{Context, anyhow};
 use quad_algorithms::{ALGORITHMS, Definition, Values};
 use quad_dataset::{RewardRule, environment, ogbench};
-use quad_runtime::Hint;
 use toml::{Table, Value};
 
-use super::experiment::{Experiment, KEYS};
+use super::error::ConfigError;
+use super::experiment::Experiment;
 use super::hyperparameters;
 use super::tables::merge;
 use super::tasks::{self, Task};
 
-const PRINT: &str = "`learner presets TASK` prints what such a file may have";
-
 /// A task, or a file that may change one.
 pub struct Preset {
-    /// What it is called in the names of runs: the task's name, or the file's without its folder
-    /// and ending.
+    /// The task's name, or the file's without folder and extension; part of the names of runs.
     pub label: String,
-    /// The task, if there is one.
+    /// The task, if the preset names one.
     pub task: Option<&'static Task>,
-    /// What the file says; nothing for a task by name.
+    /// The file's keys; empty for a task by name.
     own: Table,
 }
 
 impl Preset {
     /// Reads a preset: the name of a task, or a path that ends in `.toml`.
-    ///
-    /// # Errors
-    /// There is no such task, the file cannot be read, or it is not TOML.
-    pub fn read(preset: &str) -> anyhow::Result<Self> {
+    pub fn read(preset: &str) -> Result<Self, ConfigError> {
         if !is_path(preset) {
             let task = tasks::named(preset)?;
             return Ok(Self { label: task.name.clone(), task: Some(task), own: Table::new() });
         }
+        let name = || preset.to_owned();
         let text = std::fs::read_to_string(preset)
-            .with_context(|| format!("cannot read the preset {preset}"))
-            .hint(PRINT)?;
+            .map_err(|source| ConfigError::Unreadable { preset: name(), source })?;
         let mut own: Table =
-            text.parse().with_context(|| format!("preset {preset} is not TOML")).hint(PRINT)?;
-        let task = own.remove("task").map(|name| tasks::named(&word(&name))).transpose();
+            text.parse().map_err(|source| ConfigError::NotToml { preset: name(), source })?;
+        let task = own.remove("task").map(|task| tasks::named(&text_of(&task))).transpose();
         let stem = Path::new(preset).file_stem().and_then(|stem| stem.to_str());
         Ok(Self {
             label: stem.unwrap_or("preset").to_owned(),
-            task: task.with_context(|| format!("preset {preset} cannot be used"))?,
+            task: task
+                .map_err(|error| ConfigError::Preset { preset: name(), source: Box::new(error) })?,
             own,
         })
     }
 
-    /// Name of the task; of a file that names none, its label.
+    /// Name of the task; the label if the file names none.
     pub fn task_name(&self) -> &str {
         self.task.map_or(&self.label, |task| &task.name)
     }
 
-    /// The values of the task for the algorithm, the file's and then the changes laid over them,
-    /// all checked.
-    ///
-    /// # Errors
-    /// There is no such algorithm, or something in the file or in the changes cannot be used.
-    pub fn resolve(&self, changes: &Table) -> anyhow::Result<Experiment> {
-        let label = &self.label;
+    /// Merges the algorithm's values for the task, the task's keys, the file's and `changes`, the
+    /// later over the earlier, and checks them.
+    pub fn resolve(&self, changes: &Table) -> Result<Experiment, ConfigError> {
+        let preset = &self.label;
         let definition = self.algorithm(changes)?;
-        let mut table = Values::of(&definition)?.for_task(self.task.map(Task::valued_as));
+        let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
         for keys in self.task.map(|task| &task.keys).into_iter().chain([&self.own, changes]) {
             merge(&mut table, keys.clone());
         }
         table.insert("algorithm".to_owned(), definition.name.into());
-        let Some(named) = table.get("environment") else {
-            return Err(anyhow!("preset {label} names neither a task nor an environment"))
-                .hint("begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks");
+        let Some(environment) = table.get("environment") else {
+            return Err(ConfigError::NoEnvironment(preset.clone()));
         };
-        if !table.contains_key("reward") {
-            let rule =
-                named.as_str().map_or(RewardRule::AsIs, |name| match environment::find(name) {
-                    Ok(spec) => spec.reward,
-                    Err(_) if ogbench::maze_task(name).is_some() => RewardRule::Subtract1,
-                    Err(_) => RewardRule::AsIs,
-                });
-            table.insert("reward".to_owned(), Value::try_from(rule)?);
+        if !table.contains_key("reward")
+            && let Ok(rule) = Value::try_from(reward_rule(&text_of(environment)))
+        {
+            table.insert("reward".to_owned(), rule);
         }
         let experiment: Experiment = table
             .try_into()
-            .with_context(|| format!("preset {label} cannot be used"))
-            .hint(KEYS)?;
+            .map_err(|source| ConfigError::Keys { preset: preset.clone(), source })?;
         experiment.validate()?;
         Ok(experiment)
     }
 
-    /// The algorithm that the changes name, or the file, or the first of all.
-    fn algorithm(&self, changes: &Table) -> anyhow::Result<Definition> {
+    /// The algorithm of the changes, else of the file, else the first of all.
+    fn algorithm(&self, changes: &Table) -> Result<Definition, ConfigError> {
         let name = changes.get("algorithm").or_else(|| self.own.get("algorithm"));
-        name.map_or(Ok(ALGORITHMS[0]), |name| hyperparameters::algorithm(&word(name)))
+        name.map_or(Ok(ALGORITHMS[0]), |name| hyperparameters::algorithm(&text_of(name)))
     }
 }
 
-/// Whether this is the path of a user's own file rather than the name of a task.
+/// The usual reward rule of an environment.
+fn reward_rule(name: &str) -> RewardRule {
+    match environment::find(name) {
+        Ok(spec) => spec.reward,
+        Err(_) if ogbench::maze_task(name).is_some() => RewardRule::Subtract1,
+        Err(_) => RewardRule::AsIs,
+    }
+}
+
+/// Whether a preset is the path of a file, not the name of a task.
 pub fn is_path(preset: &str) -> bool {
     preset.ends_with(".toml")
 }
 
-/// A word of a file, or what stands there in its place.
-fn word(value: &Value) -> String {
+/// The value as text, without quotes.
+fn text_of(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
-/// Reads a preset (the name of a task, or a path that ends in `.toml`), lays changes over it,
-/// checks every range. The changes may name another `algorithm` than the preset.
-///
-/// # Errors
-/// There is no such preset, or something in it or in the changes cannot be used.
-pub fn resolve(preset: &str, changes: &Table) -> anyhow::Result<Experiment> {
+/// Reads a preset and [resolves](Preset::resolve) it with changes.
+pub fn resolve(preset: &str, changes: &Table) -> Result<Experiment, ConfigError> {
     Preset::read(preset)?.resolve(changes)
 }

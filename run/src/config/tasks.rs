@@ -2,30 +2,28 @@
 
 use std::sync::LazyLock;
 
-use anyhow::anyhow;
 use quad_dataset::ogbench::{self, TaskNames};
-use quad_runtime::hinted;
 use serde::Deserialize;
 use toml::Table;
 
+use super::error::ConfigError;
 use super::nearest::did_you_mean;
 
-/// What is to be learned, whichever algorithm learns it.
+/// A learning task: an environment and a dataset under one name.
 #[derive(Debug, Deserialize)]
 pub struct Task {
-    /// What it is called on the command line and in files.
+    /// Name on the command line and in files.
     pub name: String,
-    /// A few words for the list of tasks; empty where environment and dataset say it.
+    /// Remark in the list of tasks.
     #[serde(default)]
     pub about: String,
-    /// Whether the list of tasks has it; else another says that there are more like it.
+    /// Whether the list of tasks shows it; a similar task stands for the others.
     #[serde(default = "yes")]
     pub is_listed: bool,
-    /// The task of which algorithms' values are taken, if they are not its own.
+    /// The task whose values of algorithms apply, if not its own.
     #[serde(default)]
     values: Option<String>,
-    /// Keys of an experiment that no algorithm's file changes, among them `environment`, and
-    /// `dataset` if it has one.
+    /// Keys of an experiment that no algorithm changes, among them `environment` and `dataset`.
     #[serde(flatten)]
     pub keys: Table,
 }
@@ -52,42 +50,37 @@ impl From<TaskNames> for Task {
             Some(_) => "the default of -task1 to -task5",
             None => "likewise; its data needs quad-convert",
         };
-        let keys = [("environment", Some(environment)), ("dataset", dataset)];
-        let keys = keys
-            .into_iter()
-            .filter_map(|(key, value)| Some((key.to_owned(), value?.into())))
-            .collect();
+        let mut keys = Table::from_iter([("environment".to_owned(), environment.into())]);
+        keys.extend(dataset.map(|dataset| ("dataset".to_owned(), dataset.into())));
         Self { name: task, about: about.to_owned(), is_listed: is_default, values: None, keys }
     }
 }
 
 impl Task {
-    /// The name by which algorithms' files have its values.
-    pub fn valued_as(&self) -> &str {
+    /// The task whose values of algorithms apply.
+    pub fn values_of(&self) -> &str {
         self.values.as_deref().unwrap_or(&self.name)
     }
 
-    /// The value of a key that is a word, or nothing.
-    pub fn word(&self, key: &str) -> Option<&str> {
+    /// The value of a key, if it is text.
+    pub fn text(&self, key: &str) -> Option<&str> {
         self.keys.get(key)?.as_str()
     }
 }
 
-/// All tasks, in the order in which they are listed.
+/// All tasks, in the order of their list.
 pub fn all() -> &'static [Task] {
     &TASKS
 }
 
-/// The task of that name.
-///
-/// # Errors
-/// There is none; the hint has similar names.
-pub fn named(name: &str) -> anyhow::Result<&'static Task> {
-    let unknown = || hinted(anyhow!("there is no task named {name}"), unknown_hint(name));
+/// Finds a task by name.
+pub fn named(name: &str) -> Result<&'static Task, ConfigError> {
+    let unknown =
+        || ConfigError::Unknown { kind: "task", name: name.to_owned(), hint: unknown_hint(name) };
     all().iter().find(|task| task.name == name).ok_or_else(unknown)
 }
 
-/// What to do about a name that no task has.
+/// The hint for an unknown task: similar names.
 pub fn unknown_hint(name: &str) -> String {
     did_you_mean(name, all().iter().map(|task| &*task.name)) + "`learner presets` lists all tasks"
 }

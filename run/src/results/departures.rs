@@ -1,4 +1,5 @@
-//! Where runs of a task with published scores differ from what the authors of their algorithm ran.
+//! Differences between runs of a task with published scores and the runs of their algorithm's
+//! authors.
 
 use std::collections::BTreeSet;
 
@@ -6,27 +7,28 @@ use quad_algorithms::Variant;
 use quad_dataset::catalog;
 
 use super::published;
-use super::run::RunReport;
+use super::report::RunReport;
 use super::selection::Select;
 use crate::config::settings::{self, Settings, differences};
-use crate::config::{self, Experiment, hyperparameters, tasks};
+use crate::config::{self, ConfigError, Experiment, hyperparameters, tasks};
 
-/// Lists where runs that differ only in their seed differ from their authors' settings. `scored_in`
-/// is the precision of their scores.
+/// Lists the differences between runs that differ only in their seed and their authors' settings.
+/// `scored_in` is the precision of their scores.
 pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<String> {
     let Some(run) = runs.first() else { return Vec::new() };
     let ours = &run.config.experiment;
     let Ok(task) = tasks::named(&run.task) else { return Vec::new() };
-    let Ok(paper) = as_published(run) else { return Vec::new() };
+    // The authors' variant applies if they publish scores of it.
+    let has_row = !published::methods(&run.algorithm, &run.variant).is_empty();
+    let Ok(paper) = as_given(run, has_row) else { return Vec::new() };
     let mut departures = Vec::new();
     if select == Select::Best {
         let last = published::last(&run.task);
         departures
             .push(format!("the best evaluation of each run, not the mean of its last {last}"));
     }
-    departures.extend(
-        ours.definition().and_then(|known| hyperparameters::not_given(&known, task)).ok().flatten(),
-    );
+    let definition = ours.definition().ok();
+    departures.extend(definition.and_then(|known| hyperparameters::not_given(&known, task)));
     if let Some(theirs) = paper.dataset.as_deref().filter(|theirs| !is_trained_on(run, theirs)) {
         let name = ours.dataset.as_deref().unwrap_or("not named");
         departures.push(format!("dataset is {name}, not {theirs}"));
@@ -53,14 +55,8 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     departures
 }
 
-/// The values of the task for the algorithm, and for the variant of it that the paper has a row of.
-fn as_published(run: &RunReport) -> anyhow::Result<Experiment> {
-    as_given(run, !published::methods(&run.algorithm, &run.variant).is_empty())
-}
-
-/// The values of the task for the algorithm, and for the variant of it if that is not to be a
-/// departure.
-pub fn as_given(run: &RunReport, of_variant: bool) -> anyhow::Result<Experiment> {
+/// The authors' values of a run's task: of the run's variant, or of the algorithm's default.
+pub fn as_given(run: &RunReport, of_variant: bool) -> Result<Experiment, ConfigError> {
     let mut asked =
         toml::Table::from_iter([("algorithm".to_owned(), run.algorithm.as_str().into())]);
     let variant = run.config.experiment.definition()?.report.variant;
@@ -77,7 +73,7 @@ fn without_seed(experiment: &Experiment) -> Settings {
     settings
 }
 
-/// Whether a run learned from the dataset of that name, whatever it was called on the command line.
+/// Whether a run learned from the dataset of that name, by its hash or its name.
 fn is_trained_on(run: &RunReport, dataset: &str) -> bool {
     let known = catalog::find(dataset).and_then(|known| known.sha256.as_ref());
     let same_file = known.is_some() && run.config.dataset.sha256.as_ref() == known;

@@ -1,18 +1,19 @@
-//! One evaluation: the scores of one snapshot's episodes, summarized.
+//! Summary of one evaluation: the scores of one snapshot's episodes.
 
 use serde::Serialize;
 
 use super::spread::Spread;
-use crate::run::ScoreLine;
+use super::statistics::mean;
+use crate::folder::ScoreLine;
 
-/// One snapshot's episodes.
+/// The episodes of one snapshot.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EvaluationReport {
     /// Gradient step of the snapshot.
     pub step: u64,
-    /// Episodes scored.
+    /// Scored episodes.
     pub episodes: usize,
-    /// Whether these are all of them.
+    /// Whether all episodes are scored.
     pub complete: bool,
     /// Score over the episodes: D4RL-normalized, or the return where the environment has no
     /// reference returns.
@@ -24,20 +25,17 @@ pub struct EvaluationReport {
 }
 
 impl EvaluationReport {
-    /// The evaluation of the snapshot at `step`, of these episodes out of `expected`; none of no
-    /// episodes.
-    pub(super) fn of(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<Self> {
-        let mean = |value: fn(&ScoreLine) -> f64| {
-            episodes.iter().map(|line| value(line)).sum::<f64>() / episodes.len() as f64
-        };
-        let scores: Vec<_> = episodes.iter().map(|line| line.score).collect();
+    /// Summarizes the episodes of the snapshot at `step`, of which there should be `expected`;
+    /// `None` without episodes.
+    pub(super) fn new(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<Self> {
+        let values = |of: fn(&ScoreLine) -> f64| Vec::from_iter(episodes.iter().map(|it| of(it)));
         Some(Self {
             step,
             episodes: episodes.len(),
             complete: episodes.len() == expected as usize,
-            score: Spread::of(&scores)?,
-            mean_return: mean(|line| line.episode_return),
-            mean_length: mean(|line| line.length.into()),
+            score: Spread::of(&values(|line| line.score))?,
+            mean_return: mean(&values(|line| line.episode_return)),
+            mean_length: mean(&values(|line| line.length.into())),
         })
     }
 }

@@ -7,8 +7,8 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::spread::Spread;
-use crate::run::{Lock, RunDir, RunDirError};
-use crate::table::{Part, Table};
+use crate::folder::{Lock, RunDir, RunDirError};
+use crate::table::{Block, Table};
 
 const FILE: &str = "judgments.json";
 const LOCK: &str = "judgments.lock";
@@ -158,7 +158,7 @@ impl Ranking {
     }
 
     /// As words and a table.
-    pub fn parts(&self) -> [Part; 2] {
+    pub fn parts(&self) -> [Block; 2] {
         let Self {
             conditions: Conditions { environment, episodes, gamma, steps, seeds, .. },
             policies,
@@ -201,7 +201,7 @@ impl Ranking {
             self.verdict,
             episodes.len(),
         );
-        [Part::Words(words), Part::Table(table)]
+        [Block::Text(words), Block::Table(table)]
     }
 }
 

@@ -1,21 +1,23 @@
-//! The results of a run: its scores, summarized; the statistics of many runs; and published
-//! figures.
+//! The results of a run, statistics of many runs, and published figures.
 //!
-//! In reading order: `run` reads a run, `evaluation` summarizes one of its evaluations;
-//! `statistics` has the definitions; `published` has others' figures, `departures` the differences
-//! between a run and its authors'; `judgment` what is known of policies without a simulator.
-//! `selection` and `spread` are small parts of these.
+//! In reading order: `report` has the results of a run, `read` reads them, `text` prints them,
+//! `evaluation` summarizes an evaluation; `statistics` and `spread` have definitions; `published` has
+//! figures of papers, `departures` the differences between a run and its authors'; `judgment` has
+//! estimates without a simulator.
 
 pub mod departures;
 pub mod evaluation;
 pub mod judgment;
 pub mod published;
-pub mod run;
-pub mod selection;
-pub mod spread;
+mod read;
+mod report;
+mod selection;
+mod spread;
 pub mod statistics;
+mod text;
 
 pub use judgment::{Conditions, Estimate, Judgment, Ranking};
-pub use run::RunReport;
+pub use read::joined;
+pub use report::RunReport;
 pub use selection::Select;
 pub use spread::Spread;

@@ -1,9 +1,9 @@
-//! Which evaluations of a run are its score.
+//! The evaluations of a run that make its score.
 
 use clap::ValueEnum;
 use serde::Serialize;
 
-/// Which evaluations of a run count.
+/// The evaluations of a run that make its score. (The help of `learner report` has these lines.)
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Select {
@@ -14,7 +14,7 @@ pub enum Select {
 }
 
 impl Select {
-    /// What a reader has to know before the figures, if they are not the paper's protocol.
+    /// A warning for the reader of figures that do not follow the paper's protocol.
     pub fn warning(self) -> Option<&'static str> {
         const SELECTED: &str = "Selected: of each run its best complete evaluation counts, in place of the mean of its last ones. It is chosen by the very \
              scores that are reported, so it is optimistic, and the more so the more evaluations there are.\n";

@@ -1,21 +1,23 @@
-//! All runs below some folders, a line each.
+//! A list of the runs below some folders.
 
+use std::error::Error;
 use std::fmt::Alignment::{Left, Right};
 use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
 
 use indicatif::HumanBytes;
+use quad_runtime::one_line;
 use serde::Serialize;
 
 use super::state::State;
+use crate::folder::{RunDir, RunDirError, walk};
 use crate::results::RunReport;
-use crate::run::{RunDir, walk};
 use crate::table::{Style, Table};
 
-/// A folder: a run, or what keeps it from being read.
+/// A run, or a folder that cannot be read.
 #[derive(Serialize)]
 pub struct Entry {
-    /// Its path below the folder that was asked for, or its whole path if several were.
+    /// Path below the listed folder; the whole path if several folders are listed.
     pub name: String,
     /// The folder.
     pub dir: PathBuf,
@@ -28,42 +30,44 @@ pub struct Entry {
 #[derive(Serialize)]
 struct Listed {
     task: String,
-    /// The algorithm, and its variant if it has several.
+    /// Algorithm and variant.
     method: String,
-    /// Gradient steps done, of so many.
+    /// Gradient steps done.
     step: u64,
     steps: u64,
-    /// How far it is, in words.
     state: String,
-    /// Whether a learner has it open.
+    /// Whether a learner is at work.
     at_work: bool,
-    /// The last complete evaluation: its gradient step and mean score.
+    /// Gradient step and mean score of the last complete evaluation.
     score_step: Option<u64>,
     score: Option<f64>,
-    /// Size of all files in the folder, bytes.
+    /// Total size of the files.
     bytes: u64,
 }
 
-/// All runs in and below these folders.
+/// Lists all runs at and below these folders.
 pub fn list(dirs: &[PathBuf]) -> Vec<Entry> {
     let mut entries = Vec::new();
     for asked in dirs {
-        let mut add = |dir: &Path, found: anyhow::Result<Listed>| {
-            let below = dir
-                .strip_prefix(asked)
-                .ok()
-                .filter(|below| dirs.len() == 1 && *below != Path::new(""));
-            let error = found.as_ref().err().map(|error| format!("{error:#}").replace('\n', " "));
+        let mut add = |dir: &Path, run: Option<Listed>, error: Option<&dyn Error>| {
+            let below = dir.strip_prefix(asked).ok();
+            let below = below.filter(|below| dirs.len() == 1 && *below != Path::new(""));
             let name = below.unwrap_or(dir).display().to_string();
-            entries.push(Entry { name, dir: dir.to_owned(), run: found.ok(), error });
+            let error = error.map(|error| one_line(error).replace('\n', " "));
+            entries.push(Entry { name, dir: dir.to_owned(), run, error });
         };
-        let runs = walk(asked, &mut |dir, error| add(dir, Err(error.into())));
-        runs.iter().for_each(|dir| add(dir, Listed::read(dir)));
+        let runs = walk(asked, &mut |dir, error| add(dir, None, Some(&error)));
+        for dir in runs {
+            match Listed::read(&dir) {
+                Ok(run) => add(&dir, Some(run), None),
+                Err(error) => add(&dir, None, Some(&error)),
+            }
+        }
     }
     entries
 }
 
-/// The runs that can be read, as a table for people.
+/// The readable runs as a table.
 pub fn table(entries: &[Entry]) -> String {
     let texts = ["run", "task", "method", "state"].map(|name| (name, Left));
     let mut table = Table::new(&[&texts[..], &[("last score", Right), ("size", Right)]].concat());
@@ -79,14 +83,14 @@ pub fn table(entries: &[Entry]) -> String {
 }
 
 impl Entry {
-    /// The name of the folder and why it cannot be read, if it cannot.
+    /// Name and error of a folder that cannot be read.
     pub fn unreadable(&self) -> Option<String> {
         self.error.as_ref().map(|error| format!("{}: {error}", self.name))
     }
 }
 
 impl Listed {
-    fn read(dir: &Path) -> anyhow::Result<Self> {
+    fn read(dir: &Path) -> Result<Self, RunDirError> {
         let report = RunReport::scored(dir)?;
         let (state, newest) = (State::of(&report)?, report.newest());
         let variant = Some(&report.variant).filter(|variant| **variant != report.algorithm);
@@ -105,7 +109,7 @@ impl Listed {
     }
 }
 
-/// Bytes of all files in a folder.
+/// Total size of the files in a folder, bytes.
 fn size(dir: &Path) -> u64 {
     let of = |entry: DirEntry| match entry.metadata() {
         Ok(metadata) if metadata.is_dir() => size(&entry.path()),

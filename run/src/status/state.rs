@@ -1,4 +1,4 @@
-//! How far a run is, by its folder alone.
+//! Progress of a run, by its folder alone.
 
 use std::fmt;
 use std::io;
@@ -7,45 +7,42 @@ use std::path::Path;
 use serde::Deserialize;
 
 use crate::files;
+use crate::folder::{RunDir, RunDirError};
 use crate::results::RunReport;
-use crate::run::{RunDir, RunDirError};
 
-/// The last two lines of `metrics.jsonl` are in its last bytes, so many.
+/// Bytes at the end of `metrics.jsonl` that contain at least two lines.
 const TAIL: u64 = 8192;
 
-/// How far a run is.
+/// Progress of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// It has no folder.
+    /// The run has no folder.
     NotBegun,
-    /// So many steps are done; perhaps all of them, while scores are missing.
+    /// Gradient steps done. Scores may be missing even if these are all.
     Begun(u64),
-    /// As far as that, and the learner ended with an error.
+    /// Gradient steps done before the learner failed.
     Failed(u64),
     /// All steps are done and all episodes scored.
     Complete,
-    /// A file in its folder is not what a learner writes.
+    /// A file in the folder is damaged.
     Unreadable,
 }
 
 impl State {
-    /// State of a run whose report was read.
-    ///
-    /// # Errors
-    /// The folder of its snapshots cannot be read.
+    /// State of the run of a report.
     pub fn of(report: &RunReport) -> Result<Self, RunDirError> {
         let (dir, experiment) = (RunDir::at(&report.dir), &report.config.experiment);
         let trained =
             experiment.eval_interval > 0 || dir.snapshots()?.last() == Some(&experiment.steps);
         let step = || rows(dir.path()).last().map_or(0, |row| row.step);
-        Ok(match (report.is_complete() && trained, dir.has_failed()) {
+        Ok(match (report.is_complete() && trained, dir.failure()) {
             (true, _) => Self::Complete,
-            (false, true) => Self::Failed(step()),
-            (false, false) => Self::Begun(step()),
+            (false, Some(_)) => Self::Failed(step()),
+            (false, None) => Self::Begun(step()),
         })
     }
 
-    /// Steps that are done, of a run of so many.
+    /// Gradient steps done of a run with this many.
     pub fn step(self, steps: u64) -> u64 {
         match self {
             Self::NotBegun | Self::Unreadable => 0,
@@ -54,7 +51,7 @@ impl State {
         }
     }
 
-    /// Says the state in words, for a run of this many steps.
+    /// The state in words, for a run with this many steps.
     pub fn text(self, steps: u64) -> String {
         match self {
             Self::NotBegun => "not begun".to_owned(),
@@ -67,19 +64,19 @@ impl State {
     }
 }
 
-/// What a run at work is seen to do.
+/// Progress of a run at work.
 #[derive(Clone, Copy, Default)]
 pub struct Pace {
     /// Gradient steps done.
     pub step: u64,
     /// Gradient steps a second.
     pub rate: f64,
-    /// The newest whole evaluation: step and mean score.
+    /// Step and mean score of the newest complete evaluation.
     pub score: Option<(u64, f64)>,
 }
 
 impl Pace {
-    /// Reads the progress of the run in a folder.
+    /// Reads the run in a folder.
     pub fn read(dir: &Path) -> Self {
         let rows = rows(dir);
         let rate = match &rows[..] {
@@ -89,10 +86,8 @@ impl Pace {
             _ => 0.0,
         };
         let report = RunReport::scored(dir).ok();
-        let score = report
-            .as_ref()
-            .and_then(RunReport::newest)
-            .map(|newest| (newest.step, newest.score.mean));
+        let newest = report.as_ref().and_then(RunReport::newest);
+        let score = newest.map(|newest| (newest.step, newest.score.mean));
         Self { step: rows.last().map_or(0, |row| row.step), rate, score }
     }
 }
@@ -104,14 +99,14 @@ impl fmt::Display for Pace {
     }
 }
 
-/// What is read of a line of `metrics.jsonl`.
+/// A line of `metrics.jsonl`.
 #[derive(Deserialize)]
 struct Row {
     step: u64,
     seconds: f64,
 }
 
-/// The last lines of `metrics.jsonl`; those that are half written or half read are none.
+/// The last complete lines of `metrics.jsonl`.
 fn rows(dir: &Path) -> Vec<Row> {
     let read = || -> io::Result<Vec<u8>> {
         let mut file = files::open(&dir.join("metrics.jsonl"))?;

@@ -38,13 +38,19 @@ impl Findings {
         self.0.push(Finding { verdict, check: check.to_owned(), what, hint });
     }
 
-    /// # Errors
-    /// Fails if at least one check failed.
-    pub fn verdict(&self) -> anyhow::Result<()> {
+    /// Fails if a check failed.
+    pub fn verdict(&self) -> Result<(), ChecksFailed> {
         let failed = self.0.iter().filter(|finding| finding.verdict == "fail").count();
-        anyhow::ensure!(failed == 0, "{failed} of {} checks failed", self.0.len());
-        Ok(())
+        if failed == 0 { Ok(()) } else { Err(ChecksFailed { failed, checks: self.0.len() }) }
     }
+}
+
+/// Checks failed.
+#[derive(Debug, thiserror::Error)]
+#[error("{failed} of {checks} checks failed")]
+pub struct ChecksFailed {
+    failed: usize,
+    checks: usize,
 }
 
 impl fmt::Display for Findings {

@@ -1,6 +1,6 @@
 //! Certificates, and the endpoints at which learner and evaluators meet.
 
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::net::{Ipv4Addr, TcpListener};
 use std::path::Path;
 use std::time::Duration;
@@ -52,14 +52,12 @@ pub fn port(findings: &mut Findings, port: u16) {
 
 /// Connects to the first endpoint, by TCP alone and then with Zenoh, and does the further checks
 /// over the session if there is one.
-///
-/// # Errors
-/// No thread can be started, or the further checks cannot be done.
-pub fn connected(
+/// Fails if the further checks cannot be done.
+pub fn connected<E: From<io::Error>>(
     findings: &mut Findings,
     endpoints: &Endpoints,
-    further: impl AsyncFnOnce(&mut Findings, &Session) -> anyhow::Result<()>,
-) -> anyhow::Result<()> {
+    further: impl AsyncFnOnce(&mut Findings, &Session) -> Result<(), E>,
+) -> Result<(), E> {
     let runtime = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let done = runtime.block_on(async {
         let Some(session) = connect(findings, endpoints).await else { return Ok(()) };

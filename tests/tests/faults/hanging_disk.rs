@@ -5,7 +5,7 @@ use std::thread::sleep;
 use std::time::Duration;
 
 use quad_protocol::keys;
-use quad_run::run::RunDir;
+use quad_run::folder::RunDir;
 use quad_tests::PATIENCE;
 use quad_tests::hanging_disk::launcher;
 use quad_tests::made_up::{claim_eventually, client, name};

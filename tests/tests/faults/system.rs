@@ -6,7 +6,7 @@ use std::thread::sleep;
 use std::time::Duration;
 
 use quad_protocol::{Hash, ScoreReply, ScoreReport, decode, encode, keys};
-use quad_run::run::ScoreLine;
+use quad_run::folder::ScoreLine;
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
 use quad_tests::link::{Link, Trouble};

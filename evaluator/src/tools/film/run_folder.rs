@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
+use quad_run::folder::RunDir;
 use quad_run::results::RunReport;
-use quad_run::run::RunDir;
 use quad_runtime::Hint;
 
 const RUN: &str = "name a file like RUN/snapshots/step_000020000.safetensors, or the folder RUN that `learner train` made";

@@ -197,9 +197,11 @@ fn a_machine_that_fails_again_and_again_does_not_keep_others_from_the_end() {
 
 #[test]
 fn scores_of_an_earlier_life_count_and_other_weights_are_found_out() {
-    let earlier = Earlier { weights: hash(3000).to_string(), episodes: vec![score(22, 400.0)] };
-    let whole =
-        Earlier { weights: hash(4000).to_string(), episodes: vec![score(32, 1.0), score(31, 2.0)] };
+    let earlier = SavedScores { weights: hash(3000).to_string(), episodes: vec![score(22, 400.0)] };
+    let whole = SavedScores {
+        weights: hash(4000).to_string(),
+        episodes: vec![score(32, 1.0), score(31, 2.0)],
+    };
     let mut bench = Bench::after([(3000, earlier), (4000, whole)].into());
     let pending = bench.board.pending();
     assert_eq!(bench.board.add_evaluation(3000, hash(3000), &[21, 22, 23]), Ok(None));

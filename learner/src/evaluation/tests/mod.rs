@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
-use quad_run::run::Earlier;
+use quad_run::folder::SavedScores;
 
 use super::outcomes::Recorded;
 use super::{Claim, Claimed, HandedBack, Lost, Refusal, Rules, Scoreboard, Validated};
@@ -34,7 +34,7 @@ impl Bench {
     }
 
     /// A scoreboard of a later incarnation of the run.
-    fn after(earlier: BTreeMap<u64, Earlier>) -> Self {
+    fn after(earlier: BTreeMap<u64, SavedScores>) -> Self {
         let rules = Rules {
             run: name("run"),
             incarnation: INCARNATION,

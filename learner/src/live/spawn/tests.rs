@@ -25,7 +25,7 @@ fn a_thread_that_fails_or_panics_tells_the_main_loop_why() {
     assert_eq!(failed(|| Err(anyhow!("no such thing"))), "no such thing");
 
     let health = Health::default();
-    let beat = health.part("scores", Duration::from_secs(60));
+    let beat = health.register("scores", Duration::from_secs(60));
     spawn_alive("scores", &events, beat, |_| panic!("again")).unwrap().join().unwrap();
     assert_eq!(health.problems().len(), 1);
     spawn("scores", &events, || Ok(())).unwrap().join().unwrap();

@@ -4,7 +4,7 @@ use std::process;
 
 use clap::Parser;
 use quad_run::config::{Device, Experiment, Preset, resolve};
-use quad_run::run::RunDir;
+use quad_run::folder::RunDir;
 use toml::toml;
 
 use super::*;

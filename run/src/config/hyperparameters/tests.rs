@@ -42,7 +42,7 @@ fn every_algorithm_has_every_value_for_every_task() {
             let resolved = resolve(&task.name, &asked).unwrap();
             assert_eq!(
                 (&*resolved.algorithm, Some(&*resolved.environment)),
-                (definition.name, task.word("environment"))
+                (definition.name, task.text("environment"))
             );
         }
     }

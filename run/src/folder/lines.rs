@@ -1,23 +1,23 @@
-//! What the files of a run say: a line of each log, and where the learner is.
+//! Contents of a run's files: a line of each log, and the learner's addresses.
 
 use std::io::ErrorKind;
 use std::path::Path;
 
-use anyhow::Context;
 use quad_algorithms::MetricsLine;
 use quad_protocol::{EpisodeScore, ScoreReport};
 use serde::{Deserialize, Serialize};
 
+use super::error::{RunDirError, io_error};
 use crate::files;
 
-/// Where a learner can be reached: `endpoints.json`.
+/// Addresses of a learner: `endpoints.json`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct RunEndpoints {
-    /// Zenoh endpoints that an evaluator can connect to.
+    /// Zenoh endpoints that evaluators can connect to.
     pub zenoh: Vec<String>,
     /// Address of `/metrics`.
     pub metrics: String,
-    /// The page that shows the run to a browser; older runs have none.
+    /// Web page of the run; older runs have none.
     #[serde(default)]
     pub page: String,
 }
@@ -38,23 +38,23 @@ pub struct ScoreLine {
     pub score: f64,
     /// BLAKE3 of the snapshot's file.
     pub weights: String,
-    /// Arithmetic that the policy was computed in, e.g. `f32-avx2` or `bf16-amx`; lines from before
-    /// there was a choice do not say.
+    /// Arithmetic of the policy, e.g. `f32-avx2` or `bf16-amx`; empty in older lines.
     #[serde(default)]
     pub precision: String,
-    /// Who measured it.
+    /// Name of the evaluator.
     pub evaluator: String,
 }
 
 impl ScoreLine {
-    /// The line for an episode of a report.
+    /// The line of an episode of a report.
     pub fn new(report: &ScoreReport, score: &EpisodeScore) -> Self {
+        let EpisodeScore { seed, episode_return, length, score } = *score;
         Self {
             step: report.step,
-            seed: score.seed,
-            episode_return: score.episode_return,
-            length: score.length,
-            score: score.score,
+            seed,
+            episode_return,
+            length,
+            score,
             weights: report.weights.to_string(),
             precision: report.precision.to_string(),
             evaluator: report.evaluator.to_string(),
@@ -68,19 +68,30 @@ impl ScoreLine {
     }
 }
 
-/// The lines of `metrics.jsonl` in a run folder; none if there is no such file. The last one may
-/// not be complete.
-///
-/// # Errors
-/// The file cannot be read.
-pub fn read_metrics(folder: &Path) -> anyhow::Result<Vec<MetricsLine>> {
+/// Reads the complete lines of `metrics.jsonl` in a run folder; a missing file has none.
+pub fn read_metrics(folder: &Path) -> Result<Vec<MetricsLine>, RunDirError> {
     let path = folder.join("metrics.jsonl");
     match files::read_text(&path) {
         Ok(text) => Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
-        Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),
+        Err(error) => Err(io_error("read", &path)(error)),
     }
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+    use crate::fixtures::line;
+
+    #[test]
+    fn scores_keep_every_bit() {
+        for number in (1..5_000).map(f64::from) {
+            let score = number.ln() * 13.7;
+            let line = ScoreLine { episode_return: number.sqrt() * 37.0, ..line(1, 2, score) };
+            let text = serde_json::to_string(&line).unwrap();
+            let read: ScoreLine = serde_json::from_str(&text).unwrap();
+            let bits = |line: &ScoreLine| [line.episode_return.to_bits(), line.score.to_bits()];
+            assert_eq!(bits(&read), bits(&line), "{text}");
+        }
+    }
+}

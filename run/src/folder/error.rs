@@ -1,53 +1,38 @@
-//! Why a run folder cannot be used.
+//! Run folders that cannot be used.
 
+use std::fmt::Display;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
-/// What failed where a folder cannot be made, which has a hint of its own.
+/// The action of [`RunDirError::Io`] that makes a new folder.
 pub(super) const CREATE: &str = "create";
 
 /// A run folder that cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // The messages say what each variant is.
 pub enum RunDirError {
-    /// There is a run in it.
     #[error("there is already a run in {0}")]
     Occupied(PathBuf),
-    /// Another learner works in it.
     #[error("another learner is at work in {0}")]
     InUse(PathBuf),
-    /// Files have no locks there, and a learner on another host has claimed the folder by this
-    /// file.
+    /// The file system has no locks, and the file names another host.
     #[error(
         "files have no locks there, and {0} names another host, on which a learner is or was at work"
     )]
     Claimed(PathBuf),
-    /// The folder of a run at work is not there any more.
     #[error("the run's folder {0} was removed or renamed")]
     Gone(PathBuf),
-    /// Reading or writing failed.
+    #[error("there is a run of another configuration in {path} ({differences})")]
+    OtherConfig { path: PathBuf, differences: String },
     #[error("cannot {action} {path}")]
-    Io {
-        /// The operation: "read", "write" …
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// A file of the run has contents that no learner writes.
+    Io { action: &'static str, path: PathBuf, source: io::Error },
+    /// Lines are counted from 1.
     #[error("{path}{} is not what a learner writes: {reason}", line.map(|n| format!(", line {n},")).unwrap_or_default())]
-    Content {
-        /// The file.
-        path: PathBuf,
-        /// The line, from 1.
-        line: Option<usize>,
-        /// What is wrong.
-        reason: String,
-    },
+    Content { path: PathBuf, line: Option<usize>, reason: String },
 }
 
 impl RunDirError {
-    /// What to do about it.
+    /// Tells the user how to fix it.
     pub fn hint(&self) -> &'static str {
         match self {
             Self::Occupied(_) => {
@@ -58,6 +43,9 @@ impl RunDirError {
                 "wait for the end of that learner; if it is gone, as with its host, remove that file"
             }
             Self::InUse(_) => "wait for its end, or choose another folder by --run-dir",
+            Self::OtherConfig { .. } => {
+                "choose another --run-dir; or --fresh, which renames that folder and begins anew"
+            }
             Self::Content { .. } => {
                 "put a copy of the file in its place; --fresh renames the folder and begins anew. A line of scores.jsonl may \
                  also be taken out: its episode is scored again"
@@ -81,15 +69,11 @@ impl RunDirError {
     }
 }
 
-pub(super) fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> RunDirError {
+pub(crate) fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> RunDirError {
     let path = path.to_owned();
     move |source| RunDirError::Io { action, path, source }
 }
 
-pub(super) fn content(
-    path: &Path,
-    line: Option<usize>,
-    error: &dyn std::fmt::Display,
-) -> RunDirError {
+pub(crate) fn content(path: &Path, line: Option<usize>, error: impl Display) -> RunDirError {
     RunDirError::Content { path: path.to_owned(), line, reason: error.to_string() }
 }

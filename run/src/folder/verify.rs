@@ -1,5 +1,4 @@
-//! `learner verify`: reads a run's folder and nothing else, and says whether what a run promises
-//! has held.
+//! `learner verify`: checks a run by its folder alone.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -8,33 +7,32 @@ use std::path::Path;
 use quad_protocol::{Hash, episode_seeds};
 
 use super::error::RunDirError;
-use super::folder::RunDir;
 use super::lines::ScoreLine;
+use super::run_dir::RunDir;
 use crate::config::settings;
 
-/// Findings of one kind that are listed one by one; the others are counted.
+/// Listed findings of one kind; further ones are only counted.
 const LISTED: usize = 5;
 
-/// Evaluators compute in f32 or bf16, by the fastest instructions of their CPU, and each of these
-/// rounds in its own way.
+/// f32 and bf16 round differently, and so do different instructions of CPUs.
 const OTHER_ARITHMETIC: &str =
     "not comparable, because the evaluators computed in another precision or by other instructions";
 
-/// What was found in a folder.
+/// The result of a check.
 #[derive(Debug, Default, PartialEq)]
 pub struct Findings {
-    /// What was looked for, such as `episodes are scored`.
+    /// The checked property, such as `episodes are scored`.
     pub what: &'static str,
-    /// How many are.
+    /// Number of items that have the property.
     pub found: u64,
-    /// How many should be.
+    /// Number of items that should have it.
     pub expected: u64,
-    /// What is wrong, kind by kind: how often, and the first cases.
+    /// Violations by kind: their number and the first cases.
     pub wrong: BTreeMap<&'static str, (u64, Vec<String>)>,
 }
 
 impl Findings {
-    /// Whether every promise has held.
+    /// Whether there are no violations.
     pub fn all_held(&self) -> bool {
         self.wrong.is_empty()
     }
@@ -61,9 +59,6 @@ impl fmt::Display for Findings {
 
 /// Checks that each episode of each evaluation of a run is scored exactly once, with the weights
 /// that are on disk.
-///
-/// # Errors
-/// There is no run in the folder, or a file cannot be read.
 pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let (dir, config) = RunDir::open(path)?;
     let experiment = &config.experiment;
@@ -79,10 +74,8 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let mut seen = BTreeSet::new();
     for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
         let name = format!("step {step}, seed {seed}");
-        let hash = hashes
-            .entry(step)
-            .or_insert_with(|| hash(&dir, step).ok().map(|hash| hash.to_string()));
-        match hash {
+        let read = || hash(&dir, step).ok().map(|hash| hash.to_string());
+        match hashes.entry(step).or_insert_with(read) {
             None => found.add("scored, but the snapshot is gone", name.clone()),
             Some(hash) if *hash != weights => {
                 found.add("scored with other weights than are on disk", name.clone())
@@ -103,8 +96,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     }
     let missing = found.expected - found.found;
     if missing > 0 {
-        // Counted, and only the first ones made: a run that has no end plans more than memory
-        // holds.
+        // A run without end plans more episodes than memory holds.
         let unscored = |(step, seed): &(u64, u64)| !seen.contains(&(*step, *seed));
         let all = schedule
             .evaluated_steps()
@@ -118,16 +110,12 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     Ok(found)
 }
 
-/// The hash of a snapshot's file.
 fn hash(dir: &RunDir, step: u64) -> Result<Hash, RunDirError> {
     Ok(Hash::of(&dir.read_snapshot(step)?))
 }
 
-/// Checks that each score and each snapshot of a run is in another run of the same configuration,
-/// too, bit for bit: what was found of scores, and of snapshots.
-///
-/// # Errors
-/// As [`verify`].
+/// Compares the scores and the snapshots of a run with those of another run of the same
+/// configuration, bit for bit.
 pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> {
     let mut found = Findings { what: "episodes are compared", ..Findings::default() };
     let [(dir, config), (other_dir, other_config)] = [RunDir::open(path)?, RunDir::open(other)?];
@@ -169,7 +157,7 @@ fn compare_snapshots(dir: &RunDir, other: &RunDir) -> Result<Findings, RunDirErr
         ..Findings::default()
     };
     if ours.is_empty() {
-        // Each run ends with one.
+        // A complete run has at least one.
         found.add("nothing to compare", format!("{} has no snapshot", dir.path().display()));
     }
     for step in ours {

@@ -1,4 +1,4 @@
-//! Files of JSON lines that only grow.
+//! Append-only files of JSON lines.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -15,35 +15,30 @@ use crate::files;
 pub struct Log {
     path: PathBuf,
     file: File,
-    /// Length of the whole lines, bytes.
+    /// Length of the complete lines, bytes.
     length: u64,
-    /// Whether half a line may follow them.
+    /// Whether an incomplete line may follow them.
     torn: bool,
-    /// Lock of a file that is synchronized after each write; the run's other file has the same
-    /// writer and needs none.
+    /// A log with a lock is synchronized after each write. The run's other log has the same writer
+    /// and needs no lock.
     lock: Option<Lock>,
 }
 
 impl Log {
-    /// Opens or makes the file. With its lock, it is synchronized after each write. Half a line at
-    /// its end, which a crash left, is cut off.
-    ///
-    /// # Errors
-    /// The file cannot be opened or changed.
+    /// Opens or creates the file and cuts off an incomplete line at its end.
     pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
         let file = files::append(&path).map_err(io_error("open", &path))?;
         let mut log = Self { path, file, length: 0, torn: true, lock };
-        log.length = whole_lines(&log.bytes()?) as u64;
+        log.length = complete_lines(&log.bytes()?) as u64;
         // Lines that a killed process did not synchronize count from now on.
-        let durable = log
-            .mend()
+        log.mend()
             .and_then(|()| log.synchronize())
-            .and_then(|()| files::synchronize_folder(&log.path));
-        durable.map_err(io_error("open", &log.path))?;
+            .and_then(|()| files::synchronize_folder(&log.path))
+            .map_err(io_error("open", &log.path))?;
         Ok(log)
     }
 
-    /// Whether there is no whole line in it.
+    /// Whether it has no complete line.
     pub fn is_empty(&self) -> bool {
         self.length == 0
     }
@@ -53,7 +48,7 @@ impl Log {
         let mut text = Vec::new();
         for line in lines {
             serde_json::to_writer(&mut text, line)
-                .map_err(|error| content(&self.path, None, &error))?;
+                .map_err(|error| content(&self.path, None, error))?;
             text.push(b'\n');
         }
         self.write(&text).map_err(io_error("write", &self.path))
@@ -68,7 +63,7 @@ impl Log {
                 self.torn = false;
                 self.length += text.len() as u64;
             }
-            // At once if that is possible, else before the next line.
+            // If this fails, too, the next write tries it again.
             Err(_) => drop(self.mend()),
         }
         written
@@ -78,7 +73,7 @@ impl Log {
         if self.lock.is_some() { self.file.sync_data() } else { Ok(()) }
     }
 
-    /// Cuts off what a failed write left: half a line would make the next one unreadable.
+    /// Cuts off the incomplete line of a failed write, which would spoil the next line.
     fn mend(&mut self) -> io::Result<()> {
         if self.torn {
             self.file.set_len(self.length)?;
@@ -87,13 +82,12 @@ impl Log {
         Ok(())
     }
 
-    /// Cuts off every line from the first one on that is not to be kept.
+    /// Cuts off the first line that is not to be kept, and all lines after it.
     pub(super) fn keep_while(
         &mut self,
         mut keep: impl FnMut(&str) -> bool,
     ) -> Result<(), RunDirError> {
-        // A power cut may leave anything in a file that was not synchronized; what is no text is
-        // not kept either.
+        // After a power cut, a file that was not synchronized may contain anything.
         let bytes = self.bytes()?;
         let lines = bytes.split_inclusive(|&byte| byte == b'\n');
         let kept = lines.take_while(|line| std::str::from_utf8(line).is_ok_and(&mut keep));
@@ -107,8 +101,8 @@ impl Log {
     }
 }
 
-/// The whole lines that a file has beyond its first `read` bytes, which then count as read; none if
-/// it is not there. A file that has become shorter is read from its beginning.
+/// Reads the complete lines of a file beyond its first `read` bytes, and adds their length to
+/// `read`. A missing file has none; a file that has become shorter is read from its beginning.
 pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
     let mut file = match files::open(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -118,12 +112,12 @@ pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
         *read = 0;
     }
     let mut lines = files::rest(&mut file, *read)?;
-    lines.truncate(whole_lines(&lines));
+    lines.truncate(complete_lines(&lines));
     *read += lines.len() as u64;
     Ok(lines)
 }
 
-/// Length of the whole lines, bytes.
-fn whole_lines(text: &[u8]) -> usize {
+/// Length of the complete lines, bytes.
+fn complete_lines(text: &[u8]) -> usize {
     text.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1)
 }

@@ -1,4 +1,4 @@
-//! Tests of `run/checkpoints.rs`.
+//! Tests of checkpoints.
 
 use super::*;
 
@@ -7,7 +7,7 @@ fn checkpoint(step: u64) -> Checkpoint {
 }
 
 #[test]
-fn the_newest_are_kept_and_a_damaged_one_falls_back_to_the_one_before() {
+fn keeps_the_newest_and_skips_damaged_ones() {
     let folder = tempfile::tempdir().unwrap();
     let checkpoints = Checkpoints::of_run(folder.path());
     fs::create_dir(&checkpoints.folder).unwrap();
@@ -22,7 +22,7 @@ fn the_newest_are_kept_and_a_damaged_one_falls_back_to_the_one_before() {
         [1_000_000_000, 200, 10]
     );
 
-    // Torn, then a flipped bit, then gone; and what a crash leaves beside them.
+    // Torn, then a flipped bit, then missing; and a partial file of a crash.
     fs::write(&files[0], &checkpoint(0).state[..500]).unwrap();
     assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(200)));
     let mut bytes = fs::read(&files[1]).unwrap();
@@ -30,17 +30,13 @@ fn the_newest_are_kept_and_a_damaged_one_falls_back_to_the_one_before() {
     fs::write(&files[1], bytes).unwrap();
     fs::write(checkpoints.folder.join("step_000000300_00.safetensors.partial"), "half").unwrap();
     assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(10)));
-    assert_eq!(
-        checkpoints.files().unwrap(),
-        files[2..],
-        "damaged ones do not take the place of good ones"
-    );
+    assert_eq!(checkpoints.files().unwrap(), files[2..]);
     fs::remove_file(&files[2]).unwrap();
     assert_eq!(checkpoints.newest().unwrap(), None);
 }
 
 #[test]
-fn one_that_cannot_be_read_falls_back_and_does_not_count_as_none() {
+fn an_unreadable_checkpoint_is_an_error_unless_an_older_one_is_good() {
     let folder = tempfile::tempdir().unwrap();
     let checkpoints = Checkpoints::of_run(folder.path());
     fs::create_dir(&checkpoints.folder).unwrap();

@@ -1,4 +1,4 @@
-//! Keeps other processes out of a folder.
+//! Locks that keep other processes out of a folder.
 
 use std::fs::{self, File, TryLockError};
 use std::io::{self, ErrorKind, Write};
@@ -14,22 +14,21 @@ use rustix::io::Errno;
 use super::error::{RunDirError, io_error};
 use crate::files;
 
-/// A lock that another process has is tried again after this time: `learner list` takes one for
-/// microseconds.
-const GLANCE: Duration = Duration::from_millis(10);
-/// Has the name of this host.
+/// Pause before a second attempt: `learner list` holds a lock for microseconds.
+const RETRY: Duration = Duration::from_millis(10);
+/// Contains the name of this host.
 const HOST: &str = "/proc/sys/kernel/hostname";
 
-/// A lock on a file, as long as this lives.
+/// A lock on a file, released when dropped.
 #[derive(Debug)]
 pub struct Lock {
     _file: File,
     _claim: Option<Claim>,
 }
 
-/// Stands for a lock where files have none, as on Lustre without `flock`: a file that names the
-/// host, so that no other host takes it; and a socket, which the system gives to one process of
-/// this host, and takes back at that process's end.
+/// Replaces a lock on file systems without any, such as Lustre without `flock`: a file with the
+/// name of the host keeps out other hosts; a socket, which the system frees at the end of the
+/// process, keeps out other processes of this host.
 #[derive(Debug)]
 struct Claim {
     path: PathBuf,
@@ -37,15 +36,12 @@ struct Claim {
 }
 
 impl Lock {
-    /// Locks the file at `path`, which is made if it is missing.
-    ///
-    /// # Errors
-    /// [`RunDirError::InUse`] if another process has it, [`RunDirError::Claimed`] if another host
-    /// had it.
+    /// Locks the file at `path` and creates it if it is missing. Fails with [`RunDirError::InUse`]
+    /// if another process has the lock, with [`RunDirError::Claimed`] if another host had it.
     pub fn take(path: &Path) -> Result<Self, RunDirError> {
         let file = files::append(path).map_err(io_error("open", path))?;
         let again = |_| {
-            sleep(GLANCE);
+            sleep(RETRY);
             file.try_lock()
         };
         let claim = match file.try_lock().or_else(again) {
@@ -59,11 +55,8 @@ impl Lock {
         Ok(Self { _file: file, _claim: claim })
     }
 
-    /// Locks the file together with others who share it, against a process that wants it alone.
-    /// Where files have no locks, it does nothing.
-    ///
-    /// # Errors
-    /// [`RunDirError::InUse`] if another process has it alone.
+    /// Takes a shared lock, which excludes [`take`](Self::take). Does nothing on file systems
+    /// without locks.
     pub fn share(path: &Path) -> Result<Self, RunDirError> {
         let file = files::append(path).map_err(io_error("open", path))?;
         match file.try_lock_shared() {
@@ -72,10 +65,7 @@ impl Lock {
         }
     }
 
-    /// Whether files have locks in a folder; tries it with a file that it removes again.
-    ///
-    /// # Errors
-    /// No file can be made there, or locks fail in another way.
+    /// Whether files in a folder can be locked, tried with a temporary file.
     pub fn is_possible(folder: &Path) -> io::Result<bool> {
         let path = folder.join(format!(".lock-{:08x}", rand::random::<u32>()));
         let locked = files::append(&path)?.try_lock();
@@ -87,8 +77,8 @@ impl Lock {
         }
     }
 
-    /// Whether another process has the lock of the file alone. Where files have no locks, one that
-    /// was killed may still seem to have it.
+    /// Whether a process has the exclusive lock. On file systems without locks, a process that was
+    /// killed may still seem to have it.
     pub fn is_taken(path: &Path) -> bool {
         let Ok(file) = files::open(path) else { return false };
         match file.try_lock_shared() {
@@ -114,7 +104,7 @@ impl Claim {
         let path = claim_of(path);
         match File::create_new(&path).and_then(|mut file| file.write_all(host.as_bytes())) {
             Ok(()) => {}
-            // By a process of this host that was killed: the socket was free.
+            // A killed process of this host made the file, since the socket was free.
             Err(_) if files::read_text(&path).is_ok_and(|other| other == host) => {}
             Err(error) if error.kind() == ErrorKind::AlreadyExists => {
                 return Err(RunDirError::Claimed(path));
@@ -131,8 +121,8 @@ impl Drop for Claim {
     }
 }
 
-/// Whether a lock was refused because files have none there: the system does not know them, or asks
-/// a server that does not.
+/// Whether the file system has no locks: the system does not know them, or asks a server that does
+/// not.
 fn means_no_locks(error: &io::Error) -> bool {
     error.kind() == ErrorKind::Unsupported || Errno::from_io_error(error) == Some(Errno::NOLCK)
 }
@@ -150,7 +140,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_system_that_knows_no_locks_says_so_in_one_of_three_ways() {
+    fn errors_that_mean_no_locks() {
         let is_none = |error: Errno| means_no_locks(&error.into());
         assert!([Errno::NOSYS, Errno::OPNOTSUPP, Errno::NOLCK].into_iter().all(is_none));
         assert!(![Errno::IO, Errno::INTR, Errno::AGAIN, Errno::ACCESS].into_iter().any(is_none));

@@ -1,5 +1,6 @@
-//! Checkpoints: the training's whole state, from which it continues as if it had never stopped.
+//! Checkpoints: complete training states, from which a run resumes bit for bit.
 
+use std::cmp::Reverse;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -12,18 +13,17 @@ use crate::files;
 
 const SUFFIX: &str = ".safetensors";
 
-/// The state after a gradient step.
+/// The training state after a gradient step.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Checkpoint {
-    /// The step.
+    /// The gradient step.
     pub step: u64,
-    /// A safetensors file, as `Agent::save` makes it.
+    /// A safetensors file, from `Agent::save`.
     pub state: Vec<u8>,
 }
 
 impl Checkpoint {
-    /// How many a run keeps: the newest, and those that step in for it should it turn out to be
-    /// damaged.
+    /// Checkpoints that a run keeps: the newest, and two in case it is damaged.
     pub const KEPT: usize = 3;
 }
 
@@ -39,7 +39,7 @@ impl Checkpoints {
         Self { folder: run.join("checkpoints") }
     }
 
-    /// Saves one; only then are older ones removed.
+    /// Saves a checkpoint, then removes older ones.
     pub fn save(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
         let target = self.folder.join(file_name(checkpoint));
         files::replace(&target, &checkpoint.state).map_err(io_error("write", &target))?;
@@ -50,12 +50,9 @@ impl Checkpoints {
         Ok(())
     }
 
-    /// The newest that is whole. Those that are not get another ending, so that they do not count
-    /// as checkpoints any more; those that cannot be read stay as they are.
-    ///
-    /// # Errors
-    /// None is whole, and one cannot be read: it may be readable later, and a run should not begin
-    /// anew before.
+    /// Loads the newest undamaged checkpoint. Damaged ones are renamed, so that they no longer
+    /// count; unreadable ones stay. If none is undamaged and one is unreadable, this is an error: it
+    /// may be readable later, and the run must not begin anew before.
     pub fn newest(&self) -> Result<Option<Checkpoint>, RunDirError> {
         let mut unreadable = None;
         for path in self.files()? {
@@ -80,7 +77,7 @@ impl Checkpoints {
         unreadable.map_or(Ok(None), Err)
     }
 
-    /// All of them, newest first.
+    /// The files of all checkpoints, the newest first.
     fn files(&self) -> Result<Vec<PathBuf>, RunDirError> {
         let entries = match fs::read_dir(&self.folder) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -88,7 +85,7 @@ impl Checkpoints {
         };
         let mut files: Vec<_> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
         files.retain(|path| step(path).is_some());
-        files.sort_unstable_by_key(|path| std::cmp::Reverse(step(path)));
+        files.sort_unstable_by_key(|path| Reverse(step(path)));
         Ok(files)
     }
 }
@@ -98,7 +95,7 @@ fn file_name(Checkpoint { step, state }: &Checkpoint) -> String {
     format!("step_{step:09}_{}{SUFFIX}", &hash[..16])
 }
 
-/// The step that a file's name tells; none if it is not the name of a checkpoint.
+/// The step in the name of a checkpoint's file.
 fn step(path: &Path) -> Option<u64> {
     let name = path.file_name()?.to_str()?.strip_prefix("step_")?.strip_suffix(SUFFIX)?;
     name.split_once('_')?.0.parse().ok()

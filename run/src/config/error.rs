@@ -1,0 +1,53 @@
+//! Settings that cannot be used.
+
+use std::io;
+
+use quad_algorithms::AgentError;
+
+const PRINT: &str = "`learner presets TASK` prints the keys that a preset may have";
+const KEYS: &str = "`learner presets TASK` prints every key; on the command line --set KEY=VALUE changes one, and \
+                    --agent KEY=VALUE one below [agent]";
+
+/// A task, an algorithm or values that cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // The messages say what each variant is.
+pub enum ConfigError {
+    #[error("there is no {kind} named {name}")]
+    Unknown { kind: &'static str, name: String, hint: String },
+    #[error("cannot read the preset {preset}")]
+    Unreadable { preset: String, source: io::Error },
+    #[error("preset {preset} is not TOML")]
+    NotToml { preset: String, source: toml::de::Error },
+    #[error("preset {preset} cannot be used")]
+    Preset { preset: String, source: Box<ConfigError> },
+    #[error("preset {preset} cannot be used")]
+    Keys { preset: String, source: toml::de::Error },
+    #[error("preset {0} names neither a task nor an environment")]
+    NoEnvironment(String),
+    #[error("{field} is {value}, but must be {range}")]
+    OutOfRange { field: &'static str, value: String, range: String },
+    #[error("{steps} steps with an evaluation every {interval} are {evaluations} evaluations")]
+    Evaluations { steps: u64, interval: u64, evaluations: u64, most: u64 },
+    #[error("algorithm {algorithm}")]
+    Hyperparameters { algorithm: String, source: AgentError },
+}
+
+impl ConfigError {
+    /// Tells the user how to fix it.
+    pub fn hint(&self) -> String {
+        match self {
+            Self::Unknown { hint, .. } => hint.clone(),
+            Self::Unreadable { .. } | Self::NotToml { .. } => PRINT.to_owned(),
+            Self::Preset { source, .. } => source.hint(),
+            Self::NoEnvironment(_) => {
+                "begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks".to_owned()
+            }
+            Self::Evaluations { most, .. } => {
+                format!("choose a larger eval_interval, for at most {most}")
+            }
+            Self::Keys { .. } | Self::OutOfRange { .. } | Self::Hyperparameters { .. } => {
+                KEYS.to_owned()
+            }
+        }
+    }
+}

@@ -1,0 +1,29 @@
+//! The folder of a run: its files, resuming, and the checks of `learner verify`.
+//!
+//! A learner's thread `snapshots` writes snapshots, checkpoints and `metrics.jsonl`, `scores` writes
+//! `scores.jsonl`, the main thread everything else. A learner at work holds a lock on
+//! `scores.jsonl`. Commands that only read may run at any time.
+//!
+//! In reading order: `run_dir`, `find`, `lines`, `lock`, `log`, `checkpoints`, `error`, `resume`,
+//! `verify`.
+
+mod checkpoints;
+pub(crate) mod error;
+mod find;
+mod lines;
+mod lock;
+mod log;
+mod resume;
+mod run_dir;
+#[cfg(test)]
+mod tests;
+pub mod verify;
+
+pub use checkpoints::Checkpoint;
+pub use error::RunDirError;
+pub use find::walk;
+pub use lines::{RunEndpoints, ScoreLine, read_metrics};
+pub use lock::Lock;
+pub use log::{Log, new_lines};
+pub use resume::{ExistingRun, ResumePoint, SavedScores};
+pub use run_dir::RunDir;

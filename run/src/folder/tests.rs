@@ -1,0 +1,201 @@
+//! Tests of a run folder.
+
+use std::fs::{self, File};
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::mpsc::channel;
+use std::time::Duration;
+
+use quad_runtime::one_line;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use super::{Checkpoint, ExistingRun, Log, RunDir, RunDirError};
+use crate::fixtures::{config, line};
+
+/// A new run in a temporary folder.
+fn new_run() -> (TempDir, PathBuf, RunDir, Log) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    let (run, log) = create(&path, 0).unwrap();
+    (folder, path, run, log)
+}
+
+fn create(path: &Path, seed: u64) -> Result<(RunDir, Log), RunDirError> {
+    RunDir::create(path, &config("a", seed))
+}
+
+#[test]
+fn a_run_is_not_overwritten_and_can_be_set_aside() {
+    let (folder, path, _run, log) = new_run();
+    drop(log);
+    assert!(matches!(create(&path, 1), Err(RunDirError::Occupied(_))));
+    for _ in 0..2 {
+        RunDir::open(&path).unwrap().0.set_aside().unwrap();
+        create(&path, 2).unwrap();
+    }
+    for (name, seed) in [("a.old1", 0), ("a.old2", 2)] {
+        assert_eq!(RunDir::open(&folder.path().join(name)).unwrap().1, config("a", seed));
+    }
+}
+
+#[test]
+fn of_two_learners_that_begin_at_once_one_is_refused() {
+    let (_folder, path, _run, log) = new_run();
+    fs::remove_file(path.join("config.toml")).unwrap();
+    assert!(matches!(create(&path, 1), Err(RunDirError::InUse(_))));
+    assert!(!RunDir::is_occupied(&path));
+    drop(log);
+    create(&path, 1).unwrap();
+}
+
+#[test]
+fn a_new_run_does_not_take_over_scores_of_unknown_origin() {
+    let (_folder, path, _run, mut log) = new_run();
+    log.append(&[line(1, 1, 0.1)]).unwrap();
+    drop(log);
+    fs::remove_file(path.join("config.toml")).unwrap();
+    assert!(matches!(create(&path, 1), Err(RunDirError::Occupied(_))));
+}
+
+#[test]
+fn one_learner_at_a_time_works_in_a_folder() {
+    let (_folder, _path, run, log) = new_run();
+    assert!(matches!(run.score_log(), Err(RunDirError::InUse(path)) if path == run.path()));
+    drop(log);
+    run.score_log().unwrap();
+}
+
+#[test]
+fn a_run_that_begins_or_resumes_is_no_longer_marked_as_failed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    fs::create_dir(&path).unwrap();
+    RunDir::at(&path).mark_failed("").unwrap();
+    let (run, log) = create(&path, 0).unwrap();
+    assert_eq!(run.failure(), None);
+    drop(log);
+    run.mark_failed("the disk is full").unwrap();
+    assert_eq!(run.failure().as_deref(), Some("the disk is full"));
+    let existing = ExistingRun::open(&path, false).unwrap().unwrap();
+    existing.resume(&config("a", 0).experiment).unwrap();
+    assert_eq!(run.failure(), None);
+}
+
+#[test]
+fn metrics_after_the_resumed_step_are_cut_off() {
+    let (_folder, path, run, _log) = new_run();
+    let row = |step: u64| json!({ "step": step, "seconds": step as f64 / 10.0, "eta": 1.0 });
+    let (mut log, seconds) = run.metrics_log(0).unwrap();
+    assert_eq!(seconds, 0.0);
+    log.append(&[row(100), row(200), row(300)]).unwrap();
+    drop(log);
+    let (mut log, seconds) = run.metrics_log(250).unwrap();
+    assert_eq!(seconds, 20.0);
+    log.append(&[row(300)]).unwrap();
+    let text = fs::read_to_string(path.join("metrics.jsonl")).unwrap();
+    let parse = |line| serde_json::from_str::<Value>(line).unwrap()["step"].clone();
+    assert_eq!(Vec::from_iter(text.lines().map(parse)), [100, 200, 300]);
+}
+
+#[test]
+fn scores_survive_and_an_incomplete_line_is_cut_off() {
+    let (_folder, path, run, log) = new_run();
+    drop(log);
+    run.score_log().unwrap().append(&[line(1, 1, 0.1)]).unwrap();
+    run.score_log().unwrap().append(&[line(1, 2, 0.2)]).unwrap();
+    let path = path.join("scores.jsonl");
+    let text = fs::read_to_string(&path).unwrap() + "{\"step\":1,";
+    fs::write(&path, &text).unwrap();
+    assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2)]);
+
+    for tail in ["", &"x".repeat(200_000)] {
+        fs::write(&path, format!("{text}{tail}")).unwrap();
+        run.score_log().unwrap().append(&[line(1, 3, 0.3)]).unwrap();
+        assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2), line(1, 3, 0.3)]);
+    }
+
+    fs::write(&path, text + "\n").unwrap();
+    let error = run.read_scores().unwrap_err().to_string();
+    assert!(error.contains("scores.jsonl, line 3"), "{error}");
+}
+
+/// Another user who made the folder could link to any file of the user who trains there.
+#[test]
+fn does_not_write_through_links_to_files() {
+    let (folder, path, run, log) = new_run();
+    drop(log);
+    let [precious, missing] = ["precious", "missing"].map(|name| folder.path().join(name));
+    fs::write(&precious, "no line of a log").unwrap();
+    for name in
+        ["endpoints.json.partial", "metrics.jsonl", "scores.jsonl", "failed", "judgments.json"]
+    {
+        fs::remove_file(path.join(name)).ok();
+        symlink(&precious, path.join(name)).unwrap();
+    }
+    assert!(run.score_log().is_err() && run.metrics_log(0).is_err());
+    run.write_json("endpoints.json", &1).unwrap();
+    run.write_json("judgments.json", &1).unwrap();
+    run.mark_failed("").unwrap();
+    run.remove_partial_files();
+    assert_eq!(fs::read_to_string(precious).unwrap(), "no line of a log");
+    assert_eq!(run.read_json::<u8>("judgments.json").unwrap(), 1);
+
+    fs::remove_file(path.join("scores.jsonl")).unwrap();
+    symlink(&missing, path.join("scores.jsonl")).unwrap();
+    assert!(run.score_log().is_err() && !missing.exists());
+}
+
+/// Snapshots of another run would be overwritten, and partial files of other programs removed.
+#[test]
+fn does_not_write_through_links_to_folders() {
+    let (folder, path, run, _log) = new_run();
+    let other = folder.path().join("other");
+    let [snapshot, partial] =
+        ["step_000000010.safetensors", "download.partial"].map(|name| other.join(name));
+    fs::create_dir(&other).unwrap();
+    fs::write(&snapshot, "precious").unwrap();
+    fs::write(&partial, "precious").unwrap();
+    fs::remove_dir(path.join("snapshots")).unwrap();
+    symlink(&other, path.join("snapshots")).unwrap();
+    run.remove_partial_files();
+    assert!(run.write_snapshot(10, b"weights").is_err() && partial.exists());
+    assert_eq!(fs::read_to_string(snapshot).unwrap(), "precious");
+}
+
+#[test]
+fn does_not_wait_for_pipes_or_read_huge_files() {
+    let (_folder, path, run, _log) = new_run();
+    run.write_checkpoint(&Checkpoint { step: 10, state: b"state".to_vec() }).unwrap();
+    let checkpoint = path.join("checkpoints/step_000000020_0000000000000000.safetensors");
+    for path in [&checkpoint, &run.snapshot_path(20)] {
+        assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
+    }
+    File::create(run.snapshot_path(30)).unwrap().set_len(1 << 42).unwrap();
+    symlink(run.snapshot_path(30), run.snapshot_path(40)).unwrap();
+    assert_eq!(run.snapshots().unwrap(), [30], "a pipe and a link are no snapshots");
+    let (tx, rx) = channel();
+    std::thread::spawn(move || {
+        let refused = [20, 30].map(|step| one_line(&run.read_snapshot(step).unwrap_err()));
+        tx.send((refused, run.newest_checkpoint()))
+    });
+    let ([pipe, huge], newest) =
+        rx.recv_timeout(Duration::from_secs(60)).expect("it waits for a pipe");
+    assert!(pipe.contains("a pipe") && huge.contains("too large"), "{pipe}, {huge}");
+    assert_eq!(newest.unwrap().map(|checkpoint| checkpoint.step), Some(10));
+}
+
+#[test]
+fn a_removed_snapshot_folder_is_made_again_and_a_removed_run_is_an_error() {
+    let (_folder, path, run, _log) = new_run();
+    fs::remove_dir_all(path.join("snapshots")).unwrap();
+    assert_eq!(run.snapshots().unwrap(), [] as [u64; 0]);
+    run.write_snapshot(10, b"weights").unwrap();
+    assert_eq!(run.snapshots().unwrap(), [10]);
+    assert_eq!(run.read_snapshot(10).unwrap(), b"weights");
+    fs::remove_dir_all(&path).unwrap();
+    let error = run.write_snapshot(20, b"weights").unwrap_err();
+    assert!(matches!(&error, RunDirError::Gone(gone) if *gone == path), "{error}");
+    assert!(!path.exists());
+}

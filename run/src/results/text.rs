@@ -1,0 +1,54 @@
+//! A run's results as text.
+
+use std::fmt::Alignment::Right;
+
+use super::report::RunReport;
+use crate::table::{Style, Table};
+
+impl RunReport {
+    /// The evaluations as a table, with the run's settings above and means below.
+    pub fn text(&self) -> String {
+        let measure = self.measure();
+        // Without reference returns, the score is the return, unless the evaluator defines it.
+        let has_both = measure == "score";
+        let mut header = vec!["step", "episodes", measure, "length"];
+        if has_both {
+            header.insert(3, "return");
+        }
+        let mut table = Table::new(&Vec::from_iter(header.into_iter().map(|name| (name, Right))));
+        for e in &self.evaluations {
+            let episodes = e.episodes.to_string() + if e.complete { "" } else { " (part)" };
+            let length = format!("{:.1}", e.mean_length);
+            let mut row = vec![e.step.to_string(), episodes, e.score.text(), length];
+            if has_both {
+                row.insert(3, format!("{:.1}", e.mean_return));
+            }
+            table.push(row);
+        }
+        let Self { run, task, agent, steps, seed, scored_in, .. } = self;
+        let unit = self.measure_with_unit();
+        let mut text = format!(
+            "{run}: task {task}, {agent}, {steps} steps, seed {seed}; {unit}, scored in {scored_in}\n\n"
+        ) + &table.render(Style::Text);
+        if self.evaluations.is_empty() {
+            text += "(no evaluation has a score yet)\n";
+        }
+        if !self.is_complete() {
+            let (missing, how) = (self.episodes_missing, self.how_complete());
+            text += &format!("{missing} episodes have no score: {how}\n");
+        }
+        text.push('\n');
+        for (name, mean) in [
+            ("last 3 evaluations:", self.mean_last_3),
+            ("last 5 evaluations:", self.mean_last_5),
+            ("last 50000 steps:", self.mean_last_50000_steps),
+            ("dataset:", (!self.own_score).then_some(self.dataset_score)),
+        ] {
+            if let Some(mean) = mean {
+                text += &format!("mean {measure} of the {name:19} {mean:.2}\n");
+            }
+        }
+        let summary = self.summary.as_ref().map(|summary| format!("\n{}", summary.text));
+        text + &summary.unwrap_or_default()
+    }
+}
