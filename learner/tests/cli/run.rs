@@ -8,6 +8,9 @@ use toml::Table;
 
 use crate::printed;
 
+pub const HOPPER: &str = "hopper-medium-replay-v2";
+pub const TASKS: [&str; 2] = ["hopper-demo", "walker2d-demo"];
+
 /// A run whose files can be changed before they are written.
 #[derive(Clone)]
 pub struct Run {
@@ -27,7 +30,7 @@ impl Run {
     /// Makes a run by another algorithm.
     pub fn by(algorithm: &str, task: &str, seed: u64) -> Self {
         let mut experiment: Table =
-            printed(&["presets", task, "--algorithm", algorithm]).parse().unwrap();
+            printed(&format!("presets {task} --algorithm {algorithm}")).parse().unwrap();
         experiment.insert("seed".into(), (seed as i64).into());
         let run = toml::toml! { name = "r" incarnation = 1 version = "0" };
         let dataset = toml::toml! {
@@ -48,16 +51,20 @@ impl Run {
         Self { config, scores: Vec::new() }
     }
 
-    /// Changes values by their dotted keys.
-    pub fn set(mut self, changes: &[(&str, toml::Value)]) -> Self {
-        for (key, value) in changes {
-            let (tables, key) = key.rsplit_once('.').unwrap();
-            let table = tables
-                .split('.')
-                .fold(&mut self.config, |table, key| table[key].as_table_mut().unwrap());
-            table.insert((*key).to_owned(), value.clone());
-        }
+    /// Changes a value by its dotted key.
+    pub fn set(mut self, key: &str, value: impl Into<toml::Value>) -> Self {
+        let (tables, key) = key.rsplit_once('.').unwrap();
+        let table = tables
+            .split('.')
+            .fold(&mut self.config, |table, key| table[key].as_table_mut().unwrap());
+        table.insert(key.to_owned(), value.into());
         self
+    }
+
+    pub fn sizes(self, steps: i64, eval_interval: i64, episodes: i64) -> Self {
+        self.set("experiment.steps", steps)
+            .set("experiment.eval_interval", eval_interval)
+            .set("experiment.episodes", episodes)
     }
 
     /// Scores an episode, on a CPU with AVX-512.
@@ -79,5 +86,59 @@ impl Run {
         fs::write(path.join("config.toml"), self.config.to_string()).unwrap();
         let lines = self.scores.iter().map(|line| format!("{line}\n"));
         fs::write(path.join("scores.jsonl"), lines.collect::<String>()).unwrap();
+    }
+}
+
+/// A run of 6,000 steps with an evaluation of two episodes every thousand: complete ones with means
+/// 2, 4, 6, 8, 10 (+ shift), each ± √2, and half of a sixth.
+pub fn small(seed: u64, shift: f64) -> Run {
+    let mut run = Run::new("hopper-demo", seed).sizes(6000, 1000, 2);
+    for n in 1..=5 {
+        let mean = 2.0 * n as f64 + shift;
+        run.score(1000 * n, 0, mean - 1.0, "00");
+        run.score(1000 * n, 1, mean + 1.0, "00");
+    }
+    run.score(6000, 1, 99.0, "00");
+    run
+}
+
+/// Four runs of one of the paper's tasks, with a score of each evaluation up to `last`.
+pub fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
+    let run = |seed| {
+        let mut run = Run::new(task, seed);
+        for step in (20_000..=last).step_by(20_000) {
+            (0..10).for_each(|episode| run.score(step, episode, score(step) + seed as f64, "00"));
+        }
+        run
+    };
+    (0..4).map(run).collect()
+}
+
+/// A complete run of five evaluations with two episodes each, whose score is their mean.
+pub fn complete(run: Run, score: f64) -> Run {
+    let mut run = run.sizes(5000, 1000, 2);
+    for step in 1..=5 {
+        for episode in 0..2 {
+            run.score(1000 * step, episode, score + 2.0 * (step as f64 - 3.0), "00");
+        }
+    }
+    run
+}
+
+/// QUAD with two temperatures, DAC and IQL on two tasks with five seeds, each run in a folder of
+/// its own.
+pub fn write_study(folder: &Path) {
+    for (task, base) in TASKS.into_iter().zip([40.0, 90.0]) {
+        for (seed, noise) in [0.0, 3.0, -1.0, 2.0, -4.0].into_iter().enumerate() {
+            let quad = || Run::new(task, seed as u64);
+            for (name, run, score) in [
+                ("1", quad().set("experiment.agent.tau", 0.1), base + noise),
+                ("2", quad().set("experiment.agent.tau", 10.0), base + 10.0 + noise / 2.0),
+                ("3", quad().set("experiment.agent.guidance", "dac"), base + 0.1 - noise),
+                ("4", Run::by("iql", task, seed as u64), base + 15.0 + noise),
+            ] {
+                complete(run, score).write(&folder.join(task).join(name).join(seed.to_string()));
+            }
+        }
     }
 }

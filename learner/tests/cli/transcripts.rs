@@ -1,0 +1,212 @@
+//! Command lines and what they print: the transcripts beside this file, on runs that are made up
+//! here. `TRYCMD=overwrite cargo test …` writes anew what is printed.
+
+use std::env;
+use std::fs::{self, File};
+use std::path::Path;
+
+use quad_protocol::{Hash, episode_seeds};
+use serde_json::{Value, json};
+
+use crate::run::{HOPPER, Run, paper, small, write_study};
+use crate::write_dataset;
+
+/// A study of which some runs cannot begin.
+const STUDY: &str = "about = 'x'
+[run]
+task = 'hopper-demo'
+dataset = 'data.hdf5'
+steps = 10
+eval_interval = 0
+agent.actor.hidden = [8]
+agent.critic.hidden = [8]
+[axes]
+method = ['large', 'absent', 'small']
+seed = [0]
+[method.large]
+batch_size = 999999
+[method.absent]
+dataset = 'absent.hdf5'
+[method.small]
+batch_size = 8
+";
+
+#[test]
+fn commands_print_what_their_transcripts_have() {
+    let folder = tempfile::tempdir().unwrap();
+    env::set_current_dir(folder.path()).unwrap();
+    write_dataset(Path::new("data.hdf5"));
+    fs::write("study.toml", STUDY).unwrap();
+    write_reported();
+    write_published();
+    write_study(Path::new("study"));
+    let _at_work = write_listed();
+    write_verified();
+    trycmd::TestCases::new()
+        .register_bin("learner", Path::new(env!("CARGO_BIN_EXE_learner")))
+        .register_bin("sh", Path::new("/bin/sh"))
+        .env("PATH", bin_path())
+        .case(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/cli/*.trycmd"))
+        .run();
+}
+
+/// The search path with the learner, for pipes.
+fn bin_path() -> String {
+    let folder = Path::new(env!("CARGO_BIN_EXE_learner")).parent().unwrap();
+    format!("{}:{}", folder.display(), env::var("PATH").unwrap())
+}
+
+fn write(folder: &str, runs: impl IntoIterator<Item = (impl AsRef<str>, Run)>) {
+    runs.into_iter().for_each(|(name, run)| run.write(&Path::new(folder).join(name.as_ref())));
+}
+
+fn numbered(runs: Vec<Run>) -> impl Iterator<Item = (String, Run)> {
+    runs.into_iter().enumerate().map(|(index, run)| (index.to_string(), run))
+}
+
+/// What report.trycmd is about.
+fn write_reported() {
+    let (mut complete, mut stopped) = (small(0, 0.0), small(1, 0.0));
+    complete.score(6000, 0, 12.0, "00");
+    stopped.scores.truncate(4);
+    let mut unscored = small(1, 0.0);
+    unscored.scores.clear();
+    let mut best = small(0, 0.0);
+    (0..2).for_each(|episode| best.score(7000, episode, 10.0, "00"));
+    let mut robot = small(0, 0.0).set("experiment.environment", "my-robot");
+    robot.config["dataset"].as_table_mut().unwrap().remove("mean_score");
+    let mut returns = robot.clone();
+    returns.scores.iter_mut().for_each(|line| line["return"] = line["score"].clone());
+    write(
+        "report",
+        [
+            ("one", small(3, 0.0)),
+            ("stopped/a", complete),
+            ("stopped/b", stopped),
+            ("twice/a", small(0, 0.0)),
+            ("twice/b", small(0, 4.0)),
+            ("twice/c", unscored),
+            ("best", best),
+            ("robot", robot),
+            ("returns", returns),
+        ],
+    );
+    let changes: [(&str, toml::Value); 8] = [
+        ("experiment.agent.tau", 0.5.into()),
+        ("experiment.agent.candidates", 1.into()),
+        ("run.device", "cuda".into()),
+        ("dataset.mean_return", 21.0.into()),
+        ("experiment.agent.eta.threshold", 1.0.into()),
+        ("experiment.reward", "as-is".into()),
+        ("experiment.scale", vec!["states"].into()),
+        // The same file in another place.
+        ("dataset.path", "elsewhere.hdf5".into()),
+    ];
+    let unlike = changes.map(|(key, value)| (key, small(1, 0.0).set(key, value)));
+    write("report/unlike", [("first", small(0, 0.0))].into_iter().chain(unlike));
+    // The evaluation after 50,000 steps is none of the last 50,000.
+    let mut last = Run::new("hopper-demo", 0).sizes(100_000, 10_000, 1);
+    (1..=10).for_each(|n| last.score(10_000 * n, 0, n as f64, "00"));
+    write("report", [("last", last)]);
+    write("report/goals", numbered(paper("antmaze-umaze-v0", 100_000, |_| 50.0)));
+}
+
+/// What published.trycmd is about.
+fn write_published() {
+    // The last five: 1,920,000 to 2,000,000. An early best one counts only where it is asked for.
+    let score = |step| if step == 20_000 { 1000.0 } else { step as f64 / 20_000.0 };
+    write("paper", numbered(paper(HOPPER, 2_000_000, score)));
+    write("large", numbered(paper("antmaze-large-diverse-v0", 20_000, |_| 50.0)));
+    let complete = || paper(HOPPER, 2_000_000, |_| 50.0);
+    let stopped = paper(HOPPER, 400_000, |_| 50.0).remove(0);
+    let changed = (stopped.clone().set("experiment.dataset", "x.hdf5"))
+        .set("experiment.agent.tau", 1.0)
+        .set("experiment.scale", vec!["states"]);
+    // The named file in another place, known by its checksum.
+    let sha256 = "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b";
+    let copied = changed.clone().set("dataset.sha256", sha256);
+    write("departures", [("changed", changed), ("copied", copied)]);
+    let mut mixed = complete();
+    mixed[1].scores.iter_mut().for_each(|line| line["precision"] = json!("bf16-amx"));
+    write("mixed", numbered(mixed));
+    for guidance in ["dac", "none"] {
+        let runs = complete().into_iter().map(|run| run.set("experiment.agent.guidance", guidance));
+        write(guidance, numbered(runs.collect()));
+    }
+    let mut iql = Run::by("iql", HOPPER, 0).set("experiment.agent.expectile", 0.8);
+    (0..10).for_each(|episode| iql.score(5_000, episode, 50.0, "00"));
+    write("two", [("iql", iql), ("quad", paper(HOPPER, 100_000, |_| 50.0).remove(0))]);
+    let mut cube = Run::by("fql", "cube-single-play-singletask-v0", 0);
+    cube = cube.set("experiment.episodes", 1);
+    (1..=10).for_each(|n| cube.score(100_000 * n, 0, n as f64, "00"));
+    write("others", [("cube", cube), ("td3-bc", Run::by("td3-bc", "hopper-medium-v2", 0))]);
+    write("before/a", numbered(paper(HOPPER, 400_000, |_| 30.0)));
+    write("before/b", numbered(complete()));
+}
+
+/// What list.trycmd is about; the file is locked, as by a learner at work.
+fn write_listed() -> File {
+    let mut half = Run::new("hopper-demo", 3).sizes(40, 20, 2);
+    half.score(20, 0, 5.0, "a");
+    half.score(20, 1, 7.0, "a");
+    half.score(40, 0, 9.0, "b");
+    let mut whole = half.clone();
+    whole.score(40, 1, 9.5, "b");
+    write("list", [("study/half", half.clone()), ("whole", whole), ("damaged", half)]);
+    fs::write("list/study/half/metrics.jsonl", "{\"step\":30,\"seconds\":1.5}\n").unwrap();
+    fs::write("list/damaged/scores.jsonl", "{\"step\":10}\n").unwrap();
+    fs::create_dir("list/other").unwrap();
+    fs::write("list/other/config.toml", "[model]\nname = 'x'\n").unwrap();
+    let scores = File::open("list/study/half/scores.jsonl").unwrap();
+    scores.lock().unwrap();
+    scores
+}
+
+/// What verify.trycmd is about: a run that is as it should be, and others in which one thing is
+/// wrong.
+fn write_verified() {
+    type Change = fn(&mut Vec<Value>);
+    let changes: [(&str, Change); 11] = [
+        ("whole", |_| ()),
+        ("unscored", |lines| drop(lines.pop())),
+        ("scored-twice", |lines| lines.push(lines[0].clone())),
+        ("unknown-seed", |lines| lines.push(with(&lines[0], "seed", json!(1)))),
+        ("other-weights", |lines| lines[2]["weights"] = lines[3]["weights"].clone()),
+        ("no-snapshot", |lines| lines.push(with(&lines[0], "step", json!(12)))),
+        ("other-return", |lines| lines[0]["return"] = json!(15f64.next_up())),
+        ("two-scores", |lines| lines.truncate(2)),
+        ("guessed-weights", |lines| lines[5]["weights"] = json!("00")),
+        ("no-scores", |lines| lines.clear()),
+        ("other-precision", |lines| lines[0]["precision"] = json!("bf16-amx")),
+    ];
+    for (name, change) in changes {
+        let mut run = Run::new("hopper-demo", 4).sizes(15, 10, 3);
+        for step in [10, 15] {
+            for seed in episode_seeds(4, step, 3) {
+                run.score(step, seed, 1.5, &Hash::of(&[step as u8; 100]).to_string());
+            }
+        }
+        change(&mut run.scores);
+        write("verify", [(name, run)]);
+        for step in [10u8, 15] {
+            let snapshot = format!("verify/{name}/snapshots/step_0000000{step}.safetensors");
+            fs::write(snapshot, [step; 100]).unwrap();
+        }
+    }
+    // As with `--eval-interval 0`: no evaluations, only snapshots.
+    for name in ["alone", "alike", "flipped", "none"] {
+        write("verify", [(name, Run::new("hopper-demo", 4).sizes(15, 0, 3))]);
+        let mut snapshot = [7; 100];
+        snapshot[50] ^= u8::from(name == "flipped");
+        if name != "none" {
+            let path = format!("verify/{name}/snapshots/step_000000015.safetensors");
+            fs::write(path, snapshot).unwrap();
+        }
+    }
+}
+
+fn with(line: &Value, key: &str, value: Value) -> Value {
+    let mut line = line.clone();
+    line[key] = value;
+    line
+}
