@@ -7,17 +7,15 @@ use std::sync::Arc;
 use anyhow::Context;
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use clap_complete::Shell;
-use quad_dataset::EnvironmentSpec;
-use quad_dataset::environment;
+use quad_dataset::environment::{self, EnvironmentSpec};
 use quad_runtime::{Hint, certificates_folder, json, print};
 
 use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
 use crate::sim::Simulations;
-use crate::tools::collect::{self, Summary};
 use crate::tools::film::{self, FilmArgs};
 use crate::tools::score::{self, ScoreArgs};
-use crate::tools::verify::{self, Report};
+use crate::tools::{collect, verify};
 
 /// Runs policies in MuJoCo, and records datasets there.
 #[derive(Debug, Parser)]
@@ -85,9 +83,8 @@ struct VerifyArgs {
 }
 
 impl Cli {
-    /// Runs the command.
     pub fn run(self) -> anyhow::Result<()> {
-        // Else the first use of the threads would panic where there cannot be so many.
+        // Rayon's own first use panics if the system refuses the threads.
         let threads = rayon::ThreadPoolBuilder::new().build_global();
         threads.context("cannot start the threads").hint("ask for fewer by RAYON_NUM_THREADS")?;
         match self.command {
@@ -98,14 +95,14 @@ impl Cli {
             Command::Score(args) => print(&score::score(&args)?),
             Command::Film(args) => print(&film::film(&args)?),
             Command::Collect(args) => {
-                let summary =
-                    collect::collect(args.env, &args.out, args.transitions.get(), args.seed)?;
-                print(&collected(&args, &summary))
+                let CollectArgs { env, out, transitions, seed } = args;
+                let summary = collect::collect(env, &out, transitions.get(), seed)?;
+                print(&format!("{}: {summary}", out.display()))
             }
             Command::VerifyDataset(args) => {
                 let spec = args.env.map_or_else(|| verify::environment_of(&args.file), Ok);
                 let report = spec.and_then(|spec| verify::verify(&args.file, spec))?;
-                print(&if args.json { json(&report)? } else { verified(&report) })?;
+                print(&if args.json { json(&report)? } else { report.to_string() })?;
                 let differ = report.rewards_differ + report.terminals_differ;
                 anyhow::ensure!(differ == 0, "the simulation differs from the file");
                 Ok(())
@@ -122,41 +119,4 @@ impl Cli {
             }
         }
     }
-}
-
-fn collected(args: &CollectArgs, summary: &Summary) -> String {
-    let Summary {
-        transitions,
-        episodes,
-        mean_score,
-        score_percentiles: [p50, p90, p99, max],
-        policies,
-        seconds,
-    } = summary;
-    format!(
-        "{}: {transitions} transitions, {episodes} episodes of {policies} policies, in {seconds:.0} s\n\
-         normalized score: mean {mean_score:.1}, median {p50:.1}, p90 {p90:.1}, p99 {p99:.1}, max {max:.1}",
-        args.out.display()
-    )
-}
-
-fn verified(report: &Report) -> String {
-    let Report {
-        environment,
-        transitions,
-        compared,
-        obs_error,
-        reward_error,
-        rewards_differ,
-        terminals_differ,
-    } = report;
-    format!(
-        "environment        {environment}\n\
-         transitions        {transitions}, of which {compared} have a next observation to compare\n\
-         observation error  median {:.1e}, p99 {:.1e}, max {:.1e}\n\
-         reward error       max {:.1e}\n\
-         rewards differ     {rewards_differ}\n\
-         terminals differ   {terminals_differ}",
-        obs_error.median, obs_error.p99, obs_error.max, reward_error.max
-    )
 }

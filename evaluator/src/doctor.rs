@@ -78,7 +78,9 @@ fn simulator(findings: &mut Findings) {
     let version = mujoco_rs::mujoco_version();
     let step = || -> anyhow::Result<()> {
         let sizes = Simulations.sizes(HOPPER).unwrap_or_default();
-        Rollout::new(|| Simulations.make(HOPPER, 0), sizes, &[0], |_| ())?.step(|_, _, _| Ok(()))
+        let make = || Simulations.make(HOPPER, 0);
+        Rollout::new(make, sizes, &[0], |_| ())?.step(|_, _, _| anyhow::Ok(()))?;
+        Ok(())
     };
     match step() {
         Ok(()) => findings.ok("libmujoco", format!("{version}, and Hopper moves in it")),

@@ -2,14 +2,11 @@
 //!
 //! # Layout
 //!
-//! Three modules. The second and third use the first, and not each other:
-//!
-//! - [`sim`]: environments, and batches of episodes.
+//! - [`sim`]: environments, and batches of episodes. The next two use it, and not each other:
 //! - [`serve`]: finds runs on the network, evaluates their snapshots, delivers the scores.
-//! - [`tools`]: records and replays datasets, scores and films saved policies, on this machine
-//!   alone.
-//!
-//! Also: [`cli`], the command line; `doctor`, checks of this machine; `metrics`, for Prometheus.
+//! - [`tools`]: records and replays datasets, scores and films saved policies, on this machine.
+//! - [`cli`]: the command line; `doctor`: checks of this machine; `metrics`: for Prometheus.
+#![allow(missing_docs)] // A program: a name that says enough needs no comment.
 
 pub mod cli;
 mod doctor;

@@ -1,5 +1,5 @@
-//! The memory that a policy says its actions take is what they take: an evaluator refuses jobs by
-//! it.
+//! An evaluator refuses jobs by the memory that a policy says it takes, which is the memory that it
+//! takes.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -9,12 +9,11 @@ use candle_core::{DType, Device, Tensor};
 use quad_nn::{Attention, TrajectoryConfig};
 use quad_policy::{
     ActorCriticShape, Choice, DiffuserShape, DiffusionShape, GaussianShape, Header, MlpConfig,
-    Policy, PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, ValueGuidance, load_policy,
+    PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, ValueGuidance, load_policy,
 };
 
-/// What is not counted, such as the embedding of each denoising step: little of what an evaluator
-/// gives, bytes.
-const SMALL_CHANGE: usize = 1 << 20;
+/// Bytes that are not accounted for, such as the embedding of each denoising step.
+const SLACK: usize = 1 << 20;
 
 /// The system's allocator, which counts.
 struct Counting;
@@ -22,7 +21,7 @@ struct Counting;
 static NOW: AtomicUsize = AtomicUsize::new(0);
 static PEAK: AtomicUsize = AtomicUsize::new(0);
 
-// SAFETY: everything is handed on to the system's allocator as it came.
+// SAFETY: passes every call on to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         PEAK.fetch_max(NOW.fetch_add(layout.size(), Relaxed) + layout.size(), Relaxed);
@@ -38,76 +37,64 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-fn loaded(policy: PolicyConfig) -> Box<dyn Policy> {
-    let tensors =
-        policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
-    load_policy(&Header::new(policy, ()).to_safetensors(&tensors).unwrap(), Precision::F32).unwrap()
-}
+const OBSERVATION_DIM: usize = 11;
+const ACTION_DIM: usize = 3;
 
-fn diffusion(
-    hidden: usize,
-    critics: usize,
-    diffusion_steps: usize,
-    choice: Choice,
-) -> Box<dyn Policy> {
+fn diffusion(hidden: usize, critics: usize, steps: usize, choice: Choice) -> PolicyConfig {
     let layers = MlpConfig::mish(&[hidden; 3]);
-    let value = (choice.rule == Rule::Nearest).then(|| layers.clone());
-    let shape = DiffusionShape {
-        value,
-        ..DiffusionShape::quad((11, 3), &layers, critics, diffusion_steps)
-    };
-    loaded(PolicyConfig::Diffusion { shape, choice })
+    let sizes = (OBSERVATION_DIM, ACTION_DIM);
+    let mut shape = DiffusionShape::quad(sizes, &layers, critics, steps);
+    shape.value = (choice.rule == Rule::Nearest).then_some(layers);
+    PolicyConfig::Diffusion { shape, choice }
 }
 
-fn gaussian(hidden: usize) -> Box<dyn Policy> {
-    let shape =
-        GaussianShape { observation_dim: 11, action_dim: 3, actor: MlpConfig::mish(&[hidden; 3]) };
-    loaded(PolicyConfig::Gaussian { shape })
+fn gaussian(hidden: usize) -> PolicyConfig {
+    let (observation_dim, action_dim) = (OBSERVATION_DIM, ACTION_DIM);
+    let actor = MlpConfig::mish(&[hidden; 3]);
+    PolicyConfig::Gaussian { shape: GaussianShape { observation_dim, action_dim, actor } }
 }
 
-fn squashed(hidden: usize, norm: bool) -> Box<dyn Policy> {
+fn squashed(hidden: usize, norm: bool) -> PolicyConfig {
+    let (observation_dim, action_dim) = (OBSERVATION_DIM, ACTION_DIM);
     let actor = MlpConfig::mish(&[hidden; 3]);
     let critic = MlpConfig { norm, ..actor.clone() };
-    let shape = ActorCriticShape { observation_dim: 11, action_dim: 3, actor, critic, critics: 2 };
-    loaded(PolicyConfig::Squashed { shape, choice: Choice::best_of(1024) })
+    let shape = ActorCriticShape { observation_dim, action_dim, actor, critic, critics: 2 };
+    PolicyConfig::Squashed { shape, choice: Choice::best_of(1024) }
 }
 
-fn score(widths: &[usize], candidates: u32) -> Box<dyn Policy> {
-    let actor = MlpConfig::mish(widths);
-    let critic = MlpConfig::mish(&[8]);
-    let shape =
-        ScorePolicyShape { observation_dim: 11, action_dim: 3, actor, critic, evaluations: 4 };
-    loaded(PolicyConfig::Score { shape, choice: Choice::best_of(candidates) })
+fn score(widths: &[usize], candidates: u32) -> PolicyConfig {
+    let (observation_dim, action_dim) = (OBSERVATION_DIM, ACTION_DIM);
+    let (actor, critic) = (MlpConfig::mish(widths), MlpConfig::mish(&[8]));
+    let shape = ScorePolicyShape { observation_dim, action_dim, actor, critic, evaluations: 4 };
+    PolicyConfig::Score { shape, choice: Choice::best_of(candidates) }
 }
 
-fn planner(network: TrajectoryConfig, plans: u32) -> Box<dyn Policy> {
+/// Attention has heads and their width.
+fn diffuser(
+    (horizon, channels): (usize, usize),
+    multipliers: &[usize],
+    attention: Option<[usize; 2]>,
+    plans: u32,
+) -> PolicyConfig {
+    let attention = attention.map(|[heads, width]| Attention { heads, width });
+    let multipliers = multipliers.to_vec();
     let shape = DiffuserShape {
-        observation_dim: 11,
-        action_dim: 3,
-        network,
+        observation_dim: OBSERVATION_DIM,
+        action_dim: ACTION_DIM,
+        network: TrajectoryConfig { horizon, channels, multipliers, groups: 8, attention },
         diffusion_steps: 3,
         guidance: ValueGuidance { steps: 1, scale: 0.1, stop: 0 },
         replan_every: 1,
         units: Scaling::default(),
     };
-    loaded(PolicyConfig::Diffuser { shape, choice: Choice::best_of(plans) })
-}
-
-/// A planner's networks with eight groups.
-fn windows(
-    horizon: usize,
-    channels: usize,
-    multipliers: &[usize],
-    attention: Option<Attention>,
-) -> TrajectoryConfig {
-    TrajectoryConfig { horizon, channels, multipliers: multipliers.to_vec(), groups: 8, attention }
+    PolicyConfig::Diffuser { shape, choice: Choice::best_of(plans) }
 }
 
 #[test]
-fn actions_take_no_more_memory_than_was_said() {
+fn actions_take_no_more_memory_than_the_policy_says() {
     let best_of = Choice::best_of;
     let nearest = Choice { rule: Rule::Nearest, ..best_of(1000) };
-    let cases: [(&str, Box<dyn Policy>, usize); 14] = [
+    let cases = [
         ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
         ("many critics", diffusion(1, 4096, 1, best_of(32)), 64),
         ("many steps", diffusion(4, 1, 1000, best_of(8)), 256),
@@ -118,30 +105,28 @@ fn actions_take_no_more_memory_than_was_said() {
         ("critics with a norm", squashed(64, true), 10),
         ("a score network", score(&[512, 256, 128], 32), 10),
         ("a score network of one block", score(&[64], 1000), 64),
-        ("Diffuser's for Hopper", planner(windows(32, 32, &[1, 2, 4, 8], None), 64), 1),
-        (
-            "Diffuser's for HalfCheetah",
-            planner(windows(4, 32, &[1, 4, 8], Some(Attention { heads: 4, width: 32 })), 64),
-            1,
-        ),
-        ("many plans", planner(windows(16, 16, &[1, 2, 4], None), 8), 64),
-        (
-            "a plan of one step",
-            planner(windows(1, 32, &[1], Some(Attention { heads: 16, width: 64 })), 1000),
-            4,
-        ),
+        ("Diffuser's for Hopper", diffuser((32, 32), &[1, 2, 4, 8], None, 64), 1),
+        ("Diffuser's for HalfCheetah", diffuser((4, 32), &[1, 4, 8], Some([4, 32]), 64), 1),
+        ("many plans", diffuser((16, 16), &[1, 2, 4], None, 8), 64),
+        ("a plan of one step", diffuser((1, 32), &[1], Some([16, 64]), 1000), 4),
     ];
-    for (name, policy, n) in cases {
+    for (name, config, n) in cases {
+        let zeros =
+            |layout: &quad_nn::Layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu);
+        let tensors = config.tensors(zeros).unwrap();
+        let file = Header::new(config, ()).to_safetensors(&tensors).unwrap();
+        let policy = load_policy(&file, Precision::F32).unwrap();
         let said = policy.memory(n) as usize;
         let mut states: Vec<_> = (0..n as u64).map(|seed| policy.begin(seed)).collect();
-        let (observations, mut actions) = (vec![0.5; n * 11], vec![0.0; n * 3]);
+        let (observations, mut actions) =
+            (vec![0.5; n * OBSERVATION_DIM], vec![0.0; n * ACTION_DIM]);
         let mut act = || policy.act(&observations, &mut states, &mut actions).unwrap();
-        // What threads keep for themselves is there then.
+        // Allocates the threads' own buffers.
         act();
         let before = NOW.load(Relaxed);
         PEAK.store(before, Relaxed);
         act();
-        let took = PEAK.load(Relaxed) - before;
-        assert!(took <= said + SMALL_CHANGE, "{name}: {took} bytes were taken, {said} were said");
+        let taken = PEAK.load(Relaxed) - before;
+        assert!(taken <= said + SLACK, "{name}: took {taken} bytes, said {said}");
     }
 }

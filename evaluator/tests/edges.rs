@@ -1,12 +1,11 @@
-//! What simulations do where the comparison with Gymnasium does not come: initial states, bounds
-//! that are rarely met, time limits, numbers that are none.
+//! Behavior of simulations beyond the comparison with Gymnasium: initial states, rare bounds, time
+//! limits, and values that are not finite.
 #![allow(clippy::unwrap_used)]
 
-use quad_dataset::EnvironmentSpec;
-use quad_dataset::environment::{all, find};
+use quad_dataset::environment::{EnvironmentSpec, all, find};
 use quad_evaluator::sim::{Simulation, Step, make};
 
-const MAZES: [&str; 3] = ["antmaze-umaze", "antmaze-medium", "antmaze-large"];
+const STOP: Step = Step { reward: 0.0, terminated: true, truncated: false };
 
 fn simulation(name: &str) -> Simulation {
     make(find(name).unwrap(), 0).unwrap()
@@ -31,9 +30,8 @@ fn an_episode_is_a_function_of_its_seed() {
     }
 }
 
-/// The noise on the positions and velocities of 2,000 initial states, of which `rest` are the
-/// positions without it.
-fn initial_noise(name: &str, rest: &[f64]) -> (Vec<f64>, Vec<f64>) {
+/// The noise on the positions and velocities of 2,000 initial states around `rest`.
+fn initial_noise(name: &str, rest: &[f64]) -> [Vec<f64>; 2] {
     let mut simulation = simulation(name);
     let (mut positions, mut velocities) = (Vec::new(), Vec::new());
     for seed in 0..2000 {
@@ -41,15 +39,17 @@ fn initial_noise(name: &str, rest: &[f64]) -> (Vec<f64>, Vec<f64>) {
         positions.extend(simulation.qpos().iter().zip(rest).map(|(value, rest)| value - rest));
         velocities.extend_from_slice(simulation.qvel());
     }
-    (positions, velocities)
+    [positions, velocities]
 }
 
+/// Asserts that values lie within ± `bound` and come near to both ends.
 fn assert_fills(values: &[f64], bound: f64) {
-    let (least, most) =
-        values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)));
-    // Sums with the position at rest are rounded.
-    assert!(least >= -bound - 1e-12 && least < -0.99 * bound, "{least}");
-    assert!(most <= bound + 1e-12 && most > 0.99 * bound, "{most}");
+    let least = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let most = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    for end in [-least, most] {
+        // Sums with the position at rest are rounded.
+        assert!(end <= bound + 1e-12 && end > 0.99 * bound, "{least} {most}");
+    }
 }
 
 #[test]
@@ -57,28 +57,29 @@ fn initial_states_lie_within_the_noise() {
     let mut standing = [0.0; 15];
     standing[1] = 1.25;
     for name in ["hopper", "walker2d"] {
-        let (positions, velocities) = initial_noise(name, &standing);
-        assert_fills(&positions, 0.005);
-        assert_fills(&velocities, 0.005);
+        initial_noise(name, &standing).iter().for_each(|values| assert_fills(values, 0.005));
     }
     let mut ant = [0.0; 15];
     (ant[2], ant[3]) = (0.75, 1.0);
-    for (name, rest) in
-        [("halfcheetah", [0.0; 15])].into_iter().chain(MAZES.map(|name| (name, ant)))
-    {
-        let (positions, velocities) = initial_noise(name, &rest);
+    for (name, rest) in [
+        ("halfcheetah", [0.0; 15]),
+        ("antmaze-umaze", ant),
+        ("antmaze-medium", ant),
+        ("antmaze-large", ant),
+    ] {
+        let [positions, velocities] = initial_noise(name, &rest);
         assert_fills(&positions, 0.1);
         let n = velocities.len() as f64;
         let mean = velocities.iter().sum::<f64>() / n;
         let deviation = (velocities.iter().map(|v| v * v).sum::<f64>() / n).sqrt();
-        let within_one = velocities.iter().filter(|v| v.abs() < 0.1).count() as f64 / n;
         assert!(
             mean.abs() < 0.003 && (deviation - 0.1).abs() < 0.003,
-            "{name}: mean {mean}, deviation {deviation}"
+            "{name}: {mean} {deviation}"
         );
+        let within_one = velocities.iter().filter(|v| v.abs() < 0.1).count() as f64 / n;
         assert!(
             (within_one - 0.6827).abs() < 0.01,
-            "{name}: {within_one}; a normal distribution has 0.6827"
+            "{name}: {within_one} of a normal distribution"
         );
     }
 }
@@ -103,71 +104,56 @@ fn infinite_actions_are_clipped() {
 }
 
 #[test]
-fn a_goal_is_reached_at_half_a_metre() {
+fn a_goal_is_reached_at_half_a_meter() {
     let mut ant = simulation("antmaze-umaze");
     let standing = [1.2, 0.0, 0.55, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0];
     let mut step_with_goal = |goal: [f64; 2]| {
         ant.set_goal(&goal);
         ant.set_state(&standing, &[0.0; 14]);
         let step = ant.step(&[0.0; 8]);
-        (step, [ant.qpos()[0], ant.qpos()[1]])
+        ([ant.qpos()[0], ant.qpos()[1]], (step.reward, step.terminated))
     };
-    let (_, [x, y]) = step_with_goal([8.0, 8.0]);
+    let ([x, y], _) = step_with_goal([8.0, 8.0]);
     let edge = x + 0.5; // Exact: both lie between 1 and 2.
     assert_eq!(edge - x, 0.5);
-    assert_eq!(
-        step_with_goal([edge, y]).0,
-        Step { reward: 1.0, terminated: true, truncated: false }
-    );
-    assert_eq!(
-        step_with_goal([edge.next_up(), y]).0,
-        Step { reward: 0.0, terminated: false, truncated: false }
-    );
+    assert_eq!(step_with_goal([edge, y]).1, (1.0, true));
+    assert_eq!(step_with_goal([edge.next_up(), y]).1, (0.0, false));
 }
 
-/// Where nothing but the time limit ends an episode: in the air, or on the back. A walker has no
-/// such place.
+/// Positions in which nothing but the time limit ends an episode: in the air, or on the back. A
+/// walker has none.
 fn endless(spec: &EnvironmentSpec) -> Option<Vec<f64>> {
     let mut qpos = vec![0.0; spec.qpos_dim];
-    match spec.simulation() {
-        "walker2d" => return None,
-        "hopper" => qpos[1] = 400.0, // Falls for 8 s, 314 m, at less than 100 m/s.
-        "halfcheetah" => qpos[2] = std::f64::consts::PI,
-        ball if ball.starts_with("pointmaze") => {}
-        _ => qpos[2..5].copy_from_slice(&[0.55, 0.0, 1.0]),
+    match (spec.simulation(), spec.qpos_dim) {
+        ("walker2d", _) => return None,
+        ("hopper", _) => qpos[1] = 400.0, // Falls for 8 s, 314 m, at less than 100 m/s.
+        ("halfcheetah", _) => qpos[2] = std::f64::consts::PI,
+        (_ball, 2) => {}
+        (_ant, _) => qpos[2..5].copy_from_slice(&[0.55, 0.0, 1.0]),
     }
     Some(qpos)
 }
 
 #[test]
 fn the_time_limit_truncates_and_does_not_terminate() {
-    // OGBench's five tasks in a maze differ in start and goal alone, so the default one stands for
-    // them.
-    for spec in all().iter().filter(|spec| !spec.name.contains("-task")) {
+    // The tasks of one simulation differ in start and goal alone.
+    for spec in all().iter().filter(|spec| spec.name == spec.simulation()) {
         let Some(qpos) = endless(spec) else { continue };
-        let mut simulation = make(spec, 0).unwrap();
+        let (mut simulation, still) = (make(spec, 0).unwrap(), vec![0.0; spec.action_dim]);
         simulation.reset(0);
         simulation.set_state(&qpos, &vec![0.0; spec.qvel_dim]);
-        for step in 1..=spec.max_episode_steps {
-            let Step { terminated, truncated, .. } = simulation.step(&vec![0.0; spec.action_dim]);
-            assert_eq!(
-                (terminated, truncated),
-                (false, step == spec.max_episode_steps),
-                "{}, {step}",
-                spec.name
-            );
+        for i in 1..=spec.max_episode_steps {
+            let Step { terminated, truncated, .. } = simulation.step(&still);
+            let expected = (false, i == spec.max_episode_steps);
+            assert_eq!((terminated, truncated), expected, "{}, {i}", spec.name);
         }
         simulation.reset(0);
-        assert!(
-            !simulation.step(&vec![0.0; spec.action_dim]).truncated,
-            "a reset starts the time anew"
-        );
+        assert!(!simulation.step(&still).truncated, "a reset restarts the time");
     }
 }
 
 #[test]
-fn what_is_not_a_number_ends_the_episode_without_reward() {
-    let end = Step { reward: 0.0, terminated: true, truncated: false };
+fn values_that_are_not_finite_end_the_episode_without_reward() {
     for spec in all() {
         let mut simulation = make(spec, 0).unwrap();
         simulation.reset(0);
@@ -177,13 +163,13 @@ fn what_is_not_a_number_ends_the_episode_without_reward() {
         let still = vec![0.0; spec.action_dim];
         let mut action = still.clone();
         action[1] = f32::NAN;
-        assert_eq!(simulation.step(&action), end, "{}", spec.name);
+        assert_eq!(simulation.step(&action), STOP, "{}", spec.name);
         let (qpos, mut qvel) = (simulation.qpos().to_vec(), simulation.qvel().to_vec());
-        // Velocities count for nothing in a ball, which has two.
+        // A ball, which has two velocities, stops at every step.
         if let Some(velocity) = qvel.get_mut(3) {
             *velocity = 1e12;
             simulation.set_state(&qpos, &qvel);
-            assert_eq!(simulation.step(&still), end, "{}", spec.name);
+            assert_eq!(simulation.step(&still), STOP, "{}", spec.name);
             assert!(simulation.observation().iter().all(|value| value.is_finite()));
         }
         simulation.set_goal(&[50.0; 2]);

@@ -1,6 +1,7 @@
-//! Episodes do not depend on the batch they run in, and are what stepping an environment by hand
-//! gives.
+//! Batches of episodes.
 #![allow(clippy::unwrap_used)]
+
+use std::collections::HashSet;
 
 use quad_dataset::environment::find;
 use quad_evaluator::sim::{
@@ -21,35 +22,27 @@ fn select(
     noise: &mut [ChaCha8Rng],
     actions: &mut [f32],
 ) -> Result<(), EnvironmentError> {
-    assert_eq!(observations.len(), 11 * noise.len());
-    assert_eq!(actions.len(), 3 * noise.len());
-    for ((observation, noise), action) in
-        observations.chunks(11).zip(noise).zip(actions.chunks_mut(3))
-    {
-        act(observation, noise, action);
-    }
+    assert_eq!((observations.len(), actions.len()), (11 * noise.len(), 3 * noise.len()));
+    let rows = observations.chunks(11).zip(noise).zip(actions.chunks_mut(3));
+    rows.for_each(|((observation, noise), action)| act(observation, noise, action));
     Ok(())
 }
 
-fn hopper<S>(seeds: &[u64], begin: impl FnMut(u64) -> S) -> Rollout<S> {
-    Rollout::new(|| Simulations.make("hopper", 0), (11, 3), seeds, begin).unwrap()
+fn hopper(seeds: &[u64]) -> Rollout<ChaCha8Rng> {
+    let make = || Simulations.make("hopper", 0);
+    Rollout::new(make, (11, 3), seeds, ChaCha8Rng::seed_from_u64).unwrap()
 }
 
 fn run(seeds: &[u64]) -> Vec<EpisodeOutcome> {
-    let mut rollout = hopper(seeds, ChaCha8Rng::seed_from_u64);
-    let mut steps = 0;
+    let mut rollout = hopper(seeds);
+    let (mut steps, mut ended) = (0, 0);
     while !rollout.is_done() {
-        rollout.step(select).unwrap();
-        steps += 1;
-        assert!(steps <= 1000, "an episode outlived the time limit");
+        let stepped = rollout.step(select).unwrap();
+        (steps, ended) = (steps + stepped.steps, ended + stepped.ended as usize);
     }
-    assert_eq!(rollout.episodes_done(), seeds.len());
-    let environment_steps = rollout.environment_steps();
     let outcomes = rollout.into_outcomes();
-    assert_eq!(
-        environment_steps,
-        outcomes.iter().map(|outcome| u64::from(outcome.length)).sum::<u64>()
-    );
+    let lengths = outcomes.iter().map(|outcome| u64::from(outcome.length));
+    assert_eq!((steps, ended), (lengths.sum(), seeds.len()));
     outcomes
 }
 
@@ -57,29 +50,26 @@ fn run(seeds: &[u64]) -> Vec<EpisodeOutcome> {
 fn an_outcome_depends_on_its_seed_alone() {
     let seeds: Vec<u64> = (0..12).map(|i| i * 7919 + 3).collect();
     let together = run(&seeds);
-    assert_eq!(together.iter().map(|outcome| outcome.seed).collect::<Vec<_>>(), seeds);
-    for (outcome, &seed) in together.iter().zip(&seeds) {
-        let alone = run(&[seed])[0];
+    assert!(together.iter().map(|outcome| &outcome.seed).eq(&seeds));
+    for outcome in &together {
+        let alone = run(&[outcome.seed])[0];
         assert_eq!(alone, EpisodeOutcome { index: 0, ..*outcome });
     }
-    let lengths: std::collections::HashSet<u32> =
-        together.iter().map(|outcome| outcome.length).collect();
-    assert!(lengths.len() > 1, "episodes of one length only prove nothing about leaving the batch");
+    let lengths: HashSet<u32> = together.iter().map(|outcome| outcome.length).collect();
+    assert!(lengths.len() > 1, "some episodes leave the batch before others");
 }
 
 #[test]
-fn an_outcome_is_what_stepping_by_hand_gives() {
-    let spec = find("hopper").unwrap();
-    let mut hopper = make(spec, 0).unwrap();
+fn an_outcome_equals_that_of_stepping_the_environment() {
+    let mut hopper = make(find("hopper").unwrap(), 0).unwrap();
     for outcome in run(&[5, 6]) {
         let mut noise = ChaCha8Rng::seed_from_u64(outcome.seed);
         let (mut episode_return, mut length) = (0.0, 0);
         hopper.reset(outcome.seed);
         loop {
-            let observation: Vec<f32> =
-                hopper.observation().iter().map(|&value| value as f32).collect();
+            let observation = hopper.observation().iter().map(|&value| value as f32);
             let mut action = [0.0; 3];
-            act(&observation, &mut noise, &mut action);
+            act(&Vec::from_iter(observation), &mut noise, &mut action);
             let step = hopper.step(&action);
             episode_return += step.reward;
             length += 1;
@@ -93,62 +83,57 @@ fn an_outcome_is_what_stepping_by_hand_gives() {
 }
 
 #[test]
-fn a_policy_that_fails_stops_the_batch_where_it_is() {
-    let mut rollout = hopper(&[1, 2], ChaCha8Rng::seed_from_u64);
-    rollout.step(select).unwrap();
-    let failed = rollout.step(|_, _, _| Err(anyhow::anyhow!("no action")));
+fn a_policy_that_fails_advances_no_episode() {
+    let (mut failing, mut other) = (hopper(&[1, 2]), hopper(&[1, 2]));
+    let failed = failing.step(|_, _, _| Err(anyhow::anyhow!("no action")));
     assert_eq!(failed.unwrap_err().to_string(), "no action");
-    assert_eq!((rollout.environment_steps(), rollout.episodes_done()), (2, 0));
-    rollout.step(select).unwrap();
-    assert_eq!(rollout.environment_steps(), 4);
+    for rollout in [&mut failing, &mut other] {
+        while !rollout.is_done() {
+            rollout.step(select).unwrap();
+        }
+    }
+    assert_eq!(failing.into_outcomes(), other.into_outcomes());
 }
 
-/// An environment of another make: it observes and pays how many steps it has taken. In the third
-/// it breaks down if it is to, or pays something else.
-struct Made {
-    steps: [f64; 2],
+/// Observes and rewards its number of steps, of which there are four.
+#[derive(Clone, Copy, Default)]
+struct Counter {
+    /// Step and seed.
+    state: [f64; 2],
     breaks: bool,
-    pays: Option<f64>,
-    worth: f64,
+    third_reward: Option<f64>,
+    score: f64,
 }
 
-impl Environment for Made {
+impl Environment for Counter {
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
-        self.steps = [0.0, seed as f64];
+        self.state = [0.0, seed as f64];
         Ok(())
     }
 
     fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
         assert_eq!(action, [0.5]);
-        self.steps[0] += 1.0;
-        if self.breaks && self.steps[0] == 3.0 {
-            return Err(EnvironmentError::Failed {
-                name: "made".to_owned(),
-                reason: "a cable is loose".to_owned(),
-            });
+        self.state[0] += 1.0;
+        let steps = self.state[0];
+        if self.breaks && steps == 3.0 {
+            let (name, reason) = ("counter".to_owned(), "a cable is loose".to_owned());
+            return Err(EnvironmentError::Failed { name, reason });
         }
-        let reward = self.pays.filter(|_| self.steps[0] == 3.0).unwrap_or(self.steps[0]);
-        Ok(Step { reward, terminated: self.steps[0] == 4.0, truncated: false })
+        let reward = self.third_reward.filter(|_| steps == 3.0).unwrap_or(steps);
+        Ok(Step { reward, terminated: steps == 4.0, truncated: false })
     }
 
     fn observation(&self) -> &[f64] {
-        &self.steps
+        &self.state
     }
 
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
-        Ok(episode_return * self.worth)
+        Ok(episode_return * self.score)
     }
 }
 
-fn made(breaks: bool, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
-    roll_out(|| Made { steps: [0.0; 2], breaks, pays: None, worth: 0.1 }, sizes)
-}
-
-fn roll_out(
-    made: impl Fn() -> Made,
-    sizes: (usize, usize),
-) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
-    let make = || Ok(Box::new(made()) as Box<dyn Environment>);
+fn count(counter: Counter, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
+    let make = || Ok(Box::new(counter) as Box<dyn Environment>);
     let mut rollout = Rollout::new(make, sizes, &[7, 8], |_| ())?;
     while !rollout.is_done() {
         rollout.step(|observations, _, actions| {
@@ -161,37 +146,33 @@ fn roll_out(
 }
 
 #[test]
-fn an_environment_of_another_make_has_scores_of_its_own() {
+fn any_environment_has_its_own_scores_and_errors() {
+    let counter = Counter { score: 0.1, ..Counter::default() };
     let outcome =
         |index, seed| EpisodeOutcome { index, seed, episode_return: 10.0, length: 4, score: 1.0 };
-    assert_eq!(made(false, (2, 1)).unwrap(), [outcome(0, 7), outcome(1, 8)]);
+    assert_eq!(count(counter, (2, 1)).unwrap(), [outcome(0, 7), outcome(1, 8)]);
+    let error = |counter, sizes| count(counter, sizes).unwrap_err().to_string();
+    let broken = Counter { breaks: true, ..counter };
+    assert_eq!(error(broken, (2, 1)), "the environment \"counter\" failed: a cable is loose");
+    assert_eq!(error(counter, (3, 1)), "an observation has 2 numbers, but the policy takes 3");
 }
 
+/// A learner would refuse them.
 #[test]
-fn an_environment_that_breaks_down_or_does_not_fit_says_so() {
-    let error = |breaks, sizes| made(breaks, sizes).unwrap_err().to_string();
-    assert_eq!(error(true, (2, 1)), "the environment \"made\" failed: a cable is loose");
-    assert_eq!(error(false, (3, 1)), "an observation has 2 numbers, but the policy takes 3");
-}
-
-/// No episode counts whose return or score a learner would refuse; one that cannot come right again
-/// does not go on.
-#[test]
-fn a_return_or_score_that_cannot_count_is_told_as_soon_as_it_is_known() {
-    let told = |pays, worth| {
-        roll_out(|| Made { steps: [0.0; 2], breaks: false, pays: Some(pays), worth }, (2, 1))
+fn returns_and_scores_that_do_not_count_are_errors_as_soon_as_they_are_known() {
+    let count = |reward, score| {
+        let third_reward = Some(reward);
+        count(Counter { third_reward, score, ..Counter::default() }, (2, 1))
     };
-    for (pays, worth, sentence) in [
-        (f64::NAN, 0.1, "the return of the episode with seed 8 is NaN after 3 steps"),
-        (f64::NEG_INFINITY, 0.1, "the return of the episode with seed 8 is -inf after 3 steps"),
-        (2e12, 0.1, "the return of the episode with seed 8 is 2000000000007 after 4 steps"),
-        (3.0, f64::NAN, "the score of the episode with seed 8 is NaN after 4 steps"),
-        (3.0, -1e12, "the score of the episode with seed 8 is -10000000000000 after 4 steps"),
+    for (reward, score, problem) in [
+        (f64::NAN, 0.1, "return of the episode with seed 8 is NaN after 3 steps"),
+        (f64::NEG_INFINITY, 0.1, "return of the episode with seed 8 is -inf after 3 steps"),
+        (2e12, 0.1, "return of the episode with seed 8 is 2000000000007 after 4 steps"),
+        (3.0, f64::NAN, "score of the episode with seed 8 is NaN after 4 steps"),
+        (3.0, -1e12, "score of the episode with seed 8 is -10000000000000 after 4 steps"),
     ] {
-        assert_eq!(
-            told(pays, worth).unwrap_err().to_string(),
-            format!("{sentence}, not a finite number up to 1e12")
-        );
+        let error = count(reward, score).unwrap_err().to_string();
+        assert_eq!(error, format!("the {problem}, not a finite number up to 1e12"));
     }
-    assert_eq!(told(1e12 - 7.0, 1.0).unwrap()[0].score, 1e12, "the largest that counts");
+    assert_eq!(count(1e12 - 7.0, 1.0).unwrap()[0].score, 1e12, "the largest that counts");
 }

@@ -1,55 +1,51 @@
-//! All communication with the learner of one run: jobs, snapshots, progress; `delivery` has scores
-//! and jobs that go back.
-
-mod delivery;
+//! An evaluator's side of one run: jobs claimed, scores owed, the learner process followed.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use quad_protocol::{Job, JobReply, JobRequest, Name, Progress, Snapshot, encode, keys};
+use quad_protocol::{Job, JobReply, Name, ScoreReply, ScoreReport, Snapshot, keys};
 use rand::Rng;
-use tracing::{debug, warn};
+use tracing::{debug, info, warn};
+use zenoh::Wait;
 use zenoh::liveliness::LivelinessToken;
-use zenoh::qos::CongestionControl;
-use zenoh::{Session, Wait};
 
+use super::connection::{ANSWER_TIMEOUT, Connection};
 use super::discovery::Found;
-use super::query::{ask, may_block};
+use super::query::{QueryError, blocking};
 use super::scheduler::Turn;
-use super::snapshot::{Listener, Snapshots, is_named_by};
-use crate::metrics::Metrics;
-use delivery::Owed;
+use super::snapshot::{Listener, Snapshots};
+use crate::metrics::{JobOutcome, Metrics};
 
-/// A learner answers in milliseconds; for one that hangs or is very busy, other runs do not wait
-/// longer than this.
-pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
-/// Patience with a learner that sends a snapshot, which has megabytes.
-const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
-/// Limits of the pause that a learner without work may ask for: the learner gets no flood of
-/// queries, and loses no evaluator.
+/// Shortest and longest pause that a learner without work may ask for.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
+/// Time that a leaving evaluator has to deliver its scores; half of it to hand a job back.
+const LEAVE: Duration = Duration::from_secs(2);
+/// Pause of a leaving evaluator after a learner's error.
+const RETRY: Duration = Duration::from_millis(100);
+/// Most characters of a reason that the evaluator sends; the learner accepts no large messages.
+const MAX_REASON_LEN: usize = 1000;
 
-/// An evaluator's side of one run.
+/// The evaluator's debt to a learner, until which is paid it claims no job.
+enum Owed {
+    /// A job's episodes or, if the job has failed, the reason.
+    Job { id: u64, incarnation: u64, failed: Option<String> },
+    /// Scores that the learner has not acknowledged.
+    Scores(ScoreReport),
+}
+
 pub struct RunClient {
-    run: Name,
-    evaluator: Name,
-    session: Session,
-    metrics: Metrics,
+    connection: Connection,
     snapshots: Snapshots,
     listener: Listener,
-    /// The process of the learner that this evaluator follows. It ignores answers of others.
-    incarnation: u64,
-    /// The number of the claim that has no answer yet.
+    /// Number of the claim that has no answer yet.
     attempt: Option<u64>,
     owed: Option<Owed>,
-    /// When the run is due next.
     pub turn: Turn,
-    /// When the learner disappeared.
+    /// Time of the learner's disappearance.
     pub gone: Option<Instant>,
-    /// The last warning, so that it is not repeated.
-    complaint: String,
+    last_warning: String,
     _token: LivelinessToken,
 }
 
@@ -67,56 +63,52 @@ impl RunClient {
             Listener::start(&session, run.clone(), snapshots.clone(), metrics.clone()).await;
         let listener =
             listener.with_context(|| format!("cannot listen to the snapshots of run {run}"))?;
-        let (declared, key) = (session.clone(), keys::live_evaluator(&run, &evaluator));
-        let token = may_block(move || declared.liveliness().declare_token(key).wait()).await;
-        let token =
+        let (declarer, key) = (session.clone(), keys::live_evaluator(&run, &evaluator));
+        let token = blocking(move || declarer.liveliness().declare_token(key).wait()).await;
+        let _token =
             token.with_context(|| format!("cannot announce this evaluator in run {run}"))?;
         let mut client = RunClient {
-            run,
-            evaluator,
-            session,
-            metrics,
+            connection: Connection { run, evaluator, session, metrics, incarnation: 0 },
             snapshots,
             listener,
-            incarnation: 0,
             attempt: None,
             owed: None,
             turn: Turn::new(Instant::now()),
             gone: None,
-            complaint: String::new(),
-            _token: token,
+            last_warning: String::new(),
+            _token,
         };
         client.follow(&found.incarnations);
         Ok(client)
     }
 
-    /// Chooses which of these processes of a learner to follow: the one that it follows already,
-    /// else the one that started first, because of two learners of one name the later one stops.
+    /// Follows the learner process that it follows already or, if that is gone, the oldest one: of
+    /// two learners of one name, the later one stops.
     pub fn follow(&mut self, incarnations: &BTreeSet<u64>) {
         if self.gone.take().is_some() {
             self.turn.wake(Instant::now());
         }
         if let Some(&first) = incarnations.first()
-            && !incarnations.contains(&self.incarnation)
+            && !incarnations.contains(&self.connection.incarnation)
         {
-            self.turn_to(first);
+            self.switch_to(first);
         }
     }
 
     /// Follows the next of several processes, because this one does not answer.
     pub fn follow_next(&mut self, incarnations: &BTreeSet<u64>) {
-        let next = incarnations
-            .range(self.incarnation.saturating_add(1)..)
-            .next()
-            .or(incarnations.first());
-        if let Some(&next) = next.filter(|next| **next != self.incarnation) {
-            self.turn_to(next);
+        let current = self.connection.incarnation;
+        let later = incarnations.range(current.saturating_add(1)..).next();
+        if let Some(&next) = later.or(incarnations.first())
+            && next != current
+        {
+            self.switch_to(next);
         }
     }
 
-    fn turn_to(&mut self, incarnation: u64) {
-        debug!(run = %self.run, incarnation, "following a learner");
-        self.incarnation = incarnation;
+    fn switch_to(&mut self, incarnation: u64) {
+        debug!(run = %self.connection.run, incarnation, "following a learner");
+        self.connection.incarnation = incarnation;
         self.listener.follow(incarnation);
         self.turn.wake(Instant::now());
     }
@@ -128,89 +120,153 @@ impl RunClient {
         }
     }
 
-    /// Pauses this run, longer each time. Logs why, unless the reason is the same as the last time.
+    /// Pauses this run, longer each time. Logs the error, but not the same one twice in a row.
     pub fn back_off(&mut self, error: &anyhow::Error) {
-        let complaint = format!("{error:#}");
-        match self.complaint == complaint {
-            false => warn!(run = %self.run, "{complaint}"),
-            true => debug!(run = %self.run, "{complaint}"),
+        let warning = format!("{error:#}");
+        match self.last_warning == warning {
+            false => warn!(run = %self.connection.run, "{warning}"),
+            true => debug!(run = %self.connection.run, "{warning}"),
         }
-        self.complaint = complaint;
+        self.last_warning = warning;
         self.turn.failed(Instant::now());
     }
 
     /// Claims a job in one of these environments; `None` if there is none now.
     pub async fn claim(&mut self, environments: Vec<String>) -> anyhow::Result<Option<Job>> {
-        // The same number until there is an answer: if only the answer was lost, the learner
-        // repeats the job.
         let attempt = *self.attempt.get_or_insert_with(|| rand::rng().random());
-        let request = encode(&JobRequest::Claim {
-            evaluator: self.evaluator.clone(),
-            attempt,
-            environments,
-        })?;
-        let (run, incarnation) = (self.run.clone(), self.incarnation);
-        let fitting = move |reply: &JobReply| match reply {
-            JobReply::Job(job) if job.run != run => Err("other_run"),
-            JobReply::HandedBack { .. } => Err("unexpected"),
-            _ => is_from(incarnation, reply.incarnation()),
-        };
-        let key = keys::jobs(&self.run);
-        let answer =
-            ask(&self.session, key, request, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
+        let reply = self.connection.claim(attempt, environments).await?;
         self.attempt = None;
-        match answer {
+        Ok(match reply {
             JobReply::Job(job) => {
-                self.owed =
-                    Some(Owed::Job { id: job.id, incarnation: job.incarnation, failed: None });
-                Ok(Some(job))
+                let (id, incarnation) = (job.id, job.incarnation);
+                self.owed = Some(Owed::Job { id, incarnation, failed: None });
+                Some(job)
             }
             JobReply::Wait { milliseconds, .. } => {
-                self.complaint.clear();
+                self.last_warning.clear();
                 let pause = Duration::from_millis(milliseconds).clamp(PAUSE[0], PAUSE[1]);
                 // Spreads out evaluators that a snapshot has woken together.
                 self.turn.done(Instant::now(), pause.mul_f64(rand::random_range(0.5..1.0)));
-                Ok(None)
+                None
             }
-            JobReply::HandedBack { .. } => Ok(None),
-        }
+            JobReply::HandedBack { .. } => None,
+        })
     }
 
-    /// The snapshot that `job` names: the published one, or a requested one if the evaluator missed
-    /// the publication.
+    /// The snapshot that `job` names: the published one or, if the evaluator missed it, a requested
+    /// one.
     pub async fn snapshot(&self, job: &Job) -> anyhow::Result<Arc<Snapshot>> {
-        if let Some(snapshot) = self.snapshots.get(job) {
-            return Ok(snapshot);
-        }
-        let (key, wanted) = (keys::weights_at(&self.run, job.step), job.clone());
-        let fitting = move |found: &Snapshot| {
-            is_named_by(&wanted, found).then_some(()).ok_or("other_snapshot")
-        };
-        let snapshot: Snapshot =
-            ask(&self.session, key, Vec::new(), WEIGHTS_TIMEOUT, &self.metrics, fitting).await?;
-        self.metrics.snapshots_received.inc();
-        Ok(Arc::new(snapshot))
-    }
-
-    /// Reports the progress of `job`. A lost message does no harm, because the next one contains
-    /// its news. So Zenoh drops the message if the connection is full, and this call does not wait.
-    pub fn tell(&self, job: &Job, steps_done: u64, episodes_done: u32) {
-        let progress = Progress {
-            steps_done,
-            episodes_done,
-            environment_steps: self.metrics.environment_steps.get(),
-            episodes: self.metrics.episodes.get(),
-            ..Progress::of(job, self.evaluator.clone())
-        };
-        let Ok(message) = encode(&progress) else { return };
-        let put = self.session.put(keys::progress(&self.run, &self.evaluator), message);
-        if let Err(error) = put.congestion_control(CongestionControl::Drop).wait() {
-            debug!(run = %self.run, "cannot publish progress: {error}");
+        match self.snapshots.get(job) {
+            Some(snapshot) => Ok(snapshot),
+            None => Ok(Arc::new(self.connection.snapshot(job).await?)),
         }
     }
-}
 
-/// Whether a reply is from the followed learner; if not, the label of the reason.
-fn is_from(followed: u64, incarnation: u64) -> Result<(), &'static str> {
-    if incarnation == followed { Ok(()) } else { Err("other_incarnation") }
+    pub fn publish_progress(&self, job: &Job, steps_done: u64, episodes_done: u32) {
+        self.connection.publish_progress(job, steps_done, episodes_done);
+    }
+
+    /// True until the learner has acknowledged the scores of the last job, or its return.
+    pub fn is_in_debt(&self) -> bool {
+        self.owed.is_some()
+    }
+
+    /// Keeps the scores of the claimed job for delivery.
+    pub fn keep(&mut self, report: ScoreReport) {
+        self.owed = Some(Owed::Scores(report));
+    }
+
+    /// Delivers the kept scores, or hands a failed job back. Keeps them after an error.
+    pub async fn deliver(&mut self, timeout: Duration) -> Result<(), QueryError> {
+        let Some(Owed::Scores(report)) = &self.owed else { return self.hand_back(timeout).await };
+        let Connection { run, metrics, .. } = &self.connection;
+        let step = report.step;
+        match self.connection.deliver(report, timeout).await? {
+            ScoreReply::Recorded { new, duplicates, .. } => {
+                let scores = report.episodes.iter().map(|episode| episode.score);
+                let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
+                info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
+                scores.for_each(|score| metrics.episode_score.observe(score));
+                metrics.job(JobOutcome::Scored);
+                self.owed = None;
+                self.last_warning.clear();
+                self.turn.done(Instant::now(), Duration::ZERO);
+                Ok(())
+            }
+            ScoreReply::Refused { reason, .. } => {
+                warn!(%run, step, "the learner refused the scores: {reason}");
+                metrics.job(JobOutcome::Abandoned);
+                self.return_job(Some(format!("it refused the scores: {reason}")));
+                self.hand_back(timeout).await
+            }
+        }
+    }
+
+    /// Hands back the claimed job, which this evaluator could not run; if there is no answer,
+    /// [`deliver`](Self::deliver) tries again.
+    pub async fn fail(&mut self, reason: &str) {
+        self.connection.metrics.job(JobOutcome::Failed);
+        self.return_job(Some(reason.chars().take(MAX_REASON_LEN).collect()));
+        if let Err(error) = self.hand_back(ANSWER_TIMEOUT).await {
+            debug!(run = %self.connection.run, "{error}");
+        }
+    }
+
+    /// Delivers the scores, or hands the job back, before this evaluator ends.
+    pub async fn leave(mut self) {
+        let until = Instant::now() + LEAVE;
+        let mut answered = false;
+        while matches!(self.owed, Some(Owed::Scores(_))) {
+            let Err(error) = self.deliver(LEAVE / 2).await else { return };
+            // A learner that answers with an error has received the scores and may still save them.
+            // If the job went back now, others would run it again.
+            let retry = matches!(error, QueryError::Unusable { .. });
+            answered |= retry;
+            if !retry || Instant::now() + RETRY > until {
+                warn!(run = %self.connection.run, "the learner has not acknowledged the scores: {error}");
+                break;
+            }
+            tokio::time::sleep(RETRY).await;
+        }
+        if !answered {
+            self.return_job(None);
+            while self.hand_back(LEAVE / 2).await.is_err() && Instant::now() + RETRY < until {
+                tokio::time::sleep(RETRY).await;
+            }
+        }
+    }
+
+    /// Drops the scores, if any: the evaluator owes the job itself.
+    fn return_job(&mut self, reason: Option<String>) {
+        self.owed = self.owed.take().map(|owed| match owed {
+            Owed::Job { id, incarnation, failed } => {
+                Owed::Job { id, incarnation, failed: reason.or(failed) }
+            }
+            Owed::Scores(ScoreReport { job, incarnation, .. }) => {
+                Owed::Job { id: job, incarnation, failed: reason }
+            }
+        });
+    }
+
+    async fn hand_back(&mut self, timeout: Duration) -> Result<(), QueryError> {
+        let Some(Owed::Job { id, incarnation, failed }) = &self.owed else { return Ok(()) };
+        match self.connection.hand_back(*id, *incarnation, failed.clone(), timeout).await {
+            Ok(true) => info!(run = %self.connection.run, "a job was handed back"),
+            // If another process is followed by now, the one that gave the job may be gone.
+            Err(error) if *incarnation == self.connection.incarnation => return Err(error),
+            Ok(false) | Err(_) => {}
+        }
+        self.owed = None;
+        Ok(())
+    }
+
+    /// Stops serving the run, and drops scores that were not acknowledged.
+    pub fn give_up(self) {
+        let Connection { run, metrics, .. } = &self.connection;
+        self.snapshots.forget(run);
+        if let Some(Owed::Scores(ScoreReport { step, .. })) = self.owed {
+            warn!(%run, step, "the learner did not come back for its scores");
+            metrics.job(JobOutcome::Abandoned);
+        }
+    }
 }

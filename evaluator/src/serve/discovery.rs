@@ -13,34 +13,31 @@ use tracing::{info, warn};
 use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Session, Wait};
 
-use super::query::may_block;
+use super::query::blocking;
 use crate::metrics::Metrics;
 
-/// Most learners that an evaluator follows, over all runs and endpoints. The limit bounds memory;
-/// it is far above any use.
-const MOST_LEARNERS: usize = 1024;
-/// How often the evaluator checks that a session is still open.
-const GLANCE: Duration = Duration::from_secs(10);
+/// Most learners that an evaluator follows, over all runs and endpoints: a bound on memory, far
+/// above any use.
+const MAX_LEARNERS: usize = 1024;
+/// Interval of checks that a session is still open.
+const CHECK_INTERVAL: Duration = Duration::from_secs(10);
 
-/// A run at one endpoint: the endpoint's place on the command line, and the run's name.
-///
-/// The evaluator serves a run of two endpoints through both: either may fail on its own.
+/// Index of an endpoint on the command line, and a run's name. A run of two endpoints is served
+/// through both, because either may fail.
 pub type RunKey = (usize, Name);
 
 /// A run whose learner is connected.
 #[derive(Clone)]
 pub struct Found {
-    /// The session that reaches it.
     pub session: Session,
-    /// The incarnations that announce themselves, at least one: the token of a learner that was
-    /// disconnected or killed may still exist when the next one starts.
+    /// The announced learner processes, at least one. The token of a killed learner may still exist
+    /// when the next one starts.
     pub incarnations: BTreeSet<u64>,
 }
 
-/// The runs whose learners are connected.
 pub type Runs = BTreeMap<RunKey, Found>;
 
-/// Watches every endpoint as long as it lives.
+/// Watches every endpoint until it is dropped.
 pub struct Discovery {
     runs: watch::Receiver<Runs>,
     tasks: JoinSet<anyhow::Result<Infallible>>,
@@ -49,33 +46,27 @@ pub struct Discovery {
 impl Discovery {
     /// Starts to watch. If nothing listens at an endpoint, it waits.
     ///
-    /// Each endpoint gets a session of its own, because a Zenoh client keeps one connection: in one
-    /// session, a second endpoint would only be a spare for the first.
+    /// Each endpoint gets its own session, because a Zenoh client keeps one connection: in one
+    /// session, a second endpoint would only be a spare.
     pub fn start(
         endpoints: Vec<String>,
         certificates: Option<&Certificates>,
         metrics: &Metrics,
     ) -> Discovery {
-        let (found, runs) = watch::channel(Runs::new());
+        let (tx, runs) = watch::channel(Runs::new());
         let mut tasks = JoinSet::new();
         for (index, endpoint) in endpoints.into_iter().enumerate() {
-            tasks.spawn(watch_endpoint(
-                index,
-                endpoint,
-                certificates.cloned(),
-                found.clone(),
-                metrics.clone(),
-            ));
+            let (tx, metrics) = (tx.clone(), metrics.clone());
+            tasks.spawn(watch_endpoint(index, endpoint, certificates.cloned(), tx, metrics));
         }
         Discovery { runs, tasks }
     }
 
-    /// The current runs, as they come and go.
     pub fn runs(&self) -> watch::Receiver<Runs> {
         self.runs.clone()
     }
 
-    /// Returns only if an endpoint cannot be watched, which means a wrong endpoint or a bug.
+    /// Returns only if an endpoint cannot be watched: a wrong endpoint or a bug.
     pub async fn failed(&mut self) -> anyhow::Error {
         match self.tasks.join_next().await {
             Some(Ok(Err(error))) => error,
@@ -92,43 +83,41 @@ async fn watch_endpoint(
     index: usize,
     endpoint: String,
     certificates: Option<Certificates>,
-    found: watch::Sender<Runs>,
+    tx: watch::Sender<Runs>,
     metrics: Metrics,
 ) -> anyhow::Result<Infallible> {
     info!(endpoint, "waiting for a learner or a router");
-    let endpoints =
-        Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
-    let session = open_session(&endpoints).await?;
+    let connect = vec![endpoint.clone()];
+    let session =
+        open_session(&Endpoints { connect, certificates, ..Endpoints::default() }).await?;
     info!(endpoint, "connected");
-    let told = session.clone();
+    let (found, declarer) = (session.clone(), session.clone());
     let callback = move |token: Sample| {
-        found.send_if_modified(|runs| {
-            take_in(runs, (index, &told), token.kind(), token.key_expr().as_str()).unwrap_or_else(
-                |label| {
-                    metrics.rejected(label);
-                    warn!(key = token.key_expr().as_str(), label, "a learner is not served");
-                    false
-                },
-            )
+        let key = token.key_expr().as_str();
+        tx.send_if_modified(|runs| {
+            update(runs, (index, &found), token.kind(), key).unwrap_or_else(|label| {
+                metrics.rejected(label);
+                warn!(key, label, "a learner is not served");
+                false
+            })
         });
     };
-    let declared = session.clone();
     let declare = move || {
-        let subscriber = declared.liveliness().declare_subscriber(keys::ALL_LEARNERS).history(true);
+        let subscriber = declarer.liveliness().declare_subscriber(keys::ALL_LEARNERS).history(true);
         subscriber.callback(callback).wait()
     };
-    let subscriber = may_block(declare).await;
-    let _subscriber =
-        subscriber.with_context(|| format!("cannot look for learners at {endpoint}"))?;
+    let _subscriber = blocking(declare)
+        .await
+        .with_context(|| format!("cannot look for learners at {endpoint}"))?;
     loop {
-        tokio::time::sleep(GLANCE).await;
+        tokio::time::sleep(CHECK_INTERVAL).await;
         anyhow::ensure!(!session.is_closed(), "the Zenoh session closed");
     }
 }
 
-/// Records a token. Returns whether the runs have changed, or the label of the reason why it was
-/// ignored.
-fn take_in(
+/// Applies a token. Returns whether the runs have changed; an error is the label of the reason why
+/// the token was ignored.
+fn update(
     runs: &mut Runs,
     (index, session): (usize, &Session),
     kind: SampleKind,
@@ -137,17 +126,15 @@ fn take_in(
     let (run, incarnation) =
         keys::run_of(key).zip(keys::incarnation_of(key)).ok_or("invalid_name")?;
     let learners: usize = runs.values().map(|found| found.incarnations.len()).sum();
-    let place = (index, run);
-    let run = &place.1;
-    match (kind, runs.get_mut(&place)) {
-        (SampleKind::Put, _) if learners >= MOST_LEARNERS => Err("too_many_runs"),
+    let key = (index, run);
+    let run = &key.1;
+    match (kind, runs.get_mut(&key)) {
+        (SampleKind::Put, _) if learners >= MAX_LEARNERS => Err("too_many_runs"),
         (SampleKind::Put, Some(found)) => Ok(found.incarnations.insert(incarnation)),
         (SampleKind::Put, None) => {
             info!(%run, incarnation, "found a run");
-            runs.insert(
-                place,
-                Found { session: session.clone(), incarnations: BTreeSet::from([incarnation]) },
-            );
+            let (session, incarnations) = (session.clone(), BTreeSet::from([incarnation]));
+            runs.insert(key, Found { session, incarnations });
             Ok(true)
         }
         (SampleKind::Delete, None) => Ok(false),
@@ -155,7 +142,7 @@ fn take_in(
             let changed = found.incarnations.remove(&incarnation);
             if found.incarnations.is_empty() {
                 info!(%run, incarnation, "the run's learner has left or lost its connection");
-                runs.remove(&place);
+                runs.remove(&key);
             }
             Ok(changed)
         }
@@ -165,45 +152,28 @@ fn take_in(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use SampleKind::{Delete, Put};
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn learners_are_followed_up_to_a_bound() {
-        let endpoints =
-            Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
-        let session = open_session(&endpoints).await.unwrap();
+    async fn follows_learners_up_to_a_limit() {
+        let listen = vec!["tcp/127.0.0.1:0".to_owned()];
+        let session = open_session(&Endpoints { listen, ..Endpoints::default() }).await.unwrap();
         let mut runs = Runs::new();
-        let mut tell = |kind, run: usize, incarnation: usize| {
-            let result = take_in(
-                &mut runs,
-                (0, &session),
-                kind,
-                &format!("quad/run-{run}/live/learner/{incarnation}"),
-            );
-            (result, runs.len())
+        let mut update = |kind, run: usize, incarnation: usize| {
+            let key = format!("quad/run-{run}/live/learner/{incarnation}");
+            (update(&mut runs, (0, &session), kind, &key), runs.len())
         };
-        assert_eq!(tell(SampleKind::Put, 0, 1), (Ok(true), 1));
-        assert_eq!(tell(SampleKind::Put, 0, 1), (Ok(false), 1), "it is known");
-        assert_eq!(
-            tell(SampleKind::Put, 0, 2),
-            (Ok(true), 1),
-            "the next incarnation, while the first seems to be there"
-        );
-        for run in 2..MOST_LEARNERS {
-            assert_eq!(tell(SampleKind::Put, run, 1), (Ok(true), run));
+        assert_eq!(update(Put, 0, 1), (Ok(true), 1));
+        assert_eq!(update(Put, 0, 1), (Ok(false), 1), "it is known");
+        assert_eq!(update(Put, 0, 2), (Ok(true), 1), "a run has several incarnations");
+        for run in 2..MAX_LEARNERS {
+            assert_eq!(update(Put, run, 1), (Ok(true), run));
         }
-        assert_eq!(tell(SampleKind::Put, MOST_LEARNERS, 1).0, Err("too_many_runs"));
-        assert_eq!(tell(SampleKind::Put, 0, 3).0, Err("too_many_runs"));
-        assert_eq!(tell(SampleKind::Delete, 0, 1), (Ok(true), MOST_LEARNERS - 1));
-        assert_eq!(
-            tell(SampleKind::Delete, 0, 2),
-            (Ok(true), MOST_LEARNERS - 2),
-            "the last incarnation is gone"
-        );
-        assert_eq!(tell(SampleKind::Delete, MOST_LEARNERS, 1), (Ok(false), MOST_LEARNERS - 2));
-        assert_eq!(
-            tell(SampleKind::Put, MOST_LEARNERS, 1),
-            (Ok(true), MOST_LEARNERS - 1),
-            "there is room again"
-        );
+        assert_eq!(update(Put, MAX_LEARNERS, 1).0, Err("too_many_runs"));
+        assert_eq!(update(Put, 0, 3).0, Err("too_many_runs"));
+        assert_eq!(update(Delete, 0, 1), (Ok(true), MAX_LEARNERS - 1));
+        assert_eq!(update(Delete, 0, 2), (Ok(true), MAX_LEARNERS - 2), "the run is gone");
+        assert_eq!(update(Delete, MAX_LEARNERS, 1), (Ok(false), MAX_LEARNERS - 2));
+        assert_eq!(update(Put, MAX_LEARNERS, 1), (Ok(true), MAX_LEARNERS - 1), "there is room");
     }
 }

@@ -1,8 +1,16 @@
 //! Data for the tests of this module.
 
+use std::sync::Arc;
+use std::time::Duration;
+
 use candle_core::{DType, Device, Tensor};
-use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig};
+use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Precision};
 use quad_protocol::{Hash, Job, Name, Origin, Snapshot};
+use quad_runtime::Health;
+
+use super::evaluate::Evaluator;
+use crate::metrics::Metrics;
+use crate::sim::Simulations;
 
 /// Two episodes of Hopper.
 pub fn job() -> Job {
@@ -19,7 +27,6 @@ pub fn job() -> Job {
     }
 }
 
-/// A snapshot with this file.
 pub fn snapshot(file: Vec<u8>) -> Snapshot {
     Snapshot { run: job().run, incarnation: 1, step: 1, hash: Hash::of(&file), file }
 }
@@ -29,12 +36,23 @@ pub fn smallest() -> DiffusionShape {
     DiffusionShape::quad((11, 3), &MlpConfig::mish(&[1]), 1, 1)
 }
 
-/// The file of a diffusion policy for an environment, all zero, that takes the best of
-/// `candidates`.
+/// The file of a diffusion policy, all zero, that takes the best of `candidates`.
 pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8> {
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
     let tensors =
         policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
     let origin = Origin { environment: environment.to_owned(), seed: 1, step: 1, episodes: 2 };
     Header::new(policy, origin).to_safetensors(&tensors).unwrap()
+}
+
+/// An evaluator that is stuck without progress for `limit`.
+pub fn evaluator(health: &Health, limit: Duration) -> Evaluator {
+    Evaluator {
+        name: Name::new("evaluator").unwrap(),
+        environments: Arc::new(Simulations),
+        precision: Precision::F32,
+        metrics: Metrics::new().unwrap(),
+        policy: None,
+        beat: health.register("worker", limit),
+    }
 }

@@ -1,24 +1,24 @@
-//! One job: all of its episodes as one batch, on a thread of its own.
+//! One job: all of its episodes as one batch, on its own thread.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use quad_policy::{EpisodeState, Policy, PolicyError};
+use quad_policy::{Policy, PolicyError};
 use quad_protocol::{EpisodeScore, Job};
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
 
 use crate::metrics::{JobOutcome, Metrics};
-use crate::sim::{EnvironmentError, Environments, EpisodeOutcome, Rollout};
+use crate::sim::{Environments, EpisodeOutcome, Rollout};
 
 /// Most episodes of a job: each is a simulation. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
-/// Most memory of one network call, bytes: far more than the paper's few megabytes, and far less
-/// than an evaluator's container has (1 GiB, in docker-compose.yml), which also holds snapshots and
-/// the policy.
+/// Most bytes of one network call: far more than the paper's few megabytes, far less than an
+/// evaluator's container has (1 GiB in docker-compose.yml) beside snapshots and the policy.
 const MAX_BYTES: u64 = 256 << 20;
 
-/// Why the evaluator does not run a job.
+/// Reason not to run a job.
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
     #[error("it has {0} episodes, but must have from 1 to {MAX_EPISODES}")]
@@ -29,7 +29,6 @@ pub enum JobError {
     TooLong,
     #[error("this evaluator has no environment \"{0}\"")]
     Environment(String),
-    /// The snapshot is for another environment, or has other sizes.
     #[error("the snapshot is for {found}, the job's environment is {wanted}")]
     OtherEnvironment { found: String, wanted: String },
     #[error(transparent)]
@@ -48,7 +47,7 @@ impl JobError {
     }
 }
 
-/// Checks a job from the learner.
+/// Checks the episodes and the environment of a learner's job.
 pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError> {
     let episodes = job.seeds.len();
     if !(1..=MAX_EPISODES).contains(&episodes) {
@@ -60,149 +59,76 @@ pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError>
     }
 }
 
-/// Checks that a job with its policy does not take too much memory.
 pub fn check_memory(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
     let bytes = policy.memory(job.seeds.len());
     if bytes > MAX_BYTES { Err(JobError::Memory(bytes)) } else { Ok(()) }
 }
 
-/// The state that the thread of a job and the task that watches it share.
-#[derive(Default)]
-struct Shared {
-    canceled: AtomicBool,
-    episodes_done: AtomicU32,
-    steps_done: AtomicU64,
+/// Environment steps taken and episodes ended.
+#[derive(Clone, Copy, Default)]
+pub struct Done {
+    pub steps: u64,
+    pub episodes: u32,
 }
 
-/// A running job. Dropped before its end, it stops within one step of the batch and counts as
-/// abandoned.
-pub struct Running {
-    shared: Arc<Shared>,
+/// Starts the episodes of a checked job. They stop within one step, and the job counts as
+/// abandoned, if all receivers of `tx` are dropped.
+pub fn start(
+    job: Job,
+    environments: Arc<dyn Environments>,
+    policy: Arc<dyn Policy>,
     metrics: Metrics,
-    started: Instant,
-    thread: Option<tokio::task::JoinHandle<anyhow::Result<Option<Vec<EpisodeOutcome>>>>>,
+    tx: watch::Sender<Done>,
+) -> JoinHandle<anyhow::Result<Vec<EpisodeScore>>> {
+    tokio::task::spawn_blocking(move || {
+        let longest = Job::LONGEST;
+        // On a thread of rayon's pool: any other thread would have to wake one, and wait for it, in
+        // each parallel part of each step.
+        rayon::scope(|_| run(&*environments, &job, &*policy, &metrics, &tx, longest))
+    })
 }
 
-impl Running {
-    /// Starts the episodes of a checked job.
-    pub fn start(
-        job: &Job,
-        environments: Arc<dyn Environments>,
-        policy: Arc<dyn Policy>,
-        metrics: Metrics,
-    ) -> Running {
-        let shared = Arc::new(Shared::default());
-        let thread = tokio::task::spawn_blocking({
-            let (shared, metrics, job) = (shared.clone(), metrics.clone(), job.clone());
-            // On a thread of rayon's pool: any other thread would have to wake one, and wait for
-            // it, in each parallel part of each step.
-            move || {
-                let roll_out = |_: &_| {
-                    roll_out(
-                        environments.as_ref(),
-                        &job,
-                        policy.as_ref(),
-                        &shared,
-                        &metrics,
-                        Job::LONGEST,
-                    )
-                };
-                rayon::scope(roll_out)
-            }
-        });
-        Running { shared, metrics, started: Instant::now(), thread: Some(thread) }
-    }
-
-    /// Episodes that have ended.
-    pub fn episodes_done(&self) -> u32 {
-        self.shared.episodes_done.load(Relaxed)
-    }
-
-    /// Environment steps so far.
-    pub fn steps_done(&self) -> u64 {
-        self.shared.steps_done.load(Relaxed)
-    }
-
-    /// Waits up to `patience` for the end; `None` if it has not come by then.
-    pub async fn finished_within(
-        &mut self,
-        patience: Duration,
-    ) -> Option<anyhow::Result<Vec<EpisodeScore>>> {
-        let thread = self.thread.as_mut()?;
-        let joined = tokio::time::timeout(patience, thread).await.ok()?;
-        self.thread = None;
-        Some(match joined {
-            Ok(Ok(Some(outcomes))) => {
-                self.metrics.job_duration.observe(self.started.elapsed().as_secs_f64());
-                Ok(outcomes.iter().map(episode_score).collect())
-            }
-            Ok(Ok(None)) => Err(anyhow::anyhow!("it was canceled")),
-            Ok(Err(error)) => Err(error),
-            Err(error) => Err(error.into()),
-        })
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        if self.thread.is_some() {
-            self.shared.canceled.store(true, Relaxed);
-            self.metrics.job(JobOutcome::Abandoned);
-        }
-    }
-}
-
-/// Runs all episodes to their end; `None` if canceled. Fails if the policy cannot act, an
-/// environment fails, or the job takes longer than `longest`.
-fn roll_out(
+/// Runs all episodes. Fails if the policy cannot act, an environment fails, the job is canceled or
+/// takes longer than `longest`.
+fn run(
     environments: &dyn Environments,
     job: &Job,
     policy: &dyn Policy,
-    shared: &Shared,
     metrics: &Metrics,
+    tx: &watch::Sender<Done>,
     longest: Duration,
-) -> anyhow::Result<Option<Vec<EpisodeOutcome>>> {
+) -> anyhow::Result<Vec<EpisodeScore>> {
     let started = Instant::now();
-    let mut rollout = episodes(environments, job, policy)?;
+    let make = || environments.make(&job.environment, job.environment_seed);
+    let sizes = (policy.observation_dim(), policy.action_dim());
+    let mut rollout = Rollout::new(make, sizes, &job.seeds, |seed| policy.begin(seed))?;
     while !rollout.is_done() {
-        if shared.canceled.load(Relaxed) {
-            return Ok(None);
+        if tx.is_closed() {
+            metrics.job(JobOutcome::Abandoned);
+            anyhow::bail!("it was canceled");
         }
         if started.elapsed() > longest {
             metrics.rejected(JobError::TooLong.label());
             return Err(JobError::TooLong.into());
         }
-        let steps = rollout.environment_steps();
-        let times = [rollout.select_time(), rollout.physics_time()];
-        let done = rollout.episodes_done();
-        rollout.step(|observations, states, actions| {
+        let stepped = rollout.step(|observations, states, actions| {
             policy.act(observations, states, actions).context("the policy cannot act")
         })?;
-        metrics.environment_steps.inc_by(rollout.environment_steps() - steps);
-        metrics.select_seconds.inc_by((rollout.select_time() - times[0]).as_secs_f64());
-        metrics.physics_seconds.inc_by((rollout.physics_time() - times[1]).as_secs_f64());
-        let ended = rollout.episodes_done() - done;
-        metrics.episodes.inc_by(ended as u64);
-        shared.episodes_done.fetch_add(ended as u32, Relaxed);
-        shared.steps_done.store(rollout.environment_steps(), Relaxed);
+        metrics.environment_steps.inc_by(stepped.steps);
+        metrics.episodes.inc_by(stepped.ended.into());
+        metrics.select_seconds.inc_by(stepped.select.as_secs_f64());
+        metrics.physics_seconds.inc_by(stepped.physics.as_secs_f64());
+        tx.send_modify(|done| {
+            done.steps += stepped.steps;
+            done.episodes += stepped.ended;
+        });
     }
-    Ok(Some(rollout.into_outcomes()))
+    metrics.job_duration.observe(started.elapsed().as_secs_f64());
+    Ok(rollout.into_outcomes().into_iter().map(episode_score).collect())
 }
 
-/// The episodes of the job, at their beginning.
-fn episodes(
-    environments: &dyn Environments,
-    job: &Job,
-    policy: &dyn Policy,
-) -> Result<Rollout<EpisodeState>, EnvironmentError> {
-    let make = || environments.make(&job.environment, job.environment_seed);
-    Rollout::new(make, (policy.observation_dim(), policy.action_dim()), &job.seeds, |seed| {
-        policy.begin(seed)
-    })
-}
-
-fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
-    let EpisodeOutcome { seed, episode_return, length, score, .. } = *outcome;
+fn episode_score(outcome: EpisodeOutcome) -> EpisodeScore {
+    let EpisodeOutcome { seed, episode_return, length, score, .. } = outcome;
     EpisodeScore { seed, episode_return, length, score }
 }
 
@@ -214,7 +140,7 @@ mod tests {
 
     use super::super::fixtures::{self, file};
     use super::*;
-    use crate::sim::{Environment, Simulations};
+    use crate::sim::{Environment, EnvironmentError, Simulations};
 
     fn job(episodes: u64) -> Job {
         Job { seeds: (0..episodes).collect(), ..fixtures::job() }
@@ -225,22 +151,15 @@ mod tests {
         load_policy(&file("hopper", shape, candidates), Precision::F32).unwrap()
     }
 
-    #[test]
-    fn a_job_that_is_empty_or_huge_is_refused() {
-        let label = |episodes| check(&job(episodes), &Simulations).err().map(|error| error.label());
-        assert_eq!([1, 256].map(label), [None; 2]);
-        assert_eq!([0, 257, 65_536].map(label), [Some("job_size"); 3]);
-    }
-
-    #[test]
-    fn a_job_has_a_longest_time() {
-        let (job, policy, metrics) = (job(2), policy(8, 2, 1), Metrics::new().unwrap());
-        let run = |longest| {
-            roll_out(&Simulations, &job, policy.as_ref(), &Shared::default(), &metrics, longest)
-        };
-        assert_eq!(run(Job::LONGEST).unwrap().unwrap().len(), 2);
-        let error = run(Duration::ZERO).unwrap_err();
-        assert!(matches!(error.downcast_ref(), Some(JobError::TooLong)), "{error}");
+    /// Runs a job for at most `longest`.
+    fn run_for(
+        environments: &dyn Environments,
+        job: &Job,
+        longest: Duration,
+    ) -> anyhow::Result<Vec<EpisodeScore>> {
+        let (tx, _rx) = watch::channel(Done::default());
+        let policy = policy(8, 2, 1);
+        run(environments, job, &*policy, &Metrics::new().unwrap(), &tx, longest)
     }
 
     /// Hopper under another name, which records the seeds of its environments.
@@ -256,42 +175,40 @@ mod tests {
             None
         }
 
-        fn make(
-            &self,
-            _: &str,
-            environment_seed: u64,
-        ) -> Result<Box<dyn Environment>, EnvironmentError> {
-            self.0.lock().unwrap().push(environment_seed);
-            Simulations.make("hopper", environment_seed)
+        fn make(&self, _: &str, seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+            self.0.lock().unwrap().push(seed);
+            Simulations.make("hopper", seed)
         }
     }
 
     #[test]
-    fn environments_are_made_by_the_job_s_name_and_seed() {
-        let job = Job { environment: "my-robot".to_owned(), environment_seed: 5, ..job(2) };
-        assert!(
-            matches!(check(&job, &Simulations), Err(JobError::Environment(name)) if name == "my-robot")
-        );
-        let renamed = Renamed::default();
-        check(&job, &renamed).unwrap();
-        assert_eq!(
-            check(&fixtures::job(), &renamed).map_err(|error| error.label()),
-            Err("environment")
-        );
-        episodes(&renamed, &job, policy(1, 1, 1).as_ref()).unwrap();
-        assert_eq!(renamed.0.into_inner().unwrap(), [5, 5]);
+    fn refuses_empty_and_huge_jobs_and_unknown_environments() {
+        let label = |episodes| check(&job(episodes), &Simulations).err().map(|error| error.label());
+        assert_eq!([1, 256].map(label), [None; 2]);
+        assert_eq!([0, 257, 65_536].map(label), [Some("job_size"); 3]);
+        let unknown = check(&job(1), &Renamed::default()).unwrap_err();
+        assert_eq!(unknown.label(), "environment");
     }
 
-    /// A file of some megabytes asks for 66 GB: a value of each of 65,535 tiny critics for each of
-    /// 256,000 candidates.
     #[test]
-    fn the_memory_of_a_policy_is_known_before_it_is_taken() {
-        assert!(check_memory(&job(10), policy(256, 10, 50).as_ref()).is_ok(), "the paper's");
-        assert!(check_memory(&job(1), policy(1, 65_535, 1).as_ref()).is_ok());
-        let many_critics = check_memory(&job(256), policy(1, 65_535, 1000).as_ref());
-        assert!(
-            matches!(many_critics, Err(JobError::Memory(66_000_000_000..))),
-            "{many_critics:?}"
-        );
+    fn makes_environments_by_the_job_s_name_and_seed_and_limits_its_time() {
+        let renamed = Renamed::default();
+        let environment = "my-robot".to_owned();
+        let job = Job { environment, environment_seed: 5, ..job(2) };
+        check(&job, &renamed).unwrap();
+        assert_eq!(run_for(&renamed, &job, Job::LONGEST).unwrap().len(), 2);
+        assert_eq!(*renamed.0.lock().unwrap(), [5, 5]);
+        let error = run_for(&renamed, &job, Duration::ZERO).unwrap_err();
+        assert!(matches!(error.downcast_ref(), Some(JobError::TooLong)), "{error}");
+    }
+
+    /// A file of some megabytes asks for 66 GB: one value from each of 65,535 tiny critics for each
+    /// of 256,000 candidates.
+    #[test]
+    fn knows_the_memory_of_a_policy_before_taking_it() {
+        assert!(check_memory(&job(10), &*policy(256, 10, 50)).is_ok(), "the paper's");
+        assert!(check_memory(&job(1), &*policy(1, 65_535, 1)).is_ok());
+        let huge = check_memory(&job(256), &*policy(1, 65_535, 1000));
+        assert!(matches!(huge, Err(JobError::Memory(66_000_000_000..))), "{huge:?}");
     }
 }

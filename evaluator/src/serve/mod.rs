@@ -2,10 +2,9 @@
 //!
 //! Owns the sessions, one for each endpoint, and the state of all communication with learners,
 //! which need not last. One task on the main thread does the work in turn. A job's episodes run on
-//! a thread of their own and on rayon's, blocking calls of Zenoh on tokio's, and Zenoh's own
-//! threads decode messages. Only the command line calls this module; it uses `sim`. An evaluator
-//! that is told to leave hands its job back; the learner gives the job of a killed evaluator to
-//! another when the lease ends.
+//! their own thread and on rayon's, blocking calls of Zenoh on tokio's, and Zenoh's threads decode
+//! messages. An evaluator that leaves hands its job back; the learner gives the job of a killed one
+//! to another when the lease ends.
 //!
 //! # Layout
 //!
@@ -13,12 +12,13 @@
 //!
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
 //! - `worker`: the main loop, which serves the runs in turn; `scheduler`: chooses the next run.
-//! - `client`: all communication with the learner of one run, with `delivery` of scores; `query`: a
-//!   query to a learner.
+//! - `client`: the evaluator's state in one run; `connection`: its requests to the learner; `query`:
+//!   a request.
 //! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy from one.
 //! - `evaluate`: one job, from its policy to its scores; `job`: all of its episodes, as one batch.
 
 mod client;
+mod connection;
 mod discovery;
 mod evaluate;
 #[cfg(test)]
@@ -43,7 +43,6 @@ use quad_runtime::{
     Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, ListenError, Role,
     SessionError, default_endpoint, parse_endpoint, serve_metrics,
 };
-use rand::Rng;
 use tracing::{info, warn};
 
 use crate::metrics::Metrics;
@@ -88,25 +87,20 @@ pub struct ServeArgs {
     pub precision: Precision,
 }
 
-/// How long the process waits for its threads at the end.
+/// Time that the process waits for its threads at the end.
 const LEAVE: Duration = Duration::from_secs(1);
 
-/// The evaluator counts as stuck if it has made no progress for this long. It waits up to half a
-/// minute for weights.
+/// The evaluator counts as stuck after this long without progress. It waits up to half a minute for
+/// weights.
 const STUCK: Duration = Duration::from_secs(60);
 
 /// Serves these environments until a signal to end.
-///
-/// # Errors
-/// An endpoint or a folder of certificates that cannot be used, or a session that closed for good.
 pub fn serve(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Result<()> {
     keep_heap_small();
     // Two threads for the network; episodes run on their own.
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .enable_all()
-        .build()
-        .context("cannot start the asynchronous runtime")?;
+    let mut builder = tokio::runtime::Builder::new_multi_thread();
+    let runtime = builder.worker_threads(2).enable_all().build();
+    let runtime = runtime.context("cannot start the asynchronous runtime")?;
     let result = runtime.block_on(serve_until_stopped(args, environments));
     runtime.shutdown_timeout(LEAVE);
     result
@@ -125,23 +119,25 @@ async fn serve_until_stopped(
         warn!("{}", Precision::UNAVAILABLE);
     }
     let health = Health::default();
-    // Serves as long as this value lives.
-    let _server = match args.http {
-        Some(address) => {
-            let (registry, health) = (metrics.registry.clone(), health.clone());
-            let server = serve_metrics(address, registry, health, Default::default())
-                .await
-                .hint_of(ListenError::hint)?;
-            info!("metrics at http://{}/metrics", server.address);
-            Some(server)
-        }
-        None => None,
-    };
+    let mut server = None;
+    if let Some(address) = args.http {
+        let (registry, health) = (metrics.registry.clone(), health.clone());
+        let serving = serve_metrics(address, registry, health, Default::default()).await;
+        let serving = serving.hint_of(ListenError::hint)?;
+        info!("metrics at http://{}/metrics", serving.address);
+        server = Some(serving);
+    }
     let mut discovery =
         Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
-    let beat = health.register("worker", STUCK);
-    let evaluator = Evaluator::new(name, environments, args.precision, metrics.clone(), beat);
-    let worker = Worker::new(evaluator, metrics.clone(), discovery.runs());
+    let evaluator = Evaluator {
+        name,
+        environments,
+        precision: args.precision,
+        metrics: metrics.clone(),
+        policy: None,
+        beat: health.register("worker", STUCK),
+    };
+    let worker = Worker::new(evaluator, discovery.runs());
     let end = async {
         tokio::select! {
             biased;
@@ -152,6 +148,7 @@ async fn serve_until_stopped(
     let result = worker.run(end).await;
     let (episodes, steps) = (metrics.episodes.get(), metrics.environment_steps.get());
     info!(episodes, steps, "leaving");
+    drop(server);
     result
 }
 
@@ -168,9 +165,8 @@ fn endpoints(mut connect: Vec<String>, certificates: Option<&Path>) -> anyhow::R
 
 /// Gives a freed snapshot's memory back to the system at once.
 ///
-/// By default glibc learns from the first freed snapshot to serve later ones from its heaps, one
-/// per thread, which never shrink: with the paper's networks the process then has 150 MB instead of
-/// 50.
+/// By default, glibc serves snapshots after the first from heaps that never shrink: with the paper's
+/// networks the process then has 150 MB instead of 50.
 fn keep_heap_small() {
     // Snapshots are larger than this; what a step of a batch needs is smaller.
     const LARGE_BLOCK: i32 = 2 << 20;
@@ -178,13 +174,13 @@ fn keep_heap_small() {
     unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BLOCK) };
 }
 
-/// Host and process for readers, and a random part, because containers may share both.
+/// Host and process for people, and a random part, because containers may share both.
 fn unique_name() -> anyhow::Result<Name> {
-    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let host: String =
-        host.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
+    let mut host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    host.retain(|c| c.is_ascii_alphanumeric() || c == '-');
+    host.truncate(40);
     let host = if host.is_empty() { "evaluator" } else { &host };
-    let random: u16 = rand::rng().random();
+    let random: u16 = rand::random();
     Name::new(format!("{host}-{}-{random:04x}", std::process::id()))
         .context("cannot make up a name for this evaluator")
 }

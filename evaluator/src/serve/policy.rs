@@ -5,8 +5,8 @@ use quad_protocol::{Origin, Snapshot};
 
 use super::job::JobError;
 
-/// Most characters of an environment's name from a file that messages show.
-const LONGEST_NAME: usize = 64;
+/// Most characters of an environment's name from a file in a message.
+const MAX_NAME_LEN: usize = 64;
 
 /// Loads the policy of `snapshot` for the environment `wanted`, whose sizes may be known.
 pub fn load(
@@ -21,36 +21,28 @@ pub fn load(
     if (environment.as_str(), sizes) == (wanted, wanted_sizes) {
         return Ok(policy);
     }
-    Err(JobError::OtherEnvironment {
-        found: described(&environment, sizes),
-        wanted: described(wanted, wanted_sizes),
-    })
+    let (found, wanted) = (describe(&environment, sizes), describe(wanted, wanted_sizes));
+    Err(JobError::OtherEnvironment { found, wanted })
 }
 
-/// An environment with its sizes.
-fn described(name: &str, (observation_dim, action_dim): (usize, usize)) -> String {
-    let name: String = name.chars().take(LONGEST_NAME).collect();
+fn describe(name: &str, (observation_dim, action_dim): (usize, usize)) -> String {
+    let name: String = name.chars().take(MAX_NAME_LEN).collect();
     format!("{name} ({observation_dim} numbers observed, {action_dim} in an action)")
 }
 
 #[cfg(test)]
 mod tests {
-    use quad_policy::DiffusionShape;
-
     use super::super::fixtures::{file, smallest, snapshot};
     use super::*;
 
     #[test]
-    fn a_snapshot_is_loaded_only_for_its_own_environment() {
+    fn loads_a_snapshot_only_for_its_own_environment() {
         let label = |file| {
-            load(&snapshot(file), ("hopper", Some((11, 3))), Precision::F32)
-                .err()
-                .map(|error| error.label())
+            let loaded = load(&snapshot(file), ("hopper", Some((11, 3))), Precision::F32);
+            loaded.err().map(|error| error.label())
         };
-        let (observes_more, acts_more) = (
-            DiffusionShape { observation_dim: 17, ..smallest() },
-            DiffusionShape { action_dim: 6, ..smallest() },
-        );
+        let (mut observes_more, mut acts_more) = (smallest(), smallest());
+        (observes_more.observation_dim, acts_more.action_dim) = (17, 6);
         let hopper = file("hopper", smallest(), 1);
         assert_eq!(label(hopper.clone()), None);
         for other in [

@@ -1,117 +1,108 @@
-//! A query to a learner, and other calls of Zenoh that may block.
+//! Queries to a learner, and other calls of Zenoh that may block.
 
 use std::time::Duration;
 
-use quad_protocol::{Message, decode_from};
+use quad_protocol::{CodecError, Message, decode_from};
 use tokio::sync::mpsc;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 use zenoh::{Session, Wait};
 
 use crate::metrics::Metrics;
 
-/// Most answers to one query that wait; one is enough, and few peers answer.
-const MOST_ANSWERS: usize = 64;
-/// Zenoh's own error where an answer has not come in time. It looks like a learner's, which it is
-/// not.
-const LATE: &[u8] = b"Timeout";
+/// Capacity for answers to one query. One answer is enough, and few peers answer.
+const MAX_ANSWERS: usize = 64;
+/// The error with which Zenoh itself, not the learner, replies to a query that timed out.
+const ZENOH_TIMEOUT: &[u8] = b"Timeout";
 /// Most bytes of a learner's error in a message.
-const LONGEST_ERROR: usize = 200;
+const MAX_ERROR_LEN: usize = 200;
 
-/// Why a query brought no answer.
 #[derive(Debug, thiserror::Error)]
-pub enum AskError {
-    /// No learner or no network, or the answer took too long.
-    #[error("no answer at {key}")]
-    Silent { key: String },
-    /// The learner's error, or what is wrong with its answer.
+pub enum QueryError {
+    #[error("no answer at {0}")]
+    NoAnswer(String),
+    /// The learner's error, or the fault of its answer.
     #[error("unusable answer at {key}: {reason}")]
     Unusable { key: String, reason: String },
-    #[error("cannot ask {key}: {reason}")]
+    #[error("cannot send a query to {key}: {reason}")]
     Send { key: String, reason: String },
+    #[error(transparent)]
+    Encode(#[from] CodecError),
 }
 
-/// Runs a call of Zenoh on a thread that may block. Zenoh's `get` and declarations do all their
-/// work in the first poll of their futures. While a peer does not read, that poll blocks until
-/// Zenoh closes the connection after two seconds, and the awaiting task with it.
-pub async fn may_block<T: Send + 'static>(
+/// Runs a call of Zenoh on a thread that may block.
+///
+/// Zenoh's `get` and declarations do all their work in the first poll of their futures. While a
+/// peer does not read, that poll blocks until Zenoh closes the connection after two seconds.
+pub async fn blocking<T: Send + 'static>(
     call: impl FnOnce() -> zenoh::Result<T> + Send + 'static,
 ) -> anyhow::Result<T> {
     tokio::task::spawn_blocking(call).await?.map_err(|error| anyhow::anyhow!(error))
 }
 
-/// Sends `question` to every learner at `key`. Returns the first answer that can be decoded and
-/// that `fitting` accepts, without waiting for further ones; for a wrong answer `fitting` returns
-/// the label of the reason.
-pub async fn ask<A: Message + Send + 'static>(
+/// Sends `payload` to every learner at `key`, and returns the first answer that can be decoded and
+/// passes `check`. For a wrong answer, `check` returns the label of the reason.
+pub async fn query<A: Message + Send + 'static>(
     session: &Session,
     key: String,
-    question: Vec<u8>,
+    payload: Vec<u8>,
     timeout: Duration,
     metrics: &Metrics,
-    fitting: impl Fn(&A) -> Result<(), &'static str> + Send + Sync + 'static,
-) -> Result<A, AskError> {
-    let (tell, mut told) = mpsc::channel(MOST_ANSWERS);
-    let get = {
-        let (session, metrics, key) = (session.clone(), metrics.clone(), key.clone());
-        move || {
-            let callback = move |reply: Reply| {
-                let is_late =
-                    reply.result().err().is_some_and(|error| *error.payload().to_bytes() == *LATE);
-                if !is_late && !tell.is_closed() {
-                    tell.try_send(read(&reply, &metrics, &fitting)).ok();
-                }
-            };
-            // All targets: the best matching target would be any peer that claims to be complete.
-            // No consolidation, which would hold answers back until every peer has answered.
-            let get = session.get(key).payload(question).timeout(timeout);
-            get.target(QueryTarget::All)
-                .consolidation(ConsolidationMode::None)
-                .callback(callback)
-                .wait()
+    check: impl Fn(&A) -> Result<(), &'static str> + Send + Sync + 'static,
+) -> Result<A, QueryError> {
+    let (tx, mut rx) = mpsc::channel(MAX_ANSWERS);
+    let metrics = metrics.clone();
+    let callback = move |reply: Reply| {
+        let error = reply.result().err().map(|error| error.payload().to_bytes());
+        if error.is_none_or(|error| *error != *ZENOH_TIMEOUT) && !tx.is_closed() {
+            tx.try_send(read(&reply, &metrics, &check)).ok();
         }
     };
-    may_block(get)
-        .await
-        .map_err(|error| AskError::Send { key: key.clone(), reason: error.to_string() })?;
+    let (session, selector) = (session.clone(), key.clone());
+    let get = move || {
+        // All targets: the best matching target would be any peer that claims to be complete.
+        let get = session.get(selector).payload(payload).target(QueryTarget::All);
+        // Consolidation would hold answers back until every peer has answered.
+        let get = get.timeout(timeout).consolidation(ConsolidationMode::None);
+        get.callback(callback).wait()
+    };
+    if let Err(error) = blocking(get).await {
+        let reason = error.to_string();
+        return Err(QueryError::Send { key, reason });
+    }
     let mut unusable = None;
-    // Zenoh drops the callback, and with it the sender of the channel, after the last answer or the
-    // timeout.
-    while let Some(answer) = told.recv().await {
+    // Zenoh drops the callback, and with it `tx`, after the last answer or the timeout.
+    while let Some(answer) = rx.recv().await {
         match answer {
             Ok(answer) => return Ok(answer),
             Err(reason) => unusable = Some(reason),
         }
     }
     Err(match unusable {
-        Some(reason) => AskError::Unusable { key, reason },
-        None => AskError::Silent { key },
+        Some(reason) => QueryError::Unusable { key, reason },
+        None => QueryError::NoAnswer(key),
     })
 }
 
 fn read<A: Message>(
     reply: &Reply,
     metrics: &Metrics,
-    fitting: &impl Fn(&A) -> Result<(), &'static str>,
+    check: &impl Fn(&A) -> Result<(), &'static str>,
 ) -> Result<A, String> {
-    match reply.result() {
-        Ok(sample) => {
-            let answer = decode_from(sample.payload().len(), sample.payload().reader()).map_err(
-                |error| {
-                    metrics.rejected(error.label());
-                    error.to_string()
-                },
-            )?;
-            fitting(&answer).map_err(|label| {
-                metrics.rejected(label);
-                format!("it is not from the learner that was asked ({label})")
-            })?;
-            Ok(answer)
-        }
-        Err(error) => {
-            let text = error.payload().to_bytes();
-            Err(String::from_utf8_lossy(&text[..text.len().min(LONGEST_ERROR)]).into_owned())
-        }
-    }
+    let sample = reply.result().map_err(|error| {
+        let text = error.payload().to_bytes();
+        String::from_utf8_lossy(&text[..text.len().min(MAX_ERROR_LEN)]).into_owned()
+    })?;
+    let rejected = |label: &'static str, reason| {
+        metrics.rejected(label);
+        reason
+    };
+    let payload = sample.payload();
+    let answer = decode_from(payload.len(), payload.reader())
+        .map_err(|error| rejected(error.label(), error.to_string()))?;
+    check(&answer).map_err(|label| {
+        rejected(label, format!("it is not from the learner that was asked ({label})"))
+    })?;
+    Ok(answer)
 }
 
 #[cfg(test)]
@@ -125,68 +116,61 @@ mod tests {
 
     use super::*;
 
-    const GLANCE: Duration = Duration::from_millis(10);
+    const POLL: Duration = Duration::from_millis(10);
 
-    /// Asks a learner that reads nothing until the task that asks lets it read on. Whether there is
-    /// an answer.
+    /// Queries a learner that reads nothing until the querying task runs on. Returns true if the
+    /// learner's answer arrives.
     async fn is_answered() -> bool {
-        let listen =
-            Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+        let any_port = vec!["tcp/127.0.0.1:0".to_owned()];
+        let listen = Endpoints { listen: any_port, ..Endpoints::default() };
         let learner = open_session(&listen).await.unwrap();
-        let (stalls, has_stalled) =
-            (Arc::new(AtomicBool::new(true)), Arc::new(AtomicBool::new(false)));
-        // Until this callback returns, the learner's session reads nothing.
-        let callback = {
-            let (stalls, has_stalled) = (stalls.clone(), has_stalled.clone());
-            move |_| {
-                has_stalled.store(true, Relaxed);
-                while stalls.load(Relaxed) {
-                    std::thread::sleep(GLANCE);
-                }
+        let [stalls, has_stalled] = [true, false].map(|value| Arc::new(AtomicBool::new(value)));
+        // The learner's session reads nothing until this callback returns.
+        let (wait, stalled) = (stalls.clone(), has_stalled.clone());
+        let callback = move |_| {
+            stalled.store(true, Relaxed);
+            while wait.load(Relaxed) {
+                std::thread::sleep(POLL);
             }
         };
+        let _flooded = learner.declare_subscriber("flood").callback(callback).await.unwrap();
         let answer = encode(&JobReply::Wait { incarnation: 1, milliseconds: 1 }).unwrap();
         let answers = move |query: zenoh::query::Query| {
             query.reply(query.key_expr().clone(), answer.clone()).wait().ok();
         };
         let _jobs = learner.declare_queryable("quad/run/jobs").callback(answers).await.unwrap();
-        let _flooded = learner.declare_subscriber("flood").callback(callback).await.unwrap();
-        let connect = Endpoints {
-            connect: reachable_at(&learner, &listen).await.unwrap(),
-            ..Endpoints::default()
-        };
+        let connect = reachable_at(&learner, &listen).await.unwrap();
+        let connect = Endpoints { connect, ..Endpoints::default() };
         let evaluator = open_session(&connect).await.unwrap();
-        let reaches = async {
+        let reach = async {
             while !has_stalled.load(Relaxed) {
                 evaluator.put("flood", "").await.unwrap();
-                sleep(GLANCE).await;
+                sleep(POLL).await;
             }
         };
-        timeout(Duration::from_secs(60), reaches).await.expect("the learner is reached");
+        timeout(Duration::from_secs(60), reach).await.expect("the learner is reached");
         for _ in 0..2000 {
             // More than the connection's buffers hold.
             evaluator.put("flood", vec![0; 20_000]).await.unwrap();
         }
-        let metrics = Metrics::new().unwrap();
-        let (key, limit) = ("quad/run/jobs".to_owned(), Duration::from_secs(20));
-        let asked = ask(&evaluator, key, Vec::new(), limit, &metrics, |_: &JobReply| Ok(()));
-        let reads_on = async {
-            sleep(10 * GLANCE).await;
+        let (metrics, limit) = (Metrics::new().unwrap(), Duration::from_secs(20));
+        let key = "quad/run/jobs".to_owned();
+        let answer = query(&evaluator, key, Vec::new(), limit, &metrics, |_: &JobReply| Ok(()));
+        let read_on = async {
+            sleep(10 * POLL).await;
             stalls.store(false, Relaxed);
         };
-        tokio::join!(asked, reads_on).0.is_ok()
+        tokio::join!(answer, read_on).0.is_ok()
     }
 
-    /// A task that waits for the peer does so until Zenoh has closed the connection, and lets
-    /// nothing be read before.
     #[tokio::test(flavor = "multi_thread")]
-    async fn a_peer_that_does_not_read_does_not_stop_the_task_that_asks() {
-        // Where the machine is too busy, Zenoh may close it all the same.
+    async fn a_peer_that_does_not_read_blocks_no_task() {
+        // On a busy machine Zenoh may close the connection all the same.
         for _ in 0..5 {
             if is_answered().await {
                 return;
             }
         }
-        panic!("the task stood still");
+        panic!("the querying task was blocked");
     }
 }

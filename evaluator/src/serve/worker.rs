@@ -8,40 +8,32 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::warn;
 
-use super::client::{ANSWER_TIMEOUT, RunClient};
+use super::client::RunClient;
+use super::connection::ANSWER_TIMEOUT;
 use super::discovery::{RunKey, Runs};
 use super::evaluate::Evaluator;
 use super::scheduler;
 use super::snapshot::Snapshots;
-use crate::metrics::Metrics;
 
-/// How long scores are kept for a learner that is gone, perhaps only disconnected.
+/// Time that scores are kept for a learner that is gone, perhaps only disconnected.
 const KEEP_SCORES: Duration = Duration::from_secs(600);
 
 /// Serves all runs, one job at a time.
 pub struct Worker {
     evaluator: Evaluator,
-    metrics: Metrics,
     found: watch::Receiver<Runs>,
-    /// The runs that it serves, and runs whose learner is gone but may come back for its scores.
+    /// Runs with a learner, and runs whose learner is gone but may come back for its scores.
     clients: BTreeMap<RunKey, RunClient>,
     snapshots: Snapshots,
 }
 
 impl Worker {
-    /// A worker for the runs that `found` names.
-    pub fn new(evaluator: Evaluator, metrics: Metrics, found: watch::Receiver<Runs>) -> Worker {
-        Worker {
-            evaluator,
-            metrics,
-            found,
-            clients: BTreeMap::new(),
-            snapshots: Snapshots::default(),
-        }
+    pub fn new(evaluator: Evaluator, found: watch::Receiver<Runs>) -> Worker {
+        Worker { evaluator, found, clients: BTreeMap::new(), snapshots: Snapshots::default() }
     }
 
-    /// Serves until `stop` is ready, and returns its result. Then hands an unfinished job back, and
-    /// delivers scores that were not acknowledged.
+    /// Serves until `stop` is ready, and returns its result. Then delivers scores that were not
+    /// acknowledged, and hands unfinished jobs back.
     pub async fn run(
         mut self,
         stop: impl Future<Output = anyhow::Result<()>>,
@@ -49,7 +41,7 @@ impl Worker {
         let result = tokio::select! {
             biased;
             result = stop => result,
-            error = self.work() => Err(error),
+            error = self.work() => error,
         };
         self.follow_learners();
         let leaving = JoinSet::from_iter(self.clients.into_values().map(RunClient::leave));
@@ -57,22 +49,18 @@ impl Worker {
         result
     }
 
-    async fn work(&mut self) -> anyhow::Error {
+    /// Returns only an error.
+    async fn work(&mut self) -> anyhow::Result<()> {
         loop {
             self.evaluator.beat.alive();
             self.follow_learners();
             self.attach().await;
-            self.metrics.runs.set(self.clients.len() as i64);
-            let there = self.clients.iter().filter(|(_, client)| client.gone.is_none());
-            let next =
-                scheduler::next(there.map(|(key, client)| (key, &client.turn)), Instant::now());
-            match next.cloned() {
-                Some(key) => self.turn(&key).await,
-                None => {
-                    if let Err(error) = self.wait().await {
-                        return error;
-                    }
-                }
+            self.evaluator.metrics.runs.set(self.clients.len() as i64);
+            let connected = self.clients.iter().filter(|(_, client)| client.gone.is_none());
+            let turns = connected.map(|(key, client)| (key, &client.turn));
+            match scheduler::next(turns, Instant::now()).cloned() {
+                Some(key) => self.take_turn(&key).await,
+                None => self.wait().await?,
             }
         }
     }
@@ -80,31 +68,30 @@ impl Worker {
     /// Follows the learners of its runs, and stops serving runs whose learners are gone.
     fn follow_learners(&mut self) {
         let (found, now) = (self.found.borrow_and_update(), Instant::now());
-        let over = |(key, client): (&RunKey, &mut RunClient)| {
-            match found.get(key) {
-                Some(learner) => client.follow(&learner.incarnations),
-                None if client.owes() && now - *client.gone.get_or_insert(now) < KEEP_SCORES => {}
-                None => return Some(key.clone()),
+        let over = self.clients.extract_if(.., |key, client| match found.get(key) {
+            Some(learner) => {
+                client.follow(&learner.incarnations);
+                false
             }
-            None
-        };
-        let over: Vec<RunKey> = self.clients.iter_mut().filter_map(over).collect();
-        for client in over.iter().filter_map(|key| self.clients.remove(key)) {
-            client.give_up();
-        }
+            None => {
+                let gone = now - *client.gone.get_or_insert(now);
+                !client.is_in_debt() || gone >= KEEP_SCORES
+            }
+        });
+        over.for_each(|(_, client)| client.give_up());
     }
 
     /// Starts to serve new runs.
     async fn attach(&mut self) {
         let found = self.found.borrow().clone();
-        for (key, learner) in
-            found.iter().filter(|(key, _)| !self.clients.contains_key(*key)).collect::<Vec<_>>()
-        {
-            let (name, snapshots) = (self.evaluator.name.clone(), self.snapshots.clone());
-            match RunClient::attach(key.1.clone(), learner, name, snapshots, self.metrics.clone())
-                .await
-            {
-                Ok(client) => drop(self.clients.insert(key.clone(), client)),
+        for (key, learner) in found {
+            if self.clients.contains_key(&key) {
+                continue;
+            }
+            let Evaluator { name, metrics, .. } = &self.evaluator;
+            let (run, snapshots) = (key.1.clone(), self.snapshots.clone());
+            match RunClient::attach(run, &learner, name.clone(), snapshots, metrics.clone()).await {
+                Ok(client) => drop(self.clients.insert(key, client)),
                 Err(error) => warn!("{error:#}"),
             }
         }
@@ -126,8 +113,7 @@ impl Worker {
         Ok(())
     }
 
-    /// Takes one turn of a run.
-    async fn turn(&mut self, key: &RunKey) {
+    async fn take_turn(&mut self, key: &RunKey) {
         let Some(client) = self.clients.get_mut(key) else { return };
         if let Err(error) = serve(client, &mut self.evaluator).await {
             client.back_off(&error);
@@ -140,7 +126,7 @@ impl Worker {
 
 /// Delivers what the evaluator owes, if anything, else runs one job.
 async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
-    if !client.owes() {
+    if !client.is_in_debt() {
         let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };
         match evaluator.evaluate(&job, client).await {
             Ok(report) => client.keep(report),
@@ -150,28 +136,22 @@ async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Res
             }
         }
     }
-    client.deliver(ANSWER_TIMEOUT).await
+    Ok(client.deliver(ANSWER_TIMEOUT).await?)
 }
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
-    use quad_policy::Precision;
-    use quad_protocol::Name;
     use quad_runtime::Health;
 
+    use super::super::fixtures::evaluator;
     use super::*;
-    use crate::sim::Simulations;
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn an_evaluator_without_work_is_well() {
-        let (health, (_keep, found)) = (Health::default(), watch::channel(Runs::new()));
-        let (name, metrics, limit) =
-            (Name::new("idle").unwrap(), Metrics::new().unwrap(), Duration::from_secs(1));
-        let (environments, beat) = (Arc::new(Simulations), health.register("worker", limit));
-        let evaluator = Evaluator::new(name, environments, Precision::F32, metrics.clone(), beat);
-        // One that says nothing is not well any more by then, and stays so.
+    async fn an_evaluator_without_work_is_healthy() {
+        let (health, limit) = (Health::default(), Duration::from_secs(1));
+        let (_tx, found) = watch::channel(Runs::new());
+        let worker = Worker::new(evaluator(&health, limit), found);
+        // A part that never reports is unhealthy by then, and stays so.
         let stop = async {
             tokio::time::sleep(2 * limit).await;
             while !health.problems().is_empty() {
@@ -179,7 +159,7 @@ mod tests {
             }
             Ok(())
         };
-        let served = Worker::new(evaluator, metrics, found).run(stop);
-        tokio::time::timeout(Duration::from_secs(120), served).await.expect("it is well").unwrap();
+        let served = tokio::time::timeout(Duration::from_secs(120), worker.run(stop)).await;
+        served.expect("it is healthy").unwrap();
     }
 }

@@ -1,5 +1,4 @@
-//! What an environment is: the interface between a policy and a simulation, in this program or in
-//! another language.
+//! The interface between a policy and an environment, in this program or in another language.
 
 use quad_protocol::EpisodeScore;
 use thiserror::Error;
@@ -7,30 +6,23 @@ use thiserror::Error;
 /// The result of one step of an environment.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Step {
-    /// The reward of this step.
     pub reward: f64,
-    /// The task ended the episode here: there is no future to bootstrap from.
+    /// The task ended the episode: there is no future to bootstrap from.
     pub terminated: bool,
-    /// The time limit was reached here. Independent of `terminated`, as in Gymnasium: both may be
-    /// true.
+    /// The time limit was reached. As in Gymnasium, `terminated` may be true, too.
     pub truncated: bool,
 }
 
-/// An environment, as a rollout needs it.
 pub trait Environment: Send {
     /// Starts an episode, which is a function of its seed and its actions only.
-    ///
-    /// # Errors
-    /// The environment failed; so may the next two methods.
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError>;
 
     /// Applies an action for one control period.
     fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError>;
 
-    /// The current observation.
     fn observation(&self) -> &[f64];
 
-    /// The score of the ended episode, given the undiscounted sum of its rewards.
+    /// Scores the ended episode by the undiscounted sum of its rewards.
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError>;
 }
 
@@ -39,15 +31,11 @@ pub trait Environments: Send + Sync {
     /// The names that learners may ask for.
     fn names(&self) -> Vec<String>;
 
-    /// The sizes of an observation and of an action, if they are known before an environment
-    /// exists.
+    /// Sizes of an observation and of an action, if they are known before an environment exists.
     fn sizes(&self, name: &str) -> Option<(usize, usize)>;
 
-    /// Makes an environment. `environment_seed` is the seed of what the environment draws once and
-    /// keeps over all episodes, if anything.
-    ///
-    /// # Errors
-    /// The name is none of [`Self::names`], or the environment cannot be made.
+    /// Makes an environment of one of [`Self::names`]. `environment_seed` decides what it draws
+    /// once for all episodes, if anything.
     fn make(
         &self,
         name: &str,
@@ -55,15 +43,13 @@ pub trait Environments: Send + Sync {
     ) -> Result<Box<dyn Environment>, EnvironmentError>;
 }
 
-/// Why an environment is missing or failed.
+/// Failure to make an environment, or of an environment.
 #[derive(Debug, Error)]
-#[allow(missing_docs)] // The sentences say what each is.
 pub enum EnvironmentError {
     #[error("this evaluator cannot simulate the environment \"{0}\"")]
     NotSimulated(String),
     #[error("an observation has {found} numbers, but the policy takes {wanted}")]
     Observation { found: usize, wanted: usize },
-    /// With the environment's own message.
     #[error("the environment \"{name}\" failed: {reason}")]
     Failed { name: String, reason: String },
     /// No learner would count the episode.

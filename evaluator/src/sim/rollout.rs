@@ -1,4 +1,4 @@
-//! Runs the episodes of one job as one batch.
+//! Runs many episodes as one batch.
 
 use std::time::{Duration, Instant};
 
@@ -8,197 +8,153 @@ use serde::Serialize;
 
 use super::environment::{Environment, EnvironmentError};
 
-/// A batch of episodes that advance together: one policy call and one control period per
+/// A batch of episodes that advance together, with one policy call and one control period per
 /// [`step`](Rollout::step).
 ///
-/// Episodes that have ended leave the batch, so the policy sees only live ones. An episode's
-/// outcome is a function of its seed and the policy, whatever else is in the batch, as long as the
-/// policy treats its rows independently. For that, each episode has its own `S`: what the policy
-/// carries from step to step.
+/// Episodes that have ended leave the batch. An episode's outcome is a function of its seed and the
+/// policy, if the policy treats its rows independently; so each episode has its own policy state
+/// `S`.
 pub struct Rollout<S> {
-    /// Sizes of an observation and of an action.
-    sizes: (usize, usize),
+    observation_dim: usize,
+    action_dim: usize,
     live: Vec<Episode>,
-    /// Row i belongs to `live[i]`, also in the next two fields.
+    /// One per live episode.
     states: Vec<S>,
-    /// live × numbers in an observation
+    /// [live, observation_dim]
     observations: Vec<f32>,
-    /// live × numbers in an action
+    /// [live, action_dim]
     actions: Vec<f32>,
     outcomes: Vec<EpisodeOutcome>,
-    environment_steps: u64,
-    select_time: Duration,
-    physics_time: Duration,
 }
 
 struct Episode {
     environment: Box<dyn Environment>,
-    index: usize,
-    seed: u64,
-    episode_return: f64,
-    length: u32,
+    outcome: EpisodeOutcome,
     ended: bool,
 }
 
 /// The result of one episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct EpisodeOutcome {
-    /// The index of the episode's seed among the rollout's seeds.
+    /// Index of the episode's seed among the rollout's seeds.
     #[serde(skip)]
     pub index: usize,
-    /// The seed of its initial state and of the policy's noise.
+    /// Seed of the initial state and of the policy's noise.
     pub seed: u64,
-    /// Sum of its rewards, undiscounted.
+    /// Undiscounted.
     #[serde(rename = "return")]
     pub episode_return: f64,
-    /// Its number of steps.
+    /// Number of steps.
     pub length: u32,
-    /// Its score, from the environment: D4RL-normalized in the environments of this program.
+    /// D4RL-normalized in the environments of this program.
     pub score: f64,
 }
 
+/// Effort of one step of a batch.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Stepped {
+    /// Environment steps taken.
+    pub steps: u64,
+    /// Episodes that have ended.
+    pub ended: u32,
+    /// Time spent in the policy.
+    pub select: Duration,
+    /// Time spent in the simulations.
+    pub physics: Duration,
+}
+
 impl<S> Rollout<S> {
-    /// Begins an episode for each seed, in an environment of its own that `make` makes. `sizes` are
-    /// the policy's sizes of an observation and of an action; `begin` makes the policy's state for
-    /// the episode of a seed.
-    ///
-    /// # Errors
-    ///
-    /// An environment cannot be made, or cannot begin.
+    /// Starts an episode per seed, each in an environment that `make` makes and with a policy state
+    /// that `begin` makes. The pair has the policy's sizes of an observation and an action.
     pub fn new(
         mut make: impl FnMut() -> Result<Box<dyn Environment>, EnvironmentError>,
-        sizes: (usize, usize),
+        (observation_dim, action_dim): (usize, usize),
         seeds: &[u64],
         begin: impl FnMut(u64) -> S,
     ) -> Result<Self, EnvironmentError> {
-        let mut live = Vec::with_capacity(seeds.len());
-        for (index, &seed) in seeds.iter().enumerate() {
+        let start = |(index, &seed)| {
             let mut environment = make()?;
             environment.reset(seed)?;
-            live.push(Episode {
-                environment,
-                index,
-                seed,
-                episode_return: 0.0,
-                length: 0,
-                ended: false,
-            });
-        }
+            let outcome =
+                EpisodeOutcome { index, seed, episode_return: 0.0, length: 0, score: 0.0 };
+            Ok(Episode { environment, outcome, ended: false })
+        };
         Ok(Self {
-            sizes,
-            live,
+            observation_dim,
+            action_dim,
+            live: seeds.iter().enumerate().map(start).collect::<Result<_, _>>()?,
             states: seeds.iter().copied().map(begin).collect(),
-            observations: Vec::with_capacity(seeds.len() * sizes.0),
-            actions: Vec::with_capacity(seeds.len() * sizes.1),
-            outcomes: Vec::with_capacity(seeds.len()),
-            environment_steps: 0,
-            select_time: Duration::ZERO,
-            physics_time: Duration::ZERO,
+            observations: Vec::new(),
+            actions: Vec::new(),
+            outcomes: Vec::new(),
         })
     }
 
-    /// Advances every live episode by one control period.
-    ///
-    /// Calls `select` once, with the observations of n episodes in a row, the policy's states of
-    /// the same episodes, and the buffer for their actions, which it must fill.
+    /// Advances every live episode by one control period. `select` gets the observations [n,
+    /// observation_dim] and the policy's states [n], and fills in the actions [n, action_dim].
     ///
     /// # Errors
     ///
-    /// `select` failed, and no episode has advanced; or an environment failed, or an episode's
-    /// return or score does not count, and the batch is unusable.
+    /// `select` fails before any episode advances. After any other error the batch is unusable: an
+    /// environment has failed, or a return or score is not finite.
     pub fn step<E: From<EnvironmentError>>(
         &mut self,
         select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), E>,
-    ) -> Result<(), E> {
-        if self.live.is_empty() {
-            return Ok(());
-        }
+    ) -> Result<Stepped, E> {
         let start = Instant::now();
         self.observe()?;
-        let (_, action_dim) = self.sizes;
-        self.actions.resize(self.live.len() * action_dim, 0.0);
+        self.actions.resize(self.live.len() * self.action_dim, 0.0);
         select(&self.observations, &mut self.states, &mut self.actions)?;
         let selected = Instant::now();
-        self.select_time += selected - start;
 
         if rayon::current_num_threads() > 1 && self.live.len() > 1 {
-            let actions = self.actions.par_chunks_exact(action_dim);
-            self.live
-                .par_iter_mut()
-                .zip(actions)
-                .try_for_each(|(episode, action)| episode.step(action))?;
+            let actions = self.actions.par_chunks_exact(self.action_dim);
+            let episodes = self.live.par_iter_mut().zip(actions);
+            episodes.try_for_each(|(episode, action)| episode.step(action))?;
         } else {
-            let mut actions = self.actions.chunks_exact(action_dim);
-            self.live
-                .iter_mut()
-                .zip(&mut actions)
-                .try_for_each(|(episode, action)| episode.step(action))?;
+            let mut actions = self.actions.chunks_exact(self.action_dim);
+            let mut episodes = self.live.iter_mut().zip(&mut actions);
+            episodes.try_for_each(|(episode, action)| episode.step(action))?;
         }
-        self.environment_steps += self.live.len() as u64;
-        self.collect_ended()?;
-        self.physics_time += selected.elapsed();
-        Ok(())
+        let (steps, ended) = (self.live.len() as u64, self.collect_ended()?);
+        Ok(Stepped { steps, ended, select: selected - start, physics: selected.elapsed() })
     }
 
     fn observe(&mut self) -> Result<(), EnvironmentError> {
         self.observations.clear();
-        for episode in &self.live {
-            let observation = episode.environment.observation();
-            if observation.len() != self.sizes.0 {
-                return Err(EnvironmentError::Observation {
-                    found: observation.len(),
-                    wanted: self.sizes.0,
-                });
+        for Episode { environment, .. } in &self.live {
+            let observation = environment.observation();
+            let (found, wanted) = (observation.len(), self.observation_dim);
+            if found != wanted {
+                return Err(EnvironmentError::Observation { found, wanted });
             }
             self.observations.extend(observation.iter().map(|&value| value as f32));
         }
         Ok(())
     }
 
-    fn collect_ended(&mut self) -> Result<(), EnvironmentError> {
-        for row in (0..self.live.len()).rev() {
-            if self.live[row].ended {
-                let Episode { mut environment, index, seed, episode_return, length, .. } =
-                    self.live.swap_remove(row);
-                self.states.swap_remove(row);
-                let counted = |what, value| match EpisodeScore::counts(value) {
-                    true => Ok(value),
-                    false => Err(EnvironmentError::NotCounted { what, seed, value, length }),
-                };
-                let episode_return = counted("return", episode_return)?;
-                let score = counted("score", environment.score(episode_return)?)?;
-                self.outcomes.push(EpisodeOutcome { index, seed, episode_return, length, score });
-            }
+    fn collect_ended(&mut self) -> Result<u32, EnvironmentError> {
+        let before = self.live.len();
+        for row in (0..before).rev().filter(|&row| self.live[row].ended).collect::<Vec<_>>() {
+            let Episode { mut environment, mut outcome, .. } = self.live.swap_remove(row);
+            self.states.swap_remove(row);
+            let EpisodeOutcome { seed, episode_return, length, .. } = outcome;
+            let check = |what, value| match EpisodeScore::counts(value) {
+                true => Ok(value),
+                false => Err(EnvironmentError::NotCounted { what, seed, value, length }),
+            };
+            check("return", episode_return)?;
+            outcome.score = check("score", environment.score(episode_return)?)?;
+            self.outcomes.push(outcome);
         }
-        Ok(())
+        Ok((before - self.live.len()) as u32)
     }
 
-    /// Whether every episode has ended.
     pub fn is_done(&self) -> bool {
         self.live.is_empty()
     }
 
-    /// Episodes that have ended.
-    pub fn episodes_done(&self) -> usize {
-        self.outcomes.len()
-    }
-
-    /// Steps taken so far, summed over the episodes.
-    pub fn environment_steps(&self) -> u64 {
-        self.environment_steps
-    }
-
-    /// Time spent in the policy so far.
-    pub fn select_time(&self) -> Duration {
-        self.select_time
-    }
-
-    /// Time spent in the simulations so far.
-    pub fn physics_time(&self) -> Duration {
-        self.physics_time
-    }
-
-    /// The outcomes of the episodes that have ended, in the order of the seeds.
+    /// The outcomes of ended episodes, in the order of the seeds.
     pub fn into_outcomes(mut self) -> Vec<EpisodeOutcome> {
         self.outcomes.sort_unstable_by_key(|outcome| outcome.index);
         self.outcomes
@@ -208,10 +164,11 @@ impl<S> Rollout<S> {
 impl Episode {
     fn step(&mut self, action: &[f32]) -> Result<(), EnvironmentError> {
         let step = self.environment.step(action)?;
-        self.episode_return += step.reward;
-        self.length += 1;
+        self.outcome.episode_return += step.reward;
+        self.outcome.length += 1;
         // A sum that is not finite stays so.
-        self.ended = step.terminated || step.truncated || !self.episode_return.is_finite();
+        let is_finite = self.outcome.episode_return.is_finite();
+        self.ended = step.terminated || step.truncated || !is_finite;
         Ok(())
     }
 }

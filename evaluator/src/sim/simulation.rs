@@ -11,32 +11,30 @@ use super::physics::Physics;
 
 /// The rules of a task.
 pub(super) trait Task: Send {
-    /// The reward of the step that has just been taken from where the first two positions were
+    /// Returns the reward of the step just taken, which began with the first two positions at
     /// `from`, and whether it terminated the episode.
     fn judge(&self, from: [f64; 2], physics: &Physics) -> (f64, bool);
 
-    /// Draws what an episode of this seed has of its own.
+    /// Draws the goal of an episode.
     fn begin(&mut self, _seed: u64) {}
 
-    /// The first two positions of an episode of this seed, where it does not begin at the model's.
+    /// Draws the first two positions of an episode; `None` for the model's.
     fn start(&self, _seed: u64) -> Option<[f64; 2]> {
         None
     }
 
-    /// Moves the goal.
     fn set_goal(&mut self, _goal: &[f64]) {}
 
-    /// Where the goal is, in a task that has one.
     fn goal(&self) -> Option<&[f64]> {
         None
     }
 }
 
-/// How a robot begins, and what a policy observes of it: positions, then velocities.
+/// A robot's initial noise, and its observation: positions, then velocities.
 pub(super) struct Body {
     /// Noise on the initial state.
     pub noise: Noise,
-    /// How many of the first positions are not observed.
+    /// Number of first positions that are not observed.
     pub hidden_positions: usize,
     /// Limit of each observed velocity.
     pub observed_velocity: f64,
@@ -56,7 +54,7 @@ pub struct Simulation {
 }
 
 impl Simulation {
-    /// A simulation that waits for its first [`reset`](Self::reset).
+    /// The first [`reset`](Self::reset) starts it.
     pub(super) fn new(
         physics: Physics,
         body: Body,
@@ -67,8 +65,7 @@ impl Simulation {
         Self { physics, body, task, observation, steps: 0, spec }
     }
 
-    /// Starts an episode. The noise on the initial state comes from a stream of `seed`, so an
-    /// episode is a function of its seed and its actions only.
+    /// Starts an episode, which is a function of its seed and its actions only.
     pub fn reset(&mut self, seed: u64) {
         self.task.begin(seed);
         self.physics.reset(seed, self.body.noise, self.task.start(seed));
@@ -81,26 +78,25 @@ impl Simulation {
         self.start();
     }
 
-    /// Moves the goal (x and y, meters) until it is drawn again; does nothing in a task without a
-    /// goal.
+    /// Moves the goal (x and y, meters) until it is drawn again.
     pub fn set_goal(&mut self, goal: &[f64]) {
         self.task.set_goal(goal);
     }
 
-    /// The position of the goal (x and y, meters), in a task that has one.
+    /// The goal's x and y, meters, in a task that has one.
     pub fn goal(&self) -> Option<&[f64]> {
         self.task.goal()
     }
 
-    /// Applies `action` (`action_dim` values, clipped to [-1, 1]) for one control period.
+    /// Applies `action` [action_dim], clipped to ±1, for one control period.
     pub fn step(&mut self, action: &[f32]) -> Step {
         self.steps += 1;
         let truncated = self.steps >= self.spec.max_episode_steps;
-        let from = [0, 1].map(|position| self.physics.qpos()[position]);
-        let went_on = self.physics.step(action);
+        let from = [self.qpos()[0], self.qpos()[1]];
+        let is_valid = self.physics.step(action);
         self.observe();
         let (reward, terminated) =
-            if went_on { self.task.judge(from, &self.physics) } else { (0.0, true) };
+            if is_valid { self.task.judge(from, &self.physics) } else { (0.0, true) };
         Step { reward, terminated, truncated }
     }
 
@@ -109,17 +105,15 @@ impl Simulation {
         self.physics.dt()
     }
 
-    /// The current observation, `observation_dim` values.
+    /// [observation_dim]
     pub fn observation(&self) -> &[f64] {
         &self.observation
     }
 
-    /// The current generalized positions.
     pub fn qpos(&self) -> &[f64] {
         self.physics.qpos()
     }
 
-    /// The current generalized velocities.
     pub fn qvel(&self) -> &[f64] {
         self.physics.qvel()
     }
@@ -131,9 +125,9 @@ impl Simulation {
 
     fn observe(&mut self) {
         let Body { hidden_positions, observed_velocity: limit, .. } = self.body;
-        let (positions, velocities) =
-            self.observation.split_at_mut(self.physics.qpos().len() - hidden_positions);
-        positions.copy_from_slice(&self.physics.qpos()[hidden_positions..]);
+        let visible = &self.physics.qpos()[hidden_positions..];
+        let (positions, velocities) = self.observation.split_at_mut(visible.len());
+        positions.copy_from_slice(visible);
         for (observed, velocity) in velocities.iter_mut().zip(self.physics.qvel()) {
             *observed = velocity.clamp(-limit, limit);
         }

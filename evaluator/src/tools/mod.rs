@@ -1,9 +1,5 @@
-//! Tools for one machine, each a command of its own: `collect`, `verify-dataset`, `score` and
-//! `film`.
-//!
-//! Owns only the files of a command. Each command runs on the calling thread and shares its
-//! episodes or rows among rayon's threads. The command line calls this module; it uses `sim`, and
-//! knows nothing of the network.
+//! Commands that need no network. Each runs on the calling thread and shares its episodes or rows
+//! among rayon's threads.
 //!
 //! # Layout
 //!

@@ -1,6 +1,7 @@
 //! Replays a recorded file one step at a time from its own states, and measures how far the
 //! simulation is from it.
 
+use std::fmt;
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
@@ -24,10 +25,9 @@ use crate::sim::{self, EnvironmentError, Simulation};
 /// observation is right.
 const REWARD_TOLERANCE: f64 = 1e-3;
 
-/// How a file compares with the simulation.
+/// Comparison of a file with the simulation.
 #[derive(Debug, Serialize)]
 pub struct Report {
-    /// Environment of the replay.
     pub environment: &'static str,
     /// Rows replayed.
     pub transitions: usize,
@@ -36,7 +36,6 @@ pub struct Report {
     pub compared: usize,
     /// The largest error of each compared row's next observation, over its values.
     pub obs_error: ObservationError,
-    /// Errors of the rewards.
     pub reward_error: RewardError,
     /// Rows whose reward differs from the recorded one by more than float32 explains.
     pub rewards_differ: usize,
@@ -45,38 +44,48 @@ pub struct Report {
     pub terminals_differ: usize,
 }
 
-/// Absolute errors of the next observation.
+/// Absolute errors of the next observation, over the rows.
 #[derive(Debug, Serialize)]
 pub struct ObservationError {
-    /// Half of the rows have a smaller error.
     pub median: f64,
-    /// 99 % of the rows have a smaller error.
     pub p99: f64,
-    /// The worst row.
     pub max: f64,
 }
 
-/// Absolute errors of the reward.
+/// Absolute errors of the reward, over the rows.
 #[derive(Debug, Serialize)]
 pub struct RewardError {
-    /// The worst row.
     pub max: f64,
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { environment, transitions, compared, rewards_differ, terminals_differ, .. } =
+            self;
+        let (ObservationError { median, p99, max }, reward) =
+            (&self.obs_error, self.reward_error.max);
+        write!(
+            f,
+            "environment        {environment}\n\
+             transitions        {transitions}, of which {compared} have a next observation to compare\n\
+             observation error  median {median:.1e}, p99 {p99:.1e}, max {max:.1e}\n\
+             reward error       max {reward:.1e}\n\
+             rewards differ     {rewards_differ}\n\
+             terminals differ   {terminals_differ}"
+        )
+    }
 }
 
 const OTHER_FILE: &str =
     "a file that can be replayed is what `evaluator collect --env hopper --out FILE` writes";
 const ENVIRONMENT: &str = "--env NAME says where it was recorded";
 
-/// What to do about a file that cannot be read, or lacks what a replay needs.
 fn hint(error: &DatasetError) -> String {
     if let Problem::Missing { .. } = error.problem { OTHER_FILE.to_owned() } else { error.hint() }
 }
 
 /// The environment of a file: the one that it names or, if it names none, the only one of its
 /// sizes.
-///
-/// # Errors
-/// The file cannot be read, names an unknown environment, or its sizes fit several or none.
 pub fn environment_of(path: &Path) -> anyhow::Result<&'static EnvironmentSpec> {
     if let Some(name) = recorded_environment(path).hint_of(hint)? {
         let other = || format!("{}: recorded in another environment", path.display());
@@ -95,26 +104,20 @@ pub fn environment_of(path: &Path) -> anyhow::Result<&'static EnvironmentSpec> {
 
 /// Replays every row of the file at `path`: sets its qpos and qvel, and takes one step with its
 /// action.
-///
-/// # Errors
-/// The file lacks what a replay needs, or MuJoCo fails.
 pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> anyhow::Result<Report> {
     let rows = RecordedRows::read(path, spec).hint_of(hint)?;
     let threads = rayon::current_num_threads();
     let share = rows.len().div_ceil(threads);
-    let mut environments =
-        (0..threads).map(|_| sim::make(spec, 0)).collect::<Result<Vec<_>, EnvironmentError>>()?;
-    let errors: Vec<RowError> = environments
-        .par_iter_mut()
-        .enumerate()
-        .flat_map_iter(|(thread, environment)| {
+    let environments: Vec<_> =
+        (0..threads).map(|_| sim::make(spec, 0)).collect::<Result<_, EnvironmentError>>()?;
+    let replayed =
+        environments.into_par_iter().enumerate().flat_map_iter(|(i, mut environment)| {
             let rows = &rows;
-            let own = thread * share..rows.len().min((thread + 1) * share);
-            own.map(move |i| replay(environment, &rows.row(i), rows.goal(i)))
-        })
-        .collect();
-    let report = summarize(spec, &errors);
-    report
+            let own = i * share..rows.len().min((i + 1) * share);
+            own.map(move |i| replay(&mut environment, &rows.row(i), rows.goal(i)))
+        });
+    let errors: Vec<RowError> = replayed.collect();
+    summarize(spec, &errors)
         .with_context(|| format!("{}: no rows with a next observation", path.display()))
         .hint(OTHER_FILE)
 }
@@ -133,12 +136,8 @@ fn replay(environment: &mut Simulation, row: &Row<'_>, goal: Option<&[f64]>) -> 
     environment.set_state(row.qpos, row.qvel);
     let action: Vec<f32> = row.action.iter().map(|&value| value as f32).collect();
     let step = environment.step(&action);
-    let apart = environment
-        .observation()
-        .iter()
-        .zip(row.next_observation)
-        .map(|(ours, theirs)| (ours - theirs).abs());
-    let observation = apart.reduce(f64::max);
+    let compared = environment.observation().iter().zip(row.next_observation);
+    let observation = compared.map(|(ours, theirs)| (ours - theirs).abs()).reduce(f64::max);
     let reward = (step.reward - row.reward).abs();
     let explained = (REWARD_TOLERANCE * row.reward.abs().max(1.0)).max(observation.unwrap_or(0.0));
     let cut_off = row.timeout && !row.terminal;

@@ -1,11 +1,11 @@
-//! A learner that has one job and writes down what an evaluator says; and the evaluator's process.
+//! A learner that has one job and records an evaluator's messages; and the evaluator's process.
 
 use std::process::{Child, Command, ExitStatus};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use candle_core::Device;
-use quad_nn::Weights;
+use quad_nn::{Layout, Weights};
 use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig};
 use quad_protocol::{
     Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot,
@@ -21,52 +21,66 @@ use zenoh::{Session, Wait};
 const PATIENCE: Duration = Duration::from_secs(120);
 const INCARNATION: u64 = 7;
 
-/// What an evaluator has said.
+/// A message of the evaluator.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Heard {
-    /// With its number.
+pub enum Event {
+    /// With the number of the attempt.
     Claim(u64),
+    /// A request for weights.
     Weights,
     Progress,
     Scores(ScoreReport),
+    /// With the reason.
     HandedBack(Option<String>),
 }
 
-/// What becomes of scores, and of claims.
-#[derive(Clone, Copy)]
-pub enum Answer {
-    Recorded,
-    DiskFull,
-    Nothing,
-    /// The learner reads nothing more, as long as this is the answer.
-    Hang,
-    /// No claim is answered.
-    NoClaim,
-    Refused,
-    /// The first time that a job is handed back goes without an answer, as if the learner were too
-    /// busy for it.
-    LostHandBack,
+impl Event {
+    pub fn is_scores(&self) -> bool {
+        matches!(self, Event::Scores(_))
+    }
+
+    pub fn is_handed_back(&self) -> bool {
+        matches!(self, Event::HandedBack(_))
+    }
 }
 
-/// A learner that has one job.
+/// The learner's reaction to scores and claims.
+#[derive(Clone, Copy, PartialEq)]
+pub enum Behavior {
+    Records,
+    DiskFull,
+    /// Leaves scores without an answer.
+    Silent,
+    /// Reads nothing more.
+    Hangs,
+    /// Leaves claims without an answer.
+    IgnoresClaims,
+    Refuses,
+    /// Leaves the first job that is handed back without an answer.
+    LosesHandBack,
+}
+
+struct State {
+    events: Vec<Event>,
+    behavior: Behavior,
+    /// Given out until it is done or handed back.
+    job: Option<Job>,
+}
+
 pub struct Learner {
     pub session: Session,
-    endpoint: String,
-    pub heard: Arc<Mutex<Vec<Heard>>>,
-    answer: Arc<Mutex<Answer>>,
-    /// Given out until it is done or handed back.
-    job: Arc<Mutex<Option<Job>>>,
     pub snapshot: Snapshot,
+    endpoint: String,
+    state: Arc<Mutex<State>>,
 }
 
-/// The file of a small diffusion policy for Hopper with random weights, which takes the best of so
-/// many candidates.
-pub fn file(candidates: u32) -> Vec<u8> {
+/// The file of a small diffusion policy for Hopper with random weights.
+pub fn file() -> Vec<u8> {
     let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[8; 3]), 2, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
-    let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
-    let tensors =
-        policy.tensors(|layout| Weights::initial(layout, &mut generator, &Device::Cpu)).unwrap();
+    let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(2) };
+    let initial = |layout: &Layout| Weights::initial(layout, &mut generator, &Device::Cpu);
+    let tensors = policy.tensors(initial).unwrap();
     let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 10, episodes: 3 };
     Header::new(policy, origin).to_safetensors(&tensors).unwrap()
 }
@@ -97,127 +111,123 @@ fn reply<M: Message>(query: &Query, message: &M) {
     query.reply(query.key_expr().clone(), encode(message).unwrap()).wait().unwrap();
 }
 
-fn answer_scores(query: &Query, answer: &Mutex<Answer>, new: u32) {
-    let now = *answer.lock().unwrap();
-    match now {
-        Answer::Recorded => {
-            reply(query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 })
+fn answer(query: &Query, state: &Mutex<State>, weights: &Snapshot) {
+    let payload = query.payload().map(|payload| payload.to_bytes().into_owned());
+    let payload = payload.unwrap_or_default();
+    let (run, key, incarnation) = (name("run"), query.key_expr().as_str(), INCARNATION);
+    let mut locked = state.lock().unwrap();
+    if key == keys::weights_at(&run, 10) {
+        locked.events.push(Event::Weights);
+        reply(query, &snapshot(b"other weights".to_vec()));
+        reply(query, weights);
+    } else if key == keys::scores(&run) {
+        let report: ScoreReport = decode(&payload).unwrap();
+        let new = report.episodes.len() as u32;
+        locked.events.push(Event::Scores(report));
+        locked.job = None;
+        let refused = |incarnation, reason: &str| ScoreReply::Refused {
+            incarnation,
+            reason: reason.to_owned(),
+        };
+        match locked.behavior {
+            Behavior::Records => {
+                reply(query, &ScoreReply::Recorded { incarnation, new, duplicates: 0 })
+            }
+            Behavior::DiskFull => {
+                // The answer of a learner that is not followed does not count.
+                reply(query, &refused(99, "not mine"));
+                query.reply_err("No space left on device").wait().unwrap();
+            }
+            Behavior::Refuses => reply(query, &refused(incarnation, "the sums differ")),
+            Behavior::Hangs => {
+                drop(locked);
+                while state.lock().unwrap().behavior == Behavior::Hangs {
+                    std::thread::sleep(Duration::from_millis(20));
+                }
+            }
+            _ => {}
         }
-        Answer::DiskFull => {
-            // What a learner says that is not followed does not count, though it comes first.
-            reply(query, &ScoreReply::Refused { incarnation: 99, reason: "not mine".to_owned() });
-            query.reply_err("No space left on device").wait().unwrap();
-        }
-        Answer::Refused => {
-            reply(
-                query,
-                &ScoreReply::Refused {
-                    incarnation: INCARNATION,
-                    reason: "they are of another sum".to_owned(),
-                },
-            );
-        }
-        Answer::Nothing | Answer::NoClaim | Answer::LostHandBack => {}
-        Answer::Hang => {
-            while matches!(*answer.lock().unwrap(), Answer::Hang) {
-                std::thread::sleep(Duration::from_millis(20));
+    } else {
+        match decode(&payload).unwrap() {
+            JobRequest::HandBack { failed, .. } => {
+                locked.events.push(Event::HandedBack(failed));
+                locked.job = None;
+                if locked.behavior == Behavior::LosesHandBack {
+                    locked.behavior = Behavior::Records;
+                } else {
+                    reply(query, &JobReply::HandedBack { incarnation, accepted: true });
+                }
+            }
+            JobRequest::Claim { attempt, .. } => {
+                locked.events.push(Event::Claim(attempt));
+                if locked.behavior != Behavior::IgnoresClaims {
+                    let wait = JobReply::Wait { incarnation, milliseconds: 100 };
+                    reply(query, &locked.job.clone().map_or(wait, JobReply::Job));
+                }
             }
         }
     }
 }
 
 impl Learner {
-    pub async fn start(published: Snapshot) -> Learner {
-        let listen =
-            Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+    pub async fn start(file: Vec<u8>, behavior: Behavior) -> Learner {
+        let any_port = vec!["tcp/127.0.0.1:0".to_owned()];
+        let listen = Endpoints { listen: any_port, ..Endpoints::default() };
         let session = open_session(&listen).await.unwrap();
         let endpoint = reachable_at(&session, &listen).await.unwrap().remove(0);
-        let (heard, answer) =
-            (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(Answer::Recorded)));
-        let learner =
-            Learner { session, endpoint, heard, answer, job: Arc::default(), snapshot: published };
-        let (heard, job, answer, weights) = (
-            learner.heard.clone(),
-            learner.job.clone(),
-            learner.answer.clone(),
-            learner.snapshot.clone(),
-        );
-        let callback = move |query: Query| {
-            let message =
-                query.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default();
-            let key = query.key_expr().as_str().to_owned();
-            let mut heard = heard.lock().unwrap();
-            if key == keys::weights_at(&name("run"), 10) {
-                heard.push(Heard::Weights);
-                reply(&query, &snapshot(b"other weights".to_vec()));
-                reply(&query, &weights);
-            } else if key == keys::scores(&name("run")) {
-                let report: ScoreReport = decode(&message).unwrap();
-                let new = report.episodes.len() as u32;
-                heard.push(Heard::Scores(report));
-                *job.lock().unwrap() = None;
-                drop(heard);
-                answer_scores(&query, &answer, new);
-            } else {
-                match decode(&message).unwrap() {
-                    JobRequest::HandBack { failed, .. } => {
-                        heard.push(Heard::HandedBack(failed));
-                        *job.lock().unwrap() = None;
-                        let mut answer = answer.lock().unwrap();
-                        if matches!(*answer, Answer::LostHandBack) {
-                            *answer = Answer::Recorded;
-                        } else {
-                            reply(
-                                &query,
-                                &JobReply::HandedBack { incarnation: INCARNATION, accepted: true },
-                            );
-                        }
-                    }
-                    JobRequest::Claim { attempt, .. } => {
-                        heard.push(Heard::Claim(attempt));
-                        let job = job.lock().unwrap().clone().map(JobReply::Job);
-                        let wait = JobReply::Wait { incarnation: INCARNATION, milliseconds: 100 };
-                        if !matches!(*answer.lock().unwrap(), Answer::NoClaim) {
-                            reply(&query, &job.unwrap_or(wait));
-                        }
-                    }
-                }
-            }
-        };
-        let (told, progress) = (learner.heard.clone(), keys::all_progress(&name("run")));
-        learner
-            .session
-            .declare_queryable("quad/run/**")
-            .callback(callback)
-            .background()
-            .await
-            .unwrap();
-        let told = move |_| told.lock().unwrap().push(Heard::Progress);
-        learner.session.declare_subscriber(progress).callback(told).background().await.unwrap();
-        learner
+        let state = Arc::new(Mutex::new(State { events: Vec::new(), behavior, job: None }));
+        let snapshot = snapshot(file);
+        let (shared, weights) = (state.clone(), snapshot.clone());
+        let callback = move |query: Query| answer(&query, &shared, &weights);
+        let queryable = session.declare_queryable("quad/run/**").callback(callback);
+        queryable.background().await.unwrap();
+        let shared = state.clone();
+        let callback = move |_| shared.lock().unwrap().events.push(Event::Progress);
+        let progress = keys::all_progress(&name("run"));
+        let subscriber = session.declare_subscriber(progress).callback(callback);
+        subscriber.background().await.unwrap();
+        Learner { session, snapshot, endpoint, state }
     }
 
-    pub fn answer(&self, answer: Answer) {
-        *self.answer.lock().unwrap() = answer;
+    /// A learner that gives out its job, beside an older dead one, with an evaluator.
+    pub async fn with_job(
+        file: Vec<u8>,
+        behavior: Behavior,
+    ) -> (Learner, Evaluator, impl Sized + use<>) {
+        let learner = Learner::start(file, behavior).await;
+        learner.give(job(&learner.snapshot));
+        let (evaluator, token) = learner.evaluator().await;
+        let tokens = (token, learner.announce_dead().await);
+        (learner, evaluator, tokens)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap()
+    }
+
+    pub fn behave(&self, behavior: Behavior) {
+        self.lock().behavior = behavior;
     }
 
     pub fn give(&self, job: Job) {
-        *self.job.lock().unwrap() = Some(job);
+        self.lock().job = Some(job);
     }
 
-    /// Starts an evaluator and announces the learner; with it, one that is dead and was started
-    /// before.
+    pub fn events(&self) -> Vec<Event> {
+        self.lock().events.clone()
+    }
+
+    /// Starts an evaluator and announces the learner.
     pub async fn evaluator(&self) -> (Evaluator, impl Sized + use<>) {
-        let (evaluator, token) = self.only_evaluator().await;
-        (evaluator, (token, self.announce(INCARNATION - 1).await))
-    }
-
-    /// Starts an evaluator and announces the learner alone.
-    pub async fn only_evaluator(&self) -> (Evaluator, impl Sized + use<>) {
         let mut command = Command::new(env!("CARGO_BIN_EXE_evaluator"));
         command.args(["serve", "--name", "one", "--connect", &self.endpoint]);
         let evaluator = Evaluator(command.spawn().unwrap());
         (evaluator, self.announce(INCARNATION).await)
+    }
+
+    /// Announces an older process of the learner, which is dead.
+    pub async fn announce_dead(&self) -> LivelinessToken {
+        self.announce(INCARNATION - 1).await
     }
 
     async fn announce(&self, incarnation: u64) -> LivelinessToken {
@@ -225,44 +235,48 @@ impl Learner {
         self.session.liveliness().declare_token(key).await.unwrap()
     }
 
-    pub async fn wait_for<T>(&self, what: impl Fn(&[Heard]) -> Option<T>) -> T {
+    pub async fn wait_for<T>(&self, find: impl Fn(&[Event]) -> Option<T>) -> T {
         let begin = Instant::now();
         loop {
-            if let Some(found) = what(&self.heard.lock().unwrap()) {
+            let events = self.events();
+            if let Some(found) = find(&events) {
                 return found;
             }
-            assert!(begin.elapsed() < PATIENCE, "{:?}", self.heard.lock().unwrap());
+            assert!(begin.elapsed() < PATIENCE, "{events:?}");
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
 
     pub async fn wait_for_scores(&self, deliveries: usize) -> ScoreReport {
-        let nth = |heard: &[Heard]| reports(heard).into_iter().nth(deliveries - 1);
-        self.wait_for(nth).await
+        self.wait_for(|events| reports(events).into_iter().nth(deliveries - 1)).await
     }
 
-    pub fn count(&self, what: impl Fn(&Heard) -> bool) -> usize {
-        self.heard.lock().unwrap().iter().filter(|heard| what(heard)).count()
+    /// Waits for a job that is handed back, and returns the reason.
+    pub async fn wait_for_hand_back(&self) -> Option<String> {
+        let find = |event: &Event| match event {
+            Event::HandedBack(reason) => Some(reason.clone()),
+            _ => None,
+        };
+        self.wait_for(|events| events.iter().find_map(find)).await
+    }
+
+    pub fn count(&self, is_counted: impl Fn(&Event) -> bool) -> usize {
+        self.events().iter().filter(|event| is_counted(event)).count()
     }
 }
 
-pub fn reports(heard: &[Heard]) -> Vec<ScoreReport> {
-    let report =
-        |heard: &Heard| if let Heard::Scores(report) = heard { Some(report.clone()) } else { None };
-    heard.iter().filter_map(report).collect()
-}
-
-/// Why a job was handed back first, if one was.
-pub fn handed_back(heard: &[Heard]) -> Option<Option<String>> {
-    heard.iter().find_map(|heard| {
-        if let Heard::HandedBack(failed) = heard { Some(failed.clone()) } else { None }
-    })
+pub fn reports(events: &[Event]) -> Vec<ScoreReport> {
+    let report = |event: &Event| match event {
+        Event::Scores(report) => Some(report.clone()),
+        _ => None,
+    };
+    events.iter().filter_map(report).collect()
 }
 
 pub struct Evaluator(Child);
 
 impl Evaluator {
-    /// Tells it to leave. If that takes longer than nine seconds, it ends itself with an error.
+    /// Sends SIGTERM. After nine seconds the evaluator ends itself with an error.
     pub fn leave(mut self) -> ExitStatus {
         // SAFETY: sends a signal to a process that this one has started and not waited for.
         assert_eq!(unsafe { libc::kill(self.0.id() as i32, libc::SIGTERM) }, 0);

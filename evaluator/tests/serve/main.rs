@@ -1,148 +1,123 @@
-//! What `evaluator serve` promises a learner: which scores it delivers, what it does until they are
-//! saved, and how it leaves. The learner is made up (`learner`); the evaluator is the program, and
-//! Zenoh is real.
+//! The promises of `evaluator serve` to a learner: the scores that it delivers, until they are
+//! saved, and its leave. The learner is a fake (`learner`), the evaluator and Zenoh are real.
 #![allow(clippy::unwrap_used)]
 
 mod learner;
 
-use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations};
+use quad_evaluator::sim::{EnvironmentError, Environments, EpisodeOutcome, Rollout, Simulations};
 use quad_policy::{Precision, load_policy};
 use quad_protocol::{EpisodeScore, Job, ScoreReport, encode, keys};
 use zenoh::qos::CongestionControl;
 
-use learner::{Answer, Heard, Learner, file, handed_back, job, name, reports, snapshot};
+use learner::{Behavior, Event, Learner, file, job, name, reports};
 
 /// The scores that `job` must have, to the last bit.
-fn expected(job: &Job, file: &[u8]) -> Vec<EpisodeScore> {
-    let policy = load_policy(file, Precision::F32).unwrap();
+fn expected(job: &Job) -> Vec<EpisodeScore> {
+    let policy = load_policy(&file(), Precision::F32).unwrap();
     let make = || Simulations.make(&job.environment, job.environment_seed);
     let mut rollout = Rollout::new(make, (11, 3), &job.seeds, |seed| policy.begin(seed)).unwrap();
     while !rollout.is_done() {
-        rollout
-            .step(|observations, states, actions| {
-                policy.act(observations, states, actions).unwrap();
-                Ok::<_, EnvironmentError>(())
-            })
-            .unwrap();
+        let stepped = rollout.step(|observations, states, actions| {
+            policy.act(observations, states, actions).unwrap();
+            Ok::<_, EnvironmentError>(())
+        });
+        stepped.unwrap();
     }
-    let outcomes = rollout.into_outcomes().into_iter();
-    outcomes
-        .map(|outcome| EpisodeScore {
-            seed: outcome.seed,
-            episode_return: outcome.episode_return,
-            length: outcome.length,
-            score: outcome.score,
-        })
-        .collect()
+    let score = |outcome| {
+        let EpisodeOutcome { seed, episode_return, length, score, .. } = outcome;
+        EpisodeScore { seed, episode_return, length, score }
+    };
+    rollout.into_outcomes().into_iter().map(score).collect()
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
     for published in [false, true] {
-        let learner = Learner::start(snapshot(file(2))).await;
+        let learner = Learner::start(file(), Behavior::Records).await;
         let job = job(&learner.snapshot);
-        let (evaluator, _tokens) = learner.evaluator().await;
-        // At first the evaluator may follow the learner that is dead, which was started first.
-        learner.wait_for(|heard| (heard.len() >= 4).then_some(())).await;
+        let (evaluator, _token) = learner.evaluator().await;
+        let _dead = learner.announce_dead().await;
+        // At first the evaluator may follow the dead learner, which was started first.
+        learner.wait_for(|events| (events.len() >= 4).then_some(())).await;
         if published {
-            // Not to be dropped, and on its way before the job is.
-            let put = learner
-                .session
-                .put(keys::weights(&name("run")), encode(&learner.snapshot).unwrap());
+            // Sent before the job, and not to be dropped.
+            let weights = encode(&learner.snapshot).unwrap();
+            let put = learner.session.put(keys::weights(&name("run")), weights);
             put.congestion_control(CongestionControl::Block).await.unwrap();
         }
         learner.give(job.clone());
-        let report = learner.wait_for_scores(1).await;
         let precision = name(&Precision::F32.arithmetic());
-        assert_eq!(
-            report,
-            ScoreReport::of(&job, name("one"), precision, expected(&job, &learner.snapshot.file))
-        );
-        assert_eq!(learner.count(|heard| *heard == Heard::Weights), usize::from(!published));
+        let expected = ScoreReport::of(&job, name("one"), precision, expected(&job));
+        assert_eq!(learner.wait_for_scores(1).await, expected);
+        assert_eq!(learner.count(|event| *event == Event::Weights), usize::from(!published));
         assert!(evaluator.leave().success());
-        assert_eq!(learner.count(|heard| matches!(heard, Heard::HandedBack(_))), 0);
+        assert_eq!(learner.count(Event::is_handed_back), 0);
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_claim_without_an_answer_is_the_same_claim_again() {
-    let learner = Learner::start(snapshot(file(2))).await;
-    learner.answer(Answer::NoClaim);
-    let (_evaluator, _token) = learner.only_evaluator().await;
-    let claims = |heard: &[Heard]| -> Vec<u64> {
-        heard
-            .iter()
-            .filter_map(|heard| if let Heard::Claim(number) = heard { Some(*number) } else { None })
-            .collect()
+async fn a_claim_without_an_answer_is_repeated() {
+    let learner = Learner::start(file(), Behavior::IgnoresClaims).await;
+    let (_evaluator, _token) = learner.evaluator().await;
+    let claims = |events: &[Event]| -> Vec<u64> {
+        let number = |event: &Event| match event {
+            Event::Claim(number) => Some(*number),
+            _ => None,
+        };
+        events.iter().filter_map(number).collect()
     };
     let first =
-        learner.wait_for(|heard| Some(claims(heard)).filter(|claims| claims.len() >= 3)).await;
+        learner.wait_for(|events| Some(claims(events)).filter(|claims| claims.len() >= 3)).await;
     assert!(first.iter().all(|number| *number == first[0]), "{first:?}");
-    learner.answer(Answer::Recorded);
-    learner
-        .wait_for(|heard| claims(heard).iter().any(|number| *number != first[0]).then_some(()))
-        .await;
+    learner.behave(Behavior::Records);
+    let other = |events: &[Event]| claims(events).into_iter().find(|number| *number != first[0]);
+    learner.wait_for(other).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn scores_are_sent_again_until_the_learner_has_saved_them() {
-    let learner = Learner::start(snapshot(file(2))).await;
-    learner.answer(Answer::DiskFull);
-    learner.give(job(&learner.snapshot));
-    let (_evaluator, _tokens) = learner.evaluator().await;
+async fn scores_are_sent_until_the_learner_has_saved_them() {
+    let (learner, _evaluator, _token) = Learner::with_job(file(), Behavior::DiskFull).await;
     let report = learner.wait_for_scores(3).await;
-    learner.answer(Answer::Recorded);
-    learner.wait_for(|heard| matches!(heard.last(), Some(Heard::Claim(_))).then_some(())).await;
-    let heard = learner.heard.lock().unwrap();
-    assert!(reports(&heard).len() > 3 && reports(&heard).iter().all(|again| *again == report));
-    let is_score = |heard: &Heard| matches!(heard, Heard::Scores(_));
-    let (first, last) =
-        (heard.iter().position(is_score).unwrap(), heard.iter().rposition(is_score).unwrap());
-    assert!(heard[first..last].iter().all(is_score), "nothing new is claimed meanwhile: {heard:?}");
+    learner.behave(Behavior::Records);
+    let claims = |events: &[Event]| matches!(events.last(), Some(Event::Claim(_))).then_some(());
+    learner.wait_for(claims).await;
+    let events = learner.events();
+    assert!(reports(&events).len() > 3 && reports(&events).iter().all(|again| *again == report));
+    let first = events.iter().position(Event::is_scores).unwrap();
+    let last = events.iter().rposition(Event::is_scores).unwrap();
+    let deliveries = &events[first..last];
+    assert!(deliveries.iter().all(Event::is_scores), "nothing is claimed meanwhile: {events:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_evaluator_that_leaves_hands_its_job_back_unless_its_scores_may_be_saved() {
-    for (answer, goes_back) in [(Answer::DiskFull, false), (Answer::Nothing, true)] {
-        let learner = Learner::start(snapshot(file(2))).await;
-        learner.answer(answer);
-        learner.give(job(&learner.snapshot));
-        let (evaluator, _tokens) = learner.evaluator().await;
+async fn a_leaving_evaluator_hands_its_job_back_unless_its_scores_may_be_saved() {
+    for (behavior, hands_back) in [(Behavior::DiskFull, false), (Behavior::Silent, true)] {
+        let (learner, evaluator, _token) = Learner::with_job(file(), behavior).await;
         learner.wait_for_scores(1).await;
         assert!(evaluator.leave().success());
-        if goes_back {
-            // On a busy machine it is heard only after the evaluator has gone.
-            learner.wait_for(handed_back).await;
+        if hands_back {
+            // On a busy machine it arrives only after the evaluator has gone.
+            learner.wait_for_hand_back().await;
         }
-        assert_eq!(
-            learner.count(|heard| matches!(heard, Heard::HandedBack(_))),
-            usize::from(goes_back)
-        );
-        assert!(
-            learner.count(|heard| matches!(heard, Heard::Scores(_))) > 1,
-            "they are sent again"
-        );
+        assert_eq!(learner.count(Event::is_handed_back), usize::from(hands_back));
+        assert!(learner.count(Event::is_scores) > 1, "they are sent again");
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
-    let learner = Learner::start(snapshot(file(2))).await;
-    learner.answer(Answer::Hang);
-    learner.give(job(&learner.snapshot));
-    let (evaluator, _tokens) = learner.evaluator().await;
+    let (learner, evaluator, _token) = Learner::with_job(file(), Behavior::Hangs).await;
     learner.wait_for_scores(1).await;
     assert!(evaluator.leave().success());
-    // A learner that hangs has said nothing of the scores. When it goes on, it finds that the job
-    // is handed back.
-    learner.answer(Answer::Nothing);
-    assert_eq!(learner.wait_for(handed_back).await, None);
+    // The learner has not answered the scores, so it finds the job handed back.
+    learner.behave(Behavior::Silent);
+    assert_eq!(learner.wait_for_hand_back().await, None);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_job_that_fails_is_handed_back_with_the_reason() {
-    let learner = Learner::start(snapshot(b"no tensors".to_vec())).await;
-    let (_evaluator, _tokens) = learner.evaluator().await;
+    let learner = Learner::start(b"no tensors".to_vec(), Behavior::Records).await;
+    let (_evaluator, _token) = learner.evaluator().await;
     let good = job(&learner.snapshot);
     for (job, reason) in [
         (Job { environment: "moon".to_owned(), ..good.clone() }, "moon"),
@@ -150,50 +125,34 @@ async fn a_job_that_fails_is_handed_back_with_the_reason() {
         (good, "safetensors"),
     ] {
         learner.give(job);
-        let told = |heard: &[Heard]| {
-            heard
-                .iter()
-                .any(
-                    |heard| matches!(heard, Heard::HandedBack(Some(text)) if text.contains(reason)),
-                )
-                .then_some(())
-        };
-        learner.wait_for(told).await;
+        let has_reason =
+            |event: &Event| matches!(event, Event::HandedBack(Some(text)) if text.contains(reason));
+        learner.wait_for(|events| events.iter().any(has_reason).then_some(())).await;
     }
 }
 
-/// The learner would else believe for the whole lease that the evaluator is at it.
+/// Otherwise the learner would wait for it until the lease ends.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_job_whose_scores_are_refused_is_handed_back() {
-    let learner = Learner::start(snapshot(file(2))).await;
-    learner.answer(Answer::Refused);
-    learner.give(job(&learner.snapshot));
-    let (_evaluator, _tokens) = learner.evaluator().await;
-    let reason = learner.wait_for(handed_back).await;
-    assert_eq!(reason, Some("it refused the scores: they are of another sum".to_owned()));
-    assert_eq!(
-        learner.count(|heard| matches!(heard, Heard::Scores(_))),
-        1,
-        "they are not sent again"
-    );
+    let (learner, _evaluator, _token) = Learner::with_job(file(), Behavior::Refuses).await;
+    let reason = learner.wait_for_hand_back().await;
+    assert_eq!(reason, Some("it refused the scores: the sums differ".to_owned()));
+    assert_eq!(learner.count(Event::is_scores), 1, "they are not sent again");
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_job_is_handed_back_until_the_learner_answers_and_nothing_is_claimed_before() {
-    let learner = Learner::start(snapshot(b"no tensors".to_vec())).await;
-    learner.answer(Answer::LostHandBack);
-    let (_evaluator, _token) = learner.only_evaluator().await;
+    let learner = Learner::start(b"no tensors".to_vec(), Behavior::LosesHandBack).await;
+    let (_evaluator, _token) = learner.evaluator().await;
     learner.give(job(&learner.snapshot));
-    learner
-        .wait_for(|heard| {
-            (handed_back(heard).is_some() && matches!(heard.last(), Some(Heard::Claim(_))))
-                .then_some(())
-        })
-        .await;
-    let heard = learner.heard.lock().unwrap();
-    let is_back = |heard: &Heard| matches!(heard, Heard::HandedBack(_));
-    let (first, last) =
-        (heard.iter().position(is_back).unwrap(), heard.iter().rposition(is_back).unwrap());
-    assert!(first < last, "it is handed back once more: {heard:?}");
-    assert!(!heard[first..last].iter().any(|heard| matches!(heard, Heard::Claim(_))), "{heard:?}");
+    let claims_again = |events: &[Event]| {
+        let first = events.iter().position(Event::is_handed_back)?;
+        matches!(events.last()?, Event::Claim(_)).then_some(first)
+    };
+    let first = learner.wait_for(claims_again).await;
+    let events = learner.events();
+    let last = events.iter().rposition(Event::is_handed_back).unwrap();
+    assert!(first < last, "it is handed back twice: {events:?}");
+    let between = &events[first..last];
+    assert!(!between.iter().any(|event| matches!(event, Event::Claim(_))), "{events:?}");
 }

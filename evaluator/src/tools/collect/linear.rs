@@ -3,23 +3,19 @@
 /// a = M · (s - mean) / deviation. The environment clips it.
 #[derive(Clone, Debug)]
 pub struct LinearPolicy {
-    /// M, action_dim × observation_dim.
+    /// M [action_dim, observation_dim].
     pub weights: Vec<f64>,
-    /// Normalizes observations.
     pub normalizer: Normalizer,
 }
 
 impl LinearPolicy {
-    /// The policy that never moves.
     pub fn zero(observation_dim: usize, action_dim: usize) -> Self {
-        let normalizer = Normalizer {
-            mean: vec![0.0; observation_dim],
-            inverse_deviation: vec![1.0; observation_dim],
-        };
-        Self { weights: vec![0.0; action_dim * observation_dim], normalizer }
+        let (mean, inverse_deviation) = (vec![0.0; observation_dim], vec![1.0; observation_dim]);
+        let weights = vec![0.0; action_dim * observation_dim];
+        Self { weights, normalizer: Normalizer { mean, inverse_deviation } }
     }
 
-    /// Fills in `action` for `observation`.
+    /// Writes `action`.
     pub fn act(&self, observation: &[f64], action: &mut [f32]) {
         let Normalizer { mean, inverse_deviation } = &self.normalizer;
         for (value, row) in action.iter_mut().zip(self.weights.chunks_exact(observation.len())) {
@@ -49,19 +45,11 @@ pub struct Moments {
 }
 
 impl Moments {
-    /// Statistics of no observation.
     pub fn new(observation_dim: usize) -> Self {
-        Self { count: 0.0, mean: vec![0.0; observation_dim], squares: vec![0.0; observation_dim] }
+        let zero = vec![0.0; observation_dim];
+        Self { count: 0.0, mean: zero.clone(), squares: zero }
     }
 
-    /// Forgets all observations.
-    pub fn clear(&mut self) {
-        self.count = 0.0;
-        self.mean.fill(0.0);
-        self.squares.fill(0.0);
-    }
-
-    /// Adds one observation.
     pub fn push(&mut self, observation: &[f64]) {
         self.count += 1.0;
         for (i, value) in observation.iter().enumerate() {
@@ -71,7 +59,6 @@ impl Moments {
         }
     }
 
-    /// Adds all observations of `other`.
     pub fn merge(&mut self, other: &Self) {
         let count = self.count + other.count;
         if other.count == 0.0 {
@@ -85,16 +72,14 @@ impl Moments {
         self.count = count;
     }
 
-    /// The normalization of these observations. A value that never changes is only centered.
+    /// A value that never changes is only centered.
     pub fn normalizer(&self) -> Normalizer {
         let inverse = |squares: &f64| {
             let deviation = (squares / (self.count - 1.0).max(1.0)).sqrt();
             if deviation > 1e-7 { 1.0 / deviation } else { 1.0 }
         };
-        Normalizer {
-            mean: self.mean.clone(),
-            inverse_deviation: self.squares.iter().map(inverse).collect(),
-        }
+        let inverse_deviation = self.squares.iter().map(inverse).collect();
+        Normalizer { mean: self.mean.clone(), inverse_deviation }
     }
 }
 
@@ -103,16 +88,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn moments_merge_to_those_of_all_observations() {
+    fn merged_moments_are_those_of_all_observations() {
         let values = [[1.0, 5.0], [2.0, 5.0], [4.0, 5.0], [9.0, 5.0]];
-        let (mut all, mut merged) = (Moments::new(2), Moments::new(2));
-        values.iter().for_each(|value| all.push(value));
-        for half in [&values[..1], &values[1..], &[]] {
+        let moments = |values: &[[f64; 2]]| {
             let mut moments = Moments::new(2);
-            half.iter().for_each(|value| moments.push(value));
-            merged.merge(&moments);
-        }
-        for Normalizer { mean, inverse_deviation } in [all.normalizer(), merged.normalizer()] {
+            values.iter().for_each(|value| moments.push(value));
+            moments
+        };
+        let mut merged = moments(&values[..1]);
+        merged.merge(&moments(&values[1..]));
+        merged.merge(&moments(&[]));
+        for moments in [moments(&values), merged] {
+            let Normalizer { mean, inverse_deviation } = moments.normalizer();
             assert_eq!(mean, [4.0, 5.0]);
             // Variance 38 / 3; the second value never changed.
             assert!((inverse_deviation[0] - (3.0_f64 / 38.0).sqrt()).abs() < 1e-12);

@@ -9,6 +9,7 @@ mod linear;
 mod record;
 mod search;
 
+use std::fmt;
 use std::path::Path;
 use std::time::Instant;
 
@@ -23,38 +24,45 @@ const OUT: &str = "--out names a file in a folder that you may write in";
 const MUJOCO: &str =
     "deploy/setup.sh installs the version of MuJoCo that this program was built for";
 
-/// The streams of the file's seed: one for recording, the next ones for the searches.
+/// Stream of the file's seed for the recording. The next ones are for the searches.
 const RECORD_STREAM: u64 = 0;
 
-/// What was recorded.
 #[derive(Debug)]
 pub struct Summary {
-    /// Rows in the file.
     pub transitions: usize,
-    /// Episodes in the file.
     pub episodes: usize,
-    /// Mean over the episodes of D4RL's normalized score.
+    /// Mean of D4RL's normalized score over the episodes.
     pub mean_score: f64,
     /// The 50th, 90th and 99th percentile, and the maximum, of the normalized scores.
     pub score_percentiles: [f64; 4],
-    /// Policies that act in the episodes.
     pub policies: usize,
     /// Wall-clock time of the command.
     pub seconds: f64,
 }
 
-/// The environment of that name, if this command can record in it.
-///
-/// # Errors
-/// It cannot; the text lists the possible environments.
+impl fmt::Display for Summary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { transitions, episodes, mean_score, policies, seconds, .. } = self;
+        let [p50, p90, p99, max] = self.score_percentiles;
+        write!(
+            f,
+            "{transitions} transitions, {episodes} episodes of {policies} policies, in {seconds:.0} s\n\
+             normalized score: mean {mean_score:.1}, median {p50:.1}, p90 {p90:.1}, p99 {p99:.1}, max {max:.1}"
+        )
+    }
+}
+
+/// Finds an environment in which this command can record; an error lists them.
 pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
-    let found = find(name).map_err(|_| format!("there is no environment `{name}`"));
-    let found =
-        found.and_then(|spec| recipe(spec).map(|_| spec).map_err(|error| error.to_string()));
+    let problem = match find(name) {
+        Err(_) => format!("there is no environment `{name}`"),
+        Ok(spec) => match recipe(spec) {
+            Ok(_) => return Ok(spec),
+            Err(error) => error.to_string(),
+        },
+    };
     let possible = all().iter().filter(|spec| recipe(spec).is_ok()).map(|spec| spec.name.as_str());
-    found.map_err(|error| {
-        format!("{error}; what can be recorded is {}", possible.collect::<Vec<_>>().join(", "))
-    })
+    Err(format!("{problem}; what can be recorded is {}", Vec::from_iter(possible).join(", ")))
 }
 
 fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {
@@ -65,9 +73,6 @@ fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {
 }
 
 /// Trains, then records at least `transitions` transitions, in whole episodes, to `path`.
-///
-/// # Errors
-/// The environment has no recipe, MuJoCo fails, or the file cannot be written.
 pub fn collect(
     spec: &'static EnvironmentSpec,
     path: &Path,
@@ -80,17 +85,11 @@ pub fn collect(
 
     let random = |index| stream(seed, RECORD_STREAM + 1 + index);
     let policies = search::train(spec, recipe, transitions, random).hint(MUJOCO)?;
-    let mut scores = record::record(
-        spec,
-        recipe,
-        &policies,
-        transitions,
-        stream(seed, RECORD_STREAM),
-        &mut writer,
-    )?;
+    let random = stream(seed, RECORD_STREAM);
+    let mut scores = record::record(spec, recipe, &policies, transitions, random, &mut writer)?;
     let rows = writer.rows();
-    let (algorithm, iteration) =
-        ("augmented random search, all iterations, with action noise", policies.len() as i64 - 1);
+    let algorithm = "augmented random search, all iterations, with action noise";
+    let iteration = policies.len() as i64 - 1;
     writer.finish(&Metadata { algorithm, iteration, seed }).hint(OUT)?;
 
     scores.sort_by(f64::total_cmp);

@@ -2,28 +2,27 @@
 
 use quad_dataset::{D4rlWriter, DatasetError, EnvironmentSpec, Recipe, Row};
 use quad_runtime::{Hint, ProgressBar};
-use rand::{Rng, SeedableRng};
+use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 use super::linear::LinearPolicy;
-use super::{MUJOCO, OUT};
+use super::{MUJOCO, OUT, stream};
 use crate::sim::{self, EnvironmentError, Simulation, Step};
 
-/// Each episode adds Gaussian noise to its actions (which span ±1). Its standard deviation is drawn
-/// uniformly from this range: enough to show the effects of other actions in a state, up to more
-/// than most gaits survive.
+/// Range of the standard deviation of an episode's Gaussian action noise (actions span ±1): enough
+/// to show the effects of other actions in a state, up to more than most gaits survive.
 const NOISE: std::ops::Range<f64> = 0.1..0.5;
 
-/// Episodes run at a time, in parallel.
+/// Episodes that run in parallel.
 const ROUND: usize = 32;
 
 /// After simulating this many times the wanted transitions, the recorder takes any episode: a
 /// search that never got good has none for the upper bands.
 const PATIENCE: usize = 4;
 
-/// The stream of an episode's seed for the noise of actions.
+/// Stream of an episode's seed for the noise of actions.
 const NOISE_STREAM: u64 = 3;
 
 /// Records whole episodes, each of a policy drawn from `policies`, until there are `transitions`
@@ -36,8 +35,7 @@ pub fn record(
     mut random: ChaCha8Rng,
     writer: &mut D4rlWriter,
 ) -> anyhow::Result<Vec<f64>> {
-    let recorders =
-        (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, EnvironmentError>>();
+    let recorders = (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, _>>();
     let mut recorders = recorders.hint(MUJOCO)?;
     let mixture = &recipe.mixture;
     let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
@@ -49,16 +47,12 @@ pub fn record(
         // An episode beyond the end of the highest unfilled band is useless.
         let patient = simulated <= PATIENCE * transitions;
         let highest = room.iter().rposition(|&room| room > 0.0).filter(|_| patient);
-        let ceiling =
-            highest.and_then(|band| mixture.get(band + 1)).map_or(f64::INFINITY, |&(from, _)| from);
-        let tasks: Vec<(&LinearPolicy, u64)> = (0..ROUND)
-            .map(|_| (&policies[random.random_range(0..policies.len())], random.random()))
-            .collect();
-        recorders
-            .par_iter_mut()
-            .zip(tasks)
-            .with_max_len(1)
-            .for_each(|(recorder, (policy, seed))| recorder.run(policy, seed, ceiling));
+        let next = highest.and_then(|band| mixture.get(band + 1));
+        let ceiling = next.map_or(f64::INFINITY, |&(from, _)| from);
+        let draw = |_| (&policies[random.random_range(0..policies.len())], random.random());
+        let tasks: Vec<(&LinearPolicy, u64)> = (0..ROUND).map(draw).collect();
+        let running = recorders.par_iter_mut().zip(tasks).with_max_len(1);
+        running.for_each(|(recorder, (policy, seed))| recorder.run(policy, seed, ceiling));
         for recorder in &recorders {
             simulated += recorder.steps.len();
             let score = spec.normalized_score(recorder.episode_return);
@@ -80,12 +74,13 @@ pub fn record(
 struct Recorder {
     spec: &'static EnvironmentSpec,
     environment: Simulation,
-    /// (steps + 1) × observation_dim, also the next two fields: from the state before the first
-    /// step to that after the last.
+    /// [steps + 1, observation_dim], from the initial state to the last
     observations: Vec<f64>,
+    /// [steps + 1, qpos_dim]
     qpos: Vec<f64>,
+    /// [steps + 1, qvel_dim]
     qvel: Vec<f64>,
-    /// steps × action_dim, as they were applied.
+    /// [steps, action_dim], clipped
     actions: Vec<f64>,
     steps: Vec<Step>,
     episode_return: f64,
@@ -112,8 +107,7 @@ impl Recorder {
         }
         self.steps.clear();
         self.episode_return = 0.0;
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        random.set_stream(NOISE_STREAM);
+        let mut random = stream(seed, NOISE_STREAM);
         let deviation = random.random_range(NOISE);
         let mut action = vec![0.0; self.spec.action_dim];
         self.environment.reset(seed);
@@ -129,10 +123,7 @@ impl Recorder {
             self.steps.push(step);
             self.episode_return += step.reward;
             self.keep_state();
-            if step.terminated
-                || step.truncated
-                || self.spec.normalized_score(self.episode_return) > ceiling
-            {
+            if self.ended() || self.spec.normalized_score(self.episode_return) > ceiling {
                 return;
             }
         }

@@ -27,9 +27,9 @@ const STEP_SIZE: f64 = 0.02;
 /// Subtracted from each step's reward.
 const ALIVE_BONUS: f64 = 1.0;
 
-/// The searches take no more steps for more transitions: with these most of them move well, after a
-/// minute on two cores.
-const MOST_TRANSITIONS: u64 = 100_000;
+/// Transitions beyond which the searches take no more steps: after a minute on two cores, most of
+/// them move well.
+const MAX_TRANSITIONS: u64 = 100_000;
 
 /// Trains for as many steps as the recipe has for `transitions`. Returns the policies of all
 /// iterations; `random` makes a generator for each search.
@@ -41,23 +41,26 @@ pub fn train(
 ) -> Result<Vec<LinearPolicy>, EnvironmentError> {
     let mut policies = Vec::new();
     let progress = ProgressBar::of("steps of training");
-    let steps = recipe.steps_per_transition * (transitions as u64).min(MOST_TRANSITIONS);
-    let of_each = steps / recipe.searches;
-    progress.start(0, recipe.searches * of_each);
-    for index in 0..recipe.searches {
+    let searches = recipe.searches;
+    let steps = recipe.steps_per_transition * (transitions as u64).min(MAX_TRANSITIONS) / searches;
+    progress.start(0, searches * steps);
+    for index in 0..searches {
         let mut search = Search::new(spec, random(index))?;
-        search.run(of_each, |steps| progress.advance(index * of_each + steps));
+        while search.steps < steps {
+            search.iterate();
+            progress.advance(index * steps + search.steps);
+        }
         let score = spec.normalized_score(search.recent_return());
-        let steps = search.environment_steps;
-        let number = format!("search {} of {}", index + 1, recipe.searches);
-        progress
-            .say(&format!("training, {number}: normalized score {score:.1} after {steps} steps"));
+        progress.say(&format!(
+            "training, search {} of {searches}: normalized score {score:.1} after {} steps",
+            index + 1,
+            search.steps
+        ));
         policies.extend(search.policies);
     }
     Ok(policies)
 }
 
-/// A search and its policies so far.
 struct Search {
     policy: LinearPolicy,
     /// The policies of all iterations; the first never moves.
@@ -67,7 +70,7 @@ struct Search {
     moments: Moments,
     random: ChaCha8Rng,
     trials: Vec<Trial>,
-    environment_steps: u64,
+    steps: u64,
 }
 
 /// One perturbed policy and its environment.
@@ -82,39 +85,23 @@ struct Trial {
 }
 
 impl Search {
-    /// Starts from the policy that never moves.
     fn new(spec: &'static EnvironmentSpec, random: ChaCha8Rng) -> Result<Self, EnvironmentError> {
         let policy = LinearPolicy::zero(spec.observation_dim, spec.action_dim);
+        let moments = Moments::new(spec.observation_dim);
         let trial = |_| {
             Ok(Trial {
                 environment: sim::make(spec, 0)?,
                 policy: policy.clone(),
                 action: vec![0.0; spec.action_dim],
-                moments: Moments::new(spec.observation_dim),
+                moments: moments.clone(),
                 shaped_return: 0.0,
                 episode_return: 0.0,
                 steps: 0,
             })
         };
         let trials = (0..2 * DIRECTIONS).map(trial).collect::<Result<_, EnvironmentError>>()?;
-        Ok(Self {
-            policies: vec![policy.clone()],
-            returns: Vec::new(),
-            policy,
-            moments: Moments::new(spec.observation_dim),
-            random,
-            trials,
-            environment_steps: 0,
-        })
-    }
-
-    /// Iterates until it has taken `environment_steps`, to the end of the last iteration; calls
-    /// `advance` with the number taken.
-    fn run(&mut self, environment_steps: u64, advance: impl Fn(u64)) {
-        while self.environment_steps < environment_steps {
-            self.iterate();
-            advance(self.environment_steps);
-        }
+        let policies = vec![policy.clone()];
+        Ok(Self { policies, returns: Vec::new(), policy, moments, random, trials, steps: 0 })
     }
 
     /// Mean return of the trials of the last few iterations.
@@ -123,54 +110,42 @@ impl Search {
         recent.iter().sum::<f64>() / recent.len().max(1) as f64
     }
 
-    /// One iteration.
+    /// Runs one iteration.
     ///
     /// Trials run in parallel, but the search draws random numbers and sums results in the order of
     /// the trials, so the result does not depend on the number of threads.
     fn iterate(&mut self) {
-        let normal = StandardNormal;
-        let directions: Vec<Vec<f64>> = (0..DIRECTIONS)
-            .map(|_| {
-                (0..self.policy.weights.len()).map(|_| normal.sample(&mut self.random)).collect()
-            })
-            .collect();
-        let seeds: Vec<u64> = (0..self.trials.len()).map(|_| self.random.random()).collect();
+        let size = self.policy.weights.len();
+        let mut direction = || StandardNormal.sample_iter(&mut self.random).take(size).collect();
+        let directions: Vec<Vec<f64>> = (0..DIRECTIONS).map(|_| direction()).collect();
+        let seeds: Vec<u64> = self.trials.iter().map(|_| self.random.random()).collect();
 
-        for (trial, (direction, sign)) in self
-            .trials
-            .iter_mut()
-            .zip(directions.iter().flat_map(|direction| [(direction, 1.0), (direction, -1.0)]))
-        {
+        let signed = directions.iter().flat_map(|direction| [(direction, 1.0), (direction, -1.0)]);
+        for (trial, (direction, sign)) in self.trials.iter_mut().zip(signed) {
             trial.policy.normalizer = self.policy.normalizer.clone();
-            for ((weight, center), delta) in
-                trial.policy.weights.iter_mut().zip(&self.policy.weights).zip(direction)
-            {
+            let centers = self.policy.weights.iter().zip(direction);
+            for (weight, (center, delta)) in trial.policy.weights.iter_mut().zip(centers) {
                 *weight = center + sign * PERTURBATION * delta;
             }
         }
-        self.trials
-            .par_iter_mut()
-            .zip(&seeds)
-            .with_max_len(1)
-            .for_each(|(trial, &seed)| trial.run(seed));
+        let trials = self.trials.par_iter_mut().zip(seeds).with_max_len(1);
+        trials.for_each(|(trial, seed)| trial.run(seed));
         for trial in &self.trials {
             self.moments.merge(&trial.moments);
-            self.environment_steps += trial.steps;
+            self.steps += trial.steps;
         }
 
-        let mut pairs: Vec<(f64, f64, &Vec<f64>)> = self
-            .trials
-            .chunks_exact(2)
-            .zip(&directions)
+        let pairs = self.trials.chunks_exact(2).zip(&directions);
+        let mut pairs: Vec<(f64, f64, &Vec<f64>)> = pairs
             .map(|(pair, direction)| (pair[0].shaped_return, pair[1].shaped_return, direction))
             .collect();
         pairs.sort_by(|a, b| b.0.max(b.1).total_cmp(&a.0.max(a.1)));
         pairs.truncate(BEST);
         let returns: Vec<f64> = pairs.iter().flat_map(|pair| [pair.0, pair.1]).collect();
         let mean = returns.iter().sum::<f64>() / returns.len() as f64;
-        let variance =
-            returns.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / returns.len() as f64;
-        let rate = STEP_SIZE / (BEST as f64 * variance.sqrt().max(1e-6));
+        let squares = returns.iter().map(|value| (value - mean).powi(2)).sum::<f64>();
+        let deviation = (squares / returns.len() as f64).sqrt();
+        let rate = STEP_SIZE / (BEST as f64 * deviation.max(1e-6));
         for (forwards, backwards, direction) in pairs {
             for (weight, delta) in self.policy.weights.iter_mut().zip(direction) {
                 *weight += rate * (forwards - backwards) * delta;
@@ -178,16 +153,14 @@ impl Search {
         }
         self.policy.normalizer = self.moments.normalizer();
         self.policies.push(self.policy.clone());
-        self.returns.push(
-            self.trials.iter().map(|trial| trial.episode_return).sum::<f64>()
-                / self.trials.len() as f64,
-        );
+        let returns = self.trials.iter().map(|trial| trial.episode_return).sum::<f64>();
+        self.returns.push(returns / self.trials.len() as f64);
     }
 }
 
 impl Trial {
     fn run(&mut self, seed: u64) {
-        self.moments.clear();
+        self.moments = Moments::new(self.environment.observation().len());
         (self.shaped_return, self.episode_return, self.steps) = (0.0, 0.0, 0);
         self.environment.reset(seed);
         loop {

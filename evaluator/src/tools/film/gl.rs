@@ -7,7 +7,6 @@ use anyhow::Context;
 use khronos_egl::{self as egl, DynamicInstance, EGL1_5};
 use quad_runtime::Hint;
 
-/// What to do without OpenGL.
 pub const INSTALL: &str =
     "apt-get install --no-install-recommends libegl1 libegl-mesa0 libgl1-mesa-dri";
 /// `EGL_PLATFORM_SURFACELESS_MESA`, of the extension `EGL_MESA_platform_surfaceless`.
@@ -15,15 +14,11 @@ const SURFACELESS: egl::Enum = 0x31DD;
 
 /// An OpenGL context, current on the thread that made it.
 pub struct Gl {
-    /// The library: what it returned is valid as long as it is loaded.
+    /// The library, whose objects are valid as long as it is loaded.
     _egl: DynamicInstance<EGL1_5>,
 }
 
 impl Gl {
-    /// Makes a context.
-    ///
-    /// # Errors
-    /// EGL or Mesa is not installed.
     pub fn new() -> anyhow::Result<Self> {
         Self::open().context("pictures need EGL with Mesa's software driver").hint(INSTALL)
     }

@@ -31,21 +31,16 @@ use output::{Layout, steps, stride};
 use stage::Stage;
 
 /// Makes the film. Returns the text to print.
-///
-/// # Errors
-/// A file that is no policy of an environment that this program simulates, no OpenGL, no ffmpeg, or
-/// a file that cannot be written.
 pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
-    let first = subject(&args.subject, args.step)?;
-    let mut subjects = vec![first];
+    let mut subjects = vec![subject(&args.subject, args.step)?];
     if let Some(other) = &args.compare {
         subjects.push(subject(other, None)?);
     }
     let (spec, environment_seed) = (subjects[0].spec, subjects[0].seed);
     if let Some(other) = subjects.iter().find(|subject| subject.spec.name != spec.name) {
-        let error =
-            anyhow!("{} is for {}, not for {}", other.path.display(), other.spec.name, spec.name);
-        return Err(error).hint("only policies for one environment can be compared");
+        let (path, name) = (other.path.display(), &other.spec.name);
+        return Err(anyhow!("{path} is for {name}, not for {}", spec.name))
+            .hint("only policies for one environment can be compared");
     }
     let format = args.out.format;
     let mut stage = Stage::new(spec, Layout::of(format), subjects.len())?;
@@ -61,25 +56,21 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     info!("drawing {} pictures", steps.len());
     let draw =
         |&step| stage.draw(&episodes, step).with_context(|| format!("cannot draw step {step}"));
-    let pictures = steps.iter().map(draw);
-    encode::write(&args.out, control_period * stride(control_period) as f64, pictures)?;
-    Ok(summary(args, &subjects, &episodes))
+    let seconds = control_period * stride(control_period) as f64;
+    encode::write(&args.out, seconds, steps.iter().map(draw))?;
+    let mut summary = String::new();
+    for (subject, episode) in subjects.iter().zip(&episodes) {
+        let (path, steps) = (subject.path.display(), episode.length());
+        let Episode { seed, choice, .. } = episode;
+        let episode_return = episode.pose(steps).episode_return;
+        summary +=
+            &format!("{path}: seed {seed}, {steps} steps, return {episode_return:.2}, {choice}\n");
+    }
+    Ok(format!("{summary}film: {}", args.out.path.display()))
 }
 
 fn subject(path: &Path, step: Option<u64>) -> anyhow::Result<Subject> {
     let snapshot = run_folder::snapshot(path, step)?;
     let mut subjects = Subject::read(&snapshot, &ScoreArgs::default())?;
     Ok(subjects.remove(0))
-}
-
-/// A line for each episode, then the file.
-fn summary(args: &FilmArgs, subjects: &[Subject], episodes: &[Episode]) -> String {
-    let line = |(subject, episode): (&Subject, &Episode)| {
-        let (seed, steps) = (episode.seed, episode.length());
-        let episode_return = episode.pose(steps).episode_return;
-        let (path, choice) = (subject.path.display(), &episode.choice);
-        format!("{path}: seed {seed}, {steps} steps, return {episode_return:.2}, {choice}\n")
-    };
-    let lines: String = subjects.iter().zip(episodes).map(line).collect();
-    format!("{lines}film: {}", args.out.path.display())
 }

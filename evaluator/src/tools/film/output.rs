@@ -3,25 +3,21 @@
 use std::path::PathBuf;
 
 /// Pictures of a strip.
-pub const STRIP: usize = 8;
+const STRIP: usize = 8;
 
-/// The kinds of files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// An animation, which this program encodes.
     Gif,
     /// A video, which ffmpeg encodes.
     Mp4,
-    /// A few pictures side by side, as one picture.
+    /// A strip: a few pictures side by side.
     Png,
 }
 
-/// Where a film goes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Output {
-    /// The file.
     pub path: PathBuf,
-    /// The kind that its name says.
     pub format: Format,
 }
 
@@ -37,62 +33,52 @@ pub fn output(name: &str) -> Result<Output, String> {
     Ok(Output { path, format })
 }
 
-/// How a picture is divided among several episodes.
+/// Division of a picture among several episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
-    /// Width of one episode's part, pixels.
-    width: usize,
-    /// Height of one episode's part, pixels.
-    height: usize,
+    /// Width and height of one episode's part, pixels.
+    view: (usize, usize),
     /// One below the other, not side by side.
     stacked: bool,
 }
 
 impl Layout {
-    /// The layout for a kind of file.
     pub fn of(format: Format) -> Self {
-        let (width, height) = match format {
+        let view = match format {
             Format::Gif => (320, 240),
             Format::Mp4 => (480, 360),
             Format::Png => (240, 240),
         };
-        Self { width, height, stacked: format == Format::Png }
+        Self { view, stacked: format == Format::Png }
     }
 
     /// Width over height of one episode's part.
     pub fn aspect(self) -> f64 {
-        self.width as f64 / self.height as f64
+        self.view.0 as f64 / self.view.1 as f64
     }
 
     /// Width and height of the picture of several episodes, pixels.
     pub fn size(self, episodes: usize) -> (usize, usize) {
-        if self.stacked {
-            (self.width, self.height * episodes)
-        } else {
-            (self.width * episodes, self.height)
-        }
+        let (width, height) = self.view;
+        if self.stacked { (width, height * episodes) } else { (width * episodes, height) }
     }
 
-    /// The part of the episode with this index: left, bottom, width and height, pixels.
-    pub fn view(self, place: usize, episodes: usize) -> [usize; 4] {
-        let (left, bottom) = if self.stacked {
-            (0, (episodes - 1 - place) * self.height)
-        } else {
-            (place * self.width, 0)
-        };
-        [left, bottom, self.width, self.height]
+    /// Left, bottom, width and height of the part of the episode with this index, pixels.
+    pub fn view(self, index: usize, episodes: usize) -> [usize; 4] {
+        let (width, height) = self.view;
+        match self.stacked {
+            true => [0, (episodes - 1 - index) * height, width, height],
+            false => [index * width, 0, width, height],
+        }
     }
 }
 
-/// The steps after which a picture of an episode of `last` steps is taken: about 25 a second, and
+/// The steps of an episode of `last` steps after which a picture is taken: about 25 a second, and
 /// the last one.
 pub fn steps(format: Format, last: usize, control_period: f64) -> Vec<usize> {
     match format {
         Format::Png => (0..STRIP).map(|picture| picture * last / (STRIP - 1)).collect(),
-        Format::Gif | Format::Mp4 => {
-            let regular = (0..last).step_by(stride(control_period));
-            regular.chain([last]).collect()
-        }
+        _ => (0..last).step_by(stride(control_period)).chain([last]).collect(),
     }
 }
 
@@ -108,13 +94,10 @@ mod tests {
     #[test]
     fn films_lie_side_by_side_and_strips_one_below_the_other() {
         let (film, strip) = (Layout::of(Format::Gif), Layout::of(Format::Png));
-        assert_eq!(film.size(2), (640, 240));
-        assert_eq!([0, 1].map(|place| film.view(place, 2)), [[0, 0, 320, 240], [320, 0, 320, 240]]);
-        assert_eq!(strip.size(2), (240, 480));
-        assert_eq!(
-            [0, 1].map(|place| strip.view(place, 2)),
-            [[0, 240, 240, 240], [0, 0, 240, 240]]
-        );
+        assert_eq!((film.size(2), strip.size(2)), ((640, 240), (240, 480)));
+        let views = |layout: Layout| [layout.view(0, 2), layout.view(1, 2)];
+        assert_eq!(views(film), [[0, 0, 320, 240], [320, 0, 320, 240]]);
+        assert_eq!(views(strip), [[0, 240, 240, 240], [0, 0, 240, 240]]);
     }
 
     #[test]

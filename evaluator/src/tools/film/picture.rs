@@ -1,17 +1,13 @@
 //! A picture in memory.
 
-/// A picture: rows from the top, in them pixels from the left, of three bytes (red, green, blue)
-/// each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
-    /// Pixels in a row.
     pub width: usize,
-    /// width × height × 3 bytes
+    /// [height, width, 3], from the top left
     pub rgb: Vec<u8>,
 }
 
 impl Picture {
-    /// Rows.
     pub fn height(&self) -> usize {
         self.rgb.len() / (3 * self.width)
     }
@@ -28,7 +24,7 @@ impl Picture {
         &self.rgb[3 * self.width * row..3 * self.width * (row + 1)]
     }
 
-    /// Turns the picture upside down: OpenGL's order of rows.
+    /// Reverses the rows: OpenGL's begin at the bottom.
     pub fn flipped(self) -> Self {
         let rgb = (0..self.height()).rev().flat_map(|row| self.row(row)).copied().collect();
         Self { rgb, ..self }

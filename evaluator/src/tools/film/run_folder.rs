@@ -9,17 +9,14 @@ use quad_runtime::Hint;
 
 const RUN: &str = "name a file like RUN/snapshots/step_000020000.safetensors, or the folder RUN that `learner train` made";
 
-/// The snapshot that `path` names: the file itself or, in a run's folder, the snapshot of `step`;
-/// without a step, of the snapshots that are still there, the one with the best complete
-/// evaluation, or the newest.
-///
-/// # Errors
-/// There is no such snapshot.
+/// The snapshot that `path` names. In a run's folder it is the snapshot of `step` or, without a
+/// step, the one with the best complete evaluation of those that are left, else the newest.
 pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
+    let name = path.display();
     if !path.is_dir() {
         return match step {
             None => Ok(path.to_owned()),
-            Some(_) => Err(anyhow!("{} is not the folder of a run", path.display()))
+            Some(_) => Err(anyhow!("{name} is not the folder of a run"))
                 .hint("--step is for a run's folder"),
         };
     }
@@ -29,16 +26,14 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
         Some(step) => step,
         None => {
             let report = RunReport::scored(path).hint(RUN)?;
-            let best =
-                report.best_of(|step| steps.contains(&step)).map(|evaluation| evaluation.step);
-            best.or(steps.last().copied())
-                .with_context(|| format!("{} has no snapshot", path.display()))
-                .hint(RUN)?
+            let best = report.best_of(|step| steps.contains(&step));
+            let best = best.map(|evaluation| evaluation.step).or(steps.last().copied());
+            best.with_context(|| format!("{name} has no snapshot")).hint(RUN)?
         }
     };
     let found = steps.contains(&step).then(|| run.snapshot_path(step));
     found
-        .with_context(|| format!("{} has no snapshot of step {step}", path.display()))
+        .with_context(|| format!("{name} has no snapshot of step {step}"))
         .hint(format!("it has {steps:?}"))
 }
 
@@ -64,7 +59,7 @@ mod tests {
         RunDir::create(folder, &config).unwrap();
     }
 
-    /// The lines of `scores.jsonl` for some steps, seeds and scores.
+    /// Lines of `scores.jsonl` for steps, seeds and scores.
     fn lines(scores: &[(u64, u64, f64)]) -> String {
         let line = |&(step, seed, score): &(u64, u64, f64)| {
             let line = json!({
@@ -76,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_gives_its_best_snapshot_or_the_newest_or_the_one_of_a_step() {
+    fn chooses_the_best_snapshot_the_newest_or_the_one_of_a_step() {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path();
         begin(run);
@@ -85,7 +80,7 @@ mod tests {
         for step in [10, 20, 30] {
             fs::write(file(step), "").unwrap();
         }
-        // Of a young run no evaluation is complete, however good its first episode is.
+        // No evaluation is complete.
         fs::write(run.join("scores.jsonl"), lines(&[(10, 1, 99.0)])).unwrap();
         assert_eq!(snapshot(run, None).unwrap(), file(30));
         let scores = [(10, 1, 5.0), (10, 2, 7.0), (20, 3, 9.0), (20, 4, 1.0), (30, 5, 99.0)];

@@ -3,8 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, value_parser};
-use quad_dataset::EnvironmentSpec;
-use quad_dataset::environment;
+use quad_dataset::environment::{self, EnvironmentSpec};
 use quad_policy::{Aggregate, Choice, Precision, Rule};
 
 /// Most episodes: far above any use, but few enough for memory.

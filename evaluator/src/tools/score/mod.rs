@@ -12,35 +12,24 @@ use quad_run::results::Spread;
 use rayon::prelude::*;
 use tracing::{info, warn};
 
-use crate::sim::{Environments, Simulations};
 pub(crate) use args::ScoreArgs;
 use results::{Scored, table};
 pub(crate) use subject::Subject;
 
-/// Episodes in a batch. The limit bounds memory; a larger batch is hardly faster.
+/// Episodes per batch. The limit bounds memory; a larger batch is hardly faster.
 const BATCH: usize = 16;
 
 /// Scores the policies of the command line. Returns the text to print.
-///
-/// # Errors
-/// A file that is no policy of an environment that this program simulates (then nothing is scored),
-/// or a policy that cannot act.
 pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
     if !args.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
-    let subjects = args
-        .snapshots
-        .iter()
-        .map(|path| Subject::read(path, args))
-        .collect::<anyhow::Result<Vec<_>>>()?;
+    let read = args.snapshots.iter().map(|path| Subject::read(path, args));
+    let subjects = read.collect::<anyhow::Result<Vec<_>>>()?;
     info!("scoring {} policies", subjects.len());
     let subjects: Vec<Subject> = subjects.into_iter().flatten().collect();
-    let scored = subjects
-        .par_iter()
-        .with_max_len(1)
-        .map(measure)
-        .collect::<anyhow::Result<Vec<Scored>>>()?;
+    let scored = subjects.par_iter().with_max_len(1).map(measure);
+    let scored = scored.collect::<anyhow::Result<Vec<Scored>>>()?;
     Ok(if args.json { quad_runtime::json(&scored)? } else { table(&scored) })
 }
 
@@ -48,10 +37,8 @@ pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
 /// threads.
 fn measure(subject: &Subject) -> anyhow::Result<Scored> {
     let Subject { path, weights, spec, seed, step, episodes, policy } = subject;
-    let batch = |seeds: &[u64]| subject.roll_out(|| Simulations.make(&spec.name, *seed), seeds);
     let seeds = episode_seeds(*seed, *step, *episodes);
-    let batches =
-        seeds.par_chunks(BATCH).with_max_len(1).map(batch).collect::<anyhow::Result<Vec<_>>>()?;
+    let batches = seeds.par_chunks(BATCH).with_max_len(1).map(|seeds| subject.roll_out(seeds));
     let scored = Scored {
         snapshot: path.clone(),
         weights: weights.to_string(),
@@ -60,7 +47,7 @@ fn measure(subject: &Subject) -> anyhow::Result<Scored> {
         seed: *seed,
         choice: policy.choice(),
         precision: policy.precision().arithmetic(),
-        episodes: batches.into_iter().flatten().collect(),
+        episodes: batches.collect::<anyhow::Result<Vec<_>>>()?.concat(),
     };
     let spread = scored.spread().map(Spread::text).unwrap_or_default();
     info!("{}, {}: {spread}", path.display(), scored.title());

@@ -14,38 +14,36 @@ use crate::sim::EpisodeOutcome;
 /// The results of one policy with one way to choose.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Scored {
-    /// The file.
     pub snapshot: PathBuf,
     /// BLAKE3 of the file.
     pub weights: String,
-    /// Environment of the episodes.
     pub environment: String,
     /// Gradient step of the snapshot.
     pub step: u64,
     /// Seed from which, with the step, the episodes' seeds follow.
     pub seed: u64,
-    /// How the policy chose among its candidates; absent if it draws none.
+    /// Absent if the policy draws no candidates.
     pub choice: Option<Choice>,
     /// Arithmetic of its actions, as in `scores.jsonl`.
     pub precision: String,
-    /// Episodes in the order of their seeds.
+    /// In the order of their seeds.
     pub episodes: Vec<EpisodeOutcome>,
 }
 
 impl Scored {
-    /// How the policy chose, as text.
+    /// The way to choose, as text.
     pub fn title(&self) -> String {
         self.choice.map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string())
     }
 
-    /// The normalized scores of the episodes, of which there is at least one.
+    /// Spread of the normalized scores.
     pub fn spread(&self) -> Option<Spread> {
         Spread::of(&Vec::from_iter(self.episodes.iter().map(|episode| episode.score)))
     }
 }
 
-/// A row for each snapshot, a column for each way to choose; below, their means if averaging makes
-/// sense.
+/// A row per snapshot, a column per way to choose; below, their means if all snapshots have one
+/// environment.
 pub fn table(scored: &[Scored]) -> String {
     let mut titles: Vec<String> = Vec::new();
     for title in scored.iter().map(Scored::title) {
@@ -58,43 +56,32 @@ pub fn table(scored: &[Scored]) -> String {
     let mut table = Table::new(&Vec::from_iter(head.into_iter().chain(choices)));
     let text = |spread: Option<Spread>| spread.map(Spread::text).unwrap_or_default();
 
-    let snapshots: Vec<&[Scored]> =
-        scored.chunk_by(|one, next| one.snapshot == next.snapshot).collect();
+    let snapshots = Vec::from_iter(scored.chunk_by(|one, next| one.snapshot == next.snapshot));
     for of_one in &snapshots {
         let Scored { snapshot, step, environment, episodes, .. } = &of_one[0];
-        let head = [
-            snapshot.display().to_string(),
-            step.to_string(),
-            environment.clone(),
-            episodes.len().to_string(),
-        ];
-        let score = |title: &String| {
+        let mut row = vec![snapshot.display().to_string(), step.to_string(), environment.clone()];
+        row.push(episodes.len().to_string());
+        row.extend(titles.iter().map(|title| {
             let found = of_one.iter().find(|scored| scored.title() == *title);
             text(found.and_then(Scored::spread))
-        };
-        table.push(Vec::from_iter(head.into_iter().chain(titles.iter().map(score))));
+        }));
+        table.push(row);
     }
-    let precisions: BTreeSet<&str> =
-        scored.iter().map(|scored| scored.precision.as_str()).collect();
-    let precisions = Vec::from_iter(precisions).join(" and ");
+    let precisions = scored.iter().map(|scored| scored.precision.as_str());
+    let precisions = Vec::from_iter(BTreeSet::from_iter(precisions)).join(" and ");
     let mut note =
         format!("normalized score in {precisions}, mean ± standard deviation over the episodes");
     if snapshots.len() > 1 && scored.iter().all(|other| other.environment == scored[0].environment)
     {
-        let head = [
-            format!("mean of {} snapshots", snapshots.len()),
-            String::new(),
-            String::new(),
-            String::new(),
-        ];
-        let mean = |title: &String| {
-            let with_these = scored.iter().filter(|scored| scored.title() == *title);
-            let means =
-                Vec::from_iter(with_these.filter_map(Scored::spread).map(|spread| spread.mean));
-            // A mean over fewer snapshots would not be what the row says.
+        let mut row = vec![String::new(); head.len()];
+        row[0] = format!("mean of {} snapshots", snapshots.len());
+        row.extend(titles.iter().map(|title| {
+            let with_it = scored.iter().filter(|scored| scored.title() == *title);
+            let means = Vec::from_iter(with_it.filter_map(|scored| Some(scored.spread()?.mean)));
+            // A mean over fewer snapshots would be another number than the others in the row.
             text(Spread::of(&means).filter(|_| means.len() == snapshots.len()))
-        };
-        table.push(Vec::from_iter(head.into_iter().chain(titles.iter().map(mean))));
+        }));
+        table.push(row);
         note.push_str("; in the last row over the snapshots");
     }
     table.render(Style::Text) + &note
@@ -102,15 +89,13 @@ pub fn table(scored: &[Scored]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
 
     fn scored(snapshot: &str, candidates: u32, scores: &[f64]) -> Scored {
         let episode =
             |&score| EpisodeOutcome { index: 0, seed: 1, episode_return: 0.0, length: 7, score };
         Scored {
-            snapshot: Path::new(snapshot).to_owned(),
+            snapshot: snapshot.into(),
             weights: String::new(),
             environment: "hopper".to_owned(),
             step: 20,
@@ -122,41 +107,33 @@ mod tests {
     }
 
     #[test]
-    fn a_row_for_each_snapshot_and_a_column_for_each_way_to_choose() {
-        let table = table(&[
-            scored("a", 1, &[1.0, 3.0]),
-            scored("a", 10, &[10.0, 10.0]),
-            scored("longer", 1, &[4.0, 4.0]),
-        ]);
-        let lines: Vec<Vec<&str>> = table
-            .lines()
-            .map(|line| line.split("  ").filter(|cell| !cell.is_empty()).map(str::trim).collect())
-            .collect();
-        assert_eq!(
-            lines[0],
-            ["snapshot", "step", "environment", "episodes", "1 candidate", "10 candidates"]
-        );
-        assert_eq!(lines[1], ["a", "20", "hopper", "2", "2.00 ± 1.41", "10.00 ± 0.00"]);
-        assert_eq!(lines[2], ["longer", "20", "hopper", "2", "4.00 ± 0.00"]);
-        assert_eq!(
-            lines[3],
-            ["mean of 2 snapshots", "3.00 ± 1.41"],
-            "ten candidates were not tried for both"
-        );
+    fn has_a_row_per_snapshot_and_a_column_per_way_to_choose() {
+        let (one, ten) = (scored("a", 1, &[1.0, 3.0]), scored("a", 10, &[10.0, 10.0]));
+        let table = table(&[one, ten, scored("longer", 1, &[4.0, 4.0])]);
+        let cells = |line: &str| {
+            let cells = line.split("  ").filter(|cell| !cell.is_empty()).map(str::trim);
+            Vec::from_iter(cells).join("|")
+        };
+        // Ten candidates were not tried for both, so they have no mean.
+        let expected = [
+            "snapshot|step|environment|episodes|1 candidate|10 candidates",
+            "a|20|hopper|2|2.00 ± 1.41|10.00 ± 0.00",
+            "longer|20|hopper|2|4.00 ± 0.00",
+            "mean of 2 snapshots|3.00 ± 1.41",
+        ];
+        assert!(table.lines().map(cells).take(4).eq(expected), "{table}");
     }
 
     #[test]
     fn unlike_environments_have_no_mean_and_every_arithmetic_is_named() {
-        let gaussian =
-            Scored { choice: None, environment: "walker2d".to_owned(), ..scored("a", 1, &[1.0]) };
-        let diffusion = Scored { precision: "bf16-amx".to_owned(), ..scored("b", 10, &[1.0]) };
+        let mut gaussian = scored("a", 1, &[1.0]);
+        (gaussian.choice, gaussian.environment) = (None, "walker2d".to_owned());
+        let mut diffusion = scored("b", 10, &[1.0]);
+        diffusion.precision = "bf16-amx".to_owned();
         let table = table(&[gaussian, diffusion]);
         assert!(!table.contains("mean of"), "{table}");
-        assert!(
-            table.contains("no candidates  10 candidates")
-                && table.contains("bf16-amx and f32-avx2"),
-            "{table}"
-        );
-        assert!(table.contains(" 1.00\n"), "a single episode has no spread: {table}");
+        for text in ["no candidates  10 candidates", "bf16-amx and f32-avx2", " 1.00\n"] {
+            assert!(table.contains(text), "{text} is missing: {table}");
+        }
     }
 }
