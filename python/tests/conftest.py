@@ -1,4 +1,4 @@
-"""A file of transitions and some small policies, made once by the package's own programs."""
+"""Shared data and small policies, made once by the package's programs."""
 
 import json
 import subprocess

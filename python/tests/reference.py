@@ -1,4 +1,4 @@
-"""What a policy does, written a second time in NumPy and float64, from the file alone: its noise, networks, sampler and choice."""
+"""A second implementation of policies in NumPy and float64, from the file alone: noise, networks, sampler and choice."""
 
 import json
 import math
@@ -10,7 +10,7 @@ WORD, LONG = 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF
 
 
 class Random:
-    """ChaCha with 8 rounds (rand_chacha), one stream of a seed."""
+    """ChaCha with 8 rounds (rand_chacha): one stream of a seed."""
 
     def __init__(self, seed, stream):
         self.key, self.stream, self.block, self.words = [], stream, 0, []
@@ -108,7 +108,7 @@ class Reference:
         return x
 
     def values(self, observations, actions, reduce=None):
-        """In the network's units."""
+        """Scales observations to the network's units."""
         q = self.mlp("critic.", self.shape["critic"], np.concatenate([observations, actions], -1))[..., 0]
         return q.mean(0) if (reduce or self.choice["value"]) == "mean" else q.min(0)
 
@@ -153,7 +153,7 @@ class Reference:
         return x
 
     def act(self, observation, random, **changes):
-        """The action for one observation in the user's units; and, where there are some, the candidates and their values."""
+        """The action for one observation in the user's units, with the candidates and their values, if any."""
         s = self.to_network("observations", observation)
         if self.kind == "gaussian":
             # The file has the one network as an ensemble of one.
@@ -161,11 +161,11 @@ class Reference:
         choice = {**self.choice, **changes}
         drawn = self.draw(s, random, choice["candidates"])
         values = self.values(np.tile(s, (len(drawn), 1)), drawn, choice["value"])
-        worth, rule = values, choice["rule"]
+        scores, rule = values, choice["rule"]
         if rule == "nearest":
-            worth = -((values - self.mlp("value.", self.shape["value"], s[None]).reshape(-1)) ** 2)
-        chosen = int(np.argmax(worth))
+            scores = -((values - self.mlp("value.", self.shape["value"], s[None]).reshape(-1)) ** 2)
+        chosen = int(np.argmax(scores))
         if isinstance(rule, dict) and len(drawn) > 1:
-            weights = np.exp((worth - worth.max()) / rule["softmax"]["temperature"])
+            weights = np.exp((scores - scores.max()) / rule["softmax"]["temperature"])
             chosen = int(np.argmax(np.cumsum(weights) > random.uniform() * weights.sum()))
         return self.to_user(drawn[chosen]), self.to_user(drawn), values

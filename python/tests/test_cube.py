@@ -1,4 +1,4 @@
-"""OGBench's cube, as docs/python.md has it: recorded by examples/cube_single.py, trained on, evaluated in its own environment."""
+"""OGBench's cube of docs/python.md: recorded by examples/cube_single.py, trained, evaluated in its environment."""
 
 import re
 import socket
@@ -22,7 +22,7 @@ QUICK = {
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_the_cube_from_its_recording_to_its_scores(tmp_path, monkeypatch):
+def test_the_cube_from_recording_to_scores(tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disabled")
     monkeypatch.chdir(tmp_path)
     subprocess.run([sys.executable, ROOT / "examples/cube_single.py", "ogbench", "2"], check=True, timeout=300)

@@ -1,4 +1,4 @@
-"""Data from arrays and episodes: what is written, what training makes of it, what is refused."""
+"""Datasets from arrays and episodes: writing, training, refusals."""
 
 import json
 import subprocess
@@ -19,7 +19,7 @@ def written(dataset, path):
         return {name: array[()] for name, array in file.items()}
 
 
-def test_what_is_given_is_what_is_in_the_file(tmp_path):
+def test_the_file_has_the_given_arrays(tmp_path):
     given = arrays()
     after = given["observations"] + 1
     found = written(Dataset.from_arrays(**given, next_observations=after), tmp_path / "new" / "data.hdf5")
@@ -29,7 +29,7 @@ def test_what_is_given_is_what_is_in_the_file(tmp_path):
     assert found["terminals"].dtype == bool
 
 
-def test_without_next_observations_the_following_row_counts(tmp_path):
+def test_next_observations_default_to_the_following_row(tmp_path):
     """Steps 0 to 2 end by a terminal, 3 to 5 are cut off, 6 is cut off at once, 7 terminates as it is cut off, 8 to 9 do not end."""
     o, row = np.arange(10.0)[:, None] * 10, np.arange(10)
     found = written(
@@ -46,7 +46,7 @@ def test_without_next_observations_the_following_row_counts(tmp_path):
     assert found["timeouts"].tolist() == [0, 0, 0, 0, 1, 1, 1]
 
 
-def test_episodes_make_the_same_rows_as_their_arrays(tmp_path):
+def test_episodes_and_arrays_make_the_same_rows(tmp_path):
     whole = arrays(n=300)
     ends = np.flatnonzero(whole["terminations"] | whole["truncations"]) + 1
     whole["truncations"][-1] = True
@@ -73,7 +73,7 @@ def test_episodes_make_the_same_rows_as_their_arrays(tmp_path):
     assert (found["next_observations"][ends - 1] == 9).all() and (found["terminals"] | found["timeouts"])[ends - 1].all()
 
 
-def test_it_says_what_is_in_it_as_the_learner_does(data):
+def test_prints_the_summary_of_the_learner(data):
     dataset = Dataset.from_arrays(**arrays())
     ours = dataset.inspect()
     theirs = subprocess.run(["learner", "datasets", "inspect", "--json", str(data)], check=True, capture_output=True).stdout
@@ -94,7 +94,7 @@ def test_the_learner_trains_on_the_user_s_units(tmp_path):
     assert actions.min() > 59.9 and actions.max() < 140.1 and np.ptp(actions) > 20
 
 
-def test_what_cannot_be_is_refused(tmp_path):
+def test_refuses_invalid_arrays(tmp_path):
     good = arrays(n=200)
 
     def changed(name, row, value):
@@ -130,14 +130,14 @@ def test_what_cannot_be_is_refused(tmp_path):
         "episode 0: terminations, row 4: 0.5 is": lambda: Dataset.from_episodes([{**episode, "terminations": 0.5}]),
         "episode 0: rewards, row 1 is masked": lambda: Dataset.from_episodes(
             [{**episode, "rewards": np.ma.masked_equal([0, 9, 0, 0, 0], 9)}]),
-        "actions are whole numbers": lambda: Dataset.from_arrays(**{**good, "actions": np.ones((200, 2), int)}),
+        "actions are integers": lambda: Dataset.from_arrays(**{**good, "actions": np.ones((200, 2), int)}),
     }.items():
         with pytest.raises(ValueError, match=message):
             call()
     assert not list(tmp_path.iterdir())
 
 
-def test_a_row_with_several_bad_numbers_counts_once():
+def test_counts_a_row_with_several_bad_numbers_once():
     good = arrays(n=200)
     good["observations"][7, 2:5] = np.nan
     with pytest.raises(ValueError, match=r"row 7: number 2 is nan, .* \(1 such rows\)"):

@@ -1,4 +1,4 @@
-"""The ROS 2 node of docs/deploying.md, as it stands there, with a stand-in for rclpy, which pip cannot install."""
+"""The ROS 2 node of docs/deploying.md, with a fake of rclpy, which pip cannot install."""
 
 import re
 import sys
@@ -18,7 +18,7 @@ SEEN = [f"{part}.{joint}" for part in ("position", "velocity") for joint in JOIN
 
 @pytest.fixture(scope="module")
 def snapshot(tmp_path_factory):
-    """A policy of a robot with two joints, whose actions have another order than the controller."""
+    """A policy for a robot with two joints, in another order than the controller's."""
     folder, rng = tmp_path_factory.mktemp("robot"), np.random.default_rng(0)
     numbers = {name: rng.normal(size=400) for name in SEEN}
     done = {f"torque.{joint}": rng.uniform(-9, 9, 400) for joint in ("elbow", "shoulder")}
@@ -28,7 +28,7 @@ def snapshot(tmp_path_factory):
 
 
 class Node:
-    """rclpy's Node: it keeps what is published and what is logged."""
+    """rclpy's Node: records published and logged messages."""
 
     def __init__(self, name):
         self.published, self.errors = [], []
@@ -47,7 +47,7 @@ def message(names, position, velocity):
     return SimpleNamespace(name=names, position=position, velocity=velocity, effort=[])
 
 
-def test_the_node_goes_by_the_names_of_joints(snapshot, tmp_path, monkeypatch):
+def test_the_node_maps_joints_by_name(snapshot, tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "deploying.md").read_text()
     code = re.search(r"^## ROS 2\n.*?^```python\n(.*?)^```$", page, re.M | re.S).group(1)
     spun, modules = [], {name: ModuleType(name) for name in ("rclpy", "rclpy.node", "sensor_msgs", "sensor_msgs.msg", "std_msgs", "std_msgs.msg")}

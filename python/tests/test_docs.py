@@ -1,4 +1,4 @@
-"""What the pages show runs as it stands there; test_trackers.py runs what is about other trackers, test_cube.py the cube."""
+"""Runs the examples of the documentation; test_trackers.py those of trackers, test_cube.py the cube."""
 
 import re
 import shutil
@@ -7,7 +7,7 @@ from pathlib import Path
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def test_the_page_s_examples_run(hopper_runs, tmp_path, monkeypatch):
+def test_the_examples_run(hopper_runs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(hopper_runs / "seed0", "runs/mine")
     page, names = (DOCS / "python.md").read_text(), {}

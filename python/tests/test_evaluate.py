@@ -1,4 +1,4 @@
-"""Evaluators of environments that Python moves: real learners, real workers, real faults."""
+"""Evaluators of environments in Python: real learners, real workers, real faults."""
 
 import json
 import os
@@ -50,7 +50,7 @@ class Learner:
         self.endpoint = json.loads(endpoints.read_text())["zenoh"][0]
 
     def end(self, timeout=600):
-        """Its exit code and what it said."""
+        """Exit code and output."""
         said = self.process.communicate(timeout=timeout)[1]
         return self.process.returncode, said
 
@@ -84,7 +84,7 @@ def by_hand(policy, seed):
     return total
 
 
-def test_a_class_of_ten_lines_is_scored_as_by_hand(tmp_path, data):
+def test_scores_equal_those_of_stepping_by_hand(tmp_path, data):
     learner = Learner(tmp_path / "run", data)
     with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=learner.endpoint, workers=2):
         code, said = learner.end()
@@ -118,7 +118,7 @@ def test_success_is_a_rate(tmp_path, data):
     assert f" {np.mean(scores):.2f} ± " in report and "dataset" not in report
 
 
-def test_what_the_environment_raises_is_told_and_costs_an_attempt(tmp_path, data):
+def test_an_error_of_the_environment_is_reported_and_counts_as_an_attempt(tmp_path, data):
     marker = tmp_path / "broken"
 
     class Breaks(Walk):
@@ -135,7 +135,7 @@ def test_what_the_environment_raises_is_told_and_costs_an_attempt(tmp_path, data
     assert re.search(r'"walk" failed: ValueError: the cable is loose \(.*:\d+, in step\)', said), said
 
 
-def test_a_reward_that_is_no_number_is_told_at_once_and_costs_an_attempt(tmp_path, data):
+def test_a_nan_reward_is_reported_at_once_and_counts_as_an_attempt(tmp_path, data):
     marker = tmp_path / "broken"
 
     class Pays(Walk):
@@ -154,8 +154,8 @@ def test_a_reward_that_is_no_number_is_told_at_once_and_costs_an_attempt(tmp_pat
 
 
 @pytest.mark.parametrize("success", [float("nan"), 0.5, {"task": False}])
-def test_a_success_is_true_or_false(success):
-    made = _worker.Made(Walk(), "success")
+def test_refuses_a_success_that_is_not_boolean(success):
+    made = _worker.WrappedEnvironment(Walk(), "success")
     made.info = {"success": np.True_}
     assert made.score(0.0) == 100.0
     made.info = {"is_success": success}
@@ -163,7 +163,7 @@ def test_a_success_is_true_or_false(success):
         made.score(0.0)
 
 
-def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):
+def test_killed_workers_restart_and_lose_no_score(tmp_path, data):
     # One pool for two runs: Python's workers have one environment, the programs' evaluators the other.
     ours = Learner(tmp_path / "ours", data, steps=3000)
     theirs = Learner(tmp_path / "theirs", data, environment="hopper", steps=1000)
@@ -188,7 +188,7 @@ def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):
 
 
 def run(script):
-    """Runs a script that must end, however long the processes sleep that it forks."""
+    """Runs a script that must end, however long its forked children sleep."""
     ended = subprocess.run([sys.executable, "-c", script], cwd=pathlib.Path(__file__).parent, capture_output=True, timeout=600)
     assert ended.returncode == 0, ended.stderr.decode()
 
@@ -214,7 +214,7 @@ for group in groups:
 """
 
 
-def test_a_killed_worker_whose_environment_has_forked_comes_again_and_ends():
+def test_a_killed_worker_with_a_forked_child_restarts_and_ends():
     run(FORKING_ENVIRONMENT)
 
 
@@ -239,11 +239,11 @@ assert -signal.SIGKILL not in codes, codes
 """
 
 
-def test_a_fork_of_the_process_that_started_workers_changes_nothing():
+def test_a_fork_of_the_parent_does_not_stop_the_workers():
     run(FORK)
 
 
-def test_a_worker_that_ends_again_and_again_is_given_up(tmp_path, monkeypatch):
+def test_gives_up_a_worker_that_keeps_ending(tmp_path, monkeypatch):
     monkeypatch.setattr("quad_rl._process._ENDS", 3)
     made = tmp_path / "made"
 
@@ -280,7 +280,7 @@ def children(of):
 
 
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
-def test_workers_end_with_the_process_that_started_them(by):
+def test_workers_end_with_their_parent(by):
     process = subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=pathlib.Path(__file__).parent, stderr=subprocess.PIPE)
     wait(lambda: len(children(process.pid)) == 3)
     *workers, fork = children(process.pid)
@@ -295,7 +295,7 @@ def test_workers_end_with_the_process_that_started_them(by):
     process.stderr.close()
 
 
-def test_arguments_that_cannot_be_are_refused_at_once():
+def test_refuses_invalid_arguments():
     def refused(kind, words, *arguments, **keywords):
         with pytest.raises(kind, match=words):
             quad_rl.Evaluators(*arguments, **keywords)
@@ -312,6 +312,6 @@ def test_arguments_that_cannot_be_are_refused_at_once():
     refused(RuntimeError, "Box", "walk", "CartPole-v1", workers=1)
 
 
-def test_workers_that_cannot_connect_say_why():
+def test_a_failure_to_connect_is_reported():
     with pytest.raises(RuntimeError, match="udp"):
         quad_rl.evaluate("walk", lambda seed: Walk(), connect="udp/127.0.0.1:1", workers=1)

@@ -1,4 +1,4 @@
-"""What `pip install` puts in place: a module and programs that start, without anything else on the machine."""
+"""`pip install` of the wheel: the module and the programs start without other libraries."""
 
 import importlib.metadata
 import pathlib
@@ -26,14 +26,14 @@ def test_quad_convert_is_on_the_path():
     assert "--observations" in said
 
 
-def test_what_quad_convert_prints_may_be_read_in_part():
+def test_quad_convert_tolerates_a_reader_that_stops_early():
     script = "from quad_rl._convert import _print; _print('line\\n' * 100_000)"
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.close()
     assert (process.stderr.read(), process.wait(600)) == (b"", 0)
 
 
-def test_the_programs_need_no_library_but_the_systems_and_the_wheels():
+def test_the_programs_need_only_libraries_of_the_system_and_the_wheel():
     for file in [BIN / "learner", BIN / "evaluator", pathlib.Path(quad_rl.__file__).parent / "_quad_rl.abi3.so"]:
         for line in subprocess.run(["ldd", file], check=True, capture_output=True, text=True, timeout=600).stdout.splitlines():
             name, _, where = line.strip().partition(" => ")
@@ -43,7 +43,7 @@ def test_the_programs_need_no_library_but_the_systems_and_the_wheels():
                 assert name.split("/")[-1].startswith(("linux-vdso", "ld-linux", "libc.", "libm.", "libdl.", "libpthread.", "librt."))
 
 
-def test_the_licenses_come_along():
+def test_the_wheel_contains_the_licenses():
     files = {file.name: file for file in importlib.metadata.files("quad_rl") if "licenses" in file.parts}
     assert {"LICENSE-MIT", "LICENSE-APACHE", "LICENSE-mujoco", "LICENSE-third-party"} <= set(files)
     text = files["LICENSE-third-party"].read_text()

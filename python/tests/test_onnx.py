@@ -1,4 +1,4 @@
-"""ONNX models act as the policies do that they are of: every algorithm's, and every way to choose."""
+"""ONNX models act as their policies do, for every algorithm and every way to choose."""
 
 import subprocess
 import sys
@@ -22,7 +22,7 @@ RULES = ["best", "nearest", "softmax:0.1", "average:0.1:4", "average:0.01:20"]
 
 
 def batches():
-    """Random observations, one, three and five at a time, and extreme ones."""
+    """Batches of one, three and five random observations, and extreme ones."""
     states = np.random.default_rng(8).normal(3.0, 2.0, (17, OBSERVATION)).astype(np.float32)
     states[9:13] *= np.array([[1e2], [1e3], [-1e4], [0.0]], np.float32)
     return [states[:1], states[1:4], states[4:9], states[9:10], states[9:13], states[13:]]
@@ -33,14 +33,14 @@ def largest(array):
 
 
 def close(found, expected, by):
-    """Beside a row's largest number, if that is above 1."""
+    """Largest error, relative to a row's largest number if that is above 1."""
     assert found.shape == expected.shape
     away = largest(found - expected) / np.maximum(1.0, largest(expected))
     assert (away <= by).all(), away
 
 
 def compare(policy, path, **choice):
-    """The model of this choice beside the policy."""
+    """Compares the model of this choice with the policy."""
     export_onnx(policy, path, **choice)
     onnx.checker.check_model(path, full_check=True)
     # In float32, norms of nearly equal numbers leave some plans 1.1e-5 from float64 natively, and 4e-6 in the model.
@@ -60,7 +60,7 @@ def compare(policy, path, **choice):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_policy_of_each_algorithm_acts_alike(algorithm, data, tmp_path):
+def test_models_of_each_algorithm_act_like_the_policy(algorithm, data, tmp_path):
     compare(Policy.load(train(tmp_path / "run", data, *OWN, "--algorithm", algorithm, layers=False)), tmp_path / "policy.onnx")
 
 
@@ -70,7 +70,7 @@ def test_networks_units_and_processes_of_all_kinds(snapshots, name, tmp_path):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_every_choice_that_a_call_may_ask_for(snapshots, rule, tmp_path):
+def test_every_choice(snapshots, rule, tmp_path):
     policy = Policy.load(snapshots["align-iql"])
     for candidates, value in [(1, "mean"), (6, "min"), (30, "mean")]:
         compare(policy, tmp_path / "policy.onnx", candidates=candidates, rule=rule, value=value)
@@ -80,45 +80,45 @@ BELOW_ONE = np.nextafter(np.float32(1), np.float32(0))
 EDGES = [0.0, float(BELOW_ONE), 1.0]
 
 
-def drawn_by_rule(worth, temperature, uniform):
-    """The native policy's rule, with its own float64; where rounding leaves none, the best."""
-    weights = np.exp((worth - worth.max()).astype(np.float64) / np.float64(np.float32(temperature)))
+def sample_by_rule(scores, temperature, uniform):
+    """The native policy's rule, with its own float64; the best if rounding leaves none."""
+    weights = np.exp((scores - scores.max()).astype(np.float64) / np.float64(np.float32(temperature)))
     sums = np.cumsum(weights)
     beyond = sums > np.float64(np.float32(uniform)) * sums[-1]
-    return int(np.argmax(beyond)) if beyond.any() else int(np.argmax(worth))
+    return int(np.argmax(beyond)) if beyond.any() else int(np.argmax(scores))
 
 
-def chosen(worth, rule, uniform):
-    """What a model takes of candidates whose numbers are one-hot: the share of each."""
-    graph, (n, count) = Graph(), worth.shape
-    inputs = {"drawn": np.tile(np.eye(count, dtype=np.float32), (n, 1, 1)), "worth": worth, "uniform": uniform}
+def chosen(scores, rule, uniform):
+    """The share of each candidate in the model's choice, by one-hot candidates."""
+    graph, (n, count) = Graph(), scores.shape
+    inputs = {"drawn": np.tile(np.eye(count, dtype=np.float32), (n, 1, 1)), "scores": scores, "uniform": uniform}
     drawn, of, numbers = (graph.input(name, array.shape[1:]) for name, array in inputs.items())
     model = graph.model({"taken": (choose(drawn, of, rule, count, numbers), (count,))}, "")
     return onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"]).run(None, inputs)[0]
 
 
 @pytest.mark.parametrize("edge", [*EDGES, 0.5])
-def test_every_uniform_number_has_its_candidate(edge):
+def test_every_uniform_number_selects_the_policy_s_candidate(edge):
     rng = np.random.default_rng(0)
-    worth = rng.normal(size=(2000, 10)).astype(np.float32)
-    worth[:500, 0] -= 60  # A float32 sum of the others does not see it.
-    worth[500:600, 0] = worth[500:600].max(1) - 200  # Below float32's exp, not below float64's.
-    worth[600:700] = 1.5
+    scores = rng.normal(size=(2000, 10)).astype(np.float32)
+    scores[:500, 0] -= 60  # A float32 sum of the others does not see it.
+    scores[500:600, 0] = scores[500:600].max(1) - 200  # Below float32's exp, not below float64's.
+    scores[600:700] = 1.5
     for temperature in (1.0, 0.05):
-        taken = chosen(worth, f"softmax:{temperature}", np.full((2000, 1), edge, np.float32))
-        assert np.array_equal(taken.argmax(1), [drawn_by_rule(row, temperature, edge) for row in worth])
+        taken = chosen(scores, f"softmax:{temperature}", np.full((2000, 1), edge, np.float32))
+        assert np.array_equal(taken.argmax(1), [sample_by_rule(row, temperature, edge) for row in scores])
     if edge == BELOW_ONE:
-        assert (chosen(worth[:500], "softmax:1", np.full((500, 1), edge, np.float32)).argmax(1) > 0).all()
+        assert (chosen(scores[:500], "softmax:1", np.full((500, 1), edge, np.float32)).argmax(1) > 0).all()
     if edge == 1.0:
-        assert np.array_equal(taken.argmax(1), worth.argmax(1))
-    mean = chosen(worth, "average:1:4", np.full((2000, 4), edge, np.float32))
+        assert np.array_equal(taken.argmax(1), scores.argmax(1))
+    mean = chosen(scores, "average:1:4", np.full((2000, 4), edge, np.float32))
     np.testing.assert_allclose(mean.sum(1), 1, rtol=1e-6)
     assert ((mean > 0).sum(1) == 4).all(), "four are taken, each once"
 
 
 @pytest.mark.parametrize("name", ["dql", "dtql", "align-iql"])
-def test_the_ends_of_uniform_numbers_choose_as_the_policy(snapshots, name, tmp_path):
-    """At 0 the first candidate, at 1 the best, just below 1 the last that counts, of those that the policy itself draws."""
+def test_extreme_uniform_numbers_choose_like_the_policy(snapshots, name, tmp_path):
+    """At 0 the first candidate, at 1 the best, just below 1 the last with any weight."""
     policy, states = Policy.load(snapshots[name]), batches()[2]
     export_onnx(policy, tmp_path / "policy.onnx", rule="softmax:0.1")
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
@@ -128,7 +128,7 @@ def test_the_ends_of_uniform_numbers_choose_as_the_policy(snapshots, name, tmp_p
         noise = policy.noise(len(states), rule="softmax:0.1", seed=3)
         noise["uniform"][:] = edge
         found = session.run(["actions"], {"observations": states, **noise})[0]
-        place = [drawn_by_rule(row, 0.1, edge) for row in values]
+        place = [sample_by_rule(row, 0.1, edge) for row in values]
         expected = best if edge == 1.0 else drawn[np.arange(len(states)), place]
         assert edge or place == [0] * len(states)
         close(found, expected, 1e-5)
@@ -140,14 +140,14 @@ def test_the_ends_of_uniform_numbers_choose_as_the_policy(snapshots, name, tmp_p
     ["diffusion_steps=1", "replan_every=2", "network={horizon=5, channels=4, multipliers=[4], groups=2}"],
     ["diffusion_steps=3", "guidance={steps=1, scale=1.0, stop=9}"],
 ])
-def test_plans_of_all_kinds(data, flags, tmp_path):
+def test_planners(data, flags, tmp_path):
     given = [part for flag in flags for part in ("--agent", flag)]
     run = train(tmp_path / "run", data, *OWN, "--algorithm", "diffuser", "--scale", "states,actions", *given, layers=False)
     compare(Policy.load(run), tmp_path / "policy.onnx")
 
 
 @pytest.mark.parametrize("algorithm", ["iql", "quad", "diffuser"])
-def test_numbers_that_never_change_are_exact_and_not_seen(algorithm, tmp_path):
+def test_constant_actions_are_exact_and_constant_observations_ignored(algorithm, tmp_path):
     given = arrays()
     given["observations"][:, 4], given["actions"][:, 1] = 90.0, 0.1
     quad_rl.Dataset.from_arrays(**given).save(tmp_path / "data.hdf5")
@@ -165,7 +165,7 @@ def test_numbers_that_never_change_are_exact_and_not_seen(algorithm, tmp_path):
     assert policy.about["scaling"]["rewards"] > 0
 
 
-def test_the_page_s_example_runs(snapshots, tmp_path, monkeypatch):
+def test_the_example_of_the_documentation_runs(snapshots, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = (PRESETS.parent / "docs" / "deploying.md").read_text()
     exec(page.split("```python\n")[1].split("```")[0], {"quad_rl": quad_rl, "policy": Policy.load(snapshots["quad"])})
@@ -173,7 +173,7 @@ def test_the_page_s_example_runs(snapshots, tmp_path, monkeypatch):
     assert [given.shape[1:] for given in inputs] == [[OBSERVATION], [5, 10, 3]] and "{1, 11}, drawn[] = {1, 5, 10, 3}" in page
 
 
-def test_what_cannot_be_is_refused(snapshots, tmp_path):
+def test_refuses_invalid_choices(snapshots, tmp_path):
     for message, choice in {"takes a value function": {"rule": "nearest"}, "candidates is 0": {"candidates": 0},
                             'value is "max"': {"value": "max"}}.items():
         with pytest.raises(ValueError, match=message):
@@ -194,7 +194,7 @@ export_onnx(policy, sys.argv[2])
 """
 
 
-def test_a_full_disk_leaves_the_model_that_was_there(snapshots, tmp_path):
+def test_a_full_disk_leaves_the_previous_model(snapshots, tmp_path):
     export_onnx(snapshots["dql"], tmp_path / "policy.onnx")
     before = (tmp_path / "policy.onnx").read_bytes()
     command = [sys.executable, "-c", FULL, snapshots["quad"], tmp_path / "policy.onnx"]

@@ -1,4 +1,4 @@
-"""Policies: beside a second implementation, beside the evaluator, and what they refuse."""
+"""Policies compared with a NumPy implementation and with the evaluator; refusals."""
 
 import copy
 import json
@@ -32,7 +32,7 @@ def close(found, expected):
 
 
 @pytest.mark.parametrize("name", POLICIES)
-def test_it_acts_as_a_second_implementation_does(snapshots, name):
+def test_acts_like_the_numpy_implementation(snapshots, name):
     policy, reference = Policy.load(snapshots[name]), Reference(snapshots[name])
     states = observations(6)
     expected = [reference.act(state.astype(np.float64), Random(40 + i, POLICY_STREAM)) for i, state in enumerate(states)]
@@ -50,7 +50,7 @@ def test_it_acts_as_a_second_implementation_does(snapshots, name):
     close([policy.value(states, drawn[:, 3], value=how) for how in ("min", "mean")], critics)
 
 
-def test_another_choice_is_made_where_it_is_asked_for(snapshots):
+def test_a_call_may_change_the_choice(snapshots):
     policy, reference = Policy.load(snapshots["align-iql"]), Reference(snapshots["align-iql"])
     state = observations(1)[0]
     for rule, of_file in [("best", "best"), ("nearest", "nearest"), ("softmax:0.05", {"softmax": {"temperature": 0.05}})]:
@@ -63,8 +63,8 @@ def test_another_choice_is_made_where_it_is_asked_for(snapshots):
     assert (drawn.shape, values.shape) == ((4, ACTION), (4,))
 
 
-def test_whole_episodes_are_those_of_the_evaluator(hopper_runs):
-    """The evaluator's own returns, bit for bit, with Python's MuJoCo and its own generator of initial states."""
+def test_episodes_equal_the_evaluator_s(hopper_runs):
+    """The evaluator's own returns, bit for bit, with Python's MuJoCo and a second generator of initial states."""
     snapshot = hopper_runs / "seed0" / "snapshots" / "step_000000020.safetensors"
     scored = subprocess.run(["evaluator", "score", "--json", str(snapshot)], check=True, capture_output=True, timeout=600)
     expected = json.loads(scored.stdout)[0]["episodes"]
@@ -95,7 +95,7 @@ def test_whole_episodes_are_those_of_the_evaluator(hopper_runs):
     assert min(episode["length"] for episode in found) > 5
 
 
-def test_a_seed_is_an_episode_s_and_a_row_depends_on_nothing_else(snapshots):
+def test_a_row_depends_on_its_seed_alone(snapshots):
     policy, states = Policy.load(snapshots["quad"]), observations(200)
     actions = policy.act(states, seed=3)
     assert actions.dtype == np.float32 and actions.shape == (200, ACTION)
@@ -115,7 +115,7 @@ def test_a_seed_is_an_episode_s_and_a_row_depends_on_nothing_else(snapshots):
     assert len(one) == 3
 
 
-def test_arrays_of_any_kind_are_taken(snapshots):
+def test_accepts_arrays_of_any_type(snapshots):
     policy, states = Policy.load(snapshots["scaled"]), observations(8)
 
     class Array:
@@ -132,7 +132,7 @@ def test_arrays_of_any_kind_are_taken(snapshots):
     assert policy.value(states[:0], expected[:0]).shape == (0,)
 
 
-def test_what_it_says_of_itself(snapshots, hopper_runs):
+def test_properties(snapshots, hopper_runs):
     policy = Policy.load(str(snapshots["dql"]))
     assert (policy.observation_size, policy.action_size) == (OBSERVATION, ACTION)
     assert (policy.environment, policy.step, policy.kind, policy.precision) == ("my-robot", 12, "diffusion", "f32")
@@ -147,7 +147,7 @@ def test_what_it_says_of_itself(snapshots, hopper_runs):
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
-def test_what_cannot_be_is_refused(snapshots, tmp_path):
+def test_refuses_invalid_arguments(snapshots, tmp_path):
     policy, states = Policy.load(snapshots["quad"]), observations(3)
     bad = states.copy()
     bad[1, 4] = np.nan
@@ -186,7 +186,7 @@ def test_what_cannot_be_is_refused(snapshots, tmp_path):
     assert np.isfinite(episodes.act(states)).all(), "what was refused changed nothing"
 
 
-def test_other_threads_run_meanwhile(snapshots):
+def test_releases_the_interpreter_lock(snapshots):
     policy, states = Policy.load(snapshots["quad"]), observations(4000)
     thread = threading.Thread(target=policy.act, args=(states,), kwargs={"candidates": 100})
     ticks = 0
@@ -234,13 +234,13 @@ assert [in_a_fork(call) for call in calls] == [7] * 4
 """
 
 
-def test_a_fork_of_a_process_that_has_acted_is_told_so(snapshots):
+def test_refuses_to_act_in_a_forked_process(snapshots):
     command = [sys.executable, "-W", "ignore", "-c", FORKS, str(snapshots["quad"])]
     ended = subprocess.run(command, capture_output=True, timeout=1200)
     assert ended.returncode == 0, ended.stderr.decode()
 
 
-def test_an_exported_policy_says_all_that_is_known_of_it(hopper_runs, tmp_path):
+def test_an_exported_policy_describes_itself(hopper_runs, tmp_path):
     run, out = hopper_runs / "seed0", tmp_path / "policy.safetensors"
     command = ["learner", "export", str(run), "--step", "best", "--out", str(out), "--license", "CC0"]
     subprocess.run(command, check=True, capture_output=True, timeout=600)

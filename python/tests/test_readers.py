@@ -287,7 +287,7 @@ def test_d3rlpy():
     with pytest.raises(ValueError, match="tuples"):
         Dataset.from_d3rlpy(SimpleNamespace(episodes=[SimpleNamespace(observations=(episodes[0].observations,))]))
     episodes[0].actions = np.zeros((5, 1), int)
-    with pytest.raises(ValueError, match="whole numbers"):
+    with pytest.raises(ValueError, match="integers"):
         Dataset.from_d3rlpy(SimpleNamespace(episodes=episodes[:1]))
 
 

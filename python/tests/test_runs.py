@@ -1,4 +1,4 @@
-"""Results of runs, and that the types are those that a checker takes."""
+"""Results of runs, and the package's type hints."""
 
 import json
 import subprocess
@@ -32,7 +32,7 @@ def test_runs_are_a_table(hopper_runs, data, tmp_path):
     assert runs(tmp_path / "nothing*") == []
 
 
-def test_a_damaged_run_is_named_and_hides_no_other(data, tmp_path):
+def test_a_damaged_run_is_skipped_with_a_warning(data, tmp_path):
     for name in ("damaged", "whole"):
         train(tmp_path / name, data, "--task", "own-data", "--steps", "1")
     (tmp_path / "damaged" / "scores.jsonl").write_text('{"step": 10}\n')
@@ -81,7 +81,7 @@ quad_rl.Dataset.from_lerobot("x", observations=3)
 """
 
 
-def test_a_type_checker_accepts_right_calls_and_no_others(tmp_path):
+def test_the_type_checker_accepts_valid_calls_only(tmp_path):
     def errors(sample):
         (tmp_path / "sample.py").write_text(sample)
         command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), "sample.py"]
@@ -93,7 +93,7 @@ def test_a_type_checker_accepts_right_calls_and_no_others(tmp_path):
     assert {line.split(":")[1] for line in errors(WRONG)} == {"3", "4", "5", "6", "7", "8", "9"}
 
 
-def test_everything_public_says_what_it_takes(tmp_path):
+def test_everything_public_is_typed(tmp_path):
     import quad_rl
 
     for name in ("Policy", "Episodes", "Dataset", "Run"):

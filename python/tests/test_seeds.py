@@ -1,4 +1,4 @@
-"""An episode of an evaluator in Python is its seed's and its policy's alone, whoever runs it and beside what."""
+"""An episode of an evaluator in Python depends on its seed and its policy alone."""
 
 import importlib
 
@@ -21,7 +21,7 @@ ENVIRONMENTS = {
 
 
 class Traced(gymnasium.Wrapper):
-    """Its return tells of the whole way, which a task's own may not."""
+    """Returns a sum over the whole path, to which every step contributes."""
 
     def step(self, action):
         observation, _, *rest = self.env.step(action)
@@ -60,7 +60,7 @@ def test_scores_do_not_depend_on_the_number_of_workers(package, tmp_path, monkey
 
 
 class Draws(gymnasium.Env):
-    """Draws as OGBench does, from NumPy's global generator and from the action space, and in its steps, too."""
+    """Draws like OGBench from NumPy's global generator and from the action space, also in steps."""
 
     def __init__(self):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
@@ -74,7 +74,7 @@ class Draws(gymnasium.Env):
         return drawn, self.mass, False, False, {}
 
 
-def test_episodes_side_by_side_draw_as_each_does_alone():
+def test_concurrent_episodes_draw_like_single_ones():
     def by_hand(seed):
         np.random.seed(9)
         environment = Draws()

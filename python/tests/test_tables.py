@@ -130,7 +130,7 @@ def test_a_table_without_a_line_of_names(tmp_path):
 def test_whole_numbers_are_actions_if_they_are_said_to_be():
     frame = table().assign(torque=np.random.default_rng(0).integers(-20, 20, 60))
     asked = {**COLUMNS, "reward": "gain", "terminal": "fell"}
-    with pytest.raises(ValueError, match=r"actions are whole numbers, .*\nhint: amounts, .*astype\(float\).* continuous=True, quad-convert --continuous"):
+    with pytest.raises(ValueError, match=r"actions are integers, .*\nhint: pass amounts, .*astype\(float\).* continuous=True, quad-convert --continuous"):
         Dataset.from_frame(frame, **asked)
     right = Dataset.from_frame(frame.astype({"torque": float}), **asked)
     assert all(map(np.array_equal, rows(Dataset.from_frame(frame, **asked, continuous=True)), rows(right)))
@@ -215,7 +215,7 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys):
     (tmp_path / "none-huge-v0.npz").touch()
     for message, words in {
         "needs --actions and --reward": [tmp_path / "log.csv", "--observations", "x", "--episode", "run"],
-        "--task says nothing of this source": [*log, "--reward", "gain", "--task", "pick"],
+        "--task does not apply to this source": [*log, "--reward", "gain", "--task", "pick"],
         "nothing says what is rewarded": [folder, "--observations", "observation.state"],
         "there is no nothing.csv": ["nothing.csv"],
         "has no rewards": ["ogbench:cube-double-play-v0"],

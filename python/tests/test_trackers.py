@@ -1,4 +1,4 @@
-"""That TensorBoard, Weights & Biases and MLflow have of a run what its folder has."""
+"""The metrics of a run in TensorBoard, Weights & Biases and MLflow."""
 
 import json
 import re
@@ -40,7 +40,7 @@ def same(found, expected):
 
 
 def run_example(tracker, run, folder, monkeypatch):
-    """Runs what docs/python.md shows for a tracker, in a folder with the run in runs/mine."""
+    """Runs the example of docs/python.md for a tracker, in a folder with the run in runs/mine."""
     shutil.copytree(run, folder / "runs/mine")
     monkeypatch.chdir(folder)
     [example] = re.findall(rf"^```python\n((?:import|from) {tracker}\b.*?)^```$", PAGE, re.M | re.S)
@@ -48,7 +48,7 @@ def run_example(tracker, run, folder, monkeypatch):
 
 
 def of_rows(rows):
-    """The values of rows by name and step, without what says when they are from."""
+    """The values of rows by name and step, without times."""
     found = {}
     for row in rows:
         for name, value in row.items():
@@ -107,7 +107,7 @@ def test_mlflow_has_each_value(hopper_runs, tmp_path, monkeypatch):
     same({name: {one.step: one.value for one in values} for name, values in found.items()}, series(hopper_runs / "seed0"))
 
 
-def test_a_row_has_what_is_known_of_its_step(hopper_runs, tmp_path):
+def test_a_row_has_all_metrics_of_its_step(hopper_runs, tmp_path):
     shutil.copytree(hopper_runs / "seed0", tmp_path / "cut off")
     with (tmp_path / "cut off/metrics.jsonl").open("a") as file:
         file.write('{"step":30,"sec')

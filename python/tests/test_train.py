@@ -1,4 +1,4 @@
-"""`quad_rl.train` is the program `learner train`, with its words."""
+"""`quad_rl.train` runs the program `learner train`."""
 
 import io
 import os
@@ -21,7 +21,7 @@ from test_evaluate import Walk, children, wait
 SMALL = {"algorithm": "iql", "agent": {"actor": {"hidden": [16]}, "critic.hidden": [16], "value.hidden": [16]}}
 
 
-def test_it_trains_as_the_program_does(data, tmp_path, capsys):
+def test_trains_like_the_program(data, tmp_path, capsys):
     run = quad_rl.train(quad_rl.Dataset.from_arrays(**arrays()), run_dir=tmp_path / "run", steps=300, scale="actions,states",
                         set={"batch_size": 32}, **SMALL)
     flags = ["--agent", "actor={hidden=[16]}", "--agent", "critic={hidden=[16]}", "--agent", "value={hidden=[16]}"]
@@ -54,7 +54,7 @@ quad_rl.train(sys.argv[1], **ast.literal_eval(sys.argv[2]))
 
 
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
-def test_it_ends_with_python_and_goes_on(by, data, tmp_path):
+def test_stops_with_python_and_resumes(by, data, tmp_path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
@@ -79,7 +79,7 @@ def test_it_ends_with_python_and_goes_on(by, data, tmp_path):
 
 
 def run(script, *arguments, launcher=(), **environment):
-    """What a script prints that another program starts."""
+    """The output of a script."""
     command = [*launcher, sys.executable, "-c", script, *map(str, arguments)]
     ended = subprocess.run(command, cwd=pathlib.Path(__file__).parent, capture_output=True, text=True, timeout=600,
                            env=os.environ | environment)
@@ -87,7 +87,7 @@ def run(script, *arguments, launcher=(), **environment):
     return ended.stdout
 
 
-def test_a_page_is_found_whatever_the_log_shows(data, tmp_path):
+def test_finds_the_page_whatever_the_log_level(data, tmp_path):
     train(tmp_path / "run", data, "--task", "own-data", "--steps", "1")
     script = "import sys, quad_rl; print(quad_rl.Run(sys.argv[1]).page)"
     assert run(script, tmp_path / "run", RUST_LOG="warn").startswith("http://127.0.0.1:")
@@ -133,11 +133,11 @@ train(sys.argv[1], steps=1)
 """
 
 
-def test_a_learner_that_failed_is_no_success_where_the_ends_of_children_are_ignored(data, tmp_path):
+def test_a_failure_is_an_error_even_if_sigchld_is_ignored(data, tmp_path):
     said = run(FAILS, data, tmp_path / "run", launcher=["env", "--ignore-signal=CHLD"])  # As some init scripts start programs.
     first, killed, unknown, success = [line for line in said.splitlines() if not line.startswith((" ", "hint:"))]
-    assert first.startswith("cannot read /nowhere.hdf5") and killed == "the learner was ended by SIGKILL", said
-    assert unknown.startswith("how the learner ended is not known") and success == f"Run('{tmp_path / 'run'}')", said
+    assert first.startswith("cannot read /nowhere.hdf5") and killed == "the learner was killed by SIGKILL", said
+    assert unknown.startswith("the learner's exit code is unknown") and success == f"Run('{tmp_path / 'run'}')", said
 
 
 CLOSED = """
@@ -153,12 +153,12 @@ files[0].write("done")
 """
 
 
-def test_without_standard_streams_everything_works_and_no_file_is_taken_for_one(data, tmp_path):
+def test_works_without_standard_streams_and_writes_to_no_other_file(data, tmp_path):
     run(CLOSED, data, tmp_path, launcher=["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh"])
     assert [(tmp_path / f"file{number}").read_text() for number in range(3)] == ["done", "", ""]
 
 
-def test_where_nothing_can_be_shown_the_learner_goes_on(monkeypatch):
+def test_a_failure_to_show_progress_does_not_stop_the_learner(monkeypatch):
     class Gone(io.StringIO):
         def write(self, text):
             raise BrokenPipeError
@@ -173,7 +173,7 @@ def test_where_nothing_can_be_shown_the_learner_goes_on(monkeypatch):
         assert error == ["error: no"]
 
 
-def test_a_bar_stays_in_its_place(monkeypatch):
+def test_the_bar_overwrites_its_line(monkeypatch):
     class Screen(io.StringIO):
         def isatty(self):
             return True

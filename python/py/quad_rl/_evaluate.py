@@ -1,4 +1,4 @@
-"""Evaluators for environments that Python moves."""
+"""Evaluators for environments in Python."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from quad_rl import _quad_rl
 from quad_rl._extras import library
 from quad_rl._process import Worker
 
-# Between two looks for workers that were killed, seconds.
-_LOOK = 1.0
-# Workers get this long to deliver their scores and leave, seconds.
+# Interval of checks for workers that were killed, seconds.
+_CHECK_INTERVAL = 1.0
+# Time for workers to deliver their scores and leave, seconds.
 _LEAVE = 12.0
 
 
 class Evaluators:
     """Worker processes that evaluate a learner's policies in an environment of yours, until `stop()`.
 
-    With `with`, they are there inside the block:
+    As a context manager, it stops them at the end of the block:
 
         with quad_rl.Evaluators("my-robot", lambda seed: MyEnv(), workers=2):
             subprocess.run(["learner", "train", ...])
@@ -52,7 +52,7 @@ class Evaluators:
         if isinstance(environment, str):
             environment = _Gymnasium(environment)
         if not callable(environment):
-            raise ValueError("environment must be a Gymnasium id, or a function that takes a seed and gives an environment")
+            raise ValueError("environment must be a Gymnasium id, or a function that takes a seed and returns an environment")
         workers = len(os.sched_getaffinity(0)) if workers is None else workers
         if workers < 1:
             raise ValueError(f"workers is {workers}, but must be at least 1")
@@ -76,8 +76,8 @@ class Evaluators:
         self._watcher.start()
 
     def _watch(self) -> None:
-        """Starts workers again that were killed. One that cannot work ends them all."""
-        while not self._stopping.wait(_LOOK):
+        """Restarts workers that were killed. An error of one stops them all."""
+        while not self._stopping.wait(_CHECK_INTERVAL):
             try:
                 for worker in self._workers:
                     worker.revive()
@@ -86,9 +86,9 @@ class Evaluators:
                 self._stopping.set()
 
     def wait(self) -> None:
-        """Waits until the workers are stopped: by Ctrl-C, after which they leave in order, or by `stop()` of another thread.
+        """Waits until Ctrl-C, or `stop()` in another thread, stops the workers.
 
-        Raises RuntimeError if they cannot work.
+        Raises RuntimeError if a worker fails.
         """
         try:
             while not self._stopping.wait(0.2):
@@ -101,9 +101,9 @@ class Evaluators:
             raise self._error
 
     def stop(self) -> None:
-        """Lets the workers deliver the scores that they have, hand back the jobs that they have begun, and end."""
+        """Stops the workers, which deliver their scores and hand back unfinished jobs."""
         if os.getpid() != self._process:
-            return  # A fork of the process whose workers they are.
+            return  # A fork of the process that owns the workers.
         self._stopping.set()
         if self._watcher.is_alive():
             self._watcher.join()
@@ -127,25 +127,25 @@ class Evaluators:
 def evaluate(name: str, environment: str | Callable[[int], Any], **arguments: Any) -> None:
     """Evaluates learners' policies in an environment of yours until Ctrl-C: `evaluator serve` for any environment.
 
-    name: what the learner's run calls the environment: `learner train --task own-data --env NAME`.
-    environment: a Gymnasium id, or a function that takes a seed and gives an environment: an object with `reset(seed=…)`,
-        which gives (observation, info), and `step(action)`, which gives (observation, reward, terminated, truncated, info),
-        as in Gymnasium. The seed is the run's, the same for all episodes. Observations are flattened to one row of numbers.
-    connect: where the learner or a router listens, or a list of such places.
+    name: the environment's name in the learner's run: `learner train --task own-data --env NAME`.
+    environment: a Gymnasium id, or a function that takes a seed and returns an environment: an object with `reset(seed=…)`,
+        which returns (observation, info), and `step(action)`, which returns (observation, reward, terminated, truncated,
+        info), as in Gymnasium. The seed is the run's, the same for all episodes. Observations are flattened.
+    connect: endpoint of the learner or a router, or a list of endpoints.
     certificates: folder with ca.pem, cert.pem and key.pem, for endpoints like "tls/HOST:PORT".
-    workers: processes, each with one job at a time [default: one a core].
+    workers: processes, each with one job at a time [default: one per core].
     score: "return"; or "success", 100 if the last info's "success" (or "is_success") is true, else 0; or a pair (low, high)
         of returns that score 0 and 100.
     precision: arithmetic of the policy, "f32" or "bf16".
 
-    What the environment raises is logged, told to the learner in one line, and costs the episode an attempt.
-    Raises ValueError for arguments that cannot be, RuntimeError if the environment cannot be made.
+    An error of the environment is logged, reported to the learner in one line, and counts as a failed attempt of the job.
+    Raises ValueError for invalid arguments, RuntimeError if the environment cannot be made.
     """
     Evaluators(name, environment, **arguments).wait()
 
 
 class _Gymnasium:
-    """Makes environments by their id."""
+    """Makes environments by their Gymnasium id."""
 
     def __init__(self, name: str) -> None:
         self.name = name

@@ -1,4 +1,4 @@
-"""Optional libraries, by the extra of this package that names them."""
+"""Optional libraries, by the extra of this package that installs them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-# What pip has to install for each, as in pyproject.toml, but for versions.
+# The packages of each extra, as in pyproject.toml, without versions.
 EXTRAS = {
     "gymnasium": ["gymnasium"],
     "lerobot": ["pyarrow"],
@@ -20,17 +20,17 @@ EXTRAS = {
 
 
 def library(module: str, extra: str) -> Any:
-    """A module of an extra. Raises ImportError that names both."""
+    """Imports a module of an extra. The ImportError names both."""
     with needing(extra):
         return importlib.import_module(module)
 
 
 @contextmanager
 def needing(extra: str) -> Iterator[None]:
-    """Says of an ImportError within which extra was not installed."""
+    """Names the missing extra in an ImportError."""
     try:
         yield
     except ImportError as error:
         packages = " ".join(f"'{package}'" if "[" in package else package for package in EXTRAS[extra])
-        hint = f"hint: pip install {packages}, which the extra {extra!r} of quad-rl names"
+        hint = f"hint: pip install {packages} (the extra {extra!r} of quad-rl)"
         raise ImportError(f"{packages.split()[0]} is needed: {error}\n{hint}", name=error.name) from None

@@ -1,4 +1,4 @@
-"""Processes that this package starts: any; and a worker of `quad_rl.evaluate`, started, started again, ended."""
+"""Child processes, and the workers of `quad_rl.evaluate`, which are restarted."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-# A worker that ends so soon after its start, seconds, is started again after a growing pause.
+# A worker that ends within this many seconds of its start is restarted after a growing pause.
 _SOON = 60.0
-# So many such ends in a row are the last.
+# Most such ends in a row.
 _ENDS = 6
 _WHY = "its standard error may say why"
-# Found here, since a process that was just forked should look for nothing.
+# Looked up here, because a forked process should not load libraries.
 _PRCTL, _SIGNAL = ctypes.CDLL(None).prctl, ctypes.CDLL(None).signal
 _SIGNAL.argtypes = [ctypes.c_int, ctypes.c_void_p]
 _PR_SET_PDEATHSIG = 1
 
 
 def start(command: Sequence[str], *, ends_with_thread: bool = False, **settings: Any) -> subprocess.Popen[Any]:
-    """Starts a program, in a session of its own: a terminal's Ctrl-C is this process's to pass on.
+    """Starts a program in a new session, so that a terminal's Ctrl-C reaches this process alone.
 
-    ends_with_thread: the system ends the program in order when the thread that starts it is gone.
-    settings: what else Popen takes. Standard error is this process's by default, if it has one.
+    ends_with_thread: the program gets SIGTERM when the thread that starts it ends.
+    settings: other arguments of Popen. Standard error is this process's by default, if it has one.
     """
     if signal.getsignal(signal.SIGCHLD) == signal.SIG_IGN:
-        # Some init scripts leave it so, and then nobody learns how a child has ended. Python's own function would be for the
-        # main thread alone.
+        # Some init scripts leave it so, which hides the exit codes of children. Python's own function works in the main
+        # thread alone.
         _SIGNAL(signal.SIGCHLD, None)
     if "stderr" not in settings and not _has_stderr():
         settings["stderr"] = subprocess.DEVNULL
@@ -40,7 +40,7 @@ def start(command: Sequence[str], *, ends_with_thread: bool = False, **settings:
 
 
 def exit_code(process: subprocess.Popen[Any]) -> int | None:
-    """Waits for its end, and gives its exit code; None if another part of this process took it, which Popen takes for 0."""
+    """Waits for the exit code; None if another part of this process has taken it, which Popen reports as 0."""
     try:
         ended = os.waitid(os.P_PID, process.pid, os.WEXITED)
     except ChildProcessError:
@@ -55,7 +55,7 @@ def _end_with_thread() -> None:
 
 
 def _has_stderr() -> bool:
-    """Whether this process was started with a standard error, and has not closed it. Else number 2 may be any file."""
+    """True if this process has a standard error. Otherwise file descriptor 2 may be any file."""
     try:
         os.fstat(2)
     except OSError:
@@ -69,57 +69,57 @@ class Worker:
     def __init__(self, payload: list[bytes]) -> None:
         self._payload = payload
         self._ends = 0
-        self._again: float | None = None
+        self._restart_at: float | None = None
         self.start()
 
     def start(self) -> None:
-        self._again = None
+        self._restart_at = None
         self._started = time.monotonic()
-        # One thread moves all of a worker's environments, whatever this process uses: they share NumPy's generator.
+        # One thread steps all environments of a worker, because they share NumPy's generator.
         environment = {"OMP_NUM_THREADS": "1", **os.environ, "RAYON_NUM_THREADS": "1"}
         command = [sys.executable, "-m", "quad_rl._worker"]
         self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
         assert self.process.stdin and self.process.stdout
         self._out = self.process.stdout
-        # A process that the worker's environment has forked holds the pipe, too: it may never end.
+        # A process that the environment has forked may hold the pipe open for ever.
         os.set_blocking(self._out.fileno(), False)
         try:
             with self.process.stdin as pipe:
                 for part in self._payload:
                     pipe.write(len(part).to_bytes(8, "little") + part)
         except BrokenPipeError:
-            pass  # It has ended, which its answer tells.
+            pass  # Its answer has the reason.
 
     def wait_until_ready(self) -> None:
         """Raises RuntimeError if it cannot make its environment."""
-        said, ended = b"", False
-        while not (said.endswith(b"\n") or ended):
+        output, ended = b"", False
+        while not (output.endswith(b"\n") or ended):
             ended = self.process.poll() is not None
-            said += self._said()
+            output += self._read()
             time.sleep(0.02)
-        _check(said)
+        _check(output)
         if ended:
             raise RuntimeError(f"a worker ended before it had an environment ({self._end()}); {_WHY}")
 
     def revive(self) -> None:
-        """Starts it again if it was killed. Raises RuntimeError if it cannot work, or has ended too often."""
+        """Restarts it if it was killed. Raises RuntimeError if it reports an error or has ended too often."""
         if self.process.poll() is None:
             return
         now = time.monotonic()
-        if self._again is None:
-            _check(self._said())
+        if self._restart_at is None:
+            _check(self._read())
             self._ends = self._ends + 1 if now - self._started < _SOON else 1
             if self._ends == _ENDS:
                 raise RuntimeError(f"a worker ended {_ENDS} times in a row soon after its start ({self._end()}); {_WHY}")
             pause = 2**self._ends - 2  # 0, 2, 6, 14, 30
-            self._again = now + pause
-            print(f"quad_rl: a worker ended ({self._end()}); it is started again in {pause} s", file=sys.stderr)
-        if now >= self._again:
+            self._restart_at = now + pause
+            print(f"quad_rl: a worker ended ({self._end()}); restarting in {pause} s", file=sys.stderr)
+        if now >= self._restart_at:
             self._out.close()
             self.start()
 
     def end(self) -> None:
-        """Tells it to deliver its scores and end."""
+        """Makes it deliver its scores and end."""
         self.process.terminate()
 
     def wait(self, until: float) -> None:
@@ -131,19 +131,19 @@ class Worker:
             self.process.wait()
         self._out.close()
 
-    def _said(self) -> bytes:
-        """What it has said since it was asked last."""
+    def _read(self) -> bytes:
+        """Its output since the last call."""
         return self._out.read() or b""
 
     def _end(self) -> str:
-        """How it ended, e.g. "Killed"."""
+        """The cause of its end, e.g. "Killed"."""
         code = self.process.returncode
         return signal.strsignal(-code) or f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
-def _check(said: bytes) -> None:
-    """Raises what a worker has said is wrong. The last line may be cut off."""
-    for line in said.split(b"\n")[:-1]:
+def _check(output: bytes) -> None:
+    """Raises a worker's error. The last line of its output may be incomplete."""
+    for line in output.split(b"\n")[:-1]:
         error = json.loads(line).get("error")
         if error is not None:
             raise RuntimeError(error)

@@ -1,4 +1,4 @@
-"""Transitions as arrays, each checked."""
+"""Transitions as checked arrays."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 _NAMES = {"terminations": "terminated", "truncations": "truncated"}
-_AMOUNTS = "hint: amounts, such as torques, are given as floats, actions.astype(float); readers take continuous=True, quad-convert --continuous"
+_AMOUNTS = "hint: pass amounts, such as torques, as floats: actions.astype(float); readers take continuous=True, quad-convert --continuous"
 
 
 class Rows(NamedTuple):
-    """Transitions as the file has them."""
+    """Transitions in the layout of the file."""
 
     observations: NDArray[np.float32]
     actions: NDArray[np.float32]
@@ -24,7 +24,7 @@ class Rows(NamedTuple):
 
 
 def episode_rows(where: str, episode: Any) -> Rows:
-    def of(name: str) -> Any:
+    def get(name: str) -> Any:
         for name in (name, _NAMES.get(name, name)):
             if isinstance(episode, Mapping) and name in episode:
                 return episode[name]
@@ -32,16 +32,16 @@ def episode_rows(where: str, episode: Any) -> Rows:
                 return getattr(episode, name)
         raise ValueError(f"{where}there are no {name}")
 
-    steps = len(of("rewards"))
+    steps = len(get("rewards"))
     if not steps:
         raise ValueError(f"{where}it has no step")
     ends = []
     for name in _NAMES:
-        flags = plain(where, name, of(name))
+        flags = plain(where, name, get(name))
         ends.append(flags if flags.ndim else np.where(np.arange(steps) == steps - 1, flags, 0))
-    observations = plain(where, "observations", of("observations"))
+    observations = plain(where, "observations", get("observations"))
     after = observations[1:] if len(observations) == steps + 1 else None
-    rows = rows_of(where, observations[:steps], of("actions"), of("rewards"), ends[0], ends[1], after)
+    rows = rows_of(where, observations[:steps], get("actions"), get("rewards"), ends[0], ends[1], after)
     if after is None:
         return followed(rows)
     rows.timeouts[-1] |= not rows.terminals[-1]
@@ -58,7 +58,7 @@ def rows_of(
     next_observations: ArrayLike | None,
 ) -> Rows:
     if np.asarray(actions).dtype.kind in "iub":
-        raise ValueError(f"{where}actions are whole numbers, as if they were discrete; only continuous ones can be learned\n{_AMOUNTS}")
+        raise ValueError(f"{where}actions are integers, as if they were discrete; only continuous actions can be learned\n{_AMOUNTS}")
     r = _array(where, "rewards", rewards, None, 1)
     n = len(r)
     o = _array(where, "observations", observations, n, 2)
@@ -73,10 +73,10 @@ def rows_of(
 
 
 def plain(where: str, name: str, values: Any) -> NDArray[Any]:
-    """As an array. Raises ValueError where a masked array hides a number: what lies below is none that was recorded."""
+    """As an array. Raises ValueError for masked values, which were not recorded."""
     if np.ma.is_masked(values):
         rows = np.unique(np.nonzero(np.ma.getmaskarray(values))[0])
-        hint = "hint: leave these rows out, or fill them yourself, as by numpy.ma's filled(0)"
+        hint = "hint: leave these rows out, or fill them, as by numpy.ma's filled(0)"
         raise ValueError(f"{where}{name}, row {rows[0]} is masked ({len(rows)} such rows)\n{hint}")
     return np.asarray(values)
 
@@ -92,7 +92,7 @@ def _flags(where: str, name: str, values: ArrayLike, rows: int) -> NDArray[np.bo
 def _array(
     where: str, name: str, values: ArrayLike, rows: int | None, axes: int, width: int | None = None
 ) -> NDArray[np.float32]:
-    """Finite numbers, N or N × width."""
+    """Finite numbers [N] or [N, width]."""
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(plain(where, name, values), dtype=np.float32)
     shape, n = list(array.shape), "N" if rows is None else rows
@@ -111,13 +111,13 @@ def _array(
 
 
 def followed(rows: Rows) -> Rows:
-    """The same steps with what follows them, without those of which that is not known."""
+    """Adds next observations, and drops the steps without one."""
     o, terminals, timeouts = rows.observations, rows.terminals, rows.timeouts
     after = np.concatenate([o[1:], o[-1:]])
-    after[terminals] = o[terminals]  # Not learned from.
+    after[terminals] = o[terminals]  # Unused.
     dropped = timeouts & ~terminals
     dropped[-1:] |= ~terminals[-1:]
-    # An episode of which the last step is dropped ends with the one before.
+    # An episode whose last step is dropped ends with the step before.
     ends = timeouts & terminals
     ends[:-1] |= dropped[1:] & ~terminals[:-1]
     kept = ~dropped

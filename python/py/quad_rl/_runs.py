@@ -15,15 +15,15 @@ from quad_rl import _quad_rl
 
 
 def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*") -> list[dict[str, Any]]:
-    """What runs have scored, as `pandas.DataFrame` takes it: a dictionary for each evaluation of each run.
+    """The scores of runs, for `pandas.DataFrame`: a dictionary for each evaluation of each run.
 
-    folders: a run folder, a pattern such as "runs/*", or several of them. Folders that hold no run are left out.
+    folders: a run folder, a pattern such as "runs/*", or several of them. Folders without a run are left out.
 
-    Each dictionary has, from `learner report --json`: of its evaluation `step`, `episodes`, `complete`, `score` (mean over the
-    episodes), `score_std`, `return` and `length`; of its run `run`, `dir`, `task`, `algorithm`, `variant`, `agent`, `seed`,
+    Each dictionary has, from `learner report --json`, the evaluation's `step`, `episodes`, `complete`, `score` (mean over the
+    episodes), `score_std`, `return` and `length`; the run's `run`, `dir`, `task`, `algorithm`, `variant`, `agent`, `seed`,
     `steps`, `normalized`, `scored_in`, `dataset_score`, `mean_last_3`, `mean_last_5` and `mean_last_50000_steps`, the same in
-    all its rows; and each setting of its `config.toml` under its name there, like `experiment.batch_size`. A run that has
-    no evaluation yet has one row, in which these are None.
+    all its rows; and each setting of its `config.toml`, like `experiment.batch_size`. A run without an evaluation has one
+    row, in which the evaluation's values are None.
 
     A learner may be writing the folders. A run that cannot be read is left out, with a warning that names it.
     """
@@ -39,19 +39,18 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
 
 
 def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
-    """What a run has measured, as experiment trackers take it: a dictionary for each step at which there is something.
+    """The metrics of a run, for experiment trackers: a dictionary for each step with any.
 
     folder: a run folder.
 
-    Each dictionary has `step`. Where the run's metrics.jsonl has that step, it has `seconds` (of training) and, as `train/NAME`,
-    each metric that was measured there. Where all episodes of an evaluation of that step are scored, it has
-    `evaluation/score`, `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`.
+    Each dictionary has `step`. For a step in the run's metrics.jsonl, it has `seconds` (of training) and each metric as
+    `train/NAME`. For a step whose evaluation is complete, it has `evaluation/score`, `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`.
     Steps ascend.
 
-    A learner may be writing the folder. Raises FileNotFoundError if it holds no metrics.jsonl, RuntimeError if a file is
-    not what a learner writes.
+    A learner may be writing the folder. Raises FileNotFoundError if it holds no metrics.jsonl, RuntimeError if a file
+    is invalid.
     """
-    lines = Path(folder, "metrics.jsonl").read_text().split("\n")[:-1]  # What follows the last end of a line is half a line.
+    lines = Path(folder, "metrics.jsonl").read_text().split("\n")[:-1]  # The last line may be incomplete.
     rows: dict[int, dict[str, float]] = {}
     for line in map(json.loads, lines):
         named = {name if name in ("step", "seconds") else f"train/{name}": value for name, value in line.items()}
@@ -65,10 +64,10 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
 
 
 def rows_of(folder: str | PathLike[str]) -> list[dict[str, Any]]:
-    """What `runs` gives for one run. Raises RuntimeError if a file is not what a learner writes."""
+    """The rows of `runs` for one run. Raises RuntimeError if a file is invalid."""
     run, config = map(json.loads, _quad_rl.read_run(folder))
-    of_run = _flat("", {name: value for name, value in run.items() if name not in ("evaluations", "episodes_missing")})
-    of_run |= _flat("", config)
+    common = _flat("", {name: value for name, value in run.items() if name not in ("evaluations", "episodes_missing")})
+    common |= _flat("", config)
     evaluations = [
         {
             **{name: one[name] for name in ("step", "episodes", "complete")},
@@ -78,11 +77,11 @@ def rows_of(folder: str | PathLike[str]) -> list[dict[str, Any]]:
         for one in run["evaluations"]
     ]
     none = dict.fromkeys(("step", "episodes", "complete", "score", "score_std", "return", "length"))
-    return [of_run | evaluation for evaluation in evaluations or [none]]
+    return [common | evaluation for evaluation in evaluations or [none]]
 
 
 def _flat(prefix: str, table: dict[str, Any]) -> dict[str, Any]:
-    """Tables within tables as names with dots."""
+    """Flattens nested tables to dotted names."""
     flat: dict[str, Any] = {}
     for name, value in table.items():
         flat |= _flat(f"{prefix}{name}.", value) if isinstance(value, dict) else {prefix + name: value}

@@ -1,4 +1,4 @@
-"""Training from Python: the program `learner train`, started, shown and stopped."""
+"""Training from Python, by the program `learner train`."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from quad_rl._runs import metrics, rows_of
 _LINE = re.compile(r"\S+Z +([A-Z]+) (.*)")
 _STEP = re.compile(r"step (\d+)/(\d+) ")
 _PAGE = re.compile(r"page: (\S+)")
-# Characters of the bar.
+# Characters of the progress bar.
 _BAR = 20
 
 
 class Run:
-    """A run in its folder: what `train` gives. Made of any run's folder, it shows a run that was trained elsewhere."""
+    """A run's folder, from `train` or from elsewhere."""
 
     def __init__(self, folder: str | PathLike[str]) -> None:
         self.folder = Path(folder)
 
     def policy(self, step: int | None = None, precision: str = "f32") -> _quad_rl.Policy:
-        """The policy after that gradient step, of which there must be a snapshot; by default the last one.
+        """The policy of the snapshot after that gradient step, or of the last one.
 
-        Raises FileNotFoundError if there is none, else as `Policy.load`.
+        Raises FileNotFoundError if there is none; otherwise as `Policy.load`.
         """
-        there = sorted((self.folder / "snapshots").glob(f"step_{'*' if step is None else f'{step:09}'}.safetensors"))
-        if not there:
+        snapshots = sorted((self.folder / "snapshots").glob(f"step_{'*' if step is None else f'{step:09}'}.safetensors"))
+        if not snapshots:
             after = "" if step is None else f" after step {step}"
             raise FileNotFoundError(f"{self.folder} has no snapshot{after}")
-        return _quad_rl.Policy.load(there[-1], precision)
+        return _quad_rl.Policy.load(snapshots[-1], precision)
 
     @property
     def scores(self) -> list[dict[str, Any]]:
@@ -55,14 +55,14 @@ class Run:
 
     @property
     def metrics(self) -> list[dict[str, float]]:
-        """What `metrics` gives for it: a dictionary for each step that has metrics."""
+        """Its metrics, as of `quad_rl.metrics`: a dictionary for each step."""
         return metrics(self.folder)
 
     @cached_property
     def page(self) -> str:
-        """Address of its page, which `learner page` serves from the first access to the end of this process."""
+        """Address of its web page, which `learner page` serves until this process ends."""
         answer: SimpleQueue[str | Exception] = SimpleQueue()
-        # The program ends with the thread that starts it, so that must not be the caller's.
+        # The program ends with the thread that starts it, which may not be the caller's.
         threading.Thread(target=_serve_page, args=(self.folder, answer), daemon=True).start()
         page = answer.get()
         if isinstance(page, Exception):
@@ -74,15 +74,15 @@ class Run:
 
 
 def _serve_page(folder: Path, answer: SimpleQueue[str | Exception]) -> None:
-    """Answers with the address, or with what is wrong, and reads the program's log to its end."""
+    """Answers with the address or an error, and reads the program's log to its end."""
     try:
         process = _start("page", str(folder), "--http=127.0.0.1:0")
-        said = []
-        for _, text in _said(process):
+        lines = []
+        for _, text in _log(process):
             if page := _PAGE.match(text):
                 answer.put(page[1])
-            said.append(text)
-        raise _error(exit_code(process), said)
+            lines.append(text)
+        raise _error(exit_code(process), lines)
     except (RuntimeError, OSError) as error:
         answer.put(error)
 
@@ -97,16 +97,16 @@ def train(
     task: str | None = "own-data",
     **options: Any,
 ) -> Run:
-    """Trains by the program `learner train`, to the end of the run and of its evaluations, and shows how far it is.
+    """Runs `learner train` to the end of training and its evaluations, and shows its progress.
 
-    dataset: what `--dataset` takes, or a Dataset, which the learner gets as a temporary file.
+    dataset: an argument of `--dataset`, or a Dataset, which is passed as a temporary file.
     run_dir: folder of the run. If it contains a run of the same configuration, that run continues.
-    algorithm, steps, scale, task: as the program's; `learner train --help` says what they are.
-    options: any other option of the program, with _ for -: `eval_interval=5000`, `fresh=True`. A dictionary gives an
-        option several times: `agent={"tau": 0.5}, set={"batch_size": 64}`.
+    algorithm, steps, scale, task: as in `learner train --help`.
+    options: any other option, with _ for -: `eval_interval=5000`, `fresh=True`. A dictionary repeats an option:
+        `agent={"tau": 0.5}, set={"batch_size": 64}`.
 
-    An interrupt (Ctrl-C) ends the learner in order, and the same call continues the run; a second one ends it at once. The
-    learner also ends with this process. Raises RuntimeError with the learner's own error and hint.
+    An interrupt (Ctrl-C) stops the learner after a checkpoint, and the same call continues the run; a second one stops it at
+    once. The learner also stops with this process. Raises RuntimeError with the learner's error and hint.
     """
     own = {"task": task, "algorithm": algorithm, "steps": steps, "scale": scale, "run_dir": os.fspath(run_dir)}
     with tempfile.TemporaryDirectory() as folder:
@@ -120,7 +120,7 @@ def train(
         try:
             display.follow(process, error)
         except BaseException:
-            process.terminate()  # In order.
+            process.terminate()  # Writes a checkpoint.
             try:
                 display.follow(process, error)
             except KeyboardInterrupt:
@@ -135,8 +135,8 @@ def train(
 
 
 class _Display:
-    """Shows what a learner says. In a notebook or on a terminal, its line of progress is a bar that stays in its place. Where
-    nothing can be shown, the learner works all the same."""
+    """Shows a learner's log. In a notebook or on a terminal, its progress is a bar. A failure to show it does not stop the
+    learner."""
 
     def __init__(self) -> None:
         notebook = type(sys.stdout).__module__ == "ipykernel.iostream"
@@ -148,15 +148,15 @@ class _Display:
         self._bar = ""
 
     def follow(self, process: subprocess.Popen[str], error: list[str]) -> None:
-        """Until it has ended. What is no line of its log is the error, and not shown."""
-        for level, text in _said(process):
+        """Shows the log until the process ends. Lines that are not the log's are the error, and not shown."""
+        for level, text in _log(process):
             step = _STEP.match(text)
             if not level:
                 error.append(text)
             elif step and self._draws:
                 done = _BAR * int(step[1]) // int(step[2])
                 text = f"{'█' * done}{'░' * (_BAR - done)} {text}"
-                # A line that a terminal breaks cannot be drawn over.
+                # A wrapped line cannot be overwritten.
                 self._write(text[: shutil.get_terminal_size().columns - 1] if self._is_terminal else text)
             else:
                 self.say(text if level == "INFO" else f"{level} {text}")
@@ -171,13 +171,13 @@ class _Display:
         begin = "\r" if self._bar else ""
         try:
             print(begin + text.ljust(len(self._bar)), end=end, file=self._out, flush=True)
-        except (OSError, ValueError):  # Its reader has gone, or it was closed.
+        except (OSError, ValueError):  # It was closed.
             self._out = None
         self._bar = text
 
 
 def _start(*arguments: str) -> subprocess.Popen[str]:
-    """Starts the learner beside this Python, or else on the PATH."""
+    """Starts the learner beside this Python, otherwise the one on the PATH."""
     path = os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", "")])
     program = shutil.which("learner", path=path)
     if program is None:
@@ -190,27 +190,27 @@ def _start(*arguments: str) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         encoding="utf-8",
         errors="replace",
-        # What the log says is read here, so nothing may hide lines of it.
+        # RUST_LOG could hide lines that are parsed here.
         env={name: value for name, value in os.environ.items() if name != "RUST_LOG"},
     )
 
 
-def _said(process: subprocess.Popen[str]) -> Iterator[tuple[str, str]]:
-    """Level and text of each line of its log; a line that is no log's has no level."""
+def _log(process: subprocess.Popen[str]) -> Iterator[tuple[str, str]]:
+    """Level and text of each line of its log; other lines have no level."""
     assert process.stderr
     for line in process.stderr:
         logged = _LINE.fullmatch(line.rstrip("\n"))
         yield (logged[1], logged[2]) if logged else ("", line.rstrip("\n"))
 
 
-def _error(code: int | None, said: list[str]) -> RuntimeError:
+def _error(code: int | None, lines: list[str]) -> RuntimeError:
     if code is None:
-        how = "how the learner ended is not known: another part of this process waits for its children, or ignores their ends"
+        how = "the learner's exit code is unknown: another part of this process has waited for it, or ignores SIGCHLD"
     elif code < 0:
-        how = f"the learner was ended by {signal.Signals(-code).name}"
+        how = f"the learner was killed by {signal.Signals(-code).name}"
     else:
         how = f"the learner ended with exit code {code}"
-    return RuntimeError("\n".join(said).removeprefix("error: ") or how)
+    return RuntimeError("\n".join(lines).removeprefix("error: ") or how)
 
 
 def _flags(options: Mapping[str, Any]) -> Iterator[str]:

@@ -1,6 +1,6 @@
-"""One process of `quad_rl.evaluate`: it moves environments for a learner, until SIGTERM or the end of its parent.
+"""One process of `quad_rl.evaluate`: it steps environments for a learner, until SIGTERM or the end of its parent.
 
-`quad_rl.evaluate` starts it as `python -m quad_rl._worker`, and writes what it is to do to its standard input. The worker
+`quad_rl.evaluate` starts it as `python -m quad_rl._worker`, and writes a task to its standard input. The worker
 answers with one line of JSON: the sizes of the environment, or an error.
 """
 
@@ -25,11 +25,11 @@ from quad_rl import _quad_rl
 
 
 class EnvironmentFailed(RuntimeError):
-    """What the user's code raised, in one line, as a learner is told."""
+    """An error of the user's code, in one line, for the learner."""
 
 
 def _call(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
-    """Calls the user's code. What it raises goes to this process's log as it is, and to the learner in one line."""
+    """Calls the user's code. Logs its error in full, and raises it in one line."""
     try:
         return function(*arguments, **keywords)
     except (Exception, SystemExit) as error:
@@ -40,13 +40,13 @@ def _call(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any
 
 
 def _draw_from(generator: np.random.MT19937, seed: int) -> None:
-    """Has NumPy's global functions draw from this generator, as they would after `np.random.seed(seed)`."""
+    """Makes NumPy's global functions draw from this generator, as after `np.random.seed(seed)`."""
     set_bit_generator(generator)
     np.random.seed(seed)
 
 
 def _action_spaces(environment: Any) -> Iterator[Any]:
-    """An environment's, and those of the environments that it wraps."""
+    """The action spaces of an environment and of those that it wraps."""
     while environment is not None:
         space = getattr(environment, "action_space", None)
         if hasattr(space, "seed"):
@@ -54,8 +54,8 @@ def _action_spaces(environment: Any) -> Iterator[Any]:
         environment = getattr(environment, "env", None)
 
 
-class Made:
-    """An environment of the user's, with observations and actions as plain rows of numbers."""
+class WrappedEnvironment:
+    """A user's environment, with flat observations and actions."""
 
     def __init__(self, environment: Any, score: str | tuple[float, float]) -> None:
         self.environment = environment
@@ -72,7 +72,7 @@ class Made:
         self.bounds = None if low is None or high is None else (low, high)
 
     def sizes(self) -> tuple[int, int] | None:
-        """Numbers in an observation and in an action, if the environment says them."""
+        """Sizes of an observation and an action, if the environment has spaces."""
         if self.action_shape is None or self.space is None:
             return None
         shape = getattr(self.space, "shape", None)
@@ -89,8 +89,8 @@ class Made:
             observation = flatten(self.space, observation)
         return np.ascontiguousarray(observation, dtype=np.float64).ravel()
 
-    def _turn(self, method: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
-        # The process's environments take turns, one a step.
+    def _run(self, method: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+        # The environments of this process share NumPy's global generator.
         set_bit_generator(self.generator)
         self.broken = True
         result = _call(method, *arguments, **keywords)
@@ -104,7 +104,7 @@ class Made:
         _draw_from(self.generator, seed)
         for space in _action_spaces(self.environment):
             space.seed(seed)
-        observation, _ = self._turn(self.environment.reset, seed=seed)
+        observation, _ = self._run(self.environment.reset, seed=seed)
         return self._row(observation)
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool]:
@@ -112,7 +112,7 @@ class Made:
             action = action.reshape(self.action_shape)
         if self.bounds is not None:
             action = np.clip(action, *self.bounds)
-        observation, reward, terminated, truncated, self.info = self._turn(self.environment.step, action)
+        observation, reward, terminated, truncated, self.info = self._run(self.environment.step, action)
         return self._row(observation), float(reward), bool(terminated), bool(truncated)
 
     def score(self, episode_return: float) -> float:
@@ -130,40 +130,40 @@ class Made:
 
 
 class Factory:
-    """Makes environments, and keeps those that are free: making one may take seconds."""
+    """Makes environments, and reuses free ones, because making one may take seconds."""
 
     def __init__(self, make: Callable[[int], Any], score: str | tuple[float, float]) -> None:
         self.make_environment = make
         self.score = score
         self.seed: int | None = None
-        self.free: list[Made] = []
+        self.free: list[WrappedEnvironment] = []
 
-    def make(self, seed: int) -> Made:
+    def make(self, seed: int) -> WrappedEnvironment:
         if seed != self.seed:
             self.close()
             self.seed = seed
         if self.free:
             return self.free.pop()
         _draw_from(np.random.MT19937(), seed % 2**31)
-        return Made(_call(self.make_environment, seed), self.score)
+        return WrappedEnvironment(_call(self.make_environment, seed), self.score)
 
-    def release(self, made: Made) -> None:
-        if made.broken:
-            _close(made)
+    def release(self, wrapped: WrappedEnvironment) -> None:
+        if wrapped.broken:
+            _close(wrapped)
         else:
-            self.free.append(made)
+            self.free.append(wrapped)
 
     def close(self) -> None:
         while self.free:
             _close(self.free.pop())
 
 
-def _close(made: Made) -> None:
-    if hasattr(made.environment, "close"):
+def _close(wrapped: WrappedEnvironment) -> None:
+    if hasattr(wrapped.environment, "close"):
         try:
-            _call(made.environment.close)
+            _call(wrapped.environment.close)
         except EnvironmentFailed:
-            pass  # It is in the log, and the environment is not needed any more.
+            pass  # It is in the log.
 
 
 def _read(stream: IO[bytes]) -> bytes:
@@ -172,20 +172,19 @@ def _read(stream: IO[bytes]) -> bytes:
 
 
 def _end_with(parent: int) -> None:
-    """Ends this process in order when the process that started it is gone. A pipe would not tell: whatever that process has
-    forked holds it open."""
+    """Sends SIGTERM to this process when its parent is gone. A pipe would not show it: other children may hold it open."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os.kill(os.getpid(), signal.SIGTERM)
 
 
 def main() -> None:
-    # What the user's code prints must not get into the answer.
+    # Keeps the user's prints out of the answer.
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
 
-    def tell(**what: Any) -> None:
-        print(json.dumps(what), file=answer, flush=True)
+    def reply(**message: Any) -> None:
+        print(json.dumps(message), file=answer, flush=True)
 
     paths, task = _read(sys.stdin.buffer), _read(sys.stdin.buffer)
     sys.path[:] = json.loads(paths)
@@ -196,16 +195,16 @@ def main() -> None:
         made = factory.make(task.pop("seed"))
         sizes = made.sizes()
         factory.release(made)
-        tell(sizes=sizes)
+        reply(sizes=sizes)
         _quad_rl.serve_environment(task["name"], factory, sizes=sizes, **task["serve"])
         factory.close()
     except Exception as error:
         if not isinstance(error, EnvironmentFailed):
             traceback.print_exc(file=sys.stderr)
-        tell(error=f"{error}")
+        reply(error=f"{error}")
         sys.stderr.flush()
         os._exit(1)
-    # Threads of the user's or of a simulator's must not hold up the end.
+    # Does not wait for threads of the user or of a simulator.
     sys.stderr.flush()
     os._exit(0)
 

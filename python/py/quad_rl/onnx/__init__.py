@@ -23,11 +23,11 @@ def export_onnx(
     It acts as `Policy.act` does with the same `candidates`, `rule` and `value`, which are fixed in the model. The number of
     states, n, is free.
 
-    Inputs: `observations` [n, observation_size] and what `policy.noise(n, ...)` has: `noise`, standard normal numbers, and
-    `uniform`, numbers within [0, 1); at 1 itself the best is taken. Fill them anew for each action.
+    Inputs: `observations` [n, observation_size] and the arrays of `policy.noise(n, ...)`: `noise`, standard normal numbers, and
+    `uniform`, numbers within [0, 1); 1 itself takes the best action. Draw them anew for each action.
 
-    Outputs: `actions` [n, action_size]; `values` [n, candidates], as of `Policy.sample`, if the policy draws; and of a planner
-    that follows a plan for several steps `plan` [n, steps, action_size], whose first action is in `actions`: ask the model
+    Outputs: `actions` [n, action_size]; `values` [n, candidates], as of `Policy.sample`, if the policy samples; and, for a
+    planner that follows a plan for several steps, `plan` [n, steps, action_size], which begins with `actions`: run the model
     again after the last.
 
     Raises ImportError without the package onnx, ValueError for a choice that the policy cannot make, OSError if the file
@@ -40,7 +40,7 @@ def export_onnx(
         policy = Policy.load(policy)
     written = model(policy, candidates=candidates, rule=rule, value=value).SerializeToString()
     whole = Path(path)
-    partial = whole.with_name(f"{whole.name}.{token_hex(4)}.partial")  # A file that is there stays until the new one is whole.
+    partial = whole.with_name(f"{whole.name}.{token_hex(4)}.partial")  # An existing file stays until the new one is complete.
     try:
         with open(partial, "xb") as file:
             file.write(written)

@@ -1,4 +1,4 @@
-"""What draws in a diffusion policy: the reverse process of a noise predictor, unrolled, with the constants of each step."""
+"""Samples of a diffusion policy: the reverse process of a noise predictor, unrolled, with the constants of each step."""
 
 import math
 
@@ -10,7 +10,7 @@ from quad_rl.onnx.mlp import layers, mish
 
 
 def embeddings(file: File, steps: int) -> Array:
-    """Of t = 1..T: cosines and sines through two layers."""
+    """Embeddings of t = 1..T: cosines and sines through two layers."""
     angles = np.arange(1, steps + 1)[:, None] * np.exp(-np.arange(8) * math.log(10_000) / 7)
     features = np.concatenate([np.cos(angles), np.sin(angles)], 1)
     kernels, biases = ([file[f"actor.time.{i}.{kind}"] for i in range(2)] for kind in ("kernel", "bias"))

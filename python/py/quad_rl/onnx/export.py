@@ -1,4 +1,4 @@
-"""The model of a policy: units, what draws, critics, and the choice."""
+"""The model of a policy: units, samples, critics, and the choice."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def to_network(file: File, observations: Value) -> Value:
     for units in file.units:
         if of := units.get("observations"):
             scale = np.array(of["scale"])
-            # A number that never changes has scale 0: the network sees 0.
+            # A constant observation has scale 0; the network gets 0.
             observations = (observations - of["offset"]) / np.where(scale == 0, np.inf, scale)
     return observations
 
@@ -34,18 +34,18 @@ def to_user(file: File, actions: Value) -> Value:
 
 
 def critics(file: File, choice: dict[str, Any], observations: Value, drawn: Value) -> tuple[Value, Value]:
-    """The critics' values of what was drawn, and what the rule compares; both [n, candidates]."""
+    """The critics' values of drawn [n, candidates, a], and the rule's scores; both [n, candidates]."""
     graph, candidates = drawn.graph, choice["candidates"]
     of_members = of_actions(file, "critic.", file.shape["critic"], observations, drawn, candidates)
     values = graph("ReduceMin" if choice["value"] == "min" else "ReduceMean", of_members, axes=[0], keepdims=0)
     if choice["rule"] != "nearest":
         return values, values
-    away = values - of_states(file, "value.", file.shape["value"], observations).reshape(-1, 1)
-    return values, 0.0 - away * away
+    difference = values - of_states(file, "value.", file.shape["value"], observations).reshape(-1, 1)
+    return values, 0.0 - difference * difference
 
 
 def model(policy: Policy, **changes: Any) -> ModelProto:
-    # What it draws, for one state; this refuses what `act` refuses.
+    # The noise for one state; refuses choices that `act` refuses.
     drawn = policy.noise(1, **changes, seed=0)
     choice = {**(policy.choice or {}), **{name: change for name, change in changes.items() if change is not None}}
     file, graph, a = File(policy.to_bytes()), Graph(), policy.action_size
@@ -62,6 +62,6 @@ def model(policy: Policy, **changes: Any) -> ModelProto:
         first = {"actions": (plan.at(1, 0), (a,)), "values": (values, (candidates,))}
         return graph.model({**first, "plan": (plan, (steps, a))} if steps > 1 else {**first}, repr(policy))
     actions = DRAW[file.kind](file, observations, inputs["noise"], candidates)
-    values, worth = critics(file, choice, observations, actions)
-    taken = to_user(file, choose(actions, worth, rule, candidates, inputs.get("uniform")))
+    values, scores = critics(file, choice, observations, actions)
+    taken = to_user(file, choose(actions, scores, rule, candidates, inputs.get("uniform")))
     return graph.model({"actions": (taken, (a,)), "values": (values, (candidates,))}, repr(policy))

@@ -12,7 +12,7 @@ Array = NDArray[Any]
 
 
 class File:
-    """What the file of a policy says: `kind`, `shape`, `units`, and `file[name]` for its tensors."""
+    """The file of a policy: `kind`, `shape`, `units`, and tensors as `file[name]`."""
 
     def __init__(self, data: bytes) -> None:
         start = 8 + int.from_bytes(data[:8], "little")

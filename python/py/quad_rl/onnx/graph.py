@@ -17,9 +17,9 @@ def _binary(operator: str) -> tuple[Callable[[Value, Any], Value], Callable[[Val
 
 
 class Value:
-    """What a node of the graph puts out, or an input."""
+    """An input of the graph, or a node's output."""
 
-    __array_ufunc__ = None  # array + value is ours, too
+    __array_ufunc__ = None  # array + value calls __radd__
 
     def __init__(self, graph: Graph, name: str) -> None:
         self.graph, self.name = graph, name
@@ -31,17 +31,17 @@ class Value:
     __matmul__, __rmatmul__ = _binary("MatMul")
 
     def reshape(self, *shape: int) -> Value:
-        """0 keeps an axis as it is, -1 has what is left."""
+        """0 keeps the size of an axis, -1 infers it."""
         return self.graph("Reshape", self, np.array(shape))
 
     def transpose(self, *axes: int) -> Value:
         return self.graph("Transpose", self, perm=axes)
 
-    def part(self, axis: int, start: int, end: int) -> Value:
+    def slice(self, axis: int, start: int, end: int) -> Value:
         return self.graph("Slice", self, *(np.array([x]) for x in (start, end, axis)))
 
     def at(self, axis: int, index: int | Value) -> Value:
-        """One place of an axis, which is then gone."""
+        """Selects an index of an axis, which is removed."""
         return self.graph("Gather", self, np.array(index) if isinstance(index, int) else index, axis=axis)
 
     def clip(self, low: float, high: float) -> Value:
@@ -51,13 +51,13 @@ class Value:
         return self.graph("Cast", self, to=TensorProto.DOUBLE)
 
     def mean(self, *axes: int) -> Value:
-        """Over these axes, which stay with one place."""
+        """The mean over these axes, which keep the size 1."""
         return self.graph("ReduceMean", self, axes=axes, keepdims=1)
 
 
 class Graph:
-    """`graph(operator, inputs…, attributes…)` adds a node. Numbers and arrays among the inputs become constants. All is float32,
-    int64 or bool, but for what `double` makes."""
+    """`graph(operator, inputs…, attributes…)` adds a node. Numbers and arrays among the inputs become constants, of type
+    float32, int64 or bool."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
@@ -88,25 +88,25 @@ class Graph:
         return outs[0]
 
     def double(self, number: float) -> Value:
-        """A constant of float32 as float64."""
+        """A float32 constant as float64."""
         return self("Cast", number, to=TensorProto.DOUBLE)
 
     def repeat(self, times: int, x: Value, body: Callable[[Value, Value], Value]) -> Value:
         """x = body(i, x) for i = 0, 1, … below `times`, as a loop of the graph."""
         outside, self.nodes = self.nodes, []
-        index, go_on, before = self.new(), self.new(), self.new()
-        after, still = body(index, before), self("Identity", go_on)
+        index, condition, before = self.new(), self.new(), self.new()
+        after, unchanged = body(index, before), self("Identity", condition)
         inside, self.nodes = self.nodes, outside
 
         def info(value: Value, kind: int, shape: list[int] | None) -> Any:
             return helper.make_tensor_value_info(value.name, kind, shape)
 
-        given = [info(index, TensorProto.INT64, []), info(go_on, TensorProto.BOOL, []), info(before, TensorProto.FLOAT, None)]
-        left = [info(still, TensorProto.BOOL, []), info(after, TensorProto.FLOAT, None)]
+        given = [info(index, TensorProto.INT64, []), info(condition, TensorProto.BOOL, []), info(before, TensorProto.FLOAT, None)]
+        left = [info(unchanged, TensorProto.BOOL, []), info(after, TensorProto.FLOAT, None)]
         return self("Loop", np.array(times), np.array(True), x, body=helper.make_graph(inside, "body", given, left))
 
     def model(self, outputs: dict[str, tuple[Value, tuple[int, ...]]], about: str) -> ModelProto:
-        """The model that puts these out, each with its shape beside n."""
+        """The model with these outputs, each with its shape after n."""
         for name, (value, _) in outputs.items():
             self.nodes.append(helper.make_node("Identity", [value.name], [name]))
         infos = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", *shape]) for name, (_, shape) in outputs.items()]

@@ -1,4 +1,4 @@
-"""Hidden layers one after the other, and ensembles of them."""
+"""Multi-layer perceptrons and ensembles of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def activate(name: str, x: Value) -> Value:
 
 
 def mish(x: Array) -> Array:
-    """Of an array."""
+    """Mish of an array."""
     return x * np.tanh(np.logaddexp(x, 0))
 
 
@@ -36,7 +36,7 @@ def layer_norm(x: Value, scale: Array, shift: Array, epsilon: float, axis: int =
 
 
 def layers(file: File, prefix: str, config: dict[str, Any], x: Value) -> Value:
-    """From the first layer's products with their bias on: x [..., width], or [K, rows, width] of an ensemble."""
+    """Applies all layers to the first layer's pre-activations: x [..., width], or [K, rows, width] of an ensemble."""
     for i in range(len(config["hidden"])):
 
         def tensor(layer: int, kind: str) -> Array:
@@ -54,7 +54,7 @@ def layers(file: File, prefix: str, config: dict[str, Any], x: Value) -> Value:
 
 
 def of_states(file: File, prefix: str, config: dict[str, Any], observations: Value) -> Value:
-    """An ensemble's outputs, [K, n, outputs], of observations [n, o]."""
+    """An ensemble's outputs [K, n, outputs] for observations [n, o]."""
     first = observations @ file[f"{prefix}0.kernel"] + file[f"{prefix}0.bias"][:, None]
     return layers(file, prefix, config, first)
 
@@ -62,7 +62,7 @@ def of_states(file: File, prefix: str, config: dict[str, Any], observations: Val
 def of_actions(
     file: File, prefix: str, config: dict[str, Any], observations: Value, actions: Value, each: int, outputs: int = 1
 ) -> Value:
-    """What an ensemble gives, [K, n, each] or [K, n, each, outputs], of observations [n, o] and so many actions in each, [n, each, a]."""
+    """An ensemble's outputs [K, n, each] or [K, n, each, outputs] for observations [n, o] and actions [n, each, a]."""
     kernel, bias = file[f"{prefix}0.kernel"], file[f"{prefix}0.bias"]
     (members, _, width), a = kernel.shape, file.shape["action_dim"]
     state = (observations @ kernel[:, :-a] + bias[:, None]).reshape(members, -1, 1, width)

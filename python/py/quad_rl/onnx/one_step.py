@@ -1,4 +1,4 @@
-"""What draws in a one-step policy: a network of state and noise."""
+"""Samples of a one-step policy: a network of state and noise."""
 
 from quad_rl.onnx.file import File
 from quad_rl.onnx.graph import Value

@@ -1,5 +1,5 @@
 """Diffuser's planner: windows [a + o, steps] of actions and states, denoised from their first state on and pulled along the
-gradient of their worth. Denoising steps of one kind are a loop of the graph."""
+gradient of their value. Denoising steps of one kind are a loop of the graph."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 
 from quad_rl.onnx.file import Array, File
 from quad_rl.onnx.graph import Value
-from quad_rl.onnx.window import Model, Worth
+from quad_rl.onnx.window import Model, ValueFunction
 
 
 def schedule(steps: int) -> tuple[Array, Array, Array]:
-    """Of t = 0..T: factors of the clean window and of the noisy one, and the noise's variance."""
+    """For t = 0..T: factors of the clean and of the noisy window, and the noise's variance."""
     falls = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
     alpha = np.concatenate([[1.0], np.maximum(falls[1:] / falls[:-1], 0.001)])
     bar = np.cumprod(alpha)
@@ -21,11 +21,11 @@ def schedule(steps: int) -> tuple[Array, Array, Array]:
 
 
 def plan(file: File, observations: Value, noise: Value, plans: int) -> tuple[Value, Value]:
-    """What is taken of each plan, [n, plans, steps · a], and the plans' worth, [n, plans]."""
+    """The first actions of each plan [n, plans, steps · a], and the plans' values [n, plans]."""
     graph, guidance, horizon = noise.graph, file.shape["guidance"], file.shape["network"]["horizon"]
     o, a, steps, taken = (file.shape[name] for name in ("observation_dim", "action_dim", "diffusion_steps", "replan_every"))
     width = o + a
-    # Where the state is in a window: x·others + first has it there.
+    # x·others + first sets the first state of a window.
     place = np.zeros((o, width, horizon))
     place[np.arange(o), np.arange(a, width), 0] = 1
     first = (observations @ place.reshape(o, -1)).reshape(-1, 1, width, horizon)
@@ -37,15 +37,15 @@ def plan(file: File, observations: Value, noise: Value, plans: int) -> tuple[Val
         return noise.at(1, index).reshape(-1, horizon, width).transpose(0, 2, 1)
 
     def denoise(x: Value, times: list[int], guided: bool) -> Value:
-        """The steps t of `times`, one after the other, each above 1."""
-        model, worth = Model(file, "model.", times), Worth(file, "value.", times)
+        """Denoises at each t of `times`, all above 1."""
+        model, value = Model(file, "model.", times), ValueFunction(file, "value.", times)
 
         def body(i: Value, x: Value) -> Value:
             def of(numbers: Array) -> Value:
                 return graph.constant(numbers[times]).at(0, i)
 
             for _ in range(guidance["steps"] if guided else 0):
-                x = (x + worth(x, i)[1]() * of(guidance["scale"] * variance)) * others + first
+                x = (x + value(x, i)[1]() * of(guidance["scale"] * variance)) * others + first
             z = drawn(i + np.array(steps - times[0] + 1)) * of(np.sqrt(variance))
             return (model(x, i) * of(from_clean) + x * of(from_noisy) + z) * others + first
 
@@ -56,7 +56,7 @@ def plan(file: File, observations: Value, noise: Value, plans: int) -> tuple[Val
     x = denoise(x, list(range(steps, stop, -1)), guided=True)
     x = denoise(x, list(range(min(stop, steps), 1, -1)), guided=False)
     last = graph.constant(np.array(0))
-    worth, _ = Worth(file, "value.", [1])(x, last)
+    value, _ = ValueFunction(file, "value.", [1])(x, last)
     x = Model(file, "model.", [1])(x, last) * float(from_clean[1]) + x * float(from_noisy[1])
-    actions = x.part(1, 0, a).part(2, 0, taken).transpose(0, 2, 1)
-    return actions.reshape(-1, plans, taken * a), worth.reshape(-1, plans)
+    actions = x.slice(1, 0, a).slice(2, 0, taken).transpose(0, 2, 1)
+    return actions.reshape(-1, plans, taken * a), value.reshape(-1, plans)

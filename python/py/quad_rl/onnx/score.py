@@ -1,4 +1,4 @@
-"""What draws in SfBC's policy: a score network, solved backwards in time by DPM-Solver-fast, unrolled."""
+"""Samples of SfBC's policy: a score network, solved backwards in time by DPM-Solver-fast, unrolled."""
 
 import math
 
@@ -54,7 +54,7 @@ class Time:
 
 
 def step(times: list[Time], x: Value, noise: Network) -> Value:
-    """From the first to the last of the times, whose number less one is its order."""
+    """One step from the first to the last of the times; its order is their number less one."""
     start, end, epsilon = times[0], times[-1], noise(x, times[0].t)
 
     def straight(to: Time) -> Value:

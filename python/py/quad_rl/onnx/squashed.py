@@ -1,4 +1,4 @@
-"""What draws in a squashed Gaussian policy: tanh of normal numbers whose mean and log σ a network gives."""
+"""Samples of a squashed Gaussian policy: tanh of normal numbers with a network's mean and log σ."""
 
 from quad_rl.onnx.file import File
 from quad_rl.onnx.graph import Value
@@ -8,5 +8,5 @@ from quad_rl.onnx.mlp import of_states
 def draw(file: File, observations: Value, noise: Value, candidates: int) -> Value:
     a = file.shape["action_dim"]
     out = of_states(file, "actor.", file.shape["actor"], observations).reshape(-1, 1, 2 * a)
-    deviation = noise.graph("Exp", out.part(2, a, 2 * a).clip(-5.0, 2.0))
-    return noise.graph("Tanh", noise.at(1, 0) * deviation + out.part(2, 0, a))
+    deviation = noise.graph("Exp", out.slice(2, a, 2 * a).clip(-5.0, 2.0))
+    return noise.graph("Tanh", noise.at(1, 0) * deviation + out.slice(2, 0, a))

@@ -1,4 +1,4 @@
-"""Layers of networks over windows [B, channels, steps], and the gradients of those that guide."""
+"""Layers of networks over windows [B, channels, steps], and gradients for guidance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from quad_rl.onnx.file import Array, File
 from quad_rl.onnx.graph import Value
 from quad_rl.onnx.mlp import activate, layer_norm, mish
 
-# From the gradient of a layer's output to that of its input.
+# Maps the gradient of a layer's output to that of its input.
 Back = Callable[[Value], Value]
 
 
@@ -32,14 +32,14 @@ class Layers:
         angles = (np.array(times)[:, None] - 1) * np.exp(-np.arange(half) * math.log(10_000) / (half - 1))
         x = np.concatenate([np.sin(angles), np.cos(angles)], 1)
         (first, of_first), (second, of_second) = (self.tensors(f"time.{i}") for i in range(2))
-        # A row for each of the times.
+        # [times, channels]
         self.embedding = mish(x @ first + of_first) @ second + of_second
 
     def tensors(self, name: str, kinds: tuple[str, ...] = ("kernel", "bias")) -> list[Array]:
         return [self.file[f"{self.prefix}{name}.{kind}"] for kind in kinds]
 
     def convolution(self, name: str, x: Value, length: int, stride: int = 1) -> tuple[Value, Back]:
-        """Of windows of that length; one step's linear layer, too."""
+        """A convolution over windows of that length; a linear layer has a kernel of one step."""
         kernel, bias = self.tensors(name)
         kernel = (kernel if kernel.ndim == 3 else kernel[None]).transpose(2, 1, 0)
         around = {"pads": [kernel.shape[2] // 2] * 2, "strides": [stride]}
@@ -80,7 +80,7 @@ class Layers:
         return x.graph("ConvTranspose", x, kernel.transpose(0, 2, 1), bias, pads=[1, 1], strides=[2])
 
     def attend(self, name: str, x: Value, length: int) -> Value:
-        """x and linear attention of its layer norm, if there is attention."""
+        """x plus linear attention of its layer norm, if the network has attention."""
         graph, attention = x.graph, self.config.get("attention")
         if not attention:
             return x
@@ -98,7 +98,7 @@ class Layers:
 
 
 class Model(Layers):
-    """The clean windows in noisy ones at the t-th of the times: a U-Net."""
+    """A U-Net that predicts the clean windows from noisy ones at the t-th of the times."""
 
     def __call__(self, x: Value, t: Value) -> Value:
         lengths, beside = self.lengths(), []
@@ -120,8 +120,8 @@ class Model(Layers):
         return self.convolution("out", self.normed("last", x, lengths[0])[0], lengths[0])[0]
 
 
-class Worth(Layers):
-    """The returns [B, 1] of noisy windows at the t-th of the times, and their gradient with respect to these."""
+class ValueFunction(Layers):
+    """Predicts the returns [B, 1] of noisy windows at the t-th of the times, with their gradient."""
 
     def __call__(self, x: Value, t: Value) -> tuple[Value, Callable[[], Value]]:
         backs: list[Back] = []
@@ -140,7 +140,7 @@ class Worth(Layers):
         length, channels = (lengths[-1] + 1) // 2, self.file[f"{self.prefix}middle.1.halve.bias"].shape[0]
         (kernel, bias), (last, of_last) = (self.tensors(f"head.{i}") for i in range(2))
         flat, width = length * channels, kernel.shape[1]
-        # Its rows are of [steps, channels], then of the embedding.
+        # Rows: [steps · channels], then the embedding.
         rows = kernel[:flat].reshape(length, channels, width).transpose(1, 0, 2).reshape(flat, width)
         of_times = x.graph.constant(self.embedding @ kernel[flat:] + bias).at(0, t)
         linear = x.reshape(-1, flat) @ rows + of_times
