@@ -15,10 +15,9 @@ use zenoh::Session;
 use crate::sim::{Environments, Rollout, Simulations};
 use crate::tools::film::{Gl, INSTALL};
 
-/// The environment of the trial.
 const HOPPER: &str = "hopper";
-/// How long the check waits for learners.
-const ANSWER: Duration = Duration::from_secs(5);
+/// Time limit for learners' answers.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 
 const UPDATE: &str =
     "update the older program (--version tells); if the learner hangs, its log says why";
@@ -43,10 +42,7 @@ pub struct DoctorArgs {
     pub json: bool,
 }
 
-/// Runs all checks.
-///
-/// # Errors
-/// A check cannot run; a finding is no error.
+/// Runs all checks. Fails if a check cannot run; a finding is no error.
 pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let mut findings = Findings::default();
     doctor::threads(&mut findings);
@@ -56,24 +52,22 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     };
     findings.ok("precision", format!("evaluates in f32; {bf16}"));
     simulator(&mut findings);
-    findings.ok(
-        "film",
-        Gl::new()
-            .map_or_else(|_| format!("cannot be made: {INSTALL}"), |_| "can be made".to_owned()),
-    );
+    let film = match Gl::new() {
+        Ok(_) => "can be made".to_owned(),
+        Err(_) => format!("cannot be made: {INSTALL}"),
+    };
+    findings.ok("film", film);
     let folder = certificates_folder(args.certificates.clone());
     let certificates =
         folder.and_then(|folder| doctor::certificates(&mut findings, &folder, Role::Evaluator));
-    let endpoint = args
-        .connect
-        .clone()
-        .unwrap_or_else(|| default_endpoint(certificates.as_ref(), DEFAULT_PORT));
-    let endpoints = Endpoints { connect: vec![endpoint], certificates, ..Endpoints::default() };
+    let default = || default_endpoint(certificates.as_ref(), DEFAULT_PORT);
+    let connect = vec![args.connect.clone().unwrap_or_else(default)];
+    let endpoints = Endpoints { connect, certificates, ..Endpoints::default() };
     doctor::connected(&mut findings, &endpoints, runs)?;
     Ok(findings)
 }
 
-/// Runs one step of one episode. (Without any libmujoco this program would not have started.)
+/// Runs one step of one episode. Without any libmujoco this program would not have started.
 fn simulator(findings: &mut Findings) {
     let version = mujoco_rs::mujoco_version();
     let step = || -> anyhow::Result<()> {
@@ -84,72 +78,55 @@ fn simulator(findings: &mut Findings) {
     };
     match step() {
         Ok(()) => findings.ok("libmujoco", format!("{version}, and Hopper moves in it")),
-        Err(error) => findings.fail(
-            "libmujoco",
-            format!("{version}: {error:#}"),
-            "deploy/setup.sh fetches 3.17.0",
-        ),
+        Err(error) => {
+            let problem = format!("{version}: {error:#}");
+            findings.fail("libmujoco", problem, "deploy/setup.sh fetches 3.17.0");
+        }
     }
 }
 
 /// Lists the runs whose learners are connected, and checks that each speaks this program's version
 /// of the protocol.
 async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> {
-    let tokens = session
-        .liveliness()
-        .get(keys::ALL_LEARNERS)
-        .timeout(ANSWER)
-        .await
-        .map_err(anyhow::Error::msg)?;
+    let tokens = session.liveliness().get(keys::ALL_LEARNERS).timeout(ANSWER_TIMEOUT);
+    let tokens = tokens.await.map_err(anyhow::Error::msg)?;
     let mut found = false;
     while let Ok(reply) = tokens.recv_async().await {
-        let Some(run) =
-            reply.result().ok().and_then(|token| keys::run_of(token.key_expr().as_str()))
-        else {
+        let token = reply.result().ok();
+        let Some(run) = token.and_then(|token| keys::run_of(token.key_expr().as_str())) else {
             continue;
         };
         found = true;
-        match ask(session, &run).await? {
-            None => findings.ok(
-                "run",
-                format!(
-                    "{run} speaks version {PROTOCOL_VERSION} of the protocol, like this program"
-                ),
-            ),
+        match problem_of(session, &run).await? {
+            None => {
+                let version = format!("version {PROTOCOL_VERSION} of the protocol");
+                findings.ok("run", format!("{run} speaks {version}, like this program"));
+            }
             Some(problem) => findings.fail("run", format!("{run}: {problem}"), UPDATE),
         }
     }
     if !found {
-        findings.warn(
-            "runs",
-            "no learner is there",
-            "if it starts later: an evaluator waits for it",
-        );
+        let hint = "if it starts later: an evaluator waits for it";
+        findings.warn("runs", "no learner is there", hint);
     }
     Ok(())
 }
 
-/// Asks a run's learner for a job in no environment, so that it gives none. Returns what is wrong
-/// with the answer.
-async fn ask(session: &Session, run: &Name) -> anyhow::Result<Option<String>> {
+/// Claims a job in no environment, so that the run's learner gives none. Returns the fault of the
+/// answer.
+async fn problem_of(session: &Session, run: &Name) -> anyhow::Result<Option<String>> {
     let evaluator = Name::new(format!("doctor-{}", std::process::id()))?;
-    let claim = encode(&JobRequest::Claim {
-        evaluator,
-        attempt: rand::random(),
-        environments: Vec::new(),
-    })?;
-    let replies = session
-        .get(keys::jobs(run))
-        .payload(claim)
-        .timeout(ANSWER)
-        .await
-        .map_err(anyhow::Error::msg)?;
+    let (attempt, environments) = (rand::random(), Vec::new());
+    let claim = encode(&JobRequest::Claim { evaluator, attempt, environments })?;
+    let replies = session.get(keys::jobs(run)).payload(claim).timeout(ANSWER_TIMEOUT);
+    let replies = replies.await.map_err(anyhow::Error::msg)?;
     let Ok(reply) = replies.recv_async().await else {
-        return Ok(Some(format!("its learner gives no answer within {ANSWER:?}")));
+        return Ok(Some(format!("its learner gives no answer within {ANSWER_TIMEOUT:?}")));
     };
     Ok(match reply.result() {
         Ok(sample) => {
-            let answer = decode_from::<JobReply>(sample.payload().len(), sample.payload().reader());
+            let payload = sample.payload();
+            let answer = decode_from::<JobReply>(payload.len(), payload.reader());
             answer.err().map(|error| error.to_string())
         }
         // A learner of another version cannot read the claim, and says so.

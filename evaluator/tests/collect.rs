@@ -1,5 +1,4 @@
-//! A recorded dataset: the same for the same seed, true to the simulation, and what replaying it
-//! finds.
+//! Recorded datasets: a function of the seed, and a faithful replay.
 #![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
@@ -18,9 +17,9 @@ fn hopper() -> &'static EnvironmentSpec {
 
 fn record(folder: &TempDir, seed: u64, threads: usize) -> (PathBuf, Summary) {
     let path = folder.path().join(format!("{seed}-{threads}.hdf5"));
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    let summary = pool.install(|| collect(hopper(), &path, TRANSITIONS, seed)).unwrap();
-    (path, summary)
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+    let summary = pool.unwrap().install(|| collect(hopper(), &path, TRANSITIONS, seed));
+    (path, summary.unwrap())
 }
 
 fn read(path: &Path) -> RecordedRows {
@@ -28,39 +27,39 @@ fn read(path: &Path) -> RecordedRows {
 }
 
 #[test]
-fn the_seed_makes_the_file_and_the_threads_do_not() {
+fn the_file_depends_on_the_seed_and_not_on_the_threads() {
     let folder = tempfile::tempdir().unwrap();
-    let (one, two, other) = (record(&folder, 1, 1), record(&folder, 1, 2), record(&folder, 2, 2));
-    assert!(read(&one.0).iter().eq(read(&two.0).iter()));
-    assert!(!read(&two.0).iter().eq(read(&other.0).iter()));
+    let rows = |seed, threads| read(&record(&folder, seed, threads).0);
+    let two = rows(1, 2);
+    assert!(rows(1, 1).iter().eq(two.iter()));
+    assert!(!rows(2, 2).iter().eq(two.iter()));
 }
 
 #[test]
-fn whole_episodes_are_recorded_that_replay_and_a_change_is_noticed() {
+fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
     let folder = tempfile::tempdir().unwrap();
     let (path, summary) = record(&folder, 3, 2);
+    let Summary { transitions, episodes, mean_score, .. } = summary;
     let rows = read(&path);
-    assert_eq!(rows.len(), summary.transitions);
-    assert!(rows.len() >= TRANSITIONS);
-    assert_eq!(rows.iter().filter(|row| row.terminal || row.timeout).count(), summary.episodes);
-    assert!(rows.row(rows.len() - 1).terminal || rows.row(rows.len() - 1).timeout);
-    for i in 1..rows.len() {
-        let (before, row) = (rows.row(i - 1), rows.row(i));
-        let in_episode = !(before.terminal || before.timeout);
-        assert_eq!(before.next_observation == row.observation, in_episode, "row {i}");
-        assert!(row.action.iter().all(|value| value.abs() <= 1.0));
+    assert!(rows.len() == transitions && transitions >= TRANSITIONS);
+    let is_end = |i: usize| rows.row(i).terminal || rows.row(i).timeout;
+    assert_eq!((0..transitions).filter(|&i| is_end(i)).count(), episodes);
+    assert!(is_end(transitions - 1));
+    for i in 1..transitions {
+        let is_next = rows.row(i - 1).next_observation == rows.row(i).observation;
+        assert_eq!(is_next, !is_end(i - 1), "row {i}");
+        assert!(rows.row(i).action.iter().all(|value| value.abs() <= 1.0));
     }
     let total: f64 = rows.iter().map(|row| row.reward).sum();
-    let mean_score = hopper().normalized_score(total / summary.episodes as f64);
-    assert!((summary.mean_score - mean_score).abs() < 1e-3, "{} {mean_score}", summary.mean_score);
+    let expected = hopper().normalized_score(total / episodes as f64);
+    assert!((mean_score - expected).abs() < 1e-3, "{mean_score} {expected}");
 
-    assert_eq!(environment_of(&path).unwrap(), hopper(), "it says so itself");
+    assert_eq!(environment_of(&path).unwrap(), hopper(), "the file names it");
     let report = verify(&path, hopper()).unwrap();
-    assert_eq!((report.transitions, report.compared), (summary.transitions, summary.transitions));
+    assert_eq!((report.transitions, report.compared), (transitions, transitions));
     assert_eq!((report.rewards_differ, report.terminals_differ), (0, 0));
-    // Nothing but float32's rounding, which is there: an error of exactly zero would mean that
-    // nothing was compared.
-    assert!(report.obs_error.median > 1e-9 && report.obs_error.median < 1e-6, "{report:?}");
+    // Float32's rounding; an error of exactly zero would mean that nothing was compared.
+    assert!((1e-9..1e-6).contains(&report.obs_error.median), "{report:?}");
     assert!(report.obs_error.p99 < 1e-5 && report.reward_error.max < 1e-3, "{report:?}");
 
     let changed = folder.path().join("changed.hdf5");
@@ -76,11 +75,11 @@ fn whole_episodes_are_recorded_that_replay_and_a_change_is_noticed() {
         row.next_observation = &next_observation;
         writer.push(&row).unwrap();
     }
-    writer.finish(&Metadata { algorithm: "changed", iteration: 0, seed: 0 }).unwrap();
+    let (algorithm, iteration, seed) = ("changed", 0, 0);
+    writer.finish(&Metadata { algorithm, iteration, seed }).unwrap();
     let report = verify(&changed, hopper()).unwrap();
     assert_eq!((report.rewards_differ, report.terminals_differ), (1, 1));
-    assert!(
-        (report.reward_error.max - 0.01).abs() < 1e-4 && (report.obs_error.max - 0.5).abs() < 1e-4,
-        "{report:?}"
-    );
+    for (error, expected) in [(report.reward_error.max, 0.01), (report.obs_error.max, 0.5)] {
+        assert!((error - expected).abs() < 1e-4, "{report:?}");
+    }
 }

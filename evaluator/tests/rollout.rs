@@ -5,8 +5,9 @@ use std::collections::HashSet;
 
 use quad_dataset::environment::find;
 use quad_evaluator::sim::{
-    Environment, EnvironmentError, Environments, EpisodeOutcome, Rollout, Simulations, Step, make,
+    Environment, EnvironmentError, Environments, Rollout, Simulations, Step, make,
 };
+use quad_protocol::EpisodeScore;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -33,39 +34,37 @@ fn hopper(seeds: &[u64]) -> Rollout<ChaCha8Rng> {
     Rollout::new(make, (11, 3), seeds, ChaCha8Rng::seed_from_u64).unwrap()
 }
 
-fn run(seeds: &[u64]) -> Vec<EpisodeOutcome> {
+fn run(seeds: &[u64]) -> Vec<EpisodeScore> {
     let mut rollout = hopper(seeds);
     let (mut steps, mut ended) = (0, 0);
     while !rollout.is_done() {
         let stepped = rollout.step(select).unwrap();
         (steps, ended) = (steps + stepped.steps, ended + stepped.ended as usize);
     }
-    let outcomes = rollout.into_outcomes();
-    let lengths = outcomes.iter().map(|outcome| u64::from(outcome.length));
+    let scores = rollout.into_scores();
+    let lengths = scores.iter().map(|episode| u64::from(episode.length));
     assert_eq!((steps, ended), (lengths.sum(), seeds.len()));
-    outcomes
+    scores
 }
 
 #[test]
-fn an_outcome_depends_on_its_seed_alone() {
+fn a_score_depends_on_its_seed_alone() {
     let seeds: Vec<u64> = (0..12).map(|i| i * 7919 + 3).collect();
     let together = run(&seeds);
-    assert!(together.iter().map(|outcome| &outcome.seed).eq(&seeds));
-    for outcome in &together {
-        let alone = run(&[outcome.seed])[0];
-        assert_eq!(alone, EpisodeOutcome { index: 0, ..*outcome });
+    for (episode, &seed) in together.iter().zip(&seeds) {
+        assert_eq!(run(&[seed]), [*episode]);
     }
-    let lengths: HashSet<u32> = together.iter().map(|outcome| outcome.length).collect();
+    let lengths: HashSet<u32> = together.iter().map(|episode| episode.length).collect();
     assert!(lengths.len() > 1, "some episodes leave the batch before others");
 }
 
 #[test]
-fn an_outcome_equals_that_of_stepping_the_environment() {
+fn a_score_equals_that_of_stepping_the_environment() {
     let mut hopper = make(find("hopper").unwrap(), 0).unwrap();
-    for outcome in run(&[5, 6]) {
-        let mut noise = ChaCha8Rng::seed_from_u64(outcome.seed);
+    for episode in run(&[5, 6]) {
+        let mut noise = ChaCha8Rng::seed_from_u64(episode.seed);
         let (mut episode_return, mut length) = (0.0, 0);
-        hopper.reset(outcome.seed);
+        hopper.reset(episode.seed);
         loop {
             let observation = hopper.observation().iter().map(|&value| value as f32);
             let mut action = [0.0; 3];
@@ -77,8 +76,8 @@ fn an_outcome_equals_that_of_stepping_the_environment() {
                 break;
             }
         }
-        assert_eq!((outcome.episode_return, outcome.length), (episode_return, length));
-        assert_eq!(outcome.score, 100.0 * (episode_return + 20.272305) / (3234.3 + 20.272305));
+        assert_eq!((episode.episode_return, episode.length), (episode_return, length));
+        assert_eq!(episode.score, 100.0 * (episode_return + 20.272305) / (3234.3 + 20.272305));
     }
 }
 
@@ -92,7 +91,7 @@ fn a_policy_that_fails_advances_no_episode() {
             rollout.step(select).unwrap();
         }
     }
-    assert_eq!(failing.into_outcomes(), other.into_outcomes());
+    assert_eq!(failing.into_scores(), other.into_scores());
 }
 
 /// Observes and rewards its number of steps, of which there are four.
@@ -132,7 +131,7 @@ impl Environment for Counter {
     }
 }
 
-fn count(counter: Counter, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
+fn count(counter: Counter, sizes: (usize, usize)) -> Result<Vec<EpisodeScore>, EnvironmentError> {
     let make = || Ok(Box::new(counter) as Box<dyn Environment>);
     let mut rollout = Rollout::new(make, sizes, &[7, 8], |_| ())?;
     while !rollout.is_done() {
@@ -142,19 +141,20 @@ fn count(counter: Counter, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>,
             Ok::<_, EnvironmentError>(())
         })?;
     }
-    Ok(rollout.into_outcomes())
+    Ok(rollout.into_scores())
 }
 
 #[test]
 fn any_environment_has_its_own_scores_and_errors() {
-    let counter = Counter { score: 0.1, ..Counter::default() };
-    let outcome =
-        |index, seed| EpisodeOutcome { index, seed, episode_return: 10.0, length: 4, score: 1.0 };
-    assert_eq!(count(counter, (2, 1)).unwrap(), [outcome(0, 7), outcome(1, 8)]);
+    let mut counter = Counter { score: 0.1, ..Counter::default() };
+    for (episode, seed) in count(counter, (2, 1)).unwrap().into_iter().zip([7, 8]) {
+        let EpisodeScore { episode_return, length, score, .. } = episode;
+        assert_eq!((episode.seed, episode_return, length, score), (seed, 10.0, 4, 1.0));
+    }
     let error = |counter, sizes| count(counter, sizes).unwrap_err().to_string();
-    let broken = Counter { breaks: true, ..counter };
-    assert_eq!(error(broken, (2, 1)), "the environment \"counter\" failed: a cable is loose");
     assert_eq!(error(counter, (3, 1)), "an observation has 2 numbers, but the policy takes 3");
+    counter.breaks = true;
+    assert_eq!(error(counter, (2, 1)), "the environment \"counter\" failed: a cable is loose");
 }
 
 /// A learner would refuse them.

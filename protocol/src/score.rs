@@ -1,6 +1,7 @@
 //! Scores: an evaluator delivers them, the learner acknowledges them.
 
 use bincode::{Decode, Encode};
+use serde::Serialize;
 
 use crate::codec::Message;
 use crate::hash::Hash;
@@ -8,11 +9,12 @@ use crate::job::Job;
 use crate::name::Name;
 
 /// The result of one episode.
-#[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
+#[derive(Clone, Copy, Debug, PartialEq, Encode, Decode, Serialize)]
 pub struct EpisodeScore {
     /// Seed of the episode.
     pub seed: u64,
     /// Sum of its rewards.
+    #[serde(rename = "return")]
     pub episode_return: f64,
     /// Its environment steps.
     pub length: u32,

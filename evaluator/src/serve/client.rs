@@ -27,12 +27,15 @@ const RETRY: Duration = Duration::from_millis(100);
 /// Most characters of a reason that the evaluator sends; the learner accepts no large messages.
 const MAX_REASON_LEN: usize = 1000;
 
-/// The evaluator's debt to a learner, until which is paid it claims no job.
-enum Owed {
-    /// A job's episodes or, if the job has failed, the reason.
-    Job { id: u64, incarnation: u64, failed: Option<String> },
-    /// Scores that the learner has not acknowledged.
-    Scores(ScoreReport),
+/// A claimed job, until the learner has acknowledged its scores or its return. Meanwhile the
+/// evaluator claims no other.
+struct Claimed {
+    id: u64,
+    incarnation: u64,
+    /// Scores to deliver; without, the job goes back.
+    scores: Option<ScoreReport>,
+    /// Reason of the return, for people.
+    failed: Option<String>,
 }
 
 pub struct RunClient {
@@ -41,7 +44,7 @@ pub struct RunClient {
     listener: Listener,
     /// Number of the claim that has no answer yet.
     attempt: Option<u64>,
-    owed: Option<Owed>,
+    claimed: Option<Claimed>,
     pub turn: Turn,
     /// Time of the learner's disappearance.
     pub gone: Option<Instant>,
@@ -72,7 +75,7 @@ impl RunClient {
             snapshots,
             listener,
             attempt: None,
-            owed: None,
+            claimed: None,
             turn: Turn::new(Instant::now()),
             gone: None,
             last_warning: String::new(),
@@ -138,8 +141,8 @@ impl RunClient {
         self.attempt = None;
         Ok(match reply {
             JobReply::Job(job) => {
-                let (id, incarnation) = (job.id, job.incarnation);
-                self.owed = Some(Owed::Job { id, incarnation, failed: None });
+                let Job { id, incarnation, .. } = job;
+                self.claimed = Some(Claimed { id, incarnation, scores: None, failed: None });
                 Some(job)
             }
             JobReply::Wait { milliseconds, .. } => {
@@ -166,19 +169,24 @@ impl RunClient {
         self.connection.publish_progress(job, steps_done, episodes_done);
     }
 
-    /// True until the learner has acknowledged the scores of the last job, or its return.
-    pub fn is_in_debt(&self) -> bool {
-        self.owed.is_some()
+    pub fn has_job(&self) -> bool {
+        self.claimed.is_some()
     }
 
     /// Keeps the scores of the claimed job for delivery.
     pub fn keep(&mut self, report: ScoreReport) {
-        self.owed = Some(Owed::Scores(report));
+        if let Some(claimed) = &mut self.claimed {
+            claimed.scores = Some(report);
+        }
+    }
+
+    fn scores(&self) -> Option<&ScoreReport> {
+        self.claimed.as_ref()?.scores.as_ref()
     }
 
     /// Delivers the kept scores, or hands a failed job back. Keeps them after an error.
     pub async fn deliver(&mut self, timeout: Duration) -> Result<(), QueryError> {
-        let Some(Owed::Scores(report)) = &self.owed else { return self.hand_back(timeout).await };
+        let Some(report) = self.scores() else { return self.hand_back(timeout).await };
         let Connection { run, metrics, .. } = &self.connection;
         let step = report.step;
         match self.connection.deliver(report, timeout).await? {
@@ -188,7 +196,7 @@ impl RunClient {
                 info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
                 scores.for_each(|score| metrics.episode_score.observe(score));
                 metrics.job(JobOutcome::Scored);
-                self.owed = None;
+                self.claimed = None;
                 self.last_warning.clear();
                 self.turn.done(Instant::now(), Duration::ZERO);
                 Ok(())
@@ -216,7 +224,7 @@ impl RunClient {
     pub async fn leave(mut self) {
         let until = Instant::now() + LEAVE;
         let mut answered = false;
-        while matches!(self.owed, Some(Owed::Scores(_))) {
+        while self.scores().is_some() {
             let Err(error) = self.deliver(LEAVE / 2).await else { return };
             // A learner that answers with an error has received the scores and may still save them.
             // If the job went back now, others would run it again.
@@ -236,27 +244,25 @@ impl RunClient {
         }
     }
 
-    /// Drops the scores, if any: the evaluator owes the job itself.
+    /// Drops the scores, if any, so that the job goes back.
     fn return_job(&mut self, reason: Option<String>) {
-        self.owed = self.owed.take().map(|owed| match owed {
-            Owed::Job { id, incarnation, failed } => {
-                Owed::Job { id, incarnation, failed: reason.or(failed) }
-            }
-            Owed::Scores(ScoreReport { job, incarnation, .. }) => {
-                Owed::Job { id: job, incarnation, failed: reason }
-            }
-        });
+        if let Some(claimed) = &mut self.claimed {
+            claimed.scores = None;
+            claimed.failed = reason.or(claimed.failed.take());
+        }
     }
 
     async fn hand_back(&mut self, timeout: Duration) -> Result<(), QueryError> {
-        let Some(Owed::Job { id, incarnation, failed }) = &self.owed else { return Ok(()) };
-        match self.connection.hand_back(*id, *incarnation, failed.clone(), timeout).await {
+        let Some(claimed) = &self.claimed else { return Ok(()) };
+        let (incarnation, failed) = (claimed.incarnation, claimed.failed.clone());
+        let returned = self.connection.hand_back(claimed.id, incarnation, failed, timeout).await;
+        match returned {
             Ok(true) => info!(run = %self.connection.run, "a job was handed back"),
             // If another process is followed by now, the one that gave the job may be gone.
-            Err(error) if *incarnation == self.connection.incarnation => return Err(error),
+            Err(error) if incarnation == self.connection.incarnation => return Err(error),
             Ok(false) | Err(_) => {}
         }
-        self.owed = None;
+        self.claimed = None;
         Ok(())
     }
 
@@ -264,8 +270,8 @@ impl RunClient {
     pub fn give_up(self) {
         let Connection { run, metrics, .. } = &self.connection;
         self.snapshots.forget(run);
-        if let Some(Owed::Scores(ScoreReport { step, .. })) = self.owed {
-            warn!(%run, step, "the learner did not come back for its scores");
+        if let Some(report) = self.scores() {
+            warn!(%run, step = report.step, "the learner did not come back for its scores");
             metrics.job(JobOutcome::Abandoned);
         }
     }

@@ -103,12 +103,13 @@ async fn watch_endpoint(
         });
     };
     let declare = move || {
-        let subscriber = declarer.liveliness().declare_subscriber(keys::ALL_LEARNERS).history(true);
-        subscriber.callback(callback).wait()
+        let liveliness = declarer.liveliness();
+        let subscriber = liveliness.declare_subscriber(keys::ALL_LEARNERS);
+        subscriber.history(true).callback(callback).wait()
     };
-    let _subscriber = blocking(declare)
-        .await
-        .with_context(|| format!("cannot look for learners at {endpoint}"))?;
+    let subscriber = blocking(declare).await;
+    let _subscriber =
+        subscriber.with_context(|| format!("cannot look for learners at {endpoint}"))?;
     loop {
         tokio::time::sleep(CHECK_INTERVAL).await;
         anyhow::ensure!(!session.is_closed(), "the Zenoh session closed");
@@ -163,17 +164,18 @@ mod tests {
             let key = format!("quad/run-{run}/live/learner/{incarnation}");
             (update(&mut runs, (0, &session), kind, &key), runs.len())
         };
+        const MAX: usize = MAX_LEARNERS;
         assert_eq!(update(Put, 0, 1), (Ok(true), 1));
         assert_eq!(update(Put, 0, 1), (Ok(false), 1), "it is known");
-        assert_eq!(update(Put, 0, 2), (Ok(true), 1), "a run has several incarnations");
-        for run in 2..MAX_LEARNERS {
+        assert_eq!(update(Put, 0, 2), (Ok(true), 1), "the next incarnation");
+        for run in 2..MAX {
             assert_eq!(update(Put, run, 1), (Ok(true), run));
         }
-        assert_eq!(update(Put, MAX_LEARNERS, 1).0, Err("too_many_runs"));
+        assert_eq!(update(Put, MAX, 1).0, Err("too_many_runs"));
         assert_eq!(update(Put, 0, 3).0, Err("too_many_runs"));
-        assert_eq!(update(Delete, 0, 1), (Ok(true), MAX_LEARNERS - 1));
-        assert_eq!(update(Delete, 0, 2), (Ok(true), MAX_LEARNERS - 2), "the run is gone");
-        assert_eq!(update(Delete, MAX_LEARNERS, 1), (Ok(false), MAX_LEARNERS - 2));
-        assert_eq!(update(Put, MAX_LEARNERS, 1), (Ok(true), MAX_LEARNERS - 1), "there is room");
+        assert_eq!(update(Delete, 0, 1), (Ok(true), MAX - 1));
+        assert_eq!(update(Delete, 0, 2), (Ok(true), MAX - 2), "the run is gone");
+        assert_eq!(update(Delete, MAX, 1), (Ok(false), MAX - 2));
+        assert_eq!(update(Put, MAX, 1), (Ok(true), MAX - 1), "there is room");
     }
 }

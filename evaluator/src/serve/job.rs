@@ -10,7 +10,7 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::metrics::{JobOutcome, Metrics};
-use crate::sim::{Environments, EpisodeOutcome, Rollout};
+use crate::sim::{Environments, Rollout};
 
 /// Most episodes of a job: each is a simulation. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
@@ -124,12 +124,7 @@ fn run(
         });
     }
     metrics.job_duration.observe(started.elapsed().as_secs_f64());
-    Ok(rollout.into_outcomes().into_iter().map(episode_score).collect())
-}
-
-fn episode_score(outcome: EpisodeOutcome) -> EpisodeScore {
-    let EpisodeOutcome { seed, episode_return, length, score, .. } = outcome;
-    EpisodeScore { seed, episode_return, length, score }
+    Ok(rollout.into_scores())
 }
 
 #[cfg(test)]
@@ -143,7 +138,9 @@ mod tests {
     use crate::sim::{Environment, EnvironmentError, Simulations};
 
     fn job(episodes: u64) -> Job {
-        Job { seeds: (0..episodes).collect(), ..fixtures::job() }
+        let mut job = fixtures::job();
+        job.seeds = (0..episodes).collect();
+        job
     }
 
     fn policy(hidden: usize, critics: usize, candidates: u32) -> Box<dyn Policy> {
@@ -193,8 +190,8 @@ mod tests {
     #[test]
     fn makes_environments_by_the_job_s_name_and_seed_and_limits_its_time() {
         let renamed = Renamed::default();
-        let environment = "my-robot".to_owned();
-        let job = Job { environment, environment_seed: 5, ..job(2) };
+        let mut job = job(2);
+        (job.environment, job.environment_seed) = ("my-robot".to_owned(), 5);
         check(&job, &renamed).unwrap();
         assert_eq!(run_for(&renamed, &job, Job::LONGEST).unwrap().len(), 2);
         assert_eq!(*renamed.0.lock().unwrap(), [5, 5]);

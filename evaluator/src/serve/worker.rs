@@ -75,7 +75,7 @@ impl Worker {
             }
             None => {
                 let gone = now - *client.gone.get_or_insert(now);
-                !client.is_in_debt() || gone >= KEEP_SCORES
+                !client.has_job() || gone >= KEEP_SCORES
             }
         });
         over.for_each(|(_, client)| client.give_up());
@@ -124,9 +124,9 @@ impl Worker {
     }
 }
 
-/// Delivers what the evaluator owes, if anything, else runs one job.
+/// Runs one job, if the last one is acknowledged, and delivers its scores.
 async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
-    if !client.is_in_debt() {
+    if !client.has_job() {
         let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };
         match evaluator.evaluate(&job, client).await {
             Ok(report) => client.keep(report),

@@ -24,6 +24,6 @@ mod simulation;
 mod simulations;
 
 pub use environment::{Environment, EnvironmentError, Environments, Step};
-pub use rollout::{EpisodeOutcome, Rollout, Stepped};
+pub use rollout::{Rollout, Stepped};
 pub use simulation::Simulation;
 pub use simulations::{Simulations, make, mjcf};

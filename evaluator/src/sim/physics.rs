@@ -10,15 +10,14 @@ use mujoco_rs::wrappers::mj_model::MjModel;
 use quad_dataset::Noise;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, StandardNormal};
+use rand_distr::StandardNormal;
 
 use super::environment::EnvironmentError;
 
-/// The stream that initial states are drawn from, among those of an episode's seed.
+/// Stream of an episode's seed for the initial state.
 const RESET_STREAM: u64 = 1;
 
-/// The compiled model of a simulation. If the process does not have it yet, it is compiled from the
-/// text that `mjcf` gives.
+/// The compiled model of a simulation, which the process shares. `mjcf` makes its text.
 pub(super) fn model(
     simulation: &'static str,
     mjcf: impl FnOnce() -> String,
@@ -29,16 +28,14 @@ pub(super) fn model(
     if let Some(model) = models.get(simulation) {
         return Ok(Arc::clone(model));
     }
-    // SAFETY: every use of MuJoCo in this program starts with a compiled model, so none runs before
-    // this.
+    // SAFETY: every use of MuJoCo starts with a compiled model, so none runs before this.
     LOGGING.call_once(|| unsafe { set_log_handler(log) });
     let model = MjModel::from_xml_string(&mjcf())
         .map_err(|error| EnvironmentError::Model { simulation, reason: error.to_string() })?;
     Ok(Arc::clone(models.entry(simulation).or_insert(Arc::new(model))))
 }
 
-/// Sends MuJoCo's messages to this program's log. MuJoCo's own handler appends to `MUJOCO_LOG.TXT`
-/// in the working directory.
+/// Replaces MuJoCo's own handler, which appends to `MUJOCO_LOG.TXT` in the working directory.
 fn log(message: &MjLogMessage) {
     tracing::debug!(target: "mujoco", "{}", message.subject());
 }
@@ -96,21 +93,17 @@ impl Physics {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(RESET_STREAM);
         self.start(|qpos, qvel| {
-            match noise {
-                Noise::Uniform(bound) => {
-                    for value in qpos.iter_mut().chain(qvel) {
-                        *value += random.random_range(-bound..bound);
+            let (Noise::Uniform(bound) | Noise::NormalVelocities(bound)) = noise;
+            for value in &mut *qpos {
+                *value += random.random_range(-bound..bound);
+            }
+            for value in qvel {
+                *value += match noise {
+                    Noise::Uniform(bound) => random.random_range(-bound..bound),
+                    Noise::NormalVelocities(scale) => {
+                        scale * random.sample::<f64, _>(StandardNormal)
                     }
-                }
-                Noise::NormalVelocities(scale) => {
-                    for value in qpos.iter_mut() {
-                        *value += random.random_range(-scale..scale);
-                    }
-                    for value in qvel {
-                        let normal: f64 = StandardNormal.sample(&mut random);
-                        *value += scale * normal;
-                    }
-                }
+                };
             }
             if let Some(place) = place {
                 qpos[..2].copy_from_slice(&place);
@@ -120,36 +113,27 @@ impl Physics {
 
     /// Restarts from a given state.
     pub(super) fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) {
-        self.start(|positions, velocities| {
-            positions.copy_from_slice(qpos);
-            velocities.copy_from_slice(qvel);
+        self.start(|initial_qpos, initial_qvel| {
+            initial_qpos.copy_from_slice(qpos);
+            initial_qvel.copy_from_slice(qvel);
         });
     }
 
     /// Restarts from the state that `init` makes of the model's initial `(qpos, qvel)`.
     ///
-    /// As in Gymnasium, this computes the accelerations after a reset: they warm-start the solver,
-    /// so the first step depends on them slightly.
+    /// Computes the accelerations, as Gymnasium does after a reset: they warm-start the solver, so
+    /// the first step depends on them slightly.
     fn start(&mut self, init: impl FnOnce(&mut [f64], &mut [f64])) {
         self.data.reset();
-        // SAFETY: MuJoCo allocates both arrays, separately and with these lengths, for the life of
-        // `data`.
-        let (qpos, qvel) = unsafe {
-            let (nq, nv) = (self.data.qpos().len(), self.data.qvel().len());
-            let raw = self.data.ffi_mut();
-            (
-                std::slice::from_raw_parts_mut(raw.qpos, nq),
-                std::slice::from_raw_parts_mut(raw.qvel, nv),
-            )
-        };
-        init(qpos, qvel);
+        let (mut qpos, mut qvel) = (self.qpos().to_vec(), self.qvel().to_vec());
+        init(&mut qpos, &mut qvel);
+        self.data.qpos_mut().copy_from_slice(&qpos);
+        self.data.qvel_mut().copy_from_slice(&qvel);
         self.data.forward();
     }
 
-    /// Applies `action`, clipped to ±1, for one control period.
-    ///
-    /// False if the step failed: an action that is not a number is not applied; when a simulation
-    /// diverges, MuJoCo replaces the state by the initial one.
+    /// Applies `action`, clipped to ±1, for one control period. Returns false if the step failed: a
+    /// NaN in an action is not applied; if a simulation diverges, MuJoCo restores the initial state.
     #[must_use]
     pub(super) fn step(&mut self, action: &[f32]) -> bool {
         if action.iter().any(|value| value.is_nan()) {
@@ -172,8 +156,8 @@ impl Physics {
             self.data.step();
         }
         let warnings = self.data.warning();
-        [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC]
-            .iter()
-            .all(|&warning| warnings[warning as usize].number == 0)
+        let bad =
+            [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC];
+        bad.into_iter().all(|warning| warnings[warning as usize].number == 0)
     }
 }

@@ -4,14 +4,13 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::EpisodeScore;
 use rayon::prelude::*;
-use serde::Serialize;
 
 use super::environment::{Environment, EnvironmentError};
 
 /// A batch of episodes that advance together, with one policy call and one control period per
 /// [`step`](Rollout::step).
 ///
-/// Episodes that have ended leave the batch. An episode's outcome is a function of its seed and the
+/// Episodes that have ended leave the batch. An episode's score is a function of its seed and the
 /// policy, if the policy treats its rows independently; so each episode has its own policy state
 /// `S`.
 pub struct Rollout<S> {
@@ -24,30 +23,15 @@ pub struct Rollout<S> {
     observations: Vec<f32>,
     /// [live, action_dim]
     actions: Vec<f32>,
-    outcomes: Vec<EpisodeOutcome>,
+    /// Ended episodes, with their indices among the seeds.
+    scores: Vec<(usize, EpisodeScore)>,
 }
 
 struct Episode {
     environment: Box<dyn Environment>,
-    outcome: EpisodeOutcome,
+    index: usize,
+    score: EpisodeScore,
     ended: bool,
-}
-
-/// The result of one episode.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct EpisodeOutcome {
-    /// Index of the episode's seed among the rollout's seeds.
-    #[serde(skip)]
-    pub index: usize,
-    /// Seed of the initial state and of the policy's noise.
-    pub seed: u64,
-    /// Undiscounted.
-    #[serde(rename = "return")]
-    pub episode_return: f64,
-    /// Number of steps.
-    pub length: u32,
-    /// D4RL-normalized in the environments of this program.
-    pub score: f64,
 }
 
 /// Effort of one step of a batch.
@@ -75,9 +59,8 @@ impl<S> Rollout<S> {
         let start = |(index, &seed)| {
             let mut environment = make()?;
             environment.reset(seed)?;
-            let outcome =
-                EpisodeOutcome { index, seed, episode_return: 0.0, length: 0, score: 0.0 };
-            Ok(Episode { environment, outcome, ended: false })
+            let score = EpisodeScore { seed, episode_return: 0.0, length: 0, score: 0.0 };
+            Ok(Episode { environment, index, score, ended: false })
         };
         Ok(Self {
             observation_dim,
@@ -86,7 +69,7 @@ impl<S> Rollout<S> {
             states: seeds.iter().copied().map(begin).collect(),
             observations: Vec::new(),
             actions: Vec::new(),
-            outcomes: Vec::new(),
+            scores: Vec::new(),
         })
     }
 
@@ -136,16 +119,16 @@ impl<S> Rollout<S> {
     fn collect_ended(&mut self) -> Result<u32, EnvironmentError> {
         let before = self.live.len();
         for row in (0..before).rev().filter(|&row| self.live[row].ended).collect::<Vec<_>>() {
-            let Episode { mut environment, mut outcome, .. } = self.live.swap_remove(row);
+            let Episode { mut environment, index, mut score, .. } = self.live.swap_remove(row);
             self.states.swap_remove(row);
-            let EpisodeOutcome { seed, episode_return, length, .. } = outcome;
+            let EpisodeScore { seed, episode_return, length, .. } = score;
             let check = |what, value| match EpisodeScore::counts(value) {
                 true => Ok(value),
                 false => Err(EnvironmentError::NotCounted { what, seed, value, length }),
             };
             check("return", episode_return)?;
-            outcome.score = check("score", environment.score(episode_return)?)?;
-            self.outcomes.push(outcome);
+            score.score = check("score", environment.score(episode_return)?)?;
+            self.scores.push((index, score));
         }
         Ok((before - self.live.len()) as u32)
     }
@@ -154,20 +137,20 @@ impl<S> Rollout<S> {
         self.live.is_empty()
     }
 
-    /// The outcomes of ended episodes, in the order of the seeds.
-    pub fn into_outcomes(mut self) -> Vec<EpisodeOutcome> {
-        self.outcomes.sort_unstable_by_key(|outcome| outcome.index);
-        self.outcomes
+    /// Scores of the ended episodes, in the order of the seeds.
+    pub fn into_scores(mut self) -> Vec<EpisodeScore> {
+        self.scores.sort_unstable_by_key(|&(index, _)| index);
+        self.scores.into_iter().map(|(_, score)| score).collect()
     }
 }
 
 impl Episode {
     fn step(&mut self, action: &[f32]) -> Result<(), EnvironmentError> {
         let step = self.environment.step(action)?;
-        self.outcome.episode_return += step.reward;
-        self.outcome.length += 1;
+        self.score.episode_return += step.reward;
+        self.score.length += 1;
         // A sum that is not finite stays so.
-        let is_finite = self.outcome.episode_return.is_finite();
+        let is_finite = self.score.episode_return.is_finite();
         self.ended = step.terminated || step.truncated || !is_finite;
         Ok(())
     }

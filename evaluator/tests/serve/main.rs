@@ -4,7 +4,7 @@
 
 mod learner;
 
-use quad_evaluator::sim::{EnvironmentError, Environments, EpisodeOutcome, Rollout, Simulations};
+use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations};
 use quad_policy::{Precision, load_policy};
 use quad_protocol::{EpisodeScore, Job, ScoreReport, encode, keys};
 use zenoh::qos::CongestionControl;
@@ -23,11 +23,7 @@ fn expected(job: &Job) -> Vec<EpisodeScore> {
         });
         stepped.unwrap();
     }
-    let score = |outcome| {
-        let EpisodeOutcome { seed, episode_return, length, score, .. } = outcome;
-        EpisodeScore { seed, episode_return, length, score }
-    };
-    rollout.into_outcomes().into_iter().map(score).collect()
+    rollout.into_scores()
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -14,10 +14,11 @@ impl Picture {
 
     /// Joins pictures of one height in a row, from the left.
     pub fn strip(pictures: &[Self]) -> Self {
-        let rows = pictures.iter().map(Self::height).max().unwrap_or(0);
-        let row = |row: usize| pictures.iter().flat_map(move |picture| picture.row(row)).copied();
+        let rows = 0..pictures.first().map_or(0, Self::height);
+        let row = |row| pictures.iter().flat_map(move |picture| picture.row(row));
         let width = pictures.iter().map(|picture| picture.width).sum();
-        Self { width, rgb: (0..rows).flat_map(row).collect() }
+        let rgb = rows.flat_map(row).copied().collect();
+        Self { width, rgb }
     }
 
     fn row(&self, row: usize) -> &[u8] {
@@ -26,7 +27,8 @@ impl Picture {
 
     /// Reverses the rows: OpenGL's begin at the bottom.
     pub fn flipped(self) -> Self {
-        let rgb = (0..self.height()).rev().flat_map(|row| self.row(row)).copied().collect();
+        let rows = self.rgb.chunks_exact(3 * self.width).rev();
+        let rgb = rows.flatten().copied().collect();
         Self { rgb, ..self }
     }
 }
@@ -37,11 +39,13 @@ mod tests {
 
     #[test]
     fn a_strip_has_its_pictures_side_by_side() {
-        let one = Picture { width: 1, rgb: vec![1, 1, 1, 2, 2, 2] };
-        let two = Picture { width: 2, rgb: vec![3, 3, 3, 4, 4, 4, 5, 5, 5, 6, 6, 6] };
-        let strip = Picture::strip(&[one.clone(), two]);
-        assert_eq!((strip.width, strip.height()), (3, 2));
-        assert_eq!(strip.rgb, [1, 1, 1, 3, 3, 3, 4, 4, 4, 2, 2, 2, 5, 5, 5, 6, 6, 6]);
-        assert_eq!(one.flipped().rgb, [2, 2, 2, 1, 1, 1]);
+        let picture = |width, pixels: &[u8]| {
+            let rgb = pixels.iter().flat_map(|&pixel| [pixel; 3]).collect();
+            Picture { width, rgb }
+        };
+        let one = picture(1, &[1, 2]);
+        let strip = Picture::strip(&[one.clone(), picture(2, &[3, 4, 5, 6])]);
+        assert_eq!(strip, picture(3, &[1, 3, 4, 2, 5, 6]));
+        assert_eq!(one.flipped(), picture(1, &[2, 1]));
     }
 }

@@ -46,52 +46,47 @@ mod tests {
 
     use super::*;
 
-    /// A run that is evaluated after 10, 20, … steps, in two episodes each.
-    fn begin(folder: &Path) {
+    /// Makes the folder of a run that is evaluated every 10 steps, in two episodes each.
+    fn make_run(folder: &Path) {
         let mut experiment = resolve("hopper-demo", &Default::default()).unwrap();
         (experiment.steps, experiment.eval_interval, experiment.episodes) = (50, 10, 2);
-        let config: RunConfig = serde_json::from_value(json!({
+        let config = json!({
             "run": { "name": "r", "incarnation": 1, "task": "hopper-demo", "version": "0.1.0" },
             "dataset": { "path": "d", "transitions": 1, "episodes": 1, "min_return": 0.0, "mean_return": 0.0, "max_return": 0.0 },
             "experiment": experiment,
-        }))
-        .unwrap();
+        });
+        let config: RunConfig = serde_json::from_value(config).unwrap();
         RunDir::create(folder, &config).unwrap();
-    }
-
-    /// Lines of `scores.jsonl` for steps, seeds and scores.
-    fn lines(scores: &[(u64, u64, f64)]) -> String {
-        let line = |&(step, seed, score): &(u64, u64, f64)| {
-            let line = json!({
-                "step": step, "seed": seed, "return": 1.0, "length": 5, "score": score, "weights": "00", "evaluator": "e",
-            });
-            format!("{line}\n")
-        };
-        scores.iter().map(line).collect()
     }
 
     #[test]
     fn chooses_the_best_snapshot_the_newest_or_the_one_of_a_step() {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path();
-        begin(run);
+        make_run(run);
         let file = |step: u64| run.join(format!("snapshots/step_{step:09}.safetensors"));
+        let set_scores = |scores: &[(u64, u64, f64)], rest: &str| {
+            let line = |&(step, seed, score): &(u64, u64, f64)| {
+                let line = json!({ "step": step, "seed": seed, "return": 1.0, "length": 5, "score": score, "weights": "00", "evaluator": "e" });
+                format!("{line}\n")
+            };
+            let lines: String = scores.iter().map(line).collect();
+            fs::write(run.join("scores.jsonl"), lines + rest).unwrap();
+        };
         assert!(snapshot(run, None).unwrap_err().to_string().contains("has no snapshot"));
         for step in [10, 20, 30] {
             fs::write(file(step), "").unwrap();
         }
-        // No evaluation is complete.
-        fs::write(run.join("scores.jsonl"), lines(&[(10, 1, 99.0)])).unwrap();
-        assert_eq!(snapshot(run, None).unwrap(), file(30));
+        set_scores(&[(10, 1, 99.0)], "");
+        assert_eq!(snapshot(run, None).unwrap(), file(30), "no evaluation is complete");
         let scores = [(10, 1, 5.0), (10, 2, 7.0), (20, 3, 9.0), (20, 4, 1.0), (30, 5, 99.0)];
-        fs::write(run.join("scores.jsonl"), lines(&scores) + "{\"step\":30,\"seed\":6,\"re")
-            .unwrap();
-        assert_eq!(snapshot(run, None).unwrap(), file(10), "of step 30 an episode is missing");
+        set_scores(&scores, "{\"step\":30,\"seed\":6,\"re");
+        assert_eq!(snapshot(run, None).unwrap(), file(10), "that of step 30 is incomplete");
         assert_eq!(snapshot(run, Some(20)).unwrap(), file(20));
         assert!(snapshot(run, Some(25)).is_err());
         assert_eq!(snapshot(&file(20), None).unwrap(), file(20));
         assert!(snapshot(&file(20), Some(20)).is_err());
         fs::remove_file(file(10)).unwrap();
-        assert_eq!(snapshot(run, None).unwrap(), file(20), "the best is not there any more");
+        assert_eq!(snapshot(run, None).unwrap(), file(20), "the best one is gone");
     }
 }

@@ -14,8 +14,7 @@ use super::output::Layout;
 use super::picture::Picture;
 use crate::sim::{self, EnvironmentError};
 
-/// Parts that only a camera sees, which the simulation's model leaves out. The light follows the
-/// robot.
+/// The parts of a model that only a camera sees. The light follows the robot.
 const LOOKS: &str = r#"
   <statistic extent="4"/>
   <visual>
@@ -31,7 +30,7 @@ const LOOKS: &str = r#"
   </asset>
   <worldbody>
     <light directional="true" mode="trackcom" pos="0 -1 4" dir="0.2 0.3 -1" diffuse="0.5 0.5 0.5" specular="0 0 0"/>"#;
-/// A robot's first body has the first color, its last the second, so that crossing legs differ.
+/// Colors of a robot's first and last body, so that crossing legs differ.
 const ROBOT: [[f32; 3]; 2] = [[0.93, 0.49, 0.15], [0.16, 0.38, 0.66]];
 const WALL: [f32; 4] = [0.8, 0.7, 0.55, 1.0];
 const GOAL: [f32; 4] = [0.85, 0.15, 0.2, 0.6];
@@ -39,17 +38,16 @@ const GOAL: [f32; 4] = [0.85, 0.15, 0.2, 0.6];
 const GOAL_RADIUS: f64 = 0.5;
 /// Side of a wall, meters.
 const CELL: f64 = 4.0;
-/// Space in a scene for geometries beyond the model's: the goal, and what MuJoCo adds.
-const MORE: usize = 100;
-/// The largest vertical angle of a free camera is 45°: at this many times its height, an object is
-/// fully visible.
-const WHOLE: f64 = 1.25;
+/// Capacity of a scene for geometries beyond the model's: the goal, and those that MuJoCo adds.
+const EXTRA_GEOMS: usize = 100;
+/// Distance at which a free camera, whose vertical angle is 45°, sees all of an object of height 1.
+const DISTANCE: f64 = 1.25;
 /// The share of a view's height that the caption takes.
 const CAPTION: f64 = 0.2;
 
 /// Draws the films of one environment.
 pub struct Stage {
-    // Dropped in this order: MuJoCo must free its OpenGL objects before the context ends.
+    // MuJoCo frees its OpenGL objects before `_gl` ends: fields are dropped in this order.
     context: MjrContext,
     scene: MjvScene,
     data: MjData<Box<MjModel>>,
@@ -59,10 +57,7 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// Builds the stage of an environment, for pictures of several episodes.
-    ///
-    /// # Errors
-    /// There is no OpenGL, or MuJoCo fails.
+    /// Makes the stage of an environment, for pictures of several episodes.
     pub fn new(spec: &EnvironmentSpec, layout: Layout, episodes: usize) -> anyhow::Result<Self> {
         let gl = Gl::new()?;
         let model = Box::new(model(spec, layout.size(episodes))?);
@@ -70,7 +65,7 @@ impl Stage {
         // SAFETY: the context of `gl` is current on this thread, and outlives what is made here.
         let mut context = unsafe { MjrContext::new(&model) };
         context.offscreen();
-        let mut scene = MjvScene::new(&model, model.geom_size().len() + MORE);
+        let mut scene = MjvScene::new(&model, model.geom_size().len() + EXTRA_GEOMS);
         // MuJoCo draws shadows only around one robot; shadows of a whole maze would be in pieces.
         scene.flags_mut()[MjtRndFlag::mjRND_SHADOW as usize] = u8::from(camera.trackbodyid >= 0);
         let data = MjData::try_new(model)
@@ -79,14 +74,10 @@ impl Stage {
     }
 
     /// The picture of all episodes after `steps` steps.
-    ///
-    /// # Errors
-    /// The pixels cannot be read.
     pub fn draw(&mut self, episodes: &[Episode], steps: usize) -> anyhow::Result<Picture> {
-        for (place, episode) in episodes.iter().enumerate() {
-            let [left, bottom, width, height] =
-                self.layout.view(place, episodes.len()).map(|pixels| pixels as i32);
-            let view = MjrRectangle::new(left, bottom, width, height);
+        for (index, episode) in episodes.iter().enumerate() {
+            let view = self.layout.view(index, episodes.len()).map(|pixels| pixels as i32);
+            let view = MjrRectangle::new(view[0], view[1], view[2], view[3]);
             self.pose(episode.pose(steps));
             self.scene.render(&view, &self.context);
             let (font, corner) = (MjtFont::mjFONT_NORMAL, MjtGridPos::mjGRID_TOPLEFT);
@@ -95,44 +86,29 @@ impl Stage {
         }
         let (width, height) = self.layout.size(episodes.len());
         let mut rgb = vec![0; width * height * 3];
-        self.context.read_pixels(
-            Some(&mut rgb),
-            None,
-            &MjrRectangle::new(0, 0, width as i32, height as i32),
-        )?;
+        let all = MjrRectangle::new(0, 0, width as i32, height as i32);
+        self.context.read_pixels(Some(&mut rgb), None, &all)?;
         Ok(Picture { width, rgb }.flipped())
     }
 
     fn pose(&mut self, pose: &Pose) {
         self.data.qpos_mut().copy_from_slice(&pose.qpos);
         self.data.forward();
-        self.scene.update(
-            &mut self.data,
-            &MjvOption::default(),
-            &MjvPerturb::default(),
-            &mut self.camera,
-        );
+        let (option, perturb) = (MjvOption::default(), MjvPerturb::default());
+        self.scene.update(&mut self.data, &option, &perturb, &mut self.camera);
         if let Some([x, y]) = pose.goal {
             let (size, at) = ([GOAL_RADIUS; 3], [x, y, GOAL_RADIUS]);
-            // SAFETY: it has no material, texture or object, and there is space for it.
-            unsafe {
-                self.scene.create_geom(
-                    MjtGeom::mjGEOM_SPHERE,
-                    Some(size),
-                    Some(at),
-                    None,
-                    Some(GOAL),
-                )
-            };
+            let (shape, color) = (MjtGeom::mjGEOM_SPHERE, Some(GOAL));
+            // SAFETY: it has no material, texture or object, and the scene has capacity for it.
+            unsafe { self.scene.create_geom(shape, Some(size), Some(at), None, color) };
         }
     }
 }
 
-/// The model of an environment with the parts that only a camera sees, for pictures of a size
-/// (width, height).
+/// The model of an environment with its looks, for pictures of a width and a height.
 fn model(spec: &EnvironmentSpec, (width, height): (usize, usize)) -> anyhow::Result<MjModel> {
-    let looks =
-        LOOKS.replace("{width}", &width.to_string()).replace("{height}", &height.to_string());
+    let looks = LOOKS.replace("{width}", &width.to_string());
+    let looks = looks.replace("{height}", &height.to_string());
     let mjcf = sim::mjcf(spec).replacen("<worldbody>", &looks, 1);
     let mjcf = mjcf.replacen(r#"<geom name="floor""#, r#"<geom name="floor" material="floor""#, 1);
     let mut model = MjModel::from_xml_string(&mjcf)?;
@@ -140,15 +116,15 @@ fn model(spec: &EnvironmentSpec, (width, height): (usize, usize)) -> anyhow::Res
     Ok(model)
 }
 
-/// Colors robot and walls, and draws the floor without end, as it is in the simulation.
+/// Colors the robot and the walls, and extends the floor to infinity.
 fn paint(model: &mut MjModel) {
     let bodies = model.geom_bodyid().to_vec();
     let last = bodies.iter().copied().max().unwrap_or(1);
     for (geom, body) in bodies.into_iter().enumerate() {
         let share = (body - 1) as f32 / (last - 1).max(1) as f32;
-        let [red, green, blue] =
-            [0, 1, 2].map(|i| ROBOT[0][i] + share * (ROBOT[1][i] - ROBOT[0][i]));
-        model.geom_rgba_mut()[geom] = if body == 0 { WALL } else { [red, green, blue, 1.0] };
+        let mix = |i: usize| ROBOT[0][i] + share * (ROBOT[1][i] - ROBOT[0][i]);
+        let color = if body == 0 { WALL } else { [mix(0), mix(1), mix(2), 1.0] };
+        model.geom_rgba_mut()[geom] = color;
     }
     if let Some(floor) = model.name_to_id(MjtObjBase::mjOBJ_GEOM, "floor") {
         model.geom_size_mut()[floor] = [0.0, 0.0, 1.0];
@@ -156,38 +132,31 @@ fn paint(model: &mut MjModel) {
     }
 }
 
-/// Beside the robot, moving with it; in a maze, above all walls. `aspect` is a view's width over
-/// its height.
+/// A camera that follows the robot from the side or, in a maze, looks at all walls from above.
+/// `aspect` is a view's width over its height.
 fn camera(model: &MjModel, aspect: f64) -> MjvCamera {
-    let walls: Vec<[f64; 3]> = (0..model.geom_size().len())
-        .filter(|&geom| {
-            model.geom_bodyid()[geom] == 0 && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX
-        })
-        .map(|geom| model.geom_pos()[geom])
-        .collect();
-    let torso = model.name_to_id(MjtObjBase::mjOBJ_BODY, "torso").unwrap_or(1);
-    let beside = MjvCamera {
-        azimuth: 90.0,
-        elevation: -10.0,
-        distance: 4.0,
-        ..MjvCamera::new_tracking(torso)
-    };
+    let walls = (0..model.geom_size().len()).filter(|&geom| {
+        model.geom_bodyid()[geom] == 0 && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX
+    });
+    let walls: Vec<[f64; 3]> = walls.map(|geom| model.geom_pos()[geom]).collect();
     let bounds = |axis: usize| {
         let fold = |most: fn(f64, f64) -> f64| walls.iter().map(|wall| wall[axis]).reduce(most);
         fold(f64::min).zip(fold(f64::max))
     };
-    let (Some((west, east)), Some((south, north))) = (bounds(0), bounds(1)) else { return beside };
-    let center = [(west + east) / 2.0, (south + north) / 2.0];
-    let [width, height] = [east - west, north - south].map(|between| between + CELL);
-    let seen = (height / (1.0 - CAPTION)).max(width / aspect);
-    let lookat = [center[0], center[1] + seen * CAPTION / 2.0, 0.0];
-    MjvCamera {
-        lookat,
-        azimuth: 90.0,
-        elevation: -80.0,
-        distance: WHOLE * seen,
-        ..MjvCamera::default()
+    let mut camera;
+    if let (Some((west, east)), Some((south, north))) = (bounds(0), bounds(1)) {
+        let [width, height] = [east - west, north - south].map(|between| between + CELL);
+        let seen = (height / (1.0 - CAPTION)).max(width / aspect);
+        camera = MjvCamera::default();
+        camera.lookat = [(west + east) / 2.0, (south + north + seen * CAPTION) / 2.0, 0.0];
+        (camera.elevation, camera.distance) = (-80.0, DISTANCE * seen);
+    } else {
+        let torso = model.name_to_id(MjtObjBase::mjOBJ_BODY, "torso").unwrap_or(1);
+        camera = MjvCamera::new_tracking(torso);
+        (camera.elevation, camera.distance) = (-10.0, 4.0);
     }
+    camera.azimuth = 90.0;
+    camera
 }
 
 #[cfg(test)]

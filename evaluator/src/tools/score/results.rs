@@ -5,11 +5,10 @@ use std::fmt::Alignment::{Left, Right};
 use std::path::PathBuf;
 
 use quad_policy::Choice;
+use quad_protocol::EpisodeScore;
 use quad_run::results::Spread;
 use quad_run::table::{Style, Table};
 use serde::Serialize;
-
-use crate::sim::EpisodeOutcome;
 
 /// The results of one policy with one way to choose.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -27,7 +26,7 @@ pub struct Scored {
     /// Arithmetic of its actions, as in `scores.jsonl`.
     pub precision: String,
     /// In the order of their seeds.
-    pub episodes: Vec<EpisodeOutcome>,
+    pub episodes: Vec<EpisodeScore>,
 }
 
 impl Scored {
@@ -92,14 +91,14 @@ mod tests {
     use super::*;
 
     fn scored(snapshot: &str, candidates: u32, scores: &[f64]) -> Scored {
-        let episode =
-            |&score| EpisodeOutcome { index: 0, seed: 1, episode_return: 0.0, length: 7, score };
+        let (seed, length, episode_return) = (1, 7, 0.0);
+        let episode = |&score| EpisodeScore { seed, episode_return, length, score };
         Scored {
             snapshot: snapshot.into(),
             weights: String::new(),
             environment: "hopper".to_owned(),
             step: 20,
-            seed: 1,
+            seed,
             choice: Some(Choice::best_of(candidates)),
             precision: "f32-avx2".to_owned(),
             episodes: scores.iter().map(episode).collect(),

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::{self, EnvironmentSpec};
 use quad_policy::{Choice, Header, Policy, load_policy};
-use quad_protocol::{Hash, Origin};
+use quad_protocol::{EpisodeScore, Hash, Origin};
 use quad_run::files;
 use quad_runtime::Hint;
 
 use super::args::{MOST_EPISODES, ScoreArgs};
-use crate::sim::{Environments, EpisodeOutcome, Rollout, Simulations};
+use crate::sim::{Environments, Rollout, Simulations};
 
 const SNAPSHOT: &str = "what can be scored is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this \
                         version writes them";
@@ -69,7 +69,7 @@ impl Subject {
     }
 
     /// Plays the episodes of some seeds as one batch.
-    pub fn roll_out(&self, seeds: &[u64]) -> anyhow::Result<Vec<EpisodeOutcome>> {
+    pub fn roll_out(&self, seeds: &[u64]) -> anyhow::Result<Vec<EpisodeScore>> {
         let Self { path, policy, spec, seed, .. } = self;
         let make = || Simulations.make(&spec.name, *seed);
         let sizes = (policy.observation_dim(), policy.action_dim());
@@ -80,7 +80,7 @@ impl Subject {
                 acted.with_context(|| format!("{}: the policy cannot act", path.display()))
             })?;
         }
-        Ok(rollout.into_outcomes())
+        Ok(rollout.into_scores())
     }
 
     fn check(&self) -> anyhow::Result<()> {
