@@ -1,19 +1,17 @@
-//! Messages to bytes and back. Each message says beside its fields which kind of frame it is.
+//! Messages to bytes and back.
 //!
 //! A frame is the four bytes `QUAD`, the protocol version (u16), the message's kind (u8) and its
 //! fields in order of declaration, without padding: integers and floats little-endian at their own
-//! width, texts and lists with their length (u64) before them, an enumeration with its variant's
-//! index (u32) before its fields. (It is bincode with fixed-width integers.)
+//! width, texts and lists after their length (u64), an enumeration's fields after its variant's
+//! index (u32). (It is bincode with fixed-width integers.)
 //!
-//! The bytes may come from any peer. Whatever they are, [`decode`] gives a message that keeps all
-//! rules or a typed error. A frame of up to 1 MiB never makes it allocate more than 4 MiB at once,
-//! a larger one never more than 64 MiB.
+//! The bytes may come from any peer: [`decode`] returns a message that keeps all rules or a typed
+//! error. A frame of up to 1 MiB allocates at most 4 MiB at once, a larger one at most 64 MiB.
 
 use std::io::Read;
 
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use bincode::error::DecodeError;
-
 use bincode::{Decode, Encode};
 
 use crate::hash::Hash;
@@ -28,16 +26,16 @@ const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
 const SMALL: usize = 1 << 20;
 /// Largest frame with a policy; the paper's networks take a tenth of it.
 pub(crate) const LARGE: usize = 64 << 20;
-/// Most bytes of memory per byte of a valid small frame: an empty text in a list takes 24 bytes, 8
-/// of them in the frame.
+/// Most bytes of memory per byte of a valid small frame: an empty text in a list takes 24 bytes in
+/// memory and 8 in the frame.
 const MEMORY_PER_WIRE_BYTE: usize = 4;
 
 const FIXED: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// A message: each type has a kind of frame of its own.
+/// A message.
 pub trait Message: Encode + Decode<()> {
-    /// Identifies the message within a frame.
+    /// Identifies the type of message in a frame.
     const KIND: u8;
     /// Largest frame, bytes.
     const LIMIT: usize = SMALL;
@@ -48,9 +46,9 @@ pub trait Message: Encode + Decode<()> {
     }
 }
 
-/// Why bytes are not the expected message, or a message cannot be sent.
+/// Bytes that are not the expected message, or a message that cannot be sent.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[allow(missing_docs)] // The sentences say what each is.
+#[allow(missing_docs)] // The messages say what each variant is.
 pub enum CodecError {
     #[error("this is no QUAD message")]
     NotQuad,
@@ -88,11 +86,7 @@ impl CodecError {
     }
 }
 
-/// The frame of `message`.
-///
-/// # Errors
-///
-/// [`CodecError::Oversized`]: every receiver would refuse the frame.
+/// Encodes a message. Fails with [`CodecError::Oversized`] if every receiver would refuse the frame.
 pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
     let frame = bincode::encode_to_vec((MAGIC, PROTOCOL_VERSION, M::KIND, message), FIXED)
         .map_err(|error| CodecError::Malformed(error.to_string()))?;
@@ -102,21 +96,12 @@ pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
     Ok(frame)
 }
 
-/// The message in `frame`, verified: its version, kind, length, every field, and a snapshot's hash.
-///
-/// # Errors
-///
-/// Any [`CodecError`], the first that is found.
+/// Decodes a message and verifies version, kind, length, every field, and a snapshot's hash.
 pub fn decode<M: Message>(frame: &[u8]) -> Result<M, CodecError> {
     decode_from(frame.len(), frame)
 }
 
-/// [`decode`] of a frame of `length` bytes that are read one after the other. It saves a copy of
-/// those that did not come in one piece.
-///
-/// # Errors
-///
-/// Any [`CodecError`], the first that is found.
+/// [`decode`] of a frame of `length` bytes, which may lie in several pieces.
 pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M, CodecError> {
     let mut header = [0; HEADER_LENGTH];
     let read = &mut header[..length.min(HEADER_LENGTH)];
@@ -142,10 +127,8 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
     let mut body = frame.take((length - HEADER_LENGTH) as u64);
     // Bincode allocates what a length field claims before it reads; the limit bounds that.
     let message: M = if length <= SMALL {
-        bincode::decode_from_std_read(
-            &mut body,
-            FIXED.with_limit::<{ SMALL * MEMORY_PER_WIRE_BYTE }>(),
-        )
+        let limited = FIXED.with_limit::<{ SMALL * MEMORY_PER_WIRE_BYTE }>();
+        bincode::decode_from_std_read(&mut body, limited)
     } else {
         bincode::decode_from_std_read(&mut body, FIXED.with_limit::<LARGE>())
     }
@@ -159,8 +142,7 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
 
 fn body_error(error: DecodeError) -> CodecError {
     match error {
-        // The limits are never below what the frame's own bytes can hold, so more was claimed than
-        // there is.
+        // The limits exceed what the frame's bytes can hold, so a length field claims too much.
         DecodeError::UnexpectedEnd { .. } | DecodeError::Io { .. } | DecodeError::LimitExceeded => {
             CodecError::Truncated
         }

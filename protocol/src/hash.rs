@@ -1,4 +1,4 @@
-//! How weights are identified.
+//! Hashes, which identify weights.
 
 use std::fmt;
 
@@ -32,7 +32,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn as_b3sum_prints_it() {
+    fn text_is_that_of_b3sum() {
         // printf abc | b3sum
         let text = "6437b3ac38465133ffb63b75273a8db548c558465d79db03fd359c6cd5bd9d85";
         assert_eq!(Hash::of(b"abc").to_string(), text);

@@ -1,4 +1,4 @@
-//! An evaluator asks for work and gets some, or gives it back.
+//! Jobs: an evaluator claims one or hands it back.
 
 use std::time::Duration;
 
@@ -8,47 +8,43 @@ use crate::codec::Message;
 use crate::hash::Hash;
 use crate::name::Name;
 
-/// What an evaluator asks a learner about jobs.
+/// An evaluator's request about jobs.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[allow(missing_docs)] // Names of evaluator and job.
 pub enum JobRequest {
-    /// It wants one.
+    /// Asks for a job.
     Claim {
-        /// Who asks.
         evaluator: Name,
-        /// A random number, the same when the claim is sent again because no answer came: it is
-        /// answered with the same job again.
+        /// A random number. A claim that is repeated because no answer came has the same number and
+        /// gets the same job.
         attempt: u64,
-        /// The environments it has.
+        /// Environments that the evaluator can simulate.
         environments: Vec<String>,
     },
-    /// It will not do the one that it has.
+    /// Gives up a job.
     HandBack {
-        /// Who hands it back.
         evaluator: Name,
         /// [`Job::id`].
         job: u64,
-        /// Why it could not do it, for people; nothing if it only leaves.
+        /// Error message; none if the evaluator only leaves.
         failed: Option<String>,
     },
 }
 
-/// The learner's answer to a [`JobRequest`].
+/// The learner's answer to a [`JobRequest`], with the learner's incarnation.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[allow(missing_docs)] // The names say it.
 pub enum JobReply {
-    /// Work.
     Job(Job),
-    /// None now; ask again after so many milliseconds.
+    /// There is no job now; ask again after this time.
     Wait {
-        /// The learner's incarnation.
         incarnation: u64,
-        /// How long to wait.
         milliseconds: u64,
     },
     /// The answer to [`JobRequest::HandBack`].
     HandedBack {
-        /// The learner's incarnation.
         incarnation: u64,
-        /// Whether the evaluator still had the job; if not, there was nothing to hand back.
+        /// Whether the evaluator still had the job.
         accepted: bool,
     },
 }
@@ -63,12 +59,12 @@ impl JobReply {
     }
 }
 
-/// Episodes to run with one snapshot, all of them with the same weights.
+/// Episodes to run with one snapshot.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Job {
-    /// Number of the job, counted within the learner's incarnation.
+    /// Number within the learner's incarnation.
     pub id: u64,
-    /// The run.
+    /// Name of the run.
     pub run: Name,
     /// The learner's incarnation.
     pub incarnation: u64,
@@ -76,20 +72,20 @@ pub struct Job {
     pub step: u64,
     /// Hash of the snapshot's file.
     pub weights: Hash,
-    /// Environment to act in.
+    /// Name of the environment.
     pub environment: String,
-    /// Seed of what an environment draws once and keeps over all episodes (AntMaze-v0: its goal);
-    /// the same for a whole run.
+    /// Seed of what an environment draws once for all episodes (AntMaze-v0: its goal); the same for
+    /// a whole run.
     pub environment_seed: u64,
-    /// One episode for each seed.
+    /// A seed per episode.
     pub seeds: Vec<u64>,
-    /// Progress is to be told this often; after three times as long without any, the job may go to
+    /// Interval of progress messages; after three intervals without progress, the job may go to
     /// another evaluator.
     pub progress_milliseconds: u64,
 }
 
 impl Job {
-    /// Longest time that an evaluator may have a job, whatever its progress.
+    /// Longest time for a job, whatever its progress.
     pub const LONGEST: Duration = Duration::from_secs(24 * 3600);
 }
 

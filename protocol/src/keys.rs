@@ -1,4 +1,4 @@
-//! Where on Zenoh each message is found: everything of a run lies under `quad/<run>/`.
+//! Zenoh keys. Everything of a run lies under `quad/<run>/`.
 //!
 //! | key | verb | message |
 //! |---|---|---|
@@ -10,89 +10,88 @@
 //! | `quad/<run>/live/learner/<incarnation>` | learner's liveliness token | |
 //! | `quad/<run>/live/evaluator/<evaluator>` | evaluator's liveliness token | |
 //!
-//! A learner's answers, jobs and snapshots name its incarnation: an evaluator believes those of the
-//! incarnation that it follows by its token, and not those of an earlier incarnation. Which peers
-//! may use these keys is up to TLS and access control.
+//! A learner's answers, jobs and snapshots name its incarnation, the number of its start. An
+//! evaluator follows one incarnation and ignores messages of earlier ones. TLS and access control
+//! decide which peers may use these keys.
 
 use crate::name::Name;
 
 /// Key expression of the liveliness tokens of all runs' learners.
 pub const ALL_LEARNERS: &str = "quad/*/live/learner/*";
 
-/// The newest weights, as they are published.
+/// The newest weights.
 pub fn weights(run: &Name) -> String {
     format!("quad/{run}/weights")
 }
 
-/// The weights after `step` gradient steps, for an evaluator that asks.
+/// The weights of one gradient step.
 pub fn weights_at(run: &Name, step: u64) -> String {
     format!("quad/{run}/weights/{step}")
 }
 
-/// Key expression of [`weights_at`] any step.
+/// Key expression of [`weights_at`] for all steps.
 pub fn weights_at_any_step(run: &Name) -> String {
     format!("quad/{run}/weights/*")
 }
 
-/// Where evaluators ask for work.
+/// Requests of jobs.
 pub fn jobs(run: &Name) -> String {
     format!("quad/{run}/jobs")
 }
 
-/// Where evaluators deliver scores.
+/// Deliveries of scores.
 pub fn scores(run: &Name) -> String {
     format!("quad/{run}/scores")
 }
 
-/// How far one evaluator is.
+/// Progress of an evaluator.
 pub fn progress(run: &Name, evaluator: &Name) -> String {
     format!("quad/{run}/progress/{evaluator}")
 }
 
-/// Key expression of the [`progress`] of all evaluators.
+/// Key expression of [`progress`] for all evaluators.
 pub fn all_progress(run: &Name) -> String {
     format!("quad/{run}/progress/*")
 }
 
-/// The liveliness token of one incarnation of the learner.
+/// Liveliness token of one incarnation of the learner.
 pub fn live_learner(run: &Name, incarnation: u64) -> String {
     format!("quad/{run}/live/learner/{incarnation}")
 }
 
-/// Key expression of the tokens of all incarnations of a run's learner, and of all learners that
-/// took the same name.
+/// Key expression of [`live_learner`] for all incarnations, and for all learners of the same name.
 pub fn all_incarnations(run: &Name) -> String {
     format!("quad/{run}/live/learner/*")
 }
 
-/// An evaluator's liveliness token.
+/// Liveliness token of an evaluator.
 pub fn live_evaluator(run: &Name, evaluator: &Name) -> String {
     format!("quad/{run}/live/evaluator/{evaluator}")
 }
 
-/// Key expression of the tokens of all of a run's evaluators.
+/// Key expression of [`live_evaluator`] for all evaluators.
 pub fn all_evaluators(run: &Name) -> String {
     format!("quad/{run}/live/evaluator/*")
 }
 
-/// The evaluator that a key of [`live_evaluator`] names.
+/// The evaluator in a key of [`live_evaluator`].
 pub fn evaluator_of(key: &str) -> Option<Name> {
     Name::new(within_run(key)?.1.strip_prefix("live/evaluator/")?).ok()
 }
 
-/// The run that `key` belongs to; `None` if it is no key of ours.
+/// The run of a key.
 pub fn run_of(key: &str) -> Option<Name> {
     within_run(key).map(|(run, _)| run)
 }
 
-/// The incarnation that a key of [`live_learner`] names.
+/// The incarnation in a key of [`live_learner`].
 pub fn incarnation_of(key: &str) -> Option<u64> {
     let incarnation = within_run(key)?.1.strip_prefix("live/learner/")?;
-    // Only as it is written: `+1` and `01` would be 1, too.
+    // Refuses `+1` and `01`.
     incarnation.parse().ok().filter(|number: &u64| number.to_string() == incarnation)
 }
 
-/// The step that a key of [`weights_at`] names.
+/// The step in a key of [`weights_at`].
 pub fn step_of(key: &str) -> Option<u64> {
     within_run(key)?.1.strip_prefix("weights/")?.parse().ok()
 }
@@ -108,46 +107,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keys_give_back_what_they_were_made_of() {
+    fn parts_of_keys() {
         let (run, evaluator) = (Name::new("run-1").unwrap(), Name::new("box.7").unwrap());
-        for (key, step, incarnation, of) in [
+        let (some, box7) = (Some(run.clone()), Some(evaluator.clone()));
+        for (key, step, incarnation, named) in [
             (jobs(&run), None, None, None),
             (weights(&run), None, None, None),
             (weights_at(&run, 10_000), Some(10_000), None, None),
+            ("quad/run-1/weights/".to_owned(), None, None, None),
+            ("quad/run-1/weights/x".to_owned(), None, None, None),
+            ("quad/run-1/weights/-1".to_owned(), None, None, None),
             (live_learner(&run, 77), None, Some(77), None),
-            (live_evaluator(&run, &evaluator), None, None, Some(evaluator)),
+            ("quad/run-1/live/learner".to_owned(), None, None, None),
+            ("quad/run-1/live/learner/x".to_owned(), None, None, None),
+            ("quad/run-1/live/learner/01".to_owned(), None, None, None),
+            ("quad/run-1/live/learner/+1".to_owned(), None, None, None),
+            (live_evaluator(&run, &evaluator), None, None, box7),
+            ("quad/run-1/live/evaluator/a*b".to_owned(), None, None, None),
         ] {
-            assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), step), "{key}");
-            assert_eq!((incarnation_of(&key), evaluator_of(&key)), (incarnation, of), "{key}");
+            assert_eq!((run_of(&key), step_of(&key)), (some.clone(), step), "{key}");
+            assert_eq!((incarnation_of(&key), evaluator_of(&key)), (incarnation, named), "{key}");
         }
-        assert_eq!(evaluator_of("quad/run-1/live/evaluator/a*b"), None);
-    }
-
-    #[test]
-    fn strangers_keys_give_nothing() {
-        for key in [
-            "",
-            "quad",
-            "quad/",
-            "quad//live",
-            "quad/a b/live/learner/1",
-            "quad/*/live/learner/1",
-            "other/run/jobs",
-        ] {
+        for key in ["", "quad", "quad/", "quad//live", "quad/a b/x", "quad/*/x", "other/run/jobs"] {
             assert_eq!(run_of(key), None, "{key}");
-        }
-        for key in [
-            "quad/run/live/learner",
-            "quad/run/live/learner/x",
-            "quad/run/live/learner/01",
-            "quad/run/live/learner/+1",
-        ] {
-            assert_eq!(incarnation_of(key), None, "{key}");
-        }
-        for key in
-            ["quad/run/weights/", "quad/run/weights/x", "quad/run/weights/-1", "quad/run/jobs/1"]
-        {
-            assert_eq!(step_of(key), None, "{key}");
         }
     }
 }

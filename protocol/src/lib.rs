@@ -1,17 +1,10 @@
-//! What crosses the wire between a learner and its evaluators.
+//! The wire between a learner and its evaluators.
 //!
 //! # Layout
 //!
-//! In reading order:
-//!
-//! - `name`: what runs and evaluators may be called; `hash`: how weights are identified.
-//! - [`keys`]: where on Zenoh each message is found.
-//! - `snapshot`: weights, from the learner to evaluators; `origin`: what the header of their file
-//!   says of where it comes from.
-//! - `seeds`: which episodes an evaluation has; `job`: an evaluator asks for work and gets some.
-//! - `progress`: an evaluator tells how far its job is.
-//! - `score`: an evaluator delivers scores, the learner acknowledges them.
-//! - `codec`: messages to bytes and back.
+//! In reading order: `name` and `hash`; [`keys`]; `snapshot` and `origin`, weights and the header of
+//! their file; `seeds` and `job`, an evaluator gets episodes to run; `progress`; `score`; `codec`,
+//! messages to bytes and back.
 //!
 //! Nothing here knows what the weights mean or how episodes are simulated.
 

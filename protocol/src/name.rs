@@ -1,4 +1,4 @@
-//! What runs and evaluators may be called.
+//! Names of runs and evaluators.
 
 use std::fmt;
 
@@ -9,14 +9,12 @@ use bincode::{Decode, Encode};
 use serde::{Deserialize, Serialize};
 
 /// Name of a run or of an evaluator: 1 to 64 ASCII letters, digits, dots, dashes and underscores,
-/// and neither `.` nor `..`.
-///
-/// It fits into a Zenoh key, a file name and a metric's label without quoting.
+/// but not `.` or `..`. It needs no quoting in a Zenoh key, a file name or a metric's label.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub struct Name(String);
 
-/// Why a text cannot be a [`Name`].
+/// A text that cannot be a [`Name`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct InvalidName(String);
@@ -25,27 +23,21 @@ impl Name {
     /// Most characters of a name.
     pub const MAX_LENGTH: usize = 64;
 
-    /// Checks `text` and makes it a name.
+    /// Checks a name.
     pub fn new(text: impl Into<String>) -> Result<Name, InvalidName> {
-        let text = text.into();
+        let (text, most) = (text.into(), Self::MAX_LENGTH);
         let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_');
-        if let Some(other) = text.chars().find(|&c| !allowed(c)) {
-            return Err(InvalidName(format!(
-                "a name has only letters, digits, '.', '-' and '_', not {other:?}"
-            )));
-        }
-        if !(1..=Self::MAX_LENGTH).contains(&text.len()) {
-            return Err(InvalidName(format!(
-                "a name has 1 to {} characters, not {}",
-                Self::MAX_LENGTH,
-                text.len()
-            )));
-        }
-        // A folder by this name would be the one that it is in, or the one above.
-        if text == "." || text == ".." {
-            return Err(InvalidName(format!("{text:?} is not a name")));
-        }
-        Ok(Name(text))
+        let problem = if let Some(other) = text.chars().find(|&c| !allowed(c)) {
+            format!("a name has only letters, digits, '.', '-' and '_', not {other:?}")
+        } else if !(1..=most).contains(&text.len()) {
+            format!("a name has 1 to {most} characters, not {}", text.len())
+        } else if text == "." || text == ".." {
+            // As folders, these are the current one and the one above.
+            format!("{text:?} is not a name")
+        } else {
+            return Ok(Name(text));
+        };
+        Err(InvalidName(problem))
     }
 
     /// The name as text.
@@ -88,19 +80,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_name_may_be() {
+    fn names_are_checked() {
         for text in ["a", "hopper-medium-replay-v2", "Run_1.b", "...", &"x".repeat(64)] {
             assert_eq!(Name::new(text).unwrap().as_str(), text);
         }
-        let refused = |text: String| Name::new(text).unwrap_err().to_string();
-        assert_eq!(refused(String::new()), "a name has 1 to 64 characters, not 0");
-        assert_eq!(refused("x".repeat(65)), "a name has 1 to 64 characters, not 65");
-        assert_eq!(
-            [".", ".."].map(|text| refused(text.to_owned())),
-            ["\".\" is not a name", "\"..\" is not a name"]
-        );
+        for (text, problem) in [
+            ("", "a name has 1 to 64 characters, not 0"),
+            (&"x".repeat(65), "a name has 1 to 64 characters, not 65"),
+            (".", "\".\" is not a name"),
+            ("..", "\"..\" is not a name"),
+        ] {
+            assert_eq!(Name::new(text).unwrap_err().to_string(), problem);
+        }
         for character in ['/', '*', '$', ' ', '#', '?', '@', 'é', '\n', '\0'] {
-            assert!(refused(format!("a{character}b")).ends_with(&format!("not {character:?}")));
+            let error = Name::new(format!("a{character}b")).unwrap_err().to_string();
+            assert!(error.ends_with(&format!("not {character:?}")));
         }
     }
 }

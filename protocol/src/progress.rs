@@ -6,35 +6,33 @@ use crate::codec::Message;
 use crate::job::Job;
 use crate::name::Name;
 
-/// How far a job is, and what the evaluator has done so far. Extends the job's lease, if it is
-/// further than before.
+/// Progress of a job, and totals of the evaluator since it started. Extends the job's lease if it
+/// shows more progress than the message before.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[allow(missing_docs)] // The names say it.
 pub struct Progress {
-    /// The evaluator.
     pub evaluator: Name,
-    /// The run.
     pub run: Name,
     /// The learner's incarnation when it handed the job out.
     pub incarnation: u64,
-    /// The job.
+    /// [`Job::id`].
     pub job: u64,
-    /// Gradient step of its snapshot.
+    /// Gradient step of the job's snapshot.
     pub step: u64,
     /// Episodes of the job that have ended.
     pub episodes_done: u32,
-    /// Episodes of the job.
     pub episodes_total: u32,
-    /// Environment steps of the job. None while its weights are being fetched.
+    /// Environment steps of the job; 0 while its weights are fetched.
     pub steps_done: u64,
-    /// Environment steps of this evaluator since it started, over all of its jobs and runs.
+    /// Environment steps of all of the evaluator's jobs.
     pub environment_steps: u64,
-    /// Episodes of this evaluator since it started, over all of its jobs and runs.
+    /// Episodes of all of the evaluator's jobs.
     pub episodes: u64,
 }
 
 impl Progress {
-    /// Progress of `job` before its first step, by an evaluator that has done nothing yet.
-    pub fn of(job: &Job, evaluator: Name) -> Self {
+    /// Progress of `job` before its first step, by an evaluator without earlier jobs.
+    pub fn new(job: &Job, evaluator: Name) -> Self {
         Self {
             evaluator,
             run: job.run.clone(),

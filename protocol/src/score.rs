@@ -13,20 +13,19 @@ use crate::name::Name;
 pub struct EpisodeScore {
     /// Seed of the episode.
     pub seed: u64,
-    /// Sum of its rewards.
+    /// Sum of rewards.
     #[serde(rename = "return")]
     pub episode_return: f64,
-    /// Its environment steps.
+    /// Environment steps.
     pub length: u32,
-    /// Its score: D4RL's normalized one, 100 · (return − random) / (expert − random), where the
-    /// environment has such references; else what the evaluator's user counts, by default the
-    /// return.
+    /// D4RL's normalized score, 100 · (return − random) / (expert − random), where the environment
+    /// has reference returns; else the evaluator's own measure, by default the return.
     pub score: f64,
 }
 
 impl EpisodeScore {
-    /// Largest return or score that counts, whichever its sign. It is far above any use; statistics
-    /// of larger ones would not be finite.
+    /// Largest absolute return or score that counts: far above any use, and small enough for finite
+    /// statistics.
     pub const LARGEST: f64 = 1e12;
 
     /// Whether a return or a score is finite and no larger than [`LARGEST`](Self::LARGEST).
@@ -35,57 +34,42 @@ impl EpisodeScore {
     }
 }
 
-/// An evaluator delivers the episodes of a job. The learner records them even if the job has gone
-/// to another evaluator, or an earlier incarnation of the learner handed it out: what counts is
-/// that run, step, weights and seeds are those of an evaluation.
+/// The episodes of a job. The learner also records them if the job has gone to another evaluator or
+/// is of an earlier incarnation, as long as run, step, weights and seeds are those of an evaluation.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
+#[allow(missing_docs)] // The names say it.
 pub struct ScoreReport {
-    /// Who delivers.
     pub evaluator: Name,
-    /// The run.
     pub run: Name,
     /// The learner's incarnation when it handed the job out.
     pub incarnation: u64,
-    /// The job.
+    /// [`Job::id`].
     pub job: u64,
     /// Gradient step of the snapshot.
     pub step: u64,
     /// Hash of the snapshot's file.
     pub weights: Hash,
-    /// The arithmetic that the policy's actions were computed in, e.g. `f32-avx2` or `bf16-amx`:
-    /// the same name gives the same bits.
+    /// Arithmetic of the policy, e.g. `f32-avx2` or `bf16-amx`: the same name gives the same bits.
     pub precision: Name,
-    /// The episodes.
     pub episodes: Vec<EpisodeScore>,
 }
 
 impl ScoreReport {
-    /// What `evaluator` has measured in `job`.
-    pub fn of(job: &Job, evaluator: Name, precision: Name, episodes: Vec<EpisodeScore>) -> Self {
-        let Job { run, incarnation, id, step, weights, .. } = job.clone();
-        Self { evaluator, run, incarnation, job: id, step, weights, precision, episodes }
+    /// The report of a job.
+    pub fn new(job: &Job, evaluator: Name, precision: Name, episodes: Vec<EpisodeScore>) -> Self {
+        let Job { run, incarnation, id: job, step, weights, .. } = job.clone();
+        Self { evaluator, run, incarnation, job, step, weights, precision, episodes }
     }
 }
 
-/// The learner's answer to a [`ScoreReport`].
+/// The learner's answer to a [`ScoreReport`], with the learner's incarnation.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[allow(missing_docs)] // The names say it.
 pub enum ScoreReply {
-    /// They are on the learner's disk.
-    Recorded {
-        /// The learner's incarnation.
-        incarnation: u64,
-        /// Episodes that were not known before.
-        new: u32,
-        /// Episodes that were delivered before; they count once.
-        duplicates: u32,
-    },
-    /// They were not accepted and never will be; do not send them again.
-    Refused {
-        /// The learner's incarnation.
-        incarnation: u64,
-        /// Why, for people.
-        reason: String,
-    },
+    /// The scores are on the learner's disk. Duplicates were delivered before and count once.
+    Recorded { incarnation: u64, new: u32, duplicates: u32 },
+    /// The scores are permanently refused.
+    Refused { incarnation: u64, reason: String },
 }
 
 impl ScoreReply {

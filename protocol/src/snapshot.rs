@@ -6,28 +6,28 @@ use crate::codec::{CodecError, LARGE, Message};
 use crate::hash::Hash;
 use crate::name::Name;
 
-/// Most bytes of a snapshot's frame that are not its file.
-const BESIDE_THE_FILE: usize = 256;
+/// Most bytes of a snapshot's frame without the file.
+const OVERHEAD: usize = 256;
 
-/// The policy of one run after one gradient step.
+/// The policy of a run after a gradient step.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Snapshot {
-    /// The run.
+    /// Name of the run.
     pub run: Name,
-    /// Which start of its learner published it: one that is started again has a higher number.
+    /// The learner's incarnation: larger each time the run's learner starts.
     pub incarnation: u64,
-    /// Gradient steps so far.
+    /// Gradient step.
     pub step: u64,
-    /// BLAKE3 hash of exactly the bytes in `file`. Decoding verifies it.
+    /// BLAKE3 hash of `file`, verified by decoding.
     pub hash: Hash,
-    /// The policy's whole safetensors file. Its header says what policy it is, and its
-    /// [`Origin`](crate::Origin). It is not looked into here.
+    /// The policy's safetensors file, opaque here. Its header has the kind of policy and its
+    /// [`Origin`](crate::Origin).
     pub file: Vec<u8>,
 }
 
 impl Snapshot {
     /// Largest file that can be sent, bytes.
-    pub const MOST_FILE: usize = LARGE - BESIDE_THE_FILE;
+    pub const MOST_FILE: usize = LARGE - OVERHEAD;
 }
 
 impl Message for Snapshot {
@@ -35,11 +35,7 @@ impl Message for Snapshot {
     const LIMIT: usize = LARGE;
 
     fn verify(&self) -> Result<(), CodecError> {
-        let found = Hash::of(&self.file);
-        if found == self.hash {
-            Ok(())
-        } else {
-            Err(CodecError::Hash { claimed: self.hash, found })
-        }
+        let (claimed, found) = (self.hash, Hash::of(&self.file));
+        if found == claimed { Ok(()) } else { Err(CodecError::Hash { claimed, found }) }
     }
 }

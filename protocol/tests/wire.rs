@@ -1,4 +1,4 @@
-//! Every message survives the wire; whatever else arrives is a typed error.
+//! Messages survive the wire; damaged ones are typed errors.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod frames;
@@ -9,51 +9,43 @@ use std::io::Read;
 use frames::{Check, each, snapshot};
 use quad_protocol::*;
 
-struct Withstands;
+struct Survives;
 
-impl Check for Withstands {
-    /// What must be true of every message: it survives, and each kind of damage is named.
+impl Check for Survives {
     fn check<M: Message + PartialEq + Debug>(&mut self, message: &M) {
         let frame = encode(message).unwrap();
         assert_eq!(&decode::<M>(&frame).unwrap(), message);
         let (begin, end) = frame.split_at(frame.len() / 2);
-        assert_eq!(
-            &decode_from::<M>(frame.len(), begin.chain(end)).unwrap(),
-            message,
-            "in two pieces"
-        );
-        assert_eq!(
-            decode_from::<M>(frame.len(), begin),
-            Err(CodecError::Truncated),
-            "without the second piece"
-        );
+        let in_two_pieces = decode_from::<M>(frame.len(), begin.chain(end));
+        assert_eq!(&in_two_pieces.unwrap(), message);
+        let without_the_second = decode_from::<M>(frame.len(), begin);
+        assert_eq!(without_the_second, Err(CodecError::Truncated));
+    }
+}
 
-        for length in 0..frame.len() {
-            assert_eq!(
-                decode::<M>(&frame[..length]),
-                Err(CodecError::Truncated),
-                "cut to {length} bytes"
-            );
-        }
-        let longer = [&frame[..], &[0; 3]].concat();
-        assert_eq!(decode::<M>(&longer), Err(CodecError::Trailing(3)));
+struct NamesDamage;
+
+impl Check for NamesDamage {
+    fn check<M: Message + PartialEq + Debug>(&mut self, message: &M) {
+        let frame = encode(message).unwrap();
+        let damaged = |frame: &[u8], error: CodecError| {
+            assert_eq!(decode::<M>(frame), Err(error));
+        };
+        (0..frame.len()).for_each(|length| damaged(&frame[..length], CodecError::Truncated));
+        damaged(&[&frame[..], &[0; 3]].concat(), CodecError::Trailing(3));
         let oversized = [&frame[..], &vec![0; M::LIMIT][..]].concat();
-        let (length, limit) = (oversized.len(), M::LIMIT);
-        assert_eq!(decode::<M>(&oversized), Err(CodecError::Oversized { length, limit }));
+        damaged(&oversized, CodecError::Oversized { length: oversized.len(), limit: M::LIMIT });
+        let ours = PROTOCOL_VERSION;
         for bit in 0..8 {
             for byte in 0..4 {
-                assert_eq!(decode::<M>(&flipped(&frame, byte, bit)), Err(CodecError::NotQuad));
+                damaged(&flipped(&frame, byte, bit), CodecError::NotQuad);
             }
             for byte in 4..6 {
-                let theirs = PROTOCOL_VERSION ^ (1 << (8 * (byte - 4) + bit));
-                let expected = Err(CodecError::Version { theirs, ours: PROTOCOL_VERSION });
-                assert_eq!(decode::<M>(&flipped(&frame, byte, bit)), expected);
+                let theirs = ours ^ (1 << (8 * (byte - 4) + bit));
+                damaged(&flipped(&frame, byte, bit), CodecError::Version { theirs, ours });
             }
-            let found = M::KIND ^ (1 << bit);
-            assert_eq!(
-                decode::<M>(&flipped(&frame, 6, bit)),
-                Err(CodecError::Kind { found, expected: M::KIND })
-            );
+            let (found, expected) = (M::KIND ^ (1 << bit), M::KIND);
+            damaged(&flipped(&frame, 6, bit), CodecError::Kind { found, expected });
         }
     }
 }
@@ -65,43 +57,36 @@ fn flipped(frame: &[u8], byte: usize, bit: usize) -> Vec<u8> {
 }
 
 #[test]
-fn a_message_survives_and_each_kind_of_damage_is_named() {
-    each(&mut Withstands);
+fn messages_survive_and_each_kind_of_damage_is_named() {
+    each(&mut Survives);
+    each(&mut NamesDamage);
 }
 
 #[test]
-fn a_file_that_is_not_the_hash_s() {
+fn a_file_with_another_hash_is_refused() {
     let message = snapshot(vec![7; 100]);
     let frame = encode(&message).unwrap();
     let first = frame.len() - message.file.len();
     for bit in 0..8 * message.file.len() {
         let frame = flipped(&frame, first + bit / 8, bit % 8);
-        let found = Hash::of(&frame[first..]);
-        assert_eq!(
-            decode::<Snapshot>(&frame),
-            Err(CodecError::Hash { claimed: message.hash, found })
-        );
+        let (claimed, found) = (message.hash, Hash::of(&frame[first..]));
+        assert_eq!(decode::<Snapshot>(&frame), Err(CodecError::Hash { claimed, found }));
     }
 }
 
 #[test]
-fn a_name_that_is_not_allowed_is_malformed() {
+fn an_invalid_name_is_malformed() {
     let evaluator = Name::new("a-b").unwrap();
     let message = JobRequest::Claim { evaluator, attempt: 0, environments: vec![] };
     let mut frame = encode(&message).unwrap();
     let dash = frame.iter().position(|&byte| byte == b'-').unwrap();
     frame[dash] = b'/';
-    let error = decode::<JobRequest>(&frame).unwrap_err();
-    assert_eq!(
-        error,
-        CodecError::Malformed(
-            "a name has only letters, digits, '.', '-' and '_', not '/'".to_owned()
-        )
-    );
+    let problem = "a name has only letters, digits, '.', '-' and '_', not '/'".to_owned();
+    assert_eq!(decode::<JobRequest>(&frame), Err(CodecError::Malformed(problem)));
 }
 
 #[test]
-fn the_largest_file_is_sent_and_what_every_receiver_refuses_is_not() {
+fn the_largest_file_is_sent_and_a_larger_one_refused() {
     let named_longest =
         |file| Snapshot { run: Name::new("r".repeat(Name::MAX_LENGTH)).unwrap(), ..snapshot(file) };
     let largest = named_longest(vec![1; Snapshot::MOST_FILE]);

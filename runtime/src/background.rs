@@ -1,13 +1,10 @@
 //! Gives threads that serve the network a lower priority than threads that train.
 
-/// On a busy processor, a thread of this niceness gets about a tenth of the time of a thread that
-/// trains.
+/// A thread of this niceness gets about a tenth of the processor time of a thread that trains.
 const NICENESS: i32 = 10;
 
-/// Lowers the priority of the calling thread, and of threads that it starts later, so that messages
-/// hardly slow down training.
-///
-/// This is a compromise: if training uses every processor, an evaluator waits some milliseconds
+/// Lowers the priority of the calling thread and of threads that it starts later, so that messages
+/// hardly slow down training. If training uses every core, an evaluator waits some milliseconds
 /// longer for a job.
 pub fn stay_in_background() {
     // On Linux this changes the thread; on other systems it would change the process.

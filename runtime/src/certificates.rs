@@ -1,5 +1,4 @@
-//! The certificate by which a program shows its role: three files that
-//! `deploy/zenoh/certificates.sh` makes.
+//! Certificates of a program's role, made by `deploy/zenoh/certificates.sh`.
 
 use std::env;
 use std::fmt;
@@ -22,8 +21,7 @@ use x509_parser::time::ASN1Time;
 /// The trusted authority, the program's own certificate, and its private key.
 const FILES: [&str; 3] = ["ca.pem", "cert.pem", "key.pem"];
 
-/// The program warns about a certificate that is valid for fewer days than this: an operator needs
-/// time to renew it.
+/// Days before its expiry from which a certificate causes a warning.
 const EXPIRES_SOON: i64 = 14;
 
 const HINT: &str = "--certificates takes a folder with ca.pem, cert.pem and key.pem that this user may read; \
@@ -31,20 +29,16 @@ const HINT: &str = "--certificates takes a folder with ca.pem, cert.pem and key.
 const HINT_TIME: &str = "if the clock of this machine is right, make a new certificate with deploy/zenoh/certificates.sh";
 const HINT_ROLE: &str = "give the folder that was made for this program's role";
 
-/// Names the folder of certificates where the command line does not.
-const VARIABLE: &str = "QUAD_CERTIFICATES";
-
-/// The folder of certificates that the command line names, or else the variable QUAD_CERTIFICATES,
-/// unless it is empty.
+/// The folder of certificates of the command line, else of the variable QUAD_CERTIFICATES.
 pub fn certificates_folder(named: Option<PathBuf>) -> Option<PathBuf> {
-    named.or_else(|| env::var_os(VARIABLE).filter(|folder| !folder.is_empty()).map(PathBuf::from))
+    let variable = || env::var_os("QUAD_CERTIFICATES").filter(|folder| !folder.is_empty());
+    named.or_else(|| variable().map(PathBuf::from))
 }
 
-/// What the owner of a certificate may do. Access control tells roles apart by the certificate's
-/// common name.
+/// Role of a certificate's owner, by the certificate's common name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
-    /// Publishes weights, answers jobs and scores.
+    /// Publishes weights, hands out jobs, records scores.
     Learner,
     /// Claims jobs, delivers scores.
     Evaluator,
@@ -61,19 +55,16 @@ impl Role {
 }
 
 /// A folder with an authority (ca.pem), a certificate that it has signed (cert.pem), and the
-/// certificate's key (key.pem).
-///
-/// Zenoh reads the files again for each connection that it opens, and once for each endpoint that
-/// it listens at.
+/// certificate's key (key.pem). Zenoh reads the files again for each connection that it opens.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Certificates {
     folder: PathBuf,
     expires: ASN1Time,
-    /// The hosts at which clients may connect to the certificate's owner.
+    /// Names and addresses at which clients may connect to the owner.
     hosts: Vec<String>,
 }
 
-/// A file cannot be used.
+/// A certificate file that cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[error("{} {problem}", path.display())]
 pub struct CertificatesError {
@@ -83,7 +74,7 @@ pub struct CertificatesError {
 }
 
 impl CertificatesError {
-    /// What to do about it.
+    /// Tells the user how to fix it.
     pub fn hint(&self) -> &'static str {
         self.hint
     }
@@ -95,11 +86,7 @@ impl CertificatesError {
 
 impl Certificates {
     /// Checks the files in `folder` as the other side of a connection would, and that the
-    /// certificate is for `role`. Logs until when the certificate is valid.
-    ///
-    /// # Errors
-    /// A file is missing or malformed; the certificate is of another role, not valid now, or of
-    /// another authority; the key is another certificate's.
+    /// certificate is for `role`. Logs the certificate's expiry.
     pub fn read(folder: &Path, role: Role) -> Result<Self, CertificatesError> {
         let certificates = Self::check(folder, role)?;
         match certificates.expire_soon() {
@@ -109,52 +96,40 @@ impl Certificates {
         Ok(certificates)
     }
 
-    /// [`read`](Self::read) without the log.
+    /// Checks as [`read`](Self::read), without the log.
     pub(crate) fn check(folder: &Path, role: Role) -> Result<Self, CertificatesError> {
         let [ca, own, key] = FILES.map(|name| folder.join(name));
         let (authorities, chain) = (certificates(&ca)?, certificates(&own)?);
         let private = PrivateKeyDer::from_pem_file(&key)
             .map_err(|error| unreadable(&key, "private key", &error))?;
-        let certificate = X509Certificate::from_der(&chain[0])
-            .map_err(|_| {
-                CertificatesError::new(&own, "holds no certificate that can be read", HINT)
-            })?
-            .1;
-
+        let refuse = |problem: String, hint| Err(CertificatesError::new(&own, problem, hint));
+        let Ok((_, certificate)) = X509Certificate::from_der(&chain[0]) else {
+            return refuse("holds no certificate that can be read".to_owned(), HINT);
+        };
         let names = certificate.subject().iter_common_name().filter_map(|name| name.as_str().ok());
-        let (found, wanted) = (names.collect::<Vec<_>>().join(", "), role.common_name());
+        let (found, wanted) = (Vec::from_iter(names).join(", "), role.common_name());
         if found != wanted {
-            let problem = format!("is a certificate for {found}, not for {wanted}");
-            return Err(CertificatesError::new(&own, problem, HINT_ROLE));
+            return refuse(format!("is a certificate for {found}, not for {wanted}"), HINT_ROLE);
         }
         let validity = certificate.validity();
         if !validity.is_valid() {
             let (from, until) = (validity.not_before, validity.not_after);
-            let problem = format!("is valid from {from} to {until}, which is not now");
-            return Err(CertificatesError::new(&own, problem, HINT_TIME));
+            return refuse(format!("is valid from {from} to {until}, which is not now"), HINT_TIME);
         }
         let (expires, hosts) = (validity.not_after, hosts(&certificate));
-        verify(&chain, authorities).map_err(|error| match error {
-            // The second authority has the same name as the first.
-            TlsError::InvalidCertificate(
+        match verify(&chain, authorities) {
+            Ok(()) => {}
+            // An authority of the same name may have another key.
+            Err(TlsError::InvalidCertificate(
                 CertificateError::UnknownIssuer | CertificateError::BadSignature,
-            ) => CertificatesError::new(
-                &own,
-                format!("is of another authority than {}", ca.display()),
-                HINT,
-            ),
-            other => CertificatesError::new(
-                &own,
-                format!("does not pass with {}: {other}", ca.display()),
-                HINT,
-            ),
-        })?;
+            )) => return refuse(format!("is of another authority than {}", ca.display()), HINT),
+            Err(other) => {
+                return refuse(format!("does not pass with {}: {other}", ca.display()), HINT);
+            }
+        }
         if CertifiedKey::from_der(chain, private, &ring::default_provider()).is_err() {
-            return Err(CertificatesError::new(
-                &key,
-                format!("is not the key of {}", own.display()),
-                HINT,
-            ));
+            let problem = format!("is not the key of {}", own.display());
+            return Err(CertificatesError::new(&key, problem, HINT));
         }
         Ok(Self { folder: folder.to_owned(), expires, hosts })
     }
@@ -164,13 +139,12 @@ impl Certificates {
         self.expires.timestamp() - ASN1Time::now().timestamp() < EXPIRES_SOON * 24 * 60 * 60
     }
 
-    /// Whether only programs on this machine could connect to the certificate's owner.
+    /// Whether only programs on this machine can connect to the owner.
     pub(crate) fn is_for_this_machine_alone(&self) -> bool {
         self.hosts.iter().all(|host| is_this_machine(host))
     }
 
-    /// Zenoh's `transport/link/tls`: both sides show a certificate, and stay connected only while
-    /// it is valid.
+    /// Zenoh's `transport/link/tls`: both sides show a certificate and disconnect at its expiry.
     pub(crate) fn settings(&self) -> Value {
         let [authority, certificate, key] = FILES.map(|name| self.folder.join(name));
         json!({
@@ -197,11 +171,10 @@ impl fmt::Display for Certificates {
 
 /// All certificates of a file. While an authority is replaced, ca.pem has the old and the new one.
 fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, CertificatesError> {
-    let read = || match CertificateDer::pem_file_iter(path)?.collect::<Result<Vec<_>, _>>()? {
-        none if none.is_empty() => Err(PemError::NoItemsFound),
-        found => Ok(found),
-    };
-    read().map_err(|error| unreadable(path, "certificate", &error))
+    CertificateDer::pem_file_iter(path)
+        .and_then(Iterator::collect::<Result<Vec<_>, _>>)
+        .and_then(|all| if all.is_empty() { Err(PemError::NoItemsFound) } else { Ok(all) })
+        .map_err(|error| unreadable(path, "certificate", &error))
 }
 
 fn unreadable(path: &Path, wanted: &str, error: &PemError) -> CertificatesError {
@@ -212,7 +185,7 @@ fn unreadable(path: &Path, wanted: &str, error: &PemError) -> CertificatesError 
     CertificatesError::new(path, problem, HINT)
 }
 
-/// Whether one of the authorities has signed the certificate, now and for a client.
+/// Verifies that one of the authorities has signed the certificate, and that it is valid now.
 fn verify(
     chain: &[CertificateDer<'_>],
     authorities: Vec<CertificateDer<'static>>,
@@ -229,24 +202,19 @@ fn verify(
     verifier.verify_client_cert(&chain[0], &chain[1..], UnixTime::now()).map(|_| ())
 }
 
-/// The names and addresses in a certificate at which clients may connect to its owner.
+/// The names and addresses in a certificate.
 fn hosts(certificate: &X509Certificate<'_>) -> Vec<String> {
-    let names = certificate
-        .subject_alternative_name()
-        .ok()
-        .flatten()
-        .map(|names| &names.value.general_names);
     let host = |name: &GeneralName<'_>| match *name {
         GeneralName::DNSName(name) => Some(name.to_owned()),
         GeneralName::IPAddress(bytes) => {
             let four = <[u8; 4]>::try_from(bytes).map(IpAddr::from);
-            four.or_else(|_| <[u8; 16]>::try_from(bytes).map(IpAddr::from))
-                .ok()
-                .map(|address| address.to_string())
+            let address = four.or_else(|_| <[u8; 16]>::try_from(bytes).map(IpAddr::from));
+            address.ok().map(|address| address.to_string())
         }
         _ => None,
     };
-    names.into_iter().flatten().filter_map(host).collect()
+    let names = certificate.subject_alternative_name().ok().flatten();
+    names.iter().flat_map(|names| &names.value.general_names).filter_map(host).collect()
 }
 
 /// Whether a host is only this machine's name for itself.

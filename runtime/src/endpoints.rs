@@ -4,21 +4,20 @@ use zenoh::config::EndPoint;
 
 use crate::certificates::{Certificates, is_this_machine};
 
-/// The two protocols that this program's Zenoh supports: without and with encryption and
-/// authentication.
+/// The protocols without and with encryption and authentication.
 const OPEN: &str = "tcp/";
 const PROTECTED: &str = "tls/";
 
 /// The endpoints of a session: `tcp/127.0.0.1:7447`, or with certificates `tls/127.0.0.1:7447`.
 ///
 /// There is no scouting: a session uses only the endpoints named here. A session that listens is a
-/// peer, to which clients connect directly. A session that does not listen is a client of the peer
-/// or router that it connects to.
+/// peer, any other a client of the peer or router that it connects to.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Endpoints {
-    /// Listen here. Port 0 takes a free port; [`reachable_at`](crate::reachable_at) returns it.
+    /// Endpoints to listen at. Port 0 takes a free port; [`reachable_at`](crate::reachable_at) returns
+    /// it.
     pub listen: Vec<String>,
-    /// Connect to these. A client keeps one connection, so a program that must reach several
+    /// Endpoints to connect to. A client keeps one connection, so a program that must reach several
     /// learners or routers opens a session for each.
     pub connect: Vec<String>,
     /// With certificates, every connection uses TLS, and both sides show a certificate. A client of
@@ -26,39 +25,29 @@ pub struct Endpoints {
     pub certificates: Option<Certificates>,
 }
 
-/// Why there is no session.
+/// Endpoints at which no session can be opened.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // The messages say what each variant is.
 pub enum SessionError {
-    /// The endpoints name neither a place to listen at nor one to connect to.
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
-    /// This program cannot use the endpoint. (Zenoh would try for ever to connect by an unknown
-    /// protocol.)
+    /// Zenoh would try for ever to connect by an unknown protocol.
     #[error(
         "{0:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447"
     )]
     NotAnEndpoint(String),
-    /// There are certificates, but the endpoint would not use them.
     #[error("certificates are given, but the connection at {0} would not be encrypted")]
     Open(String),
-    /// The endpoint needs certificates, but there are none.
     #[error("{0} needs certificates")]
     NoCertificates(String),
-    /// The session cannot listen at the endpoints, or their options are wrong.
     #[error("cannot use the Zenoh endpoint {endpoints}: {reason}")]
-    Endpoint {
-        /// The endpoints.
-        endpoints: String,
-        /// Zenoh's error message.
-        reason: String,
-    },
-    /// The session does not say which endpoints it has bound.
+    Endpoint { endpoints: String, reason: String },
     #[error("the Zenoh session does not tell where it listens")]
     Unknown,
 }
 
 impl SessionError {
-    /// What to do about it.
+    /// Tells the user how to fix it.
     pub fn hint(&self) -> &'static str {
         match self {
             SessionError::Open(_) => {
@@ -76,11 +65,8 @@ impl SessionError {
 }
 
 impl Endpoints {
-    /// Checks early for what [`open_session`](crate::open_session) would refuse.
-    ///
-    /// # Errors
-    ///
-    /// No endpoint, or a malformed one; tcp/ with certificates, and tls/ without.
+    /// Checks early for what [`open_session`](crate::open_session) would refuse: no endpoint, or a
+    /// malformed one; tcp/ with certificates, tls/ without.
     pub fn check(&self) -> Result<(), SessionError> {
         if self.listen.is_empty() && self.connect.is_empty() {
             return Err(SessionError::NoEndpoint);
@@ -96,32 +82,36 @@ impl Endpoints {
         Ok(())
     }
 
-    /// The endpoint at which other machines may connect without a certificate, if there is one.
+    /// An endpoint at which other machines may connect without a certificate.
     pub fn open_to_all(&self) -> Option<&str> {
         self.for_others().filter(|_| self.certificates.is_none())
     }
 
-    /// The endpoint for other machines whose certificate all of them would refuse, if there is one:
-    /// the certificate contains only names that this machine has for itself.
+    /// An endpoint for other machines that all of them would refuse, because the certificate contains
+    /// only this machine's names for itself.
     pub(crate) fn closed_to_all(&self) -> Option<&str> {
-        self.for_others().filter(|_| {
-            self.certificates.as_ref().is_some_and(Certificates::is_for_this_machine_alone)
-        })
+        let certificates = self.certificates.as_ref();
+        let is_local = certificates.is_some_and(Certificates::is_for_this_machine_alone);
+        self.for_others().filter(|_| is_local)
     }
 
-    /// The first endpoint to listen at that other machines can reach, so not on loopback.
+    /// Whether the system chooses a port.
+    pub(crate) fn has_open_port(&self) -> bool {
+        self.listen.iter().any(|endpoint| address_of(endpoint).ends_with(":0"))
+    }
+
+    /// The first endpoint to listen at that is not on loopback.
     fn for_others(&self) -> Option<&str> {
         let is_local = |endpoint: &&String| {
             let address = address_of(endpoint);
-            let host =
-                address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
-            is_this_machine(host)
+            let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
+            is_this_machine(host.trim_matches(['[', ']']))
         };
         self.listen.iter().find(|endpoint| !is_local(endpoint)).map(String::as_str)
     }
 }
 
-/// The port at which a learner listens and evaluators look by default.
+/// The default port of a learner.
 pub const DEFAULT_PORT: u16 = 7447;
 
 /// The default endpoint at which learner and evaluator of one machine meet.
@@ -130,10 +120,6 @@ pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> Strin
 }
 
 /// Checks an endpoint from the command line and returns it unchanged: a `value_parser`.
-///
-/// # Errors
-///
-/// [`SessionError::NotAnEndpoint`]: the endpoint is malformed, or names a protocol other than TCP and TLS.
 pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
     if [OPEN, PROTECTED].iter().any(|protocol| text.starts_with(protocol))
         && text.parse::<EndPoint>().is_ok()
@@ -149,47 +135,31 @@ pub(crate) fn address_of(endpoint: &str) -> &str {
     address.split(['?', '#']).next().unwrap_or(address)
 }
 
-/// Whether the system chooses the endpoint's port.
-pub(crate) fn leaves_port_open(endpoint: &str) -> bool {
-    address_of(endpoint).ends_with(":0")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn endpoints_that_other_machines_reach() {
-        let open = |endpoint: &str| {
-            let listen = vec!["tcp/127.0.0.1:1".to_owned(), endpoint.to_owned()];
-            Endpoints { listen, ..Endpoints::default() }.open_to_all().map(str::to_owned)
-        };
-        for endpoint in
-            ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:0", "tcp/127.1.2.3:1#iface=lo"]
-        {
-            assert_eq!(open(endpoint), None, "{endpoint}");
-        }
-        for endpoint in
-            ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/192.0.2.1:0", "tcp/learner:1?prio=1-7"]
-        {
-            assert_eq!(open(endpoint).as_deref(), Some(endpoint));
-        }
-    }
-
-    #[test]
-    fn which_ports_the_system_chooses() {
-        for endpoint in
-            ["tcp/127.0.0.1:0", "tcp/[::1]:0", "tcp/0.0.0.0:0#iface=lo", "tcp/127.0.0.1:0?prio=1-7"]
-        {
-            assert!(leaves_port_open(endpoint), "{endpoint}");
-        }
-        for endpoint in [
-            "tcp/127.0.0.1:7447",
-            "tcp/learner:10",
-            "tcp/[::0]:7447",
-            "tcp/127.0.0.1:7447#iface=e:0",
+    fn endpoints_for_others_and_open_ports() {
+        for (endpoint, is_local, has_open_port) in [
+            ("tcp/127.0.0.1:7447", true, false),
+            ("tcp/[::1]:7447", true, false),
+            ("tcp/localhost:0", true, true),
+            ("tcp/127.1.2.3:1#iface=lo", true, false),
+            ("tcp/0.0.0.0:7447", false, false),
+            ("tcp/[::]:7447", false, false),
+            ("tcp/192.0.2.1:0", false, true),
+            ("tcp/learner:10?prio=1-7", false, false),
+            ("tcp/127.0.0.1:0?prio=1-7", true, true),
+            ("tcp/0.0.0.0:0#iface=lo", false, true),
+            ("tcp/[::0]:7447", false, false),
+            ("tcp/127.0.0.1:7447#iface=e:0", true, false),
         ] {
-            assert!(!leaves_port_open(endpoint), "{endpoint}");
+            let listen = ["tcp/127.0.0.1:1", endpoint].map(str::to_owned).to_vec();
+            let endpoints = Endpoints { listen, ..Endpoints::default() };
+            let expected = if is_local { None } else { Some(endpoint) };
+            assert_eq!(endpoints.open_to_all(), expected);
+            assert_eq!(endpoints.has_open_port(), has_open_port, "{endpoint}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Which log lines a program writes, and where to.
+//! Log lines of a program.
 
 use std::env;
 use std::io::{self, IsTerminal, Write};
@@ -11,23 +11,21 @@ use tracing_subscriber::filter::dynamic_filter_fn;
 use tracing_subscriber::prelude::*;
 use tracing_subscriber::{EnvFilter, fmt, registry};
 
-/// The default of RUST_LOG: our own progress and Zenoh's warnings. `zenoh` is the prefix of all of
-/// its crates. Two of its messages are left out: that scouting by gossip is off, which is intended;
-/// and that it cannot listen or connect, which this program reports itself.
+/// The default of RUST_LOG: our own progress and Zenoh's warnings, without two of its messages: that
+/// scouting by gossip is off, which is intended; and that it cannot listen or connect, which this
+/// program reports itself.
 const DEFAULT_FILTER: &str =
     "info,zenoh=warn,zenoh::net::routing::hat::peer=error,zenoh::net::runtime::orchestrator=error";
 
-/// Most lines of Zenoh in a minute. Zenoh writes a line for each client that it refuses, so a
-/// stranger could fill the disk. Our own lines are not counted: messages of strangers are logged at
-/// the level `debug`, which only RUST_LOG shows.
+/// Most lines of Zenoh in a minute: it writes a line for each client that it refuses, so a stranger
+/// could fill the disk. Our own lines about strangers have the level `debug`.
 const ZENOH_LINES: u32 = 100;
 const MINUTE: Duration = Duration::from_secs(60);
 
 /// Lines that may wait for a reader of stderr; further lines are lost.
 const MOST_WAITING: usize = 10_000;
 
-/// Writes log lines as long as it lives. When it is dropped it writes the waiting lines, for at
-/// most a second.
+/// Writes log lines until it is dropped; then it writes the waiting lines, for at most a second.
 #[must_use]
 pub struct Logging {
     _writer: WorkerGuard,
@@ -35,9 +33,7 @@ pub struct Logging {
 
 /// Sends log lines to stderr, in color on a terminal with colors unless NO_COLOR is set. The
 /// environment variable RUST_LOG chooses the lines. If stderr is not read, only the log's own
-/// thread waits.
-///
-/// Call it once, first in `main`; further calls do nothing.
+/// thread waits. Call it first in `main`; further calls do nothing.
 pub fn init_logging() -> Logging {
     let writer =
         NonBlockingBuilder::default().buffered_lines_limit(MOST_WAITING).thread_name("log");
@@ -52,8 +48,8 @@ pub fn init_logging() -> Logging {
     Logging { _writer: guard }
 }
 
-/// Writes lines without control characters. The formatter has escaped those that terminals'
-/// commands begin with; what has these in the end is our own, for colors.
+/// Writes lines without control characters but those of our colors: the formatter has escaped the
+/// others with which terminals' commands begin.
 struct Clean<W>(W);
 
 impl<W: Write> Write for Clean<W> {
@@ -85,7 +81,7 @@ fn subscriber<W: Write + 'static>(
     registry().with(lines).with(filter)
 }
 
-/// Counts one more line of Zenoh in the minute that began at the first value.
+/// Counts a line of Zenoh in the minute that began at the first value.
 fn has_room(minute: &Mutex<(Instant, u32)>, now: Instant) -> bool {
     let (begin, count) = &mut *minute.lock().unwrap_or_else(PoisonError::into_inner);
     if now - *begin >= MINUTE {
@@ -106,12 +102,6 @@ mod tests {
     #[derive(Clone, Default)]
     struct Page(Arc<Mutex<Vec<u8>>>);
 
-    impl Page {
-        fn text(&self) -> String {
-            String::from_utf8(self.0.lock().unwrap().clone()).unwrap()
-        }
-    }
-
     impl Write for Page {
         fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
             self.0.lock().unwrap().write(bytes)
@@ -122,47 +112,38 @@ mod tests {
         }
     }
 
-    #[test]
-    fn what_is_logged_commands_no_terminal() {
+    /// The lines of some events.
+    fn logged(filter: &str, events: impl FnOnce()) -> String {
         let page = Page::default();
         let writer = page.clone();
-        tracing::subscriber::with_default(
-            subscriber(move || writer.clone(), EnvFilter::new("info"), false),
-            || {
-                let all = String::from_iter((0..0xa0).filter_map(char::from_u32));
-                info!(name = all, "{all}");
-            },
-        );
-        let text = page.text();
+        let subscriber = subscriber(move || writer.clone(), EnvFilter::new(filter), false);
+        tracing::subscriber::with_default(subscriber, events);
+        String::from_utf8(page.0.lock().unwrap().clone()).unwrap()
+    }
+
+    #[test]
+    fn control_characters_are_removed() {
+        let all = String::from_iter((0..0xa0).filter_map(char::from_u32));
+        let text = logged("info", || info!(name = all, "{all}"));
         assert!(!text.contains(|c: char| c.is_control() && !matches!(c, '\n' | '\t')), "{text:?}");
     }
 
     #[test]
-    fn refused_clients_do_not_fill_the_log_and_hide_nothing_of_ours() {
-        let page = Page::default();
-        let writer = page.clone();
-        let filter = EnvFilter::new("debug");
-        tracing::subscriber::with_default(
-            subscriber(move || writer.clone(), filter, false),
-            || {
-                // All events of a learner come from one place in the code.
-                for text in
-                    std::iter::repeat_n("evaluator left", 1000).chain(["the score cannot be saved"])
-                {
-                    warn!(target: "zenoh_transport::unicast", "refused");
-                    debug!(target: "zenoh_transport::unicast", "asked for");
-                    info!("{text}");
-                }
-            },
-        );
-        let text = page.text();
+    fn refused_clients_do_not_fill_the_log_or_hide_our_lines() {
+        let text = logged("debug", || {
+            for text in std::iter::repeat_n("evaluator left", 1000).chain(["cannot be saved"]) {
+                warn!(target: "zenoh_transport::unicast", "refused");
+                debug!(target: "zenoh_transport::unicast", "asked for");
+                info!("{text}");
+            }
+        });
         let count = |what: &str| text.lines().filter(|line| line.contains(what)).count();
         assert_eq!((count("left"), count("cannot be saved"), count("asked for")), (1000, 1, 1001));
         assert_eq!(count("refused"), ZENOH_LINES as usize);
     }
 
     #[test]
-    fn each_minute_begins_anew() {
+    fn each_minute_has_its_own_limit() {
         let begin = Instant::now();
         let minute = Mutex::new((begin, ZENOH_LINES));
         assert!(!has_room(&minute, begin + MINUTE / 2));

@@ -1,4 +1,4 @@
-//! Shows the progress of a task of known size: a bar on a terminal, plain log lines otherwise.
+//! Progress of a task of known size: a bar on a terminal, else log lines.
 
 use std::cell::Cell;
 use std::time::{Duration, Instant};
@@ -8,25 +8,25 @@ use tracing::info;
 
 use crate::exit::clean;
 
-/// How often a log gets a line.
+/// Interval of log lines.
 const LINE: Duration = Duration::from_secs(5);
 
-/// Shows the progress of one task, such as a fetch of a file.
+/// Progress of a task, such as a download.
 pub struct ProgressBar {
     /// Hidden if stderr is no terminal.
     bar: indicatif::ProgressBar,
-    /// What is counted; `None` for bytes.
+    /// The unit; `None` for bytes.
     counted: Option<&'static str>,
     last_line: Cell<Instant>,
 }
 
 impl ProgressBar {
-    /// A display of bytes that shows nothing yet.
+    /// Progress in bytes, not shown yet.
     pub fn of_bytes() -> Self {
         Self::new(None)
     }
 
-    /// A display that shows nothing yet, of `counted` things, such as `transitions recorded`.
+    /// Progress in another unit, such as `transitions recorded`, not shown yet.
     pub fn of(counted: &'static str) -> Self {
         Self::new(Some(counted))
     }
@@ -36,24 +36,21 @@ impl ProgressBar {
         Self { bar, counted, last_line: Cell::new(Instant::now()) }
     }
 
-    /// Starts (again) with `position` of `length` done.
+    /// Starts, or starts again, with `position` of `length` done.
     pub fn start(&self, position: u64, length: u64) {
-        let figures =
-            self.counted.map_or("{bytes}/{total_bytes} at {bytes_per_sec}".to_owned(), |counted| {
-                format!("{{pos}}/{{len}} {counted}")
-            });
+        let figures = match self.counted {
+            None => "{bytes}/{total_bytes} at {bytes_per_sec}".to_owned(),
+            Some(counted) => format!("{{pos}}/{{len}} {counted}"),
+        };
         // Without our style the bar still works, but shows less.
-        if let Ok(style) =
-            ProgressStyle::with_template(&format!("{{bar:40}} {figures}, {{eta}} left"))
-        {
-            self.bar.set_style(style);
-        }
+        let template = format!("{{bar:40}} {figures}, {{eta}} left");
+        ProgressStyle::with_template(&template).into_iter().for_each(|it| self.bar.set_style(it));
         self.bar.set_length(length);
         self.bar.set_position(position);
         self.bar.reset_eta();
     }
 
-    /// Sets how much is done.
+    /// Updates the position.
     pub fn advance(&self, position: u64) {
         self.bar.set_position(position);
         if !self.bar.is_hidden() || self.last_line.get().elapsed() < LINE {
@@ -70,7 +67,7 @@ impl ProgressBar {
         }
     }
 
-    /// An event, as a line of its own.
+    /// Shows a message above the bar.
     pub fn say(&self, text: &str) {
         if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(clean(text)) }
     }

@@ -6,16 +6,12 @@ use zenoh::{Config, Session};
 use crate::endpoints::{Endpoints, SessionError};
 use crate::session::{for_people, reachable_at};
 
-/// Settings beyond those of the file.
 const SETTINGS: &str = include_str!("../../deploy/zenoh/router.json5");
-/// Other machines cannot reach the router; the system chooses its port.
+/// Loopback; the system chooses the port.
 const LISTEN: &str = "tcp/127.0.0.1:0";
 
-/// Opens a router that lives as long as the session, and returns its endpoint. Needs a multi-thread
+/// Opens a router, which lives as long as the session, and returns its endpoint. Needs a multi-thread
 /// tokio runtime.
-///
-/// # Errors
-/// The router cannot listen.
 pub async fn open_router() -> Result<(Session, String), SessionError> {
     let wrong =
         |error| SessionError::Endpoint { endpoints: LISTEN.to_owned(), reason: for_people(error) };

@@ -11,42 +11,41 @@ use zenoh::{Config, Session, Wait};
 
 use crate::access;
 use crate::background::stay_in_background;
-use crate::endpoints::{Endpoints, SessionError, leaves_port_open};
+use crate::endpoints::{Endpoints, SessionError};
 
-/// A frozen or disconnected process counts as gone after this time; the end of a process is noticed
-/// at once. This is half of Zenoh's default, but long enough for a machine that is busy training
-/// and misses several keep-alive messages.
+/// Time after which a frozen or disconnected process counts as gone: half of Zenoh's default, but long
+/// enough for a busy machine that misses several keep-alive messages.
 const LEASE: Duration = Duration::from_secs(5);
-/// Largest message that a client accepts, bytes: the largest snapshot (64 MiB) and what Zenoh adds.
+/// Largest message that a client accepts, bytes: the largest snapshot (64 MiB) and Zenoh's overhead.
 const MAX_SNAPSHOT_SIZE: u64 = 65 << 20;
-/// Largest fragmented message that a listening session accepts, bytes: none. Zenoh keeps each
-/// fragment until the last one has come, together with the buffer of 64 KiB in which it arrived, so
-/// fragments of one byte could fill any memory. Evaluators' messages have at most 30 KiB and need
-/// no fragments: one packet has space for 32,700 bytes on every network.
-const MAX_PIECED_REQUEST: u64 = 0;
-/// Most connections of a listening session; it refuses further ones. Each is an open file, and a
-/// process may open 1024 files on many systems. The rest is for datasets, logs and metrics.
+/// Largest fragmented message that a listening session accepts, bytes. Zenoh keeps each fragment in its
+/// buffer of 64 KiB until the last one arrives, so fragments of one byte could fill any memory.
+/// Evaluators' messages have at most 30 KiB, and a packet has space for 32,700 bytes.
+const MAX_FRAGMENTED: u64 = 0;
+/// Most connections of a listening session. Each is an open file, and many systems limit a process to
+/// 1024. The rest is for datasets, logs and metrics.
 const MAX_SESSIONS: u64 = 768;
+const DROP_WAIT: &str =
+    "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments";
+const BLOCK_WAIT: &str = "transport/link/tx/queue/congestion_control/block/wait_before_close";
 /// First and longest pause between two attempts to connect.
 const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
-/// How long a large message that may be dropped waits for a slow receiver. Zenoh's 50 ms are too
-/// short for a snapshot when training uses all cores; but a receiver that hangs must not delay the
-/// others for long.
+/// Time that a droppable large message waits for a slow receiver. Zenoh's 50 ms are too short for a
+/// snapshot when training uses all cores; a receiver that hangs must not delay the others for long.
 const DROP_AFTER: Duration = Duration::from_millis(500);
-/// How long a message that may not be dropped waits for a receiver that does not read, before the
-/// connection is closed. Other receivers may wait meanwhile, so this is less than Zenoh's five
-/// seconds; it suffices for one packet of 64 KiB on a network of 256 kbit/s.
+/// Time that any other message waits for a receiver before its connection is closed. Other receivers
+/// may wait meanwhile, so this is less than Zenoh's five seconds; it suffices for a packet of 64 KiB at
+/// 256 kbit/s.
 const CLOSE_AFTER: Duration = Duration::from_secs(2);
-/// A client that has no connection after this time logs it.
+/// Time without a connection after which a client logs a warning.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Time limit when a session asks itself for its endpoints, which needs no network.
 const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Opens a session. Needs a multi-thread tokio runtime.
 ///
-/// A session that listens is open at once. A client is open as soon as it has a connection: it
-/// waits for a learner or router that has not started yet, until this future is dropped. If the
-/// connection is lost later, the client connects again.
+/// A client waits for a learner or router that has not started yet, until this future is dropped. If
+/// the connection is lost later, the client connects again.
 pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError> {
     endpoints.check()?;
     if let Some(endpoint) = endpoints.closed_to_all() {
@@ -60,19 +59,19 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
         SessionError::Endpoint { endpoints, reason: for_people(error) }
     };
     let config = config(endpoints).map_err(wrong)?;
-    // Zenoh's future blocks its thread until there is a connection, so it gets a thread of its own.
-    // Nothing joins that thread: if this future is dropped, the process can end.
-    let (sender, mut opened) = oneshot::channel();
+    // Zenoh's future blocks its thread until there is a connection. Nothing joins the new thread: if
+    // this future is dropped, the process can end.
+    let (tx, mut rx) = oneshot::channel();
     let open = move || {
         // This thread starts Zenoh's own threads, which inherit its priority.
         stay_in_background();
-        drop(sender.send(zenoh::open(config).wait()));
+        drop(tx.send(zenoh::open(config).wait()));
     };
     thread::Builder::new()
         .name("zenoh-open".to_owned())
         .spawn(open)
         .map_err(|error| wrong(error.into()))?;
-    let opened = match timeout(PATIENCE, &mut opened).await {
+    let opened = match timeout(PATIENCE, &mut rx).await {
         Ok(opened) => opened,
         Err(_) => {
             warn!(
@@ -80,7 +79,7 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
                  RUST_LOG=zenoh::net::runtime=debug logs each try",
                 endpoints.connect.join(", ")
             );
-            opened.await
+            rx.await
         }
     };
     opened.map_err(|error| wrong(error.into()))?.map_err(wrong)
@@ -89,38 +88,26 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
 fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     let listens = !endpoints.listen.is_empty();
     let mode = if listens { "peer" } else { "client" };
+    let max_message_size = if listens { MAX_FRAGMENTED } else { MAX_SNAPSHOT_SIZE };
     let retry = RETRY.map(|pause| pause.as_millis() as u64);
     let mut settings = vec![
         ("mode", json!(mode)),
         ("listen/endpoints", json!(endpoints.listen)),
         ("connect/endpoints", json!(endpoints.connect)),
-        // Makes a client wait for a learner or router that has not started; by default it would
-        // give up at once.
+        // A client waits for a learner or router; by default it would give up at once.
         ("connect/timeout_ms", json!(-1)),
         ("connect/exit_on_failure", json!(false)),
         ("connect/retry", json!({ "period_init_ms": retry[0], "period_max_ms": retry[1] })),
         ("scouting/multicast/enabled", json!(false)),
         ("scouting/gossip/enabled", json!(false)),
         ("transport/link/tx/lease", json!(LEASE.as_millis() as u64)),
-        (
-            "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
-            json!(DROP_AFTER.as_micros() as u64),
-        ),
-        (
-            "transport/link/tx/queue/congestion_control/block/wait_before_close",
-            json!(CLOSE_AFTER.as_micros() as u64),
-        ),
-        (
-            "transport/link/rx/max_message_size",
-            json!(if listens { MAX_PIECED_REQUEST } else { MAX_SNAPSHOT_SIZE }),
-        ),
+        (DROP_WAIT, json!(DROP_AFTER.as_micros() as u64)),
+        (BLOCK_WAIT, json!(CLOSE_AFTER.as_micros() as u64)),
+        ("transport/link/rx/max_message_size", json!(max_message_size)),
         ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
         // This is the only stable way to learn a port that the system chose. Clients could read the
         // configuration there, so it is on only if needed.
-        (
-            "adminspace/enabled",
-            json!(endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint))),
-        ),
+        ("adminspace/enabled", json!(endpoints.has_open_port())),
     ];
     if let Some(certificates) = &endpoints.certificates {
         settings.push(("transport/link/tls", certificates.settings()));
@@ -136,7 +123,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     Ok(config)
 }
 
-/// Zenoh's message without the places in its source code (`at /…/tcp.rs:61.`).
+/// Zenoh's error message without the places in its source code (`at /…/tcp.rs:61.`).
 pub(crate) fn for_people(error: zenoh::Error) -> String {
     let text = error.to_string();
     let mut words = text.split(' ').peekable();
@@ -151,9 +138,8 @@ pub(crate) fn for_people(error: zenoh::Error) -> String {
     plain
 }
 
-/// Where evaluators can reach `session`, which was opened with `endpoints`: the addresses at which
-/// it listens, with the ports that the system chose, or, if it does not listen, those to which it
-/// connects.
+/// The endpoints for evaluators of `session`, which was opened with `endpoints`: those at which it
+/// listens, with the ports that the system chose; if it does not listen, those to which it connects.
 pub async fn reachable_at(
     session: &Session,
     endpoints: &Endpoints,
@@ -161,23 +147,21 @@ pub async fn reachable_at(
     if endpoints.listen.is_empty() {
         return Ok(endpoints.connect.clone());
     }
-    if !endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint)) {
+    if !endpoints.has_open_port() {
         return Ok(endpoints.listen.clone());
     }
-    let about_itself = format!("@/{}/*", session.zid());
-    let replies = session
-        .get(about_itself)
-        .timeout(SELF_QUERY_TIMEOUT)
-        .await
-        .map_err(|_| SessionError::Unknown)?;
-    let reply = replies.recv_async().await.map_err(|_| SessionError::Unknown)?;
-    let sample = reply.result().map_err(|_| SessionError::Unknown)?;
-    let description: Value =
-        serde_json::from_slice(&sample.payload().to_bytes()).map_err(|_| SessionError::Unknown)?;
-    let locators =
-        description["locators"].as_array().into_iter().flatten().filter_map(Value::as_str);
-    let bound: Vec<String> = locators.map(str::to_owned).collect();
+    let bound = locators(session).await.unwrap_or_default();
     if bound.is_empty() { Err(SessionError::Unknown) } else { Ok(bound) }
+}
+
+/// The endpoints that a session has bound, by a query to itself.
+async fn locators(session: &Session) -> zenoh::Result<Vec<String>> {
+    let query = session.get(format!("@/{}/*", session.zid())).timeout(SELF_QUERY_TIMEOUT);
+    let reply = query.await?.recv_async().await?;
+    let sample = reply.result().map_err(|_| "no answer")?;
+    let description: Value = serde_json::from_slice(&sample.payload().to_bytes())?;
+    let locators = description["locators"].as_array().into_iter().flatten();
+    Ok(locators.filter_map(Value::as_str).map(str::to_owned).collect())
 }
 
 #[cfg(test)]

@@ -10,32 +10,29 @@ use tracing::{info, warn};
 
 use crate::exit::{ENDED_AT_ONCE, UNFINISHED};
 
-/// A process that was told to end has this long for it: less than the 10 s after which Docker kills
-/// it.
+/// Time limit of a shutdown: less than the 10 s after which Docker kills a process.
 pub const LEAVE_WITHIN: Duration = Duration::from_secs(9);
-/// A second signal within this time counts as the first: a terminal's Ctrl-C reaches a script and
-/// its children, and the script may then send them a signal, too.
+/// A second signal within this time counts as the first: Ctrl-C reaches a script and its children,
+/// and the script may then send them a signal, too.
 const SAME: Duration = Duration::from_millis(500);
-/// How long the thread that writes the log has for its last line.
+/// Time for the thread that writes the log.
 const LAST_WORDS: Duration = Duration::from_millis(100);
 
 /// Becomes ready at the first signal to end after this call, even before a task awaits it: SIGINT
 /// (Ctrl-C), SIGTERM, SIGHUP (the end of a terminal's session), or SIGUSR1 (what Slurm's `--signal`
 /// sends before a time limit). Of SIGHUP and SIGUSR1, one that was ignored when the process began
-/// stays so: that is what `nohup` is for.
+/// stays ignored, as `nohup` needs.
 ///
-/// Takes over these signals: the first no longer ends the process. A further signal, half a second
-/// later or more, ends it at once with exit code 130. All that the process does to end shares one
-/// budget: this long after the first signal it ends, whatever it waits for, with exit code 75,
-/// because the same command continues its work. Needs a tokio runtime, and lasts as long as that
-/// runtime.
+/// The first signal no longer ends the process. A further signal, half a second later or more, ends it
+/// at once with exit code 130. `within` after the first signal, the process ends with exit code 75,
+/// because the same command continues its work. Needs a tokio runtime, and lasts as long as it.
 pub fn shutdown_signal(within: Duration) -> impl Future<Output = ()> + Send {
     let mut signals = listen();
-    let (tell, told) = oneshot::channel();
+    let (tx, rx) = oneshot::channel();
     tokio::spawn(async move {
         let name = first_of(&mut signals).await;
         let first = Instant::now();
-        tell.send(()).ok();
+        tx.send(()).ok();
         info!("received {name}");
         let another = async {
             loop {
@@ -51,10 +48,8 @@ pub fn shutdown_signal(within: Duration) -> impl Future<Output = ()> + Send {
                 ENDED_AT_ONCE
             }
             Err(_) => {
-                warn!(
-                    "{} s after {name} something has not ended: ending without it",
-                    within.as_secs()
-                );
+                let seconds = within.as_secs();
+                warn!("{seconds} s after {name} something has not ended: ending without it");
                 UNFINISHED
             }
         };
@@ -62,14 +57,14 @@ pub fn shutdown_signal(within: Duration) -> impl Future<Output = ()> + Send {
         std::process::exit(code.into());
     });
     async move {
-        if told.await.is_err() {
+        if rx.await.is_err() {
             // The task above ended with its runtime, so no signal will come.
             std::future::pending::<()>().await;
         }
     }
 }
 
-/// The name of the first of these signals that comes.
+/// Waits for a signal and returns its name.
 async fn first_of(signals: &mut [(&'static str, Signal)]) -> &'static str {
     poll_fn(|context| {
         let come = |(name, signal): &mut (_, Signal)| {
@@ -80,15 +75,13 @@ async fn first_of(signals: &mut [(&'static str, Signal)]) -> &'static str {
     .await
 }
 
-/// Takes over the signals. One for which no handler can be set keeps its default action: it ends
-/// the process.
+/// Sets handlers. A signal whose handler cannot be set keeps its default action: it ends the process.
 fn listen() -> Vec<(&'static str, Signal)> {
     let always = [("SIGINT", SignalKind::interrupt()), ("SIGTERM", SignalKind::terminate())];
     let unless_ignored =
         [("SIGHUP", SignalKind::hangup()), ("SIGUSR1", SignalKind::user_defined1())];
-    let kinds =
-        always.into_iter().chain(unless_ignored.into_iter().filter(|(_, kind)| !is_ignored(*kind)));
-    let prepared = kinds.filter_map(|(name, kind)| match signal(kind) {
+    let others = unless_ignored.into_iter().filter(|(_, kind)| !is_ignored(*kind));
+    let prepared = always.into_iter().chain(others).filter_map(|(name, kind)| match signal(kind) {
         Ok(signal) => Some((name, signal)),
         Err(error) => {
             warn!("cannot prepare for a clean shutdown by {name}: {error}");
@@ -98,10 +91,9 @@ fn listen() -> Vec<(&'static str, Signal)> {
     prepared.collect()
 }
 
-/// Whether the process ignores a signal, as one that `nohup` has started ignores SIGHUP.
+/// Whether the process ignores a signal, as `nohup` makes it ignore SIGHUP.
 fn is_ignored(kind: SignalKind) -> bool {
-    // SAFETY: it changes nothing, and writes what is set into a structure of the type that it
-    // takes.
+    // SAFETY: with a null new action, sigaction only writes the current action to `set`.
     #[allow(unsafe_code)]
     unsafe {
         let mut set: libc::sigaction = std::mem::zeroed();

@@ -1,5 +1,4 @@
-//! How many threads Zenoh, candle and rayon use. They read the number from the environment when
-//! they are first used.
+//! Numbers of threads of Zenoh, candle and rayon, which they read from the environment.
 
 use std::env;
 use std::num::NonZero;
@@ -14,9 +13,8 @@ const ZENOH: (&str, &str) =
 /// take turns on the cores, and a step would take twenty times as long.
 const CANDLE: (&str, &str) = ("CANDLE_NUM_THREADS", "1");
 
-/// Limits the threads of both, unless the user has set the variables.
-///
-/// Call it at the start of `main`, before there are other threads.
+/// Limits the threads of Zenoh and candle, unless the user has set the variables. Call it at the start
+/// of `main`, before there are other threads.
 pub fn choose_threads() {
     for (variable, threads) in [ZENOH, CANDLE] {
         if env::var_os(variable).is_none() {
@@ -30,8 +28,7 @@ pub fn choose_threads() {
     }
 }
 
-/// How many threads the user wants rayon to have, by RAYON_NUM_THREADS. It counts as not set if it
-/// is 0 or no number: rayon then chooses, and so may the program.
+/// The user's number of rayon threads, by RAYON_NUM_THREADS; `None` if it is unset, 0 or no number.
 pub fn threads_asked() -> Option<NonZero<usize>> {
     env::var("RAYON_NUM_THREADS").ok()?.parse().ok()
 }

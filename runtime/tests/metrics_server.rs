@@ -1,4 +1,4 @@
-//! The metrics server, asked like Prometheus asks it: over TCP, in HTTP/1.1.
+//! The metrics server over TCP, in HTTP/1.1.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::io::{Read, Write};
@@ -21,12 +21,12 @@ async fn server(health: Health) -> (MetricsServer, IntGauge) {
     (serve_metrics(ANY_PORT, registry, health, Router::new()).await.unwrap(), gauge)
 }
 
-/// Head and body of the response.
+/// Head and body of a response.
 async fn get(address: SocketAddr, path: &'static str) -> (String, String) {
     get_as(address, address.to_string(), path).await
 }
 
-/// The response to a client that knows this machine by the name `host`.
+/// [`get`] from a client that calls this machine `host`.
 async fn get_as(address: SocketAddr, host: String, path: &'static str) -> (String, String) {
     let exchange = move || {
         let mut stream = TcpStream::connect(address).unwrap();
@@ -41,7 +41,7 @@ async fn get_as(address: SocketAddr, host: String, path: &'static str) -> (Strin
 }
 
 #[tokio::test]
-async fn metrics_and_health_and_nothing_else() {
+async fn serves_metrics_and_health() {
     let (server, apples) = server(Health::default()).await;
     assert_ne!(server.address.port(), 0);
     apples.set(3);
@@ -55,21 +55,19 @@ async fn metrics_and_health_and_nothing_else() {
 }
 
 #[tokio::test]
-async fn a_strangers_name_that_leads_here_is_told_nothing() {
+async fn requests_for_another_host_are_refused() {
     let (server, _) = server(Health::default()).await;
     for path in ["/metrics", "/healthz", "/secret"] {
         let (head, body) = get_as(server.address, "evil.example".to_owned(), path).await;
-        assert!(
-            head.starts_with("http/1.1 403") && body.starts_with("ask for this machine"),
-            "{head}{body}"
-        );
+        assert!(head.starts_with("http/1.1 403"), "{head}");
+        assert!(body.starts_with("ask for this machine"), "{body}");
     }
     let host = format!("localhost:{}", server.address.port());
     assert_eq!(get_as(server.address, host, "/healthz").await.1, "ok\n");
 }
 
 #[tokio::test]
-async fn ill_health_is_told_line_by_line() {
+async fn unhealthy_components_have_a_line_each() {
     let health = Health::default();
     let (server, _) = server(health.clone()).await;
     let scores = health.register("scores", Duration::from_secs(3600));
@@ -82,30 +80,27 @@ async fn ill_health_is_told_line_by_line() {
     assert!(head.starts_with("http/1.1 200"), "a sick process is still measured: {head}");
 }
 
-/// A server with a page that never comes, and a connection that asks for it, which the server bears
-/// for 15 s.
-async fn server_that_bears() -> (MetricsServer, impl Fn() -> TcpStream) {
+/// A server with a page that never answers, and a connection that asks for it.
+async fn slow_server() -> (MetricsServer, impl Fn() -> TcpStream) {
     let never = Router::new().route("/never", routing::get(std::future::pending::<()>));
     let server = serve_metrics(ANY_PORT, Registry::new(), Health::default(), never).await.unwrap();
     let address = server.address;
-    (server, move || sends(address, "GET /never HTTP/1.1\r\nHost: localhost\r\n\r\n"))
+    (server, move || send(address, "GET /never HTTP/1.1\r\nHost: localhost\r\n\r\n"))
 }
 
-/// A connection on which `sent` is all that the server ever gets.
-fn sends(address: SocketAddr, sent: &str) -> TcpStream {
+/// A connection that sends this and nothing more.
+fn send(address: SocketAddr, text: &str) -> TcpStream {
     let mut stream = TcpStream::connect(address).unwrap();
-    stream.write_all(sent.as_bytes()).unwrap();
+    stream.write_all(text.as_bytes()).unwrap();
     stream
 }
 
-/// Waits until the server hangs up; what it said before.
-fn ended(mut stream: &TcpStream) -> String {
+/// Waits until the server hangs up.
+fn wait_for_end(mut stream: &TcpStream) {
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    let mut said = String::new();
-    if let Err(error) = stream.read_to_string(&mut said) {
+    if let Err(error) = stream.read_to_string(&mut String::new()) {
         assert_eq!(error.kind(), std::io::ErrorKind::ConnectionReset);
     }
-    said
 }
 
 fn assert_is_open(mut stream: &TcpStream) {
@@ -114,35 +109,31 @@ fn assert_is_open(mut stream: &TcpStream) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn half_a_request_and_silence_are_cut_off_long_before_one_that_waits_for_its_answer() {
-    let (server, bear) = server_that_bears().await;
-    let whole = bear();
-    let halves = ["GET /metrics HTTP/1.1\r\nHost: localhost", "GET /met", ""]
-        .map(|sent| sends(server.address, sent));
-    tokio::task::spawn_blocking(move || halves.iter().for_each(|half| drop(ended(half))))
-        .await
-        .unwrap();
-    assert_is_open(&whole);
+async fn incomplete_requests_are_cut_off_before_complete_ones() {
+    let (server, ask) = slow_server().await;
+    let complete = ask();
+    let incomplete = ["GET /metrics HTTP/1.1\r\nHost: localhost", "GET /met", ""]
+        .map(|text| send(server.address, text));
+    let ends = move || incomplete.iter().for_each(wait_for_end);
+    tokio::task::spawn_blocking(ends).await.unwrap();
+    assert_is_open(&complete);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_hundred_connections_that_wait_keep_no_client_out() {
-    let (server, bear) = server_that_bears().await;
-    let waiting: Vec<TcpStream> = (0..100).map(|_| bear()).collect();
+async fn a_hundred_waiting_connections_keep_no_client_out() {
+    let (server, ask) = slow_server().await;
+    let waiting: Vec<TcpStream> = (0..100).map(|_| ask()).collect();
     let (head, _) = get(server.address, "/metrics").await;
     assert!(head.starts_with("http/1.1 200"), "{head}");
-    // The first ones made room for the others: there is a bound. The client did not wait for the
-    // others.
+    // The first ones made room for the others.
     assert_is_open(&waiting[99]);
-    tokio::task::spawn_blocking(move || ended(&waiting[0])).await.unwrap();
+    tokio::task::spawn_blocking(move || wait_for_end(&waiting[0])).await.unwrap();
 }
 
 #[tokio::test]
 async fn an_address_in_use_is_an_error() {
     let (server, _) = server(Health::default()).await;
-    let address = server.address;
-    let error = serve_metrics(address, Registry::new(), Health::default(), Router::new())
-        .await
-        .unwrap_err();
+    let (address, health) = (server.address, Health::default());
+    let error = serve_metrics(address, Registry::new(), health, Router::new()).await.unwrap_err();
     assert_eq!(error.to_string(), format!("cannot listen at {address}"));
 }

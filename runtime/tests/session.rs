@@ -1,6 +1,4 @@
-//! Sessions over real TCP: what they refuse, and how much they take in. That learner and evaluators
-//! find each other, whichever comes first, goes or comes back, is tested with the programs
-//! (tests/tests/service).
+//! Limits and errors of sessions over TCP. tests/tests/service tests connections of the programs.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::time::Duration;
@@ -12,9 +10,9 @@ use tokio::time::timeout;
 use zenoh::Session;
 use zenoh::qos::CongestionControl;
 
-/// For whatever must happen; on a machine busy with other things.
+/// Time limit of events that must happen.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// For what must not happen.
+/// Time in which an event must not happen.
 const LULL: Duration = Duration::from_millis(500);
 
 fn listening_at(endpoint: &str) -> Endpoints {
@@ -25,20 +23,17 @@ fn connecting_to(endpoint: &str) -> Endpoints {
     Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() }
 }
 
-/// A session at a port that the system chose, and its endpoint.
+/// A session at a free port, and its endpoint.
 async fn meeting_point() -> (Session, String) {
     let endpoints = listening_at("tcp/127.0.0.1:0");
     let session = open_session(&endpoints).await.unwrap();
     let reachable = reachable_at(&session, &endpoints).await.unwrap();
-    assert_eq!(reachable.len(), 1, "{reachable:?}");
-    assert!(
-        reachable[0].starts_with("tcp/127.0.0.1:") && !reachable[0].ends_with(":0"),
-        "{reachable:?}"
-    );
-    (session, reachable[0].clone())
+    let [endpoint] = <[String; 1]>::try_from(reachable).unwrap();
+    assert!(endpoint.starts_with("tcp/127.0.0.1:") && !endpoint.ends_with(":0"), "{endpoint}");
+    (session, endpoint)
 }
 
-/// What a learner declares; ends when dropped.
+/// Answers requests for jobs with their reverse, until dropped.
 async fn declare_learner(session: &Session) -> impl Sized + use<> {
     let queryable = session.declare_queryable("quad/run/jobs").await.unwrap();
     let mut answers = JoinSet::new();
@@ -58,7 +53,7 @@ async fn ask(session: &Session, request: Vec<u8>) -> Vec<u8> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_session_that_listens_takes_in_nothing_in_several_pieces() {
+async fn a_session_that_listens_drops_fragmented_messages() {
     let (learner, endpoint) = meeting_point().await;
     let progress = learner.declare_subscriber("quad/run/progress/*").await.unwrap();
     let _declared = declare_learner(&learner).await;
@@ -66,65 +61,52 @@ async fn a_session_that_listens_takes_in_nothing_in_several_pieces() {
     let largest_report = vec![1; 30 << 10];
     assert_eq!(ask(&evaluator, largest_report.clone()).await, largest_report);
     for size in [100_000, 1] {
-        evaluator
-            .put("quad/run/progress/e", vec![1; size])
-            .congestion_control(CongestionControl::Block)
-            .await
-            .unwrap();
+        let put = evaluator.put("quad/run/progress/e", vec![1; size]);
+        put.congestion_control(CongestionControl::Block).await.unwrap();
     }
-    let sample =
-        timeout(PATIENCE, progress.recv_async()).await.expect("no progress arrived").unwrap();
-    assert_eq!(sample.payload().len(), 1, "a message in two pieces was taken in");
+    let sample = timeout(PATIENCE, progress.recv_async()).await.expect("no progress").unwrap();
+    assert_eq!(sample.payload().len(), 1);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_cannot_work_is_an_error_at_once() {
+async fn unusable_endpoints_are_errors_at_once() {
     let (_session, endpoint) = meeting_point().await;
     let open = async |endpoints: Endpoints| {
         timeout(PATIENCE, open_session(&endpoints)).await.unwrap().err().unwrap()
     };
     assert!(matches!(open(Endpoints::default()).await, SessionError::NoEndpoint));
-    let taken = open(listening_at(&endpoint)).await;
-    let text = taken.to_string();
-    assert!(
-        text.contains(&endpoint) && text.contains("in use") && !text.contains(".rs:"),
-        "{text}"
-    );
+    let text = open(listening_at(&endpoint)).await.to_string();
+    assert!(text.contains(&endpoint) && text.contains("in use"), "{text}");
+    assert!(!text.contains(".rs:"), "{text}");
     for wrong in ["127.0.0.1:7447", "udp/127.0.0.1:7447", "smoke/signals:1", "tcp", "tcp/", ""] {
         let error = open(connecting_to(wrong)).await;
-        assert!(
-            matches!(&error, SessionError::NotAnEndpoint(endpoint) if endpoint == wrong),
-            "{error}"
-        );
-        assert!(error.to_string().contains("tcp/127.0.0.1:7447"), "{error}");
+        assert!(matches!(&error, SessionError::NotAnEndpoint(it) if it == wrong), "{error}");
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn beyond_the_most_connections_no_client_comes_in_until_one_leaves() {
+async fn connections_beyond_the_limit_wait_until_one_leaves() {
     const MOST: usize = 768;
     // Both ends of each connection are open files of this process.
     let limit = rustix::process::getrlimit(Resource::Nofile);
-    rustix::process::setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit })
-        .unwrap();
+    let raised = Rlimit { current: limit.maximum, ..limit };
+    rustix::process::setrlimit(Resource::Nofile, raised).unwrap();
     let (learner, endpoint) = meeting_point().await;
     let _declared = declare_learner(&learner).await;
-    let (come, mut there) = tokio::sync::mpsc::unbounded_channel();
+    let (tx, mut rx) = tokio::sync::mpsc::unbounded_channel();
     for _ in 0..MOST + 20 {
-        let (endpoint, come) = (endpoint.clone(), come.clone());
-        tokio::spawn(async move {
-            come.send(open_session(&connecting_to(&endpoint)).await.unwrap()).unwrap()
-        });
+        let (endpoints, tx) = (connecting_to(&endpoint), tx.clone());
+        tokio::spawn(async move { tx.send(open_session(&endpoints).await.unwrap()).unwrap() });
     }
     let mut sessions = Vec::new();
     while sessions.len() < MOST {
-        sessions.push(timeout(PATIENCE, there.recv()).await.expect("there is room").unwrap());
+        sessions.push(timeout(PATIENCE, rx.recv()).await.expect("there is room").unwrap());
     }
-    assert!(timeout(2 * LULL, there.recv()).await.is_err(), "one too many");
+    assert!(timeout(2 * LULL, rx.recv()).await.is_err(), "one too many");
     for session in [&sessions[0], &sessions[MOST - 1]] {
         assert_eq!(ask(session, b"abc".to_vec()).await, b"cba");
     }
     sessions.pop().unwrap().close().await.unwrap();
-    let last = timeout(PATIENCE, there.recv()).await.expect("there is room again").unwrap();
+    let last = timeout(PATIENCE, rx.recv()).await.expect("there is room again").unwrap();
     assert_eq!(ask(&last, b"abc".to_vec()).await, b"cba");
 }

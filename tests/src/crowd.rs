@@ -131,7 +131,7 @@ impl Member {
             // Like a real one, it does not tell more because its jobs are short.
             if self.told.is_none_or(|told| told.elapsed() >= every) {
                 self.told = Some(Instant::now());
-                let of_job = Progress::of(job, self.name.clone());
+                let of_job = Progress::new(job, self.name.clone());
                 let progress = Progress { steps_done, environment_steps: steps_done, ..of_job };
                 let message = encode(&progress).expect("it is small");
                 let put = self.session.put(keys::progress(&job.run, &self.name), message);

@@ -71,7 +71,7 @@ pub fn scores(job: &Job, evaluator: &str) -> ScoreReport {
             score: hopper.normalized_score(episode_return),
         }
     });
-    ScoreReport::of(job, name(evaluator), name("f32"), episodes.collect())
+    ScoreReport::new(job, name(evaluator), name("f32"), episodes.collect())
 }
 
 /// A client without a certificate.

@@ -97,7 +97,7 @@ impl Connection {
             episodes_done,
             environment_steps: self.metrics.environment_steps.get(),
             episodes: self.metrics.episodes.get(),
-            ..Progress::of(job, self.evaluator.clone())
+            ..Progress::new(job, self.evaluator.clone())
         };
         let Ok(message) = encode(&progress) else { return };
         let put = self.session.put(keys::progress(&self.run, &self.evaluator), message);

@@ -52,7 +52,7 @@ impl Evaluator {
         info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "evaluating");
         let report = |done: Done| client.publish_progress(job, done.steps, done.episodes);
         let episodes = self.roll_out(job, policy, report).await?;
-        Ok(ScoreReport::of(job, self.name.clone(), arithmetic, episodes))
+        Ok(ScoreReport::new(job, self.name.clone(), arithmetic, episodes))
     }
 
     /// The policy of `job`, kept from the last job or loaded from a snapshot.

@@ -43,7 +43,7 @@ async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
         }
         learner.give(job.clone());
         let precision = name(&Precision::F32.arithmetic());
-        let expected = ScoreReport::of(&job, name("one"), precision, expected(&job));
+        let expected = ScoreReport::new(&job, name("one"), precision, expected(&job));
         assert_eq!(learner.wait_for_scores(1).await, expected);
         assert_eq!(learner.count(|event| *event == Event::Weights), usize::from(!published));
         assert!(evaluator.leave().success());

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use quad_run::folder::walk;
 use quad_run::results::{Ranking, RunReport, Select, Spread, published};
 use quad_run::table::{Block, Style, Table};
+use quad_runtime::one_line;
 use serde::Serialize;
 use tracing::warn;
 
@@ -59,7 +60,7 @@ impl Report {
             found.extend(dirs.into_iter().filter(|dir| seen.insert(dir.clone())));
         }
         let read = |dir: &PathBuf| {
-            RunReport::read(dir).map_err(|error| unreadable.push(format!("{error:#}"))).ok()
+            RunReport::read(dir).map_err(|error| unreadable.push(one_line(&error))).ok()
         };
         let runs: Vec<_> = found.iter().filter_map(read).collect();
         if runs.is_empty() {

@@ -1,11 +1,11 @@
-//! One message of each kind, for the tests beside this folder and for the fuzzer in protocol/fuzz.
-#![allow(dead_code)] // Not each of them uses all of it.
+//! One message of each kind, for tests and for the fuzzer in protocol/fuzz.
+#![allow(dead_code)] // Not every test uses all of it.
 
 use std::fmt::Debug;
 
 use quad_protocol::*;
 
-/// What a test does with a message of any type.
+/// A check of a message of any type.
 pub trait Check {
     fn check<M: Message + PartialEq + Debug>(&mut self, message: &M);
 }
@@ -24,7 +24,7 @@ pub fn frames() -> Vec<Vec<u8>> {
     frames
 }
 
-/// Decodes bytes as a message of each kind. What can be read is what is sent on.
+/// Decodes bytes as a message of each kind. A decoded message is encoded as the same bytes.
 pub fn decode_as_each(bytes: &[u8]) {
     fn read<M: Message>(bytes: &[u8]) {
         if let Ok(message) = decode::<M>(bytes) {
@@ -48,7 +48,7 @@ pub fn snapshot(file: Vec<u8>) -> Snapshot {
     Snapshot { run: name(), incarnation: 1, step: 2, hash: Hash::of(&file), file }
 }
 
-/// Checks one message of each kind and variant, with all of its fields filled.
+/// Checks one message of each kind and variant, with all fields filled.
 pub fn each(test: &mut impl Check) {
     let text = || "hopper".to_owned();
     let snapshot = snapshot((0..100).collect());
@@ -69,14 +69,14 @@ pub fn each(test: &mut impl Check) {
         steps_done: 100,
         environment_steps: 200,
         episodes: 7,
-        ..Progress::of(&job, name())
+        ..Progress::new(&job, name())
     };
     let episodes = vec![score(1, 4.0), score(u64::MAX, f64::NEG_INFINITY), score(3, -0.0)];
     let environments = vec![text(), "walker2d".to_owned(), String::new()];
     test.check(&snapshot);
     test.check(&JobRequest::Claim { evaluator: name(), attempt: 9, environments });
     test.check(&JobRequest::HandBack { evaluator: name(), job: 1, failed: Some(text()) });
-    test.check(&ScoreReport::of(&job, name(), name(), episodes));
+    test.check(&ScoreReport::new(&job, name(), name(), episodes));
     test.check(&JobReply::Job(job));
     test.check(&JobReply::Wait { incarnation: 2, milliseconds: 10 });
     test.check(&JobReply::HandedBack { incarnation: 2, accepted: true });

@@ -1,10 +1,10 @@
-//! The results of checks, for people and for programs.
+//! Results of checks.
 
 use std::fmt;
 
 use serde::Serialize;
 
-/// The results of all checks, in their order. Display prints a line for each, with hints below.
+/// Results of checks. Display prints a line for each, with hints below.
 #[derive(Debug, Default, Serialize)]
 pub struct Findings(Vec<Finding>);
 
@@ -19,17 +19,17 @@ struct Finding {
 }
 
 impl Findings {
-    /// Adds that `check` found what it should.
+    /// Adds a passed check.
     pub fn ok(&mut self, check: &str, what: impl Into<String>) {
         self.add("ok", check, what.into(), None);
     }
 
-    /// Adds that `check` found something that works, but may fail later or be slow.
+    /// Adds a check that found something slow, or something that may fail later.
     pub fn warn(&mut self, check: &str, what: impl Into<String>, hint: impl Into<String>) {
         self.add("warn", check, what.into(), Some(hint.into()));
     }
 
-    /// Adds that `check` found something that does not work.
+    /// Adds a failed check.
     pub fn fail(&mut self, check: &str, what: impl Into<String>, hint: impl Into<String>) {
         self.add("fail", check, what.into(), Some(hint.into()));
     }

@@ -1,4 +1,4 @@
-//! Processor cores, and folders that a program writes to.
+//! Checks of processor cores and of folders that a program writes to.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -12,41 +12,34 @@ use super::findings::Findings;
 
 /// Limits the threads of the networks' arithmetic, which are rayon's.
 const THREADS: &str = "RAYON_NUM_THREADS";
-/// Size of the trial file, bytes: more than a file system keeps aside for small files.
+/// Bytes of the trial file: more than a file system reserves for small files.
 const TRIAL: usize = 1 << 20;
-/// A disk that takes longer than this for the trial delays scores: the learner synchronizes each
-/// score before it counts.
+/// Longest time for the trial before a warning: the learner synchronizes each score before it counts.
 const SLOW: Duration = Duration::from_millis(500);
-/// Less free space than this is not enough for a checkpoint and some snapshots of the paper's
-/// networks, bytes.
+/// Least free bytes for a checkpoint and some snapshots of the paper's networks.
 const TOO_LITTLE: u64 = 100 << 20;
-/// A long run with many snapshots may need this much, bytes.
+/// Free bytes that a long run with many snapshots may need.
 const LITTLE: u64 = 2 << 30;
 
-/// The cores that this process may use, and how many threads it would start on them.
+/// Checks the cores that this process may use, and its threads on them.
 pub fn threads(findings: &mut Findings) {
     let cores = thread::available_parallelism().map_or(1, usize::from);
-    let set = env::var(THREADS).ok();
-    match set.as_ref().map(|text| text.parse::<usize>()) {
-        None | Some(Ok(0)) => {
-            findings.ok("threads", format!("{cores}, one per core: {THREADS} is not set or 0"))
+    let set = env::var(THREADS).unwrap_or_else(|_| "0".to_owned());
+    let found = match set.parse::<usize>() {
+        Ok(0) => format!("{cores}, one per core: {THREADS} is not set or 0"),
+        Ok(threads) if threads <= cores => format!("{THREADS}={threads} of {cores} cores"),
+        _ => {
+            let found = format!("{THREADS}={set}, but this process may use {cores} cores");
+            let hint = "more threads than cores are slow";
+            let hint = format!("set it to a number from 1 to {cores}: {hint}");
+            return findings.warn("threads", found, hint);
         }
-        Some(Ok(threads)) if threads <= cores => {
-            findings.ok("threads", format!("{THREADS}={threads} of {cores} cores"))
-        }
-        Some(_) => findings.warn(
-            "threads",
-            format!(
-                "{THREADS}={}, but this process may use {cores} cores",
-                set.unwrap_or_default()
-            ),
-            format!("set it to a number from 1 to {cores}: more threads than cores are slow"),
-        ),
-    }
+    };
+    findings.ok("threads", found);
 }
 
-/// Checks a folder that a program will write to, or the nearest existing folder in which the
-/// program would make it. `elsewhere` says how to choose another folder. Leaves no file behind.
+/// Checks a folder that a program will write to, or its nearest existing ancestor. `elsewhere` is the
+/// hint for choosing another folder.
 pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str) {
     let path = &absolute(path).unwrap_or_else(|_| path.to_owned());
     let folder = path.ancestors().find(|folder| folder.is_dir()).unwrap_or(path);
@@ -65,26 +58,19 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
             return findings.fail(check, format!("{shown} cannot be written to: {error}"), hint);
         }
     };
-    let found = format!(
-        "{shown}: {:.1} GiB free, a write of 1 MiB takes {took:.0?}",
-        free as f64 / f64::from(1 << 30)
-    );
+    let gib = free as f64 / f64::from(1 << 30);
+    let found = format!("{shown}: {gib:.1} GiB free, a write of 1 MiB takes {took:.0?}");
+    let little = || format!("{found}: little room for a long run");
+    let faster = || format!("a local disk, or one that is less busy, is faster; {elsewhere}");
     match free {
         ..TOO_LITTLE => findings.fail(check, found, room),
-        TOO_LITTLE..LITTLE => {
-            findings.warn(check, format!("{found}: little room for a long run"), room)
-        }
-        _ if took > SLOW => findings.warn(
-            check,
-            found,
-            format!("a local disk, or one that is less busy, is faster; {elsewhere}"),
-        ),
+        TOO_LITTLE..LITTLE => findings.warn(check, little(), room),
+        _ if took > SLOW => findings.warn(check, found.clone(), faster()),
         _ => findings.ok(check, found),
     }
 }
 
-/// Writes a file, synchronizes it to the disk and removes it. Returns the free bytes, and how long
-/// the trial took.
+/// Writes a file, synchronizes it and removes it. Returns the free bytes and the time of the trial.
 fn write_trial(folder: &Path) -> io::Result<(u64, Duration)> {
     let path = folder.join(format!(".doctor-{}", std::process::id()));
     let begin = Instant::now();

@@ -1,6 +1,5 @@
-//! `learner doctor` and `evaluator doctor`: checks of a machine, before a run is started on it.
-//!
-//! These checks are for both programs; each program adds its own in its `doctor.rs`.
+//! Checks of a machine for `learner doctor` and `evaluator doctor`. Each program adds its own in its
+//! `doctor.rs`.
 
 mod findings;
 mod machine;

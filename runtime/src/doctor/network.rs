@@ -1,4 +1,4 @@
-//! Certificates, and the endpoints at which learner and evaluators meet.
+//! Checks of certificates and of the endpoints at which learner and evaluators meet.
 
 use std::io::{self, ErrorKind};
 use std::net::{Ipv4Addr, TcpListener};
@@ -20,8 +20,7 @@ const CONNECT: Duration = Duration::from_secs(3);
 /// Time limit of a connection with Zenoh's own handshake, and perhaps TLS's.
 const SESSION: Duration = Duration::from_secs(5);
 
-/// Checks the certificates in `folder`, which must be for `role`. Returns them if a connection can
-/// be tried with them.
+/// Checks the certificates in `folder`, which must be for `role`.
 pub fn certificates(findings: &mut Findings, folder: &Path, role: Role) -> Option<Certificates> {
     let found = Certificates::check(folder, role);
     match &found {
@@ -34,25 +33,23 @@ pub fn certificates(findings: &mut Findings, folder: &Path, role: Role) -> Optio
     found.ok()
 }
 
-/// Checks whether a learner can listen at a port of this machine.
+/// Checks that a learner can listen at a port of this machine.
 pub fn port(findings: &mut Findings, port: u16) {
     match TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
-        Ok(_) => findings
-            .ok("port", format!("tcp/127.0.0.1:{port} is free for the learner to listen at")),
+        Ok(_) => {
+            let found = format!("tcp/127.0.0.1:{port} is free for the learner to listen at");
+            findings.ok("port", found);
+        }
         Err(error) => {
+            let found = format!("tcp/127.0.0.1:{port} cannot be listened at: {error}");
             let hint = "if another learner has it, choose a free one by --listen tcp/127.0.0.1:0, or a router by --connect";
-            findings.warn(
-                "port",
-                format!("tcp/127.0.0.1:{port} cannot be listened at: {error}"),
-                hint,
-            );
+            findings.warn("port", found, hint);
         }
     }
 }
 
-/// Connects to the first endpoint, by TCP alone and then with Zenoh, and does the further checks
-/// over the session if there is one.
-/// Fails if the further checks cannot be done.
+/// Connects to the first endpoint, by TCP alone and then with Zenoh, and does further checks over the
+/// session.
 pub fn connected<E: From<io::Error>>(
     findings: &mut Findings,
     endpoints: &Endpoints,
@@ -72,10 +69,8 @@ pub fn connected<E: From<io::Error>>(
 async fn connect(findings: &mut Findings, endpoints: &Endpoints) -> Option<Session> {
     let endpoint = endpoints.connect.first()?;
     let address = address_of(endpoint);
-    let reached = timeout(CONNECT, TcpStream::connect(address))
-        .await
-        .unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()));
-    if let Err(error) = reached {
+    let reached = timeout(CONNECT, TcpStream::connect(address)).await;
+    if let Err(error) = reached.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into())) {
         let hint = match error.kind() {
             ErrorKind::ConnectionRefused => {
                 "that machine is there, but nothing listens at this port: is the learner or router started, and does \

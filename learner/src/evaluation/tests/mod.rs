@@ -126,7 +126,7 @@ fn score(seed: u64, episode_return: f64) -> EpisodeScore {
 
 /// Some of a job's scores.
 fn report(job: &Job, evaluator: &str, episodes: Vec<EpisodeScore>) -> ScoreReport {
-    ScoreReport::of(job, name(evaluator), name("f32"), episodes)
+    ScoreReport::new(job, name(evaluator), name("f32"), episodes)
 }
 
 /// All of them.
@@ -140,6 +140,6 @@ fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
         steps_done,
         environment_steps: 10,
         episodes: 1,
-        ..Progress::of(job, name(evaluator))
+        ..Progress::new(job, name(evaluator))
     }
 }

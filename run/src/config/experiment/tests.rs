@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::config::resolve;
+use quad_runtime::one_line;
 use toml::toml;
 
 #[test]
@@ -95,7 +96,7 @@ fn what_cannot_be_used_is_named_with_what_can() {
         ("hopper-demo", toml! { algorithm = "iql" agent.tau = 2 }, "unknown field `tau`"),
         ("hoper-demo", toml! { steps = 1 }, "no task named hoper-demo"),
     ] {
-        let error = format!("{:#}", resolve(preset, &changes).unwrap_err());
+        let error = one_line(&resolve(preset, &changes).unwrap_err());
         assert!(error.contains(words), "{error}");
     }
 }
