@@ -53,6 +53,11 @@ impl Certificates {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 
+    /// The folder of all of them.
+    pub fn folder(&self) -> &Path {
+        self.folder.path()
+    }
+
     /// The folder of the certificate called so.
     pub fn of(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)

@@ -37,6 +37,25 @@ pub fn preload(example: &str) -> Vec<String> {
     vec!["env".to_owned(), format!("LD_PRELOAD={}", library.display())]
 }
 
+/// One of our programs with its arguments, none of which has a space in it.
+pub fn command(line: &str) -> Command {
+    let mut words = line.split_whitespace();
+    let mut command = Command::new(binary(words.next().expect("a program")));
+    command.args(words);
+    command
+}
+
+/// Runs a command line, which must succeed; gives what it printed to stdout.
+pub fn succeeds(line: &str) -> String {
+    stdout(&command(line).output().expect("it starts"))
+}
+
+/// The stdout of a program, which must have succeeded.
+pub fn stdout(output: &Output) -> String {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
 /// Asserts that a program ended with exit code 1, an error that has this sentence, and a hint that
 /// has that.
 pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {

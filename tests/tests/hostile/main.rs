@@ -5,7 +5,6 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 mod access;
-mod certificates;
 mod floods;
 mod nonsense;
 mod roles;

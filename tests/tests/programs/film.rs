@@ -4,12 +4,12 @@ use std::fs::{self, File, Permissions};
 use std::io::BufReader;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Command;
 
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
 use quad_tests::peers::has_egl;
-use quad_tests::process::{assert_refused, binary};
+use quad_tests::process::{assert_refused, binary, stdout};
 use quad_tests::setting::Setting;
 use quad_tests::small_disk::SmallDisk;
 use quad_tests::system::Scratch;
@@ -21,11 +21,6 @@ fn film(folder: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(binary("evaluator"));
     command.current_dir(folder).arg("film").args(arguments);
     command
-}
-
-fn said(output: &Output) -> String {
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8(output.stdout.clone()).unwrap()
 }
 
 /// A finished run with scores.
@@ -61,13 +56,13 @@ fn a_film_shows_the_episode_that_is_scored() {
     let score = learner.scores().into_iter().find(|score| score.step == 40).unwrap();
     let seed = score.seed.to_string();
 
-    let told = said(&film(folder, &[last, "--seed", &seed]).output().unwrap());
+    let printed = stdout(&film(folder, &[last, "--seed", &seed]).output().unwrap());
     let (length, episode_return) = (u64::from(score.length), score.episode_return);
     let words = format!(
         "seed {seed}, {length} steps, return {episode_return:.2}, {} candidates",
         SETTING.candidates
     );
-    assert!(told.contains(&words), "{words:?} is not in {told:?}");
+    assert!(printed.contains(&words), "{words:?} is not in {printed:?}");
     let (size, frames) = frames(&folder.join("film.gif"));
     assert_eq!(size, (320, 240));
     assert_eq!(
@@ -82,14 +77,11 @@ fn a_film_shows_the_episode_that_is_scored() {
     assert_ne!(frames.first(), frames.last());
 
     let run = first.split_once("/snapshots").unwrap().0;
-    let told = said(
-        &film(folder, &[run, "--step", "20", "--compare", last, "--out", "two.png"])
-            .output()
-            .unwrap(),
-    );
+    let flags = [run, "--step", "20", "--compare", last, "--out", "two.png"];
+    let printed = stdout(&film(folder, &flags).output().unwrap());
     let seeds: Vec<&str> =
-        told.lines().filter_map(|line| line.split_once("seed ")?.1.split(',').next()).collect();
-    assert!(seeds.len() == 2 && seeds[0] == seeds[1], "two episodes of one seed: {told}");
+        printed.lines().filter_map(|line| line.split_once("seed ")?.1.split(',').next()).collect();
+    assert!(seeds.len() == 2 && seeds[0] == seeds[1], "two episodes of one seed: {printed}");
     let mut picture =
         png::Decoder::new(BufReader::new(File::open(folder.join("two.png")).unwrap()))
             .read_info()
@@ -103,37 +95,6 @@ fn a_film_shows_the_episode_that_is_scored() {
     };
     assert!(part(0, 0) != part(7, 0) && part(0, 1) != part(7, 1), "they move");
     assert!(part(7, 0) != part(7, 1), "the two do not do the same");
-}
-
-#[test]
-fn what_cannot_be_filmed_is_said_in_a_sentence() {
-    let scratch = Scratch::new();
-    let learner = run(&scratch);
-    let (folder, snapshot) = (scratch.path(), learner.snapshot(40));
-    let snapshot = snapshot.to_str().unwrap();
-    let refused = |arguments: &[&str], sentence: &str, hint: &str| {
-        assert_refused(&film(folder, arguments).output().unwrap(), sentence, hint);
-    };
-    refused(&["."], "cannot read ./config.toml", "RUN/snapshots/step_");
-    refused(&[snapshot, "--step", "20"], "is not the folder of a run", "--step");
-    let moon = folder.join("moon.safetensors");
-    let bytes = fs::read(snapshot).unwrap();
-    let at = bytes.windows(6).position(|window| window == b"hopper").unwrap();
-    fs::write(&moon, [&bytes[..at], b"onmoon", &bytes[at + 6..]].concat()).unwrap();
-    refused(&[moon.to_str().unwrap()], "is a policy for another environment", "docs/python.md");
-    let without_driver =
-        film(folder, &[snapshot]).env("__EGL_VENDOR_LIBRARY_DIRS", folder).output().unwrap();
-    assert_refused(
-        &without_driver,
-        "pictures need EGL",
-        "apt-get install --no-install-recommends libegl1",
-    );
-    if has_egl() {
-        let output =
-            film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", folder).output().unwrap();
-        assert_refused(&output, "ffmpeg cannot be started", "--out film.gif");
-        assert!(!folder.join("film.mp4").exists());
-    }
 }
 
 /// An ffmpeg that writes what it is fed to the file that it is told, by a name that means no option
@@ -155,17 +116,18 @@ fn a_film_is_whole_or_is_not_there_whatever_its_name() {
     fs::set_permissions(&ffmpeg, Permissions::from_mode(0o755)).unwrap();
     let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
     for name in ["-y.mp4", "a:b/x.mp4"] {
-        said(
-            &film(folder, &[snapshot, &format!("--out={name}")])
-                .env("PATH", &path)
-                .output()
-                .unwrap(),
-        );
+        let out = format!("--out={name}");
+        stdout(&film(folder, &[snapshot, &out]).env("PATH", &path).output().unwrap());
         assert!(
             fs::metadata(folder.join(name)).unwrap().len() > 480 * 360 * 3,
             "{name} has pictures"
         );
     }
+    let output =
+        film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", "/nowhere").output().unwrap();
+    assert_refused(&output, "ffmpeg cannot be started", "--out film.gif");
+    assert!(!folder.join("film.mp4").exists());
+
     let Some(disk) = SmallDisk::mount(&folder.join("disk"), 1) else { return };
     disk.fill();
     for name in ["disk/film.gif", "disk/film.png"] {

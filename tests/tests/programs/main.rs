@@ -1,9 +1,8 @@
-//! What a user gets from a command: exit codes, hints, help, files; and that none of ours is
-//! misread by the programs of others.
+//! A user's view of the programs: exit codes, hints, help, files; and that the programs of others
+//! read ours.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 mod alerts;
-mod bad_input;
 mod command_line;
 mod dashboard;
 mod datasets;
@@ -14,3 +13,4 @@ mod judging;
 mod own_data;
 mod score;
 mod systemd;
+mod transcripts;
