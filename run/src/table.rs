@@ -38,6 +38,9 @@ impl Block {
     }
 }
 
+/// A column of a table of `T`s: its header, its alignment, and the text of a cell.
+pub type Column<T> = (&'static str, Alignment, fn(&T) -> String);
+
 /// A table: which columns are aligned to the right, and rows of cells, of which the first is the
 /// header.
 #[derive(Serialize)]
@@ -54,6 +57,16 @@ impl Table {
             right,
             rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()],
         }
+    }
+
+    /// A table with a row for each item.
+    pub fn of<T>(items: &[T], columns: &[Column<T>]) -> Self {
+        let header = Vec::from_iter(columns.iter().map(|(name, alignment, _)| (*name, *alignment)));
+        let mut table = Self::new(&header);
+        for item in items {
+            table.push(Vec::from_iter(columns.iter().map(|(_, _, cell)| cell(item))));
+        }
+        table
     }
 
     /// A row has a cell for each column. A cell is in one line, whatever file its text is from.

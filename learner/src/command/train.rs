@@ -26,7 +26,7 @@ use crate::cli::TrainArgs;
 use crate::data::{LocalDataset, Source, load};
 use crate::live::{Display, Ending, Incarnation, Live, MainLoop, Metrics, Run, STUCK, Threads};
 use crate::page;
-use crate::report::of_run;
+use crate::report::learning_curve;
 use crate::train::{HeldOut, begin, device};
 
 /// How long a run that is not complete may take to write its report.
@@ -267,7 +267,7 @@ fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     if !report.evaluations.is_empty() {
         run_dir.write_json("report.json", &report)?;
         let picture = run_dir.path().join("learning_curve.svg");
-        of_run(&report).write_svg(&picture)?;
+        learning_curve(&report).write_svg(&picture)?;
         text = format!("\n{}\nlearning curve: {}\n", report.text(), picture.display());
     }
     print(&format!("{text}run folder: {}", run_dir.path().display()))?;

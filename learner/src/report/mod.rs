@@ -1,30 +1,27 @@
-//! The results of runs: evaluations, summaries over seeds, published figures of the same tasks, and
-//! pictures.
+//! Reports of runs: evaluations, aggregates over seeds and tasks, published scores, and figures.
 //!
-//! Owns nothing: it reads run folders, which a learner may be writing, and makes text, JSON, HTML,
-//! SVG and PNG. It runs on its caller's thread: `learner report`, and `train` at the end of a run
-//! call it on the main thread. [`quad_run::results`] reads the runs.
+//! Reads run folders, which a learner may be writing, and makes text, JSON, HTML, SVG and PNG.
+//! [`quad_run::results`] reads the runs and has the statistics.
 //!
 //! The protocol is the paper's (section 5.1 and appendix B): the score of a run is the mean of its
-//! last 5 evaluations (3 where a task's published figures are so), or of the evaluations in its
-//! last 50,000 steps; several seeds give mean ± standard deviation. If the user asks for it, a
-//! run's best evaluation counts instead, and the report says so. A run that is not complete has no
-//! score.
+//! last 5 evaluations (3 where a task's published scores are), and several seeds give mean ±
+//! standard deviation. With `--select best`, a run's best evaluation counts instead, and the report
+//! says so. A run that is not complete has no score.
 //!
-//! In reading order: `seeds` groups runs that differ only in their seed; `study` applies the
-//! statistics to methods over tasks and seeds; `beside` makes published tables with our figures in
-//! them; `summary` is the whole report; `figures` are its pictures, which `plot` draws; `html` puts
-//! all of it into one file, with the commands of `remake`.
+//! In reading order: `groups` groups runs that differ only in their seed; `methods` aggregates them
+//! over tasks; `published` makes published tables with our scores; `summary` is the whole report;
+//! `figures` are its plots, which `plot` draws; `html` is the report as one file, with the commands
+//! of `reproduce`.
 
-mod beside;
 mod figures;
+mod groups;
 mod html;
+mod methods;
 mod plot;
-mod remake;
-mod seeds;
-mod study;
+mod published;
+mod reproduce;
 mod summary;
 
-pub(crate) use figures::{draw_all, of_run};
+pub(crate) use figures::{draw_all, learning_curve};
 pub(crate) use html::write as write_html;
 pub(crate) use summary::Report;

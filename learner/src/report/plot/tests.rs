@@ -1,44 +1,42 @@
 //! Tests of `report/plot.rs`.
 
+use std::fs;
+use std::sync::mpsc;
+use std::thread;
 use std::time::Duration;
 
 use super::*;
 
 #[test]
-fn what_is_no_finite_number_is_left_out_of_a_picture() {
+fn infinite_values_are_not_drawn() {
     let huge = [1e200, 1e308, -1e308, f64::INFINITY, f64::NEG_INFINITY, f64::NAN];
     let estimate = |value: f64| Estimate { value, low: Some(-value), high: Some(value * value) };
-    let points =
-        |number: f64| [(number, estimate(1.0)), (1.0, estimate(number)), (2.0, estimate(3.0))];
-    let line = |number: f64| Line { label: "a line".to_owned(), points: points(number).to_vec() };
-    for is_power in [false, true] {
-        let lines = huge.into_iter().map(line).collect();
-        let references =
-            huge.into_iter().map(|number| ("a reference".to_owned(), number)).collect();
-        let picture = Picture {
-            title: "a picture".to_owned(),
-            is_power,
-            references,
-            lines,
-            ..Picture::default()
+    let line = |huge: f64| {
+        let points = vec![(huge, estimate(1.0)), (1.0, estimate(huge)), (2.0, estimate(3.0))];
+        Line { label: "a line".to_owned(), points }
+    };
+    for is_log in [false, true] {
+        let plot = Plot {
+            is_log,
+            references: huge.map(|huge| ("a reference".to_owned(), huge)).to_vec(),
+            lines: huge.map(line).to_vec(),
+            ..Plot::default()
         };
-        let (tell, drawn) = std::sync::mpsc::channel();
-        std::thread::spawn(move || tell.send(picture.svg().unwrap()));
-        let svg = drawn.recv_timeout(Duration::from_secs(60)).expect("an axis has no end");
-        assert!(
-            svg.contains("a line") && svg.contains("a reference") && !svg.contains("NaN"),
-            "{svg}"
-        );
+        let (tx, rx) = mpsc::channel();
+        thread::spawn(move || tx.send(plot.svg().unwrap()));
+        let svg = rx.recv_timeout(Duration::from_secs(60)).expect("an axis has no end");
+        assert!(svg.contains("a line") && svg.contains("a reference"), "{svg}");
+        assert!(!svg.contains("NaN"), "{svg}");
     }
 }
 
 #[test]
-fn a_picture_that_cannot_be_written_leaves_nothing_behind() {
+fn a_failed_write_leaves_no_file() {
     let folder = tempfile::tempdir().unwrap();
-    let taken = folder.path().join("picture.svg");
-    std::fs::create_dir(&taken).unwrap();
-    let error = Picture::default().write_svg(&taken).unwrap_err();
-    assert!(error.to_string().contains("picture.svg"), "{error}");
-    let there = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path());
-    assert_eq!(Vec::from_iter(there), [taken]);
+    let taken = folder.path().join("plot.svg");
+    fs::create_dir(&taken).unwrap();
+    let error = Plot::default().write_svg(&taken).unwrap_err();
+    assert!(error.to_string().contains("plot.svg"), "{error}");
+    let files = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path());
+    assert_eq!(Vec::from_iter(files), [taken]);
 }

@@ -1,0 +1,240 @@
+//! Groups of runs that differ only in their seed.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use quad_dataset::{Goal, environment};
+use quad_run::config::Device;
+use quad_run::config::settings::{self, Settings, differences};
+use quad_run::results::departures::{as_given, departures};
+use quad_run::results::published::{self, Published};
+use quad_run::results::{RunReport, joined};
+use quad_run::results::{Select, Spread};
+use serde::Serialize;
+
+/// Runs that agree in task, data, device, all hyper-parameters and progress. The precision of their
+/// scores may differ.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct GroupReport {
+    pub task: String,
+    pub algorithm: String,
+    /// The kind of guidance for QUAD, such as `quad`, `dac` and `none`, or another algorithm's
+    /// name.
+    pub variant: String,
+    /// Name in tables and figures: the variant, and settings that are not the task's own if other
+    /// runs of the variant have other values.
+    pub method: String,
+    /// The most important hyper-parameters.
+    pub agent: String,
+    /// Names of the variant in published tables.
+    pub methods: Vec<&'static str>,
+    /// Planned gradient steps.
+    pub steps: u64,
+    /// Step of the last complete evaluation, if the runs are not complete.
+    pub reached: Option<u64>,
+    pub device: Device,
+    /// False: scores are returns.
+    pub normalized: bool,
+    pub scored_in: String,
+    /// One seed for each counted run.
+    pub seeds: Vec<u64>,
+    /// The score of each seed; empty if the runs are not complete, or have too few evaluations.
+    pub scores: Vec<f64>,
+    #[serde(skip)]
+    pub runs: Vec<RunReport>,
+    /// The folders of all runs, counted or not.
+    #[serde(skip)]
+    pub dirs: Vec<PathBuf>,
+    /// Number of goals, in an environment that draws one for a whole run.
+    pub goals: Option<usize>,
+    pub mean_last_3: Option<Spread>,
+    pub mean_last_5: Option<Spread>,
+    pub mean_last_50000_steps: Option<Spread>,
+    /// The best evaluation of each run; only with `--select best`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub best: Option<Spread>,
+    /// Runs with missing evaluations, and their number.
+    pub unfinished: Vec<String>,
+    /// Runs that are not counted, and why.
+    pub left_out: Vec<String>,
+    /// The settings in which other runs of the task and algorithm differ.
+    pub differs: Vec<String>,
+    /// Departures from the authors' protocol; empty without published scores of the task.
+    pub departures: Vec<String>,
+    pub published: Vec<Published>,
+}
+
+impl GroupReport {
+    /// `4 seeds, 2000000 steps on cpu, scored in f32`.
+    pub fn provenance(&self) -> String {
+        let seeds = self.seeds.len();
+        let plural = if seeds == 1 { "" } else { "s" };
+        let goals = if self.goals.is_some() { " with a goal each" } else { "" };
+        let (steps, device) = (self.steps_in_words(), self.device.name());
+        format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {}", self.scored_in)
+    }
+
+    pub fn measure(&self) -> &'static str {
+        self.runs.first().map_or("return", RunReport::measure_with_unit)
+    }
+
+    pub fn by_seed(&self) -> impl Iterator<Item = (&u64, &f64)> {
+        self.seeds.iter().zip(&self.scores)
+    }
+
+    pub fn steps_in_words(&self) -> String {
+        match self.reached {
+            Some(step) => format!("{step} of {} steps (not complete)", self.steps),
+            None => format!("{} steps", self.steps),
+        }
+    }
+}
+
+struct Group<'a> {
+    /// Algorithm and variant.
+    variant: [&'a str; 2],
+    /// Without the seed.
+    settings: Settings,
+    /// The task's own values for the variant; empty if the task is unknown.
+    preset: Settings,
+    runs: Vec<&'a RunReport>,
+}
+
+impl Group<'_> {
+    fn task(&self) -> &str {
+        &self.runs[0].task
+    }
+
+    fn is_preset(&self, key: &str) -> bool {
+        let is_task = key == "environment" || key.starts_with("dataset.");
+        is_task || !self.preset.is_empty() && self.preset.get(key) == self.settings.get(key)
+    }
+
+    fn setting(&self, key: &str) -> String {
+        let value = self.settings.get(key);
+        value.map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"))
+    }
+
+    /// Whether the run differs from these only in its seed.
+    fn fits(&self, run: &RunReport, settings: &Settings) -> bool {
+        let progress_fits = self.runs[0].reached() == run.reached() || run.reached() == Some(0);
+        self.task() == run.task && self.settings == *settings && progress_fits
+    }
+}
+
+/// Groups runs, in the order in which they are given.
+pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
+    let mut groups: Vec<Group> = Vec::new();
+    for run in runs {
+        let mut settings = settings::of_run(&run.config);
+        settings.remove("seed");
+        if let Some(group) = groups.iter_mut().find(|group| group.fits(run, &settings)) {
+            group.runs.push(run);
+            continue;
+        }
+        let preset = as_given(run, true).map(|given| settings::of_experiment(&given));
+        groups.push(Group {
+            variant: [&run.algorithm, &run.variant],
+            settings,
+            preset: preset.unwrap_or_default(),
+            runs: vec![run],
+        });
+    }
+    // The settings in which groups of one variant differ. Two tasks may have values of their own;
+    // any other value makes another method.
+    let mut differing: BTreeMap<[&str; 2], BTreeSet<&String>> = BTreeMap::new();
+    for (index, one) in groups.iter().enumerate() {
+        for other in groups[..index].iter().filter(|other| other.variant == one.variant) {
+            let other_task = one.task() != other.task();
+            let keys = differences(&one.settings, &other.settings)
+                .filter(|key| !(other_task && one.is_preset(key) && other.is_preset(key)));
+            differing.entry(one.variant).or_default().extend(keys);
+        }
+    }
+    let mut reports = Vec::new();
+    for group in &groups {
+        let mut method = vec![group.runs[0].label.clone()];
+        for key in differing.get(&group.variant).into_iter().flatten() {
+            if group.preset.get(*key) != group.settings.get(*key) {
+                method.push(group.setting(key));
+            }
+        }
+        let mut differs = BTreeSet::new();
+        for other in &groups {
+            if other.task() == group.task() && other.variant[0] == group.variant[0] {
+                differs.extend(differences(&group.settings, &other.settings));
+            }
+        }
+        let differs = differs.into_iter().map(|key| group.setting(key)).collect();
+        reports.push(report(&group.runs, method.join(", "), differs, select));
+    }
+    reports
+}
+
+fn report(
+    runs: &[&RunReport],
+    method: String,
+    differs: Vec<String>,
+    select: Select,
+) -> GroupReport {
+    let (mut counted, mut left_out) = (Vec::<&RunReport>::new(), Vec::new());
+    for run in runs {
+        let (dir, seed) = (run.dir.display(), run.seed);
+        if run.newest().is_none() {
+            left_out.push(format!("{dir} has no complete evaluation"));
+        } else if let Some(first) = counted.iter().find(|other| other.seed == seed) {
+            let first = first.dir.display();
+            left_out.push(format!("{dir} has seed {seed} like {first}, which is counted"));
+        } else {
+            counted.push(run);
+        }
+    }
+    let values = |value: fn(&RunReport) -> Option<f64>| -> Option<Vec<f64>> {
+        counted.iter().map(|run| value(run)).collect()
+    };
+    let spread = |value| Spread::of(&values(value)?);
+    let best = |run: &RunReport| run.best().map(|best| best.score.mean);
+    let scores = match select {
+        Select::Last => values(RunReport::score),
+        Select::Best => values(best),
+    };
+    let first = runs[0];
+    let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
+    let published = published::scores(&first.task);
+    let environment = environment::find(&first.config.experiment.environment);
+    let has_one_goal = environment.is_ok_and(|known| known.goal == Some(Goal::EachInstance));
+    let unfinished = counted.iter().filter(|run| !run.is_complete());
+    let departures = match published.is_empty() {
+        true => Vec::new(),
+        false => departures(&counted, &scored_in, select),
+    };
+    GroupReport {
+        task: first.task.clone(),
+        algorithm: first.algorithm.clone(),
+        variant: first.variant.clone(),
+        method,
+        agent: first.agent.clone(),
+        methods: published::methods(&first.algorithm, &first.variant),
+        steps: first.steps,
+        reached: first.reached(),
+        device: first.config.run.device,
+        normalized: first.normalized,
+        seeds: counted.iter().map(|run| run.seed).collect(),
+        scores: scores.filter(|_| first.is_complete()).unwrap_or_default(),
+        goals: has_one_goal.then_some(counted.len()),
+        mean_last_3: spread(|run| run.mean_last_3),
+        mean_last_5: spread(|run| run.mean_last_5),
+        mean_last_50000_steps: spread(|run| run.mean_last_50000_steps),
+        best: spread(best).filter(|_| select == Select::Best),
+        unfinished: unfinished
+            .map(|run| format!("in {} {}", run.dir.display(), run.how_complete()))
+            .collect(),
+        left_out,
+        differs,
+        dirs: runs.iter().map(|run| run.dir.clone()).collect(),
+        departures,
+        runs: counted.into_iter().cloned().collect(),
+        scored_in,
+        published,
+    }
+}

@@ -1,0 +1,225 @@
+//! Methods over all their tasks and seeds, and in comparison with each other.
+
+use std::collections::BTreeSet;
+use std::fmt::Alignment::{Left, Right};
+
+use quad_run::results::statistics::{self, Estimate, RESAMPLES, Runs};
+use quad_run::table::{Block, Table};
+use serde::Serialize;
+
+use super::groups::GroupReport;
+
+/// A method over all its tasks with D4RL-normalized scores, or over one task with returns.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct MethodReport {
+    pub method: String,
+    pub measure: &'static str,
+    pub tasks: Vec<String>,
+    /// Seeds of any of the tasks.
+    pub seeds: BTreeSet<u64>,
+    /// Interquartile mean.
+    pub iqm: Estimate,
+    /// Mean of the tasks' means.
+    pub mean: Estimate,
+    /// Median of the tasks' means.
+    pub median: Estimate,
+    /// Absent for returns.
+    pub optimality_gap: Option<Estimate>,
+    /// Performance profile; empty for returns.
+    pub profile: Vec<ProfilePoint>,
+    /// Smallest and largest number of seeds of a task.
+    #[serde(skip)]
+    seeds_per_task: [usize; 2],
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ProfilePoint {
+    pub threshold: f64,
+    /// Share of runs whose score is above the threshold.
+    #[serde(flatten)]
+    pub share: Estimate,
+}
+
+/// A method against another, in the tasks that both have.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Comparison {
+    pub method: String,
+    pub against: String,
+    pub tasks: Vec<String>,
+    pub probability_of_improvement: Estimate,
+    /// Pairs of runs with the same task and seed.
+    pub pairs: usize,
+    /// Absent without pairs, as are the p-values.
+    pub mean_difference: Option<f64>,
+    /// p-value of the sign-flip test.
+    pub p: Option<f64>,
+    /// Corrected for the number of comparisons by Holm's method.
+    pub p_holm: Option<f64>,
+}
+
+/// Groups of one method, each of another task.
+type Method<'a> = Vec<&'a GroupReport>;
+
+/// Aggregates all groups that have scores, and compares each method with the first.
+pub fn aggregate(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>) {
+    // Returns of different tasks have no common unit.
+    let mut comparable: Vec<Vec<Method>> = Vec::new();
+    for group in groups.iter().filter(|group| !group.scores.is_empty()) {
+        let fits = |methods: &Vec<Method>| {
+            let other = methods[0][0];
+            other.normalized && group.normalized || other.task == group.task
+        };
+        let index = comparable.iter().position(fits).unwrap_or(comparable.len());
+        if index == comparable.len() {
+            comparable.push(Vec::new());
+        }
+        let methods = &mut comparable[index];
+        match methods.iter_mut().find(|method| method[0].method == group.method) {
+            Some(method) => method.push(group),
+            None => methods.push(vec![group]),
+        }
+    }
+    let reports = comparable.iter().flatten().map(of_method).collect();
+    let mut comparisons = Vec::new();
+    for methods in &comparable {
+        comparisons.extend(methods[1..].iter().filter_map(|method| compare(method, &methods[0])));
+    }
+    let p_values = Vec::from_iter(comparisons.iter().filter_map(|comparison| comparison.p));
+    let tested = comparisons.iter_mut().filter(|comparison| comparison.p.is_some());
+    for (comparison, p) in tested.zip(statistics::holm(&p_values)) {
+        comparison.p_holm = Some(p);
+    }
+    (reports, comparisons)
+}
+
+fn of_method(method: &Method) -> MethodReport {
+    use statistics::{interquartile_mean, mean_of_means, median_of_means, optimality_gap};
+    let first = method[0];
+    let runs: Runs = method.iter().map(|group| group.scores.clone()).collect();
+    let count = if first.normalized { 61 } else { 0 };
+    let thresholds = Vec::from_iter((0..count).map(|index| f64::from(2 * index)));
+    let statistics = |drawn: &[Runs]| {
+        let of = [interquartile_mean, mean_of_means, median_of_means, optimality_gap];
+        let mut values = Vec::from_iter(of.map(|of| of(&drawn[0])));
+        values.extend(thresholds.iter().map(|at| statistics::share_above(&drawn[0], *at)));
+        values
+    };
+    let estimates = statistics::estimates(&[&runs], statistics);
+    let shares = thresholds.iter().zip(&estimates[4..]);
+    let seeds = || runs.iter().map(Vec::len);
+    MethodReport {
+        method: first.method.clone(),
+        measure: first.measure(),
+        tasks: method.iter().map(|group| group.task.clone()).collect(),
+        seeds: method.iter().flat_map(|group| &group.seeds).copied().collect(),
+        iqm: estimates[0],
+        mean: estimates[1],
+        median: estimates[2],
+        optimality_gap: first.normalized.then_some(estimates[3]),
+        profile: shares
+            .map(|(threshold, share)| ProfilePoint { threshold: *threshold, share: *share })
+            .collect(),
+        seeds_per_task: [seeds().min(), seeds().max()].map(Option::unwrap_or_default),
+    }
+}
+
+/// None without a common task.
+fn compare(method: &Method, against: &Method) -> Option<Comparison> {
+    let (mut tasks, mut x, mut y, mut differences) = (vec![], Runs::new(), Runs::new(), vec![]);
+    for one in method {
+        let Some(other) = against.iter().find(|other| other.task == one.task) else { continue };
+        tasks.push(one.task.clone());
+        x.push(one.scores.clone());
+        y.push(other.scores.clone());
+        for (seed, score) in one.by_seed() {
+            let pair = other.by_seed().find(|(other, _)| *other == seed);
+            differences.extend(pair.map(|(_, other)| score - other));
+        }
+    }
+    if tasks.is_empty() {
+        return None;
+    }
+    let improvement =
+        |drawn: &[Runs]| vec![statistics::probability_of_improvement(&drawn[0], &drawn[1])];
+    let has_pairs = !differences.is_empty();
+    Some(Comparison {
+        method: method[0].method.clone(),
+        against: against[0].method.clone(),
+        tasks,
+        probability_of_improvement: statistics::estimates(&[&x, &y], improvement)[0],
+        pairs: differences.len(),
+        mean_difference: has_pairs.then(|| statistics::mean(&differences)),
+        p: has_pairs.then(|| statistics::sign_flip_test(&differences)),
+        p_holm: None,
+    })
+}
+
+impl MethodReport {
+    fn tasks_in_words(&self) -> String {
+        match self.optimality_gap {
+            Some(_) => self.tasks.len().to_string(),
+            None => format!("{} ({}s)", self.tasks[0], self.measure),
+        }
+    }
+
+    fn seeds_in_words(&self) -> String {
+        let [fewest, most] = self.seeds_per_task;
+        if fewest == most { most.to_string() } else { format!("{fewest} to {most}") }
+    }
+}
+
+/// The number as text, or a dash.
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("-".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+/// All methods and comparisons as tables.
+pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Block> {
+    let mut notes = format!(
+        "Over tasks and seeds, in brackets the 95 % interval of the bootstrap: {RESAMPLES} times, seeds are drawn in each task \
+         (Agarwal et al. 2021). The optimality gap is that of scores over 100. Only complete runs count.\n"
+    );
+    for MethodReport { method, .. } in methods.iter().filter(|it| it.seeds_per_task[0] < 2) {
+        notes += &format!(
+            "No interval for {method}: of a single seed in a task, the spread is not known.\n"
+        );
+    }
+    let table = Table::of(
+        methods,
+        &[
+            ("method", Left, |it| it.method.clone()),
+            ("tasks", Left, MethodReport::tasks_in_words),
+            ("seeds", Right, MethodReport::seeds_in_words),
+            ("IQM", Right, |it| it.iqm.text(2)),
+            ("mean", Right, |it| it.mean.text(2)),
+            ("median", Right, |it| it.median.text(2)),
+            ("optimality gap", Right, |it| {
+                it.optimality_gap.map_or("-".to_owned(), |gap| gap.text(3))
+            }),
+        ],
+    );
+    let mut blocks = vec![Block::Text(notes), Block::Table(table)];
+    if comparisons.is_empty() {
+        return blocks;
+    }
+    blocks.push(Block::Text(format!(
+        "Against the method named first, in the tasks that both have: the mean difference of runs with the same task and seed, \
+         its p-value by sign flips (Fisher 1935), corrected for {} comparisons (Holm 1979), and the probability that a run \
+         scores more than one of the other.\n",
+        comparisons.len()
+    )));
+    blocks.push(Block::Table(Table::of(
+        comparisons,
+        &[
+            ("method", Left, |it| it.method.clone()),
+            ("against", Left, |it| it.against.clone()),
+            ("tasks", Right, |it| it.tasks.len().to_string()),
+            ("pairs", Right, |it| it.pairs.to_string()),
+            ("mean difference", Right, |it| number(it.mean_difference, 2)),
+            ("p", Right, |it| number(it.p, 4)),
+            ("p (Holm)", Right, |it| number(it.p_holm, 4)),
+            ("probability of improvement", Right, |it| it.probability_of_improvement.text(2)),
+        ],
+    )));
+    blocks
+}

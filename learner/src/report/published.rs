@@ -1,0 +1,151 @@
+//! Published scores beside ours, one row per task.
+
+use std::fmt::Alignment::{Left, Right};
+
+use quad_run::results::published::{self, Published, once_each};
+use quad_run::results::{Select, Spread};
+use quad_run::table::{Block, Table};
+
+use super::groups::GroupReport;
+
+/// A published score and its task.
+type Score<'a> = (&'a str, &'a Published);
+
+/// The published table of this name with footnotes, of the tasks that some of these runs are on;
+/// nothing without such runs.
+pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
+    let in_table =
+        |group: &&GroupReport| published::tables(&group.task, &group.algorithm).contains(&name);
+    let groups = Vec::from_iter(groups.iter().filter(in_table));
+    let Some(first) = groups.first() else { return Vec::new() };
+    let tasks = once_each(groups.iter().map(|group| &*group.task));
+    let ours = once_each(groups.iter().map(|group| &*group.method));
+    let mut scores: Vec<Score> = Vec::new();
+    for task in &tasks {
+        let of_task = groups.iter().find(|group| group.task == *task);
+        let all = of_task.into_iter().flat_map(|group| &group.published);
+        let in_table = all.filter(|score| score.tables.iter().any(|table| table == name));
+        scores.extend(in_table.map(|score| (*task, score)));
+    }
+    let theirs = methods(scores.iter());
+    let reasons = scores.iter().flat_map(|(_, score)| &score.remarks);
+    let mut notes =
+        Footnotes { ours: Vec::new(), theirs: once_each(reasons.map(|remark| remark.reason)) };
+
+    let mut header = vec![("task".to_owned(), Left)];
+    header.extend(ours.iter().map(|method| (format!("ours: {method}"), Right)));
+    header.extend(theirs.iter().map(|method| ((*method).to_owned(), Right)));
+    let mut table = Table::new(&header);
+    for task in tasks {
+        let mut row = vec![task.to_owned()];
+        for method in &ours {
+            let groups =
+                groups.iter().filter(|group| group.task == task && group.method == *method);
+            // Complete runs come first.
+            let group = groups.min_by_key(|group| group.reached.is_some());
+            row.push(group.map_or("-".to_owned(), |group| notes.ours(group)));
+        }
+        for method in &theirs {
+            let score = scores.iter().find(|(of, score)| *of == task && score.method == *method);
+            row.push(score.map_or("-".to_owned(), |(_, score)| notes.theirs(score)));
+        }
+        table.push(row);
+    }
+    let score = match select {
+        Select::Last => {
+            format!("the mean of its last {} evaluations", published::last(&first.task))
+        }
+        Select::Best => "its best evaluation".to_owned(),
+    };
+    let protocol = scores.first().map_or("", |(_, score)| score.protocol);
+    let title = format!(
+        "{name}. Ours: mean ± standard deviation over seeds, divided by n - 1 (in parentheses: by n); a run's score is {score}. \
+         {protocol}\n"
+    );
+    vec![Block::Text(title), Block::Table(table), Block::Text(notes.text(&scores, select))]
+}
+
+fn methods<'a>(scores: impl Iterator<Item = &'a Score<'a>>) -> Vec<&'static str> {
+    once_each(scores.map(|(_, score)| score.method))
+}
+
+/// Footnotes of our scores, with numbers, and of theirs, with letters.
+struct Footnotes {
+    ours: Vec<String>,
+    theirs: Vec<&'static str>,
+}
+
+impl Footnotes {
+    /// The score of a group, with the number of its footnote.
+    fn ours(&mut self, group: &GroupReport) -> String {
+        let mut note = group.provenance();
+        if !group.departures.is_empty() {
+            note += &format!(". Not its authors' protocol: {}", group.departures.join("; "));
+        }
+        if let Some(goals) = group.goals {
+            note += &format!(
+                ". AntMaze-v0 has one goal a run: {goals} behind this ±, where D4RL's code asks for 50 to 100 seeds"
+            );
+        }
+        let index = self.ours.iter().position(|other| *other == note);
+        let index = index.unwrap_or_else(|| {
+            self.ours.push(note);
+            self.ours.len() - 1
+        });
+        let score = Spread::of(&group.scores).map_or("-".to_owned(), Spread::text_of_both);
+        format!("{score} [{}]", index + 1)
+    }
+
+    fn lettered(&self) -> impl Iterator<Item = (char, &'static str)> {
+        ('a'..='z').zip(self.theirs.iter().copied())
+    }
+
+    /// A score as published, with the letters of its remarks.
+    fn theirs(&self, score: &Published) -> String {
+        let std = score.score.std.map(|std| format!(" ± {std:.1}")).unwrap_or_default();
+        let mut text = format!("{:.1}{std} ", score.score.mean);
+        for (letter, reason) in self.lettered() {
+            if score.remarks.iter().any(|remark| remark.reason == reason) {
+                text.push(letter);
+            }
+        }
+        text.trim_end().to_owned()
+    }
+
+    fn text(&self, scores: &[Score], select: Select) -> String {
+        let mut text = String::new();
+        for (number, note) in self.ours.iter().enumerate() {
+            text += &format!("- [{}] {note}.\n", number + 1);
+        }
+        let mut sources = Vec::new();
+        for source in once_each(scores.iter().map(|(_, score)| score.source)) {
+            let methods = methods(scores.iter().filter(|(_, score)| score.source == source));
+            sources.push(format!("{}: {source}", methods.join(", ")));
+        }
+        text += &format!("- Sources: {}.\n", sources.join("; "));
+        for (letter, reason) in self.lettered() {
+            let (mut on, mut instead, mut selected) = (Vec::new(), Vec::new(), "");
+            for score in scores {
+                let remarks = &score.1.remarks;
+                let Some(remark) = remarks.iter().find(|remark| remark.reason == reason) else {
+                    continue;
+                };
+                on.push(score);
+                if remark.selected {
+                    selected = "selected by test returns: ";
+                }
+                instead.extend(remark.instead.map(|mean| format!(" {mean:.1} in {}", score.0)));
+            }
+            let (methods, instead) = (methods(on.into_iter()).join(", "), instead.join(","));
+            text += &format!("- {letter} ({methods}): {selected}{reason}{instead}\n");
+        }
+        if select == Select::Best {
+            let is_selected = |(_, score): &&Score| score.remarks.iter().any(|it| it.selected);
+            let selected = methods(scores.iter().filter(is_selected)).join(", ");
+            text += &format!(
+                "- Of these figures, such selection stands behind those of {selected}, as far as is known.\n"
+            );
+        }
+        text
+    }
+}

@@ -1,0 +1,52 @@
+//! The command that reproduces a run.
+
+use quad_run::config::settings::{self, differences};
+use quad_run::config::tables::parse_assignment;
+use quad_run::results::RunReport;
+use quad_run::results::departures::as_given;
+
+/// `learner train` with all settings that decide the outcome of the run. None if the run is of no
+/// task that this learner has, or lacks a value of its task.
+pub fn command(run: &RunReport) -> Option<String> {
+    let experiment = &run.config.experiment;
+    let preset = as_given(run, false).ok()?;
+    let mut words = vec!["learner train --task".to_owned(), quoted(&run.task)];
+    let mut push = |flag: &str, value: &str| words.extend([flag.to_owned(), quoted(value)]);
+    push("--algorithm", &run.algorithm);
+    if let Some(dataset) = &experiment.dataset {
+        push("--dataset", dataset);
+    }
+    if experiment.environment != preset.environment {
+        push("--env", &experiment.environment);
+    }
+    let [ours, theirs] = [experiment, &preset].map(settings::of_experiment);
+    for key in differences(&ours, &theirs) {
+        if !matches!(key.as_str(), "environment" | "seed") {
+            push("--set", &assignment(key, ours.get(key)?));
+        }
+    }
+    if run.config.run.device != Default::default() {
+        push("--device", run.config.run.device.name());
+    }
+    push("--seed", &run.seed.to_string());
+    push("--run-dir", &run.dir.to_string_lossy());
+    Some(words.join(" "))
+}
+
+/// `KEY=VALUE`, without quotes where they can be omitted.
+fn assignment(key: &str, value: &str) -> String {
+    let [exact, bare] = [value, value.trim_matches('"')].map(|value| format!("{key}={value}"));
+    if parse_assignment(&bare) == parse_assignment(&exact) { bare } else { exact }
+}
+
+/// Quotes a word for a shell.
+pub fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+#[cfg(test)]
+mod tests;
