@@ -86,7 +86,8 @@ impl Cli {
     pub fn run(self) -> anyhow::Result<()> {
         // Rayon's own first use panics if the system refuses the threads.
         let threads = rayon::ThreadPoolBuilder::new().build_global();
-        threads.context("cannot start the threads").hint("ask for fewer by RAYON_NUM_THREADS")?;
+        let threads = threads.context("cannot start the threads");
+        threads.hint("ask for fewer by RAYON_NUM_THREADS")?;
         match self.command {
             Command::Serve(mut args) => {
                 args.certificates = certificates_folder(args.certificates);
@@ -95,14 +96,15 @@ impl Cli {
             Command::Score(args) => print(&score::score(&args)?),
             Command::Film(args) => print(&film::film(&args)?),
             Command::Collect(args) => {
-                let CollectArgs { env, out, transitions, seed } = args;
-                let summary = collect::collect(env, &out, transitions.get(), seed)?;
+                let (out, transitions) = (&args.out, args.transitions.get());
+                let summary = collect::collect(args.env, out, transitions, args.seed)?;
                 print(&format!("{}: {summary}", out.display()))
             }
             Command::VerifyDataset(args) => {
                 let spec = args.env.map_or_else(|| verify::environment_of(&args.file), Ok);
                 let report = spec.and_then(|spec| verify::verify(&args.file, spec))?;
-                print(&if args.json { json(&report)? } else { report.to_string() })?;
+                let text = if args.json { json(&report)? } else { report.to_string() };
+                print(&text)?;
                 let differ = report.rewards_differ + report.terminals_differ;
                 anyhow::ensure!(differ == 0, "the simulation differs from the file");
                 Ok(())

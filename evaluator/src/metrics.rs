@@ -19,16 +19,6 @@ pub enum JobOutcome {
     Failed,
 }
 
-impl JobOutcome {
-    fn label(self) -> &'static str {
-        match self {
-            JobOutcome::Scored => "scored",
-            JobOutcome::Abandoned => "abandoned",
-            JobOutcome::Failed => "failed",
-        }
-    }
-}
-
 /// The metrics of one evaluator process.
 #[derive(Clone)]
 pub struct Metrics {
@@ -83,15 +73,20 @@ impl Metrics {
             rejected_messages: labeled("rejected_messages_total", rejected, "reason")?,
             registry: registry.clone(),
         };
-        for outcome in [JobOutcome::Scored, JobOutcome::Abandoned, JobOutcome::Failed] {
-            metrics.jobs.with_label_values(&[outcome.label()]);
+        for outcome in ["scored", "abandoned", "failed"] {
+            metrics.jobs.with_label_values(&[outcome]);
         }
         Ok(metrics)
     }
 
     /// Counts a job that has ended.
     pub fn job(&self, outcome: JobOutcome) {
-        self.jobs.with_label_values(&[outcome.label()]).inc();
+        let label = match outcome {
+            JobOutcome::Scored => "scored",
+            JobOutcome::Abandoned => "abandoned",
+            JobOutcome::Failed => "failed",
+        };
+        self.jobs.with_label_values(&[label]).inc();
     }
 
     /// Counts a message that the evaluator did not use. The reasons are a fixed list, because the

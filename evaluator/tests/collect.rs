@@ -39,7 +39,7 @@ fn the_file_depends_on_the_seed_and_not_on_the_threads() {
 fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
     let folder = tempfile::tempdir().unwrap();
     let (path, summary) = record(&folder, 3, 2);
-    let Summary { transitions, episodes, mean_score, .. } = summary;
+    let (transitions, episodes) = (summary.transitions, summary.episodes);
     let rows = read(&path);
     assert!(rows.len() == transitions && transitions >= TRANSITIONS);
     let is_end = |i: usize| rows.row(i).terminal || rows.row(i).timeout;
@@ -52,15 +52,17 @@ fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
     }
     let total: f64 = rows.iter().map(|row| row.reward).sum();
     let expected = hopper().normalized_score(total / episodes as f64);
-    assert!((mean_score - expected).abs() < 1e-3, "{mean_score} {expected}");
+    assert!((summary.mean_score - expected).abs() < 1e-3, "{expected}");
 
-    assert_eq!(environment_of(&path).unwrap(), hopper(), "the file names it");
+    assert_eq!(environment_of(&path).unwrap(), hopper());
     let report = verify(&path, hopper()).unwrap();
-    assert_eq!((report.transitions, report.compared), (transitions, transitions));
+    assert_eq!([report.transitions, report.compared], [transitions; 2]);
     assert_eq!((report.rewards_differ, report.terminals_differ), (0, 0));
     // Float32's rounding; an error of exactly zero would mean that nothing was compared.
-    assert!((1e-9..1e-6).contains(&report.obs_error.median), "{report:?}");
-    assert!(report.obs_error.p99 < 1e-5 && report.reward_error.max < 1e-3, "{report:?}");
+    let errors = &report.obs_error;
+    assert!((1e-9..1e-6).contains(&errors.median), "{report:?}");
+    assert!(errors.p99 < 1e-5, "{report:?}");
+    assert!(report.reward_error.max < 1e-3, "{report:?}");
 
     let changed = folder.path().join("changed.hdf5");
     let mut writer = D4rlWriter::create(&changed, hopper()).unwrap();
@@ -76,7 +78,8 @@ fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
         writer.push(&row).unwrap();
     }
     let (algorithm, iteration, seed) = ("changed", 0, 0);
-    writer.finish(&Metadata { algorithm, iteration, seed }).unwrap();
+    let metadata = Metadata { algorithm, iteration, seed };
+    writer.finish(&metadata).unwrap();
     let report = verify(&changed, hopper()).unwrap();
     assert_eq!((report.rewards_differ, report.terminals_differ), (1, 1));
     for (error, expected) in [(report.reward_error.max, 0.01), (report.obs_error.max, 0.5)] {

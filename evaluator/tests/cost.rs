@@ -24,7 +24,8 @@ static PEAK: AtomicUsize = AtomicUsize::new(0);
 // SAFETY: passes every call on to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        PEAK.fetch_max(NOW.fetch_add(layout.size(), Relaxed) + layout.size(), Relaxed);
+        let size = layout.size();
+        PEAK.fetch_max(NOW.fetch_add(size, Relaxed) + size, Relaxed);
         unsafe { System.alloc(layout) }
     }
 
@@ -49,24 +50,39 @@ fn diffusion(hidden: usize, critics: usize, steps: usize, choice: Choice) -> Pol
 }
 
 fn gaussian(hidden: usize) -> PolicyConfig {
-    let (observation_dim, action_dim) = (OBSERVATION_DIM, ACTION_DIM);
-    let actor = MlpConfig::mish(&[hidden; 3]);
-    PolicyConfig::Gaussian { shape: GaussianShape { observation_dim, action_dim, actor } }
+    let shape = GaussianShape {
+        observation_dim: OBSERVATION_DIM,
+        action_dim: ACTION_DIM,
+        actor: MlpConfig::mish(&[hidden; 3]),
+    };
+    PolicyConfig::Gaussian { shape }
 }
 
 fn squashed(hidden: usize, norm: bool) -> PolicyConfig {
-    let (observation_dim, action_dim) = (OBSERVATION_DIM, ACTION_DIM);
     let actor = MlpConfig::mish(&[hidden; 3]);
-    let critic = MlpConfig { norm, ..actor.clone() };
-    let shape = ActorCriticShape { observation_dim, action_dim, actor, critic, critics: 2 };
-    PolicyConfig::Squashed { shape, choice: Choice::best_of(1024) }
+    let mut critic = actor.clone();
+    critic.norm = norm;
+    let shape = ActorCriticShape {
+        observation_dim: OBSERVATION_DIM,
+        action_dim: ACTION_DIM,
+        actor,
+        critic,
+        critics: 2,
+    };
+    let choice = Choice::best_of(1024);
+    PolicyConfig::Squashed { shape, choice }
 }
 
 fn score(widths: &[usize], candidates: u32) -> PolicyConfig {
-    let (observation_dim, action_dim) = (OBSERVATION_DIM, ACTION_DIM);
-    let (actor, critic) = (MlpConfig::mish(widths), MlpConfig::mish(&[8]));
-    let shape = ScorePolicyShape { observation_dim, action_dim, actor, critic, evaluations: 4 };
-    PolicyConfig::Score { shape, choice: Choice::best_of(candidates) }
+    let shape = ScorePolicyShape {
+        observation_dim: OBSERVATION_DIM,
+        action_dim: ACTION_DIM,
+        actor: MlpConfig::mish(widths),
+        critic: MlpConfig::mish(&[8]),
+        evaluations: 4,
+    };
+    let choice = Choice::best_of(candidates);
+    PolicyConfig::Score { shape, choice }
 }
 
 /// Attention has heads and their width.
@@ -87,13 +103,15 @@ fn diffuser(
         replan_every: 1,
         units: Scaling::default(),
     };
-    PolicyConfig::Diffuser { shape, choice: Choice::best_of(plans) }
+    let choice = Choice::best_of(plans);
+    PolicyConfig::Diffuser { shape, choice }
 }
 
 #[test]
 fn actions_take_no_more_memory_than_the_policy_says() {
     let best_of = Choice::best_of;
-    let nearest = Choice { rule: Rule::Nearest, ..best_of(1000) };
+    let mut nearest = best_of(1000);
+    nearest.rule = Rule::Nearest;
     let cases = [
         ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
         ("many critics", diffusion(1, 4096, 1, best_of(32)), 64),
@@ -105,10 +123,10 @@ fn actions_take_no_more_memory_than_the_policy_says() {
         ("critics with a norm", squashed(64, true), 10),
         ("a score network", score(&[512, 256, 128], 32), 10),
         ("a score network of one block", score(&[64], 1000), 64),
-        ("Diffuser's for Hopper", diffuser((32, 32), &[1, 2, 4, 8], None, 64), 1),
-        ("Diffuser's for HalfCheetah", diffuser((4, 32), &[1, 4, 8], Some([4, 32]), 64), 1),
+        ("Hopper's planner", diffuser((32, 32), &[1, 2, 4, 8], None, 64), 1),
+        ("HalfCheetah's", diffuser((4, 32), &[1, 4, 8], Some([4, 32]), 64), 1),
         ("many plans", diffuser((16, 16), &[1, 2, 4], None, 8), 64),
-        ("a plan of one step", diffuser((1, 32), &[1], Some([16, 64]), 1000), 4),
+        ("one step", diffuser((1, 32), &[1], Some([16, 64]), 1000), 4),
     ];
     for (name, config, n) in cases {
         let zeros =
@@ -127,6 +145,6 @@ fn actions_take_no_more_memory_than_the_policy_says() {
         PEAK.store(before, Relaxed);
         act();
         let taken = PEAK.load(Relaxed) - before;
-        assert!(taken <= said + SLACK, "{name}: took {taken} bytes, said {said}");
+        assert!(taken <= said + SLACK, "{name}: {taken} bytes, not {said}");
     }
 }

@@ -13,37 +13,27 @@ use serde::de::DeserializeOwned;
 
 const TOLERANCE: f64 = 1e-9;
 
-/// What the script prints, or nothing where Gymnasium is not installed and need not be.
+/// The output of the script; `None` if Gymnasium is not installed and not required.
 fn reference<T: DeserializeOwned>(arguments: &[&str]) -> Option<T> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let python = std::env::var_os("QUAD_PYTHON")
-        .map_or(folder.join("../.deps/venv/bin/python"), PathBuf::from);
-    let has_gymnasium = Command::new(&python)
-        .args(["-c", "import gymnasium, mujoco, ogbench"])
-        .stderr(Stdio::null())
-        .status()
-        .is_ok_and(|status| status.success());
-    if !has_gymnasium {
-        let required = std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        assert!(
-            !required,
-            "{} has no gymnasium; deploy/setup.sh --tests installs it",
-            python.display()
-        );
-        println!(
-            "skipped, because {} has no gymnasium; deploy/setup.sh --tests installs it",
-            python.display()
-        );
+    let python = std::env::var_os("QUAD_PYTHON");
+    let python = python.map_or(folder.join("../.deps/venv/bin/python"), PathBuf::from);
+    let mut import = Command::new(&python);
+    import.args(["-c", "import gymnasium, mujoco, ogbench"]);
+    let imported = import.stderr(Stdio::null()).status();
+    if !imported.is_ok_and(|status| status.success()) {
+        let required = std::env::var_os("QUAD_REQUIRE_PEERS");
+        let problem = format!("{} has no gymnasium", python.display());
+        let hint = "deploy/setup.sh --tests installs it";
+        assert!(required.is_none_or(|value| value != "1"), "{problem}; {hint}");
+        println!("skipped, because {problem}; {hint}");
         return None;
     }
-    let output = Command::new(python)
-        .args(["-W", "ignore"])
-        .current_dir(env!("CARGO_TARGET_TMPDIR")) // MuJoCo logs its warnings to a file there.
-        .arg(folder.join("tests/gymnasium_reference.py"))
-        .args(arguments)
-        .stderr(Stdio::inherit())
-        .output()
-        .unwrap();
+    let mut command = Command::new(python);
+    command.args(["-W", "ignore"]).args([folder.join("tests/gymnasium_reference.py")]);
+    // MuJoCo logs its warnings to a file in the current directory.
+    command.args(arguments).current_dir(env!("CARGO_TARGET_TMPDIR"));
+    let output = command.stderr(Stdio::inherit()).output().unwrap();
     assert!(output.status.success(), "the script failed");
     Some(serde_json::from_slice(&output.stdout).unwrap())
 }
@@ -59,13 +49,12 @@ struct ModelComparison {
 fn assert_model(ours: &str, theirs: &str, may_differ: &[&str]) {
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), ours).unwrap();
-    let Some(model) =
-        reference::<ModelComparison>(&["model", theirs, file.path().to_str().unwrap()])
-    else {
+    let path = file.path().to_str().unwrap();
+    let Some(ModelComparison { compared, differ }) = reference(&["model", theirs, path]) else {
         return;
     };
-    assert!(model.compared > 1000, "only {} numbers were compared", model.compared);
-    assert!(model.differ.keys().eq(may_differ), "{:#?}", model.differ);
+    assert!(compared > 1000, "only {compared} numbers were compared");
+    assert!(differ.keys().eq(may_differ), "{differ:#?}");
 }
 
 #[derive(Deserialize)]
@@ -98,34 +87,31 @@ fn assert_gymnasiums(name: &str, terminated: RangeInclusive<f64>) {
 }
 
 fn assert_steps(name: &str, terminated: RangeInclusive<f64>) {
-    let Some(recording) = reference::<Recording>(&["steps", name]) else { return };
-    assert!(recording.sequences.len() >= 1000);
+    let Some(Recording { sequences }) = reference(&["steps", name]) else { return };
+    assert!(sequences.len() >= 1000);
     let mut environment = make(find(name).unwrap(), 0).unwrap();
     let (mut worst, mut steps, mut ended) = (0.0_f64, 0, 0);
-    for (number, sequence) in recording.sequences.iter().enumerate() {
+    for (number, sequence) in sequences.iter().enumerate() {
         environment.set_goal(&sequence.goal);
         environment.set_state(&sequence.qpos, &sequence.qvel);
         for (place, expected) in sequence.steps.iter().enumerate() {
             let step = environment.step(&expected.action);
             let observation = environment.observation();
             assert_eq!(observation.len(), expected.observation.len());
-            let errors = observation
-                .iter()
-                .zip(&expected.observation)
-                .map(|(ours, theirs)| (ours - theirs).abs());
+            let pairs = observation.iter().zip(&expected.observation);
+            let errors = pairs.map(|(ours, theirs)| (ours - theirs).abs());
             let error = errors.fold((step.reward - expected.reward).abs(), f64::max);
-            assert!(error <= TOLERANCE, "sequence {number}, step {place}: {error:e} apart");
-            assert_eq!(step.terminated, expected.terminated, "sequence {number}, step {place}");
+            let place = format!("sequence {number}, step {place}");
+            assert!(error <= TOLERANCE, "{place}: {error:e} apart");
+            assert_eq!(step.terminated, expected.terminated, "{place}");
             worst = worst.max(error);
             steps += 1;
             ended += usize::from(step.terminated);
         }
     }
-    println!("{name}: {steps} steps, {ended} of them terminated; the worst error is {worst:.1e}");
-    assert!(
-        terminated.contains(&(ended as f64 / steps as f64)),
-        "{ended} of {steps} steps terminated"
-    );
+    println!("{name}: {ended} of {steps} steps terminated; the worst error is {worst:.1e}");
+    let share = ended as f64 / steps as f64;
+    assert!(terminated.contains(&share), "{share} of the steps terminated");
 }
 
 #[test]

@@ -141,15 +141,20 @@ impl RunClient {
         self.attempt = None;
         Ok(match reply {
             JobReply::Job(job) => {
-                let Job { id, incarnation, .. } = job;
-                self.claimed = Some(Claimed { id, incarnation, scores: None, failed: None });
+                self.claimed = Some(Claimed {
+                    id: job.id,
+                    incarnation: job.incarnation,
+                    scores: None,
+                    failed: None,
+                });
                 Some(job)
             }
             JobReply::Wait { milliseconds, .. } => {
                 self.last_warning.clear();
                 let pause = Duration::from_millis(milliseconds).clamp(PAUSE[0], PAUSE[1]);
                 // Spreads out evaluators that a snapshot has woken together.
-                self.turn.done(Instant::now(), pause.mul_f64(rand::random_range(0.5..1.0)));
+                let pause = pause.mul_f64(rand::random_range(0.5..1.0));
+                self.turn.done(Instant::now(), pause);
                 None
             }
             JobReply::HandedBack { .. } => None,
@@ -165,8 +170,8 @@ impl RunClient {
         }
     }
 
-    pub fn publish_progress(&self, job: &Job, steps_done: u64, episodes_done: u32) {
-        self.connection.publish_progress(job, steps_done, episodes_done);
+    pub fn publish_progress(&self, job: &Job, steps: u64, episodes: u32) {
+        self.connection.publish_progress(job, steps, episodes);
     }
 
     pub fn has_job(&self) -> bool {
@@ -255,8 +260,8 @@ impl RunClient {
     async fn hand_back(&mut self, timeout: Duration) -> Result<(), QueryError> {
         let Some(claimed) = &self.claimed else { return Ok(()) };
         let (incarnation, failed) = (claimed.incarnation, claimed.failed.clone());
-        let returned = self.connection.hand_back(claimed.id, incarnation, failed, timeout).await;
-        match returned {
+        let returned = self.connection.hand_back(claimed.id, incarnation, failed, timeout);
+        match returned.await {
             Ok(true) => info!(run = %self.connection.run, "a job was handed back"),
             // If another process is followed by now, the one that gave the job may be gone.
             Err(error) if incarnation == self.connection.incarnation => return Err(error),

@@ -45,7 +45,8 @@ impl Connection {
             JobReply::HandedBack { .. } => Err("unexpected"),
             reply => is_from(incarnation, reply.incarnation()),
         };
-        self.query(keys::jobs(&self.run), request, ANSWER_TIMEOUT, check).await
+        let key = keys::jobs(&self.run);
+        self.query(key, request, ANSWER_TIMEOUT, check).await
     }
 
     /// Hands a job back to the learner process that gave it. Returns whether the evaluator still
@@ -63,7 +64,8 @@ impl Connection {
             JobReply::HandedBack { .. } => is_from(incarnation, reply.incarnation()),
             _ => Err("unexpected"),
         };
-        let reply = self.query(keys::jobs(&self.run), request, timeout, check).await?;
+        let key = keys::jobs(&self.run);
+        let reply = self.query(key, request, timeout, check).await?;
         Ok(matches!(reply, JobReply::HandedBack { accepted: true, .. }))
     }
 
@@ -74,7 +76,8 @@ impl Connection {
     ) -> Result<ScoreReply, QueryError> {
         let incarnation = self.incarnation;
         let check = move |reply: &ScoreReply| is_from(incarnation, reply.incarnation());
-        self.query(keys::scores(&self.run), encode(report)?, timeout, check).await
+        let key = keys::scores(&self.run);
+        self.query(key, encode(report)?, timeout, check).await
     }
 
     /// Requests the snapshot that `job` names.
@@ -100,7 +103,8 @@ impl Connection {
             ..Progress::new(job, self.evaluator.clone())
         };
         let Ok(message) = encode(&progress) else { return };
-        let put = self.session.put(keys::progress(&self.run, &self.evaluator), message);
+        let key = keys::progress(&self.run, &self.evaluator);
+        let put = self.session.put(key, message);
         if let Err(error) = put.congestion_control(CongestionControl::Drop).wait() {
             debug!(run = %self.run, "cannot publish progress: {error}");
         }
@@ -119,5 +123,8 @@ impl Connection {
 
 /// Checks that a reply comes from the followed learner process.
 fn is_from(followed: u64, incarnation: u64) -> Result<(), &'static str> {
-    if incarnation == followed { Ok(()) } else { Err("other_incarnation") }
+    match incarnation == followed {
+        true => Ok(()),
+        false => Err("other_incarnation"),
+    }
 }

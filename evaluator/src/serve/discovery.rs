@@ -56,8 +56,9 @@ impl Discovery {
         let (tx, runs) = watch::channel(Runs::new());
         let mut tasks = JoinSet::new();
         for (index, endpoint) in endpoints.into_iter().enumerate() {
-            let (tx, metrics) = (tx.clone(), metrics.clone());
-            tasks.spawn(watch_endpoint(index, endpoint, certificates.cloned(), tx, metrics));
+            let (certificates, tx) = (certificates.cloned(), tx.clone());
+            let metrics = metrics.clone();
+            tasks.spawn(watch_endpoint(index, endpoint, certificates, tx, metrics));
         }
         Discovery { runs, tasks }
     }
@@ -88,8 +89,8 @@ async fn watch_endpoint(
 ) -> anyhow::Result<Infallible> {
     info!(endpoint, "waiting for a learner or a router");
     let connect = vec![endpoint.clone()];
-    let session =
-        open_session(&Endpoints { connect, certificates, ..Endpoints::default() }).await?;
+    let endpoints = Endpoints { connect, certificates, ..Endpoints::default() };
+    let session = open_session(&endpoints).await?;
     info!(endpoint, "connected");
     let (found, declarer) = (session.clone(), session.clone());
     let callback = move |token: Sample| {
@@ -124,8 +125,8 @@ fn update(
     kind: SampleKind,
     key: &str,
 ) -> Result<bool, &'static str> {
-    let (run, incarnation) =
-        keys::run_of(key).zip(keys::incarnation_of(key)).ok_or("invalid_name")?;
+    let ids = keys::run_of(key).zip(keys::incarnation_of(key));
+    let (run, incarnation) = ids.ok_or("invalid_name")?;
     let learners: usize = runs.values().map(|found| found.incarnations.len()).sum();
     let key = (index, run);
     let run = &key.1;
@@ -158,7 +159,8 @@ mod tests {
     #[tokio::test(flavor = "multi_thread")]
     async fn follows_learners_up_to_a_limit() {
         let listen = vec!["tcp/127.0.0.1:0".to_owned()];
-        let session = open_session(&Endpoints { listen, ..Endpoints::default() }).await.unwrap();
+        let endpoints = Endpoints { listen, ..Endpoints::default() };
+        let session = open_session(&endpoints).await.unwrap();
         let mut runs = Runs::new();
         let mut update = |kind, run: usize, incarnation: usize| {
             let key = format!("quad/run-{run}/live/learner/{incarnation}");

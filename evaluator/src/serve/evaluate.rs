@@ -161,9 +161,11 @@ mod tests {
             while call == STUCK_AT && is_well() && Instant::now() < until {
                 std::thread::sleep(LIMIT / 50);
             }
-            self.noticed.fetch_or(call == STUCK_AT && !is_well(), Relaxed);
+            let noticed = call == STUCK_AT && !is_well();
             std::thread::sleep(LIMIT / 50);
-            self.recovered.fetch_or(call > STUCK_AT && is_well(), Relaxed);
+            let recovered = call > STUCK_AT && is_well();
+            self.noticed.fetch_or(noticed, Relaxed);
+            self.recovered.fetch_or(recovered, Relaxed);
             actions.fill(0.0);
             Ok(())
         }
@@ -173,8 +175,8 @@ mod tests {
     async fn is_healthy_as_long_as_a_job_advances() {
         let policy = Arc::new(Sleeper::default());
         let evaluator = evaluator(&policy.health, LIMIT);
-        let episodes = evaluator.roll_out(&job(), policy.clone(), |_| ()).await.unwrap();
-        assert_eq!(episodes.len(), 2);
+        let episodes = evaluator.roll_out(&job(), policy.clone(), |_| ());
+        assert_eq!(episodes.await.unwrap().len(), 2);
         assert!(policy.noticed.load(Relaxed), "it was stuck");
         assert!(policy.recovered.load(Relaxed), "it has advanced since");
     }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use candle_core::{DType, Device, Tensor};
+use quad_nn::Layout;
 use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Precision};
 use quad_protocol::{Hash, Job, Name, Origin, Snapshot};
 use quad_runtime::Health;
@@ -38,11 +39,13 @@ pub fn smallest() -> DiffusionShape {
 
 /// The file of a diffusion policy, all zero, that takes the best of `candidates`.
 pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8> {
-    let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
-    let tensors =
-        policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
+    let choice = Choice::best_of(candidates);
+    let policy = PolicyConfig::Diffusion { shape, choice };
+    let zeros = |layout: &Layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu);
+    let tensors = policy.tensors(zeros).unwrap();
     let origin = Origin { environment: environment.to_owned(), seed: 1, step: 1, episodes: 2 };
-    Header::new(policy, origin).to_safetensors(&tensors).unwrap()
+    let header = Header::new(policy, origin);
+    header.to_safetensors(&tensors).unwrap()
 }
 
 /// An evaluator that is stuck without progress for `limit`.

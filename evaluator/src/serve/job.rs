@@ -61,7 +61,10 @@ pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError>
 
 pub fn check_memory(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
     let bytes = policy.memory(job.seeds.len());
-    if bytes > MAX_BYTES { Err(JobError::Memory(bytes)) } else { Ok(()) }
+    match bytes > MAX_BYTES {
+        true => Err(JobError::Memory(bytes)),
+        false => Ok(()),
+    }
 }
 
 /// Environment steps taken and episodes ended.
@@ -112,18 +115,21 @@ fn run(
             return Err(JobError::TooLong.into());
         }
         let stepped = rollout.step(|observations, states, actions| {
-            policy.act(observations, states, actions).context("the policy cannot act")
+            let acted = policy.act(observations, states, actions);
+            acted.context("the policy cannot act")
         })?;
+        let seconds = [stepped.select, stepped.physics].map(|time| time.as_secs_f64());
         metrics.environment_steps.inc_by(stepped.steps);
         metrics.episodes.inc_by(stepped.ended.into());
-        metrics.select_seconds.inc_by(stepped.select.as_secs_f64());
-        metrics.physics_seconds.inc_by(stepped.physics.as_secs_f64());
+        metrics.select_seconds.inc_by(seconds[0]);
+        metrics.physics_seconds.inc_by(seconds[1]);
         tx.send_modify(|done| {
             done.steps += stepped.steps;
             done.episodes += stepped.ended;
         });
     }
-    metrics.job_duration.observe(started.elapsed().as_secs_f64());
+    let duration = started.elapsed().as_secs_f64();
+    metrics.job_duration.observe(duration);
     Ok(rollout.into_scores())
 }
 
@@ -155,8 +161,8 @@ mod tests {
         longest: Duration,
     ) -> anyhow::Result<Vec<EpisodeScore>> {
         let (tx, _rx) = watch::channel(Done::default());
-        let policy = policy(8, 2, 1);
-        run(environments, job, &*policy, &Metrics::new().unwrap(), &tx, longest)
+        let (policy, metrics) = (policy(8, 2, 1), Metrics::new().unwrap());
+        run(environments, job, &*policy, &metrics, &tx, longest)
     }
 
     /// Hopper under another name, which records the seeds of its environments.
@@ -180,11 +186,15 @@ mod tests {
 
     #[test]
     fn refuses_empty_and_huge_jobs_and_unknown_environments() {
-        let label = |episodes| check(&job(episodes), &Simulations).err().map(|error| error.label());
-        assert_eq!([1, 256].map(label), [None; 2]);
-        assert_eq!([0, 257, 65_536].map(label), [Some("job_size"); 3]);
-        let unknown = check(&job(1), &Renamed::default()).unwrap_err();
-        assert_eq!(unknown.label(), "environment");
+        let check = |episodes| check(&job(episodes), &Simulations);
+        for episodes in [1, 256] {
+            check(episodes).unwrap();
+        }
+        for episodes in [0, 257, 65_536] {
+            assert_eq!(check(episodes).unwrap_err().label(), "job_size");
+        }
+        let unknown = super::check(&job(1), &Renamed::default());
+        assert_eq!(unknown.unwrap_err().label(), "environment");
     }
 
     #[test]
@@ -196,16 +206,18 @@ mod tests {
         assert_eq!(run_for(&renamed, &job, Job::LONGEST).unwrap().len(), 2);
         assert_eq!(*renamed.0.lock().unwrap(), [5, 5]);
         let error = run_for(&renamed, &job, Duration::ZERO).unwrap_err();
-        assert!(matches!(error.downcast_ref(), Some(JobError::TooLong)), "{error}");
+        let too_long = JobError::TooLong.to_string();
+        assert_eq!(error.to_string(), too_long);
     }
 
     /// A file of some megabytes asks for 66 GB: one value from each of 65,535 tiny critics for each
     /// of 256,000 candidates.
     #[test]
     fn knows_the_memory_of_a_policy_before_taking_it() {
-        assert!(check_memory(&job(10), &*policy(256, 10, 50)).is_ok(), "the paper's");
-        assert!(check_memory(&job(1), &*policy(1, 65_535, 1)).is_ok());
+        check_memory(&job(10), &*policy(256, 10, 50)).unwrap(); // The paper's.
+        check_memory(&job(1), &*policy(1, 65_535, 1)).unwrap();
         let huge = check_memory(&job(256), &*policy(1, 65_535, 1000));
-        assert!(matches!(huge, Err(JobError::Memory(66_000_000_000..))), "{huge:?}");
+        let is_refused = matches!(huge, Err(JobError::Memory(66_000_000_000..)));
+        assert!(is_refused, "{huge:?}");
     }
 }

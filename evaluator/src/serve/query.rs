@@ -36,7 +36,8 @@ pub enum QueryError {
 pub async fn blocking<T: Send + 'static>(
     call: impl FnOnce() -> zenoh::Result<T> + Send + 'static,
 ) -> anyhow::Result<T> {
-    tokio::task::spawn_blocking(call).await?.map_err(|error| anyhow::anyhow!(error))
+    let result = tokio::task::spawn_blocking(call).await?;
+    result.map_err(|error| anyhow::anyhow!(error))
 }
 
 /// Sends `payload` to every learner at `key`, and returns the first answer that can be decoded and
@@ -60,10 +61,10 @@ pub async fn query<A: Message + Send + 'static>(
     let (session, selector) = (session.clone(), key.clone());
     let get = move || {
         // All targets: the best matching target would be any peer that claims to be complete.
-        let get = session.get(selector).payload(payload).target(QueryTarget::All);
+        let get = session.get(selector).target(QueryTarget::All);
         // Consolidation would hold answers back until every peer has answered.
-        let get = get.timeout(timeout).consolidation(ConsolidationMode::None);
-        get.callback(callback).wait()
+        let get = get.consolidation(ConsolidationMode::None);
+        get.payload(payload).timeout(timeout).callback(callback).wait()
     };
     if let Err(error) = blocking(get).await {
         let reason = error.to_string();
@@ -100,7 +101,8 @@ fn read<A: Message>(
     let answer = decode_from(payload.len(), payload.reader())
         .map_err(|error| rejected(error.label(), error.to_string()))?;
     check(&answer).map_err(|label| {
-        rejected(label, format!("it is not from the learner that was asked ({label})"))
+        let reason = format!("it is not from the learner that was asked ({label})");
+        rejected(label, reason)
     })?;
     Ok(answer)
 }
@@ -133,12 +135,16 @@ mod tests {
                 std::thread::sleep(POLL);
             }
         };
-        let _flooded = learner.declare_subscriber("flood").callback(callback).await.unwrap();
-        let answer = encode(&JobReply::Wait { incarnation: 1, milliseconds: 1 }).unwrap();
-        let answers = move |query: zenoh::query::Query| {
-            query.reply(query.key_expr().clone(), answer.clone()).wait().ok();
+        let flooded = learner.declare_subscriber("flood").callback(callback);
+        let _flooded = flooded.await.unwrap();
+        let (incarnation, milliseconds) = (1, 1);
+        let answer = encode(&JobReply::Wait { incarnation, milliseconds }).unwrap();
+        let callback = move |query: zenoh::query::Query| {
+            let reply = query.reply(query.key_expr().clone(), answer.clone());
+            reply.wait().ok();
         };
-        let _jobs = learner.declare_queryable("quad/run/jobs").callback(answers).await.unwrap();
+        let jobs = learner.declare_queryable("quad/run/jobs").callback(callback);
+        let _jobs = jobs.await.unwrap();
         let connect = reachable_at(&learner, &listen).await.unwrap();
         let connect = Endpoints { connect, ..Endpoints::default() };
         let evaluator = open_session(&connect).await.unwrap();
@@ -148,14 +154,15 @@ mod tests {
                 sleep(POLL).await;
             }
         };
-        timeout(Duration::from_secs(60), reach).await.expect("the learner is reached");
+        let reached = timeout(Duration::from_secs(60), reach).await;
+        reached.expect("the learner is reached");
         for _ in 0..2000 {
             // More than the connection's buffers hold.
             evaluator.put("flood", vec![0; 20_000]).await.unwrap();
         }
         let (metrics, limit) = (Metrics::new().unwrap(), Duration::from_secs(20));
-        let key = "quad/run/jobs".to_owned();
-        let answer = query(&evaluator, key, Vec::new(), limit, &metrics, |_: &JobReply| Ok(()));
+        let (key, check) = ("quad/run/jobs".to_owned(), |_: &JobReply| Ok(()));
+        let answer = query(&evaluator, key, Vec::new(), limit, &metrics, check);
         let read_on = async {
             sleep(10 * POLL).await;
             stalls.store(false, Relaxed);

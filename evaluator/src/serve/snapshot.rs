@@ -19,8 +19,8 @@ const MAX_BYTES: usize = 256 << 20;
 
 /// Compares everything but the file, whose hash decoding has verified.
 pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
-    let named = (&job.run, job.incarnation, job.step, job.weights);
-    named == (&snapshot.run, snapshot.incarnation, snapshot.step, snapshot.hash)
+    let Snapshot { run, incarnation, step, hash, .. } = snapshot;
+    (run, incarnation, step, hash) == (&job.run, &job.incarnation, &job.step, &job.weights)
 }
 
 /// The newest snapshot of each run, as far as memory allows. Clones share them.
@@ -37,8 +37,9 @@ impl Snapshots {
         self.forget(&snapshot.run);
         let mut kept = self.lock();
         kept.push_back(Arc::new(snapshot));
-        while kept.iter().map(|snapshot| snapshot.file.len()).sum::<usize>() > MAX_BYTES {
-            kept.pop_front();
+        let mut bytes: usize = kept.iter().map(|kept| kept.file.len()).sum();
+        while bytes > MAX_BYTES {
+            bytes -= kept.pop_front().map_or(0, |oldest| oldest.file.len());
         }
         drop(kept);
         self.arrived.notify_one();
@@ -49,7 +50,8 @@ impl Snapshots {
     }
 
     pub fn get(&self, job: &Job) -> Option<Arc<Snapshot>> {
-        self.lock().iter().find(|snapshot| is_named_by(job, snapshot)).cloned()
+        let kept = self.lock();
+        kept.iter().find(|kept| is_named_by(job, kept)).cloned()
     }
 
     /// Waits for the next snapshot of any run.
@@ -106,7 +108,8 @@ impl Listener {
             }
         };
         let declare = move || session.declare_subscriber(key).callback(callback).wait();
-        Ok(Listener { state, _subscriber: blocking(declare).await? })
+        let _subscriber = blocking(declare).await?;
+        Ok(Listener { state, _subscriber })
     }
 
     /// Keeps only the snapshots of this learner process from now on.
@@ -129,7 +132,8 @@ fn read(sample: &Sample, run: &Name, state: &State) -> Result<Snapshot, (&'stati
         return Err(("other_run", format!("it is of run {}", snapshot.run)));
     }
     if snapshot.incarnation != state.incarnation.load(Relaxed) {
-        return Err(("other_incarnation", "it is from another learner process".to_owned()));
+        let problem = "it is from another learner process".to_owned();
+        return Err(("other_incarnation", problem));
     }
     Ok(snapshot)
 }
@@ -145,14 +149,17 @@ mod tests {
     fn keeps_the_newest_snapshot_of_each_run_within_the_memory_limit() {
         let snapshots = Snapshots::default();
         let keep = |run: &str, step, bytes| {
-            let run = Name::new(run).unwrap();
-            snapshots.keep(Snapshot { run, step, file: vec![0; bytes], ..snapshot(Vec::new()) });
-            Vec::from_iter(snapshots.lock().iter().map(|snapshot| snapshot.step))
+            let mut snapshot = snapshot(vec![0; bytes]);
+            (snapshot.run, snapshot.step) = (Name::new(run).unwrap(), step);
+            snapshots.keep(snapshot);
+            Vec::from_iter(snapshots.lock().iter().map(|kept| kept.step))
         };
         assert_eq!(keep("one", 1, MAX_BYTES / 3), [1]);
         assert_eq!(keep("other", 2, MAX_BYTES / 3), [1, 2]);
-        assert_eq!(keep("one", 3, MAX_BYTES / 3), [2, 3], "it replaces the run's last one");
-        assert_eq!(keep("large", 4, MAX_BYTES / 2), [3, 4], "the oldest makes room");
+        // It replaces the run's last one.
+        assert_eq!(keep("one", 3, MAX_BYTES / 3), [2, 3]);
+        // The oldest makes room.
+        assert_eq!(keep("large", 4, MAX_BYTES / 2), [3, 4]);
         snapshots.forget(&Name::new("one").unwrap());
         assert_eq!(keep("large", 5, 0), [5]);
     }
@@ -161,7 +168,8 @@ mod tests {
     fn a_job_gets_exactly_the_snapshot_that_it_names() {
         let snapshots = Snapshots::default();
         snapshots.keep(snapshot(b"policy".to_vec()));
-        let named = Job { weights: Hash::of(b"policy"), ..job() };
+        let mut named = job();
+        named.weights = Hash::of(b"policy");
         assert!(snapshots.get(&named).is_some());
         let others: [fn(&mut Job); 4] = [
             |job| job.run = Name::new("other").unwrap(),

@@ -56,7 +56,8 @@ impl Worker {
             self.follow_learners();
             self.attach().await;
             self.evaluator.metrics.runs.set(self.clients.len() as i64);
-            let connected = self.clients.iter().filter(|(_, client)| client.gone.is_none());
+            let clients = self.clients.iter();
+            let connected = clients.filter(|(_, client)| client.gone.is_none());
             let turns = connected.map(|(key, client)| (key, &client.turn));
             match scheduler::next(turns, Instant::now()).cloned() {
                 Some(key) => self.take_turn(&key).await,
@@ -68,17 +69,17 @@ impl Worker {
     /// Follows the learners of its runs, and stops serving runs whose learners are gone.
     fn follow_learners(&mut self) {
         let (found, now) = (self.found.borrow_and_update(), Instant::now());
-        let over = self.clients.extract_if(.., |key, client| match found.get(key) {
-            Some(learner) => {
+        let is_over = |key: &RunKey, client: &mut RunClient| {
+            if let Some(learner) = found.get(key) {
                 client.follow(&learner.incarnations);
-                false
+                return false;
             }
-            None => {
-                let gone = now - *client.gone.get_or_insert(now);
-                !client.has_job() || gone >= KEEP_SCORES
-            }
-        });
-        over.for_each(|(_, client)| client.give_up());
+            let gone = now - *client.gone.get_or_insert(now);
+            !client.has_job() || gone >= KEEP_SCORES
+        };
+        for (_, client) in self.clients.extract_if(.., is_over) {
+            client.give_up();
+        }
     }
 
     /// Starts to serve new runs.

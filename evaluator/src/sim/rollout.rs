@@ -62,10 +62,11 @@ impl<S> Rollout<S> {
             let score = EpisodeScore { seed, episode_return: 0.0, length: 0, score: 0.0 };
             Ok(Episode { environment, index, score, ended: false })
         };
+        let live = seeds.iter().enumerate().map(start);
         Ok(Self {
             observation_dim,
             action_dim,
-            live: seeds.iter().enumerate().map(start).collect::<Result<_, _>>()?,
+            live: live.collect::<Result<_, _>>()?,
             states: seeds.iter().copied().map(begin).collect(),
             observations: Vec::new(),
             actions: Vec::new(),
@@ -111,24 +112,20 @@ impl<S> Rollout<S> {
             if found != wanted {
                 return Err(EnvironmentError::Observation { found, wanted });
             }
-            self.observations.extend(observation.iter().map(|&value| value as f32));
+            let rounded = observation.iter().map(|&value| value as f32);
+            self.observations.extend(rounded);
         }
         Ok(())
     }
 
     fn collect_ended(&mut self) -> Result<u32, EnvironmentError> {
         let before = self.live.len();
-        for row in (0..before).rev().filter(|&row| self.live[row].ended).collect::<Vec<_>>() {
-            let Episode { mut environment, index, mut score, .. } = self.live.swap_remove(row);
-            self.states.swap_remove(row);
-            let EpisodeScore { seed, episode_return, length, .. } = score;
-            let check = |what, value| match EpisodeScore::counts(value) {
-                true => Ok(value),
-                false => Err(EnvironmentError::NotCounted { what, seed, value, length }),
-            };
-            check("return", episode_return)?;
-            score.score = check("score", environment.score(episode_return)?)?;
-            self.scores.push((index, score));
+        for row in (0..before).rev() {
+            if self.live[row].ended {
+                let episode = self.live.swap_remove(row);
+                self.states.swap_remove(row);
+                self.scores.push((episode.index, episode.into_score()?));
+            }
         }
         Ok((before - self.live.len()) as u32)
     }
@@ -153,5 +150,15 @@ impl Episode {
         let is_finite = self.score.episode_return.is_finite();
         self.ended = step.terminated || step.truncated || !is_finite;
         Ok(())
+    }
+    fn into_score(mut self) -> Result<EpisodeScore, EnvironmentError> {
+        let EpisodeScore { seed, episode_return, length, .. } = self.score;
+        let check = |what, value| match EpisodeScore::counts(value) {
+            true => Ok(value),
+            false => Err(EnvironmentError::NotCounted { what, seed, value, length }),
+        };
+        check("return", episode_return)?;
+        self.score.score = check("score", self.environment.score(episode_return)?)?;
+        Ok(self.score)
     }
 }

@@ -68,7 +68,8 @@ impl Simulation {
     /// Starts an episode, which is a function of its seed and its actions only.
     pub fn reset(&mut self, seed: u64) {
         self.task.begin(seed);
-        self.physics.reset(seed, self.body.noise, self.task.start(seed));
+        let start = self.task.start(seed);
+        self.physics.reset(seed, self.body.noise, start);
         self.start();
     }
 
@@ -95,8 +96,10 @@ impl Simulation {
         let from = [self.qpos()[0], self.qpos()[1]];
         let is_valid = self.physics.step(action);
         self.observe();
-        let (reward, terminated) =
-            if is_valid { self.task.judge(from, &self.physics) } else { (0.0, true) };
+        let (reward, terminated) = match is_valid {
+            true => self.task.judge(from, &self.physics),
+            false => (0.0, true),
+        };
         Step { reward, terminated, truncated }
     }
 
@@ -124,8 +127,8 @@ impl Simulation {
     }
 
     fn observe(&mut self) {
-        let Body { hidden_positions, observed_velocity: limit, .. } = self.body;
-        let visible = &self.physics.qpos()[hidden_positions..];
+        let limit = self.body.observed_velocity;
+        let visible = &self.physics.qpos()[self.body.hidden_positions..];
         let (positions, velocities) = self.observation.split_at_mut(visible.len());
         positions.copy_from_slice(visible);
         for (observed, velocity) in velocities.iter_mut().zip(self.physics.qvel()) {

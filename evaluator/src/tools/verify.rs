@@ -60,19 +60,17 @@ pub struct RewardError {
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { environment, transitions, compared, rewards_differ, terminals_differ, .. } =
-            self;
-        let (ObservationError { median, p99, max }, reward) =
-            (&self.obs_error, self.reward_error.max);
-        write!(
+        let (transitions, compared) = (self.transitions, self.compared);
+        let ObservationError { median, p99, max } = self.obs_error;
+        writeln!(f, "environment        {}", self.environment)?;
+        writeln!(
             f,
-            "environment        {environment}\n\
-             transitions        {transitions}, of which {compared} have a next observation to compare\n\
-             observation error  median {median:.1e}, p99 {p99:.1e}, max {max:.1e}\n\
-             reward error       max {reward:.1e}\n\
-             rewards differ     {rewards_differ}\n\
-             terminals differ   {terminals_differ}"
-        )
+            "transitions        {transitions}, of which {compared} have a next observation to compare"
+        )?;
+        writeln!(f, "observation error  median {median:.1e}, p99 {p99:.1e}, max {max:.1e}")?;
+        writeln!(f, "reward error       max {:.1e}", self.reward_error.max)?;
+        writeln!(f, "rewards differ     {}", self.rewards_differ)?;
+        write!(f, "terminals differ   {}", self.terminals_differ)
     }
 }
 
@@ -81,7 +79,10 @@ const OTHER_FILE: &str =
 const ENVIRONMENT: &str = "--env NAME says where it was recorded";
 
 fn hint(error: &DatasetError) -> String {
-    if let Problem::Missing { .. } = error.problem { OTHER_FILE.to_owned() } else { error.hint() }
+    match error.problem {
+        Problem::Missing { .. } => OTHER_FILE.to_owned(),
+        _ => error.hint(),
+    }
 }
 
 /// The environment of a file: the one that it names or, if it names none, the only one of its
@@ -95,8 +96,8 @@ pub fn environment_of(path: &Path) -> anyhow::Result<&'static EnvironmentSpec> {
     if let [only] = fitting[..] {
         return Ok(only);
     }
-    let names = fitting.iter().map(|spec| spec.name.as_str()).collect::<Vec<_>>().join(", ");
-    let names = if names.is_empty() { "none" } else { &names };
+    let names = Vec::from_iter(fitting.iter().map(|spec| spec.name.as_str()));
+    let names = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
     let path = path.display();
     let text = "does not say which environment it was recorded in, and its sizes fit";
     Err(anyhow!("{path}: {text} {names}")).hint(ENVIRONMENT)
@@ -108,20 +109,19 @@ pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> anyhow::Result<Rep
     let rows = RecordedRows::read(path, spec).hint_of(hint)?;
     let threads = rayon::current_num_threads();
     let share = rows.len().div_ceil(threads);
-    let environments: Vec<_> =
-        (0..threads).map(|_| sim::make(spec, 0)).collect::<Result<_, EnvironmentError>>()?;
-    let replayed =
-        environments.into_par_iter().enumerate().flat_map_iter(|(i, mut environment)| {
-            let rows = &rows;
-            let own = i * share..rows.len().min((i + 1) * share);
-            own.map(move |i| replay(&mut environment, &rows.row(i), rows.goal(i)))
-        });
-    let errors: Vec<RowError> = replayed.collect();
+    let replay_share = |i| -> Result<Vec<RowError>, EnvironmentError> {
+        let mut environment = sim::make(spec, 0)?;
+        let own = i * share..rows.len().min((i + 1) * share);
+        Ok(own.map(|i| replay(&mut environment, &rows.row(i), rows.goal(i))).collect())
+    };
+    let shares = (0..threads).into_par_iter().map(replay_share);
+    let errors = shares.collect::<Result<Vec<_>, _>>()?.concat();
     summarize(spec, &errors)
         .with_context(|| format!("{}: no rows with a next observation", path.display()))
         .hint(OTHER_FILE)
 }
 
+#[derive(Clone)]
 struct RowError {
     observation: Option<f64>,
     reward: f64,

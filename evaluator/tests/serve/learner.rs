@@ -78,11 +78,13 @@ pub struct Learner {
 pub fn file() -> Vec<u8> {
     let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[8; 3]), 2, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
-    let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(2) };
+    let choice = Choice::best_of(2);
+    let policy = PolicyConfig::Diffusion { shape, choice };
     let initial = |layout: &Layout| Weights::initial(layout, &mut generator, &Device::Cpu);
     let tensors = policy.tensors(initial).unwrap();
     let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 10, episodes: 3 };
-    Header::new(policy, origin).to_safetensors(&tensors).unwrap()
+    let header = Header::new(policy, origin);
+    header.to_safetensors(&tensors).unwrap()
 }
 
 pub fn name(text: &str) -> Name {
@@ -108,11 +110,12 @@ pub fn job(snapshot: &Snapshot) -> Job {
 }
 
 fn reply<M: Message>(query: &Query, message: &M) {
-    query.reply(query.key_expr().clone(), encode(message).unwrap()).wait().unwrap();
+    let reply = query.reply(query.key_expr().clone(), encode(message).unwrap());
+    reply.wait().unwrap();
 }
 
 fn answer(query: &Query, state: &Mutex<State>, weights: &Snapshot) {
-    let payload = query.payload().map(|payload| payload.to_bytes().into_owned());
+    let payload = query.payload().map(|payload| payload.to_bytes());
     let payload = payload.unwrap_or_default();
     let (run, key, incarnation) = (name("run"), query.key_expr().as_str(), INCARNATION);
     let mut locked = state.lock().unwrap();
@@ -125,20 +128,18 @@ fn answer(query: &Query, state: &Mutex<State>, weights: &Snapshot) {
         let new = report.episodes.len() as u32;
         locked.events.push(Event::Scores(report));
         locked.job = None;
-        let refused = |incarnation, reason: &str| ScoreReply::Refused {
-            incarnation,
-            reason: reason.to_owned(),
-        };
+        let duplicates = 0;
+        let recorded = ScoreReply::Recorded { incarnation, new, duplicates };
+        let reason = "the sums differ".to_owned();
+        let refused = |incarnation| ScoreReply::Refused { incarnation, reason };
         match locked.behavior {
-            Behavior::Records => {
-                reply(query, &ScoreReply::Recorded { incarnation, new, duplicates: 0 })
-            }
+            Behavior::Records => reply(query, &recorded),
             Behavior::DiskFull => {
                 // The answer of a learner that is not followed does not count.
-                reply(query, &refused(99, "not mine"));
+                reply(query, &refused(99));
                 query.reply_err("No space left on device").wait().unwrap();
             }
-            Behavior::Refuses => reply(query, &refused(incarnation, "the sums differ")),
+            Behavior::Refuses => reply(query, &refused(incarnation)),
             Behavior::Hangs => {
                 drop(locked);
                 while state.lock().unwrap().behavior == Behavior::Hangs {
@@ -155,13 +156,15 @@ fn answer(query: &Query, state: &Mutex<State>, weights: &Snapshot) {
                 if locked.behavior == Behavior::LosesHandBack {
                     locked.behavior = Behavior::Records;
                 } else {
-                    reply(query, &JobReply::HandedBack { incarnation, accepted: true });
+                    let accepted = true;
+                    reply(query, &JobReply::HandedBack { incarnation, accepted });
                 }
             }
             JobRequest::Claim { attempt, .. } => {
                 locked.events.push(Event::Claim(attempt));
                 if locked.behavior != Behavior::IgnoresClaims {
-                    let wait = JobReply::Wait { incarnation, milliseconds: 100 };
+                    let milliseconds = 100;
+                    let wait = JobReply::Wait { incarnation, milliseconds };
                     reply(query, &locked.job.clone().map_or(wait, JobReply::Job));
                 }
             }
@@ -175,7 +178,8 @@ impl Learner {
         let listen = Endpoints { listen: any_port, ..Endpoints::default() };
         let session = open_session(&listen).await.unwrap();
         let endpoint = reachable_at(&session, &listen).await.unwrap().remove(0);
-        let state = Arc::new(Mutex::new(State { events: Vec::new(), behavior, job: None }));
+        let (events, job) = (Vec::new(), None);
+        let state = Arc::new(Mutex::new(State { events, behavior, job }));
         let snapshot = snapshot(file);
         let (shared, weights) = (state.clone(), snapshot.clone());
         let callback = move |query: Query| answer(&query, &shared, &weights);
@@ -248,7 +252,8 @@ impl Learner {
     }
 
     pub async fn wait_for_scores(&self, deliveries: usize) -> ScoreReport {
-        self.wait_for(|events| reports(events).into_iter().nth(deliveries - 1)).await
+        let last = |events: &[Event]| reports(events).get(deliveries - 1).cloned();
+        self.wait_for(last).await
     }
 
     /// Waits for a job that is handed back, and returns the reason.
@@ -261,7 +266,8 @@ impl Learner {
     }
 
     pub fn count(&self, is_counted: impl Fn(&Event) -> bool) -> usize {
-        self.events().iter().filter(|event| is_counted(event)).count()
+        let events = self.events();
+        events.iter().filter(|event| is_counted(event)).count()
     }
 }
 

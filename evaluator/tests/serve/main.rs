@@ -45,7 +45,8 @@ async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
         let precision = name(&Precision::F32.arithmetic());
         let expected = ScoreReport::new(&job, name("one"), precision, expected(&job));
         assert_eq!(learner.wait_for_scores(1).await, expected);
-        assert_eq!(learner.count(|event| *event == Event::Weights), usize::from(!published));
+        let requests = learner.count(|event| *event == Event::Weights);
+        assert_eq!(requests, usize::from(!published));
         assert!(evaluator.leave().success());
         assert_eq!(learner.count(Event::is_handed_back), 0);
     }
@@ -62,12 +63,12 @@ async fn a_claim_without_an_answer_is_repeated() {
         };
         events.iter().filter_map(number).collect()
     };
-    let first =
-        learner.wait_for(|events| Some(claims(events)).filter(|claims| claims.len() >= 3)).await;
-    assert!(first.iter().all(|number| *number == first[0]), "{first:?}");
+    let three = |events: &[Event]| Some(claims(events)).filter(|claims| claims.len() >= 3);
+    let first = learner.wait_for(three).await;
+    let is_other = |number: &u64| *number != first[0];
+    assert!(!first.iter().any(is_other), "{first:?}");
     learner.behave(Behavior::Records);
-    let other = |events: &[Event]| claims(events).into_iter().find(|number| *number != first[0]);
-    learner.wait_for(other).await;
+    learner.wait_for(|events| claims(events).into_iter().find(is_other)).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -82,7 +83,8 @@ async fn scores_are_sent_until_the_learner_has_saved_them() {
     let first = events.iter().position(Event::is_scores).unwrap();
     let last = events.iter().rposition(Event::is_scores).unwrap();
     let deliveries = &events[first..last];
-    assert!(deliveries.iter().all(Event::is_scores), "nothing is claimed meanwhile: {events:?}");
+    // Nothing is claimed meanwhile.
+    assert!(deliveries.iter().all(Event::is_scores), "{events:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -95,7 +97,8 @@ async fn a_leaving_evaluator_hands_its_job_back_unless_its_scores_may_be_saved()
             // On a busy machine it arrives only after the evaluator has gone.
             learner.wait_for_hand_back().await;
         }
-        assert_eq!(learner.count(Event::is_handed_back), usize::from(hands_back));
+        let returned = learner.count(Event::is_handed_back);
+        assert_eq!(returned, usize::from(hands_back));
         assert!(learner.count(Event::is_scores) > 1, "they are sent again");
     }
 }
@@ -115,11 +118,10 @@ async fn a_job_that_fails_is_handed_back_with_the_reason() {
     let learner = Learner::start(b"no tensors".to_vec(), Behavior::Records).await;
     let (_evaluator, _token) = learner.evaluator().await;
     let good = job(&learner.snapshot);
-    for (job, reason) in [
-        (Job { environment: "moon".to_owned(), ..good.clone() }, "moon"),
-        (Job { seeds: Vec::new(), ..good.clone() }, "0 episodes"),
-        (good, "safetensors"),
-    ] {
+    let (mut unknown, mut empty) = (good.clone(), good.clone());
+    unknown.environment = "moon".to_owned();
+    empty.seeds.clear();
+    for (job, reason) in [(unknown, "moon"), (empty, "0 episodes"), (good, "safetensors")] {
         learner.give(job);
         let has_reason =
             |event: &Event| matches!(event, Event::HandedBack(Some(text)) if text.contains(reason));
@@ -132,8 +134,9 @@ async fn a_job_that_fails_is_handed_back_with_the_reason() {
 async fn a_job_whose_scores_are_refused_is_handed_back() {
     let (learner, _evaluator, _token) = Learner::with_job(file(), Behavior::Refuses).await;
     let reason = learner.wait_for_hand_back().await;
-    assert_eq!(reason, Some("it refused the scores: the sums differ".to_owned()));
-    assert_eq!(learner.count(Event::is_scores), 1, "they are not sent again");
+    assert_eq!(reason.unwrap(), "it refused the scores: the sums differ");
+    // They are not sent again.
+    assert_eq!(learner.count(Event::is_scores), 1);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -149,6 +152,6 @@ async fn a_job_is_handed_back_until_the_learner_answers_and_nothing_is_claimed_b
     let events = learner.events();
     let last = events.iter().rposition(Event::is_handed_back).unwrap();
     assert!(first < last, "it is handed back twice: {events:?}");
-    let between = &events[first..last];
-    assert!(!between.iter().any(|event| matches!(event, Event::Claim(_))), "{events:?}");
+    let is_claim = |event: &Event| matches!(event, Event::Claim(_));
+    assert!(!events[first..last].iter().any(is_claim), "{events:?}");
 }

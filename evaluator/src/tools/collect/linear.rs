@@ -10,18 +10,21 @@ pub struct LinearPolicy {
 
 impl LinearPolicy {
     pub fn zero(observation_dim: usize, action_dim: usize) -> Self {
-        let (mean, inverse_deviation) = (vec![0.0; observation_dim], vec![1.0; observation_dim]);
         let weights = vec![0.0; action_dim * observation_dim];
-        Self { weights, normalizer: Normalizer { mean, inverse_deviation } }
+        let mean = vec![0.0; observation_dim];
+        let inverse_std = vec![1.0; observation_dim];
+        let normalizer = Normalizer { mean, inverse_std };
+        Self { weights, normalizer }
     }
 
     /// Writes `action`.
     pub fn act(&self, observation: &[f64], action: &mut [f32]) {
-        let Normalizer { mean, inverse_deviation } = &self.normalizer;
-        for (value, row) in action.iter_mut().zip(self.weights.chunks_exact(observation.len())) {
+        let Normalizer { mean, inverse_std } = &self.normalizer;
+        let rows = self.weights.chunks_exact(observation.len());
+        for (value, row) in action.iter_mut().zip(rows) {
             let mut sum = 0.0;
             for (i, &observed) in observation.iter().enumerate() {
-                sum += row[i] * (observed - mean[i]) * inverse_deviation[i];
+                sum += row[i] * (observed - mean[i]) * inverse_std[i];
             }
             *value = sum as f32;
         }
@@ -32,7 +35,7 @@ impl LinearPolicy {
 #[derive(Clone, Debug)]
 pub struct Normalizer {
     mean: Vec<f64>,
-    inverse_deviation: Vec<f64>,
+    inverse_std: Vec<f64>,
 }
 
 /// Running mean and variance of observations, by Welford's recurrence; two merge by Chan's formula.
@@ -46,8 +49,8 @@ pub struct Moments {
 
 impl Moments {
     pub fn new(observation_dim: usize) -> Self {
-        let zero = vec![0.0; observation_dim];
-        Self { count: 0.0, mean: zero.clone(), squares: zero }
+        let [mean, squares] = [(); 2].map(|_| vec![0.0; observation_dim]);
+        Self { count: 0.0, mean, squares }
     }
 
     pub fn push(&mut self, observation: &[f64]) {
@@ -75,11 +78,12 @@ impl Moments {
     /// A value that never changes is only centered.
     pub fn normalizer(&self) -> Normalizer {
         let inverse = |squares: &f64| {
-            let deviation = (squares / (self.count - 1.0).max(1.0)).sqrt();
-            if deviation > 1e-7 { 1.0 / deviation } else { 1.0 }
+            let std = (squares / (self.count - 1.0).max(1.0)).sqrt();
+            if std > 1e-7 { 1.0 / std } else { 1.0 }
         };
-        let inverse_deviation = self.squares.iter().map(inverse).collect();
-        Normalizer { mean: self.mean.clone(), inverse_deviation }
+        let inverse_std = self.squares.iter().map(inverse).collect();
+        let mean = self.mean.clone();
+        Normalizer { mean, inverse_std }
     }
 }
 
@@ -99,11 +103,11 @@ mod tests {
         merged.merge(&moments(&values[1..]));
         merged.merge(&moments(&[]));
         for moments in [moments(&values), merged] {
-            let Normalizer { mean, inverse_deviation } = moments.normalizer();
+            let Normalizer { mean, inverse_std } = moments.normalizer();
             assert_eq!(mean, [4.0, 5.0]);
             // Variance 38 / 3; the second value never changed.
-            assert!((inverse_deviation[0] - (3.0_f64 / 38.0).sqrt()).abs() < 1e-12);
-            assert_eq!(inverse_deviation[1], 1.0);
+            assert!((inverse_std[0] - (3.0_f64 / 38.0).sqrt()).abs() < 1e-12);
+            assert_eq!(inverse_std[1], 1.0);
         }
     }
 }

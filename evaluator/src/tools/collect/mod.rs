@@ -42,13 +42,11 @@ pub struct Summary {
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { transitions, episodes, mean_score, policies, seconds, .. } = self;
         let [p50, p90, p99, max] = self.score_percentiles;
-        write!(
-            f,
-            "{transitions} transitions, {episodes} episodes of {policies} policies, in {seconds:.0} s\n\
-             normalized score: mean {mean_score:.1}, median {p50:.1}, p90 {p90:.1}, p99 {p99:.1}, max {max:.1}"
-        )
+        write!(f, "{} transitions, {} episodes", self.transitions, self.episodes)?;
+        writeln!(f, " of {} policies, in {:.0} s", self.policies, self.seconds)?;
+        write!(f, "normalized score: mean {:.1}, median {p50:.1}", self.mean_score)?;
+        write!(f, ", p90 {p90:.1}, p99 {p99:.1}, max {max:.1}")
     }
 }
 
@@ -61,8 +59,9 @@ pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
             Err(error) => error.to_string(),
         },
     };
-    let possible = all().iter().filter(|spec| recipe(spec).is_ok()).map(|spec| spec.name.as_str());
-    Err(format!("{problem}; what can be recorded is {}", Vec::from_iter(possible).join(", ")))
+    let possible = all().iter().filter(|spec| recipe(spec).is_ok());
+    let names = Vec::from_iter(possible.map(|spec| spec.name.as_str()));
+    Err(format!("{problem}; what can be recorded is {}", names.join(", ")))
 }
 
 fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {

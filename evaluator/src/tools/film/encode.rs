@@ -60,16 +60,17 @@ fn strip(pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
 fn animation(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     let first = pictures.next().context("there is no picture")?;
     let (width, height) = (first.width as u16, first.height() as u16);
-    let rgba: Vec<u8> =
-        first.rgb.chunks_exact(3).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
+    let opaque = |rgb: &[u8]| [rgb[0], rgb[1], rgb[2], 255];
+    let rgba: Vec<u8> = first.rgb.chunks_exact(3).flat_map(opaque).collect();
     let colors = NeuQuant::new(SAMPLE, COLORS, &rgba);
-    let nearest = |rgb: &[u8]| colors.index_of(&[rgb[0], rgb[1], rgb[2], 255]) as u8;
+    let nearest = |rgb: &[u8]| colors.index_of(&opaque(rgb)) as u8;
     let mut encoder = Encoder::new(Vec::new(), width, height, &colors.color_map_rgb())?;
     encoder.set_repeat(Repeat::Infinite)?;
     for picture in once(first).chain(pictures) {
         let pixels: Vec<u8> = picture.rgb.chunks_exact(3).map(nearest).collect();
-        let frame = Frame::from_indexed_pixels(width, height, pixels, None);
-        encoder.write_frame(&Frame { delay: (100.0 * seconds).round() as u16, ..frame })?;
+        let mut frame = Frame::from_indexed_pixels(width, height, pixels, None);
+        frame.delay = (100.0 * seconds).round() as u16;
+        encoder.write_frame(&frame)?;
     }
     Ok(encoder.into_inner()?)
 }
@@ -123,14 +124,16 @@ mod tests {
     fn a_film_gets_its_name_when_it_is_whole() {
         let folder = tempfile::tempdir().unwrap();
         for (name, format) in [("film.gif", Format::Gif), ("film.png", Format::Png)] {
-            let output = Output { path: folder.path().join(name), format };
+            let path = folder.path().join(name);
+            let output = Output { path, format };
             let unnamed = pictures(9).inspect(|_| assert!(!output.path.exists(), "{name}"));
             write(&output, 0.04, unnamed).unwrap();
             let whole = fs::read(&output.path).unwrap();
             for broken in [0, 5] {
                 let error = write(&output, 0.04, pictures(broken)).unwrap_err();
-                assert_eq!(format!("{error:#}"), "no light", "nothing is wrong with the file");
-                assert!(fs::read(&output.path).unwrap() == whole, "{name} was changed");
+                // Nothing is wrong with the file.
+                assert_eq!(format!("{error:#}"), "no light");
+                assert!(fs::read(&output.path).unwrap() == whole, "{name}");
             }
             fs::remove_file(&output.path).unwrap();
             let left = fs::read_dir(folder.path()).unwrap().count();

@@ -36,18 +36,18 @@ impl Episode {
         seed: Option<u64>,
         environment_seed: u64,
     ) -> anyhow::Result<Self> {
-        let Subject { path, policy, spec, .. } = subject;
+        let policy = &*subject.policy;
         let seed = seed.unwrap_or_else(|| episode_seeds(subject.seed, subject.step, 1)[0]);
-        let mut simulation = sim::make(spec, environment_seed)?;
+        let mut simulation = sim::make(subject.spec, environment_seed)?;
         simulation.reset(seed);
-        let (mut states, mut action) = ([policy.begin(seed)], vec![0.0; spec.action_dim]);
+        let (mut states, mut action) = ([policy.begin(seed)], vec![0.0; policy.action_dim()]);
         let mut episode_return = 0.0;
         let mut poses = vec![pose(&simulation, episode_return)];
         loop {
             let observation = simulation.observation().iter().map(|&value| value as f32);
             policy
                 .act(&Vec::from_iter(observation), &mut states, &mut action)
-                .with_context(|| format!("{}: the policy cannot act", path.display()))?;
+                .with_context(|| format!("{}: the policy cannot act", subject.path.display()))?;
             let step = simulation.step(&action);
             episode_return += step.reward;
             poses.push(pose(&simulation, episode_return));

@@ -54,8 +54,10 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     let last = episodes.iter().map(Episode::length).max().unwrap_or(0);
     let steps = steps(format, last, control_period);
     info!("drawing {} pictures", steps.len());
-    let draw =
-        |&step| stage.draw(&episodes, step).with_context(|| format!("cannot draw step {step}"));
+    let draw = |&step| {
+        let picture = stage.draw(&episodes, step);
+        picture.with_context(|| format!("cannot draw step {step}"))
+    };
     let seconds = control_period * stride(control_period) as f64;
     encode::write(&args.out, seconds, steps.iter().map(draw))?;
     let mut summary = String::new();

@@ -27,8 +27,8 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
         None => {
             let report = RunReport::scored(path).hint(RUN)?;
             let best = report.best_of(|step| steps.contains(&step));
-            let best = best.map(|evaluation| evaluation.step).or(steps.last().copied());
-            best.with_context(|| format!("{name} has no snapshot")).hint(RUN)?
+            let step = best.map(|best| best.step).or(steps.last().copied());
+            step.with_context(|| format!("{name} has no snapshot")).hint(RUN)?
         }
     };
     let found = steps.contains(&step).then(|| run.snapshot_path(step));
@@ -73,20 +73,24 @@ mod tests {
             let lines: String = scores.iter().map(line).collect();
             fs::write(run.join("scores.jsonl"), lines + rest).unwrap();
         };
-        assert!(snapshot(run, None).unwrap_err().to_string().contains("has no snapshot"));
+        let error = snapshot(run, None).unwrap_err().to_string();
+        assert!(error.contains("has no snapshot"), "{error}");
         for step in [10, 20, 30] {
             fs::write(file(step), "").unwrap();
         }
         set_scores(&[(10, 1, 99.0)], "");
-        assert_eq!(snapshot(run, None).unwrap(), file(30), "no evaluation is complete");
-        let scores = [(10, 1, 5.0), (10, 2, 7.0), (20, 3, 9.0), (20, 4, 1.0), (30, 5, 99.0)];
+        // No evaluation is complete.
+        assert_eq!(snapshot(run, None).unwrap(), file(30));
+        let [ten, twenty] = [[(10, 1, 5.0), (10, 2, 7.0)], [(20, 3, 9.0), (20, 4, 1.0)]];
+        let scores = [&ten[..], &twenty, &[(30, 5, 99.0)]].concat();
         set_scores(&scores, "{\"step\":30,\"seed\":6,\"re");
-        assert_eq!(snapshot(run, None).unwrap(), file(10), "that of step 30 is incomplete");
+        // That of step 30 is incomplete.
+        assert_eq!(snapshot(run, None).unwrap(), file(10));
         assert_eq!(snapshot(run, Some(20)).unwrap(), file(20));
         assert!(snapshot(run, Some(25)).is_err());
         assert_eq!(snapshot(&file(20), None).unwrap(), file(20));
         assert!(snapshot(&file(20), Some(20)).is_err());
         fs::remove_file(file(10)).unwrap();
-        assert_eq!(snapshot(run, None).unwrap(), file(20), "the best one is gone");
+        assert_eq!(snapshot(run, None).unwrap(), file(20));
     }
 }

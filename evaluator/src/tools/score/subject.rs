@@ -46,38 +46,45 @@ impl Subject {
         let header = Header::read(&file)
             .with_context(|| format!("{name} is not a snapshot of a run"))
             .hint(SNAPSHOT)?;
-        let Origin { environment, seed, step, episodes } = header.origin;
-        let spec = args.env.map_or_else(|| environment::find(&environment), Ok);
+        let origin: Origin = header.origin;
+        let spec = args.env.map_or_else(|| environment::find(&origin.environment), Ok);
         let spec = spec
             .with_context(|| format!("{name} is a policy for another environment"))
             .hint(OTHER_ENVIRONMENT)?;
-        let (weights, path) = (Hash::of(&file), path.to_owned());
-        let (seed, episodes) = (args.seed.unwrap_or(seed), args.episodes.unwrap_or(episodes));
-        let subject = Self { path: path.clone(), weights, policy, spec, seed, step, episodes };
-        subject.check()?;
-        let choices = choices(args, subject.policy.choice());
+        let weights = Hash::of(&file);
+        let subject = |policy| Self {
+            path: path.to_owned(),
+            weights,
+            policy,
+            spec,
+            seed: args.seed.unwrap_or(origin.seed),
+            step: origin.step,
+            episodes: args.episodes.unwrap_or(origin.episodes),
+        };
+        let unchanged = subject(policy);
+        unchanged.check()?;
+        let choices = choices(args, unchanged.policy.choice());
         if choices.is_empty() {
-            return Ok(vec![subject]);
+            return Ok(vec![unchanged]);
         }
         let with_choice = |choice| {
-            let policy = subject.policy.with_choice(choice);
-            let policy =
-                policy.with_context(|| format!("{name} cannot be scored so")).hint(OTHER_CHOICE)?;
-            Ok(Self { path: path.clone(), weights, policy, spec, seed, step, episodes })
+            let policy = unchanged.policy.with_choice(choice);
+            let policy = policy.with_context(|| format!("{name} cannot be scored so"));
+            policy.hint(OTHER_CHOICE).map(subject)
         };
         choices.into_iter().map(with_choice).collect()
     }
 
     /// Plays the episodes of some seeds as one batch.
     pub fn roll_out(&self, seeds: &[u64]) -> anyhow::Result<Vec<EpisodeScore>> {
-        let Self { path, policy, spec, seed, .. } = self;
-        let make = || Simulations.make(&spec.name, *seed);
+        let policy = &*self.policy;
+        let make = || Simulations.make(&self.spec.name, self.seed);
         let sizes = (policy.observation_dim(), policy.action_dim());
         let mut rollout = Rollout::new(make, sizes, seeds, |seed| policy.begin(seed))?;
         while !rollout.is_done() {
             rollout.step(|observations, states, actions| {
                 let acted = policy.act(observations, states, actions);
-                acted.with_context(|| format!("{}: the policy cannot act", path.display()))
+                acted.with_context(|| format!("{}: the policy cannot act", self.path.display()))
             })?;
         }
         Ok(rollout.into_scores())
@@ -106,7 +113,8 @@ impl Subject {
 /// asks for none.
 fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
     let own = own.unwrap_or(Choice::best_of(1));
-    let (rule, value) = (args.rule.unwrap_or(own.rule), args.value.unwrap_or(own.value));
+    let rule = args.rule.unwrap_or(own.rule);
+    let value = args.value.unwrap_or(own.value);
     let with = |candidates| Choice { candidates, rule, value };
     match args.candidates.as_slice() {
         [] if args.rule.is_none() && args.value.is_none() => Vec::new(),
@@ -123,13 +131,14 @@ mod tests {
 
     #[test]
     fn options_replace_the_policy_s_own_choice() {
-        let own = Choice { value: Aggregate::Min, ..Choice::best_of(7) };
-        let choices = |args| choices(&args, Some(own));
-        assert!(choices(ScoreArgs::default()).is_empty());
-        let rule = Rule::Softmax { temperature: 0.5 };
-        let args = ScoreArgs { rule: Some(rule), ..ScoreArgs::default() };
-        assert_eq!(choices(args), [Choice { rule, ..own }]);
-        let args = ScoreArgs { candidates: vec![1, 10], ..ScoreArgs::default() };
-        assert_eq!(choices(args), [1, 10].map(|candidates| Choice { candidates, ..own }));
+        let (mut own, mut args) = (Choice::best_of(7), ScoreArgs::default());
+        own.value = Aggregate::Min;
+        assert!(choices(&args, Some(own)).is_empty());
+        let with = |candidates| Choice { candidates, ..own };
+        args.candidates = vec![1, 10];
+        assert_eq!(choices(&args, Some(own)), [with(1), with(10)]);
+        own.rule = Rule::Softmax { temperature: 0.5 };
+        (args.candidates, args.rule) = (Vec::new(), Some(own.rule));
+        assert_eq!(choices(&args, Some(own)), [own]);
     }
 }
