@@ -19,11 +19,10 @@ const HOPPER: &str = "hopper";
 /// Time limit for learners' answers.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 
-const UPDATE: &str =
-    "update the older program (--version tells); if the learner hangs, its log says why";
+const UPDATE: &str = "update the older program (see --version); if the learner hangs, see its log";
 
 const AFTER_HELP: &str = "\
-The evaluator prints a line per check: ok, warn or FAIL, with a hint if you can do something. The exit code is 1 if a check failed.";
+The evaluator prints a line per check: ok, warn or FAIL, with a hint if there is something to do. The exit code is 1 if a check failed.";
 
 /// Check this machine before it evaluates anything, and say how to fix what is wrong
 #[derive(Args, Debug)]
@@ -77,7 +76,7 @@ fn simulator(findings: &mut Findings) {
         Ok(())
     };
     match step() {
-        Ok(()) => findings.ok("libmujoco", format!("{version}, and Hopper moves in it")),
+        Ok(()) => findings.ok("libmujoco", format!("{version} simulates Hopper")),
         Err(error) => {
             let problem = format!("{version}: {error:#}");
             findings.fail("libmujoco", problem, "deploy/setup.sh fetches 3.17.0");
@@ -106,8 +105,8 @@ async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> 
         }
     }
     if !found {
-        let hint = "if it starts later: an evaluator waits for it";
-        findings.warn("runs", "no learner is there", hint);
+        let hint = "an evaluator waits for learners that start later";
+        findings.warn("runs", "no learner is connected", hint);
     }
     Ok(())
 }
@@ -121,7 +120,7 @@ async fn problem_of(session: &Session, run: &Name) -> anyhow::Result<Option<Stri
     let replies = session.get(keys::jobs(run)).payload(claim).timeout(ANSWER_TIMEOUT);
     let replies = replies.await.map_err(anyhow::Error::msg)?;
     let Ok(reply) = replies.recv_async().await else {
-        return Ok(Some(format!("its learner gives no answer within {ANSWER_TIMEOUT:?}")));
+        return Ok(Some(format!("its learner has not answered within {ANSWER_TIMEOUT:?}")));
     };
     Ok(match reply.result() {
         Ok(sample) => {

@@ -276,7 +276,7 @@ impl RunClient {
         let Connection { run, metrics, .. } = &self.connection;
         self.snapshots.forget(run);
         if let Some(report) = self.scores() {
-            warn!(%run, step = report.step, "the learner did not come back for its scores");
+            warn!(%run, step = report.step, "the learner did not return; its scores are dropped");
             metrics.job(JobOutcome::Abandoned);
         }
     }

@@ -71,9 +71,7 @@ impl Discovery {
     pub async fn failed(&mut self) -> anyhow::Error {
         match self.tasks.join_next().await {
             Some(Ok(Err(error))) => error,
-            Some(Err(error)) => {
-                anyhow::Error::new(error).context("the search for learners broke off")
-            }
+            Some(Err(error)) => anyhow::Error::new(error).context("the search for learners failed"),
             Some(Ok(Ok(never))) => match never {},
             None => std::future::pending().await,
         }

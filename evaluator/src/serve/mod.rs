@@ -182,5 +182,5 @@ fn unique_name() -> anyhow::Result<Name> {
     let host = if host.is_empty() { "evaluator" } else { &host };
     let random: u16 = rand::random();
     Name::new(format!("{host}-{}-{random:04x}", std::process::id()))
-        .context("cannot make up a name for this evaluator")
+        .context("cannot generate a name for this evaluator")
 }

@@ -75,8 +75,8 @@ impl fmt::Display for Report {
 }
 
 const OTHER_FILE: &str =
-    "a file that can be replayed is what `evaluator collect --env hopper --out FILE` writes";
-const ENVIRONMENT: &str = "--env NAME says where it was recorded";
+    "`evaluator collect --env hopper --out FILE` writes a file that can be replayed";
+const ENVIRONMENT: &str = "name its environment with --env NAME";
 
 fn hint(error: &DatasetError) -> String {
     match error.problem {
@@ -89,7 +89,7 @@ fn hint(error: &DatasetError) -> String {
 /// sizes.
 pub fn environment_of(path: &Path) -> anyhow::Result<&'static EnvironmentSpec> {
     if let Some(name) = recorded_environment(path).hint_of(hint)? {
-        let other = || format!("{}: recorded in another environment", path.display());
+        let other = || format!("{}: recorded in an unknown environment", path.display());
         return find(&name).with_context(other).hint(ENVIRONMENT);
     }
     let fitting = environments_of_its_sizes(path).hint_of(hint)?;

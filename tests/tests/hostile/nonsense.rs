@@ -102,7 +102,7 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     let count = learner.scores().len();
     learner.wait_for_scores(count + 2 * ENDLESS.episodes as usize);
     assert!(learner.process.is_running() && evaluator.process.is_running());
-    let said = evaluator.process.log().matches("ignored what was published as weights").count();
+    let said = evaluator.process.log().matches("ignored a bad snapshot").count();
     assert_eq!(said, 1, "bad weights are logged once");
     for (name, log) in [("learner", learner.process.log()), ("evaluator", evaluator.process.log())]
     {

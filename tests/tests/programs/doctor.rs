@@ -47,7 +47,7 @@ fn a_healthy_machine_passes_all_checks() {
     for (check, words) in [
         ("connection", &*endpoint),
         ("run", "well speaks version "),
-        ("libmujoco", "3.17.0, and Hopper moves in it"),
+        ("libmujoco", "3.17.0 simulates Hopper"),
         ("precision", ""),
     ] {
         assert_found(&text, "ok", check, &[words]);

@@ -125,14 +125,14 @@ fn a_film_is_whole_or_is_not_there_whatever_its_name() {
     }
     let output =
         film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", "/nowhere").output().unwrap();
-    assert_refused(&output, "ffmpeg cannot be started", "--out film.gif");
+    assert_refused(&output, "cannot start ffmpeg", "--out film.gif");
     assert!(!folder.join("film.mp4").exists());
 
     let Some(disk) = SmallDisk::mount(&folder.join("disk"), 1) else { return };
     disk.fill();
     for name in ["disk/film.gif", "disk/film.png"] {
         let output = film(folder, &[snapshot, "--out", name]).output().unwrap();
-        assert_refused(&output, &format!("cannot write {name}"), "has room");
+        assert_refused(&output, &format!("cannot write {name}"), "enough space");
         assert_eq!(
             fs::read_dir(folder.join("disk")).unwrap().count(),
             1,

@@ -20,7 +20,7 @@ use quad_runtime::Hint;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-const OUT: &str = "--out names a file in a folder that you may write in";
+const OUT: &str = "choose a file with --out in a folder that you may write to";
 const MUJOCO: &str =
     "deploy/setup.sh installs the version of MuJoCo that this program was built for";
 
@@ -61,13 +61,15 @@ pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
     };
     let possible = all().iter().filter(|spec| recipe(spec).is_ok());
     let names = Vec::from_iter(possible.map(|spec| spec.name.as_str()));
-    Err(format!("{problem}; what can be recorded is {}", names.join(", ")))
+    Err(format!("{problem}; datasets can be recorded in {}", names.join(", ")))
 }
 
 fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {
     match &spec.collect {
         Collect::Recipe(recipe) => Ok(recipe),
-        Collect::None(reason) => Err(anyhow!("nothing can be recorded in {}: {reason}", spec.name)),
+        Collect::None(reason) => {
+            Err(anyhow!("no dataset can be recorded in {}: {reason}", spec.name))
+        }
     }
 }
 

@@ -36,13 +36,13 @@ pub fn write(
     undrawn?;
     film.and_then(|film| Ok(files::replace(&output.path, &film)?))
         .with_context(|| format!("cannot write {}", output.path.display()))
-        .hint("--out names a file in a folder that you may write in and that has room")
+        .hint("choose a file with --out in a folder that you may write to, with enough space")
 }
 
 fn strip(pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     let pictures: Vec<_> = pictures.collect();
     if pictures.is_empty() {
-        bail!("there is no picture");
+        bail!("there are no pictures");
     }
     let strip = Picture::strip(&pictures);
     let mut file = Vec::new();
@@ -58,7 +58,7 @@ fn strip(pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
 /// All pictures have the colors of the first: with a palette for each picture, the floor would
 /// flicker.
 fn animation(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
-    let first = pictures.next().context("there is no picture")?;
+    let first = pictures.next().context("there are no pictures")?;
     let (width, height) = (first.width as u16, first.height() as u16);
     let opaque = |rgb: &[u8]| [rgb[0], rgb[1], rgb[2], 255];
     let rgba: Vec<u8> = first.rgb.chunks_exact(3).flat_map(opaque).collect();
@@ -76,7 +76,7 @@ fn animation(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyho
 }
 
 fn video(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
-    let first = pictures.next().context("there is no picture")?;
+    let first = pictures.next().context("there are no pictures")?;
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("film.mp4");
     let size = format!("{}x{}", first.width, first.height());
@@ -89,8 +89,8 @@ fn video(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::R
         .arg([OsStr::new("file:"), path.as_os_str()].join(OsStr::new("")))
         .stdin(Stdio::piped())
         .spawn()
-        .context("ffmpeg cannot be started")
-        .hint("apt-get install --no-install-recommends ffmpeg, or --out film.gif, which needs nothing")?;
+        .context("cannot start ffmpeg")
+        .hint("apt-get install --no-install-recommends ffmpeg, or use --out film.gif, which needs no other program")?;
     if let Some(mut pipe) = ffmpeg.stdin.take() {
         for picture in once(first).chain(pictures) {
             // If ffmpeg has ended, its message says why.

@@ -35,7 +35,8 @@ impl Gl {
         egl.bind_api(egl::OPENGL_API)?;
         let wanted =
             [egl::SURFACE_TYPE, egl::PBUFFER_BIT, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
-        let config = egl.choose_first_config(display, &wanted)?.context("it draws no OpenGL")?;
+        let config =
+            egl.choose_first_config(display, &wanted)?.context("it does not support OpenGL")?;
         let context = egl.create_context(display, config, None, &[egl::NONE])?;
         egl.make_current(display, None, None, Some(context))?;
         Ok(Self { _egl: egl })

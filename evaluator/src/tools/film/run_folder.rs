@@ -7,7 +7,8 @@ use quad_run::folder::RunDir;
 use quad_run::results::RunReport;
 use quad_runtime::Hint;
 
-const RUN: &str = "name a file like RUN/snapshots/step_000020000.safetensors, or the folder RUN that `learner train` made";
+const RUN: &str =
+    "pass a file like RUN/snapshots/step_000020000.safetensors, or the folder of a run";
 
 /// The snapshot that `path` names. In a run's folder it is the snapshot of `step` or, without a
 /// step, the one with the best complete evaluation of those that are left, else the newest.
@@ -17,7 +18,7 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
         return match step {
             None => Ok(path.to_owned()),
             Some(_) => Err(anyhow!("{name} is not the folder of a run"))
-                .hint("--step is for a run's folder"),
+                .hint("--step needs the folder of a run"),
         };
     }
     let run = RunDir::at(path);
@@ -34,7 +35,7 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
     let found = steps.contains(&step).then(|| run.snapshot_path(step));
     found
         .with_context(|| format!("{name} has no snapshot of step {step}"))
-        .hint(format!("it has {steps:?}"))
+        .hint(format!("its snapshots have the steps {steps:?}"))
 }
 
 #[cfg(test)]

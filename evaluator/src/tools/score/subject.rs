@@ -12,10 +12,8 @@ use quad_runtime::Hint;
 use super::args::{MOST_EPISODES, ScoreArgs};
 use crate::sim::{Environments, Rollout, Simulations};
 
-const SNAPSHOT: &str = "what can be scored is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this \
-                        version writes them";
-const OTHER_ENVIRONMENT: &str =
-    "in an environment of your own it acts from Python (docs/python.md)";
+const SNAPSHOT: &str = "pass a file like RUN/snapshots/step_000020000.safetensors, written by `learner train` of this version";
+const OTHER_ENVIRONMENT: &str = "in your own environment, run it from Python (docs/python.md)";
 const OTHER_CHOICE: &str = "score it without --candidates, --rule and --value";
 
 /// A saved policy, ready to act, with its episodes.
@@ -69,7 +67,7 @@ impl Subject {
         }
         let with_choice = |choice| {
             let policy = unchanged.policy.with_choice(choice);
-            let policy = policy.with_context(|| format!("{name} cannot be scored so"));
+            let policy = policy.with_context(|| format!("{name} cannot choose actions this way"));
             policy.hint(OTHER_CHOICE).map(subject)
         };
         choices.into_iter().map(with_choice).collect()
@@ -96,14 +94,13 @@ impl Subject {
         let wanted = (self.spec.observation_dim, self.spec.action_dim);
         if found != wanted {
             return Err(anyhow!(
-                "{name} turns {found:?} observed numbers into actions of {environment}, which has {wanted:?} \
-                 (observation, action)"
+                "{name} has the sizes {found:?} (observation, action), but {environment} has {wanted:?}"
             ))
-            .hint("--env NAME says where it is to act");
+            .hint("choose its environment with --env NAME");
         }
         if !(1..=MOST_EPISODES).contains(&episodes.into()) {
             return Err(anyhow!("{name} asks for {episodes} episodes"))
-                .hint("--episodes takes the place of what the file says");
+                .hint("set their number with --episodes");
         }
         Ok(())
     }
