@@ -35,8 +35,8 @@ pub fn record(
     mut random: ChaCha8Rng,
     writer: &mut D4rlWriter,
 ) -> anyhow::Result<Vec<f64>> {
-    let recorders = (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, _>>();
-    let mut recorders = recorders.hint(MUJOCO)?;
+    let recorders = (0..ROUND).map(|_| Recorder::new(spec));
+    let mut recorders = recorders.collect::<Result<Vec<_>, _>>().hint(MUJOCO)?;
     let mixture = &recipe.mixture;
     let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
     let mut scores = Vec::new();
@@ -49,10 +49,13 @@ pub fn record(
         let highest = room.iter().rposition(|&room| room > 0.0).filter(|_| patient);
         let next = highest.and_then(|band| mixture.get(band + 1));
         let ceiling = next.map_or(f64::INFINITY, |&(from, _)| from);
-        let draw = |_| (&policies[random.random_range(0..policies.len())], random.random());
-        let tasks: Vec<(&LinearPolicy, u64)> = (0..ROUND).map(draw).collect();
+        let mut draw = || {
+            let policy = &policies[random.random_range(0..policies.len())];
+            (policy, random.random())
+        };
+        let tasks: Vec<(&LinearPolicy, u64)> = (0..ROUND).map(|_| draw()).collect();
         let running = recorders.par_iter_mut().zip(tasks).with_max_len(1);
-        running.for_each(|(recorder, (policy, seed))| recorder.run(policy, seed, ceiling));
+        running.for_each(|(recorder, (policy, seed))| recorder.run(spec, policy, seed, ceiling));
         for recorder in &recorders {
             simulated += recorder.steps.len();
             let score = spec.normalized_score(recorder.episode_return);
@@ -72,28 +75,26 @@ pub fn record(
 
 /// An environment and its last episode.
 struct Recorder {
-    spec: &'static EnvironmentSpec,
     environment: Simulation,
-    /// [steps + 1, observation_dim], from the initial state to the last
-    observations: Vec<f64>,
-    /// [steps + 1, qpos_dim]
-    qpos: Vec<f64>,
-    /// [steps + 1, qvel_dim]
-    qvel: Vec<f64>,
-    /// [steps, action_dim], clipped
-    actions: Vec<f64>,
+    /// From the initial state to the last: one more than steps.
+    states: Vec<State>,
+    /// Clipped actions [action_dim].
+    actions: Vec<Vec<f64>>,
     steps: Vec<Step>,
     episode_return: f64,
+}
+
+struct State {
+    observation: Vec<f64>,
+    qpos: Vec<f64>,
+    qvel: Vec<f64>,
 }
 
 impl Recorder {
     fn new(spec: &'static EnvironmentSpec) -> Result<Self, EnvironmentError> {
         Ok(Self {
-            spec,
             environment: sim::make(spec, 0)?,
-            observations: Vec::new(),
-            qpos: Vec::new(),
-            qvel: Vec::new(),
+            states: Vec::new(),
             actions: Vec::new(),
             steps: Vec::new(),
             episode_return: 0.0,
@@ -101,15 +102,14 @@ impl Recorder {
     }
 
     /// Runs an episode to its end, or until its score so far is above `ceiling`.
-    fn run(&mut self, policy: &LinearPolicy, seed: u64, ceiling: f64) {
-        for values in [&mut self.observations, &mut self.qpos, &mut self.qvel, &mut self.actions] {
-            values.clear();
-        }
+    fn run(&mut self, spec: &EnvironmentSpec, policy: &LinearPolicy, seed: u64, ceiling: f64) {
+        self.states.clear();
+        self.actions.clear();
         self.steps.clear();
         self.episode_return = 0.0;
         let mut random = stream(seed, NOISE_STREAM);
         let deviation = random.random_range(NOISE);
-        let mut action = vec![0.0; self.spec.action_dim];
+        let mut action = vec![0.0; spec.action_dim];
         self.environment.reset(seed);
         self.keep_state();
         loop {
@@ -117,41 +117,43 @@ impl Recorder {
             for value in &mut action {
                 let noise: f64 = StandardNormal.sample(&mut random);
                 *value = (f64::from(*value) + deviation * noise).clamp(-1.0, 1.0) as f32;
-                self.actions.push(f64::from(*value));
             }
             let step = self.environment.step(&action);
+            self.actions.push(action.iter().copied().map(f64::from).collect());
             self.steps.push(step);
             self.episode_return += step.reward;
             self.keep_state();
-            if self.ended() || self.spec.normalized_score(self.episode_return) > ceiling {
+            if self.ended() || spec.normalized_score(self.episode_return) > ceiling {
                 return;
             }
         }
     }
 
     fn ended(&self) -> bool {
-        self.steps.last().is_some_and(|step| step.terminated || step.truncated)
+        let last = self.steps.last();
+        last.is_some_and(|step| step.terminated || step.truncated)
     }
 
     fn keep_state(&mut self) {
-        self.observations.extend_from_slice(self.environment.observation());
-        self.qpos.extend_from_slice(self.environment.qpos());
-        self.qvel.extend_from_slice(self.environment.qvel());
+        self.states.push(State {
+            observation: self.environment.observation().to_vec(),
+            qpos: self.environment.qpos().to_vec(),
+            qvel: self.environment.qvel().to_vec(),
+        });
     }
 
     fn write(&self, writer: &mut D4rlWriter) -> Result<(), DatasetError> {
-        let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } = *self.spec;
         for (i, step) in self.steps.iter().enumerate() {
+            let state = &self.states[i];
             writer.push(&Row {
-                observation: &self.observations[i * observation_dim..][..observation_dim],
-                action: &self.actions[i * action_dim..][..action_dim],
-                next_observation: &self.observations[(i + 1) * observation_dim..]
-                    [..observation_dim],
+                observation: &state.observation,
+                action: &self.actions[i],
+                next_observation: &self.states[i + 1].observation,
                 reward: step.reward,
                 terminal: step.terminated,
                 timeout: step.truncated && !step.terminated,
-                qpos: &self.qpos[i * qpos_dim..][..qpos_dim],
-                qvel: &self.qvel[i * qvel_dim..][..qvel_dim],
+                qpos: &state.qpos,
+                qvel: &state.qvel,
             })?;
         }
         Ok(())

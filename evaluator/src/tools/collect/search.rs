@@ -99,9 +99,16 @@ impl Search {
                 steps: 0,
             })
         };
-        let trials = (0..2 * DIRECTIONS).map(trial).collect::<Result<_, EnvironmentError>>()?;
-        let policies = vec![policy.clone()];
-        Ok(Self { policies, returns: Vec::new(), policy, moments, random, trials, steps: 0 })
+        let trials = (0..2 * DIRECTIONS).map(trial);
+        Ok(Self {
+            trials: trials.collect::<Result<_, EnvironmentError>>()?,
+            policies: vec![policy.clone()],
+            returns: Vec::new(),
+            policy,
+            moments,
+            random,
+            steps: 0,
+        })
     }
 
     /// Mean return of the trials of the last few iterations.
@@ -116,11 +123,15 @@ impl Search {
     /// the trials, so the result does not depend on the number of threads.
     fn iterate(&mut self) {
         let size = self.policy.weights.len();
-        let mut direction = || StandardNormal.sample_iter(&mut self.random).take(size).collect();
-        let directions: Vec<Vec<f64>> = (0..DIRECTIONS).map(|_| direction()).collect();
+        let mut direction = || {
+            let normal = StandardNormal.sample_iter(&mut self.random);
+            Vec::<f64>::from_iter(normal.take(size))
+        };
+        let directions = Vec::from_iter((0..DIRECTIONS).map(|_| direction()));
         let seeds: Vec<u64> = self.trials.iter().map(|_| self.random.random()).collect();
 
-        let signed = directions.iter().flat_map(|direction| [(direction, 1.0), (direction, -1.0)]);
+        let both = |direction| [(direction, 1.0), (direction, -1.0)];
+        let signed = directions.iter().flat_map(both);
         for (trial, (direction, sign)) in self.trials.iter_mut().zip(signed) {
             trial.policy.normalizer = self.policy.normalizer.clone();
             let centers = self.policy.weights.iter().zip(direction);
@@ -143,8 +154,8 @@ impl Search {
         pairs.truncate(BEST);
         let returns: Vec<f64> = pairs.iter().flat_map(|pair| [pair.0, pair.1]).collect();
         let mean = returns.iter().sum::<f64>() / returns.len() as f64;
-        let squares = returns.iter().map(|value| (value - mean).powi(2)).sum::<f64>();
-        let deviation = (squares / returns.len() as f64).sqrt();
+        let squares = returns.iter().map(|value| (value - mean).powi(2));
+        let deviation = (squares.sum::<f64>() / returns.len() as f64).sqrt();
         let rate = STEP_SIZE / (BEST as f64 * deviation.max(1e-6));
         for (forwards, backwards, direction) in pairs {
             for (weight, delta) in self.policy.weights.iter_mut().zip(direction) {
@@ -153,8 +164,9 @@ impl Search {
         }
         self.policy.normalizer = self.moments.normalizer();
         self.policies.push(self.policy.clone());
-        let returns = self.trials.iter().map(|trial| trial.episode_return).sum::<f64>();
-        self.returns.push(returns / self.trials.len() as f64);
+        let returns = self.trials.iter().map(|trial| trial.episode_return);
+        let mean = returns.sum::<f64>() / self.trials.len() as f64;
+        self.returns.push(mean);
     }
 }
 
@@ -164,8 +176,9 @@ impl Trial {
         (self.shaped_return, self.episode_return, self.steps) = (0.0, 0.0, 0);
         self.environment.reset(seed);
         loop {
-            self.moments.push(self.environment.observation());
-            self.policy.act(self.environment.observation(), &mut self.action);
+            let observation = self.environment.observation();
+            self.moments.push(observation);
+            self.policy.act(observation, &mut self.action);
             let step = self.environment.step(&self.action);
             self.shaped_return += step.reward - ALIVE_BONUS;
             self.episode_return += step.reward;
