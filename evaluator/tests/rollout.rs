@@ -150,8 +150,8 @@ fn count(counter: Counter, sizes: (usize, usize)) -> Result<Vec<EpisodeScore>, E
 
 #[test]
 fn any_environment_has_its_own_scores_and_errors() {
-    let mut counter = Counter::default();
-    counter.score = 0.1;
+    let score = 0.1;
+    let mut counter = Counter { score, ..Counter::default() };
     for (episode, seed) in count(counter, (2, 1)).unwrap().into_iter().zip([7, 8]) {
         assert_eq!((episode.seed, episode.length), (seed, 4));
         assert_eq!((episode.episode_return, episode.score), (10.0, 1.0));
