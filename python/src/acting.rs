@@ -1,4 +1,4 @@
-//! Acting in the rows of an array, and the seeds of rows.
+//! Actions for the rows of an array, and their seeds.
 
 use std::process;
 use std::sync::OnceLock;
@@ -12,17 +12,16 @@ use quad_policy::{EpisodeState, Policy, PolicyError};
 use crate::arrays::Rows;
 use crate::error::of_policy;
 
-/// Memory that one call of the policy may take, bytes; more rows are split. An action does not
-/// depend on the other rows.
+/// Memory of one call of a policy, bytes; more rows are split. An action does not depend on other rows.
 const MEMORY: u64 = 256 << 20;
 
 const FORKED: &str = "this process was forked from one in which a policy has acted, and a fork lacks the threads that compute\n\
                       hint: multiprocessing.set_start_method(\"spawn\"), or let policies act only after the fork";
 
-/// What comes out of a policy.
+/// Output of a policy.
 pub type Array<'py> = Bound<'py, PyArrayDyn<f32>>;
 
-/// Acts in each row, without Python's lock.
+/// The policy's action in each row, `[rows, action_size]`.
 pub fn act<'py>(
     py: Python<'py>,
     policy: &dyn Policy,
@@ -43,11 +42,8 @@ pub fn act<'py>(
     rows.array(py, actions, &[width])
 }
 
-/// Has a policy compute without Python's lock.
-///
-/// # Errors
-/// It fails, or this process was forked from one in which a policy has computed: then rayon's
-/// threads, which a fork does not copy, would never answer.
+/// Runs a policy without Python's lock. Fails in a process that was forked after a policy has run:
+/// rayon's threads, which a fork does not copy, would never answer.
 pub fn compute<T: Send>(
     py: Python<'_>,
     work: impl Send + FnOnce() -> Result<T, PolicyError>,
@@ -59,7 +55,7 @@ pub fn compute<T: Send>(
     py.detach(work).map_err(|error| of_policy(&error))
 }
 
-/// Rows and their states, in parts of which each takes bounded memory.
+/// Splits rows and their states into parts of bounded memory.
 pub fn parts<'a>(
     policy: &dyn Policy,
     observations: &'a [f32],
@@ -69,13 +65,12 @@ pub fn parts<'a>(
     observations.chunks(rows * policy.observation_dim()).zip(states.chunks_mut(rows))
 }
 
-/// What the policy carries through the episodes of these seeds.
+/// The initial states of the episodes of these seeds.
 pub fn begin(policy: &dyn Policy, seeds: &[u64]) -> Vec<EpisodeState> {
     seeds.iter().map(|seed| policy.begin(*seed)).collect()
 }
 
-/// What a policy draws in the first step of these episodes, by name: what is not drawn is not
-/// there.
+/// The noise of a policy in the first step of these episodes, by name.
 pub fn noise<'py>(
     py: Python<'py>,
     policy: &dyn Policy,
@@ -91,29 +86,26 @@ pub fn noise<'py>(
         uniform.extend((0..draws).map(|_| (state.uniform() as f32).min(1.0_f32.next_down())));
     }
     let inputs = PyDict::new(py);
+    let rows = states.len();
     if row > 0 {
-        inputs.set_item(
-            "noise",
-            PyArray::from_vec(py, normal).reshape([&[states.len()], &shape[..]].concat())?,
-        )?;
+        let shape = [&[rows], &shape[..]].concat();
+        inputs.set_item("noise", PyArray::from_vec(py, normal).reshape(shape)?)?;
     }
     if draws > 0 {
-        inputs
-            .set_item("uniform", PyArray::from_vec(py, uniform).reshape([states.len(), draws])?)?;
+        inputs.set_item("uniform", PyArray::from_vec(py, uniform).reshape([rows, draws])?)?;
     }
     Ok(inputs)
 }
 
-/// A seed for each of n rows: `seed + i`, or what a sequence says, or fresh ones.
+/// A seed for each of n rows: `seed + i`, or those of a sequence, or random ones.
 pub fn seeds(seed: Option<&Bound<'_, PyAny>>, n: usize) -> PyResult<Vec<u64>> {
     let Some(seed) = seed else { return Ok((0..n).map(|_| rand::random()).collect()) };
     if let Ok(seed) = seed.extract::<u64>() {
         return Ok((0..n as u64).map(|i| seed.wrapping_add(i)).collect());
     }
-    let expected = format!("a sequence of {n} of them, or None");
     match seed.extract::<Vec<u64>>() {
         Ok(seeds) if seeds.len() == n => Ok(seeds),
-        _ => Err(not_seeds(&expected)),
+        _ => Err(not_seeds(&format!("a sequence of {n} of them, or None"))),
     }
 }
 

@@ -1,4 +1,4 @@
-//! Arrays from Python as rows of numbers, and back.
+//! Conversion between Python's arrays and rows of numbers.
 
 use numpy::{
     AllowTypeChange, Element, PyArray, PyArrayDyn, PyArrayLikeDyn, PyArrayMethods,
@@ -9,62 +9,60 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use std::borrow::Cow;
 
-/// What Python gives for an array: float32 as it is, anything else that NumPy takes, converted.
-pub struct Like<'py> {
+/// An array-like argument: float32 arrays as they are, anything else converted by NumPy.
+pub struct ArrayLike<'py> {
     array: PyArrayLikeDyn<'py, f32, AllowTypeChange>,
-    /// The names that a table, such as pandas's, has for its columns, or a dictionary's keys.
+    /// Columns of a table, such as pandas's, or keys of a dictionary.
     columns: Vec<String>,
-    /// Whether it was a dictionary, whose numbers go by their names, in any order.
+    /// Whether it was a dictionary, whose order does not count.
     by_name: bool,
 }
 
-impl<'a, 'py> FromPyObject<'a, 'py> for Like<'py> {
+impl<'a, 'py> FromPyObject<'a, 'py> for ArrayLike<'py> {
     type Error = PyErr;
 
     fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
         if let Ok(numbers) = given.cast::<PyDict>() {
             let array =
                 given.py().import("numpy")?.call_method1("stack", (numbers.values(), -1))?;
-            return Ok(Self {
-                array: array.extract()?,
-                columns: numbers.keys().extract()?,
-                by_name: true,
-            });
+            let columns = numbers.keys().extract()?;
+            return Ok(Self { array: array.extract()?, columns, by_name: true });
         }
-        let columns = given.getattr("columns").and_then(|columns| columns.try_iter());
-        let columns =
-            columns.and_then(|names| names.map(|name| name?.extract()).collect::<PyResult<_>>());
-        Ok(Self { array: given.extract()?, columns: columns.unwrap_or_default(), by_name: false })
+        let names = given.getattr("columns").and_then(|columns| columns.try_iter());
+        let names = names.and_then(|names| names.map(|name| name?.extract()).collect());
+        let columns = names.unwrap_or_default();
+        Ok(Self { array: given.extract()?, columns, by_name: false })
     }
 }
 
 /// Rows of an array, `rows × width`.
 pub struct Rows<'a> {
-    /// The numbers, all finite. Borrowed if they lie side by side.
+    /// Finite numbers, borrowed if the array is contiguous.
     pub values: Cow<'a, [f32]>,
-    /// How many rows; 1 for an array of one axis.
+    /// Number of rows; 1 for an array of one axis.
     pub count: usize,
     /// Whether the array has one axis.
     pub single: bool,
 }
 
 impl<'a> Rows<'a> {
-    /// The rows of an array, called `name` to the user, each of `width` numbers: `[n, width]` or
-    /// `[width]`. These have the names `names`, or none. A dictionary of `[n]` or of single numbers
-    /// is read by these names; what else it has is not looked at.
-    ///
-    /// # Errors
-    /// ValueError for another shape, for a table whose columns are others, for a dictionary that
-    /// lacks one, and for NaN or an infinite number.
-    pub fn of(name: &str, given: &'a Like<'_>, width: usize, names: &[String]) -> PyResult<Self> {
-        let Like { array, columns, by_name } = given;
-        let list = names.join(", ");
+    /// The rows of an array `[n, width]` or `[width]`, which errors call `name`. `names` are the names
+    /// of the columns, or empty. A dictionary of `[n]` or of single numbers is read by these names,
+    /// its other keys are ignored. Other shapes, columns, and numbers that are not finite are
+    /// ValueErrors.
+    pub fn of(
+        name: &str,
+        given: &'a ArrayLike<'_>,
+        width: usize,
+        names: &[String],
+    ) -> PyResult<Self> {
+        let ArrayLike { array, columns, by_name } = given;
+        let (list, refused) = (names.join(", "), |error| Err(PyValueError::new_err(error)));
         if !by_name && !names.is_empty() && !columns.is_empty() && columns != names {
             let columns = columns.join(", ");
-            let error = format!(
+            return refused(format!(
                 "{name} has the columns {columns}, but the policy takes, in this order, {list}"
-            );
-            return Err(PyValueError::new_err(error));
+            ));
         }
         let places = if *by_name { places(name, columns, names)? } else { Vec::new() };
         let across = if *by_name { columns.len() } else { width };
@@ -74,38 +72,33 @@ impl<'a> Rows<'a> {
             ref shape => {
                 let shape = shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
                 let list = if names.is_empty() { list } else { format!(": {list}") };
-                let error = format!(
+                return refused(format!(
                     "{name} has shape [{shape}], but must have [n, {width}] or [{width}]{list}"
-                );
-                return Err(PyValueError::new_err(error));
+                ));
             }
         };
+        let copied = || Vec::from_iter(array.as_array().iter().copied());
         let values = match array.as_slice() {
             _ if *by_name => {
-                let all: Vec<f32> = array.as_array().iter().copied().collect();
-                Cow::Owned(
-                    all.chunks(across)
-                        .flat_map(|row| places.iter().map(|place| row[*place]))
-                        .collect(),
-                )
+                let all = copied();
+                let of_row = |row: &[f32]| Vec::from_iter(places.iter().map(|place| row[*place]));
+                Cow::Owned(all.chunks(across).flat_map(of_row).collect())
             }
-            // Columns may lie side by side, too.
+            // A slice may also have the order of columns.
             Ok(values) if array.is_c_contiguous() => Cow::Borrowed(values),
-            _ => Cow::Owned(array.as_array().iter().copied().collect()),
+            _ => Cow::Owned(copied()),
         };
         if let Some(i) = values.iter().position(|value| !value.is_finite()) {
             let (row, column, value) = (i / width, i % width, values[i]);
             let called = names.get(column).map_or(String::new(), |name| format!(" ({name})"));
-            let error = format!(
+            return refused(format!(
                 "{name}, row {row}: number {column}{called} is {value}, but must be a finite float32"
-            );
-            return Err(PyValueError::new_err(error));
+            ));
         }
         Ok(Self { values, count, single })
     }
 
-    /// An array of a row of that shape for each of these rows, without the axis of rows if these
-    /// lack it.
+    /// An array `[count, row...]`; `[row...]` for a single row.
     pub fn array<'py, T: Element>(
         &self,
         py: Python<'py>,
@@ -117,7 +110,7 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// The place of each name among a dictionary's keys.
+/// The position of each name among a dictionary's keys.
 fn places(name: &str, keys: &[String], names: &[String]) -> PyResult<Vec<usize>> {
     if names.is_empty() {
         let error = format!(
@@ -125,12 +118,10 @@ fn places(name: &str, keys: &[String], names: &[String]) -> PyResult<Vec<usize>>
         );
         return Err(PyValueError::new_err(error));
     }
-    let place = |name: &String| keys.iter().position(|key| key == name);
-    let lacking: Vec<_> =
-        names.iter().filter(|name| place(name).is_none()).map(String::as_str).collect();
+    let lacking = Vec::from_iter(names.iter().filter(|name| !keys.contains(name)).cloned());
     if !lacking.is_empty() {
         let error = format!("{name} lacks {}; it has {}", lacking.join(", "), keys.join(", "));
         return Err(PyValueError::new_err(error));
     }
-    Ok(names.iter().filter_map(place).collect())
+    Ok(names.iter().filter_map(|name| keys.iter().position(|key| key == name)).collect())
 }

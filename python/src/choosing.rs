@@ -1,4 +1,4 @@
-//! How a policy chooses among its candidates, as Python says it.
+//! A policy's choice among its candidates, as Python's arguments.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use quad_policy::{Aggregate, Choice, Policy};
 
 use crate::error::of_policy;
 
-/// How a call chooses among candidates where it differs from the file.
+/// Arguments that change the choice of the file.
 #[derive(Default)]
 pub struct Changes {
     pub candidates: Option<i64>,
@@ -17,7 +17,7 @@ pub struct Changes {
     pub value: Option<String>,
 }
 
-/// The policy, with these changes to how it chooses.
+/// The policy with a changed choice.
 pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn Policy>> {
     if let Changes { candidates: None, rule: None, value: None } = changes {
         return Ok(policy.clone());
@@ -25,13 +25,9 @@ pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn 
     let mut choice = policy.choice().unwrap_or(Choice::best_of(1));
     if let Some(candidates) = changes.candidates {
         let most = Choice::MOST_CANDIDATES;
-        let error = || {
-            PyValueError::new_err(format!(
-                "candidates is {candidates}, but must be from 1 to {most}"
-            ))
-        };
-        choice.candidates =
-            u32::try_from(candidates).ok().filter(|n| (1..=most).contains(n)).ok_or_else(error)?;
+        let count = u32::try_from(candidates).ok().filter(|n| (1..=most).contains(n));
+        let error = format!("candidates is {candidates}, but must be from 1 to {most}");
+        choice.candidates = count.ok_or_else(|| PyValueError::new_err(error))?;
     }
     if let Some(rule) = changes.rule {
         let error = |expected| PyValueError::new_err(format!("rule is {rule:?}, not {expected}"));
@@ -44,16 +40,15 @@ pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn 
     policy.with_choice(choice).map(Arc::from).map_err(|error| of_policy(&error))
 }
 
-/// A choice as the arguments that ask for it.
+/// A choice as Python's arguments.
 pub fn as_dictionary(py: Python<'_>, choice: Choice) -> PyResult<Bound<'_, PyDict>> {
-    let rule = choice.rule.to_string();
     let value = match choice.value {
         Aggregate::Mean => "mean",
         Aggregate::Min => "min",
     };
     let dictionary = PyDict::new(py);
     dictionary.set_item("candidates", choice.candidates)?;
-    dictionary.set_item("rule", rule)?;
+    dictionary.set_item("rule", choice.rule.to_string())?;
     dictionary.set_item("value", value)?;
     Ok(dictionary)
 }

@@ -1,4 +1,4 @@
-//! What `quad_rl.Dataset` takes from the crate that Rust's programs read and write data with.
+//! Datasets, for `quad_rl.Dataset`.
 
 use std::path::PathBuf;
 
@@ -13,8 +13,8 @@ fn refused(error: &DatasetError) -> PyErr {
     with_hint(error, &error.hint())
 }
 
-/// Writes the custom layout. All arrays are C-contiguous and have the same number of rows; names
-/// may be empty lists.
+/// Writes a file of our own layout. All arrays are C-contiguous and have the same number of rows;
+/// names may be empty lists.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "they are the file's arrays")]
 pub fn write_dataset(
@@ -43,7 +43,7 @@ pub fn write_dataset(
     py.detach(|| write_own(path, arrays, names)).map_err(|error| refused(&error))
 }
 
-/// What is in a dataset: as JSON, and as a page.
+/// A summary of a dataset, as JSON and as text.
 #[pyfunction]
 pub fn inspect_dataset(py: Python<'_>, path: PathBuf) -> PyResult<(String, String)> {
     let inspection = py.detach(|| inspect(path, None)).map_err(|error| refused(&error))?;

@@ -1,5 +1,4 @@
-//! `quad_rl.Episodes`: a policy in the middle of episodes, each with its own noise, as an evaluator
-//! has it.
+//! `quad_rl.Episodes`: a policy in several episodes, each with its own noise.
 
 use std::mem;
 use std::sync::Arc;
@@ -10,9 +9,9 @@ use quad_dataset::Names;
 use quad_policy::{EpisodeState, Policy};
 
 use crate::acting::{Array, act, begin};
-use crate::arrays::{Like, Rows};
+use crate::arrays::{ArrayLike, Rows};
 
-/// Episodes in which a policy acts, as `Policy.begin` gives them. `len` is how many.
+/// Episodes in which a policy acts, from `Policy.begin`. `len` is their number.
 #[pyclass(module = "quad_rl")]
 pub struct Episodes {
     policy: Arc<dyn Policy>,
@@ -26,22 +25,16 @@ impl Episodes {
         Self { states: begin(&*policy, seeds), policy, names }
     }
 
-    /// These rows, if they are ours and each is named once.
+    /// Checks that rows are within range and distinct.
     fn check(&self, rows: Vec<i64>) -> PyResult<Vec<usize>> {
-        let mut seen = vec![false; self.states.len()];
-        let check = |row| {
-            let place =
-                usize::try_from(row).ok().filter(|place| *place < seen.len()).ok_or_else(|| {
-                    format!(
-                        "rows has {row}, but there are {} episodes, counted from 0",
-                        self.states.len()
-                    )
-                })?;
-            if mem::replace(&mut seen[place], true) {
+        let count = self.states.len();
+        let mut seen = vec![false; count];
+        let check = |row| match usize::try_from(row).ok().filter(|row| *row < count) {
+            None => Err(format!("rows has {row}, but there are {count} episodes, counted from 0")),
+            Some(place) if mem::replace(&mut seen[place], true) => {
                 Err(format!("rows has {row} twice"))
-            } else {
-                Ok(place)
             }
+            Some(place) => Ok(place),
         };
         rows.into_iter().map(check).collect::<Result<_, _>>().map_err(PyValueError::new_err)
     }
@@ -61,30 +54,25 @@ impl Episodes {
     fn act<'py>(
         &mut self,
         py: Python<'py>,
-        observations: Like<'py>,
+        observations: ArrayLike<'py>,
         rows: Option<Vec<i64>>,
     ) -> PyResult<Array<'py>> {
-        let given = Rows::of(
-            "observations",
-            &observations,
-            self.policy.observation_dim(),
-            &self.names.observations,
-        )?;
+        let width = self.policy.observation_dim();
+        let given = Rows::of("observations", &observations, width, &self.names.observations)?;
         let rows = match rows {
             Some(rows) => self.check(rows)?,
             None => (0..self.states.len()).collect(),
         };
         if given.count != rows.len() {
-            let error = format!("{} rows of observations for {} episodes", given.count, rows.len());
             return Err(PyValueError::new_err(format!(
-                "{error}; rows=[…] says to which of them they belong"
+                "{} rows of observations for {} episodes; rows=[…] says to which of them they belong",
+                given.count,
+                rows.len()
             )));
         }
-        // Out of the list and back: the policy takes states that lie side by side.
-        let mut states: Vec<_> = rows
-            .iter()
-            .map(|row| mem::replace(&mut self.states[*row], EpisodeState::new(0)))
-            .collect();
+        // The policy takes a slice of states.
+        let take = |row: &usize| mem::replace(&mut self.states[*row], EpisodeState::new(0));
+        let mut states: Vec<_> = rows.iter().map(take).collect();
         let acted = act(py, &*self.policy, &given, &mut states);
         rows.iter().zip(states).for_each(|(row, state)| self.states[*row] = state);
         acted

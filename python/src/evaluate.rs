@@ -1,8 +1,6 @@
-//! Environments that Python moves, and the evaluator that serves them: the one of `evaluator
-//! serve`, with another body.
+//! Environments in Python, served like `evaluator serve` serves its own.
 //!
-//! `quad_rl/_worker.py` is the other side: its objects make, reset and step environments, and say
-//! what went wrong.
+//! The objects of `quad_rl/_worker.py` make, reset and step environments.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -14,14 +12,14 @@ use quad_evaluator::serve::{ServeArgs, serve};
 use quad_evaluator::sim::{Environment, EnvironmentError, Environments, Simulations, Step};
 use quad_runtime::init_logging;
 
-/// What Python's object can make environments of.
+/// Environments that Python's factory makes.
 struct PythonEnvironments {
     name: String,
     sizes: Option<(usize, usize)>,
     factory: Arc<Py<PyAny>>,
 }
 
-/// One that was made. Dropped, it goes back to the factory, which may give it out again.
+/// An environment. When dropped, it goes back to the factory, which may return it again.
 struct PythonEnvironment {
     name: String,
     environment: Py<PyAny>,
@@ -54,7 +52,7 @@ impl Environments for PythonEnvironments {
 }
 
 impl PythonEnvironment {
-    /// Calls a method and keeps the observation that comes first in what it gives.
+    /// Calls a method that returns an observation and something else. Keeps the observation.
     fn observe<T>(
         &mut self,
         call: impl FnOnce(&Bound<'_, PyAny>) -> PyResult<(Py<PyAny>, T)>,
@@ -100,20 +98,19 @@ impl Environment for PythonEnvironment {
 
 impl Drop for PythonEnvironment {
     fn drop(&mut self) {
-        // What closing it may say is the worker's to log.
+        // The worker logs errors.
         Python::attach(|py| self.factory.call_method1(py, "release", (&self.environment,)).ok());
     }
 }
 
-/// What the worker says of an error, in one line.
+/// The worker's one-line message of an error.
 fn failed(name: &str, error: &PyErr) -> EnvironmentError {
     let reason = Python::attach(|py| error.value(py).to_string());
     EnvironmentError::Failed { name: name.to_owned(), reason }
 }
 
-/// Serves learners with `factory`'s environments until this process gets SIGTERM. `factory` has
-/// `make(seed)`, `release(made)`, and what it makes has `reset(seed)`, `step(action)` and
-/// `score(return)`.
+/// Serves learners with `factory`'s environments until SIGTERM. `factory` has `make(seed)` and
+/// `release(environment)`, an environment `reset(seed)`, `step(action)` and `score(return)`.
 #[pyfunction]
 #[pyo3(signature = (name, factory, *, sizes, connect, certificates, precision))]
 pub fn serve_environment(
@@ -136,7 +133,7 @@ pub fn serve_environment(
     served.map_err(|error| PyRuntimeError::new_err(format!("{error:#}")))
 }
 
-/// Names of the environments that `evaluator serve` simulates.
+/// Names of the environments of `evaluator serve`.
 #[pyfunction]
 pub fn simulated() -> Vec<String> {
     Simulations.names()

@@ -1,4 +1,4 @@
-//! A policy's file, and what it says of itself.
+//! Policy files and their headers.
 
 use pyo3::exceptions::{PyUserWarning, PyValueError};
 use pyo3::prelude::*;
@@ -8,11 +8,9 @@ use serde_json::{Value, json};
 
 use crate::error::with_hint;
 
-/// What such a file is.
 pub const HINT: &str = "a policy is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this version writes them";
 
-/// Reads a policy of this file, which errors call `name`, in this precision; others than this CPU
-/// has warn.
+/// Loads a policy from a file, which errors call `name`. Warns if this CPU lacks the precision.
 pub fn read(
     py: Python<'_>,
     file: &[u8],
@@ -33,7 +31,7 @@ pub fn read(
     Ok((asked, policy, header))
 }
 
-/// What any file says, and what `learner export` has added.
+/// The header of a file with the additions of `learner export`, as JSON.
 pub fn all_about(header: &Header<Origin>) -> String {
     let Header { scaling, observation_names, action_names, origin, about, version, .. } = header;
     let of_any = json!({

@@ -1,5 +1,4 @@
-//! The module `quad_rl._quad_rl`: QUAD for Python. The types of what its classes and functions take
-//! and give stand in `py/quad_rl/_quad_rl.pyi`, too.
+//! The module `quad_rl._quad_rl`: QUAD for Python. `py/quad_rl/_quad_rl.pyi` has its types.
 
 mod acting;
 mod arrays;

@@ -12,26 +12,26 @@ use quad_protocol::Origin;
 use quad_run::files;
 
 use crate::acting::{Array, act, begin, compute, noise, not_seeds, parts, seeds};
-use crate::arrays::{Like, Rows};
+use crate::arrays::{ArrayLike, Rows};
 use crate::choosing::{Changes, as_dictionary, choosing};
 use crate::episodes::Episodes;
 use crate::file::{HINT, all_about, read};
 
 /// A policy that `learner train` has saved: `Policy.load(path)`.
 ///
-/// It takes and gives the units of the data that it has learned from. All calls release Python's
-/// lock and share the processor's cores with rayon: the environment variable RAYON_NUM_THREADS
-/// says, before the first call, how many. In a process that was forked after a call, calls raise
-/// RuntimeError; with multiprocessing use "spawn".
+/// Observations and actions have the units of the data. All calls release Python's lock and use
+/// rayon's threads; the environment variable RAYON_NUM_THREADS sets their number before the first
+/// call. In a process that was forked after a call, calls raise RuntimeError; with multiprocessing
+/// use "spawn".
 #[pyclass(name = "Policy", module = "quad_rl", frozen)]
 pub struct PyPolicy {
     policy: Arc<dyn Policy>,
     config: PolicyConfig,
     origin: Origin,
     names: Arc<Names>,
-    /// What else its file says of it, as JSON.
+    /// The file's header as JSON.
     about: String,
-    /// The file and the precision that was asked for, to make a copy of.
+    /// The file and the requested precision, for copies.
     file: Vec<u8>,
     asked: Precision,
 }
@@ -40,22 +40,22 @@ pub struct PyPolicy {
 impl PyPolicy {
     /// Reads the file of a snapshot, like "runs/mine/snapshots/step_000020000.safetensors".
     ///
-    /// precision: "f32", or "bf16", which rounds and is faster on CPUs with AMX or AMD's
-    /// AVX512-BF16; others warn and use f32.
+    /// precision: "f32", or "bf16", which is less exact and faster on CPUs with AMX or AMD's
+    /// AVX512-BF16; on others it warns and uses f32.
     ///
     /// Raises OSError if the file cannot be read, ValueError if it is no policy.
     #[staticmethod]
     #[pyo3(signature = (path, precision = "f32"))]
     fn load(py: Python<'_>, path: PathBuf, precision: &str) -> PyResult<Self> {
-        let read = py.detach(|| files::read_named(&path));
-        let file = read.map_err(|error| {
-            let message = format!("cannot read {}: {error}\nhint: {HINT}", path.display());
+        let name = path.display().to_string();
+        let file = py.detach(|| files::read_named(&path)).map_err(|error| {
+            let message = format!("cannot read {name}: {error}\nhint: {HINT}");
             std::io::Error::new(error.kind(), message)
         })?;
-        Self::from_bytes(py, file, precision, &path.display().to_string())
+        Self::from_bytes(py, file, precision, &name)
     }
 
-    /// As `load`, from the file's bytes; `name` is what errors call it.
+    /// As `load`, from the file's bytes; errors call the file `name`.
     #[staticmethod]
     #[pyo3(signature = (file, precision = "f32", name = "the file"))]
     fn from_bytes(py: Python<'_>, file: Vec<u8>, precision: &str, name: &str) -> PyResult<Self> {
@@ -66,21 +66,17 @@ impl PyPolicy {
         Ok(Self { policy: policy.into(), config, origin, names, about, file, asked })
     }
 
-    /// Acts in each of n states: observations [n, observation_size] -> actions [n, action_size],
-    /// float32.
+    /// Acts in n states: observations [n, observation_size] -> actions [n, action_size], float32.
     ///
-    /// An array of one axis is one state, and gives one action. float32 arrays whose numbers lie
-    /// side by side are not copied; anything else that NumPy takes is converted. A dictionary, such
-    /// as of a message's joints, is read by `observation_names`, in any order: single numbers are
-    /// one state, [n] each are n; what else it has is not looked at.
-    ///
-    /// candidates: how many actions are drawn in each state. rule: which of them is taken, "best",
-    /// "softmax:TEMPERATURE",
-    ///     "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest". value: what the critics' values of an action count
-    ///     as, "mean" or "min". None: what the file says (`choice`).
-    /// seed: an int: row i draws from seed + i, so that one observation gives what an evaluator
-    /// does in the first step of the
-    ///     episode of that seed. A sequence of n ints: a seed for each row. None: fresh random numbers.
+    /// observations: an array of one axis is one state, and gives one action. Contiguous float32
+    ///     arrays are not copied; anything else that NumPy takes is converted. A dictionary is read by
+    ///     `observation_names`, in any order: single numbers are one state, arrays [n] are n; other
+    ///     keys are ignored.
+    /// candidates: the number of actions drawn in each state. rule: the choice among them, "best",
+    ///     "softmax:TEMPERATURE", "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest".
+    ///     value: the "mean" or "min" of the critics. None: the file's `choice`.
+    /// seed: an int: row i draws from seed + i, as an evaluator does in the first step of the episode
+    ///     of that seed. A sequence of n ints: a seed for each row. None: fresh random numbers.
     ///
     /// For whole episodes see `begin`.
     ///
@@ -90,7 +86,7 @@ impl PyPolicy {
     fn act<'py>(
         &self,
         py: Python<'py>,
-        observations: Like<'py>,
+        observations: ArrayLike<'py>,
         candidates: Option<i64>,
         rule: Option<String>,
         value: Option<String>,
@@ -107,7 +103,7 @@ impl PyPolicy {
     fn predict<'py>(
         &self,
         py: Python<'py>,
-        observations: Like<'py>,
+        observations: ArrayLike<'py>,
         candidates: Option<i64>,
         rule: Option<String>,
         value: Option<String>,
@@ -116,16 +112,14 @@ impl PyPolicy {
         self.act(py, observations, candidates, rule, value, seed)
     }
 
-    /// Draws what `act` chooses among: (actions [n, candidates, action_size], values [n,
-    /// candidates]), float32.
-    ///
-    /// For one state, without the first axis. With the same seed `act` takes one of these. Raises
-    /// as `act`, and ValueError if the policy has no critics.
+    /// Draws candidates of `act`: (actions [n, candidates, action_size], values [n, candidates]),
+    /// float32; for one state, without the first axis. With the same seed, `act` chooses among these.
+    /// Raises as `act`, and ValueError if the policy has no critics.
     #[pyo3(signature = (observations, *, candidates = None, value = None, seed = None))]
     fn sample<'py>(
         &self,
         py: Python<'py>,
-        observations: Like<'py>,
+        observations: ArrayLike<'py>,
         candidates: Option<i64>,
         value: Option<String>,
         seed: Option<&Bound<'py, PyAny>>,
@@ -143,33 +137,29 @@ impl PyPolicy {
             Ok((actions, values))
         })?;
         let candidates = policy.choice().map_or(1, |choice| choice.candidates as usize);
-        Ok((
-            rows.array(py, actions, &[candidates, policy.action_dim()])?,
-            rows.array(py, values, &[candidates])?,
-        ))
+        let actions = rows.array(py, actions, &[candidates, policy.action_dim()])?;
+        Ok((actions, rows.array(py, values, &[candidates])?))
     }
 
-    /// What the critics say that actions are worth: observations [n, observation_size], actions [n,
-    /// action_size] -> [n], float32, the discounted return that they expect of the rewards that the
-    /// learner saw. For one state and action an array without axes.
+    /// The critics' values of actions, discounted returns of the scaled rewards: observations [n,
+    /// observation_size], actions [n, action_size] -> [n], float32. For one state and action, an array
+    /// without axes.
     ///
-    /// value: "mean" of the critics or their "min". Raises as `act`, and ValueError if the policy
-    /// has no critics.
+    /// value: the "mean" or "min" of the critics. Raises as `act`, and ValueError if the policy has no
+    /// critics.
     #[pyo3(signature = (observations, actions, *, value = None))]
     fn value<'py>(
         &self,
         py: Python<'py>,
-        observations: Like<'py>,
-        actions: Like<'py>,
+        observations: ArrayLike<'py>,
+        actions: ArrayLike<'py>,
         value: Option<String>,
     ) -> PyResult<Array<'py>> {
         let rows = self.rows(&observations)?;
         let taken = Rows::of("actions", &actions, self.policy.action_dim(), &self.names.actions)?;
-        if (taken.count, taken.single) != (rows.count, rows.single) {
-            let error = format!(
-                "{} observations, but {} actions: one action for each",
-                rows.count, taken.count
-            );
+        let (n, m) = (rows.count, taken.count);
+        if (m, taken.single) != (n, rows.single) {
+            let error = format!("{n} observations, but {m} actions: one action for each");
             return Err(PyValueError::new_err(error));
         }
         let policy = choosing(&self.policy, Changes { value, ..Changes::default() })?;
@@ -180,10 +170,10 @@ impl PyPolicy {
         rows.array(py, values, &[])
     }
 
-    /// The noise that `act` draws with these arguments in n states: the inputs, beside the
-    /// observations, of what `export_onnx` writes. A dictionary, empty if the policy draws nothing,
-    /// of "noise", standard normal numbers [n, ...], and, where the rule draws too, "uniform",
-    /// numbers within [0, 1), [n, draws]; float32. Raises as `act`.
+    /// The noise that `act` draws with these arguments in n states, as inputs of the models of
+    /// `export_onnx`: a dictionary of "noise", standard normal numbers [n, ...], and "uniform", numbers
+    /// within [0, 1), [n, draws], float32, without those that the policy does not draw. Raises as
+    /// `act`.
     #[pyo3(signature = (n, *, candidates = None, rule = None, value = None, seed = None))]
     fn noise<'py>(
         &self,
@@ -198,9 +188,8 @@ impl PyPolicy {
         noise(py, &*policy, &mut begin(&*policy, &seeds(seed, n)?))
     }
 
-    /// Begins an episode for each seed (an int, or a sequence of them). In each, the policy draws
-    /// as an evaluator does from step to step: the same seed and observations give the same
-    /// actions, bit for bit.
+    /// Begins an episode for each seed (an int or a sequence). The policy draws as in an evaluator:
+    /// equal seeds and observations give equal actions, bit for bit.
     ///
     ///     episodes = policy.begin([0, 1, 2])
     ///     actions = episodes.act(observations)  # [3, observation_size] -> [3, action_size]
@@ -232,14 +221,13 @@ impl PyPolicy {
         self.policy.action_dim()
     }
 
-    /// What its data calls the numbers of an observation; empty where they have no names. Other
-    /// columns are refused.
+    /// Names of the numbers in an observation, from the data; empty if it has none.
     #[getter]
     fn observation_names(&self) -> Vec<String> {
         self.names.observations.clone()
     }
 
-    /// What that data calls the numbers of an action.
+    /// Names of the numbers in an action.
     #[getter]
     fn action_names(&self) -> Vec<String> {
         self.names.actions.clone()
@@ -251,7 +239,7 @@ impl PyPolicy {
         &self.origin.environment
     }
 
-    /// The gradient step that it was saved after.
+    /// The gradient step of the snapshot.
     #[getter]
     fn step(&self) -> u64 {
         self.origin.step
@@ -272,23 +260,22 @@ impl PyPolicy {
         }
     }
 
-    /// All that its file says of it, a dictionary: version that wrote it, environment, step, names
-    /// of the numbers of observations and actions, scaling (user's = offset + scale · network's, or
-    /// None); and, if `learner export` made the file, run, task, algorithm, data with its license,
-    /// score, and judgment.
+    /// The file's header, a dictionary: version of the learner, environment, step, names of the
+    /// numbers in observations and actions, scaling (data's = offset + scale · network's, or None); and
+    /// from `learner export` run, task, algorithm, data with its license, score, and judgment.
     #[getter]
     fn about<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         py.import("json")?.call_method1("loads", (&self.about,))
     }
 
-    /// Arithmetic in effect, "f32" or "bf16".
+    /// Precision in effect, "f32" or "bf16".
     #[getter]
     fn precision(&self) -> &'static str {
         self.policy.precision().name()
     }
 
-    /// How it chooses: a dictionary of candidates, rule and value, as `act` takes them. None if it
-    /// draws nothing.
+    /// The choice among candidates: a dictionary of `act`'s arguments candidates, rule and value; None
+    /// if the policy draws nothing.
     #[getter]
     fn choice<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
         self.policy.choice().map(|choice| as_dictionary(py, choice)).transpose()
@@ -317,12 +304,8 @@ impl PyPolicy {
 }
 
 impl PyPolicy {
-    fn rows<'a>(&self, observations: &'a Like<'_>) -> PyResult<Rows<'a>> {
-        Rows::of(
-            "observations",
-            observations,
-            self.policy.observation_dim(),
-            &self.names.observations,
-        )
+    fn rows<'a>(&self, observations: &'a ArrayLike<'_>) -> PyResult<Rows<'a>> {
+        let width = self.policy.observation_dim();
+        Rows::of("observations", observations, width, &self.names.observations)
     }
 }

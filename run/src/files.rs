@@ -1,9 +1,8 @@
 //! The one way to open and the one way to make a file in a run's folder, for all programs.
 //!
-//! Another user may have made the folder. So a file there is opened through no link, and a pipe or
-//! a device in its place is neither waited for nor read without end. A file is made beside its
-//! place under a random name, and renamed when it is whole: what was there before, or all of the
-//! new contents, also after a power cut. The tests find every other call.
+//! Another user may have made the folder, so links are not followed, and pipes and devices are not
+//! read. A new file is written under a random name, then renamed: after a power cut the old or the new
+//! contents are there, never a part. A test finds every other call.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom, Write};
@@ -15,36 +14,26 @@ use rustix::io::Errno;
 
 /// Ending of a file that is being written.
 const PARTIAL: &str = "partial";
-/// The most that is read of a file, bytes: a checkpoint of networks as large as evaluators take has
-/// less.
+/// Most bytes that are read of a file; checkpoints of the largest networks have fewer.
 const LARGEST: u64 = 2 << 30;
 
-/// Opens a file of a run's folder for reading.
-///
-/// # Errors
-/// There is none, or it is a link, a pipe or a device.
+/// Opens a file of a run's folder for reading; links, pipes and devices are errors.
 pub fn open(path: &Path) -> io::Result<File> {
     open_as(OpenOptions::new().read(true), OFlags::NOFOLLOW, path)
 }
 
 /// As [`open`], for a path that the user has named: it may be a link.
-///
-/// # Errors
-/// There is no file, or it is a pipe or a device.
 pub fn open_named(path: &Path) -> io::Result<File> {
     open_as(OpenOptions::new().read(true), OFlags::empty(), path)
 }
 
-/// Opens a file for appending and reading; makes it if there is none.
-///
-/// # Errors
-/// It is a link, a pipe or a device, or cannot be written to.
+/// Opens or makes a file for appending and reading; links, pipes and devices are errors.
 pub fn append(path: &Path) -> io::Result<File> {
     open_as(OpenOptions::new().create(true).read(true).append(true), OFlags::NOFOLLOW, path)
 }
 
 fn open_as(options: &mut OpenOptions, link: OFlags, path: &Path) -> io::Result<File> {
-    // Else the system waits for the other end of a pipe.
+    // Without NONBLOCK, the system waits for the other end of a pipe.
     let flags = link | OFlags::NONBLOCK | OFlags::NOCTTY;
     let file = options.custom_flags(flags.bits() as i32).open(path).map_err(|error| {
         let is_none = matches!(Errno::from_io_error(&error), Some(Errno::LOOP | Errno::NXIO));
@@ -58,41 +47,27 @@ pub(crate) fn no_file() -> io::Error {
 }
 
 /// Reads a file of a run's folder.
-///
-/// # Errors
-/// Those of [`open`] and [`rest`].
 pub fn read(path: &Path) -> io::Result<Vec<u8>> {
     rest(&mut open(path)?, 0)
 }
 
 /// Reads a file whose path the user has named.
-///
-/// # Errors
-/// Those of [`open_named`] and [`rest`].
 pub fn read_named(path: &Path) -> io::Result<Vec<u8>> {
     rest(&mut open_named(path)?, 0)
 }
 
 /// Reads a text file of a run's folder.
-///
-/// # Errors
-/// Those of [`read`], or it is not UTF-8.
 pub fn read_text(path: &Path) -> io::Result<String> {
     String::from_utf8(read(path)?)
         .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is not UTF-8"))
 }
 
-/// What a file has from a byte on.
-///
-/// # Errors
-/// That is too large, or cannot be read.
+/// Reads a file from an offset to its end.
 pub fn rest(file: &mut File, from: u64) -> io::Result<Vec<u8>> {
     let length = file.metadata()?.len().saturating_sub(from);
     if length > LARGEST {
-        return Err(io::Error::new(
-            ErrorKind::FileTooLarge,
-            format!("it is too large, with {length} bytes"),
-        ));
+        let problem = format!("it is too large, with {length} bytes");
+        return Err(io::Error::new(ErrorKind::FileTooLarge, problem));
     }
     let mut bytes = Vec::new();
     bytes.try_reserve_exact(length as usize)?;
@@ -101,10 +76,7 @@ pub fn rest(file: &mut File, from: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Makes the file `target`, or puts it in the place of one, durably.
-///
-/// # Errors
-/// It cannot be written: then what was there stays.
+/// Makes or replaces the file `target`, durably. After an error, the old file is still there.
 pub fn replace(target: &Path, bytes: &[u8]) -> io::Result<()> {
     let partial = target.with_added_extension(format!("{:08x}.{PARTIAL}", rand::random::<u32>()));
     let mut file = File::create_new(&partial)?;
@@ -113,19 +85,18 @@ pub fn replace(target: &Path, bytes: &[u8]) -> io::Result<()> {
         .and_then(|()| fs::rename(&partial, target))
         .and_then(|()| synchronize_folder(target))
         .inspect_err(|_| {
-            // On a full disk the half file would keep others from being written.
+            // On a full disk, the partial file would take the room of others.
             fs::remove_file(&partial).ok();
         })
 }
 
-/// Removes a file, if it is there.
+/// Removes a file if it exists.
 pub(crate) fn remove_if_there(path: &Path) -> io::Result<()> {
     fs::remove_file(path)
         .or_else(|error| if error.kind() == ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }
 
-/// Removes the half files that killed processes have left in a folder. One that stays does no harm
-/// but to take room.
+/// Removes the partial files of killed processes in a folder.
 pub(crate) fn remove_partial_files(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
@@ -136,8 +107,7 @@ pub(crate) fn remove_partial_files(folder: &Path) {
     }
 }
 
-/// Makes a folder and those above it that are missing, so that a power cut does not take what will
-/// be in them.
+/// Makes a folder and its missing parents, durably.
 pub(crate) fn create_folder(path: &Path) -> io::Result<()> {
     if path.is_dir() {
         return Ok(());
@@ -149,10 +119,7 @@ pub(crate) fn create_folder(path: &Path) -> io::Result<()> {
     synchronize_folder(path)
 }
 
-/// Makes the names in the folder that `path` lies in durable.
-///
-/// # Errors
-/// The folder cannot be opened or synchronized.
+/// Makes the names in the folder of `path` durable.
 pub fn synchronize_folder(path: &Path) -> io::Result<()> {
     let folder =
         path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));

@@ -1,10 +1,10 @@
-//! What tests write into run folders; the learner's have them, too.
+//! Contents of run folders for the tests of this crate and of the learner.
 
 use quad_run::config::{RunConfig, resolve};
 use quad_run::folder::ScoreLine;
 use serde_json::json;
 
-/// The configuration of a run with two episodes an evaluation.
+/// The configuration of a run with two episodes per evaluation.
 pub fn config(name: &str, seed: u64) -> RunConfig {
     let mut experiment = resolve("hopper-demo", &Default::default()).unwrap();
     (experiment.seed, experiment.episodes) = (seed, 2);

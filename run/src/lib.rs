@@ -1,15 +1,13 @@
-//! Runs on the disk: a run's settings, its folder, its results and its state. It is the one reader
-//! of what a learner writes.
+//! Runs on disk: settings, folders, results and progress.
 //!
-//! It has no thread; every program calls it on threads of its own. In reading order; each module
-//! may use those below it:
+//! In reading order; each module may use those below it:
 //!
-//! - [`status`]: how far runs are, and a list of all runs.
-//! - [`results`]: a run's scores, summarized, and the paper's.
-//! - [`folder`]: a run's folder.
-//! - [`config`]: a run's settings.
-//! - [`table`]: a table as text, Markdown, LaTeX and CSV.
-//! - [`files`]: how every program opens and makes files in a run's folder.
+//! - [`status`]: progress of runs, and a list of all runs.
+//! - [`results`]: summaries of a run's scores, and published scores.
+//! - [`folder`]: the files of a run.
+//! - [`config`]: the settings of a run.
+//! - [`table`]: tables as text, Markdown and LaTeX.
+//! - [`files`]: opens and makes files in a run's folder, for all programs.
 
 #![deny(unsafe_code)]
 

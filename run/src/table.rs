@@ -1,4 +1,4 @@
-//! Tables and sentences for people: aligned for a terminal, as Markdown or LaTeX.
+//! Tables and paragraphs: aligned for a terminal, as Markdown or LaTeX.
 
 use std::fmt::Alignment::{self, Right};
 
@@ -41,10 +41,10 @@ impl Block {
 /// A column of a table of `T`s: its header, its alignment, and the text of a cell.
 pub type Column<T> = (&'static str, Alignment, fn(&T) -> String);
 
-/// A table: which columns are aligned to the right, and rows of cells, of which the first is the
-/// header.
+/// A table. The first row is the header.
 #[derive(Serialize)]
 pub struct Table {
+    /// Columns that are aligned to the right.
     right: Vec<bool>,
     rows: Vec<Vec<String>>,
 }
@@ -52,11 +52,9 @@ pub struct Table {
 impl Table {
     /// A table with this header and no rows.
     pub fn new<T: AsRef<str>>(header: &[(T, Alignment)]) -> Self {
-        let right = header.iter().map(|(_, alignment)| *alignment == Right).collect();
-        Self {
-            right,
-            rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()],
-        }
+        let names = header.iter().map(|(name, _)| name.as_ref().to_owned());
+        let right = header.iter().map(|(_, alignment)| *alignment == Right);
+        Self { right: right.collect(), rows: vec![names.collect()] }
     }
 
     /// A table with a row for each item.
@@ -69,7 +67,7 @@ impl Table {
         table
     }
 
-    /// A row has a cell for each column. A cell is in one line, whatever file its text is from.
+    /// Adds a row with a cell for each column. Control characters become spaces.
     pub fn push(&mut self, row: impl Into<Vec<String>>) {
         self.rows.push(row.into().iter().map(|cell| cell.replace(char::is_control, " ")).collect());
     }
@@ -81,9 +79,9 @@ impl Table {
                 self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat()
             }
             Style::Markdown => {
-                let rows =
-                    self.rows.iter().map(|row| row.iter().map(|cell| markdown(cell)).collect());
-                let escaped = Self { right: self.right.clone(), rows: rows.collect() };
+                let escape = |row: &Vec<String>| row.iter().map(|cell| markdown(cell)).collect();
+                let rows = self.rows.iter().map(escape).collect();
+                let escaped = Self { right: self.right.clone(), rows };
                 let mut lines = escaped.lines(|cells| format!("| {} |\n", cells.join(" | ")));
                 let rule = self.right.iter().map(|right| if *right { "---:" } else { "---" });
                 lines.insert(1, format!("| {} |\n", Vec::from_iter(rule).join(" | ")));
@@ -91,7 +89,7 @@ impl Table {
             }
             Style::Latex => {
                 let line = |row: &Vec<String>| {
-                    let cells = row.iter().map(|cell| latex(cell)).collect::<Vec<_>>().join(" & ");
+                    let cells = Vec::from_iter(row.iter().map(|cell| latex(cell))).join(" & ");
                     // After the \\ of another row, these would be its options.
                     let guard = if cells.trim_start().starts_with(['[', '*']) { "{}" } else { "" };
                     format!("{guard}{cells} \\\\\n")
@@ -99,10 +97,9 @@ impl Table {
                 let mut lines: Vec<String> = self.rows.iter().map(line).collect();
                 lines.insert(1, "\\midrule\n".to_owned());
                 let columns = self.right.iter().map(|right| if *right { 'r' } else { 'l' });
-                let columns = String::from_iter(columns);
+                let (columns, rows) = (String::from_iter(columns), lines.concat());
                 format!(
-                    "\\begin{{tabular}}{{{columns}}}\n\\toprule\n{}\\bottomrule\n\\end{{tabular}}\n",
-                    lines.concat()
+                    "\\begin{{tabular}}{{{columns}}}\n\\toprule\n{rows}\\bottomrule\n\\end{{tabular}}\n"
                 )
             }
         }
@@ -114,21 +111,18 @@ impl Table {
             self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0)
         };
         let widths: Vec<usize> = (0..self.right.len()).map(width).collect();
+        let pad = |((cell, width), right): ((&String, &usize), &bool)| match right {
+            false => format!("{cell:<width$}"),
+            true => format!("{cell:>width$}"),
+        };
         let padded = |row: &Vec<String>| {
-            let cells =
-                row.iter().zip(&widths).zip(&self.right).map(
-                    |((cell, width), right)| match right {
-                        false => format!("{cell:<width$}"),
-                        true => format!("{cell:>width$}"),
-                    },
-                );
-            line(&Vec::from_iter(cells))
+            line(&Vec::from_iter(row.iter().zip(&widths).zip(&self.right).map(pad)))
         };
         self.rows.iter().map(padded).collect()
     }
 }
 
-/// Text as LaTeX has it, whatever its encoding of fonts.
+/// Escapes text for LaTeX, for any encoding of fonts.
 fn latex(text: &str) -> String {
     let escaped = |c: char| match c {
         '&' | '%' | '$' | '#' | '_' | '{' | '}' => format!("\\{c}"),
@@ -144,7 +138,7 @@ fn latex(text: &str) -> String {
     text.chars().map(escaped).collect()
 }
 
-/// A cell of a Markdown table, of which nothing is taken for another cell or for HTML.
+/// Escapes a cell of a Markdown table.
 fn markdown(cell: &str) -> String {
     cell.replace('\\', "\\\\").replace('|', "\\|").replace('<', "\\<")
 }

@@ -10,5 +10,5 @@ pub fn run(args: &JudgeArgs) -> anyhow::Result<()> {
     let JudgeArgs { policies, gamma, steps, seeds, json: as_json } = args;
     let ranking = judge(policies, *gamma, Budget { steps: *steps, seeds: *seeds })?;
     let text = |part: Block| part.render(Style::Text);
-    print(&if *as_json { json(&ranking)? } else { ranking.parts().map(text).join("\n") })
+    print(&if *as_json { json(&ranking)? } else { ranking.blocks().map(text).join("\n") })
 }

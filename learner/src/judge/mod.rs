@@ -90,7 +90,7 @@ fn judge_all(
         let (run, count) = (folder.path().display(), snapshots.len());
         info!("{number} of {count}: {run} @ {step} is judged");
         // A folder of another user's cannot be written to; its judgment is printed all the same.
-        if let Err(error) = judgment.keep(folder) {
+        if let Err(error) = judgment.save(folder) {
             warn!("{error}: the judgment is not kept");
         }
         judgments.push(judgment);

@@ -101,7 +101,7 @@ fn of_method(method: &Method) -> MethodReport {
     let statistics = |drawn: &[Runs]| {
         let of = [interquartile_mean, mean_of_means, median_of_means, optimality_gap];
         let mut values = Vec::from_iter(of.map(|of| of(&drawn[0])));
-        values.extend(thresholds.iter().map(|at| statistics::share_above(&drawn[0], *at)));
+        values.extend(thresholds.iter().map(|at| statistics::fraction_above(&drawn[0], *at)));
         values
     };
     let estimates = statistics::estimates(&[&runs], statistics);

@@ -1,8 +1,8 @@
-//! Where training runs, as a name.
+//! The device of training.
 
 use serde::{Deserialize, Serialize};
 
-/// Where training runs, as it is called on the command line and in files.
+/// The device of training.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Device {
@@ -14,7 +14,7 @@ pub enum Device {
 }
 
 impl Device {
-    /// What it is called on command lines and in files.
+    /// Name on the command line and in files.
     pub fn name(self) -> &'static str {
         match self {
             Self::Cpu => "cpu",

@@ -1,7 +1,7 @@
-//! What a user probably meant by a misspelled name.
+//! Suggestions for misspelled names.
 
-/// `did you mean a, b? ` with up to three of the known names, the most similar first; nothing if
-/// none is similar. A name is similar if few letters differ, or if the word is part of it.
+/// `did you mean a, b? ` with up to three known names that contain the word or differ in few letters,
+/// the most similar first; empty if there are none.
 pub fn did_you_mean<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> String {
     let likeness = |name| (strsim::normalized_damerau_levenshtein(word, name), name);
     let mut similar: Vec<(f64, &str)> = known.into_iter().map(likeness).collect();
@@ -12,4 +12,19 @@ pub fn did_you_mean<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) ->
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::did_you_mean;
+
+    #[test]
+    fn suggests_similar_names() {
+        let known = ["hopper-demo", "walker2d-demo", "walker2d-medium-replay-v2"];
+        for (word, answer) in [
+            ("hoper-demo", "did you mean hopper-demo? "),
+            ("walker2d-medium-reply-v2", "did you mean walker2d-medium-replay-v2? "),
+            ("walker", "did you mean walker2d-demo, walker2d-medium-replay-v2? "),
+            ("zzz", ""),
+        ] {
+            assert_eq!(did_you_mean(word, known), answer);
+        }
+    }
+}

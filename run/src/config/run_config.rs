@@ -1,4 +1,4 @@
-//! What a run's folder says of itself in `config.toml`.
+//! Contents of `config.toml` in a run's folder.
 
 use std::path::PathBuf;
 
@@ -8,82 +8,76 @@ use serde::{Deserialize, Serialize};
 use super::device::Device;
 use super::experiment::Experiment;
 
-/// The file's contents.
+/// The configuration of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[allow(missing_docs)] // The types say what each is.
 pub struct RunConfig {
-    /// Which run this is.
     pub run: RunInfo,
-    /// What it learns from.
     pub dataset: DatasetInfo,
-    /// How it learns.
     pub experiment: Experiment,
 }
 
-/// Which run this is.
+/// Identity of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunInfo {
-    /// Name of the run: its folder's name, and its place in Zenoh's key space.
+    /// Name of the run: its folder's name, and part of its Zenoh keys.
     pub name: Name,
-    /// When the run was first started, in milliseconds since 1970. In the file it is called
-    /// `incarnation`, as it always was; it is not the number of a learner's start on the wire,
-    /// which has that name, too.
+    /// Time of the first start, in milliseconds since 1970. The file calls it `incarnation`; on the
+    /// wire, this is the name of another number.
     #[serde(rename = "incarnation")]
     pub started: u64,
-    /// Task that was asked for; of a user's file that names none, the file's name. Older runs call
-    /// it their preset.
+    /// The task, or the name of a user's file that names no task. Older runs call it their preset.
     #[serde(alias = "preset")]
     pub task: String,
     /// Version of the learner.
     pub version: String,
-    /// The machine on which the run began: its CPU, how many threads of it, and the instructions it
-    /// multiplies with. Older runs do not say.
+    /// CPU, number of threads and instructions of the machine on which the run began; absent in older
+    /// runs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub machine: Option<String>,
-    /// Where it trains; runs from before there was a choice do not say.
+    /// Device of training; absent in older runs.
     #[serde(default)]
     pub device: Device,
 }
 
-/// What the run learns from.
+/// Contents of the dataset.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetInfo {
     /// The file.
     pub path: PathBuf,
     /// SHA-256 of the file in hexadecimal, of a folder of Minari's that of its `main_data.hdf5`;
-    /// older runs do not say.
+    /// absent in older runs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sha256: Option<String>,
-    /// Transitions that are learned from.
+    /// Transitions of training.
     pub transitions: u64,
-    /// Trajectories in the file.
+    /// Trajectories of training.
     pub episodes: u64,
-    /// Numbers of the episodes that are kept out of training, from 0 in the file's order; the other
-    /// figures are not of them.
+    /// Indices of the episodes that are kept out of training, in the file's order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub held_out: Vec<usize>,
     /// Smallest return of a trajectory, unscaled.
     pub min_return: f64,
-    /// The mean of their returns.
+    /// Mean return.
     pub mean_return: f64,
-    /// The largest of them.
+    /// Largest return.
     pub max_return: f64,
-    /// Mean D4RL-normalized score of the trajectories, where the environment has reference returns.
+    /// Mean D4RL-normalized score, where the environment has reference returns.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mean_score: Option<f64>,
 }
 
 impl DatasetInfo {
-    /// How much it holds and how good it is, in one line.
+    /// Size and quality of the data, in one line.
     pub fn summary(&self) -> String {
         let Self { transitions, episodes, held_out, mean_return, mean_score, .. } = self;
-        let score = mean_score.map(|score| format!(", mean score {score:.2}")).unwrap_or_default();
-        let held_out = if held_out.is_empty() {
-            String::new()
-        } else {
-            format!("; {} more are held out", held_out.len())
+        let score = mean_score.map_or(String::new(), |score| format!(", mean score {score:.2}"));
+        let held_out = match held_out.len() {
+            0 => String::new(),
+            count => format!("; {count} more are held out"),
         };
         format!(
             "{transitions} transitions of {episodes} episodes, mean return {mean_return:.2}{score}{held_out}"

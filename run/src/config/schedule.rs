@@ -1,35 +1,61 @@
-//! How many gradient steps a run has, and after which of them its policy is evaluated.
+//! Gradient steps and evaluations of a run.
 
-/// A run's gradient steps and evaluations.
+/// Gradient steps and evaluations of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Schedule {
     /// Gradient steps.
     pub steps: u64,
-    /// Gradient steps between two evaluations; 0: none at all.
+    /// Gradient steps between two evaluations; 0 turns evaluations off.
     pub eval_interval: u64,
 }
 
 impl Schedule {
-    /// Whether the policy after that gradient step is evaluated.
+    /// Whether the policy after a gradient step is evaluated.
     pub fn is_evaluated(&self, step: u64) -> bool {
         let is_due = step == self.steps || step.is_multiple_of(self.eval_interval);
         self.eval_interval > 0 && (1..=self.steps).contains(&step) && is_due
     }
 
-    /// How many policies are evaluated.
+    /// Number of evaluated policies.
     pub fn evaluations(self) -> u64 {
         if self.eval_interval == 0 { 0 } else { self.steps.div_ceil(self.eval_interval) }
     }
 
-    /// The steps whose policies are evaluated, in ascending order.
+    /// The evaluated steps, in ascending order.
     pub fn evaluated_steps(self) -> impl Iterator<Item = u64> {
         let Self { steps, eval_interval } = self;
-        let regular =
-            (1..=steps.checked_div(eval_interval).unwrap_or(0)).map(move |n| n * eval_interval);
+        let count = steps.checked_div(eval_interval).unwrap_or(0);
+        let regular = (1..=count).map(move |n| n * eval_interval);
         let last = eval_interval > 0 && !steps.is_multiple_of(eval_interval);
         regular.chain(last.then_some(steps))
     }
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+
+    #[test]
+    fn evaluations_of_a_run_without_end_are_counted() {
+        assert_eq!(Schedule { steps: u64::MAX, eval_interval: 1 }.evaluations(), u64::MAX);
+        let long = Schedule { steps: 1_000_000_000_001, eval_interval: 1000 };
+        assert_eq!(long.evaluations(), 1_000_000_001);
+    }
+
+    #[test]
+    fn evaluated_steps() {
+        for (steps, eval_interval, expected) in [
+            (10, 5, &[5, 10][..]),
+            (10, 4, &[4, 8, 10]),
+            (10, 20, &[10]),
+            (3, 1, &[1, 2, 3]),
+            (10, 0, &[]),
+        ] {
+            let schedule = Schedule { steps, eval_interval };
+            assert_eq!(Vec::from_iter(schedule.evaluated_steps()), expected, "{schedule:?}");
+            assert_eq!(schedule.evaluations(), expected.len() as u64, "{schedule:?}");
+            let evaluated = (0..=2 * steps).filter(|step| schedule.is_evaluated(*step));
+            assert_eq!(Vec::from_iter(evaluated), expected, "{schedule:?}");
+        }
+    }
+}

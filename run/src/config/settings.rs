@@ -1,5 +1,4 @@
-//! What decides the outcome of a run, key by key: by it a run is compared with others, and with
-//! itself when it continues.
+//! Settings of a run as keys and values, to compare runs.
 
 use std::collections::BTreeMap;
 
@@ -12,12 +11,11 @@ use super::tables;
 /// Values by dotted key.
 pub type Settings = BTreeMap<String, String>;
 
-/// Everything that decides the outcome of a run, the seed included.
+/// All settings that decide the outcome of a run.
 pub fn of_run(config: &RunConfig) -> Settings {
     let mut settings = of_experiment(&config.experiment);
     let mut dataset = flat(&config.dataset);
-    // The same file may lie in several places. Where the hash of its contents is known, it says
-    // all.
+    // The path says nothing; a known hash says everything.
     dataset.remove("path");
     if dataset.contains_key("sha256") {
         dataset.retain(|key, _| key == "sha256");
@@ -27,7 +25,7 @@ pub fn of_run(config: &RunConfig) -> Settings {
     settings
 }
 
-/// What is set, but for the name of the dataset, which says less than its contents.
+/// The settings of an experiment, without the dataset.
 pub fn of_experiment(experiment: &Experiment) -> Settings {
     let mut settings = flat(experiment);
     settings.remove("dataset");
@@ -35,12 +33,12 @@ pub fn of_experiment(experiment: &Experiment) -> Settings {
 }
 
 fn flat(value: &impl Serialize) -> Settings {
-    // Everything here was read from TOML, so it can be written.
+    // Serialization cannot fail: everything was read from TOML.
     let table = toml::Table::try_from(value).unwrap_or_default();
     tables::keys(&table).into_iter().map(|(key, value)| (key, value.to_string())).collect()
 }
 
-/// The keys at which two settings differ, in alphabetical order for each of them.
+/// The keys at which two settings differ.
 pub fn differences<'a>(a: &'a Settings, b: &'a Settings) -> impl Iterator<Item = &'a String> {
     a.keys()
         .chain(b.keys().filter(|key| !a.contains_key(*key)))

@@ -1,14 +1,9 @@
-//! What TOML tables are to presets and settings: laid over one another, flattened, and written on a
-//! command line.
+//! Operations on TOML tables.
 
 pub use quad_algorithms::merge;
 use toml::{Table, Value};
 
-/// Reads `agent.tau=0.5`: a dotted key and a value in TOML's notation, where a word needs no
-/// quotes.
-///
-/// # Errors
-/// A sentence for the user who typed it.
+/// Parses `agent.tau=0.5`: a dotted key and a TOML value, in which text needs no quotes.
 pub fn parse_assignment(text: &str) -> Result<Table, String> {
     let (key, value) = text.split_once('=').ok_or("write KEY=VALUE, for example agent.tau=0.5")?;
     let quoted = || format!("{key} = {}", Value::String(value.trim().to_owned()));
@@ -17,15 +12,14 @@ pub fn parse_assignment(text: &str) -> Result<Table, String> {
         .map_err(|_| format!("{key:?} is no key like agent.tau"))
 }
 
-/// The values of a table and of the tables in it, with dotted keys.
+/// The values of a table and its inner tables, with dotted keys.
 pub fn keys(table: &Table) -> Vec<(String, &Value)> {
     let mut all = Vec::new();
     for (key, value) in table {
         match value {
             Value::Table(inner) => {
-                all.extend(
-                    keys(inner).into_iter().map(|(rest, value)| (format!("{key}.{rest}"), value)),
-                );
+                let dotted = |(rest, value)| (format!("{key}.{rest}"), value);
+                all.extend(keys(inner).into_iter().map(dotted));
             }
             value => all.push((key.clone(), value)),
         }
@@ -34,4 +28,19 @@ pub fn keys(table: &Table) -> Vec<(String, &Value)> {
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parses_assignments() {
+        for (text, expected) in [
+            ("agent.tau=0.5", "agent.tau = 0.5"),
+            ("environment=my-robot", "environment = 'my-robot'"),
+            ("dataset=a b/c=\"d\".hdf5", "dataset = 'a b/c=\"d\".hdf5'"),
+        ] {
+            assert_eq!(parse_assignment(text), Ok(expected.parse().unwrap()));
+        }
+        assert!(parse_assignment("agent.tau").unwrap_err().contains("KEY=VALUE"));
+        assert!(parse_assignment("agent tau=1").unwrap_err().contains("agent tau"));
+    }
+}

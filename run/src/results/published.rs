@@ -1,4 +1,4 @@
-//! Scores that others publish for tasks: the files in `published/`, the QUAD paper's first.
+//! Published scores of tasks: the files in `published/`, the QUAD paper's first.
 
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
@@ -6,57 +6,58 @@ use std::sync::LazyLock;
 use quad_dataset::ogbench::is_ogbench;
 use serde::{Deserialize, Serialize};
 
-/// What a method is published to score on a task.
+/// The published score of a method on a task.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Published {
-    /// The method, as its source calls it.
+    /// Name of the method in its source.
     pub method: &'static str,
-    /// Its D4RL-normalized score, or its rate of success in percent.
+    /// D4RL-normalized score, or rate of success in percent.
     pub score: Printed,
-    /// Where it stands.
+    /// Citation.
     pub source: &'static str,
-    /// The tables that have the method.
+    /// Tables that contain the method.
     #[serde(skip)]
     pub tables: &'static [String],
-    /// How such figures are made, in a sentence.
+    /// The source's protocol of evaluation, in a sentence.
     #[serde(skip)]
     pub protocol: &'static str,
-    /// What the figure does not show.
+    /// Known peculiarities of the score.
     pub remarks: Vec<Remark>,
 }
 
-/// What is known to be wrong or peculiar of a figure.
+/// A known error or peculiarity of a score.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Remark {
-    /// What it is, in words.
+    /// Explanation.
     pub reason: &'static str,
-    /// The figure with which the reason ends, if it ends with one.
+    /// The figure at the end of the explanation, if it ends with one.
     pub instead: Option<f64>,
-    /// Whether the figure is the best of several, by the very returns that it reports.
+    /// Whether the score is the best of several, selected by the reported returns.
     pub selected: bool,
 }
 
-/// A figure as it is printed.
+/// A score as it is printed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Printed {
-    /// The mean over seeds.
+    /// Mean over seeds.
     pub mean: f64,
-    /// What stands behind its ±, if it has one. Its source may not say which convention that
-    /// follows.
+    /// The number after ±, whose convention the source may not name.
     pub std: Option<f64>,
 }
+
+/// Scores by task and method: the mean and, if printed, the deviation.
+type Scores = BTreeMap<String, BTreeMap<String, Vec<f64>>>;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Tables {
-    /// Training seeds behind a figure.
+    /// Training seeds per score.
     seeds: usize,
-    /// Evaluations at a run's end whose mean is the run's score.
+    /// Final evaluations averaged.
     last: usize,
     protocol: String,
     method: Vec<Method>,
-    /// Scores by task and method: the mean, and where there is one the deviation.
-    scores: BTreeMap<String, BTreeMap<String, Vec<f64>>>,
+    scores: Scores,
     remark: Vec<KnownRemark>,
 }
 
@@ -66,20 +67,20 @@ struct Method {
     name: String,
     source: String,
     tables: Vec<String>,
-    /// Ours of that method, and its variant.
+    /// Our algorithm and variant.
     algorithm: Option<String>,
     variant: Option<String>,
 }
 
-/// A remark on figures of some methods.
+/// A remark on the scores of some methods.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct KnownRemark {
     methods: Vec<String>,
-    /// How the names of its tasks begin; empty: any task.
+    /// Prefixes of its tasks; empty: all tasks.
     #[serde(default)]
     tasks: Vec<String>,
-    /// The figure with which the reason ends, by task; empty: it ends with none.
+    /// [`Remark::instead`] by task.
     #[serde(default)]
     instead: BTreeMap<String, f64>,
     reason: String,
@@ -88,7 +89,7 @@ struct KnownRemark {
 }
 
 impl KnownRemark {
-    /// The remark, if it is about this figure.
+    /// The remark, if it applies to a score.
     fn on(&'static self, method: &str, task: &str) -> Option<Remark> {
         let is_of_task = match (self.tasks.is_empty(), self.instead.is_empty()) {
             (true, true) => true,
@@ -112,61 +113,53 @@ static SOURCES: LazyLock<[Tables; 4]> = LazyLock::new(|| {
     files.map(|file| toml::from_str(file).expect("the embedded tables are valid"))
 });
 
-/// The sources that have a task, with its scores by method.
-fn of_task(
-    task: &str,
-) -> impl Iterator<Item = (&'static Tables, &'static BTreeMap<String, Vec<f64>>)> {
-    SOURCES.iter().filter_map(move |tables| Some((tables, tables.scores.get(task)?)))
+/// The sources of a task.
+fn of_task(task: &str) -> impl Iterator<Item = &'static Tables> {
+    SOURCES.iter().filter(move |tables| tables.scores.contains_key(task))
 }
 
-/// What is published for a task, the paper's own method first; nothing for tasks that no source
-/// has.
+/// The published scores of a task, the paper's own method first.
 pub fn scores(task: &str) -> Vec<Published> {
-    let of_source = |(tables, scores): (&'static Tables, &'static BTreeMap<String, Vec<f64>>)| {
-        tables.method.iter().filter_map(
-            move |Method { name, source, tables: of_method, .. }| {
-                let figures = scores.get(name)?;
-                let score = Printed { mean: *figures.first()?, std: figures.get(1).copied() };
-                let remarks =
-                    tables.remark.iter().filter_map(|known| known.on(name, task)).collect();
-                Some(Published {
-                    method: name,
-                    score,
-                    source,
-                    tables: of_method,
-                    protocol: &tables.protocol,
-                    remarks,
-                })
-            },
-        )
+    let of_source = |source: &'static Tables| {
+        source.method.iter().filter_map(move |Method { name, source: cited, tables, .. }| {
+            let figures = source.scores[task].get(name)?;
+            let remarks = source.remark.iter().filter_map(|known| known.on(name, task));
+            Some(Published {
+                method: name,
+                score: Printed { mean: *figures.first()?, std: figures.get(1).copied() },
+                source: cited,
+                tables,
+                protocol: &source.protocol,
+                remarks: remarks.collect(),
+            })
+        })
     };
     of_task(task).flat_map(of_source).collect()
 }
 
-/// How many training seeds stand behind a figure for the task; a single one where nothing is
-/// published.
+/// Training seeds per published score of the task; 1 if nothing is published.
 pub fn seeds(task: &str) -> usize {
-    of_task(task).next().map_or(1, |(tables, _)| tables.seeds)
+    of_task(task).next().map_or(1, |tables| tables.seeds)
 }
 
-/// How many evaluations at a run's end have the mean that is its score. Where nothing is published,
-/// it is FQL's authors' number in OGBench, else the QUAD paper's.
+/// Number of final evaluations averaged for a score. If nothing is published, it is that of FQL's
+/// authors in OGBench, else the QUAD paper's.
 pub fn last(task: &str) -> usize {
     let [paper, .., of_ogbench] = &*SOURCES;
     let unpublished = if is_ogbench(task) { of_ogbench } else { paper };
-    of_task(task).next().map_or(unpublished.last, |(tables, _)| tables.last)
+    of_task(task).next().unwrap_or(unpublished).last
 }
 
-/// The tables in which runs of an algorithm stand: those of the task that have the algorithm, or
-/// else the first of the task.
+/// The tables for runs of an algorithm: the task's tables that contain the algorithm, else the task's
+/// first table.
 pub fn tables(task: &str, algorithm: &str) -> Vec<&'static str> {
     let figures = scores(task);
-    // A table has the task if one of its figures is in no other.
+    // A table has the task if one of its scores is in no other table.
     let of_task = |table: &&str| figures.iter().any(|figure| figure.tables == [*table]);
     let all = Vec::from_iter(all_tables().into_iter().filter(of_task));
     let has_it = |table: &&str| {
-        let is_it = |method: &&Method| method.algorithm.as_deref() == Some(algorithm);
-        all_methods().filter(is_it).any(|method| method.tables.iter().any(|one| one == table))
+        let has = |method: &Method| method.tables.iter().any(|one| one == table);
+        all_methods().any(|method| method.algorithm.as_deref() == Some(algorithm) && has(method))
     };
     let with_it = Vec::from_iter(all.iter().copied().filter(has_it));
     if with_it.is_empty() { all.into_iter().take(1).collect() } else { with_it }
@@ -177,8 +170,7 @@ pub fn all_tables() -> Vec<&'static str> {
     once_each(all_methods().flat_map(|method| &method.tables).map(String::as_str))
 }
 
-/// What sources call a variant of an algorithm: several names where one has several rows, none
-/// where none has one.
+/// The sources' names of a variant of an algorithm: one for each of its rows.
 pub fn methods(algorithm: &str, variant: &str) -> Vec<&'static str> {
     let is_it = |method: &&Method| {
         method.algorithm.as_deref() == Some(algorithm)
@@ -191,7 +183,7 @@ fn all_methods() -> impl Iterator<Item = &'static Method> {
     SOURCES.iter().flat_map(|tables| &tables.method)
 }
 
-/// Names in their order, none twice.
+/// Removes later duplicates of names.
 pub fn once_each<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     let mut known = Vec::new();
     for name in names {

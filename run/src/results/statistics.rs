@@ -1,43 +1,38 @@
-//! Statistics over runs, each beside its definition. Pure functions: what is random has a seed of
-//! its own.
+//! Statistics over runs. Random ones have a fixed seed.
 //!
-//! Those over tasks are of Agarwal et al. 2021, "Deep reinforcement learning at the edge of the
-//! statistical precipice" (NeurIPS), as its authors' library rliable computes them. Their strata
-//! are the tasks: a task counts as much as any other, however many seeds it has.
+//! Statistics over tasks are those of Agarwal et al. 2021, "Deep reinforcement learning at the edge
+//! of the statistical precipice" (NeurIPS), as its authors' library rliable computes them. Strata are
+//! the tasks: each has the same weight, however many seeds it has.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
-/// Resamples behind an interval, and sign flips behind a p-value that is not exact.
+/// Resamples of an interval, and sign flips of a p-value that is not exact.
 pub const RESAMPLES: usize = 10_000;
 /// Pairs up to which all sign flips are tried.
 const EXACT_PAIRS: usize = 16;
 const SEED: u64 = 0;
 
-/// A figure of each run of a method: a list for each task, with a value for each seed. None of them
-/// is empty.
+/// Values of a method's runs: a nonempty list for each task, with a value for each seed.
 pub type Runs<T = f64> = Vec<Vec<T>>;
 
-/// A statistic, and the ends of its 95 % interval; without these where a task has a single seed, of
-/// whose spread nothing is known.
+/// A statistic and its 95 % interval, which is absent if a task has a single seed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Estimate {
-    /// The statistic of the runs themselves.
+    /// The statistic of the runs.
     pub value: f64,
-    /// 2.5 % of the resamples are below it.
+    /// 2.5 % of the resamples are below.
     pub low: Option<f64>,
-    /// 2.5 % of the resamples are above it.
+    /// 2.5 % of the resamples are above.
     pub high: Option<f64>,
 }
 
 impl Estimate {
     /// `value [low, high]`.
     pub fn text(self, digits: usize) -> String {
-        let interval = self
-            .low
-            .zip(self.high)
-            .map(|(low, high)| format!(" [{low:.digits$}, {high:.digits$}]"));
+        let interval = |(low, high)| format!(" [{low:.digits$}, {high:.digits$}]");
+        let interval = self.low.zip(self.high).map(interval);
         format!("{:.digits$}{}", self.value, interval.unwrap_or_default())
     }
 }
@@ -47,9 +42,9 @@ pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// The mean over tasks of a task's figure.
-fn over_tasks(scores: &Runs, figure: impl Fn(&[f64]) -> f64) -> f64 {
-    scores.iter().map(|task| figure(task)).sum::<f64>() / scores.len() as f64
+/// The mean over tasks of a statistic of a task.
+fn over_tasks(scores: &Runs, statistic: impl Fn(&[f64]) -> f64) -> f64 {
+    scores.iter().map(|task| statistic(task)).sum::<f64>() / scores.len() as f64
 }
 
 /// The mean over tasks of the mean over seeds.
@@ -57,26 +52,23 @@ pub fn mean_of_means(scores: &Runs) -> f64 {
     over_tasks(scores, mean)
 }
 
-/// The median over tasks of the mean over seeds; of an even number of tasks, the mean of the two in
-/// the middle.
+/// The median over tasks of the mean over seeds.
 pub fn median_of_means(scores: &Runs) -> f64 {
     let mut means: Vec<f64> = scores.iter().map(|task| mean(task)).collect();
     means.sort_by(f64::total_cmp);
     percentile(&means, 0.5)
 }
 
-/// The mean distance to an expert's score of 100, in units of it; a score above it has none.
+/// The mean of max(1 − score / 100, 0), the distance to an expert's score.
 pub fn optimality_gap(scores: &Runs) -> f64 {
-    over_tasks(scores, |task| {
-        task.iter().map(|score| (1.0 - score / 100.0).max(0.0)).sum::<f64>() / task.len() as f64
-    })
+    let gap = |score: &f64| (1.0 - score / 100.0).max(0.0);
+    over_tasks(scores, |task| task.iter().map(gap).sum::<f64>() / task.len() as f64)
 }
 
-/// The interquartile mean (IQM): the mean of the scores of all tasks without the lowest and the
-/// highest quarter, ⌊n / 4⌋ of n.
+/// The interquartile mean (IQM): the mean of all n scores without the lowest and the highest ⌊n / 4⌋.
 ///
-/// Where tasks have unequal numbers of seeds, a score weighs as much less as its task has more of
-/// them, and the quarters are those of the weight: ⌊n / 4⌋ / n of it.
+/// If tasks have unequal numbers of seeds, a score has the weight of its task divided by them, and
+/// ⌊n / 4⌋ / n of the weight is cut at either end.
 pub fn interquartile_mean(scores: &Runs) -> f64 {
     let weigh = |task: &Vec<f64>| 1.0 / (task.len() * scores.len()) as f64;
     let mut weighed: Vec<_> =
@@ -92,16 +84,15 @@ pub fn interquartile_mean(scores: &Runs) -> f64 {
     sum / (1.0 - 2.0 * cut)
 }
 
-/// A point of the performance profile: the share of runs that score more than this.
-pub fn share_above(scores: &Runs, threshold: f64) -> f64 {
-    over_tasks(scores, |task| {
-        task.iter().filter(|score| **score > threshold).count() as f64 / task.len() as f64
-    })
+/// A point of the performance profile: the fraction of runs that score more than `threshold`.
+pub fn fraction_above(scores: &Runs, threshold: f64) -> f64 {
+    let count = |task: &[f64]| task.iter().filter(|score| **score > threshold).count();
+    over_tasks(scores, |task| count(task) as f64 / task.len() as f64)
 }
 
-/// The mean over tasks of P(X > Y): that a run of one method scores more than a run of another.
-/// Equal scores count half: it is the U of Mann and Whitney (1947) over the number of pairs. Both
-/// have the same tasks.
+/// The mean over tasks of P(X > Y), the probability that a run of one method scores more than a run
+/// of another. Equal scores count half: it is the U of Mann and Whitney (1947) divided by the number
+/// of pairs. Both methods have the same tasks.
 pub fn probability_of_improvement(x: &Runs, y: &Runs) -> f64 {
     let wins = |x: f64, y: f64| if x == y { 0.5 } else { f64::from(u8::from(x > y)) };
     let of_task = |(x, y): (&Vec<f64>, &Vec<f64>)| {
@@ -111,8 +102,8 @@ pub fn probability_of_improvement(x: &Runs, y: &Runs) -> f64 {
     x.iter().zip(y).map(of_task).sum::<f64>() / x.len() as f64
 }
 
-/// Statistics of some methods' runs, with 95 % percentile intervals of the stratified bootstrap: of
-/// each method and in each task, as many seeds are drawn as there are, with replacement.
+/// Statistics of methods' runs with 95 % percentile intervals of the stratified bootstrap, which draws
+/// seeds with replacement within each method and task.
 pub fn estimates<T: Copy>(
     methods: &[&Runs<T>],
     statistics: impl Fn(&[Runs<T>]) -> Vec<f64>,
@@ -137,19 +128,19 @@ pub fn estimates<T: Copy>(
     values.into_iter().zip(resampled).map(estimate).collect()
 }
 
-/// The share of sorted values that is below, between two values in proportion.
+/// The percentile of sorted values, interpolated linearly.
 fn percentile(sorted: &[f64], share: f64) -> f64 {
     let position = share * (sorted.len() - 1) as f64;
     let [below, above] = [position.floor(), position.ceil()].map(|index| sorted[index as usize]);
     below + (above - below) * position.fract()
 }
 
-/// The two-sided p-value of paired differences whose mean would be 0 by chance: the share of all
-/// ways to choose their signs by which the mean is as far from 0 as it is (Fisher 1935, "The design
-/// of experiments", section 21). Of more than 16 pairs 10,000 ways are drawn, and the one at hand
-/// is counted with them (Phipson and Smyth 2010).
+/// The two-sided p-value of paired differences under the hypothesis of mean 0: the fraction of sign
+/// assignments whose mean is as far from 0 as the observed one (Fisher 1935, "The design of
+/// experiments", section 21). For more than 16 pairs, 10,000 assignments are drawn, and the observed
+/// one is counted with them (Phipson and Smyth 2010).
 pub fn sign_flip_test(differences: &[f64]) -> f64 {
-    // Sums of the same numbers differ in their last bits by their order.
+    // Rounding depends on the order of a sum.
     let extreme = differences.iter().sum::<f64>().abs() * (1.0 - 1e-12);
     let is_as_far = |is_flipped: &mut dyn FnMut(usize) -> bool| {
         let signed =
@@ -166,9 +157,9 @@ pub fn sign_flip_test(differences: &[f64]) -> f64 {
     (as_far + 1) as f64 / (RESAMPLES + 1) as f64
 }
 
-/// p-values of some comparisons, corrected for their number by Holm's procedure (1979, "A simple
-/// sequentially rejective multiple test procedure"): the i-th smallest of m is multiplied by m − i
-/// + 1, and is not below a smaller one's.
+/// p-values corrected for their number by Holm's procedure (1979, "A simple sequentially rejective
+/// multiple test procedure"): the i-th smallest of m is multiplied by m − i + 1, and is at least the
+/// one before.
 pub fn holm(p_values: &[f64]) -> Vec<f64> {
     let mut order: Vec<usize> = (0..p_values.len()).collect();
     order.sort_by(|one, other| p_values[*one].total_cmp(&p_values[*other]));

@@ -1,6 +1,4 @@
-//! How far runs are, by their folders alone.
-//!
-//! In reading order: `state` is the state of a run, `list` a table of all runs.
+//! Progress of runs, by their folders alone.
 
 pub mod list;
 mod state;

@@ -1,4 +1,4 @@
-//! Tests of `report/table.rs`.
+//! Tests of tables.
 
 use std::fmt::Alignment::Left;
 
@@ -15,7 +15,7 @@ fn columns_are_aligned_by_characters() {
 }
 
 #[test]
-fn what_a_format_would_take_for_its_own_is_escaped() {
+fn special_characters_are_escaped() {
     let mut table = Table::new(&[("a_b", Left), ("b", Right)]);
     table.push(["50 %, & more".to_owned(), "1 ± 2 \"x\"".to_owned()]);
     let latex = "\\begin{tabular}{lr}\n\\toprule\na\\_b & b \\\\\n\\midrule\n50 \\%, \\& more & 1 $\\pm$ 2 \"x\" \\\\\n\\bottomrule\n\\end{tabular}\n";
@@ -24,9 +24,9 @@ fn what_a_format_would_take_for_its_own_is_escaped() {
     assert_eq!(words.render(Style::Latex), "$\\pm$1 of a\\_b\n\nand\n\n");
 }
 
-/// Tasks are called what their users' files are called, and runs may be another user's.
+/// Names of tasks and runs may be those of another user's files.
 #[test]
-fn a_name_changes_no_table() {
+fn names_do_not_break_tables() {
     for (name, text, markdown, latex) in [
         ("[2cm]", "[2cm]", "[2cm]", "{}[2cm]"),
         ("*", "*", "*", "{}*"),

@@ -1,4 +1,4 @@
-//! Tests of `report/statistics.rs`.
+//! Tests of statistics.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use serde::Deserialize;
 
 use super::*;
 
-/// What rliable and SciPy say; `statistics.py` beside this file writes it.
+/// Results of rliable and SciPy, from `statistics.py` beside this file.
 #[derive(Deserialize)]
 struct Known {
     methods: BTreeMap<String, KnownMethod>,
@@ -34,8 +34,7 @@ fn is_close(one: f64, other: f64) -> bool {
     (one - other).abs() <= 1e-12 * other.abs().max(1.0)
 }
 
-/// The ends of both have noise of their own: with 10,000 resamples of roughly normal statistics
-/// about 1 % of the width.
+/// Intervals are random: with 10,000 resamples, their ends vary by about 1 % of the width.
 fn agree(estimate: Estimate, value: f64, low: f64, high: f64) {
     assert!(is_close(estimate.value, value), "{estimate:?} {value}");
     for (ours, theirs) in [(estimate.low, low), (estimate.high, high)] {
@@ -56,7 +55,7 @@ fn estimates_are_those_of_rliable() {
             agree(estimate, method.values[index], method.low[index], method.high[index]);
         }
         for (threshold, share) in known.thresholds.iter().zip(&method.profile) {
-            assert!(is_close(share_above(&method.scores, *threshold), *share), "{threshold}");
+            assert!(is_close(fraction_above(&method.scores, *threshold), *share), "{threshold}");
         }
     }
     let [x, y] = ["x", "y"].map(|name| &known.methods[name].scores);
@@ -66,18 +65,16 @@ fn estimates_are_those_of_rliable() {
 }
 
 #[test]
-fn the_same_scores_give_the_same_interval_and_a_single_seed_gives_none() {
+fn intervals_are_repeatable_and_need_two_seeds() {
     let of = |runs: Runs| estimates(&[&runs], |drawn| vec![mean_of_means(&drawn[0])])[0];
     let runs = vec![vec![1.0, 2.0, 4.0], vec![3.0, 5.0]];
     assert_eq!(of(runs.clone()), of(runs));
-    assert_eq!(
-        of(vec![vec![1.0, 2.0], vec![3.0]]),
-        Estimate { value: 2.25, low: None, high: None }
-    );
+    let single = Estimate { value: 2.25, low: None, high: None };
+    assert_eq!(of(vec![vec![1.0, 2.0], vec![3.0]]), single);
 }
 
-/// With nine scores, ⌊9 / 4⌋ / 9 of the weight is cut at either end: two of equal weight. With six
-/// and three of them in two tasks, one of the first weighs 1/12 and one of the second 1/6.
+/// Of nine scores, ⌊9 / 4⌋ / 9 of the weight is cut at either end. With six and three of them in two
+/// tasks, a score of the first has the weight 1/12, one of the second 1/6.
 #[test]
 fn the_interquartile_mean_weighs_tasks_alike() {
     let nine = vec![vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 100.0]];
@@ -91,13 +88,12 @@ fn the_interquartile_mean_weighs_tasks_alike() {
 }
 
 #[test]
-fn sign_flips_give_the_p_values_of_scipy_and_drawn_ones_are_near_them() {
+fn sign_flips_give_the_p_values_of_scipy() {
     let known = known();
     for (count, p_value) in (1..).zip(&known.p_values) {
         assert!(is_close(sign_flip_test(&known.differences[..count].concat()), *p_value));
     }
-    // Of 17 differences the ways are drawn. Of eight pairs of opposite ones and one alone, the sum
-    // is as near to 0 as it can be.
+    // For 17 differences, signs are drawn.
     assert_eq!(sign_flip_test(&[1.0; 17]), 1.0 / 10_001.0);
     let balanced: Vec<f64> = (0..17).map(|index| if index % 2 == 0 { 1.0 } else { -1.0 }).collect();
     assert_eq!(sign_flip_test(&balanced), 1.0);
@@ -107,7 +103,7 @@ fn sign_flips_give_the_p_values_of_scipy_and_drawn_ones_are_near_them() {
 }
 
 #[test]
-fn holms_procedure_multiplies_by_how_many_are_left() {
+fn holms_procedure() {
     assert_eq!(holm(&[0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02]);
     assert_eq!(holm(&[0.9, 0.6]), [1.0, 1.0]);
     assert!(holm(&[]).is_empty());
