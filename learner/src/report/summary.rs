@@ -97,7 +97,7 @@ impl Report {
             unreadable.map(|it| format!("Not in this report: {it}.\n")).collect(),
         ));
         let judgments = self.runs.iter().flat_map(|run| run.judgments.iter().cloned());
-        blocks.extend(Ranking::of(judgments).iter().flat_map(Ranking::parts));
+        blocks.extend(Ranking::of(judgments).iter().flat_map(Ranking::blocks));
         for name in all_tables() {
             blocks.extend(published::table(name, &self.groups, self.select));
         }

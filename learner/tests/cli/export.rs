@@ -61,7 +61,7 @@ fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
         behavior: estimate,
         recorded: 1.0,
     };
-    judgment.keep(run).unwrap();
+    judgment.save(run).unwrap();
 }
 
 /// What the file says of its score and judgment, and what is said to the user.
