@@ -30,12 +30,12 @@ impl Certificates {
             .then_some(Certificates { folder })
     }
 
-    /// Makes an evaluator's anew, under the name that it had.
+    /// Makes an evaluator's certificate anew.
     pub fn renew(&self, name: &str) {
         assert!(peers::certificates(self.folder.path(), &["evaluator", name]));
     }
 
-    /// An evaluator's that is valid for so many seconds, which the script's days are too long for.
+    /// Makes an evaluator's certificate that is valid for `seconds`; the script takes days.
     pub fn short(&self, name: &str, seconds: u64) {
         self.renew(name);
         let script = r#"
@@ -58,12 +58,11 @@ impl Certificates {
         self.folder.path()
     }
 
-    /// The folder of the certificate called so.
     pub fn of(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
 
-    /// Path of the folder of that name, for a command line.
+    /// Path of a certificate, for a command line.
     pub fn argument(&self, name: &str) -> String {
         self.of(name).to_str().unwrap().to_owned()
     }

@@ -17,25 +17,21 @@ use zenoh::Session;
 
 use crate::made_up::{self, name};
 
-/// Its pause after a question without an answer.
+/// Pause after a question without an answer.
 const PAUSE: Duration = Duration::from_millis(250);
 
-/// What a crowd has measured since it was last asked.
+/// Times and counts since the last reading.
 #[derive(Clone, Debug, Default)]
 pub struct Measured {
-    /// How long each answer to a claim took.
     pub claims: Vec<Duration>,
-    /// How long each acknowledgment of scores took.
     pub reports: Vec<Duration>,
     /// Questions without an answer.
     pub unanswered: usize,
     /// Scores that the learner acknowledged: step, seed, weights.
     pub acknowledged: Vec<(u64, u64, String)>,
-    /// Reports that it refused.
     pub refused: usize,
 }
 
-/// Many light evaluators of one run.
 pub struct Crowd {
     shared: Arc<Shared>,
     _tasks: JoinSet<()>,
@@ -45,14 +41,13 @@ struct Shared {
     run: Name,
     /// The longest episode; the shortest takes half as long.
     episode: Duration,
-    /// Evaluators that have a job.
     busy: AtomicUsize,
     measured: Mutex<Measured>,
 }
 
 impl Crowd {
-    /// Connects `count` evaluators of `run`, each with a session of its own, to `endpoint`, where
-    /// they begin to work. An episode takes up to `episode`.
+    /// Connects `count` evaluators of `run`, each with its own session, to `endpoint`. An episode
+    /// takes up to `episode`.
     pub async fn connect(count: usize, episode: Duration, run: &Name, endpoint: &str) -> Crowd {
         let (busy, measured) = Default::default();
         let shared = Arc::new(Shared { run: run.clone(), episode, busy, measured });
@@ -67,12 +62,11 @@ impl Crowd {
         Crowd { shared, _tasks: tasks }
     }
 
-    /// How many have a job.
     pub fn busy(&self) -> usize {
         self.shared.busy.load(Relaxed)
     }
 
-    /// What was measured since this was last called.
+    /// Returns the measurements since the last call.
     pub fn measured(&self) -> Measured {
         mem::take(&mut *self.shared.measured.lock().unwrap())
     }
@@ -83,7 +77,6 @@ struct Member {
     session: Session,
     shared: Arc<Shared>,
     random: ChaCha8Rng,
-    /// When it last told its progress.
     told: Option<Instant>,
 }
 
@@ -121,7 +114,7 @@ impl Member {
         }
     }
 
-    /// Takes the time that a job takes, and tells its progress.
+    /// Sleeps as long as a job takes, and reports progress.
     async fn act(&mut self, job: &Job) {
         let longest = self.shared.episode * job.seeds.len() as u32;
         let mut left = self.random.random_range(longest / 2..longest);

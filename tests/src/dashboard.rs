@@ -10,7 +10,7 @@ use serde_json::Value;
 use crate::eventually;
 use crate::prometheus::Prometheus;
 
-/// What Grafana puts in place of a panel's variables, for all runs.
+/// Values of a panel's variables, for all runs.
 const VARIABLES: [(&str, &str); 2] = [("$run", ".*"), ("$__rate_interval", "1m")];
 
 /// Asks every query of every panel until it returns data.
@@ -33,7 +33,6 @@ pub fn metrics() -> BTreeSet<String> {
     of_names.flat_map(|title| title.split(", ").map(str::to_owned).collect::<Vec<_>>()).collect()
 }
 
-/// The panels' titles and queries.
 fn queries() -> Vec<(String, String)> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/grafana/dashboards/quad.json");
     let text = fs::read_to_string(&path).expect("the dashboard is there");

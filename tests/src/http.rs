@@ -16,7 +16,6 @@ pub fn get(address: &str, path: &str) -> Option<(u16, String)> {
     Some((status, body.to_owned()))
 }
 
-/// The metrics page of a process.
 pub fn metrics(address: &str) -> Option<String> {
     get(address, "/metrics").filter(|(status, _)| *status == 200).map(|(_, body)| body)
 }

@@ -11,21 +11,16 @@ use quad_run::folder::{RunDir, RunEndpoints, ScoreLine};
 use crate::process::{Process, binary};
 use crate::{PATIENCE, eventually, http};
 
-/// A learner and the folder of its run.
 pub struct Learner {
-    /// The process.
     pub process: Process,
-    /// Its run folder.
     pub run_dir: PathBuf,
 }
 
 impl Learner {
-    /// The endpoint that evaluators connect to, once it listens.
     pub fn endpoint(&self) -> String {
         self.endpoints().zenoh.remove(0)
     }
 
-    /// Address of its metrics page.
     pub fn metrics(&self) -> String {
         self.endpoints().metrics
     }
@@ -35,30 +30,25 @@ impl Learner {
         eventually("the learner wrote endpoints.json", PATIENCE, || dir.read_endpoints().ok())
     }
 
-    /// Sum of the samples of `quad_learner_<name>` whose labels contain `label`; nothing if it does
-    /// not answer.
+    /// Sum of the samples of `quad_learner_<name>` whose labels contain `label`.
     pub fn metric(&self, name: &str, label: &str) -> Option<f64> {
         Some(http::sum(&http::metrics(&self.metrics())?, &format!("quad_learner_{name}"), label))
     }
 
-    /// Waits until that sum is as it should be.
     pub fn wait_for_metric(&self, name: &str, label: &str, wanted: impl Fn(f64) -> bool) -> f64 {
         eventually(name, PATIENCE, || self.metric(name, label).filter(|value| wanted(*value)))
     }
 
-    /// Waits until there are more scores than that.
     pub fn wait_for_scores(&self, count: usize) {
         eventually("there are scores", PATIENCE, || (self.scores().len() > count).then_some(()));
     }
 
-    /// Waits for its end, which must be a success, after which everything must have been scored
-    /// once.
+    /// Waits for a successful end with every episode scored once.
     pub fn assert_completes(&mut self, patience: Duration) {
         self.process.assert_succeeds(patience);
         self.assert_complete();
     }
 
-    /// The lines of scores.jsonl so far.
     pub fn scores(&self) -> Vec<ScoreLine> {
         RunDir::at(&self.run_dir).read_scores().expect("the lines are a learner's")
     }
@@ -108,7 +98,6 @@ impl Learner {
         files.filter(|(name, _)| !name.ends_with(".partial")).collect()
     }
 
-    /// The snapshot that the learner saved after a gradient step.
     pub fn snapshot(&self, step: u64) -> PathBuf {
         RunDir::at(&self.run_dir).snapshot_path(step)
     }

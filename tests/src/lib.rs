@@ -17,7 +17,7 @@
 //! - [`prometheus`]: one to start and ask; [`dashboard`]: what Grafana's panels ask it.
 //!
 //! A helper that cannot do its work panics, and so fails its test.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 pub mod certificates;
 pub mod crowd;
@@ -57,7 +57,7 @@ pub fn eventually<T>(
     }
 }
 
-/// What an environment variable says about the size of a test.
+/// The size of a test, from an environment variable.
 pub fn number(variable: &str, default: u64) -> u64 {
     std::env::var(variable).map_or(default, |text| text.parse().expect("a number"))
 }

@@ -11,7 +11,7 @@ use std::time::Duration;
 /// How often a connection without traffic looks whether it still is one.
 const GLANCE: Duration = Duration::from_millis(20);
 
-/// What goes wrong on a connection, for a while.
+/// Fault of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Trouble {
     /// Connections end, and new ones are turned away.
@@ -22,18 +22,16 @@ pub enum Trouble {
     Deaf,
     /// Nothing that the program sends arrives; what others send reaches it.
     Mute,
-    /// Everything takes its time.
     Slow,
 }
 
 impl Trouble {
-    /// All that can go wrong.
     pub const ALL: [Self; 5] = [Self::Cut, Self::Silent, Self::Deaf, Self::Mute, Self::Slow];
 }
 
 /// Leads every connection to its address on to a port of this machine.
 pub struct Link {
-    /// Where a program connects to, as `tcp/host:port`.
+    /// Address for the program, as `tcp/host:port`.
     pub endpoint: String,
     state: Arc<State>,
 }
@@ -41,7 +39,7 @@ pub struct Link {
 #[derive(Default)]
 struct State {
     cut: AtomicBool,
-    /// What the program sends, and what it is sent.
+    /// The directions from and to the program.
     frozen: [AtomicBool; 2],
     delay_milliseconds: AtomicU64,
     streams: Mutex<Vec<TcpStream>>,

@@ -15,12 +15,10 @@ use zenoh::query::{ConsolidationMode, QueryTarget};
 
 use crate::PATIENCE;
 
-/// A name that is allowed.
 pub fn name(text: &str) -> Name {
     Name::new(text).expect("an allowed name")
 }
 
-/// Asks for work in one environment.
 pub fn claim(evaluator: &str, attempt: u64, environment: &str) -> JobRequest {
     JobRequest::Claim {
         evaluator: name(evaluator),
@@ -29,7 +27,7 @@ pub fn claim(evaluator: &str, attempt: u64, environment: &str) -> JobRequest {
     }
 }
 
-/// Tells of a job that was never handed out.
+/// Progress of a job that was never handed out.
 pub fn progress(run: &Name, evaluator: &str, steps_done: u64) -> Progress {
     Progress {
         evaluator: name(evaluator),
@@ -74,7 +72,6 @@ pub fn scores(job: &Job, evaluator: &str) -> ScoreReport {
     ScoreReport::new(job, name(evaluator), name("f32"), episodes.collect())
 }
 
-/// A client without a certificate.
 pub async fn client(endpoint: &str) -> Session {
     let endpoints = Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() };
     open_session(&endpoints).await.expect("the endpoint is open")

@@ -5,7 +5,7 @@ use std::process::Command;
 
 use crate::process::binary;
 
-/// Whether a missing peer fails a test (`deploy/test.sh` says so) or skips it.
+/// Fails the test if QUAD_REQUIRE_PEERS=1 (`deploy/test.sh`), else says that it is skipped.
 fn missing(what: &str, remedy: &str) {
     let required = std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");
     assert!(!required, "{what} is missing; {remedy}");
@@ -64,12 +64,12 @@ pub fn certificates(folder: &Path, arguments: &[&str]) -> bool {
     true
 }
 
-/// Whether programs of Debian's package `prometheus` are there; if not, the test is to be skipped.
+/// Finds Debian's package `prometheus`; without it the test is skipped.
 pub fn has_prometheus() -> bool {
     ["prometheus", "promtool"].iter().all(|program| has(program, &["--version"], "prometheus"))
 }
 
-/// Whether Debian's browser is there; if not, the test is to be skipped.
+/// Finds Debian's browser; without it the test is skipped.
 pub fn has_chromium() -> bool {
     has("chromium", &["--version"], "chromium")
 }
@@ -86,8 +86,7 @@ fn has(program: &str, version: &[&str], package: &str) -> bool {
     found
 }
 
-/// Whether pictures can be drawn here, as `evaluator doctor` says; if not, the test is to be
-/// skipped.
+/// Asks `evaluator doctor` for EGL; without it the test is skipped.
 pub fn has_egl() -> bool {
     let output =
         Command::new(binary("evaluator")).arg("doctor").output().expect("the evaluator starts");

@@ -12,11 +12,11 @@ use std::time::UNIX_EPOCH;
 
 use crate::process::preload;
 
-/// The variables that tell the preloaded library of the two folders.
+/// Variables with the two folders, for the preloaded library.
 const FOLDER: &str = "QUAD_TESTS_DISK";
 const KEPT: &str = "QUAD_TESTS_DISK_KEPT";
 
-/// A folder, and beside it what would be left of it.
+/// A folder, and beside it what a power cut would leave of it.
 pub struct Disk {
     folder: PathBuf,
     /// A file for each file and each folder, called by its identity: the contents, or a line for
@@ -25,7 +25,6 @@ pub struct Disk {
 }
 
 impl Disk {
-    /// An empty folder `disk` in `scratch`.
     pub fn new(scratch: &Path) -> Disk {
         let disk = Disk { folder: scratch.join("disk"), kept: scratch.join("disk.kept") };
         fs::create_dir(&disk.folder).unwrap();
@@ -33,7 +32,7 @@ impl Disk {
         disk
     }
 
-    /// The one that this program was started for by [`Disk::launcher`].
+    /// The disk that [`Disk::launcher`] names.
     pub fn of_environment() -> Disk {
         let folder = |variable: &str| {
             PathBuf::from(std::env::var_os(variable).expect("the launcher sets it"))
@@ -41,7 +40,7 @@ impl Disk {
         Disk { folder: folder(FOLDER), kept: folder(KEPT) }
     }
 
-    /// The words that start a program whose synchronizing is watched.
+    /// Command line prefix of a program whose synchronizing is recorded.
     pub fn launcher(&self) -> Vec<String> {
         let set = |variable: &str, path: &Path| format!("{variable}={}", path.display());
         [preload("power_cut"), vec![set(FOLDER, &self.folder), set(KEPT, &self.kept)]].concat()
@@ -110,9 +109,8 @@ fn entry_line(entry: &fs::DirEntry) -> io::Result<String> {
     Ok(format!("{kind} {} {}\n", identity(&entry.path())?, entry.file_name().to_string_lossy()))
 }
 
-/// What stays the same when a file is renamed, and is another for another file. A number alone is
-/// given again, but some filesystems know no more; there, a new file that was never synchronized
-/// may be left with the contents of a former one.
+/// Identity of a file, also when it is renamed. Inode numbers are reused, so the time of birth belongs
+/// to it where the filesystem has one.
 fn identity(path: &Path) -> io::Result<String> {
     let metadata = fs::symlink_metadata(path)?;
     let born = metadata.created().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());

@@ -7,14 +7,13 @@ use std::time::Duration;
 
 use crate::eventually;
 
-/// Where cargo put a file, below the folder in which it puts our programs.
+/// Path of a file that cargo built.
 fn built(path: &str) -> PathBuf {
     let test = std::env::current_exe().expect("a test knows its own executable");
     // target/release/deps/test-123 → target/release/name
     test.parent().and_then(Path::parent).expect("a test lies two folders below target/").join(path)
 }
 
-/// One of our programs.
 pub fn binary(name: &str) -> PathBuf {
     let path = built(name);
     assert!(
@@ -25,8 +24,7 @@ pub fn binary(name: &str) -> PathBuf {
     path
 }
 
-/// The words that start a program with a library that is an example of this crate, as `cargo test`
-/// builds it.
+/// Command line prefix that preloads an example of this crate.
 pub fn preload(example: &str) -> Vec<String> {
     let library = built(&format!("examples/lib{example}.so"));
     assert!(
@@ -50,14 +48,13 @@ pub fn succeeds(line: &str) -> String {
     stdout(&command(line).output().expect("it starts"))
 }
 
-/// The stdout of a program, which must have succeeded.
+/// The stdout of a program that has succeeded.
 pub fn stdout(output: &Output) -> String {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
-/// Asserts that a program ended with exit code 1, an error that has this sentence, and a hint that
-/// has that.
+/// Asserts exit code 1, and `sentence` in the error and `hint` in its hint.
 pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
     let text = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");
@@ -66,8 +63,7 @@ pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
     assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
 }
 
-/// A running program, killed when dropped. Its output goes to files; a failing test prints their
-/// ends.
+/// A running program, killed when dropped. A failing test prints the ends of its output.
 pub struct Process {
     name: String,
     child: Child,
@@ -86,12 +82,10 @@ impl Process {
         Process { name: name.to_owned(), child, log, out }
     }
 
-    /// What it wrote to stderr so far.
     pub fn log(&self) -> String {
         fs::read_to_string(&self.log).unwrap_or_default()
     }
 
-    /// What it wrote to stdout so far.
     pub fn out(&self) -> String {
         fs::read_to_string(&self.out).unwrap_or_default()
     }
@@ -104,6 +98,18 @@ impl Process {
         })
     }
 
+    /// Asserts that its log has `text`.
+    pub fn assert_said(&self, text: &str) {
+        let log = self.log();
+        assert!(log.contains(text), "`{text}` is not in the log of {}:\n{log}", self.name);
+    }
+
+    /// Waits for its end with this exit code.
+    pub fn assert_ends(&mut self, code: i32, patience: Duration) {
+        let status = self.wait(patience);
+        assert_eq!(status.code(), Some(code), "{} ended with {status}:\n{}", self.name, self.log());
+    }
+
     /// Sends a signal by its name, e.g. `TERM` or `KILL`.
     pub fn signal(&self, signal: &str) {
         // The shell's own `kill`: a slim Debian has no program of that name.
@@ -112,7 +118,6 @@ impl Process {
         assert!(status.success(), "{command}: {status}");
     }
 
-    /// Its process's number.
     pub fn id(&self) -> u32 {
         self.child.id()
     }
@@ -126,31 +131,26 @@ impl Process {
         Some(kilobytes << 10)
     }
 
-    /// Kills it at once, as a power cut would.
     pub fn kill(&mut self) {
         self.child.kill().expect("a child can be killed");
         self.child.wait().expect("a child can be waited for");
     }
 
-    /// Whether it runs.
     pub fn is_running(&mut self) -> bool {
         self.child.try_wait().expect("a child can be waited for").is_none()
     }
 
-    /// Waits for its end.
     pub fn wait(&mut self, patience: Duration) -> ExitStatus {
         let what = format!("{} ended", self.name);
         eventually(&what, patience, || self.child.try_wait().expect("a child can be waited for"))
     }
 
-    /// Waits for its end, which must be a success.
     pub fn assert_succeeds(&mut self, patience: Duration) {
         let status = self.wait(patience);
         assert!(status.success(), "{} ended with {status}", self.name);
     }
 
-    /// Tells it to leave; how it ended. It must not have taken longer than it may, by the clock
-    /// that it starts with the signal.
+    /// Sends SIGTERM. The program must not have needed its own time limit.
     pub fn terminate(&mut self, patience: Duration) -> ExitStatus {
         self.signal("TERM");
         let status = self.wait(patience);

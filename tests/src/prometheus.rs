@@ -10,9 +10,7 @@ use crate::http;
 use crate::process::Process;
 use crate::system::{Scratch, free_port};
 
-/// A Prometheus at work.
 pub struct Prometheus {
-    /// Where it answers, e.g. `127.0.0.1:9090`.
     address: String,
     _process: Process,
 }

@@ -52,7 +52,6 @@ fn listening(endpoint: &str) -> Config {
     config
 }
 
-/// A file of deploy/zenoh, as it is.
 fn configuration(file: &str) -> Config {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh").join(file);
     Config::from_file(file).expect("Zenoh understands the router's configuration")

@@ -1,19 +1,14 @@
 //! What a training run of a test is asked to do: small networks, few steps.
 
-/// What a test may choose of a run; the rest is fixed and small.
+/// Sizes of a run; the rest is fixed and small.
 #[derive(Clone, Copy)]
 pub struct Setting {
-    /// Gradient steps.
     pub steps: u64,
-    /// Gradient steps between two evaluations.
     pub eval_interval: u64,
-    /// Episodes per evaluation.
     pub episodes: u32,
     /// N_a: what makes an evaluator's job long or short.
     pub candidates: u32,
-    /// Width of the networks.
     pub hidden: u32,
-    /// Seed of the run.
     pub seed: u64,
 }
 
@@ -26,14 +21,12 @@ pub const ENDLESS: Setting = Setting { steps: 100_000_000, eval_interval: 500, .
 pub const IDLE: Setting = Setting { eval_interval: 50_000_000, ..ENDLESS };
 
 impl Setting {
-    /// The steps that are evaluated.
     pub fn evaluated_steps(&self) -> Vec<u64> {
         (1..=self.steps)
             .filter(|step| step % self.eval_interval == 0 || *step == self.steps)
             .collect()
     }
 
-    /// The text of a preset.
     pub fn to_toml(self) -> String {
         let Setting { steps, eval_interval, episodes, candidates, hidden, seed } = self;
         format!(

@@ -5,13 +5,13 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// A disk of its own, unmounted when dropped.
+/// A tmpfs, unmounted when dropped.
 pub struct SmallDisk {
     path: PathBuf,
 }
 
 impl SmallDisk {
-    /// A disk of so many megabytes at `path`; none where that is not allowed.
+    /// Mounts a disk at `path`; `None` where that is not allowed.
     pub fn mount(path: &Path, megabytes: u32) -> Option<SmallDisk> {
         fs::create_dir_all(path).expect("the scratch folder is writable");
         let size = format!("size={megabytes}m");
@@ -24,13 +24,11 @@ impl SmallDisk {
         mounted.then(|| SmallDisk { path: path.to_owned() })
     }
 
-    /// Takes all the room that it has left.
     pub fn fill(&self) {
         let mut file = File::create(self.filler()).expect("the disk is writable");
         while file.write_all(&[0; 4096]).is_ok() {}
     }
 
-    /// Gives it back.
     pub fn clear(&self) {
         fs::remove_file(self.filler()).expect("it was filled");
     }

@@ -17,19 +17,18 @@ use crate::setting::Setting;
 mod hopper;
 use hopper::write_hopper;
 
-/// A folder that goes when the test is over.
+/// A temporary folder.
 pub struct Scratch {
     folder: TempDir,
 }
 
 #[allow(clippy::new_without_default)]
 impl Scratch {
-    /// Makes it, with a dataset of a few thousand made-up transitions.
+    /// Makes it, with a dataset of 2,990 made-up transitions.
     pub fn new() -> Scratch {
         Self::inside(&std::env::temp_dir())
     }
 
-    /// Makes the folder inside of another.
     pub fn inside(parent: &Path) -> Scratch {
         let folder = tempfile::tempdir_in(parent).expect("there is room for a scratch folder");
         fs::write(folder.path().join("tiny.hdf5"), &*DATASET)
@@ -37,17 +36,14 @@ impl Scratch {
         Scratch { folder }
     }
 
-    /// Where it is.
     pub fn path(&self) -> &Path {
         self.folder.path()
     }
 
-    /// The dataset.
     pub fn dataset(&self) -> PathBuf {
         self.path().join("tiny.hdf5")
     }
 
-    /// Writes a preset of that name.
     pub fn preset(&self, name: &str, setting: Setting) -> PathBuf {
         let preset = self.path().join(format!("{name}.toml"));
         fs::write(&preset, setting.to_toml()).expect("the scratch folder is writable");
@@ -64,8 +60,8 @@ impl Scratch {
         self.learner_through(&[], run, setting, arguments)
     }
 
-    /// Starts a learner by a command line of which its own is the end, as `ip netns exec` and `env`
-    /// have it. `run` may be a path below this folder.
+    /// Starts a learner behind a command line prefix such as `env`. `run` may be a path below this
+    /// folder.
     pub fn learner_through(
         &self,
         launcher: &[String],
@@ -87,17 +83,14 @@ impl Scratch {
         Learner { process, run_dir }
     }
 
-    /// Starts an evaluator that is called `name`.
     pub fn evaluator(&self, name: &str, endpoint: &str) -> Evaluator {
         self.evaluator_with(name, &["--connect", endpoint, "--http", "127.0.0.1:0"])
     }
 
-    /// Starts an evaluator that is called `name`, with further arguments.
     pub fn evaluator_with(&self, name: &str, arguments: &[&str]) -> Evaluator {
         self.evaluator_through(&[], name, arguments)
     }
 
-    /// Starts an evaluator by a command line of which its own is the end.
     pub fn evaluator_through(
         &self,
         launcher: &[String],
@@ -117,14 +110,12 @@ fn through(launcher: &[String], program: &str) -> Command {
     command
 }
 
-/// An evaluator.
 pub struct Evaluator {
-    /// The process.
     pub process: Process,
 }
 
 impl Evaluator {
-    /// Address of its metrics page, which it logs.
+    /// Address of the metrics page, from the log.
     pub fn metrics(&self) -> String {
         let line = self.process.wait_for_log("/metrics", PATIENCE);
         let address = line.split_once("http://").and_then(|(_, rest)| rest.split_once("/metrics"));
@@ -138,7 +129,6 @@ pub fn free_port() -> u16 {
     listener.local_addr().expect("a bound socket has an address").port()
 }
 
-/// A TCP endpoint at such a port.
 pub fn free_endpoint() -> String {
     format!("tcp/127.0.0.1:{}", free_port())
 }

@@ -30,7 +30,7 @@ fn a_report_contains_films_and_no_other_files() {
         ("text", Some(secret.as_bytes()), false),
         ("film", Some(&film[..]), true),
     ] {
-        Run::new("hopper-demo", 0).write(&path(run));
+        Run::new("hopper-demo", 0).write(path(run));
         match film {
             Some(bytes) => fs::write(path(run).join("film.gif"), bytes).unwrap(),
             None => symlink(path("secret.gif"), path(run).join("film.gif")).unwrap(),
@@ -125,7 +125,7 @@ fn no_link_beside_a_report_is_written_through() {
     fs::write(path("precious"), "precious").unwrap();
     let mut run = Run::new("hopper-demo", 0);
     run.score(1000, 0, 5.0, "00");
-    run.write(&path("run"));
+    run.write(path("run"));
     for name in ["page.html", "curve-hopper-demo.svg", "curve-hopper-demo.png"] {
         symlink(path("precious"), path(&format!("{name}.partial"))).unwrap();
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 
 use crate::printed;
-use crate::run::{HOPPER, Run, TASKS, complete, paper, small, write_study};
+use crate::run::{HOPPER, Run, TASKS, complete, paper, small, write_all, write_study};
 
 fn report(folder: &Path, flags: &str) -> Value {
     let text = printed(&format!("report {} --json {flags}", folder.display()));
@@ -16,18 +16,14 @@ fn report(folder: &Path, flags: &str) -> Value {
 
 fn report_of(runs: impl IntoIterator<Item = Run>) -> Value {
     let folder = tempfile::tempdir().unwrap();
-    for (index, run) in runs.into_iter().enumerate() {
-        run.write(&folder.path().join(index.to_string()));
-    }
+    write_all(folder.path(), runs);
     report(folder.path(), "")
 }
 
 /// Draws the figures of runs; gives the curve of their task.
 fn curve(runs: &[Run]) -> String {
     let folder = tempfile::tempdir().unwrap();
-    for (index, run) in runs.iter().enumerate() {
-        run.write(&folder.path().join(index.to_string()));
-    }
+    write_all(folder.path(), runs.iter().cloned());
     let figures = folder.path().join("figures");
     report(folder.path(), &format!("--figures {}", figures.display()));
     fs::read_to_string(figures.join("curve-hopper-demo.svg")).unwrap()
@@ -64,7 +60,7 @@ fn json_has_the_numbers_of_runs_and_seeds() {
 #[test]
 fn a_study_has_interquartile_means_and_corrected_p_values() {
     let folder = tempfile::tempdir().unwrap();
-    write_study(folder.path());
+    write_study(folder.path().to_str().unwrap());
     let report = || report(folder.path(), "");
     let reported = report();
     assert_eq!(reported, report(), "the same runs give the same intervals");
@@ -168,7 +164,7 @@ fn methods_are_compared_seed_by_seed_and_returns_apart_from_scores() {
 #[test]
 fn figures_and_tables_come_in_the_formats_of_papers() {
     let folder = tempfile::tempdir().unwrap();
-    write_study(folder.path());
+    write_study(folder.path().to_str().unwrap());
     let figures = folder.path().join("figures");
     let latex = printed(&format!(
         "report {} --latex --figures {}",
@@ -216,9 +212,9 @@ fn a_page_is_one_file_and_escapes_what_it_shows() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let dataset = "<script>alert(1)</script>.hdf5";
-    small(3, 0.0).set("experiment.dataset", dataset).write(&path("a"));
-    small(4, 1.0).write(&path("b"));
-    small(5, 1.0).write(&path("damaged"));
+    small(3, 0.0).set("experiment.dataset", dataset).write(path("a"));
+    small(4, 1.0).write(path("b"));
+    small(5, 1.0).write(path("damaged"));
     fs::write(path("a/film.gif"), "GIF89a of a run").unwrap();
     let [page, b] = ["page.html", "b"].map(|name| path(name).display().to_string());
     printed(&format!("report {} {b} --html {page}", path("a").display()));

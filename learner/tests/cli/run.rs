@@ -81,11 +81,19 @@ impl Run {
         }));
     }
 
-    pub fn write(&self, path: &Path) {
+    pub fn write(&self, path: impl AsRef<Path>) {
+        let path = path.as_ref();
         fs::create_dir_all(path.join("snapshots")).unwrap();
         fs::write(path.join("config.toml"), self.config.to_string()).unwrap();
         let lines = self.scores.iter().map(|line| format!("{line}\n"));
         fs::write(path.join("scores.jsonl"), lines.collect::<String>()).unwrap();
+    }
+}
+
+/// Writes runs into folders 0, 1, …
+pub fn write_all(folder: impl AsRef<Path>, runs: impl IntoIterator<Item = Run>) {
+    for (index, run) in runs.into_iter().enumerate() {
+        run.write(folder.as_ref().join(index.to_string()));
     }
 }
 
@@ -127,7 +135,7 @@ pub fn complete(run: Run, score: f64) -> Run {
 
 /// QUAD with two temperatures, DAC and IQL on two tasks with five seeds, each run in a folder of
 /// its own.
-pub fn write_study(folder: &Path) {
+pub fn write_study(folder: &str) {
     for (task, base) in TASKS.into_iter().zip([40.0, 90.0]) {
         for (seed, noise) in [0.0, 3.0, -1.0, 2.0, -4.0].into_iter().enumerate() {
             let quad = || Run::new(task, seed as u64);
@@ -137,7 +145,7 @@ pub fn write_study(folder: &Path) {
                 ("3", quad().set("experiment.agent.guidance", "dac"), base + 0.1 - noise),
                 ("4", Run::by("iql", task, seed as u64), base + 15.0 + noise),
             ] {
-                complete(run, score).write(&folder.join(task).join(name).join(seed.to_string()));
+                complete(run, score).write(format!("{folder}/{task}/{name}/{seed}"));
             }
         }
     }

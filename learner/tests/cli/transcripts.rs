@@ -8,7 +8,7 @@ use std::path::Path;
 use quad_protocol::{Hash, episode_seeds};
 use serde_json::{Value, json};
 
-use crate::run::{HOPPER, Run, paper, small, write_study};
+use crate::run::{HOPPER, Run, paper, small, write_all, write_study};
 use crate::write_dataset;
 
 /// A study of which some runs cannot begin.
@@ -39,7 +39,7 @@ fn commands_print_what_their_transcripts_have() {
     fs::write("study.toml", STUDY).unwrap();
     write_reported();
     write_published();
-    write_study(Path::new("study"));
+    write_study("study");
     let _at_work = write_listed();
     write_verified();
     trycmd::TestCases::new()
@@ -56,95 +56,84 @@ fn bin_path() -> String {
     format!("{}:{}", folder.display(), env::var("PATH").unwrap())
 }
 
-fn write(folder: &str, runs: impl IntoIterator<Item = (impl AsRef<str>, Run)>) {
-    runs.into_iter().for_each(|(name, run)| run.write(&Path::new(folder).join(name.as_ref())));
-}
-
-fn numbered(runs: Vec<Run>) -> impl Iterator<Item = (String, Run)> {
-    runs.into_iter().enumerate().map(|(index, run)| (index.to_string(), run))
-}
-
-/// What report.trycmd is about.
+/// The runs of report.trycmd.
 fn write_reported() {
+    small(3, 0.0).write("report/one");
     let (mut complete, mut stopped) = (small(0, 0.0), small(1, 0.0));
     complete.score(6000, 0, 12.0, "00");
+    complete.write("report/stopped/a");
     stopped.scores.truncate(4);
+    stopped.write("report/stopped/b");
     let mut unscored = small(1, 0.0);
     unscored.scores.clear();
+    small(0, 0.0).write("report/twice/a");
+    small(0, 4.0).write("report/twice/b");
+    unscored.write("report/twice/c");
     let mut best = small(0, 0.0);
     (0..2).for_each(|episode| best.score(7000, episode, 10.0, "00"));
+    best.write("report/best");
     let mut robot = small(0, 0.0).set("experiment.environment", "my-robot");
     robot.config["dataset"].as_table_mut().unwrap().remove("mean_score");
-    let mut returns = robot.clone();
-    returns.scores.iter_mut().for_each(|line| line["return"] = line["score"].clone());
-    write(
-        "report",
-        [
-            ("one", small(3, 0.0)),
-            ("stopped/a", complete),
-            ("stopped/b", stopped),
-            ("twice/a", small(0, 0.0)),
-            ("twice/b", small(0, 4.0)),
-            ("twice/c", unscored),
-            ("best", best),
-            ("robot", robot),
-            ("returns", returns),
-        ],
-    );
-    let changes: [(&str, toml::Value); 8] = [
-        ("experiment.agent.tau", 0.5.into()),
-        ("experiment.agent.candidates", 1.into()),
-        ("run.device", "cuda".into()),
-        ("dataset.mean_return", 21.0.into()),
-        ("experiment.agent.eta.threshold", 1.0.into()),
-        ("experiment.reward", "as-is".into()),
-        ("experiment.scale", vec!["states"].into()),
-        // The same file in another place.
-        ("dataset.path", "elsewhere.hdf5".into()),
-    ];
-    let unlike = changes.map(|(key, value)| (key, small(1, 0.0).set(key, value)));
-    write("report/unlike", [("first", small(0, 0.0))].into_iter().chain(unlike));
+    robot.write("report/robot");
+    robot.scores.iter_mut().for_each(|line| line["return"] = line["score"].clone());
+    robot.write("report/returns");
+    small(0, 0.0).write("report/unlike/first");
+    let unlike = |key: &str, value: toml::Value| {
+        small(1, 0.0).set(key, value).write(format!("report/unlike/{key}"));
+    };
+    unlike("experiment.agent.tau", 0.5.into());
+    unlike("experiment.agent.candidates", 1.into());
+    unlike("run.device", "cuda".into());
+    unlike("dataset.mean_return", 21.0.into());
+    unlike("experiment.agent.eta.threshold", 1.0.into());
+    unlike("experiment.reward", "as-is".into());
+    unlike("experiment.scale", vec!["states"].into());
+    // The same file in another place.
+    unlike("dataset.path", "elsewhere.hdf5".into());
     // The evaluation after 50,000 steps is none of the last 50,000.
     let mut last = Run::new("hopper-demo", 0).sizes(100_000, 10_000, 1);
     (1..=10).for_each(|n| last.score(10_000 * n, 0, n as f64, "00"));
-    write("report", [("last", last)]);
-    write("report/goals", numbered(paper("antmaze-umaze-v0", 100_000, |_| 50.0)));
+    last.write("report/last");
+    write_all("report/goals", paper("antmaze-umaze-v0", 100_000, |_| 50.0));
 }
 
-/// What published.trycmd is about.
+/// The runs of published.trycmd.
 fn write_published() {
     // The last five: 1,920,000 to 2,000,000. An early best one counts only where it is asked for.
     let score = |step| if step == 20_000 { 1000.0 } else { step as f64 / 20_000.0 };
-    write("paper", numbered(paper(HOPPER, 2_000_000, score)));
-    write("large", numbered(paper("antmaze-large-diverse-v0", 20_000, |_| 50.0)));
+    write_all("paper", paper(HOPPER, 2_000_000, score));
+    write_all("large", paper("antmaze-large-diverse-v0", 20_000, |_| 50.0));
     let complete = || paper(HOPPER, 2_000_000, |_| 50.0);
-    let stopped = paper(HOPPER, 400_000, |_| 50.0).remove(0);
-    let changed = (stopped.clone().set("experiment.dataset", "x.hdf5"))
+    let changed = paper(HOPPER, 400_000, |_| 50.0)
+        .remove(0)
+        .set("experiment.dataset", "x.hdf5")
         .set("experiment.agent.tau", 1.0)
         .set("experiment.scale", vec!["states"]);
+    changed.write("departures/changed");
     // The named file in another place, known by its checksum.
     let sha256 = "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b";
-    let copied = changed.clone().set("dataset.sha256", sha256);
-    write("departures", [("changed", changed), ("copied", copied)]);
+    changed.set("dataset.sha256", sha256).write("departures/copied");
     let mut mixed = complete();
     mixed[1].scores.iter_mut().for_each(|line| line["precision"] = json!("bf16-amx"));
-    write("mixed", numbered(mixed));
+    write_all("mixed", mixed);
     for guidance in ["dac", "none"] {
-        let runs = complete().into_iter().map(|run| run.set("experiment.agent.guidance", guidance));
-        write(guidance, numbered(runs.collect()));
+        let guided = |run: Run| run.set("experiment.agent.guidance", guidance);
+        write_all(guidance, complete().into_iter().map(guided));
     }
     let mut iql = Run::by("iql", HOPPER, 0).set("experiment.agent.expectile", 0.8);
     (0..10).for_each(|episode| iql.score(5_000, episode, 50.0, "00"));
-    write("two", [("iql", iql), ("quad", paper(HOPPER, 100_000, |_| 50.0).remove(0))]);
+    iql.write("two/iql");
+    paper(HOPPER, 100_000, |_| 50.0)[0].write("two/quad");
     let mut cube = Run::by("fql", "cube-single-play-singletask-v0", 0);
     cube = cube.set("experiment.episodes", 1);
     (1..=10).for_each(|n| cube.score(100_000 * n, 0, n as f64, "00"));
-    write("others", [("cube", cube), ("td3-bc", Run::by("td3-bc", "hopper-medium-v2", 0))]);
-    write("before/a", numbered(paper(HOPPER, 400_000, |_| 30.0)));
-    write("before/b", numbered(complete()));
+    cube.write("others/cube");
+    Run::by("td3-bc", "hopper-medium-v2", 0).write("others/td3-bc");
+    write_all("before/a", paper(HOPPER, 400_000, |_| 30.0));
+    write_all("before/b", complete());
 }
 
-/// What list.trycmd is about; the file is locked, as by a learner at work.
+/// The runs of list.trycmd. The file is locked, as by a learner at work.
 fn write_listed() -> File {
     let mut half = Run::new("hopper-demo", 3).sizes(40, 20, 2);
     half.score(20, 0, 5.0, "a");
@@ -152,7 +141,9 @@ fn write_listed() -> File {
     half.score(40, 0, 9.0, "b");
     let mut whole = half.clone();
     whole.score(40, 1, 9.5, "b");
-    write("list", [("study/half", half.clone()), ("whole", whole), ("damaged", half)]);
+    whole.write("list/whole");
+    half.write("list/study/half");
+    half.write("list/damaged");
     fs::write("list/study/half/metrics.jsonl", "{\"step\":30,\"seconds\":1.5}\n").unwrap();
     fs::write("list/damaged/scores.jsonl", "{\"step\":10}\n").unwrap();
     fs::create_dir("list/other").unwrap();
@@ -162,8 +153,7 @@ fn write_listed() -> File {
     scores
 }
 
-/// What verify.trycmd is about: a run that is as it should be, and others in which one thing is
-/// wrong.
+/// The runs of verify.trycmd: a correct one, and others with one error each.
 fn write_verified() {
     type Change = fn(&mut Vec<Value>);
     let changes: [(&str, Change); 11] = [
@@ -187,7 +177,7 @@ fn write_verified() {
             }
         }
         change(&mut run.scores);
-        write("verify", [(name, run)]);
+        run.write(format!("verify/{name}"));
         for step in [10u8, 15] {
             let snapshot = format!("verify/{name}/snapshots/step_0000000{step}.safetensors");
             fs::write(snapshot, [step; 100]).unwrap();
@@ -195,7 +185,7 @@ fn write_verified() {
     }
     // As with `--eval-interval 0`: no evaluations, only snapshots.
     for name in ["alone", "alike", "flipped", "none"] {
-        write("verify", [(name, Run::new("hopper-demo", 4).sizes(15, 0, 3))]);
+        Run::new("hopper-demo", 4).sizes(15, 0, 3).write(format!("verify/{name}"));
         let mut snapshot = [7; 100];
         snapshot[50] ^= u8::from(name == "flipped");
         if name != "none" {

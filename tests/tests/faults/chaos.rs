@@ -59,7 +59,7 @@ fn endure(faults: &[Fault], count: u64) {
 }
 
 #[test]
-fn after_a_few_faults_a_run_ends_as_if_nothing_had_happened() {
+fn a_few_faults_change_no_bit_of_a_run() {
     let faults = [
         Fault::Kill(Program::Evaluator),
         Fault::Kill(Program::Learner),
@@ -74,6 +74,6 @@ fn after_a_few_faults_a_run_ends_as_if_nothing_had_happened() {
 
 #[test]
 #[ignore = "ten minutes"]
-fn after_a_hundred_faults_a_run_ends_as_if_nothing_had_happened() {
+fn a_hundred_faults_change_no_bit_of_a_run() {
     endure(&all_faults(), number("QUAD_FAULTS", 100));
 }

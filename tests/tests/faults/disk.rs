@@ -83,7 +83,7 @@ async fn a_full_disk_delays_snapshots_scores_and_checkpoints_until_there_is_room
 }
 
 #[test]
-fn scores_wait_for_a_disk_that_is_full_and_that_is_told() {
+fn scores_wait_for_a_full_disk() {
     let scratch = Scratch::new();
     let Some(disk) = SmallDisk::mount(&scratch.path().join("run"), 6) else { return };
     let setting = Setting { steps: 500, eval_interval: 250, ..SETTING };

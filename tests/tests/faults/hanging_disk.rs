@@ -15,7 +15,7 @@ use quad_tests::system::Scratch;
 use crate::disk::{LISTEN, SETTING};
 
 #[test]
-fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
+fn a_hanging_disk_blocks_neither_training_nor_exit() {
     let scratch = Scratch::new();
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
     learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
@@ -41,13 +41,8 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
             // Sooner, the next one would count as the same.
             sleep(Duration::from_millis(600));
         }
-        let status = learner.process.wait(PATIENCE);
-        assert_eq!(status.code(), Some(code), "{status}");
-        assert!(
-            learner.process.log().contains(reason),
-            "after {signals} signals: {}",
-            learner.process.log()
-        );
+        learner.process.assert_ends(code, PATIENCE);
+        learner.process.assert_said(reason);
     }
 
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
@@ -56,7 +51,7 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn while_the_disk_hangs_that_is_read_from_claims_are_answered() {
+async fn claims_are_answered_while_reads_hang() {
     let scratch = Scratch::new();
     let (run, first) = (name("run"), ENDLESS.eval_interval);
     let hung = RunDir::at(&scratch.path().join("run")).snapshot_path(first);

@@ -10,7 +10,7 @@ use quad_tests::system::Scratch;
 use crate::disk::LISTEN;
 
 #[test]
-fn where_files_have_no_locks_a_folder_is_still_one_learners() {
+fn without_file_locks_a_folder_has_one_learner() {
     let [scratch, beside] = [Scratch::new(), Scratch::new()];
     let launcher = preload("no_locks");
     let folder = scratch.path().join("run");
@@ -21,12 +21,8 @@ fn where_files_have_no_locks_a_folder_is_still_one_learners() {
     let _evaluator = scratch.evaluator("one", &first.endpoint());
     first.wait_for_scores(0);
     let mut second = start(&beside);
-    assert_eq!(second.process.wait(PATIENCE).code(), Some(75), "{}", second.process.log());
-    assert!(
-        second.process.log().contains("another learner is at work in"),
-        "{}",
-        second.process.log()
-    );
+    second.process.assert_ends(75, PATIENCE);
+    second.process.assert_said("another learner is at work in");
 
     // One that was killed on this host keeps no learner out.
     first.process.kill();
@@ -41,10 +37,7 @@ fn where_files_have_no_locks_a_folder_is_still_one_learners() {
     assert!(!claim.exists(), "one that ends takes its claim back");
     fs::write(&claim, "elsewhere\n").unwrap();
     let mut third = start(&scratch);
-    assert_eq!(third.process.wait(PATIENCE).code(), Some(1), "{}", third.process.log());
-    let log = third.process.log();
-    assert!(
-        log.contains("scores.host") && log.contains("hint: wait for the end of that learner"),
-        "{log}"
-    );
+    third.process.assert_ends(1, PATIENCE);
+    third.process.assert_said("scores.host");
+    third.process.assert_said("hint: wait for the end of that learner");
 }

@@ -174,12 +174,12 @@ fn cut_power(cuts: u64) {
 }
 
 #[test]
-fn two_power_cuts_take_nothing_that_was_promised() {
+fn two_power_cuts_lose_nothing_acknowledged() {
     cut_power(2);
 }
 
 #[test]
 #[ignore = "two minutes"]
-fn sixteen_power_cuts_take_nothing_that_was_promised() {
+fn sixteen_power_cuts_lose_nothing_acknowledged() {
     cut_power(16);
 }

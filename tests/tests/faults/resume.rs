@@ -13,7 +13,7 @@ const LONG: Setting =
     Setting { steps: 3000, eval_interval: 300, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
 
 #[test]
-fn a_stopped_learner_goes_on_from_its_very_step() {
+fn a_stopped_learner_resumes_at_its_step() {
     let scratch = Scratch::new();
     let learner = |arguments: &[&str]| {
         scratch.learner_with(
@@ -30,11 +30,7 @@ fn a_stopped_learner_goes_on_from_its_very_step() {
     let mut first = learner(&[]);
     first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     assert_eq!(first.process.terminate(PATIENCE).code(), Some(75));
-    assert!(
-        first.process.log().contains("the same command continues from there"),
-        "{}",
-        first.process.log()
-    );
+    first.process.assert_said("the same command continues from there");
 
     let mut second = learner(&[]);
     let step = step_of(&second);
@@ -46,12 +42,12 @@ fn a_stopped_learner_goes_on_from_its_very_step() {
     fs::write(second.run_dir.join("checkpoints").join(name), bytes).unwrap();
     let mut third = learner(&[]);
     assert!(step_of(&third) < step);
-    assert!(third.process.log().contains("is damaged"), "{}", third.process.log());
+    third.process.assert_said("is damaged");
     third.process.terminate(PATIENCE);
 }
 
 #[test]
-fn a_folder_is_of_one_configuration_and_of_one_learner_at_a_time() {
+fn a_folder_has_one_configuration_and_one_learner() {
     let scratch = Scratch::new();
     let learner = |seed: &str, fresh: &[&str]| {
         scratch.learner_with(
@@ -64,7 +60,7 @@ fn a_folder_is_of_one_configuration_and_of_one_learner_at_a_time() {
     first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     first.process.kill();
     let mut other = learner("6", &[]);
-    assert_eq!(other.process.wait(PATIENCE).code(), Some(1));
+    other.process.assert_ends(1, PATIENCE);
     let log = other.process.log();
     assert!(log.contains("seed: 1 there, 6 here") && log.contains("--fresh"), "{log}");
 
@@ -74,8 +70,8 @@ fn a_folder_is_of_one_configuration_and_of_one_learner_at_a_time() {
     assert!(scratch.path().join("run.old1/config.toml").exists());
     assert!(!fresh.process.log().contains("continues after step"));
     let mut twin = learner("6", &[]);
-    assert_eq!(twin.process.wait(PATIENCE).code(), Some(75));
-    assert!(twin.process.log().contains("another learner is at work"), "{}", twin.process.log());
+    twin.process.assert_ends(75, PATIENCE);
+    twin.process.assert_said("another learner is at work");
 }
 
 #[test]
@@ -84,7 +80,7 @@ fn a_run_whose_folder_is_removed_ends() {
     let mut learner = scratch.learner("run", ENDLESS);
     learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     fs::rename(&learner.run_dir, scratch.path().join("elsewhere")).unwrap();
-    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    learner.process.assert_ends(1, PATIENCE);
     let log = learner.process.log();
     assert!(log.contains("was removed or renamed") && log.contains("hint: put it back"), "{log}");
 }
@@ -92,7 +88,7 @@ fn a_run_whose_folder_is_removed_ends() {
 /// As if the scores were of another machine's bits. Training has to come by the step again to find
 /// out.
 #[test]
-fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {
+fn other_weights_for_a_scored_step_end_the_run() {
     let scratch = Scratch::new();
     let mut learner = scratch.learner("run", LONG);
     let _evaluator = scratch.evaluator("one", &learner.endpoint());
@@ -108,7 +104,7 @@ fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {
     let weights = Hash::of(&bytes).to_string();
     fs::write(&log, fs::read_to_string(&log).unwrap().replace(&first.weights, &weights)).unwrap();
     let mut learner = scratch.learner("run", LONG);
-    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    learner.process.assert_ends(1, PATIENCE);
     let said = learner.process.log();
     assert!(said.contains(&format!("but {weights} were scored before")), "{said}");
     assert!(said.contains("hint: another kind of processor"), "{said}");
@@ -128,14 +124,14 @@ fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
     fs::write(learner.snapshot(step), bytes).unwrap();
     let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
     learner.process.assert_succeeds(PATIENCE);
-    assert!(learner.process.log().contains("its file is damaged"), "{}", learner.process.log());
+    learner.process.assert_said("its file is damaged");
 
     let log = learner.run_dir.join("scores.jsonl");
     let lines = fs::read_to_string(&log).unwrap();
     let lost = lines.lines().find(|line| line.contains(&format!("\"step\":{step},"))).unwrap();
     fs::write(&log, lines.replace(&format!("{lost}\n"), "")).unwrap();
     let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
-    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    learner.process.assert_ends(1, PATIENCE);
     for said in [
         &format!("without the snapshot of step {step}")[..],
         "but 1 episodes have no score",

@@ -40,7 +40,7 @@ async fn a_run_completes_through_the_shipped_router() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_router_whose_certificate_is_for_another_host_is_not_believed() {
+async fn a_router_with_a_certificate_for_another_host_is_refused() {
     let Some(certificates) = Certificates::make() else { return };
     let (_router, endpoint) = protected_router("127.0.0.2", &certificates.of("router")).await;
     let (scratch, folder) = (Scratch::new(), certificates.argument("evaluator"));
@@ -56,7 +56,7 @@ async fn a_router_whose_certificate_is_for_another_host_is_not_believed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_learner_that_listens_itself_asks_who_comes() {
+async fn a_listening_learner_checks_certificates() {
     let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let learner = scratch.learner_with(
@@ -95,7 +95,7 @@ async fn a_learner_that_listens_itself_asks_who_comes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_router_refuses_those_without_a_valid_certificate() {
+async fn the_router_refuses_invalid_certificates() {
     let Some(certificates) = Certificates::make() else { return };
     let elsewhere = Certificates::make().unwrap();
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;

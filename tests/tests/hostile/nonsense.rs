@@ -111,7 +111,7 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn why_a_job_could_not_be_done_is_told_once_in_few_plain_letters() {
+async fn failed_jobs_are_logged_once_and_shortened() {
     let scratch = Scratch::new();
     let learner = scratch.learner("run", ENDLESS);
     let (session, run) = (made_up::client(&learner.endpoint()).await, name("run"));

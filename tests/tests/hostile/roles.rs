@@ -84,7 +84,7 @@ async fn answers(session: &Session, key: &str) -> usize {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn only_learners_publish_weights_and_only_evaluators_tell_progress() {
+async fn only_learners_publish_weights_and_only_evaluators_report_progress() {
     let roles = ["learner", "evaluator", "monitor", "monitor", "evaluator"];
     let Some((_router, [learner, evaluator, monitor, listener, receiver])) =
         at_the_router(roles).await
@@ -153,7 +153,7 @@ async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn only_learners_and_evaluators_say_that_they_are_there() {
+async fn only_learners_and_evaluators_declare_tokens() {
     let roles = ["learner", "evaluator", "monitor", "monitor"];
     let Some((_router, [learner, evaluator, monitor, listener])) = at_the_router(roles).await
     else {

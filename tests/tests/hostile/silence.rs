@@ -42,7 +42,7 @@ async fn read_nothing(endpoint: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
+async fn a_peer_that_reads_nothing_blocks_neither_jobs_nor_snapshots() {
     if let Ok(endpoint) = env::var(STRANGER) {
         return read_nothing(&endpoint).await;
     }
@@ -53,7 +53,7 @@ async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
     let mut command = Command::new(env::current_exe().unwrap());
     command.args([
         "--exact",
-        "silence::a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots",
+        "silence::a_peer_that_reads_nothing_blocks_neither_jobs_nor_snapshots",
     ]);
     command.env(STRANGER, learner.endpoint()).current_dir(scratch.path());
     let stranger = Process::start("stranger", scratch.path(), command);

@@ -17,7 +17,7 @@ fn read(path: &str) -> String {
 }
 
 #[test]
-fn each_fires_when_it_should_and_only_then() {
+fn alerts_fire_in_their_cases_only() {
     if !peers::has_prometheus() {
         return;
     }
@@ -33,7 +33,7 @@ fn each_fires_when_it_should_and_only_then() {
 }
 
 #[test]
-fn each_is_tested_and_says_what_to_do_and_asks_for_what_is_documented() {
+fn alerts_are_tested_explained_and_documented() {
     let (rules, tests) =
         (read("deploy/prometheus/alerts.yml"), read("deploy/prometheus/alerts.test.yml"));
     let metrics = read("docs/metrics.md");

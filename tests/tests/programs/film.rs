@@ -102,7 +102,7 @@ fn a_film_shows_the_episode_that_is_scored() {
 const FFMPEG: &str = "#!/bin/sh\nfor last; do :; done\ncat > \"${last#file:}\" && [ \"$last\" != \"${last#file:}\" ]\n";
 
 #[test]
-fn a_film_is_whole_or_is_not_there_whatever_its_name() {
+fn a_film_is_whole_or_absent() {
     if !has_egl() {
         return;
     }

@@ -58,7 +58,7 @@ fn work(count: usize, episode: Duration, during: Duration, launcher: &[String]) 
 
 /// The only one takes a job, and then all the time in the world.
 #[test]
-fn a_run_whose_evaluators_are_slow_says_so_once() {
+fn slow_evaluators_are_reported_once() {
     let (scratch, runtime) = (Scratch::new(), Runtime::new().unwrap());
     let learner = scratch.learner("run", ENDLESS);
     learner.wait_for_metric("snapshots_published_total", "", |published| published > 5.0);

@@ -34,7 +34,7 @@ fn ends(mut child: Child) -> Option<i32> {
 }
 
 #[test]
-fn a_stderr_that_is_never_read_holds_up_neither_the_work_nor_the_end() {
+fn an_unread_stderr_blocks_neither_work_nor_exit() {
     let scratch = Scratch::new();
     let (unread, _reader) = full_pipe();
     let start = |command: &mut Command| {
@@ -87,7 +87,7 @@ fn a_stderr_that_is_never_read_holds_up_neither_the_work_nor_the_end() {
 /// A closed session, and what Slurm sends before the end of a time limit; but not where `nohup`
 /// keeps a session's end away.
 #[test]
-fn a_learner_ends_in_order_by_every_signal_that_tells_it_to() {
+fn every_stop_signal_ends_a_learner_with_a_checkpoint() {
     let scratch = Scratch::new();
     // The tests themselves may run under `nohup`.
     let [session, nohup] = ["--default-signal=HUP", "--ignore-signal=HUP,CHLD"]
@@ -103,24 +103,15 @@ fn a_learner_ends_in_order_by_every_signal_that_tells_it_to() {
             learner.wait_for_scores(learner.scores().len());
         }
         learner.process.signal(signal);
-        assert_eq!(
-            learner.process.wait(PATIENCE).code(),
-            Some(75),
-            "{run}: {}",
-            learner.process.log()
-        );
-        assert!(
-            learner.process.log().contains(&format!("received SIG{signal}")),
-            "{}",
-            learner.process.log()
-        );
+        learner.process.assert_ends(75, PATIENCE);
+        learner.process.assert_said(&format!("received SIG{signal}"));
         assert!(!learner.files("checkpoints").is_empty(), "{run} has left without a checkpoint");
     }
 }
 
 /// After a crash, the token of the dead learner is still there for some seconds.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_learner_that_waits_for_another_to_be_gone_hears_of_a_failure_and_leaves_in_order() {
+async fn a_learner_that_waits_for_another_reports_failures_and_stops() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let session = router(&endpoint).await;
@@ -128,18 +119,14 @@ async fn a_learner_that_waits_for_another_to_be_gone_hears_of_a_failure_and_leav
         session.liveliness().declare_token(keys::live_learner(&name("run"), 1)).await.unwrap();
     let diverges = ["--connect", &endpoint, "--agent", "critic_learning_rate=1e30"];
     let mut learner = scratch.learner_with("run", ENDLESS, &diverges);
-    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    learner.process.assert_ends(1, PATIENCE);
     // One that heard nothing would say in the end that there is another learner.
-    assert!(learner.process.log().contains("training diverged"), "{}", learner.process.log());
+    learner.process.assert_said("training diverged");
 
     let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint, "--fresh"]);
     learner.process.wait_for_log("waiting to see if it is gone", PATIENCE);
     assert_eq!(learner.process.terminate(PATIENCE).code(), Some(75), "{}", learner.process.log());
-    assert!(
-        learner.process.log().contains("the same command continues from there"),
-        "{}",
-        learner.process.log()
-    );
+    learner.process.assert_said("the same command continues from there");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -37,7 +37,7 @@ fn at_work(learner: &Learner) -> Vec<u32> {
 }
 
 #[test]
-fn one_command_trains_and_evaluates_also_beside_another_without_being_told_ports() {
+fn two_runs_on_one_machine_need_no_ports() {
     let scratch = Scratch::new();
     let mut by_default = scratch.learner_with("default", SHORT, &[]);
     let mut learner = scratch.learner_with("run", SHORT, &["--evaluators", "2"]);
@@ -51,7 +51,7 @@ fn one_command_trains_and_evaluates_also_beside_another_without_being_told_ports
 }
 
 #[test]
-fn evaluators_end_with_their_learner_however_it_ends() {
+fn evaluators_end_with_their_learner() {
     let scratch = Scratch::new();
     for signal in ["INT", "KILL"] {
         let mut learner = learner(&scratch, ENDLESS);
@@ -68,7 +68,7 @@ fn evaluators_end_with_their_learner_however_it_ends() {
 }
 
 #[test]
-fn one_that_dies_is_told_with_its_log_and_started_again() {
+fn a_dead_evaluator_is_reported_and_replaced() {
     let scratch = Scratch::new();
     let learner = learner(&scratch, ENDLESS);
     let evaluators = at_work(&learner);
@@ -84,7 +84,7 @@ fn one_that_dies_is_told_with_its_log_and_started_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn those_of_two_learners_at_one_router_have_names_of_their_own() {
+async fn evaluators_of_two_learners_have_different_names() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let _router = router(&endpoint).await;
@@ -107,7 +107,7 @@ async fn those_of_two_learners_at_one_router_have_names_of_their_own() {
 
 /// A lab may set the variable for all users of a machine.
 #[test]
-fn certificates_that_only_the_environment_names_are_for_other_networks() {
+fn local_runs_ignore_certificates_of_the_environment() {
     let scratch = Scratch::new();
     for (folder, flags) in
         [("/nowhere", ["--evaluators", "1"]), ("", ["--listen", "tcp/127.0.0.1:0"])]

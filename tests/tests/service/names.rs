@@ -8,7 +8,7 @@ use quad_tests::system::{Scratch, free_endpoint};
 use quad_tests::{PATIENCE, eventually};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn of_two_learners_under_one_name_that_start_at_once_one_stops() {
+async fn one_of_two_learners_with_one_name_stops() {
     let scratches = [Scratch::new(), Scratch::new()];
     let endpoint = free_endpoint();
     let mut learners = scratches
@@ -37,7 +37,7 @@ async fn of_two_learners_under_one_name_that_start_at_once_one_stops() {
 }
 
 #[test]
-fn of_two_evaluators_under_one_name_the_learner_warns_once() {
+fn two_evaluators_with_one_name_cause_one_warning() {
     let scratch = Scratch::new();
     // Jobs of seconds, so that one of them has a job whenever the other one asks.
     let learner = scratch.learner("run", Setting { candidates: 500, hidden: 256, ..ENDLESS });

@@ -58,7 +58,7 @@ fn an_evaluator_waits_for_its_learner_and_serves_the_next_one() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn scores_measured_while_cut_off_are_delivered_to_the_learners_next_life() {
+async fn scores_measured_offline_reach_the_next_incarnation() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let setting = Setting {
@@ -89,7 +89,7 @@ async fn scores_measured_while_cut_off_are_delivered_to_the_learners_next_life()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn evaluators_behind_a_router_are_counted_and_missed_when_they_leave() {
+async fn evaluators_behind_a_router_are_counted_as_they_come_and_leave() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let _session = router(&endpoint).await;

@@ -104,19 +104,19 @@ fn kill(signal: &str, process: &str) {
 }
 
 #[test]
-fn a_sweep_goes_on_after_an_interruption_and_a_failed_run_ends_no_other() {
+fn a_sweep_resumes_and_a_failed_run_ends_no_other() {
     let (undisturbed, study) = (Study::new(), Study::new());
     let mut sweep = undisturbed.sweep(&["--jobs", "2"]);
     sweep.assert_succeeds(PATIENCE);
     assert!(sweep.out().contains("all 4 runs are complete"), "{}", sweep.out());
-    assert!(sweep.log().contains("training takes about"), "{}", sweep.log());
+    sweep.assert_said("training takes about");
 
     assert_eq!(study.states(), ["not begun"; 4]);
     let mut sweep = study.sweep(&["--jobs", "2"]);
     study.wait_for(RUNS[1]);
     sweep.signal("INT");
-    assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
-    assert!(sweep.log().contains("the same command continues"), "{}", sweep.log());
+    sweep.assert_ends(75, PATIENCE);
+    sweep.assert_said("the same command continues");
     assert_eq!(study.states()[3], "not begun");
 
     let mut sweep = study.sweep(&["--jobs", "2"]);
@@ -124,12 +124,9 @@ fn a_sweep_goes_on_after_an_interruption_and_a_failed_run_ends_no_other() {
     study.wait_for(victim);
     let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, victim));
     kill("-KILL", &learner);
-    assert_eq!(sweep.wait(PATIENCE).code(), Some(1), "{}", sweep.log());
-    let log = sweep.log();
-    assert!(
-        log.contains("1 of 4 runs have failed") && log.contains(&format!("{victim}/learner.log")),
-        "{log}"
-    );
+    sweep.assert_ends(1, PATIENCE);
+    sweep.assert_said("1 of 4 runs have failed");
+    sweep.assert_said(&format!("{victim}/learner.log"));
     let states = study.states();
     assert!(states[2].starts_with("failed after"), "{states:?}");
     assert_eq!([&*states[0], &states[1], &states[3]], ["complete"; 3]);
@@ -139,7 +136,7 @@ fn a_sweep_goes_on_after_an_interruption_and_a_failed_run_ends_no_other() {
 }
 
 #[test]
-fn parts_of_a_study_are_done_by_number() {
+fn shards_and_indices_train_parts_of_a_study() {
     let study = Study::new();
     study.sweep(&["--shard", "2/2"]).assert_succeeds(PATIENCE);
     assert_eq!(study.states(), ["not begun", "complete", "not begun", "complete"]);
@@ -152,22 +149,18 @@ fn parts_of_a_study_are_done_by_number() {
     let mut sweep = study.sweep(&["--index", "0"]);
     study.wait_for(RUNS[0]);
     sweep.signal("TERM");
-    assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
+    sweep.assert_ends(75, PATIENCE);
     assert!(study.states()[0].ends_with("of 3000 steps"), "{:?}", study.states());
 }
 
 #[test]
-fn a_run_of_other_settings_is_never_taken_for_one_of_the_study() {
+fn runs_with_other_settings_are_refused() {
     let study = Study::new();
     study.sweep(&["--index", "0"]).assert_succeeds(PATIENCE);
     study.scratch.preset("tiny", Setting { steps: 4000, ..SETTING });
     let mut sweep = study.sweep(&[]);
-    assert_eq!(sweep.wait(PATIENCE).code(), Some(1));
-    assert!(
-        sweep.log().contains("has a run of other settings than the study's: steps"),
-        "{}",
-        sweep.log()
-    );
+    sweep.assert_ends(1, PATIENCE);
+    sweep.assert_said("has a run of other settings than the study's: steps");
 }
 
 /// Its runs would train, and each wait ten minutes for an evaluator.
@@ -180,12 +173,12 @@ fn a_sweep_whose_only_evaluator_is_killed_gets_another() {
         eventually("there is an evaluator", PATIENCE, || child_of(&sweep, |word| word == "serve"));
     kill("-KILL", &evaluator);
     sweep.assert_succeeds(PATIENCE);
-    assert!(sweep.log().contains("an evaluator has ended (signal: 9"), "{}", sweep.log());
+    sweep.assert_said("an evaluator has ended (signal: 9");
 }
 
 /// As some init scripts and containers start programs.
 #[test]
-fn a_parent_that_ignores_its_childrens_ends_and_asks_for_no_thread_changes_nothing() {
+fn an_ignored_sigchld_and_zero_threads_change_nothing() {
     let study = Study::new();
     let command = study.command(&["--index", "0"]);
     // Not a shell's `trap`: some shells never ignore this signal.
@@ -221,13 +214,13 @@ fn two_sweeps_of_one_study_do_not_disturb_each_other() {
 /// Slurm queues a task again by this exit code, so neither a slow disk nor a learner that has only
 /// begun may change it.
 #[test]
-fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
+fn a_stopped_sweep_exits_with_75_whatever_hangs() {
     let study = Study::new();
     // At once: the learner does not yet listen to signals.
     let mut sweep = study.sweep(&["--index", "0"]);
     eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[0]));
     sweep.signal("TERM");
-    assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
+    sweep.assert_ends(75, PATIENCE);
     assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
 
     // A learner that is frozen, as by a disk that hangs.
@@ -236,7 +229,7 @@ fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
     study.wait_for(RUNS[0]);
     kill("-STOP", &learner);
     sweep.signal("TERM");
-    assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
+    sweep.assert_ends(75, PATIENCE);
     assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
 
     // A disk that hangs when the sweep reads how one of two runs has ended.
@@ -249,7 +242,7 @@ fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
     kill("-KILL", &learner);
     study.wait_for(RUNS[2]);
     sweep.signal("TERM");
-    assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
+    sweep.assert_ends(75, PATIENCE);
     let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
     assert!(
         log.contains("received SIGTERM") && log.contains("the same command continues"),
