@@ -21,7 +21,10 @@ EPISODES=20
 CANDIDATES=
 
 seeds="0 1 2"
-methods="bc quad iql align-iql dql ivr xql onestep cql dtql sfbc diffuser td3-bc rebrac idql fql"
+methods="bc"
+for values in presets/*.toml; do
+  case $values in */tasks.toml) ;; *) methods="$methods $(basename "$values" .toml)" ;; esac
+done
 while [ $# -gt 1 ]; do
   case $1 in
     --seeds) seeds=$2 ;;

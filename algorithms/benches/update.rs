@@ -38,7 +38,7 @@ const CONFIGURATIONS: [(&str, [&str; 2], Option<u32>); 4] = [
     ("demo, IQL", ["hopper-demo", "iql"], None),
 ];
 
-/// What is measured: an algorithm with its values for a task.
+/// An algorithm with its values for a task.
 struct Experiment {
     definition: Definition,
     agent: Table,
@@ -48,7 +48,7 @@ struct Experiment {
 
 fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment {
     let definition =
-        ALGORITHMS.into_iter().find(|known| known.name == algorithm).expect("an algorithm");
+        *ALGORITHMS.iter().find(|known| known.name == algorithm).expect("an algorithm");
     let mut values = Values::of(&definition).for_task(Some(task));
     let Some(toml::Value::Table(mut agent)) = values.remove("agent") else {
         panic!("no values for {task}")
@@ -115,10 +115,11 @@ fn updates(criterion: &mut Criterion) {
         for (name, which, samples) in CONFIGURATIONS.into_iter().chain(others) {
             let experiment = experiment(which, samples);
             let context = context(&experiment, precision, &device);
-            let mut agent = Agent::new(experiment.definition, &experiment.agent, context)
+            let hyperparameters = experiment.agent.clone().into();
+            let mut agent = Agent::new(experiment.definition, &hyperparameters, context)
                 .expect("usable values");
-            let items: Vec<u32> =
-                (0..experiment.batch_size).map(|i| (i % agent.items()) as u32).collect();
+            let indices: Vec<u32> =
+                (0..experiment.batch_size).map(|i| (i % agent.dataset_len()) as u32).collect();
             let phases = agent.phases();
             for (i, start) in phases.iter().enumerate() {
                 agent.skip_to(*start);
@@ -128,7 +129,7 @@ fn updates(criterion: &mut Criterion) {
                     format!("{name}, phase {}", i + 1)
                 };
                 group.bench_function(name, |bencher| {
-                    bencher.iter(|| agent.update(&items).expect("a step"))
+                    bencher.iter(|| agent.update(&indices).expect("a step"))
                 });
             }
         }
@@ -174,7 +175,7 @@ fn peaks(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// What QUAD's update consists of, in its order, each by itself.
+/// The parts of QUAD's update, each by itself.
 fn parts(criterion: &mut Criterion) {
     for (name, which, samples) in CONFIGURATIONS {
         let Some(samples) = samples else { continue };
@@ -206,7 +207,8 @@ fn parts_of(
     samples: usize,
 ) -> Result<()> {
     let count = |name: &str| experiment.agent[name].as_integer().expect("a whole number") as usize;
-    let (b, k, steps) = (experiment.batch_size, count("critics"), count("diffusion_steps"));
+    let b = experiment.batch_size;
+    let (k, steps) = (count("critics"), count("diffusion_steps"));
     let (observation_dim, action_dim) = DIMS;
     let layers = experiment.agent["critic"].clone().try_into().expect("hidden layers");
     let shape = DiffusionShape::quad(DIMS, &layers, k, steps);
@@ -214,7 +216,8 @@ fn parts_of(
         let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu)?;
         Weights::trainable(layout, &values)
     };
-    let (actor, critics) = (weights(shape.actor().layout())?, weights(shape.critics().layout())?);
+    let actor = weights(shape.actor().layout())?;
+    let critics = weights(shape.critics().layout())?;
     let (mut actor_adam, mut critic_adam) = (Adam::new(&actor, 0.0)?, Adam::new(&critics, 0.0)?);
     let mut target_actor = NoisePredictor::new(shape.actor(), actor.copy()?, Precision::F32);
     let mut target_critics = Ensemble::new(shape.critics(), critics.copy()?, Precision::F32);

@@ -1,11 +1,10 @@
-//! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads
-//! its whole state.
+//! A training agent: counts an algorithm's updates, publishes its policy, saves and loads its
+//! state.
 
-use crate::algorithm::{Algorithm, AlgorithmError, Measured};
+use crate::algorithm::{Algorithm, Measured};
 use crate::context::Context;
-use crate::definition::{Definition, Metric};
-#[cfg(test)]
-use crate::parts::Parts;
+use crate::definition::{Definition, Hyperparameters, Metric};
+use crate::error::AlgorithmError;
 use crate::pool::run_awake;
 use candle_core::Device;
 use quad_dataset::Names;
@@ -16,22 +15,22 @@ use serde::{Deserialize, Serialize};
 /// Key of the counters in the metadata of a saved state.
 const COUNTERS: &str = "state";
 
-/// An algorithm, where it runs, and how far it is.
+/// An algorithm in training.
 pub struct Agent {
     definition: Definition,
-    algorithm: Box<dyn Algorithm>,
+    pub(super) algorithm: Box<dyn Algorithm>,
     device: Device,
     /// Transitions in the dataset.
     transitions: usize,
     /// The maps between the data's units and the algorithm's, unless they are the same.
     scaling: Option<Scaling>,
-    /// What the data calls the numbers of its rows.
+    /// The dataset's names of observations and actions.
     names: Names,
     /// Updates done.
     step: u64,
 }
 
-/// What a saved state holds beside its tensors.
+/// The metadata of a saved state.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Counters {
@@ -42,7 +41,7 @@ struct Counters {
 /// A saved state from which training cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
-    /// The state is of another algorithm.
+    /// A state of another algorithm.
     #[error("the state is of the algorithm {found}, this run is of {expected}")]
     Algorithm {
         /// The state's.
@@ -50,49 +49,42 @@ pub enum StateError {
         /// The run's.
         expected: &'static str,
     },
-    /// Its tensors are not the algorithm's.
+    /// Tensors that are missing, unknown or of another shape.
     #[error(transparent)]
     Policy(#[from] PolicyError),
 }
 
 impl Agent {
-    /// Makes an agent at step 0, with the hyper-parameters of this table.
+    /// Makes an agent at step 0.
     ///
     /// # Errors
-    /// They cannot be used, or candle fails.
+    /// The hyper-parameters or the data cannot be used.
     pub fn new(
         definition: Definition,
-        table: &toml::Table,
+        hyperparameters: &Hyperparameters,
         context: Context,
     ) -> Result<Self, AlgorithmError> {
         let (device, transitions) = (context.device.clone(), context.transitions.len());
         let scaling = Some(context.transitions.scaling().clone())
             .filter(|scaling| *scaling != Scaling::default());
         let names = context.transitions.names().clone();
-        let algorithm = (definition.start)(table, context)?;
-        // Each thread has a queue of its own on a GPU; the next thread must find what this one has
-        // made.
+        let algorithm = hyperparameters.start(&definition, context)?;
+        // Each thread has its own queue on a GPU: what this one made must be there for the next.
         device.synchronize()?;
         Ok(Self { definition, algorithm, device, transitions, scaling, names, step: 0 })
     }
 
-    /// The algorithm's state.
-    #[cfg(test)]
-    pub(crate) fn parts(&mut self) -> Parts<'_> {
-        self.algorithm.parts()
+    /// The number of examples that batches are drawn from.
+    pub fn dataset_len(&self) -> usize {
+        self.algorithm.dataset_len(self.transitions)
     }
 
-    /// How many items updates draw from.
-    pub fn items(&self) -> usize {
-        self.algorithm.items(self.transitions)
-    }
-
-    /// What an update measures.
+    /// The metrics of its updates.
     pub fn metrics(&self) -> &'static [Metric] {
         self.definition.metrics
     }
 
-    /// The steps at which phases begin whose updates take another time than those before.
+    /// The first step of each training phase; updates of different phases take different times.
     pub fn phases(&self) -> Vec<u64> {
         self.algorithm.phases()
     }
@@ -102,34 +94,33 @@ impl Agent {
         self.step
     }
 
-    /// Goes on as if so many updates were done, to measure what those of a later phase take.
+    /// Continues as if this number of updates were done, to time those of a later phase.
     pub fn skip_to(&mut self, step: u64) {
         self.step = step;
     }
 
-    /// One update on the items of these numbers. Gives the values of the metrics, in the order of
-    /// their table; none of those that this update did not measure.
+    /// Performs an update on the examples with these indices. Returns the metrics in the order of
+    /// their table; `None` for those that this update did not measure.
     ///
     /// # Errors
     /// Candle fails.
-    pub fn update(&mut self, items: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
+    pub fn update(&mut self, indices: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
         let (algorithm, step) = (&mut self.algorithm, self.step);
         let measured = match self.device.is_cpu() {
-            true => run_awake(|| algorithm.update(step, items))?,
-            false => algorithm.update(step, items)?,
+            true => run_awake(|| algorithm.update(step, indices))?,
+            false => algorithm.update(step, indices)?,
         };
         self.step += 1;
         Ok(self.in_order(&measured).collect())
     }
 
-    /// What the last update would measure on the items of these numbers if no network moved, as
-    /// [`Self::update`] gives it, but only of metrics that are measured on held-out episodes.
-    /// Nothing is changed.
+    /// Computes the losses of the last update on other examples, as [`Self::update`] returns them,
+    /// but only the metrics that are measured on held-out episodes. Changes nothing.
     ///
     /// # Errors
     /// Candle fails.
-    pub fn evaluate(&self, items: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
-        let measured = self.algorithm.evaluate(self.step.saturating_sub(1), items)?;
+    pub fn evaluate(&self, indices: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
+        let measured = self.algorithm.evaluate(self.step.saturating_sub(1), indices)?;
         let metrics = self.metrics().iter();
         Ok(self
             .in_order(&measured)
@@ -138,17 +129,16 @@ impl Agent {
             .collect())
     }
 
-    /// Values in the order of the table.
     fn in_order(&self, measured: &Measured) -> impl Iterator<Item = Option<f32>> {
         let value =
             |name| measured.iter().find(|(known, _)| *known == name).map(|(_, value)| *value);
         self.metrics().iter().map(move |metric| value(metric.name))
     }
 
-    /// The file of the policy as it is now, which says where it is from.
+    /// The file of the current policy, with its origin.
     ///
     /// # Errors
-    /// A weight that is not finite.
+    /// A weight is not finite.
     pub fn policy(&self, origin: impl Serialize) -> Result<Vec<u8>, AlgorithmError> {
         let (policy, tensors) = self.algorithm.policy()?;
         let Names { observations: observation_names, actions: action_names } = self.names.clone();
@@ -158,30 +148,27 @@ impl Agent {
         Ok(header.to_safetensors(&tensors)?)
     }
 
-    /// Everything that decides the future of the run, as one safetensors file: the same bytes for
-    /// the same state.
+    /// The state of the run as a safetensors file: the same bytes for the same state.
     ///
     /// # Errors
-    /// A number that is not finite: a state with no future.
+    /// A number is not finite.
     pub fn save(&mut self) -> Result<Vec<u8>, AlgorithmError> {
         let counters = Counters { algorithm: self.definition.name.to_owned(), step: self.step };
-        Ok(write_tensors(&self.algorithm.parts().save()?, COUNTERS, &counters)?)
+        Ok(write_tensors(&self.algorithm.state_dict().save()?, COUNTERS, &counters)?)
     }
 
-    /// Goes on from a saved state, bit for bit, if the run's configuration is the same.
+    /// Resumes from a saved state, bit for bit if the run's configuration is the same.
     ///
     /// # Errors
-    /// A file that is not the whole state of this algorithm; the agent is not to be used then.
+    /// The file is not the whole state of this algorithm; the agent is not to be used then.
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
         let counters: Counters = read_header(bytes, COUNTERS)?;
-        if counters.algorithm != self.definition.name {
-            return Err(StateError::Algorithm {
-                found: counters.algorithm,
-                expected: self.definition.name,
-            });
+        let expected = self.definition.name;
+        if counters.algorithm != expected {
+            return Err(StateError::Algorithm { found: counters.algorithm, expected });
         }
         let mut tensors = read_tensors(bytes)?;
-        self.algorithm.parts().load(&mut tensors)?;
+        self.algorithm.state_dict().load(&mut tensors)?;
         if let Some(name) = tensors.into_keys().next() {
             return Err(PolicyError::Unexpected(name).into());
         }

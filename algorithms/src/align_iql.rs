@@ -4,46 +4,35 @@
 //! takes the one whose Q is closest to V. Equations of critics and V are IQL's; what is left out,
 //! and what its authors' code does, is in docs/deviations.md.
 
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-#[path = "golden/align_iql.rs"]
-pub(super) mod golden;
-
-use super::algorithm::{Loss, Measured, smaller};
+use super::algorithm::Measured;
 use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
+use super::definition::{Definition, Metric, Reporting, metrics, read, start};
 use super::denoising::Denoising;
-use super::diffusion::{Diffusion, DiffusionUpdate, Networks};
+use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler};
 use super::hyperparameters::{
     Candidates, Count, NotNegative, OpenUnit, Positive, Rate, UnitInterval,
 };
 use super::iql::expectile_loss;
-use super::parts::Parts;
-use super::replay::Computed;
-use super::train_state::{TrainState, ensemble};
-use candle_core::{Device, Result, Tensor};
-use quad_nn::{
-    AdamStep, Ensemble, EnsembleShape, MlpConfig, Reverse, Tensors, Weighted, cosine_decay,
-};
+use super::losses::{Loss, smallest};
+use super::networks::{TWIN, TrainState, state_value};
+use super::state_dict::StateDict;
+use candle_core::{Result, Tensor};
+use quad_nn::{AdamStep, Ensemble, MlpConfig, Reverse, Tensors, cosine_decay};
 use quad_policy::{Aggregate, Choice, DiffusionPolicy, DiffusionShape, Rule};
-use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "align-iql",
-    settings: include_str!("../../presets/align-iql.toml"),
+    presets: include_str!("../../presets/align-iql.toml"),
     metrics: METRICS,
-    report: Reporting { counts: &["candidates"], ..Reporting::PLAIN },
-    check: readable::<Config>,
-    start: |table, context| Ok(Box::new(read::<Config>(table)?.start(Rule::Nearest, context)?)),
+    report: Reporting::CANDIDATES,
+    read: |table| {
+        Ok(start(read::<Config>(table)?, |config, context| config.start(Rule::Nearest, context)))
+    },
 };
 
-/// Critics, of whose values the smaller counts.
-const CRITICS: usize = 2;
-
 pub(super) const METRICS: &[Metric] = &metrics! {
-    q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).";
+    target_q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).";
     v_mean ["V"] held_out: "Mean over the batch of the value V(s) after its step.";
     value_loss ["value loss"] held_out: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).";
     critic_loss ["critic loss"] held_out: "Mean over critics and batch of (Q_k(s, a) − y)² (IQL's Eq. 6).";
@@ -53,7 +42,7 @@ pub(super) const METRICS: &[Metric] = &metrics! {
 };
 
 /// The hyper-parameters of AlignIQL and of IDQL: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Config {
     actor: MlpConfig,
@@ -68,7 +57,7 @@ pub(super) struct Config {
     actor_learning_rate: Positive,
     critic_learning_rate: Positive,
     value_learning_rate: Positive,
-    /// What each step takes off the actor's weights, relative to them and to the learning rate.
+    /// Share of the learning rate by which each step shrinks the actor's weights.
     weight_decay: NotNegative,
     /// EMA rate of the target critics.
     ema_rate: Rate,
@@ -78,67 +67,57 @@ pub(super) struct Config {
     candidates: Candidates,
 }
 
-/// AlignIQL, or IDQL, beside its diffusion policy and critics.
+/// AlignIQL or IDQL, which differ in the policy's rule of choice.
 pub(super) struct AlignIql {
     config: Config,
-    /// How the policy chooses.
     rule: Rule,
-    /// V.
     value: TrainState<Ensemble>,
 }
 
 impl Config {
-    /// The algorithm at its beginning, whose policy chooses by this rule: IDQL's by `best`.
     pub(super) fn start(self, rule: Rule, context: Context) -> Result<Diffusion<AlignIql>> {
         let shape = DiffusionShape {
             actor: self.actor.clone(),
             critic: self.critic.clone(),
             value: (rule == Rule::Nearest).then(|| self.value.clone()),
-            critics: CRITICS,
+            critics: TWIN,
             diffusion_steps: *self.diffusion_steps,
             reverse: Reverse::ClipSample,
             ..DiffusionShape::default()
         };
-        let networks = Networks::new(shape, *self.weight_decay, context)?;
-        let value = EnsembleShape {
-            members: 1,
-            action_dim: 0,
-            layers: self.value.clone(),
-            ..networks.shape.critics()
-        };
-        let value = ensemble(value, &networks.context, 2)?;
-        Ok(Diffusion::new(networks, AlignIql { config: self, rule, value }))
+        Diffusion::new(shape, context, |networks, init| {
+            networks.actor.decay_weights(*self.weight_decay)?;
+            Ok(AlignIql { value: init.value(&self.value)?, config: self, rule })
+        })
     }
 }
 
-/// The policy: cloning, whatever the actions are worth.
+/// The policy toward the data's actions.
 fn bc_loss(networks: &Networks, batch: &Minibatch, noise: &Denoising) -> Result<Loss> {
     let (_, predicted) = networks.denoise(batch, noise)?;
     Ok(Loss::new("bc_loss", (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?))
 }
 
+/// The smaller Q̂(s, a), `[B]`.
+fn q(networks: &Networks, batch: &Minibatch) -> Result<Tensor> {
+    smallest(&batch.values(&networks.critic.target)?)
+}
+
 impl AlignIql {
     /// V(s) toward an expectile of the smaller Q̂(s, a), `[B]`, IQL's Eq. 5.
     fn value_loss(&self, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
-        let u = (q - self.value.network.state_values(&batch.observations)?.squeeze(0)?)?;
+        let u = (q - state_value(&self.value, &batch.observations)?)?;
         Ok(Loss::new("value_loss", expectile_loss(&u, *self.config.expectile)?))
     }
 
     /// Q(s, a) toward r + γ·V(s'), IQL's Eq. 6. Also measures V and, with the smaller Q̂(s, a), the
     /// advantage.
     fn critic_loss(&self, networks: &Networks, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
-        let value = self.value.network.detach();
-        let targets = batch.target(
-            *self.config.gamma,
-            &value.state_values(&batch.next_observations)?.squeeze(0)?,
-        )?;
-        let loss = networks.critics.network.squared_error(
-            &batch.observations,
-            &batch.actions,
-            &targets,
-        )?;
-        let v = value.state_values(&batch.observations)?.squeeze(0)?;
-        let loss = Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?);
+        let value = self.value.detach();
+        let next = state_value(&value, &batch.next_observations)?;
+        let targets = batch.target(*self.config.gamma, &next)?;
+        let loss = batch.critic_loss(&networks.critic, &targets)?;
+        let v = state_value(&value, &batch.observations)?;
         Ok(loss.with("v_mean", v.mean_all()?).with("advantage_mean", (q - v)?.mean_all()?))
     }
 }
@@ -146,50 +125,47 @@ impl AlignIql {
 impl DiffusionUpdate for AlignIql {
     type Noise = Denoising;
 
-    fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Denoising> {
-        networks.denoising(generator)
+    fn noise(&self, mut sampler: Sampler<'_>) -> Result<Denoising> {
+        sampler.denoising()
     }
 
-    fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
-        let (config, decay) = (&self.config, cosine_decay(step, networks.context.total_steps));
+    fn begin(&mut self, networks: &mut Networks, step: u64, total_steps: u64) -> Result<()> {
+        let (config, decay) = (&self.config, cosine_decay(step, total_steps));
         let adam = |rate: f32| AdamStep::after(step, rate);
         networks.actor.adam.set(adam(*config.actor_learning_rate * decay))?;
         self.value.adam.set(adam(*config.value_learning_rate))?;
-        networks.critics.adam.set(adam(*config.critic_learning_rate))
+        networks.critic.adam.set(adam(*config.critic_learning_rate))
     }
 
-    fn work(
+    fn update(
         &mut self,
         networks: &mut Networks,
         batch: &Minibatch,
         noise: &Denoising,
-    ) -> Result<Computed> {
+    ) -> Result<Vec<Loss>> {
         let bc_loss = bc_loss(networks, batch, noise)?;
-        let Networks { actor, target_actor, .. } = networks;
-        actor.apply_as_set(&bc_loss.value)?;
-        target_actor.soft_update(&actor.network, *self.config.actor_ema_rate)?;
+        networks.actor.minimize_as_set(&bc_loss.value)?;
+        networks.actor.soft_update(*self.config.actor_ema_rate)?;
 
-        let q = smaller(&networks.target_critics.values(&batch.observations, &batch.actions)?)?;
+        let q = q(networks, batch)?;
         let value_loss = self.value_loss(batch, &q)?;
-        self.value.apply_as_set(&value_loss.value)?;
+        self.value.minimize_as_set(&value_loss.value)?;
 
         let critic_loss = self.critic_loss(networks, batch, &q)?;
-        let Networks { critics, target_critics, .. } = networks;
-        critics.apply_as_set(&critic_loss.value)?;
-        target_critics.soft_update(&critics.network, *self.config.ema_rate)?;
-        Computed::new(&[bc_loss, value_loss, critic_loss], &[])
+        networks.critic.minimize_as_set(&critic_loss.value)?;
+        networks.critic.soft_update(*self.config.ema_rate)?;
+        Ok(vec![bc_loss, value_loss, critic_loss])
     }
 
-    fn evaluate(
+    fn losses(
         &self,
         networks: &Networks,
         batch: &Minibatch,
         noise: &Denoising,
-    ) -> Result<Computed> {
-        let q = smaller(&networks.target_critics.values(&batch.observations, &batch.actions)?)?;
-        let of_critics = [self.value_loss(batch, &q)?, self.critic_loss(networks, batch, &q)?];
-        let [value_loss, critic_loss] = of_critics;
-        Computed::new(&[bc_loss(networks, batch, noise)?, value_loss, critic_loss], &[])
+    ) -> Result<Vec<Loss>> {
+        let (bc_loss, q) = (bc_loss(networks, batch, noise)?, q(networks, batch)?);
+        let value_loss = self.value_loss(batch, &q)?;
+        Ok(vec![bc_loss, value_loss, self.critic_loss(networks, batch, &q)?])
     }
 
     fn measure(&self, networks: &Networks, _: &Denoising, _: &[f32]) -> Result<Measured> {
@@ -199,16 +175,14 @@ impl DiffusionUpdate for AlignIql {
     /// AlignIQL takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of
     /// the aligned policy, as a penalty.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let Networks { target_actor, target_critics, .. } = networks;
-        let value = (self.rule == Rule::Nearest).then_some(&self.value.network);
-        let tensors = DiffusionPolicy::tensors(target_actor, target_critics, value)?;
-        Ok((
-            Choice { candidates: *self.config.candidates, value: Aggregate::Min, rule: self.rule },
-            tensors,
-        ))
+        let Networks { actor, critic } = networks;
+        let value = (self.rule == Rule::Nearest).then_some(&*self.value);
+        let tensors = DiffusionPolicy::tensors(&actor.target, &critic.target, value)?;
+        let candidates = *self.config.candidates;
+        Ok((Choice { candidates, value: Aggregate::Min, rule: self.rule }, tensors))
     }
 
-    fn parts<'a>(&'a mut self, parts: Parts<'a>, _: &'a Device) -> Parts<'a> {
-        parts.trained("value", &mut self.value)
+    fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {
+        dict.with("value", &mut self.value)
     }
 }

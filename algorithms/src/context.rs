@@ -1,19 +1,22 @@
-//! What an algorithm knows of its run, the data above all.
+//! The data and settings of a run that an algorithm learns with.
 
 use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::{Batch, Transitions};
-use quad_nn::Precision;
+use quad_nn::{Ensemble, Precision};
 
-use super::replay::Inputs;
+use super::error::AlgorithmError;
+use super::inputs::Inputs;
+use super::losses::Loss;
+use super::random::{Purpose, Random, stream};
 
-/// What an algorithm has to know of a run.
+/// The data and settings of a run that an algorithm learns with.
 #[derive(Clone)]
 pub struct Context {
-    /// What it learns from: transitions, their order in episodes, windows of them.
+    /// Transitions in their episodes.
     pub transitions: Arc<Transitions>,
-    /// Items per update, B.
+    /// Examples per update, B.
     pub batch_size: usize,
     /// Updates of the whole run; learning rates that decay reach 0 there.
     pub total_steps: u64,
@@ -21,37 +24,52 @@ pub struct Context {
     pub seed: u64,
     /// Precision of forward passes without a gradient.
     pub precision: Precision,
-    /// Where the tensors lie.
+    /// Device of all tensors.
     pub device: Device,
+    /// Tensors of a golden folder that take the place of random numbers.
+    #[cfg(test)]
+    pub golden: Option<Arc<quad_nn::Tensors>>,
 }
 
 impl Context {
-    /// Numbers in an observation.
+    /// Size of an observation, o.
     pub fn observation_dim(&self) -> usize {
         self.transitions.observation_dim()
     }
 
-    /// Numbers in an action.
+    /// Size of an action, a.
     pub fn action_dim(&self) -> usize {
         self.transitions.action_dim()
     }
 
-    /// The transitions of these numbers as tensors.
-    ///
-    /// # Errors
-    /// Candle fails.
-    pub fn batch(&self, items: &[u32]) -> Result<Minibatch> {
-        self.batch_on(items, &self.device)
+    /// The random numbers of update number `step`.
+    pub(super) fn random(&self, step: u64) -> Random {
+        self.random_for(Purpose::Noise, step)
+    }
+
+    /// The random numbers of another purpose.
+    pub(super) fn random_for(&self, purpose: Purpose, count: u64) -> Random {
+        Random {
+            generator: stream(self.seed, purpose, count),
+            device: self.device.clone(),
+            #[cfg(test)]
+            golden: self.golden.clone(),
+        }
+    }
+
+    /// The transitions with these indices as tensors.
+    pub fn batch(&self, indices: &[u32]) -> Result<Minibatch> {
+        self.batch_on(indices, &self.device)
     }
 
     /// [`Self::batch`] on another device.
-    pub(super) fn batch_on(&self, items: &[u32], device: &Device) -> Result<Minibatch> {
+    pub(super) fn batch_on(&self, indices: &[u32], device: &Device) -> Result<Minibatch> {
         let mut batch = Batch::default();
-        self.transitions.gather(items, &mut batch);
+        self.transitions.gather(indices, &mut batch);
         let rows = |numbers: &[f32]| {
-            Tensor::from_slice(numbers, (items.len(), numbers.len() / items.len()), device)
+            Tensor::from_slice(numbers, (indices.len(), numbers.len() / indices.len()), device)
         };
-        let column = |numbers: &[f32]| Tensor::from_slice(numbers, items.len(), device);
+        let column = |numbers: &[f32]| Tensor::from_slice(numbers, indices.len(), device);
         Ok(Minibatch {
             observations: rows(&batch.observations)?,
             actions: rows(&batch.actions)?,
@@ -62,17 +80,18 @@ impl Context {
     }
 
     /// The transitions that have a next action, or need none because the episode terminates.
-    pub(super) fn items_with_next_action(&self) -> Vec<u32> {
+    pub(super) fn with_next_action(&self) -> std::result::Result<Vec<u32>, AlgorithmError> {
         let (transitions, mut one) = (&self.transitions, Batch::default());
         let usable = |row: &u32| {
             transitions.gather(&[*row], &mut one);
             transitions.next_action(*row).is_some() || one.masks == [0.0]
         };
-        (0..transitions.len() as u32).filter(usable).collect()
+        let rows = Vec::from_iter((0..transitions.len() as u32).filter(usable));
+        if rows.is_empty() { Err(AlgorithmError::NoNextAction) } else { Ok(rows) }
     }
 
     /// The actions that the data takes after these transitions, `[B, a]`; 0 at the end of an
-    /// episode, where none counts.
+    /// episode.
     pub(super) fn next_actions(&self, rows: &[u32]) -> Result<Tensor> {
         let a = self.action_dim();
         let none = vec![0.0; a];
@@ -82,7 +101,12 @@ impl Context {
     }
 }
 
-/// A batch of B transitions as tensors.
+/// The elements of `of` with these indices.
+pub(super) fn select(of: &[u32], indices: &[u32]) -> Vec<u32> {
+    indices.iter().map(|index| of[*index as usize]).collect()
+}
+
+/// A batch of B transitions.
 #[derive(Clone, Debug)]
 pub struct Minibatch {
     /// s, `[B, o]`.
@@ -106,10 +130,32 @@ impl Inputs for Minibatch {
 
 impl Minibatch {
     /// y = r + γ·mask·v for values v of s', `[B]`, as constants.
-    ///
-    /// # Errors
-    /// Candle fails.
     pub fn target(&self, gamma: f32, next: &Tensor) -> Result<Tensor> {
         Ok((&self.rewards + ((next * &self.masks)? * f64::from(gamma))?)?.detach())
+    }
+
+    /// Q_k(s, a), `[K, B]`.
+    pub(super) fn values(&self, critics: &Ensemble) -> Result<Tensor> {
+        self.values_at(critics, &self.actions)
+    }
+
+    /// Q_k of other actions in s, of which each s has the same number.
+    pub(super) fn values_at(&self, critics: &Ensemble, actions: &Tensor) -> Result<Tensor> {
+        critics.values(&self.observations, actions)
+    }
+
+    /// Q_k of actions in s', of which each s' has the same number.
+    pub(super) fn next_values(&self, critics: &Ensemble, actions: &Tensor) -> Result<Tensor> {
+        critics.values(&self.next_observations, actions)
+    }
+
+    /// The loss of critics that is the mean over critics and batch of (Q_k(s, a) − y)².
+    pub(super) fn critic_loss(&self, critics: &Ensemble, targets: &Tensor) -> Result<Loss> {
+        Loss::of_critics(self.squared_error(critics, targets)?, targets)
+    }
+
+    /// Mean over critics and batch of (Q_k(s, a) − y)², `[]`.
+    pub(super) fn squared_error(&self, critics: &Ensemble, targets: &Tensor) -> Result<Tensor> {
+        critics.squared_error(&self.observations, &self.actions, targets)
     }
 }

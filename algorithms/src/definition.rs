@@ -1,33 +1,129 @@
-//! What is known of an algorithm before it runs: its values, its checks, what it measures, and what
-//! reports say of it.
+//! An algorithm before it runs: its name, presets, hyper-parameters, metrics, and what reports say
+//! of it.
 
 use std::collections::BTreeMap;
+use std::fmt;
+use std::ops::Deref;
+use std::sync::Arc;
 
 use serde::de::DeserializeOwned;
-use serde::{Serialize, Serializer};
+use serde::{Deserialize, Serialize, Serializer};
+use toml::Table;
 
-use super::algorithm::{AgentError, Algorithm, AlgorithmError};
+use super::algorithm::Algorithm;
 use super::context::Context;
+use super::error::{AgentError, AlgorithmError};
 
 /// An algorithm before it runs.
 #[derive(Clone, Copy)]
 pub struct Definition {
     /// Its name on the command line and in files.
     pub name: &'static str,
-    /// The file of its values for each task, `presets/NAME.toml`.
-    pub settings: &'static str,
-    /// What its updates measure, each what its phase has.
+    /// The contents of `presets/NAME.toml`.
+    pub presets: &'static str,
+    /// The metrics of its updates; some are measured in one phase only.
     pub metrics: &'static [Metric],
-    /// How reports call its runs, and what they say of them beside scores.
+    /// What reports say of its runs beside scores.
     pub report: Reporting,
-    /// Checks its hyper-parameters, the `[agent]` table of a preset.
-    pub check: fn(&toml::Table) -> Result<(), AgentError>,
-    /// The algorithm at step 0, of such a table.
-    pub start: fn(&toml::Table, Context) -> Started,
+    /// Reads an `[agent]` table into the type of its hyper-parameters.
+    pub read: fn(&Table) -> Result<Start, AgentError>,
 }
 
-/// An algorithm, or why it cannot start.
-pub type Started = Result<Box<dyn Algorithm>, AlgorithmError>;
+/// Makes an algorithm at step 0 with hyper-parameters that were read before.
+pub type Start = Arc<dyn Fn(Context) -> Result<Box<dyn Algorithm>, AlgorithmError> + Send + Sync>;
+
+/// Makes a [`Start`] of hyper-parameters and a constructor.
+pub(super) fn start<C, A, E>(
+    config: C,
+    new: impl Fn(C, Context) -> Result<A, E> + Send + Sync + 'static,
+) -> Start
+where
+    C: Clone + Send + Sync + 'static,
+    A: Algorithm + 'static,
+    AlgorithmError: From<E>,
+{
+    Arc::new(move |context| Ok(Box::new(new(config.clone(), context)?)))
+}
+
+/// Reads a table of hyper-parameters, whose types check their ranges.
+pub(super) fn read<T: DeserializeOwned>(table: &Table) -> Result<T, AgentError> {
+    Ok(T::deserialize(table.clone())?)
+}
+
+/// Reads hyper-parameters into which those of `C` are flattened. Serde does not name the key of a
+/// flattened struct that it refuses, so these are read by themselves first.
+pub(super) fn read_with<C: DeserializeOwned, T: DeserializeOwned>(
+    table: &Table,
+) -> Result<T, AgentError> {
+    read::<C>(table)?;
+    read(table)
+}
+
+/// The hyper-parameters of an algorithm: the `[agent]` table of an experiment and, once it was
+/// checked, the same as the algorithm's own type.
+#[derive(Clone, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Hyperparameters {
+    table: Table,
+    #[serde(skip)]
+    start: Option<Start>,
+}
+
+impl Hyperparameters {
+    /// Reads a table for an algorithm.
+    ///
+    /// # Errors
+    /// A key is missing, unknown, of the wrong type or out of range.
+    pub fn new(definition: &Definition, table: Table) -> Result<Self, AgentError> {
+        Ok(Self { start: Some((definition.read)(&table)?), table })
+    }
+
+    /// A copy of the table.
+    pub fn to_table(&self) -> Table {
+        self.table.clone()
+    }
+
+    /// The algorithm at step 0. A table that comes from a run's folder is read here.
+    ///
+    /// # Errors
+    /// The table cannot be used, the data has no examples for the algorithm, or candle fails.
+    pub fn start(
+        &self,
+        definition: &Definition,
+        context: Context,
+    ) -> Result<Box<dyn Algorithm>, AlgorithmError> {
+        match &self.start {
+            Some(start) => start(context),
+            None => (definition.read)(&self.table)?(context),
+        }
+    }
+}
+
+impl Deref for Hyperparameters {
+    type Target = Table;
+
+    fn deref(&self) -> &Table {
+        &self.table
+    }
+}
+
+impl From<Table> for Hyperparameters {
+    fn from(table: Table) -> Self {
+        Self { table, start: None }
+    }
+}
+
+impl PartialEq for Hyperparameters {
+    fn eq(&self, other: &Self) -> bool {
+        self.table == other.table
+    }
+}
+
+impl fmt::Debug for Hyperparameters {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.table.fmt(f)
+    }
+}
 
 /// A number that an update measures. Gauges, `metrics.jsonl`, the progress display and `learner
 /// presets --metrics` derive from it.
@@ -35,17 +131,16 @@ pub type Started = Result<Box<dyn Algorithm>, AlgorithmError>;
 pub struct Metric {
     /// Its name in `metrics.jsonl`; Prometheus sees `quad_learner_<name>`.
     pub name: &'static str,
-    /// What it is, with its equation and, where it has one, its unit.
+    /// Its description with the equation and, where it has one, the unit.
     pub help: &'static str,
-    /// What the progress display calls it; empty where it does not show it.
+    /// Its label in the progress display; empty if it is not shown there.
     pub label: &'static str,
-    /// Whether it is also measured on held-out episodes: it says something of data that is not
-    /// learned from.
+    /// Also measured on held-out episodes.
     pub held_out: bool,
 }
 
-/// A table of metrics: in each line a name, in brackets what the display calls it if it shows it,
-/// `held_out` if it is also measured on held-out episodes, and the help.
+/// A table of metrics: each line has a name, the label in brackets, `held_out` if it is also
+/// measured on held-out episodes, and the help.
 macro_rules! metrics {
     (@ held_out) => { true };
     (@) => { false };
@@ -60,22 +155,24 @@ macro_rules! metrics {
 }
 pub(crate) use metrics;
 
-/// What reports have to know of an algorithm.
+/// What reports say of an algorithm's runs beside scores.
 #[derive(Clone, Copy)]
 pub struct Reporting {
-    /// What tells its variants apart, if it has any.
+    /// The hyper-parameter that tells its variants apart, if it has any.
     pub variant: Option<Variant>,
     /// Counts among the hyper-parameters that reports name with a run, such as `candidates`.
     pub counts: &'static [&'static str],
-    /// What its paper draws scores over.
+    /// The hyper-parameter over which its paper draws scores.
     pub axis: Option<Axis>,
-    /// What a run's metrics say about it.
+    /// Summary of a run's metrics.
     pub summary: Option<Summarize>,
 }
 
 impl Reporting {
     /// For an algorithm with neither variants nor figures of its own.
     pub const PLAIN: Self = Self { variant: None, counts: &[], axis: None, summary: None };
+    /// For an algorithm whose policy chooses among candidates.
+    pub const CANDIDATES: Self = Self { counts: &["candidates"], ..Self::PLAIN };
 }
 
 /// The hyper-parameter that tells an algorithm's variants apart.
@@ -83,7 +180,7 @@ impl Reporting {
 pub struct Variant {
     /// Its name.
     pub key: &'static str,
-    /// What tables and figures call the variant with this value.
+    /// The label of the variant with this value in tables and figures.
     pub called: fn(&str) -> String,
 }
 
@@ -102,41 +199,22 @@ pub type Summarize = fn(&[MetricsLine], &str) -> Option<Summary>;
 /// A line of `metrics.jsonl`: means over some steps, by name.
 pub type MetricsLine = BTreeMap<String, f64>;
 
-/// What an algorithm says about the metrics of a run.
+/// An algorithm's summary of the metrics of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Summary {
     /// Its key in JSON.
     pub key: &'static str,
     /// Its title.
     pub title: &'static str,
-    /// The numbers in it.
+    /// Its numbers.
     pub json: serde_json::Value,
-    /// As lines for people.
+    /// Its lines for people.
     pub text: String,
 }
 
 impl Serialize for Summary {
-    /// A map of `key` to `json`.
+    /// Writes a map of `key` to `json`.
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_map([(self.key, &self.json)])
     }
-}
-
-/// Reads a table of hyper-parameters, whose types say their ranges.
-pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> Result<T, AgentError> {
-    Ok(T::deserialize(table.clone())?)
-}
-
-/// Reads hyper-parameters into which those of `C` are flattened. Serde does not say which key of a
-/// flattened struct is refused, so these are read by themselves first.
-pub(super) fn read_with<C: DeserializeOwned, T: DeserializeOwned>(
-    table: &toml::Table,
-) -> Result<T, AgentError> {
-    readable::<C>(table)?;
-    read(table)
-}
-
-/// The check of hyper-parameters whose types say their ranges.
-pub(super) fn readable<T: DeserializeOwned>(table: &toml::Table) -> Result<(), AgentError> {
-    read::<T>(table).map(drop)
 }

@@ -4,51 +4,40 @@
 //! the data's: inside that trust region π_θ moves toward large Q, and no chain of denoising steps
 //! is ever sampled. Where the authors' code says more than their paper, docs/deviations.md has it.
 
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-#[path = "golden/dtql.rs"]
-mod golden;
-
-use super::algorithm::{Algorithm, Loss, Measured, measured, smaller};
+use super::algorithm::{Algorithm, Measured};
 use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
-use super::denoising::normal;
+use super::definition::{Definition, Metric, Reporting, metrics, read, start};
 use super::gaussian::log_density;
 use super::hyperparameters::{
     Candidates, NotNegative, OpenUnit, Positive, Rate, Steps, UnitInterval,
 };
 use super::iql::expectile_loss;
-use super::parts::Parts;
-use super::phases;
-use super::random::{Purpose, stream};
+use super::losses::{Loss, measured, smallest};
+use super::networks::{Initializer, TWIN, TrainState, WithTarget, networks, state_value};
+use super::phases::first_steps;
+use super::random::Random;
 use super::squashed::{Normal, Squashed};
-use super::train_state::{TrainState, ensemble, initial};
-use candle_core::{Result, Tensor};
+use super::state_dict::StateDict;
+use candle_core::{Device, Result, Tensor};
 use quad_nn::{
-    AdamStep, Denoiser, DenoiserShape, Ensemble, EnsembleShape, MlpConfig, NoiseLevels, Tensors,
-    Weighted, cosine_decay,
+    AdamStep, Denoiser, DenoiserShape, Ensemble, MlpConfig, NoiseLevels, Tensors, cosine_decay,
 };
 use quad_policy::{ActorCriticShape, Aggregate, Choice, PolicyConfig, Rule, SquashedActor};
-use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "dtql",
-    settings: include_str!("../../presets/dtql.toml"),
+    presets: include_str!("../../presets/dtql.toml"),
     metrics: METRICS,
-    report: Reporting { counts: &["candidates"], ..Reporting::PLAIN },
-    check: readable::<Config>,
-    start: |table, context| Ok(Box::new(Dtql::new(read(table)?, context)?)),
+    report: Reporting::CANDIDATES,
+    read: |table| Ok(start(read(table)?, Dtql::new)),
 };
 
-/// Critics, of whose values the smaller counts.
-const CRITICS: usize = 2;
-/// What the data's actions are divided by before atanh, which is infinite at ±1.
+/// Divisor of the data's actions before atanh, which is infinite at ±1.
 const ROOM: f64 = 1.001;
 
 const METRICS: &[Metric] = &metrics! {
-    q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s').";
+    target_q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s').";
     v_mean ["V"] held_out: "Mean over the batch of the value V(s) before its step.";
     value_loss ["value loss"] held_out: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q_k(s, a) − V(s).";
     critic_loss ["critic loss"] held_out: "Sum over both critics of the mean over the batch of (Q_k(s, a) − y)².";
@@ -61,7 +50,7 @@ const METRICS: &[Metric] = &metrics! {
 };
 
 /// DTQL's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     /// The one-step policy π_θ.
@@ -82,7 +71,7 @@ struct Config {
     learning_rate: Positive,
     /// Learning rate of critics and V.
     critic_learning_rate: Positive,
-    /// Whether all learning rates fall to 0 along a cosine, from the end of pre-training on.
+    /// Decay of all learning rates to 0 along a cosine, from the end of pre-training on.
     cosine: bool,
     /// EMA rate of the target critics.
     ema_rate: Rate,
@@ -101,129 +90,112 @@ struct Phases {
     policy: Steps,
 }
 
-/// Noise for the actions of a batch.
+networks! {
+    struct Networks(config: &Config, init) {
+        /// π_θ.
+        actor: Squashed = Squashed::new(&config.actor, SquashedActor::LOG_STD, init),
+        /// The policy chooses by the target critics when it acts.
+        critic: WithTarget<Ensemble> = init.critics(TWIN, &config.critic),
+        value: TrainState<Ensemble> = init.value(&config.value),
+        /// μ_φ.
+        diffusion: TrainState<Denoiser> = {
+            let shape = DenoiserShape {
+                observation_dim: init.context.observation_dim(),
+                action_dim: init.context.action_dim(),
+                layers: config.diffusion.clone(),
+            };
+            init.network(&shape.layout(), |weights| Denoiser::new(&shape, weights))
+        },
+    }
+}
+
+/// Noise σ·n on the actions of a batch.
 struct Noising {
     levels: NoiseLevels,
     /// n, `[B, a]`.
     noise: Tensor,
 }
 
+impl Noising {
+    fn draw(random: &mut Random, loss: &str, (rows, action_dim): (usize, usize)) -> Result<Self> {
+        let levels = random.vector(&format!("{loss}_sigma"), |generator| {
+            NoiseLevels::draw(rows, generator).sigma(&Device::Cpu)?.flatten_all()?.to_vec1()
+        })?;
+        let noise = random.normal(&format!("{loss}_noise"), (rows, action_dim))?;
+        Ok(Self { levels: NoiseLevels::new(levels), noise })
+    }
+}
+
 /// The random numbers of one update.
 struct Noise {
-    /// For the data's actions.
+    /// Noise on the data's actions.
     cloning: Noising,
-    /// By which π_θ draws its actions, `[B, a]`.
+    /// Noise of π_θ's actions, `[B, 1, a]`.
     policy: Tensor,
-    /// For these.
+    /// Noise on π_θ's actions in the trust loss.
     trust: Noising,
 }
 
-/// DTQL in the middle of a run.
 struct Dtql {
     config: Config,
     context: Context,
-    /// μ_φ.
-    diffusion: TrainState<Denoiser>,
-    /// π_θ.
-    actor: Squashed,
-    /// V.
-    value: TrainState<Ensemble>,
-    /// Q_1 and Q_2, and their EMA, by which the policy chooses when it acts.
-    critics: TrainState<Ensemble>,
-    target_critics: Ensemble,
+    networks: Networks,
 }
 
 impl Dtql {
     fn new(config: Config, context: Context) -> Result<Self> {
-        let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
-        let shape = DenoiserShape { observation_dim, action_dim, layers: config.diffusion.clone() };
-        let diffusion = Denoiser::new(&shape, initial(&shape.layout(), &context, 3)?);
-        let shape = |members, action_dim, layers: &MlpConfig| EnsembleShape {
-            members,
-            observation_dim,
-            action_dim,
-            layers: layers.clone(),
-            outputs: 1,
-        };
-        let critics = ensemble(shape(CRITICS, action_dim, &config.critic), &context, 1)?;
-        Ok(Self {
-            diffusion: TrainState::new(diffusion, 0.0)?,
-            actor: Squashed::new(&config.actor, SquashedActor::LOG_STD, None, &context, 0)?,
-            value: ensemble(shape(1, 0, &config.value), &context, 2)?,
-            target_critics: critics.network.copy()?,
-            critics,
-            config,
-            context,
-        })
+        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
+        Ok(Self { config, context, networks })
     }
 
     /// The step at which π_θ begins to learn.
     fn pretraining(&self) -> u64 {
-        let Phases { pretraining, policy } = self.config.phases;
-        phases::begin(self.context.total_steps, [pretraining, policy])[1]
+        let phases = self.config.phases;
+        first_steps(self.context.total_steps, [phases.pretraining, phases.policy])[1]
     }
 
-    /// Update number `step`: critics and diffusion policy in both phases, then the one-step policy
-    /// in the second.
-    fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
-        let pretraining = self.pretraining();
-        let decay = match self.config.cosine {
-            true => cosine_decay(
-                step.saturating_sub(pretraining),
-                self.context.total_steps - pretraining,
-            ),
-            false => 1.0,
-        };
-        let rate = *self.config.learning_rate * decay;
-        let adam = AdamStep::after(step, rate);
-        let of_values = AdamStep { rate: *self.config.critic_learning_rate * decay, ..adam };
-        let [value_loss, critic_loss] = self.value_losses(batch)?;
-        self.value.minimize(&value_loss.value, of_values)?;
-        self.critics.minimize(&critic_loss.value, of_values)?;
-        let bc_loss = self.bc_loss(batch, &noise.cloning)?;
-        self.diffusion.minimize(&bc_loss.value, adam)?;
-        let mut losses = vec![value_loss, critic_loss, bc_loss];
-        if step >= pretraining {
-            let actor_loss = self.actor_loss(batch, noise)?;
-            self.actor
-                .minimize(&actor_loss.value, AdamStep { count: step - pretraining + 1, ..adam })?;
-            self.target_critics.soft_update(&self.critics.network, *self.config.ema_rate)?;
-            losses.push(actor_loss);
-        }
-        let mut measured = measured(&losses)?;
-        measured.push(("learning_rate", rate));
-        Ok(measured)
+    fn noise(&self, step: u64) -> Result<Noise> {
+        let shape = (self.context.batch_size, self.context.action_dim());
+        let random = &mut self.context.random(step);
+        Ok(Noise {
+            cloning: Noising::draw(random, "bc", shape)?,
+            policy: random.normal("policy_noise", (shape.0, 1, shape.1))?,
+            trust: Noising::draw(random, "trust", shape)?,
+        })
     }
 
     /// V(s) toward an expectile of the smaller Q(s, a), and Q(s, a) toward r + γ·V(s'), both as
     /// they are before this step.
     fn value_losses(&self, batch: &Minibatch) -> Result<[Loss; 2]> {
-        let next =
-            self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
+        let Networks { critic, value, .. } = &self.networks;
+        let next = state_value(&value.detach(), &batch.next_observations)?;
         let targets = batch.target(*self.config.gamma, &next)?;
-        let q = self.critics.network.values(&batch.observations, &batch.actions)?;
-        let v = self.value.network.state_values(&batch.observations)?.squeeze(0)?;
-        let value_loss = expectile_loss(&(smaller(&q.detach())? - &v)?, *self.config.expectile)?;
-        let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
-        let critic_loss = Loss::new("critic_loss", critic_loss).with("q_mean", targets.mean_all()?);
-        Ok([Loss::new("value_loss", value_loss).with("v_mean", v.mean_all()?), critic_loss])
+        let q = batch.values(&critic)?;
+        let v = state_value(&value, &batch.observations)?;
+        let value_loss = expectile_loss(&(smallest(&q.detach())? - &v)?, *self.config.expectile)?;
+        let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * TWIN as f64)?;
+        Ok([
+            Loss::new("value_loss", value_loss).with("v_mean", v.mean_all()?),
+            Loss::of_critics(critic_loss, &targets)?,
+        ])
     }
 
     /// μ_φ toward the data's actions.
     fn bc_loss(&self, batch: &Minibatch, noising: &Noising) -> Result<Loss> {
-        let loss =
-            denoising_loss(&self.diffusion.network, &batch.observations, &batch.actions, noising)?;
+        let diffusion = &self.networks.diffusion;
+        let loss = denoising_loss(diffusion, &batch.observations, &batch.actions, noising)?;
         Ok(Loss::new("bc_loss", loss))
     }
 
     /// π_θ toward actions that the critics value and that μ_φ, which is fixed, denoises well.
     fn actor_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
-        let distribution = self.actor.distribution(&batch.observations)?;
-        let actions = distribution.draw(&noise.policy.unsqueeze(1)?)?.actions.squeeze(1)?;
-        let diffusion = self.diffusion.network.detach();
+        let Networks { actor, critic, diffusion, .. } = &self.networks;
+        let distribution = actor.distribution(&batch.observations)?;
+        let drawn = distribution.draw(&noise.policy)?;
+        let (actions, diffusion) = (drawn.actions.squeeze(1)?, diffusion.detach());
         let trust_loss = denoising_loss(&diffusion, &batch.observations, &actions, &noise.trust)?;
-        let q = smaller(&self.critics.network.detach().values(&batch.observations, &actions)?)?;
-        let q_loss = q.mean_all()?.neg()?;
+        let q = batch.values_at(&critic.detach(), &actions)?;
+        let q_loss = smallest(&q)?.mean_all()?.neg()?;
         let mut loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         let likelihood =
             (*self.config.likelihood > 0.0).then(|| likelihood_loss(&distribution, &batch.actions));
@@ -234,20 +206,6 @@ impl Dtql {
         let loss =
             Loss::new("actor_loss", loss).with("trust_loss", trust_loss).with("q_loss", q_loss);
         Ok(loss.with("likelihood_loss", likelihood))
-    }
-
-    /// The random numbers of update number `step`.
-    fn noise(&self, step: u64) -> Result<Noise> {
-        let mut generator = stream(self.context.seed, Purpose::Noise, step);
-        let (batch, action_dim) = (self.context.batch_size, self.context.action_dim());
-        let rows = |generator: &mut ChaCha8Rng| {
-            normal((batch, action_dim), generator, &self.context.device)
-        };
-        let levels = NoiseLevels::draw(batch, &mut generator);
-        let cloning = Noising { levels, noise: rows(&mut generator)? };
-        let policy = rows(&mut generator)?;
-        let levels = NoiseLevels::draw(batch, &mut generator);
-        Ok(Noise { cloning, policy, trust: Noising { levels, noise: rows(&mut generator)? } })
     }
 }
 
@@ -260,9 +218,10 @@ fn denoising_loss(
     noising: &Noising,
 ) -> Result<Tensor> {
     let device = actions.device();
-    let noisy = (actions + noising.noise.broadcast_mul(&noising.levels.sigma(device)?)?)?;
-    let error = (diffusion.denoise(observations, &noisy, &noising.levels)? - actions)?;
-    error.broadcast_div(&noising.levels.output_scale(device)?)?.sqr()?.mean_all()
+    let Noising { levels, noise } = noising;
+    let noisy = (actions + noise.broadcast_mul(&levels.sigma(device)?)?)?;
+    let error = (diffusion.denoise(observations, &noisy, levels)? - actions)?;
+    error.broadcast_div(&levels.output_scale(device)?)?.sqr()?.mean_all()
 }
 
 /// −E[log N(atanh(a/1.001))] of the data's actions, `[]`: not of a, whose density would also have
@@ -278,13 +237,36 @@ impl Algorithm for Dtql {
         vec![0, self.pretraining()]
     }
 
-    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
-        self.step(step, &batch, &noise)
+    /// Critics and diffusion policy learn in both phases, the one-step policy in the second.
+    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+        let pretraining = self.pretraining();
+        let (steps, total) =
+            (step.saturating_sub(pretraining), self.context.total_steps - pretraining);
+        let decay = if self.config.cosine { cosine_decay(steps, total) } else { 1.0 };
+        let adam = AdamStep::after(step, *self.config.learning_rate * decay);
+        let of_values = AdamStep::after(step, *self.config.critic_learning_rate * decay);
+        let [value_loss, critic_loss] = self.value_losses(&batch)?;
+        let bc_loss = self.bc_loss(&batch, &noise.cloning)?;
+        let networks = &mut self.networks;
+        networks.value.minimize(&value_loss.value, of_values)?;
+        networks.critic.minimize(&critic_loss.value, of_values)?;
+        networks.diffusion.minimize(&bc_loss.value, adam)?;
+        let mut losses = vec![value_loss, critic_loss, bc_loss];
+        if step >= pretraining {
+            let actor_loss = self.actor_loss(&batch, &noise)?;
+            let adam = AdamStep::after(step - pretraining, adam.rate);
+            self.networks.actor.minimize(&actor_loss.value, adam)?;
+            self.networks.critic.soft_update(*self.config.ema_rate)?;
+            losses.push(actor_loss);
+        }
+        let mut measured = measured(&losses)?;
+        measured.push(("learning_rate", adam.rate));
+        Ok(measured)
     }
 
-    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
+    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
         let mut losses = Vec::from(self.value_losses(&batch)?);
         losses.push(self.bc_loss(&batch, &noise.cloning)?);
         if step >= self.pretraining() {
@@ -293,29 +275,18 @@ impl Algorithm for Dtql {
         measured(&losses)
     }
 
-    /// The one-step policy as it is; one of its candidates is drawn by what the target critics say
-    /// of them.
+    /// The one-step policy, which draws one of its candidates by the target critics' values.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let Config { actor, critic, candidates, temperature, .. } = &self.config;
-        let shape = ActorCriticShape {
-            observation_dim: self.context.observation_dim(),
-            action_dim: self.context.action_dim(),
-            actor: actor.clone(),
-            critic: critic.clone(),
-            critics: CRITICS,
-        };
-        let rule = Rule::Softmax { temperature: **temperature };
-        let choice = Choice { candidates: **candidates, value: Aggregate::Min, rule };
-        let tensors = ActorCriticShape::tensors(&self.actor.network.network, &self.target_critics)?;
+        let (candidates, temperature) = (*self.config.candidates, *self.config.temperature);
+        let (value, rule) = (Aggregate::Min, Rule::Softmax { temperature });
+        let choice = Choice { candidates, value, rule };
+        let (actor, critics) = (&self.networks.actor.network, &self.networks.critic.target);
+        let shape = ActorCriticShape::of(actor, critics);
+        let tensors = ActorCriticShape::tensors(actor, critics)?;
         Ok((PolicyConfig::Squashed { shape, choice }, tensors))
     }
 
-    fn parts(&mut self) -> Parts<'_> {
-        let parts = Parts::default()
-            .trained("diffusion", &mut self.diffusion)
-            .trained("value", &mut self.value)
-            .trained("critic", &mut self.critics)
-            .weights("target_critic", self.target_critics.weights_mut());
-        self.actor.parts(parts)
+    fn state_dict(&mut self) -> StateDict<'_> {
+        self.networks.state_dict()
     }
 }

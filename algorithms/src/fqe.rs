@@ -1,23 +1,24 @@
 //! Fitted Q evaluation (Le, Voloshin and Yue 2019, "Batch Policy Learning under Constraints"; with
-//! the clipped targets of Fu et al. 2021, "Benchmarks for Deep Off-Policy Evaluation"): what a
-//! policy that is given would be worth, learned from the data alone. Q moves toward r +
+//! the clipped targets of Fu et al. 2021, "Benchmarks for Deep Off-Policy Evaluation"): the
+//! value of a given policy, learned from the data alone. Q moves toward r +
 //! γ·mask·Q̂(s', a') with the action a' that the policy takes at s', drawn once for each s'.
 //!
-//! It makes no policy, so it is none of [`ALGORITHMS`](crate::ALGORITHMS): `learner judge` runs it.
+//! It makes no policy, so it is not among [`ALGORITHMS`](crate::ALGORITHMS): `learner judge` runs it.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
-#[path = "golden/fqe.rs"]
-mod golden;
+mod tests;
 
-use super::algorithm::{AgentError, AlgorithmError, Loss, Measured, measured};
-use super::context::{Context, Minibatch};
+use super::algorithm::Measured;
+use super::context::{Context, Minibatch, select};
 use super::definition::read;
+use super::error::{AgentError, AlgorithmError};
 use super::hyperparameters::{NotNegative, Positive, Rate, UnitInterval};
-use super::parts::Parts;
-use super::train_state::{TrainState, initial};
+use super::losses::{Loss, measured};
+use super::networks::{Initializer, WithTarget, networks};
+use super::state_dict::StateDict;
 use candle_core::{Device, Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Weighted};
+use quad_nn::{AdamStep, Ensemble, MlpConfig, Weighted};
 use serde::Deserialize;
 
 const SETTINGS: &str = "
@@ -35,14 +36,14 @@ pub struct FqeConfig {
     /// Discount γ.
     gamma: UnitInterval,
     learning_rate: Positive,
-    /// What each step takes off the weights, relative to them and to its rate.
+    /// Share of the learning rate by which each step shrinks the weights.
     weight_decay: NotNegative,
     /// EMA rate of the target critic.
     ema_rate: Rate,
 }
 
 impl FqeConfig {
-    /// The settings of google-research's policy_eval, but for a target that follows twice as fast.
+    /// The settings of google-research's policy_eval, but for an EMA rate twice as large.
     ///
     /// # Errors
     /// γ is not in [0, 1].
@@ -53,23 +54,22 @@ impl FqeConfig {
     }
 }
 
-/// Units of values: those of the network are so many times `scale` from `offset`. Targets stay
-/// within what rewards allow.
+/// Units of the network, whose value is (value − offset)/scale, and bounds of the targets.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Units {
-    /// Where values begin: the data's mean return from a state on.
+    /// The data's mean return from a state on.
     pub offset: f64,
-    /// The standard deviation of these returns; 1 where they are all the same.
+    /// The standard deviation of these returns; 1 if they are all the same.
     pub scale: f64,
     /// The value of the least reward for ever, or of one of it if that is less, because an episode
     /// may terminate.
     pub least: f64,
-    /// Likewise of the largest.
+    /// The value of the largest reward for ever, or of one of it if that is more.
     pub most: f64,
 }
 
 impl Units {
-    /// Those of the data's rewards.
+    /// The units and bounds of the data's rewards.
     pub fn of(context: &Context, gamma: f64) -> Self {
         let mut batch = quad_dataset::Batch::default();
         context
@@ -98,43 +98,42 @@ impl Units {
     }
 }
 
+networks! {
+    /// Q in the network's units.
+    struct Networks(config: &FqeConfig, init) {
+        critic: WithTarget<Ensemble> = init.critics(1, &config.critic),
+    }
+}
+
 /// An evaluation of one policy in progress.
 pub struct Fqe {
     config: FqeConfig,
     units: Units,
     context: Context,
     /// The transitions to learn from.
-    items: Vec<u32>,
+    rows: Vec<u32>,
     /// a' of each transition of the data, `[N, a]`.
     next_actions: Tensor,
-    /// Q, and its EMA Q̂; both in the network's units.
-    critic: TrainState<Ensemble>,
-    target_critic: Ensemble,
+    networks: Networks,
 }
 
 impl Fqe {
-    /// An evaluation at its beginning of the policy that takes these actions, `[N, a]`, after the
-    /// data's N transitions.
-    ///
-    /// # Errors
-    /// Candle fails.
+    /// An evaluation at step 0 of the policy that takes these actions, `[N, a]`, after the data's N
+    /// transitions.
     pub fn new(
         config: FqeConfig,
         units: Units,
         context: Context,
         next_actions: Vec<f32>,
     ) -> Result<Self> {
-        let items = (0..context.transitions.len() as u32).collect();
-        let next_actions = Tensor::from_vec(
-            next_actions,
-            (context.transitions.len(), context.action_dim()),
-            &context.device,
-        )?;
-        Self::over(items, config, units, context, next_actions)
+        let rows = (0..context.transitions.len() as u32).collect();
+        let shape = (context.transitions.len(), context.action_dim());
+        let next_actions = Tensor::from_vec(next_actions, shape, &context.device)?;
+        Self::over(rows, config, units, context, next_actions)
     }
 
-    /// An evaluation of the policy that recorded the data, over the transitions after which the
-    /// data says what it did.
+    /// An evaluation of the policy that recorded the data, on the transitions whose next action is
+    /// in the data.
     ///
     /// # Errors
     /// There is no such transition, or candle fails.
@@ -143,108 +142,77 @@ impl Fqe {
         units: Units,
         context: Context,
     ) -> std::result::Result<Self, AlgorithmError> {
-        let items = context.items_with_next_action();
-        if items.is_empty() {
-            return Err(AlgorithmError::NoNextAction);
-        }
+        let rows = context.with_next_action()?;
         let next_actions =
             context.next_actions(&Vec::from_iter(0..context.transitions.len() as u32))?;
-        Ok(Self::over(items, config, units, context, next_actions)?)
+        Ok(Self::over(rows, config, units, context, next_actions)?)
     }
 
     fn over(
-        items: Vec<u32>,
+        rows: Vec<u32>,
         config: FqeConfig,
         units: Units,
         context: Context,
         next_actions: Tensor,
     ) -> Result<Self> {
-        let shape = EnsembleShape {
-            members: 1,
-            observation_dim: context.observation_dim(),
-            action_dim: context.action_dim(),
-            layers: config.critic.clone(),
-            outputs: 1,
-        };
-        let network =
-            Ensemble::new(shape.clone(), initial(&shape.layout(), &context, 0)?, context.precision);
-        let critic = TrainState::new(network, *config.weight_decay)?;
-        Ok(Self {
-            target_critic: critic.network.copy()?,
-            critic,
-            config,
-            units,
-            context,
-            items,
-            next_actions,
-        })
+        let mut networks = Networks::new(&config, &mut Initializer::new(&context))?;
+        networks.critic.decay_weights(*config.weight_decay)?;
+        Ok(Self { config, units, context, rows, next_actions, networks })
     }
 
-    /// Begins with the networks of another evaluation, such as the behavior's, from whose values a
-    /// policy's differ little.
-    ///
-    /// # Errors
-    /// Candle fails.
+    /// Takes the networks of another evaluation, such as the behavior's, from whose values a policy's
+    /// differ little.
     pub fn begin_with(&mut self, other: &Fqe) -> Result<()> {
-        self.critic.network.soft_update(&other.critic.network, 1.0)?;
-        self.target_critic.soft_update(&other.target_critic, 1.0)
+        let (critic, other) = (&mut self.networks.critic, &other.networks.critic);
+        critic.network.soft_update(&other.network, 1.0)?;
+        critic.target.soft_update(&other.target, 1.0)
     }
 
-    /// How many items updates draw from.
-    pub fn items(&self) -> usize {
-        self.items.len()
+    /// The number of transitions that batches are drawn from.
+    pub fn dataset_len(&self) -> usize {
+        self.rows.len()
     }
 
-    /// Update number `step`, from 0, on the items of these numbers. Measures `critic_loss`, the
-    /// mean over the batch of (Q(s, a) − y)² in the network's units, and `q_mean`, the mean of the
-    /// targets y in the rewards'.
-    ///
-    /// # Errors
-    /// Candle fails.
-    pub fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
-        let rows: Vec<u32> = items.iter().map(|item| self.items[*item as usize]).collect();
+    /// Performs update number `step`, from 0, on the transitions with these indices. Measures
+    /// `critic_loss`, the mean over the batch of (Q(s, a) − y)² in the network's units, and
+    /// `target_q_mean`, the mean of the targets y in the rewards'.
+    pub fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+        let rows = select(&self.rows, indices);
         let batch = self.context.batch(&rows)?;
-        let next_actions = self
-            .next_actions
-            .index_select(&Tensor::from_vec(rows, items.len(), &self.context.device)?, 0)?;
-        let targets = self.targets(&batch, &next_actions)?;
+        let rows = Tensor::from_vec(rows, indices.len(), &self.context.device)?;
+        let targets = self.targets(&batch, &self.next_actions.index_select(&rows, 0)?)?;
         let of_network =
             targets.affine(1.0 / self.units.scale, -self.units.offset / self.units.scale)?;
-        let loss =
-            self.critic.network.squared_error(&batch.observations, &batch.actions, &of_network)?;
-        let loss = Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?);
-        self.critic.minimize(&loss.value, AdamStep::after(step, *self.config.learning_rate))?;
-        self.target_critic.soft_update(&self.critic.network, *self.config.ema_rate)?;
-        measured(&[loss])
+        let critic = &mut self.networks.critic;
+        let loss = batch.squared_error(&critic, &of_network)?;
+        critic.minimize(&loss, AdamStep::after(step, *self.config.learning_rate))?;
+        critic.soft_update(*self.config.ema_rate)?;
+        measured(&[Loss::of_critics(loss, &targets)?])
     }
 
-    /// y = r + γ·mask·Q̂(s', a'), at most and at least what rewards allow; `[B]`.
+    /// y = r + γ·mask·Q̂(s', a'), clipped to the bounds of the units; `[B]`.
     fn targets(&self, batch: &Minibatch, next_actions: &Tensor) -> Result<Tensor> {
-        let next = self.target_critic.values(&batch.next_observations, next_actions)?.squeeze(0)?;
+        let critic = &self.networks.critic.target;
+        let next = batch.next_values(&critic, next_actions)?.squeeze(0)?;
         let next = next.affine(self.units.scale, self.units.offset)?;
         batch
             .target(*self.config.gamma, &next)?
             .clamp(self.units.least as f32, self.units.most as f32)
     }
 
-    /// Q̂ of some actions `[n, a]`, each in a state of its own, `[n, o]`, in the rewards' units.
-    ///
-    /// # Errors
-    /// Candle fails.
+    /// Q̂ of n observations and actions, `[n, o]` and `[n, a]`, in the rewards' units.
     pub fn values(&self, observations: &[f32], actions: &[f32]) -> Result<Vec<f32>> {
         let n = actions.len() / self.context.action_dim();
         let rows = |numbers: &[f32]| {
             Tensor::from_slice(numbers, (n, numbers.len() / n), &self.context.device)
         };
-        let values =
-            self.target_critic.values(&rows(observations)?, &rows(actions)?)?.squeeze(0)?;
+        let critic = &self.networks.critic.target;
+        let values = critic.values(&rows(observations)?, &rows(actions)?)?.squeeze(0)?;
         values.affine(self.units.scale, self.units.offset)?.to_device(&Device::Cpu)?.to_vec1()
     }
 
-    /// Everything that updates change, by name.
-    pub fn parts(&mut self) -> Parts<'_> {
-        Parts::default()
-            .trained("critic", &mut self.critic)
-            .weights("target_critic", self.target_critic.weights_mut())
+    /// Everything that updates change.
+    pub fn state_dict(&mut self) -> StateDict<'_> {
+        self.networks.state_dict()
     }
 }

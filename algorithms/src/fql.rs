@@ -2,39 +2,29 @@
 //! step is distilled from it while it climbs the critics. No gradient passes through the flow's
 //! steps. Its update is its authors' code's; equations are that paper's.
 
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-#[path = "golden/fql.rs"]
-mod golden;
-
-use super::algorithm::{Algorithm, Loss, Measured, measured, smaller};
+use super::algorithm::{Algorithm, Measured};
 use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
-use super::denoising::normal;
+use super::definition::{Definition, Metric, Reporting, metrics, read, start};
 use super::hyperparameters::{Candidates, Count, Positive, Rate, UnitInterval};
-use super::parts::Parts;
-use super::random::{Purpose, stream};
-use super::train_state::{TrainState, ensemble};
+use super::losses::{Loss, measured, smallest};
+use super::networks::{Initializer, TWIN, TrainState, WithTarget, networks};
+use super::state_dict::StateDict;
 use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, Tensors, Weighted};
+use quad_nn::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, Tensors};
 use quad_policy::{ActorCriticShape, Aggregate, Choice, OneStepActor, PolicyConfig, Rule};
 use rand::Rng;
 use serde::Deserialize;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "fql",
-    settings: include_str!("../../presets/fql.toml"),
+    presets: include_str!("../../presets/fql.toml"),
     metrics: METRICS,
-    report: Reporting { counts: &["candidates"], ..Reporting::PLAIN },
-    check: readable::<Config>,
-    start: |table, context| Ok(Box::new(Fql::new(read(table)?, context)?)),
+    report: Reporting::CANDIDATES,
+    read: |table| Ok(start(read(table)?, Fql::new)),
 };
 
-const CRITICS: usize = 2;
-
 const METRICS: &[Metric] = &metrics! {
-    q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(mean or smaller of Q̂_k(s', a')), where a' is the one-step policy's action, clipped.";
+    target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(mean or smaller of Q̂_k(s', a')), where a' is the one-step policy's action, clipped.";
     critic_loss ["critic loss"] held_out: "Mean over batch and critics of (Q_k(s, a) − y)² (FQL's Eq. 3).";
     bc_loss ["BC loss"] held_out: "The flow's loss: mean over batch and dimensions of (v(s, x_t, t) − (a − x_0))² (FQL's Eq. 4).";
     distill_loss held_out: "Mean over batch and dimensions of the squared distance between the one-step policy's action, not clipped, and the flow's of the same noise (FQL's Eq. 6).";
@@ -43,7 +33,7 @@ const METRICS: &[Metric] = &metrics! {
 };
 
 /// FQL's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     /// The hidden layers of the flow's velocity, and of the one-step policy.
@@ -51,11 +41,11 @@ struct Config {
     critic: MlpConfig,
     /// Discount γ.
     gamma: UnitInterval,
-    /// Whether the critics' target takes their mean or the smaller.
+    /// Reduction of the two critics' values in their target.
     target: Aggregate,
     /// Weight α of the distance between the one-step policy and the flow.
     alpha: Positive,
-    /// Whether Q is divided by its mean size in the policy's loss.
+    /// Divide Q by its mean size in the policy's loss.
     normalize_q: bool,
     /// Euler steps of the flow.
     flow_steps: Count,
@@ -66,67 +56,50 @@ struct Config {
     candidates: Candidates,
 }
 
-/// FQL in the middle of a run.
+networks! {
+    struct Networks(config: &Config, init) {
+        /// The one-step policy π(s, z).
+        actor: TrainState<Ensemble> = init.ensemble(EnsembleShape {
+            outputs: init.context.action_dim(),
+            ..init.shape(&config.actor)
+        }),
+        critic: WithTarget<Ensemble> = init.critics(TWIN, &config.critic),
+        /// The velocity v(s, x, t), a network of s and [x, t].
+        flow: TrainState<Ensemble> = init.ensemble(EnsembleShape {
+            action_dim: init.context.action_dim() + 1,
+            outputs: init.context.action_dim(),
+            ..init.shape(&config.actor)
+        }),
+    }
+}
+
 struct Fql {
     config: Config,
     context: Context,
-    /// The velocity v(s, x, t), a network of s and [x, t].
-    flow: TrainState<Ensemble>,
-    /// The one-step policy π(s, z).
-    actor: TrainState<Ensemble>,
-    critics: TrainState<Ensemble>,
-    target_critics: Ensemble,
-}
-
-/// The random numbers of an update.
-struct Noise {
-    /// Where the flow starts from, x_0, `[B, a]`, and its times t, `[B, 1]`.
-    start: Tensor,
-    times: Tensor,
-    /// The noise of the one-step policy's actions in s and in s', `[B, a]`.
-    of_policy: Tensor,
-    of_targets: Tensor,
+    networks: Networks,
 }
 
 impl Fql {
     fn new(config: Config, context: Context) -> Result<Self> {
-        let shape = shape(&config, &context);
-        let of_actor = OneStepActor::shape(&shape);
-        let of_flow = EnsembleShape { action_dim: of_actor.action_dim + 1, ..of_actor.clone() };
-        let critics = ensemble(shape.critics(), &context, 1)?;
-        Ok(Self {
-            flow: ensemble(of_flow, &context, 2)?,
-            actor: ensemble(of_actor, &context, 0)?,
-            target_critics: critics.network.copy()?,
-            critics,
-            config,
-            context,
-        })
+        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
+        Ok(Self { config, context, networks })
     }
 
-    /// Update number `step`. All losses are those of the networks before it, and the targets follow
-    /// these.
-    fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
-        let adam = AdamStep::after(step, *self.config.learning_rate);
-        let [critic_loss, bc_loss, actor_loss] = self.losses(batch, noise)?;
-        let gradients = Gradients::of(&actor_loss.value)?;
-        self.target_critics.soft_update(&self.critics.network, *self.config.ema_rate)?;
-        self.critics.minimize(&critic_loss.value, adam)?;
-        self.flow.minimize(&bc_loss.value, adam)?;
-        self.actor.apply_gradients(&gradients, adam)?;
-        measured(&[critic_loss, bc_loss, actor_loss])
-    }
-
-    /// Those of critics, flow and policy.
-    fn losses(&self, batch: &Minibatch, noise: &Noise) -> Result<[Loss; 3]> {
-        let targets = self.targets(batch, &noise.of_targets)?;
-        let critic_loss =
-            self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        let bc_loss = self.flow_loss(batch, noise)?;
-        let [distill_loss, q_loss] = self.actor_losses(batch, &noise.of_policy)?;
+    /// The losses of critics, flow and policy.
+    fn losses(&self, step: u64, indices: &[u32]) -> Result<[Loss; 3]> {
+        let (batch, random) = (self.context.batch(indices)?, &mut self.context.random(step));
+        let (b, a) = batch.actions.dims2()?;
+        let start = random.normal("start_noise", (b, a))?; // x_0
+        let policy_noise = random.normal("policy_noise", (b, a))?;
+        let next_noise = random.normal("next_noise", (b, a))?;
+        let times = random.tensor("times", (b, 1), |generator| generator.random::<f32>())?;
+        let targets = self.targets(&batch, &next_noise)?;
+        let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
+        let bc_loss = self.flow_loss(&batch, &start, &times)?;
+        let [distill_loss, q_loss] = self.actor_losses(&batch, &policy_noise)?;
         let actor_loss = ((&distill_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         Ok([
-            Loss::new("critic_loss", critic_loss).with("q_mean", targets.mean_all()?),
+            critic_loss,
             Loss::new("bc_loss", bc_loss),
             Loss::new("actor_loss", actor_loss)
                 .with("distill_loss", distill_loss)
@@ -136,109 +109,90 @@ impl Fql {
 
     /// y = r + γ·mask·Q̂(s', π(s', z)), `[B]`.
     fn targets(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
-        let actions = OneStepActor::new(self.actor.network.detach())
+        let actions = OneStepActor::new(self.networks.actor.detach())
             .sample(&batch.next_observations, noise)?;
-        let values = self.target_critics.values(&batch.next_observations, &actions)?;
+        let values = batch.next_values(&self.networks.critic.target, &actions)?;
         let q = match self.config.target {
             Aggregate::Mean => values.mean(0)?,
-            Aggregate::Min => smaller(&values)?,
+            Aggregate::Min => smallest(&values)?,
         };
         batch.target(*self.config.gamma, &q)
     }
 
-    /// Mean of (v(s, x_t, t) − (a − x_0))², `[]`, on the straight way x_t from x_0 to a.
-    fn flow_loss(&self, batch: &Minibatch, Noise { start, times, .. }: &Noise) -> Result<Tensor> {
+    /// Mean of (v(s, x_t, t) − (a − x_0))², `[]`, with x_t = x_0 + t·(a − x_0).
+    fn flow_loss(&self, batch: &Minibatch, start: &Tensor, times: &Tensor) -> Result<Tensor> {
         let velocity = (&batch.actions - start)?;
         let x = (start + velocity.broadcast_mul(times)?)?;
-        let predicted = self
-            .flow
-            .network
-            .outputs(&batch.observations, &Tensor::cat(&[&x, times], 1)?)?
-            .squeeze(0)?;
+        let predicted = velocity_of(&self.networks.flow, &batch.observations, &x, times)?;
         (predicted - velocity)?.sqr()?.mean_all()
     }
 
-    /// Where the flow leads from this noise in as many Euler steps, `[B, a]`, a constant.
+    /// The flow's actions, `[B, a]`, by Euler steps from this noise; constants.
     fn flow_actions(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
-        let (flow, steps) = (self.flow.network.detach(), *self.config.flow_steps);
+        let (flow, steps) = (self.networks.flow.detach(), *self.config.flow_steps);
         let mut x = noise.clone();
         for step in 0..steps {
-            let t = Tensor::full(step as f32 / steps as f32, (noise.dim(0)?, 1), noise.device())?;
-            let velocity = flow.outputs(observations, &Tensor::cat(&[&x, &t], 1)?)?.squeeze(0)?;
+            let (t, rows) = (step as f32 / steps as f32, noise.dim(0)?);
+            let t = Tensor::full(t, (rows, 1), noise.device())?;
+            let velocity = velocity_of(&flow, observations, &x, &t)?;
             x = (x + (velocity / steps as f64)?)?;
         }
         x.clamp(-1f32, 1f32)
     }
 
-    /// The one-step policy's distance to the flow, and −Q of its actions, maybe divided by its mean
-    /// size; both `[]`.
+    /// The squared distance of the one-step policy's actions to the flow's, and −Q of these actions,
+    /// divided by the mean of |Q| with `normalize_q`; both `[]`.
     fn actor_losses(&self, batch: &Minibatch, noise: &Tensor) -> Result<[Tensor; 2]> {
-        let actions = self.actor.network.outputs(&batch.observations, noise)?.squeeze(0)?;
+        let actions = self.networks.actor.outputs(&batch.observations, noise)?.squeeze(0)?;
         let distill_loss =
             (&actions - self.flow_actions(&batch.observations, noise)?)?.sqr()?.mean_all()?;
         let actions = actions.clamp(-1f32, 1f32)?;
-        let q = self.critics.network.detach().values(&batch.observations, &actions)?.mean(0)?;
+        let q = batch.values_at(&self.networks.critic.detach(), &actions)?.mean(0)?;
         let mut q_loss = q.mean_all()?.neg()?;
         if self.config.normalize_q {
             q_loss = (q_loss / q.detach().abs()?.mean_all()?)?;
         }
         Ok([distill_loss, q_loss])
     }
-
-    fn noise(&self, step: u64) -> Result<Noise> {
-        let (generator, device) =
-            (&mut stream(self.context.seed, Purpose::Noise, step), &self.context.device);
-        let (rows, shape) =
-            (self.context.batch_size, (self.context.batch_size, self.context.action_dim()));
-        Ok(Noise {
-            start: normal(shape, generator, device)?,
-            of_policy: normal(shape, generator, device)?,
-            of_targets: normal(shape, generator, device)?,
-            times: Tensor::from_vec(
-                (0..rows).map(|_| generator.random::<f32>()).collect(),
-                (rows, 1),
-                device,
-            )?,
-        })
-    }
 }
 
-fn shape(config: &Config, context: &Context) -> ActorCriticShape {
-    ActorCriticShape {
-        observation_dim: context.observation_dim(),
-        action_dim: context.action_dim(),
-        actor: config.actor.clone(),
-        critic: config.critic.clone(),
-        critics: CRITICS,
-    }
+/// v(s, x, t), `[B, a]`.
+fn velocity_of(flow: &Ensemble, observations: &Tensor, x: &Tensor, t: &Tensor) -> Result<Tensor> {
+    flow.outputs(observations, &Tensor::cat(&[x, t], 1)?)?.squeeze(0)
 }
 
 impl Algorithm for Fql {
-    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
-        self.step(step, &batch, &noise)
+    /// All losses are those of the networks before the update, and so are the critics that the
+    /// targets follow.
+    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+        let adam = AdamStep::after(step, *self.config.learning_rate);
+        let losses = self.losses(step, indices)?;
+        let [critic_loss, bc_loss, actor_loss] = &losses;
+        let Networks { actor, critic, flow } = &mut self.networks;
+        // Before the critics change, of which they are a function.
+        let gradients = Gradients::of(&actor_loss.value)?;
+        critic.soft_update(*self.config.ema_rate)?;
+        critic.minimize(&critic_loss.value, adam)?;
+        flow.minimize(&bc_loss.value, adam)?;
+        actor.apply_gradients(&gradients, adam)?;
+        measured(&losses)
     }
 
-    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
-        measured(&self.losses(&self.context.batch(items)?, &self.noise(step)?)?)
+    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
+        measured(&self.losses(step, indices)?)
     }
 
-    /// The one-step policy, with the target critics to choose by.
+    /// The one-step policy, which chooses by the target critics.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let choice = Choice {
-            candidates: *self.config.candidates,
-            value: self.config.target,
-            rule: Rule::Best,
-        };
-        let tensors = ActorCriticShape::tensors(&self.actor.network, &self.target_critics)?;
-        Ok((PolicyConfig::OneStep { shape: shape(&self.config, &self.context), choice }, tensors))
+        let (candidates, value) = (*self.config.candidates, self.config.target);
+        let choice = Choice { candidates, value, rule: Rule::Best };
+        let (actor, critics) = (&self.networks.actor, &self.networks.critic.target);
+        let shape = ActorCriticShape::of(actor, critics);
+        let tensors = ActorCriticShape::tensors(actor, critics)?;
+        Ok((PolicyConfig::OneStep { shape, choice }, tensors))
     }
 
-    fn parts(&mut self) -> Parts<'_> {
-        Parts::default()
-            .trained("actor", &mut self.actor)
-            .trained("flow", &mut self.flow)
-            .trained("critic", &mut self.critics)
-            .weights("target_critic", self.target_critics.weights_mut())
+    fn state_dict(&mut self) -> StateDict<'_> {
+        self.networks.state_dict()
     }
 }

@@ -1,56 +1,27 @@
-//! What the golden tests of all algorithms share (tests/golden/README.md).
+//! Golden tests: one update of every algorithm, and its policy's actions, against an independent
+//! implementation (tests/golden/README.md).
 
 #[path = "../../tests/golden/golden.rs"]
 mod reader;
 
 use std::sync::Arc;
 
-use super::algorithm::{Algorithm, Measured, smaller};
-use super::context::{Context, Minibatch};
+use super::algorithm::{Algorithm, Measured};
+use super::context::Context;
 use super::definition::{Definition, Metric};
-use super::denoising::Denoising;
-use super::parts::Parts;
-use candle_core::{Device, Tensor};
+use super::state_dict::StateDict;
+use super::{ALGORITHMS, Hyperparameters};
+use candle_core::{D, DType, Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
-use quad_nn::{
-    Ensemble, EnsembleShape, Layout, NoisePredictor, Precision, Reverse, Schedule, Tensors,
-    Weights, open_gpu,
-};
+use quad_nn::{Precision, Scaling, Tensors, open_gpu};
 use quad_policy::{
-    Choice, Header, OneStepActor, PolicyConfig, SquashedActor, load_policy, read_tensors,
+    Aggregate, Choice, EpisodeState, Header, PolicyConfig, Rule, Sampled, load_policy,
 };
-pub(super) use reader::{Golden, MAKE, goldens, run};
+pub(super) use reader::{Golden, MAKE, committed, fresh, goldens, run};
 
-/// Tests an update against the folders of an algorithm, on each device; and against one of a fresh
-/// seed of each of its variants.
-macro_rules! golden_tests {
-    ($algorithm:literal, $check:expr) => {
-        #[test]
-        fn golden_update() {
-            crate::golden::check_all(crate::golden::goldens($algorithm), $check);
-        }
-
-        #[test]
-        fn golden_update_of_a_fresh_seed() {
-            crate::golden::check_all(crate::golden::fresh_ones($algorithm), $check);
-        }
-    };
-}
-pub(super) use golden_tests;
-
-pub(super) fn check_all(goldens: Vec<Golden>, check: impl Fn(&Golden, &Device)) {
-    goldens.iter().for_each(|golden| devices().iter().for_each(|device| check(golden, device)));
-}
-
-/// Folders of a fresh seed, one for each committed one; fewer where make.py cannot run.
-pub(super) fn fresh_ones(algorithm: &str) -> Vec<Golden> {
-    let name = |golden: &Golden| golden.folder.file_name().unwrap().to_str().unwrap().to_owned();
-    reader::committed(algorithm).iter().filter_map(|golden| reader::fresh(&name(golden))).collect()
-}
-
-/// Where updates are tested: on the CPU, and on a GPU with the feature `cuda`. Without a GPU that
-/// share is skipped, unless QUAD_REQUIRE_PEERS=1 asks for one.
-#[allow(clippy::print_stderr)] // what is skipped is said
+/// Devices of the tests: the CPU, and a GPU with the feature `cuda`. Without a GPU that half is
+/// skipped, unless QUAD_REQUIRE_PEERS=1 asks for one.
+#[allow(clippy::print_stderr)]
 pub(super) fn devices() -> Vec<Device> {
     let mut devices = vec![Device::Cpu];
     if cfg!(feature = "cuda") {
@@ -67,64 +38,100 @@ pub(super) fn devices() -> Vec<Device> {
     devices
 }
 
-/// What an update measured under a name.
-pub(super) fn value(measured: &Measured, name: &str) -> Option<f32> {
-    measured.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
-}
-
-/// Checks that an update gave what a golden folder expects: each metric and each tensor of the
-/// state. What the folder's update does not measure is 0 there.
+/// Compares metrics and state after an update. Metrics that an update does not measure are 0 in a
+/// golden folder. One that is also state, such as η, is compared as state.
 pub(super) fn check_update(
     golden: &Golden,
     metrics: &[Metric],
     measured: &Measured,
     state: Tensors,
 ) {
-    for Metric { name, .. } in
-        metrics.iter().filter(|metric| golden.expected.contains_key(metric.name))
-    {
-        golden
-            .close(name, &Tensor::new(value(measured, name).unwrap_or(0.0), &Device::Cpu).unwrap());
+    let value = |name| measured.iter().find(|(known, _)| *known == name).map_or(0.0, |of| of.1);
+    let in_folder = metrics.iter().filter(|Metric { name, .. }| {
+        golden.expected.contains_key(*name) && !state.contains_key(*name)
+    });
+    for Metric { name, .. } in in_folder {
+        golden.close(name, &Tensor::new(value(*name), &Device::Cpu).unwrap());
     }
     for (name, tensor) in state {
         golden.close(&name, &tensor);
     }
 }
 
-/// Loads the state of a golden folder, all of it.
-pub(super) fn load(golden: &Golden, parts: Parts<'_>) {
+/// Loads all of a golden folder's state.
+pub(super) fn load(golden: &Golden, dict: StateDict<'_>) {
     let mut state = golden.state.clone();
-    parts.load(&mut state).unwrap();
+    dict.load(&mut state).unwrap();
     assert!(state.is_empty(), "tensors that are not read: {:?}", state.keys());
 }
 
-/// The context of a golden folder, whose transitions are those of its batch.
-pub(super) fn context(golden: &Golden, device: &Device) -> Context {
-    let numbers = |name: &str| {
-        golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap()
-    };
+fn numbers(golden: &Golden, name: &str) -> Vec<f32> {
+    golden.inputs[name].to_dtype(DType::F32).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+}
+
+/// Random transitions in one episode, for an algorithm that learns from windows.
+fn episode((o, a): (usize, usize), n: usize) -> Arrays {
+    let numbers = |width: usize| (0..n * width).map(|i| (i as f32).sin()).collect();
+    Arrays {
+        observation_dim: o,
+        action_dim: a,
+        observations: numbers(o),
+        actions: numbers(a),
+        rewards: numbers(1),
+        next_observations: numbers(o),
+        terminals: vec![false; n],
+        timeouts: (1..=n).map(|i| i == n).collect(),
+    }
+}
+
+/// The transitions of a golden folder's batch, and their indices: each is an episode, unless the
+/// folder says where episodes end; with next actions, a second transition follows.
+fn transitions(golden: &Golden) -> Transitions {
+    let (o, a) = (golden.count("/observation_dim"), golden.count("/action_dim"));
+    if !golden.inputs.contains_key("observations") {
+        return Transitions::of(episode((o, a), 2 * golden.count("/agent/network/horizon")))
+            .unwrap();
+    }
+    let numbers = |name: &str| numbers(golden, name);
+    let given = |name: &str| golden.inputs.contains_key(name).then(|| numbers(name));
     let terminals: Vec<bool> = numbers("masks").iter().map(|mask| *mask == 0.0).collect();
-    let arrays = Arrays {
-        observation_dim: golden.count("/observation_dim"),
-        action_dim: golden.count("/action_dim"),
+    let n = terminals.len();
+    let timeouts =
+        given("timeouts").map_or(vec![true; n], |ends| ends.iter().map(|x| *x == 1.0).collect());
+    let mut arrays = Arrays {
+        observation_dim: o,
+        action_dim: a,
         observations: numbers("observations"),
         actions: numbers("actions"),
         rewards: numbers("rewards"),
         next_observations: numbers("next_observations"),
-        // Unless it is said, none leads to the next: they are rows at random.
-        timeouts: match golden.inputs.contains_key("timeouts") {
-            true => numbers("timeouts").iter().map(|timeout| *timeout == 1.0).collect(),
-            false => vec![true; terminals.len()],
-        },
+        timeouts,
         terminals,
     };
+    if let Some(next_actions) = given("next_actions") {
+        let alternate = |x: &[f32], y: &[f32], width: usize| {
+            x.chunks(width).zip(y.chunks(width)).flat_map(|(x, y)| [x, y].concat()).collect()
+        };
+        arrays.observations = alternate(&arrays.observations, &arrays.next_observations, o);
+        arrays.next_observations = alternate(&arrays.next_observations, &vec![0.0; n * o], o);
+        arrays.actions = alternate(&arrays.actions, &next_actions, a);
+        arrays.rewards = alternate(&arrays.rewards, &vec![0.0; n], 1);
+        arrays.terminals = arrays.terminals.iter().flat_map(|last| [*last, false]).collect();
+        arrays.timeouts = (0..2 * n).map(|row| row % 2 == 1).collect();
+    }
+    Transitions::of(arrays).unwrap()
+}
+
+/// The context of a golden folder.
+pub(super) fn context(golden: &Golden, device: &Device) -> Context {
     Context {
-        transitions: Arc::new(Transitions::of(arrays).unwrap()),
+        transitions: Arc::new(transitions(golden)),
         batch_size: golden.count("/batch_size"),
         total_steps: golden.count("/total_steps") as u64,
         seed: 0,
         precision: Precision::F32,
         device: device.clone(),
+        golden: Some(Arc::new(golden.inputs.clone())),
     }
 }
 
@@ -133,106 +140,92 @@ pub(super) fn table(golden: &Golden) -> toml::Table {
     toml::Table::try_from(&golden.config["agent"]).unwrap()
 }
 
-/// The noise of sampled actions, `[T, states, samples, a]` in a golden folder, one row for each
-/// action.
-pub(super) fn chain_noise(golden: &Golden, name: &str, device: &Device) -> Tensor {
-    golden.input(name, device).flatten(1, golden.inputs[name].rank() - 2).unwrap()
+fn check(definition: &Definition, golden: &Golden, device: &Device) {
+    let hyperparameters = Hyperparameters::new(definition, table(golden)).unwrap();
+    let mut algorithm = hyperparameters.start(definition, context(golden, device)).unwrap();
+    load(golden, algorithm.state_dict());
+    check_policy(golden, &*algorithm);
+    let indices = Vec::from_iter(0..golden.count("/batch_size") as u32);
+    let measured = algorithm.update(golden.count("/step") as u64, &indices).unwrap();
+    check_update(golden, definition.metrics, &measured, algorithm.state_dict().save().unwrap());
 }
 
-/// How a golden folder makes the actions of its batch noisy.
-pub(super) fn denoising(golden: &Golden, device: &Device) -> Denoising {
-    let t: Vec<i64> = golden.inputs["t"].to_vec1().unwrap();
-    let t: Vec<u32> = t.into_iter().map(|t| t as u32).collect();
-    let schedule =
-        Schedule::variance_preserving(golden.count("/agent/diffusion_steps"), Reverse::ClipClean);
-    Denoising::new(&t, golden.input("epsilon", device), &schedule).unwrap()
-}
-
-/// The batch of a golden folder.
-pub(super) fn batch(golden: &Golden, context: &Context) -> Minibatch {
-    context.batch(&items(golden)).unwrap()
-}
-
-/// The numbers of its items.
-pub(super) fn items(golden: &Golden) -> Vec<u32> {
-    (0..golden.count("/batch_size") as u32).collect()
-}
-
-/// Checks an update without random numbers.
-pub(super) fn check_definition(definition: &Definition, golden: &Golden, device: &Device) {
-    let mut algorithm = (definition.start)(&table(golden), context(golden, device)).unwrap();
-    load(golden, algorithm.parts());
-    check_actions(golden, &*algorithm);
-    let measured = algorithm.update(golden.count("/step") as u64, &items(golden)).unwrap();
-    check_update(golden, definition.metrics, &measured, algorithm.parts().save().unwrap());
-}
-
-/// Checks that a policy that draws nothing acts as a golden folder expects.
-pub(super) fn check_actions(golden: &Golden, algorithm: &dyn Algorithm) {
-    let (policy, tensors) = algorithm.policy().unwrap();
+/// Compares the published policy: its candidates and their values, and its actions.
+fn check_policy(golden: &Golden, algorithm: &dyn Algorithm) {
+    let name = golden.config["algorithm"].as_str().unwrap();
+    let (mut policy, tensors) = algorithm.policy().unwrap();
+    if let PolicyConfig::Diffuser { shape, .. } = &mut policy {
+        shape.units = Scaling::default();
+    }
     let file = Header::new(policy, ()).to_safetensors(&tensors).unwrap();
-    let policy = load_policy(&file, Precision::F32).unwrap();
-    let observations = golden.input("select_observations", &Device::Cpu);
-    let mut states: Vec<_> =
-        (0..observations.dim(0).unwrap() as u64).map(|seed| policy.begin(seed)).collect();
-    let observations: Vec<f32> = observations.flatten_all().unwrap().to_vec1().unwrap();
-    let mut actions = vec![0.0; states.len() * policy.action_dim()];
-    policy.act(&observations, &mut states, &mut actions).unwrap();
-    golden.close("select.actions", &Tensor::new(actions, &Device::Cpu).unwrap());
-}
-
-/// What a published policy that draws candidates makes of a golden folder's states and noise.
-pub(super) struct Drawn {
-    pub choice: Choice,
-    /// Candidates, `[states · N_a, a]`.
-    pub candidates: Tensor,
-    /// The smaller of the critics' values of each, `[states, N_a]`.
-    pub q: Tensor,
-    /// V of each state, if the policy has it, `[states]`.
-    pub v: Option<Tensor>,
-}
-
-/// Checks that the networks of a published policy draw and value candidates as a golden folder
-/// expects.
-pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Drawn {
-    let (policy, tensors) = algorithm.policy().unwrap();
-    let file = Header::new(policy.clone(), ()).to_safetensors(&tensors).unwrap();
-    load_policy(&file, Precision::F32).unwrap();
-    let mut tensors = read_tensors(&file).unwrap();
-    let mut weights =
-        |layout: Layout, prefix: &str| Weights::take(layout, &mut tensors, prefix).unwrap();
-    let ensemble = |of: EnsembleShape, weights: Weights| Ensemble::new(of, weights, Precision::F32);
-    let observations = golden.input("select_observations", &Device::Cpu);
-    let noise = chain_noise(golden, "select_noise", &Device::Cpu);
-    let (choice, candidates, critics, value) = match policy {
-        PolicyConfig::Diffusion { shape, choice } => {
-            let actor = NoisePredictor::new(
-                shape.actor(),
-                weights(shape.actor().layout(), "actor."),
-                Precision::F32,
-            );
-            let value =
-                shape.value().map(|of| ensemble(of.clone(), weights(of.layout(), "value.")));
-            (choice, actor.sample(&observations, &noise), shape.critics(), value)
-        }
-        PolicyConfig::Squashed { shape, choice } => {
-            let of = SquashedActor::shape(&shape);
-            let actor = SquashedActor::new(ensemble(of.clone(), weights(of.layout(), "actor.")));
-            (choice, actor.sample(&observations, &noise.squeeze(0).unwrap()), shape.critics(), None)
-        }
-        PolicyConfig::OneStep { shape, choice } => {
-            let of = OneStepActor::shape(&shape);
-            let actor = OneStepActor::new(ensemble(of.clone(), weights(of.layout(), "actor.")));
-            (choice, actor.sample(&observations, &noise.squeeze(0).unwrap()), shape.critics(), None)
-        }
-        other => panic!("{other:?}"),
+    let mut policy = load_policy(&file, Precision::F32).unwrap();
+    let observations = numbers(golden, "select_observations");
+    let n = observations.len() / policy.observation_dim();
+    let noise = policy.choice().map(|_| {
+        let noise = golden.inputs["select_noise"].reshape((policy.noise()[0], n, ())).unwrap();
+        noise.transpose(0, 1).unwrap().flatten_from(1).unwrap().to_vec2::<f32>().unwrap()
+    });
+    let begin = || -> Vec<EpisodeState> {
+        let noise = noise.clone().unwrap_or_else(|| vec![Vec::new(); n]);
+        noise.into_iter().map(EpisodeState::with_noise).collect()
     };
-    let (candidates, critics) =
-        (candidates.unwrap(), ensemble(critics.clone(), weights(critics.layout(), "critic.")));
-    let q = smaller(&critics.values(&observations, &candidates).unwrap()).unwrap();
-    golden.close("select.candidates", &candidates);
-    golden.close("select.q", &q);
-    let q = q.reshape((observations.dim(0).unwrap(), ())).unwrap();
-    let v = value.map(|value| value.state_values(&observations).unwrap().squeeze(0).unwrap());
-    Drawn { choice, candidates, q, v }
+    if let Some(choice) = policy.choice() {
+        assert_eq!(choice.candidates as usize, golden.count("/agent/candidates"));
+        // The folders of all but QUAD have the smaller of the critics' values.
+        let value =
+            if golden.config["algorithm"] == "quad" { choice.value } else { Aggregate::Min };
+        policy = policy.with_choice(Choice { value, ..choice }).unwrap();
+        let Sampled { actions, values } = policy.sample(&observations, &mut begin()).unwrap();
+        let [actions, values] = [actions, values].map(|x| Tensor::new(x, &Device::Cpu).unwrap());
+        // A planner has more candidates than first actions, and QUAD's folders have none.
+        if !["diffuser", "quad"].contains(&name) {
+            golden.close("select.candidates", &actions);
+        }
+        golden.close(if name == "diffuser" { "select.values" } else { "select.q" }, &values);
+        if let Rule::Softmax { temperature } = choice.rule {
+            let q = (values.reshape((n, ())).unwrap() / f64::from(temperature)).unwrap();
+            golden.close("select.probabilities", &candle_nn::ops::softmax(&q, D::Minus1).unwrap());
+        }
+    }
+    if golden.expected.contains_key("select.actions") {
+        let mut actions = vec![0.0; n * policy.action_dim()];
+        policy.act(&observations, &mut begin(), &mut actions).unwrap();
+        golden.close("select.actions", &Tensor::new(actions, &Device::Cpu).unwrap());
+    }
+}
+
+fn check_all(goldens: &[Golden]) {
+    for golden in goldens {
+        let name = golden.config["algorithm"].as_str().unwrap();
+        let known = ALGORITHMS.iter().find(|known| known.name == name);
+        devices().iter().for_each(|device| {
+            known.into_iter().for_each(|definition| check(definition, golden, device));
+        });
+    }
+}
+
+#[test]
+fn golden_update() {
+    for Definition { name, .. } in ALGORITHMS {
+        let goldens = goldens(name);
+        check_all(&goldens);
+        let one = std::env::var_os("GOLDEN_DIR").is_some();
+        assert!(one || !goldens.is_empty(), "there are no golden folders of {name}");
+    }
+}
+
+#[test]
+fn golden_update_of_a_fresh_seed() {
+    check_all(&fresh());
+}
+
+#[test]
+fn golden_folders_are_what_their_script_makes() {
+    run(MAKE, &["--check"]);
+}
+
+/// The JAX program that `deploy/bench.sh` compares with does the same work.
+#[test]
+fn golden_peer_of_the_benchmarks() {
+    run("algorithms/benches/jax_step.py", &["--check"]);
 }

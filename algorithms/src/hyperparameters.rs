@@ -1,4 +1,4 @@
-//! Types of hyper-parameters that are in their range by being read.
+//! Types of hyper-parameters that check their range when they are read.
 
 use std::ops::{Deref, RangeInclusive};
 
@@ -68,5 +68,5 @@ checked!(
     Candidates(u32), |x| (1..=Choice::MOST_CANDIDATES).contains(&x), "a whole number from 1 to 10000"
 );
 
-/// What policies are read with: their denoising steps have the same bound.
+/// Bounds of counts; those of a policy's denoising steps are the same.
 const COUNTS: RangeInclusive<usize> = 1..=1000;

@@ -2,25 +2,18 @@
 //! Q-Learning"): a value function learned by expectile regression, and a Gaussian policy cloned
 //! from the data with advantages as weights. Equations are that paper's.
 
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-#[path = "golden/iql.rs"]
-mod golden;
-
-use super::definition::{Definition, Metric, Reporting};
+use super::definition::{Definition, Metric, Reporting, start};
 use super::hyperparameters::{OpenUnit, Positive};
 use super::in_sample::{COSINE, Common, Helps, ImplicitLosses, InSample, read, table};
 use candle_core::{DType, Result, Tensor};
 use serde::Deserialize;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "iql",
-    settings: include_str!("../../presets/iql.toml"),
+    presets: include_str!("../../presets/iql.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
-    check: |table| read::<Config>(table).map(drop),
-    start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
+    read: |table| Ok(start(read::<Config>(table)?, InSample::new)),
 };
 
 const METRICS: &[Metric] = &table(Helps {
@@ -32,7 +25,7 @@ const METRICS: &[Metric] = &table(Helps {
 });
 
 /// IQL's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     #[serde(flatten)]

@@ -4,21 +4,15 @@
 //! SQL, sparse Q-learning, or EQL, exponential Q-learning. Equations are that paper's; where its
 //! authors' code does something else, docs/deviations.md says what holds.
 
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-#[path = "golden/ivr.rs"]
-mod golden;
-
-use super::definition::{Definition, Metric, Reporting, Variant};
+use super::definition::{Definition, Metric, Reporting, Variant, start};
 use super::hyperparameters::Positive;
 use super::in_sample::{COSINE, Common, Helps, ImplicitLosses, InSample, read, scale_down, table};
 use candle_core::{Result, Tensor};
 use serde::Deserialize;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "ivr",
-    settings: include_str!("../../presets/ivr.toml"),
+    presets: include_str!("../../presets/ivr.toml"),
     metrics: METRICS,
     report: Reporting {
         variant: Some(Variant {
@@ -27,13 +21,12 @@ pub(super) const DEFINITION: Definition = Definition {
         }),
         ..Reporting::PLAIN
     },
-    check: |table| read::<Config>(table).map(drop),
-    start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
+    read: |table| Ok(start(read::<Config>(table)?, InSample::new)),
 };
 
 /// (q − V)/α at which EQL's exponentials are cut off.
 const LARGEST_EXPONENT: f64 = 5.0;
-/// EQL's weights are those of an α that is as many times smaller.
+/// Factor of 1/α in EQL's weights.
 const SHARPER: f64 = 10.0;
 
 const METRICS: &[Metric] = &table(Helps {
@@ -44,7 +37,7 @@ const METRICS: &[Metric] = &table(Helps {
     learning_rate: COSINE,
 });
 
-/// What the policy's distance from the data is measured by.
+/// Divergence of the policy from the data's.
 #[derive(Clone, Copy, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Divergence {
@@ -55,7 +48,7 @@ enum Divergence {
 }
 
 /// The strength of regularization with each.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Alpha {
     sparse: Positive,
@@ -63,7 +56,7 @@ struct Alpha {
 }
 
 /// IVR's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     #[serde(flatten)]

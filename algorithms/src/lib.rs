@@ -1,9 +1,17 @@
 //! Learning algorithms, one file each, to be read beside its paper.
 //!
-//! `definition` is what is known of an algorithm before it runs, `algorithm` all that the learner
-//! sees of it at work, `agent` an algorithm at work, saved and loaded, and `values` its values for
-//! each task. A new algorithm is a file here, a line in [`ALGORITHMS`] and its values in
-//! `presets/`.
+//! # Layout
+//!
+//! - [`Definition`]: an algorithm before it runs, a line of [`ALGORITHMS`]; [`Values`]: its presets.
+//! - [`Algorithm`]: the interface to the learner; [`Agent`]: an algorithm in training.
+//! - `networks`: networks with optimizers and targets, which an algorithm declares once;
+//!   `state_dict`; `losses`; `hyperparameters`: types that check themselves; `random`; `context`:
+//!   the data and settings of a run.
+//! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; QUAD, Diffusion-QL, AlignIQL and
+//!   IDQL `diffusion`. `fql` stands alone and is the one to read first.
+//!
+//! A new algorithm is a file here, a line in [`ALGORITHMS`], `presets/NAME.toml`, and a script with
+//! golden folders in `tests/golden`.
 
 #![deny(unsafe_code)]
 
@@ -18,16 +26,19 @@ mod diffuser;
 mod diffusion;
 mod dql;
 mod dtql;
+mod error;
 mod fqe;
 mod fql;
 mod gaussian;
 mod hyperparameters;
 mod idql;
 mod in_sample;
+mod inputs;
 mod iql;
 mod ivr;
+mod losses;
+mod networks;
 mod onestep;
-mod parts;
 mod phases;
 mod pool;
 mod quad;
@@ -37,22 +48,25 @@ mod replay;
 mod returns;
 mod sfbc;
 mod squashed;
+mod state_dict;
 mod td3;
 mod td3bc;
-mod train_state;
 mod values;
 mod xql;
 
 pub use agent::{Agent, StateError};
-pub use algorithm::{AgentError, Algorithm, AlgorithmError, Measured};
+pub use algorithm::{Algorithm, Measured};
 pub use context::{Context, Minibatch};
-pub use definition::{Axis, Definition, Metric, MetricsLine, Reporting, Summary, Variant};
+pub use definition::{
+    Axis, Definition, Hyperparameters, Metric, MetricsLine, Reporting, Start, Summary, Variant,
+};
+pub use error::{AgentError, AlgorithmError};
 pub use fqe::{Fqe, FqeConfig, Units};
-pub use parts::Parts;
+pub use state_dict::StateDict;
 pub use values::{Values, fits, merge};
 
-/// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 15] = [
+/// All algorithms, the default first.
+pub const ALGORITHMS: &[Definition] = &[
     quad::DEFINITION,
     iql::DEFINITION,
     align_iql::DEFINITION,

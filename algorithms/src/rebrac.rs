@@ -1,34 +1,32 @@
 //! ReBRAC (Tarasov, Kurenkov, Nikulin and Kolesnikov 2023, "Revisiting the Minimalist Approach to
 //! Offline Reinforcement Learning"): TD3+BC that keeps near the data's actions in policy and
-//! critics, each with a weight of its own. Its update is CORL's, in which its authors published it;
+//! critics, each with its own weight. Its update is CORL's, in which its authors published it;
 //! equations are that paper's.
 
-use super::algorithm::smaller;
-use super::definition::{Definition, Metric, Reporting, metrics};
+use super::definition::{Definition, Metric, Reporting, metrics, start};
 use super::hyperparameters::NotNegative;
+use super::losses::smallest;
 use super::td3::{BcRegularizer, Common, Td3, read};
 use candle_core::{Result, Tensor};
 use serde::Deserialize;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "rebrac",
-    settings: include_str!("../../presets/rebrac.toml"),
+    presets: include_str!("../../presets/rebrac.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
-    check: |table| read::<Config>(table).map(drop),
-    start: |table, context| Ok(Box::new(Td3::new(read::<Config>(table)?, context)?)),
+    read: |table| Ok(start(read::<Config>(table)?, Td3::new)),
 };
 
 const METRICS: &[Metric] = &metrics! {
-    q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(min_k Q̂_k(s', ã') − critic_penalty·Σ (ã' − a')²), where ã' is the target policy's action with noise and a' the data's next action (ReBRAC's Eq. 4).";
+    target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(min_k Q̂_k(s', ã') − critic_penalty·Σ (ã' − a')²), where ã' is the target policy's action with noise and a' the data's next action (ReBRAC's Eq. 4).";
     critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)².";
     actor_loss ["actor loss"] held_out: "Mean over the batch of actor_penalty·Σ (π(s) − a)² − λ·min_k Q_k(s, π(s)) with λ = 1/mean |min_k Q_k(s, π(s))| (ReBRAC's Eq. 5), in the policy's last step.";
     bc_loss held_out: "Mean over the batch of Σ (π(s) − a)², summed over dimensions, in the policy's last step.";
 };
 
 /// ReBRAC's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     #[serde(flatten)]
@@ -52,16 +50,9 @@ impl BcRegularizer for Config {
     }
 
     fn actor_loss(&self, actions: &Tensor, of_data: &Tensor, q: &Tensor) -> Result<[Tensor; 2]> {
-        let q = smaller(q)?;
+        let q = smallest(q)?;
         let weight = q.detach().abs()?.mean_all()?.recip()?;
         let bc_loss = (actions - of_data)?.sqr()?.sum(1)?.mean_all()?;
         Ok([((&bc_loss * f64::from(*self.actor_penalty))? - (q.mean_all()? * weight)?)?, bc_loss])
     }
-}
-
-#[cfg(test)]
-mod golden {
-    crate::golden::golden_tests!("rebrac", |golden, device| {
-        crate::td3::golden::check::<super::Config>(golden, device, super::METRICS);
-    });
 }

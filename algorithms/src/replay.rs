@@ -1,68 +1,21 @@
-//! The work of an update: a GPU does it once, records it in the next update, and replays it in
-//! those after that. It is hundreds of kernels, and the host takes longer to start one of them than
-//! the GPU to run it.
+//! The work of an update: a GPU does it once, records it as a CUDA graph in the next update, and
+//! replays that in those after it. It is hundreds of kernels, and the host takes longer to start one
+//! of them than the GPU to run it.
 
-use super::algorithm::{Loss, Measured, joined, scalars};
+use super::algorithm::Measured;
+use super::inputs::Inputs;
+use super::losses::{Computed, Loss};
 use candle_core::{Device, Result, Tensor};
 use quad_nn::{CudaGraph, overwrite};
 use std::thread::{ThreadId, current};
 
-/// Tensors that each update has of its own, always as many and in the same shapes.
-pub(super) trait Inputs: Clone {
-    fn tensors(&mut self) -> Vec<&mut Tensor>;
-
-    /// They on a device.
-    fn on(&self, device: &Device) -> Result<Self> {
-        let mut inputs = self.clone();
-        for tensor in inputs.tensors() {
-            *tensor = tensor.to_device(device)?;
-        }
-        Ok(inputs)
-    }
-}
-
-impl<A: Inputs, B: Inputs> Inputs for (A, B) {
-    fn tensors(&mut self) -> Vec<&mut Tensor> {
-        let (mut tensors, more) = (self.0.tensors(), self.1.tensors());
-        tensors.extend(more);
-        tensors
-    }
-}
-
-/// What an update computes for its metrics.
-pub(super) struct Computed {
-    /// Names of the scalars.
-    names: Vec<&'static str>,
-    /// The scalars, then the other numbers, `[n]`.
-    numbers: Tensor,
-}
-
-impl Computed {
-    /// What some losses measure, and tensors of any shape.
-    pub fn new(losses: &[Loss], others: &[&Tensor]) -> Result<Self> {
-        let tensors: Vec<_> =
-            scalars(losses).map(|(_, scalar)| scalar).chain(others.iter().copied()).collect();
-        Ok(Self {
-            names: scalars(losses).map(|(name, _)| *name).collect(),
-            numbers: joined(&tensors)?,
-        })
-    }
-
-    /// The scalars by name, and the other numbers; waits until they are computed.
-    pub fn read(&self) -> Result<(Measured, Vec<f32>)> {
-        let mut scalars = self.numbers.to_vec1()?;
-        let others = scalars.split_off(self.names.len());
-        Ok((self.names.iter().copied().zip(scalars).collect(), others))
-    }
-}
-
-/// What is kept from update to update.
+/// State between two updates.
 struct Kept<I> {
     inputs: I,
     computed: Computed,
     /// None before the second update.
     recording: Option<CudaGraph>,
-    /// What is recorded reads constants that belong to this thread.
+    /// The recording reads constants that belong to this thread.
     thread: ThreadId,
 }
 
@@ -76,15 +29,16 @@ impl<I> Default for Replay<I> {
 }
 
 impl<I: Inputs> Replay<I> {
-    /// Does `work` on a device, or queues it there. On a GPU that is the same each time but for the
-    /// numbers of `inputs`, which are on the CPU after the first time. It changes tensors in place;
-    /// from the second time on none that it makes outlives it.
+    /// Does `work` on a device, or queues it there. On a GPU it must be the same each time but for the
+    /// numbers of `inputs`, which are on the CPU; it changes tensors in place, and from the second
+    /// time on no tensor that it makes may outlive it.
     pub fn start(
         &mut self,
         device: &Device,
         inputs: &I,
-        work: impl FnOnce(&I) -> Result<Computed>,
+        work: impl FnOnce(&I) -> Result<Vec<Loss>>,
     ) -> Result<()> {
+        let work = |inputs: &I| Computed::new(&work(inputs)?);
         let thread = current().id();
         let Some(mut kept) = self.0.take().filter(|kept| kept.thread == thread) else {
             let inputs = inputs.on(device)?;
@@ -112,7 +66,7 @@ impl<I: Inputs> Replay<I> {
         Ok(())
     }
 
-    /// What the newest work computed, as [`Computed::read`] gives it.
+    /// The results of the newest work, as [`Computed::read`] returns them.
     pub fn computed(&self) -> Result<(Measured, Vec<f32>)> {
         self.0.as_ref().map_or_else(|| Ok(Default::default()), |kept| kept.computed.read())
     }
@@ -126,30 +80,4 @@ fn renew(tensor: &mut Tensor, new: &Tensor) -> Result<()> {
     }
     *tensor = new.clone();
     Ok(())
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-mod tests {
-    use super::*;
-
-    #[derive(Clone)]
-    struct One(Tensor);
-
-    impl Inputs for One {
-        fn tensors(&mut self) -> Vec<&mut Tensor> {
-            vec![&mut self.0]
-        }
-    }
-
-    #[test]
-    fn each_update_has_its_own_inputs() {
-        let mut replay = Replay::default();
-        for number in [1.0, 2.0, 3.0] {
-            let inputs = One(Tensor::new(number, &Device::Cpu).unwrap());
-            let work = |One(x): &One| Computed::new(&[Loss::new("x", x.clone())], &[x]);
-            replay.start(&Device::Cpu, &inputs, work).unwrap();
-            assert_eq!(replay.computed().unwrap(), (vec![("x", number)], vec![number]));
-        }
-    }
 }

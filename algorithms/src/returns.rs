@@ -1,24 +1,24 @@
 //! Returns of a dataset's episodes as a critic's targets: standardized, and planned anew with
 //! values of states.
 
-use super::parts::Parts;
+use super::state_dict::StateDict;
 use candle_core::{DType, Device, Result, Tensor};
 use std::ops::Range;
 
-/// Returns are divided by at least this.
+/// Least divisor of the returns.
 const LEAST_DEVIATION: f64 = 0.1;
 
 /// The returns of n transitions, on the CPU.
 pub(super) struct Returns {
     gamma: f64,
     rewards: Vec<f32>,
-    /// Where episodes lie among the transitions.
+    /// Ranges of the episodes among the transitions.
     pub episodes: Vec<Range<usize>>,
-    /// V(s) as far as planning has come, `[n]`.
+    /// V(s) of the states that were planned so far, `[n]`.
     values: Tensor,
     /// Standardized returns, `[n]`.
     pub targets: Tensor,
-    /// What they were standardized by: mean and standard deviation, `[2]`.
+    /// Mean and standard deviation of the returns before they were standardized, `[2]`.
     scale: Tensor,
 }
 
@@ -39,18 +39,18 @@ impl Returns {
         values.affine(f64::from(scale[1]), f64::from(scale[0]))
     }
 
-    /// Keeps values of the states from number `first` on, in units of the return, `[m]`.
+    /// Sets values `[m]` of the states from number `first` on, in units of the return.
     pub fn keep(&mut self, values: &Tensor, first: usize) -> Result<()> {
         self.values.slice_set(&values.to_device(&Device::Cpu)?, 0, first)
     }
 
-    /// The mean of the values of some states, if there are any.
+    /// The mean value of a range of states, if it is not empty.
     pub fn mean_value(&self, states: Range<usize>) -> Result<Option<f32>> {
         let values: Vec<f32> = self.values.narrow(0, states.start, states.len())?.to_vec1()?;
         Ok((!values.is_empty()).then(|| values.iter().sum::<f32>() / values.len() as f32))
     }
 
-    /// Makes new returns with the values of all states.
+    /// Plans new returns with the values of all states.
     pub fn plan(&mut self) -> Result<()> {
         let returns = self.planned(Some(&self.values.to_vec1()?));
         self.standardize(&returns)
@@ -89,10 +89,10 @@ impl Returns {
         Ok(())
     }
 
-    /// What planning changes.
-    pub fn parts<'a>(&'a mut self, parts: Parts<'a>) -> Parts<'a> {
+    /// Adds what planning changes.
+    pub fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {
         let Self { values, targets, scale, .. } = self;
-        parts.number("values", values).number("targets", targets).number("scale", scale)
+        dict.with("values", values).with("targets", targets).with("scale", scale)
     }
 }
 

@@ -3,38 +3,34 @@
 //! returns; then returns are planned anew with what the critic says of the clone's actions, and
 //! another critic learns these. The policy takes the best of the clone's samples.
 
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-#[path = "golden/sfbc.rs"]
-mod golden;
-
-use super::algorithm::{AgentError, Algorithm, AlgorithmError, Loss, Measured, check, measured};
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read};
-use super::denoising::{NoiseInTime, normal};
+use super::algorithm::{Algorithm, Measured};
+use super::context::{Context, Minibatch, select};
+use super::definition::{Definition, Metric, Reporting, metrics, read, start};
+use super::error::{AgentError, AlgorithmError, check};
 use super::hyperparameters::{Candidates, Count, Positive, Steps, UnitInterval};
-use super::parts::Parts;
-use super::phases;
+use super::losses::{Loss, measured};
+use super::networks::{Initializer, TrainState, networks};
+use super::phases::{first_steps, phase};
 use super::random::{Purpose, stream};
 use super::returns::Returns;
-use super::train_state::{TrainState, ensemble, initial};
+use super::state_dict::StateDict;
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::Batch;
-use quad_nn::{AdamStep, DpmSolver, Ensemble, MlpConfig, ScoreNetwork, ScoreShape, Tensors};
+use quad_nn::{
+    AdamStep, ContinuousNoise, DpmSolver, Ensemble, MlpConfig, ScoreNetwork, ScoreShape, Tensors,
+};
 use quad_policy::{Aggregate, Choice, PolicyConfig, Rule, ScorePolicy, ScorePolicyShape};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::Deserialize;
 use std::ops::Range;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "sfbc",
-    settings: include_str!("../../presets/sfbc.toml"),
+    presets: include_str!("../../presets/sfbc.toml"),
     metrics: METRICS,
-    report: Reporting { counts: &["candidates"], ..Reporting::PLAIN },
-    check: |table| Config::of(table).map(drop),
-    start: |table, context| Ok(Box::new(Sfbc::new(Config::of(table)?, context)?)),
+    report: Reporting::CANDIDATES,
+    read: |table| Ok(start(Config::read(table)?, Sfbc::new)),
 };
 
 /// The earliest time whose noise is learned.
@@ -45,12 +41,12 @@ const TOGETHER: usize = 256;
 const METRICS: &[Metric] = &metrics! {
     bc_loss ["BC loss"]: "First phase: mean over the batch of the sum over dimensions of (ε − ε_θ(a_t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
     critic_loss ["critic loss"]: "A critic's round: mean over the batch of (Q(s, a) − target)², of standardized returns.";
-    q_mean: "A critic's round: mean over the batch of the targets, standardized returns.";
+    target_q_mean: "A critic's round: mean over the batch of the targets, standardized returns.";
     v_mean ["V"]: "Planning: mean over the step's states of V(s) = Σ softmax(Q/planning_temperature)·Q over actions of the clone, in units of the return.";
 };
 
 /// SfBC's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     /// The score network's narrowing blocks.
@@ -60,11 +56,11 @@ struct Config {
     gamma: UnitInterval,
     /// Evaluations of the score network for an action.
     evaluations: Count,
-    /// Actions of the clone, of whose values V is made, and the temperature of its softmax.
+    /// Actions of the clone whose values make V, and the temperature of its softmax.
     samples: Count,
     planning_temperature: Positive,
-    /// What the policy draws, how many of these it averages, and the temperature by which it draws
-    /// them.
+    /// Actions that the policy draws, number of those it averages, and the temperature by which
+    /// these are chosen.
     candidates: Candidates,
     averaged: Candidates,
     temperature: Positive,
@@ -76,16 +72,12 @@ struct Config {
 }
 
 impl Config {
-    fn of(table: &toml::Table) -> std::result::Result<Self, AgentError> {
+    fn read(table: &toml::Table) -> std::result::Result<Self, AgentError> {
         let config: Self = read(table)?;
-        let Self { averaged, candidates, .. } = config;
-        check("averaged", *averaged, *averaged <= *candidates, "at most candidates")?;
-        check(
-            "actor.norm",
-            config.actor.norm,
-            !config.actor.norm,
-            "false: this network has no norm",
-        )?;
+        let (averaged, norm) = (*config.averaged, config.actor.norm);
+        let fits = averaged <= *config.candidates;
+        check("averaged", averaged, fits, "at most candidates")?;
+        check("actor.norm", norm, !norm, "false: this network has no norm")?;
         Ok(config)
     }
 }
@@ -100,27 +92,32 @@ struct Phases {
     planning: Steps,
 }
 
-/// What an update does.
-enum Phase {
-    Behavior,
-    /// The round's number, from 0.
-    Critic(usize),
-    /// Values of these items' states, of all items in turn.
-    Planning(Range<usize>),
+networks! {
+    struct Networks(config: &Config, init) {
+        /// ε_θ.
+        actor: TrainState<ScoreNetwork> = {
+            let (observation_dim, action_dim) =
+                (init.context.observation_dim(), init.context.action_dim());
+            let shape = ScoreShape { observation_dim, action_dim, layers: config.actor.clone() };
+            // Of the stream behind the networks'. They are a function of the seed: no state.
+            let frequencies = init.context.random_for(Purpose::Weights, 2).vector(
+                "frequencies",
+                |generator| ScoreShape::frequencies(generator)?.to_vec1::<f32>(),
+            )?;
+            let frequencies = Tensor::new(frequencies, &Device::Cpu)?;
+            init.network(&shape.layout(), |weights| ScoreNetwork::new(shape, weights, frequencies))
+        },
+        critic: TrainState<Ensemble> = init.ensemble(init.shape(&config.critic)),
+    }
 }
 
-/// SfBC in the middle of a run.
 struct Sfbc {
     config: Config,
     context: Context,
-    shape: ScorePolicyShape,
-    solver: DpmSolver,
     /// The transitions to learn from, episode by episode, and their returns.
-    items: Vec<u32>,
+    rows: Vec<u32>,
     returns: Returns,
-    /// ε_θ.
-    actor: TrainState<ScoreNetwork>,
-    critic: TrainState<Ensemble>,
+    networks: Networks,
 }
 
 impl Sfbc {
@@ -134,197 +131,156 @@ impl Sfbc {
             start..end
         };
         let episodes = all.iter().map(place).collect();
-        let items: Vec<u32> = all.into_iter().flatten().collect();
-        if items.is_empty() {
+        let rows: Vec<u32> = all.into_iter().flatten().collect();
+        if rows.is_empty() {
             return Err(AlgorithmError::ShortEpisodes(*config.shortest_episode));
         }
-        let mut rows = Batch::default();
-        context.transitions.gather(&items, &mut rows);
-        let shape = ScorePolicyShape {
-            observation_dim: context.observation_dim(),
-            action_dim: context.action_dim(),
-            actor: config.actor.clone(),
-            critic: config.critic.clone(),
-            evaluations: *config.evaluations,
-        };
-        let frequencies = ScoreShape::frequencies(&mut stream(context.seed, Purpose::Weights, 2))?;
-        let weights = initial(&shape.actor().layout(), &context, 0)?;
-        Ok(Self {
-            actor: TrainState::new(ScoreNetwork::new(shape.actor(), weights, frequencies), 0.0)?,
-            critic: first_critic(&shape, &context)?,
-            solver: DpmSolver::new(shape.evaluations),
-            returns: Returns::new(rows.rewards, episodes, *config.gamma)?,
-            items,
-            shape,
-            config,
-            context,
-        })
+        let mut batch = Batch::default();
+        context.transitions.gather(&rows, &mut batch);
+        let returns = Returns::new(batch.rewards, episodes, *config.gamma)?;
+        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
+        Ok(Self { config, context, rows, returns, networks })
     }
 
-    /// The steps at which cloning, the first critic's round, planning and the second critic's round
-    /// begin.
-    fn begins(&self) -> [u64; 4] {
-        let Phases { behavior, critic, planning } = self.config.phases;
-        phases::begin(self.context.total_steps, [behavior, critic, planning, critic])
-    }
-
-    /// What update number `step` does, and how many came before it in its phase.
-    fn phase(&self, step: u64) -> (Phase, u64) {
-        let begins = self.begins();
-        let number = begins.partition_point(|begin| *begin <= step) - 1;
-        let steps = step - begins[number];
-        let phase = match number {
-            0 => Phase::Behavior,
-            1 => Phase::Critic(0),
-            3 => Phase::Critic(1),
-            _ => {
-                let before = |steps: u64| {
-                    let length = u128::from(begins[number + 1] - begins[number]);
-                    (u128::from(steps) * self.items.len() as u128 / length) as usize
-                };
-                Phase::Planning(before(steps)..before(steps + 1))
-            }
-        };
-        (phase, steps)
+    /// The first steps of cloning, the first critic's round, planning and the second critic's.
+    fn first_steps(&self) -> [u64; 4] {
+        let phases = self.config.phases;
+        let lengths = [phases.behavior, phases.critic, phases.planning, phases.critic];
+        first_steps(self.context.total_steps, lengths)
     }
 
     /// ε_θ toward the noise in the data's actions.
-    fn clone_behavior(
-        &mut self,
-        batch: &Minibatch,
-        noise: &NoiseInTime,
-        steps: u64,
-    ) -> Result<Measured> {
-        let noisy = noise.noisy(&batch.actions)?;
-        let predicted = self.actor.network.predict(&batch.observations, &noisy, &noise.t)?;
-        let loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
-        self.actor.minimize(&loss, AdamStep::after(steps, *self.config.actor_learning_rate))?;
+    fn clone_behavior(&mut self, step: u64, batch: &Minibatch, adam: AdamStep) -> Result<Measured> {
+        let (mut random, rows) = (self.context.random(step), self.context.batch_size);
+        let epsilon = random.normal("epsilon", batch.actions.shape())?;
+        let t: Vec<f64> = random.vector("t", |generator| {
+            Ok((0..rows).map(|_| generator.random_range(FIRST_TIME..1.0)).collect())
+        })?;
+        let column = |of: fn(ContinuousNoise) -> f64| {
+            let numbers = t.iter().map(|t| of(ContinuousNoise::at(*t)) as f32);
+            Tensor::from_vec(numbers.collect(), (rows, 1), &self.context.device)
+        };
+        let signal = batch.actions.broadcast_mul(&column(|noise| noise.signal)?)?;
+        let noisy = (signal + epsilon.broadcast_mul(&column(|noise| noise.deviation)?)?)?;
+        let actor = &mut self.networks.actor;
+        let predicted = actor.predict(&batch.observations, &noisy, &t)?;
+        let loss = (predicted - epsilon)?.sqr()?.sum(1)?.mean_all()?;
+        actor.minimize(&loss, adam)?;
         measured(&[Loss::new("bc_loss", loss)])
     }
 
-    /// Q(s, a) toward the returns of these items, the batch. Each round has a critic of its own,
-    /// which begins as the first did.
+    /// Q(s, a) toward the returns of the batch's transitions, which have these indices.
     fn learn_returns(
         &mut self,
         batch: &Minibatch,
-        items: &[u32],
-        round: usize,
-        steps: u64,
+        indices: &[u32],
+        adam: AdamStep,
     ) -> Result<Measured> {
-        if round > 0 && steps == 0 {
-            self.critic = first_critic(&self.shape, &self.context)?;
-        }
-        let items = Tensor::from_slice(items, items.len(), &Device::Cpu)?;
+        let indices = Tensor::from_slice(indices, indices.len(), &Device::Cpu)?;
         let targets =
-            self.returns.targets.index_select(&items, 0)?.to_device(&self.context.device)?;
-        let loss =
-            self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        self.critic.minimize(&loss, AdamStep::after(steps, *self.config.critic_learning_rate))?;
-        measured(&[Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?)])
+            self.returns.targets.index_select(&indices, 0)?.to_device(&self.context.device)?;
+        let loss = batch.critic_loss(&self.networks.critic, &targets)?;
+        self.networks.critic.minimize(&loss.value, adam)?;
+        measured(&[loss])
+    }
+
+    /// V(s) of the states in a range, and with the last of all states new returns.
+    fn plan(&mut self, states: Range<usize>) -> Result<Measured> {
+        for first in states.clone().step_by(TOGETHER) {
+            self.value(first..(first + TOGETHER).min(states.end))?;
+        }
+        if states.end == self.rows.len() {
+            self.returns.plan()?;
+        }
+        Ok(self.returns.mean_value(states)?.map(|mean| ("v_mean", mean)).into_iter().collect())
     }
 
     /// Keeps V(s) = Σ softmax(Q/temperature)·Q over S actions of the clone, in units of the return,
-    /// for the states of some items. The actions are drawn with this noise, `[items · S, a]`.
-    fn value(&mut self, items: Range<usize>, noise: &Tensor) -> Result<()> {
-        let (first, count) = (items.start, items.len());
-        let observations = self.context.batch(&self.items[items])?.observations;
-        let actions = self.actor.network.sample(&self.solver, &observations, noise)?;
-        let q =
-            self.critic.network.detach().values(&observations, &actions)?.reshape((count, ()))?;
+    /// for the states in a range.
+    fn value(&mut self, states: Range<usize>) -> Result<()> {
+        let (first, count, Networks { actor, critic }) =
+            (states.start, states.len(), &self.networks);
+        let rows = &self.rows[states];
+        let observations = self.context.batch(rows)?.observations;
+        let solver = DpmSolver::new(*self.config.evaluations);
+        let actions = actor.sample(&solver, &observations, &self.noise(rows)?)?;
+        let q = critic.detach().values(&observations, &actions)?.reshape((count, ()))?;
         let exponents = q.broadcast_sub(&q.max_keepdim(1)?)?;
         let weights = (exponents / f64::from(*self.config.planning_temperature))?.exp()?;
         let values = ((&weights * q)?.sum(1)? / weights.sum(1)?)?;
         self.returns.keep(&self.returns.unscaled(&values)?, first)
     }
 
-    /// After [`Self::value`] of these items: with the last of all, makes new returns.
-    fn plan(&mut self, items: Range<usize>) -> Result<Measured> {
-        if items.end == self.items.len() {
-            self.returns.plan()?;
-        }
-        Ok(self.returns.mean_value(items)?.map(|mean| ("v_mean", mean)).into_iter().collect())
-    }
-
-    /// The noise of a cloning step.
-    fn noise(&self, step: u64) -> Result<NoiseInTime> {
-        let (context, generator) =
-            (&self.context, &mut stream(self.context.seed, Purpose::Noise, step));
-        let epsilon =
-            normal((context.batch_size, context.action_dim()), generator, &context.device)?;
-        let t = (0..context.batch_size).map(|_| generator.random_range(FIRST_TIME..1.0)).collect();
-        Ok(NoiseInTime { t, epsilon })
-    }
-
-    /// The noise of the clone's actions in some states.
-    fn noise_of(&self, rows: &[u32]) -> Result<Tensor> {
+    /// The noise of the clone's S actions in some states, `[states·S, a]`.
+    fn noise(&self, rows: &[u32]) -> Result<Tensor> {
         let (count, a) = (*self.config.samples, self.context.action_dim());
-        let numbers = rows.iter().flat_map(|row| {
+        let of = |row: &u32| {
             let mut generator = stream(self.context.seed, Purpose::Actions, u64::from(*row));
             (0..count * a).map(move |_| StandardNormal.sample(&mut generator))
-        });
-        Tensor::from_vec(
-            numbers.collect::<Vec<f32>>(),
-            (rows.len() * count, a),
-            &self.context.device,
-        )
+        };
+        let numbers = self
+            .context
+            .random_for(Purpose::Actions, 0)
+            .vector("planning_noise", |_| Ok(rows.iter().flat_map(of).collect::<Vec<f32>>()))?;
+        Tensor::from_vec(numbers, (rows.len() * count, a), &self.context.device)
     }
-}
-
-/// A critic at its beginning.
-fn first_critic(shape: &ScorePolicyShape, context: &Context) -> Result<TrainState<Ensemble>> {
-    ensemble(shape.critic(), context, 1)
 }
 
 impl Algorithm for Sfbc {
-    fn items(&self, _: usize) -> usize {
-        self.items.len()
+    fn dataset_len(&self, _: usize) -> usize {
+        self.rows.len()
     }
 
     fn phases(&self) -> Vec<u64> {
-        self.begins().to_vec()
+        self.first_steps().to_vec()
     }
 
-    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
-        let (phase, steps) = self.phase(step);
-        let rows: Vec<u32> = items.iter().map(|item| self.items[*item as usize]).collect();
-        match phase {
-            Phase::Behavior => {
-                self.clone_behavior(&self.context.batch(&rows)?, &self.noise(step)?, steps)
-            }
-            Phase::Critic(round) => {
-                self.learn_returns(&self.context.batch(&rows)?, items, round, steps)
-            }
-            Phase::Planning(items) => {
-                for some in items
-                    .clone()
-                    .step_by(TOGETHER)
-                    .map(|first| first..(first + TOGETHER).min(items.end))
-                {
-                    let noise = self.noise_of(&self.items[some.clone()])?;
-                    self.value(some, &noise)?;
-                }
-                self.plan(items)
-            }
+    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+        let first_steps = self.first_steps();
+        let (phase, steps) = phase(&first_steps, step);
+        let of_actor = AdamStep::after(steps, *self.config.actor_learning_rate);
+        let of_critic = AdamStep::after(steps, *self.config.critic_learning_rate);
+        if phase == 2 {
+            let length = u128::from(first_steps[3] - first_steps[2]);
+            let before =
+                |steps: u64| (u128::from(steps) * self.rows.len() as u128 / length) as usize;
+            return self.plan(before(steps)..before(steps + 1));
         }
+        let batch = self.context.batch(&select(&self.rows, indices))?;
+        if phase == 0 {
+            return self.clone_behavior(step, &batch, of_actor);
+        }
+        if phase == 3 && steps == 0 {
+            // The second critic begins as the first did.
+            let networks = Networks::new(&self.config, &mut Initializer::new(&self.context))?;
+            self.networks.critic = networks.critic;
+        }
+        self.learn_returns(&batch, indices, of_critic)
     }
 
-    /// Nothing: its state has a return of each transition that it learns from, and of no other.
+    /// Measures nothing: only the transitions that it learns from have returns.
     fn evaluate(&self, _: u64, _: &[u32]) -> Result<Measured> {
         Ok(Measured::new())
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let rule =
-            Rule::Average { temperature: *self.config.temperature, actions: *self.config.averaged };
-        let choice = Choice { candidates: *self.config.candidates, value: Aggregate::Mean, rule };
-        let tensors = ScorePolicy::tensors(&self.actor.network, &self.critic.network)?;
-        Ok((PolicyConfig::Score { shape: self.shape.clone(), choice }, tensors))
+        let (temperature, actions) = (*self.config.temperature, *self.config.averaged);
+        let rule = Rule::Average { temperature, actions };
+        let (candidates, value) = (*self.config.candidates, Aggregate::Mean);
+        let choice = Choice { candidates, value, rule };
+        let shape = ScorePolicyShape {
+            observation_dim: self.context.observation_dim(),
+            action_dim: self.context.action_dim(),
+            actor: self.config.actor.clone(),
+            critic: self.config.critic.clone(),
+            evaluations: *self.config.evaluations,
+        };
+        let Networks { actor, critic } = &self.networks;
+        let tensors = ScorePolicy::tensors(&actor, &critic)?;
+        Ok((PolicyConfig::Score { shape, choice }, tensors))
     }
 
-    fn parts(&mut self) -> Parts<'_> {
-        // The frequencies do not change: they are a function of the seed.
-        let parts =
-            Parts::default().trained("actor", &mut self.actor).trained("critic", &mut self.critic);
-        self.returns.parts(parts)
+    fn state_dict(&mut self) -> StateDict<'_> {
+        self.returns.add_to(self.networks.state_dict())
     }
 }

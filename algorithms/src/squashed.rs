@@ -3,17 +3,15 @@
 //! a gradient, and their densities have the tanh's Jacobian.
 
 use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, Tensors, Weights};
+use quad_nn::{AdamStep, Ensemble, Gradients, MlpConfig, Tensors, Weights};
 use quad_policy::PolicyConfig;
 
-use super::context::Context;
-use super::gaussian::first_half;
-use super::parts::Parts;
-use super::train_state::{TrainState, ensemble, learned};
+use super::gaussian::first_half_policy;
+use super::networks::{Initializer, TrainState};
+use super::state_dict::{StateDict, Stateful};
 
 /// A squashed Gaussian policy in training.
 pub(super) struct Squashed {
-    layers: MlpConfig,
     /// Mean and x of each state, `[n, 2a]`.
     pub network: TrainState<Ensemble>,
     /// c₁ and c₂ where log σ is c₁·x + c₂; else it is x.
@@ -23,39 +21,27 @@ pub(super) struct Squashed {
 }
 
 impl Squashed {
-    /// At its beginning, as network number `network` of the run; `map` is what c₁ and c₂ begin
-    /// with, where they are learned.
-    pub fn new(
-        layers: &MlpConfig,
-        bounds: (f32, f32),
-        map: Option<[f32; 2]>,
-        context: &Context,
-        network: u64,
-    ) -> Result<Self> {
-        let shape = EnsembleShape {
-            members: 1,
-            observation_dim: context.observation_dim(),
-            action_dim: 0,
-            layers: layers.clone(),
-            outputs: 2 * context.action_dim(),
-        };
-        let map = map.map(|begin| learned("log_std_map", &begin, context)).transpose()?;
-        Ok(Self {
-            network: ensemble(shape, context, network)?,
-            map,
-            bounds,
-            layers: layers.clone(),
-        })
+    /// A policy whose log σ is the network's output.
+    pub fn new(layers: &MlpConfig, bounds: (f32, f32), init: &mut Initializer<'_>) -> Result<Self> {
+        let network = init.state_network(layers, 2 * init.context.action_dim())?;
+        Ok(Self { network, map: None, bounds })
+    }
+
+    /// Makes log σ a learned linear function of the network's output with these initial c₁ and c₂,
+    /// and the last layer smaller by a factor.
+    pub fn with_map(self, map: [f32; 2], factor: f64, init: &Initializer<'_>) -> Result<Self> {
+        let map = Some(init.numbers("log_std_map", &map)?);
+        Ok(Self { network: self.network.scale_last_layer(factor)?, map, ..self })
     }
 
     /// The distributions of u in these states, `[n, o]`; differentiable in all that is learned.
     pub fn distribution(&self, observations: &Tensor) -> Result<Normal> {
-        self.of(&self.network.network, observations)
+        self.of(&self.network, observations)
     }
 
     /// [`Self::distribution`] as constants.
     pub fn constant_distribution(&self, observations: &Tensor) -> Result<Normal> {
-        Ok(self.of(&self.network.network.detach(), observations)?.detach())
+        Ok(self.of(&self.network.detach(), observations)?.detach())
     }
 
     fn of(&self, network: &Ensemble, observations: &Tensor) -> Result<Normal> {
@@ -64,7 +50,7 @@ impl Squashed {
         let (mean, x) = (out.narrow(1, 0, a)?, out.narrow(1, a, a)?);
         let log_std = match &self.map {
             Some(map) => {
-                let c = map.network.values();
+                let c = map.values();
                 x.broadcast_mul(&c.narrow(0, 0, 1)?)?.broadcast_add(&c.narrow(0, 1, 1)?)?
             }
             None => x,
@@ -83,17 +69,15 @@ impl Squashed {
     }
 
     /// The policy that acts by tanh(mean).
-    pub fn policy(&self, context: &Context) -> Result<(PolicyConfig, Tensors)> {
-        first_half(&self.network.network, &self.layers, context)
+    pub fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        first_half_policy(&self.network)
     }
+}
 
-    /// Its parts, called `actor`.
-    pub fn parts<'a>(&'a mut self, parts: Parts<'a>) -> Parts<'a> {
-        let parts = parts.trained("actor", &mut self.network);
-        match &mut self.map {
-            Some(map) => parts.trained("actor", map),
-            None => parts,
-        }
+impl Stateful for Squashed {
+    fn add_to<'a>(&'a mut self, dict: &mut StateDict<'a>, name: &str) {
+        self.network.add_to(dict, name);
+        self.map.add_to(dict, name);
     }
 }
 
@@ -149,4 +133,43 @@ fn log_density(u: &Tensor, noise: &Tensor, log_std: &Tensor) -> Result<Tensor> {
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
-mod tests;
+mod tests {
+    use super::*;
+    use candle_core::Device;
+
+    /// One state and as many dimensions as numbers.
+    fn row(numbers: &[f64]) -> Tensor {
+        Tensor::from_slice(numbers, (1, numbers.len()), &Device::Cpu).unwrap()
+    }
+
+    fn normal(mean: &[f64], log_std: &[f64]) -> Normal {
+        Normal { mean: row(mean), log_std: row(log_std) }
+    }
+
+    fn number(x: &Tensor) -> f64 {
+        x.flatten_all().unwrap().to_vec1::<f64>().unwrap()[0]
+    }
+
+    #[test]
+    fn drawn_and_given_actions_have_the_same_density() {
+        let distribution = normal(&[0.3, -0.7], &[-0.4, 0.1]);
+        let noise = row(&[0.5, -1.2]).unsqueeze(1).unwrap();
+        let Drawn { actions, log_density } = distribution.draw(&noise).unwrap();
+        assert_eq!((actions.dims(), log_density.dims()), (&[1, 1, 2][..], &[1, 1][..]));
+        let again = distribution.log_density(&actions.squeeze(1).unwrap()).unwrap();
+        assert!((number(&log_density) - number(&again)).abs() < 1e-10);
+    }
+
+    /// Where tanh(u) is 1 in float32, the density is still that of u: log(1 − tanh² u) is 2·(log 2 − u)
+    /// there.
+    #[test]
+    fn densities_are_finite_where_actions_round_to_one() {
+        let one = |x: f32| Tensor::from_slice(&[x], (1, 1), &Device::Cpu).unwrap();
+        let distribution = Normal { mean: one(30.0), log_std: one(0.0) };
+        let drawn = distribution.draw(&one(0.0).unsqueeze(1).unwrap()).unwrap();
+        let found = drawn.log_density.flatten_all().unwrap().to_vec1::<f32>().unwrap()[0];
+        let expected = -0.5 * (2.0 * std::f32::consts::PI).ln() - 2.0 * (2f32.ln() - 30.0);
+        assert_eq!(drawn.actions.flatten_all().unwrap().to_vec1::<f32>().unwrap(), [1.0]);
+        assert!((found - expected).abs() < 1e-4, "{found} {expected}");
+    }
+}

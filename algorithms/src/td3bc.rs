@@ -2,31 +2,29 @@
 //! whose policy also stays near the data's actions. Its update is its authors' code's; equations
 //! are that paper's.
 
-use super::definition::{Definition, Metric, Reporting, metrics};
+use super::definition::{Definition, Metric, Reporting, metrics, start};
 use super::hyperparameters::Positive;
 use super::td3::{BcRegularizer, Common, Td3, read};
 use candle_core::{Result, Tensor};
 use serde::Deserialize;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "td3-bc",
-    settings: include_str!("../../presets/td3-bc.toml"),
+    presets: include_str!("../../presets/td3-bc.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
-    check: |table| read::<Config>(table).map(drop),
-    start: |table, context| Ok(Box::new(Td3::new(read::<Config>(table)?, context)?)),
+    read: |table| Ok(start(read::<Config>(table)?, Td3::new)),
 };
 
 const METRICS: &[Metric] = &metrics! {
-    q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', ã'), where ã' is the target policy's action with noise.";
+    target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', ã'), where ã' is the target policy's action with noise.";
     critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)².";
     actor_loss ["actor loss"] held_out: "−λ·mean Q_1(s, π(s)) + mean (π(s) − a)² with λ = weight/mean |Q_1(s, π(s))| (TD3+BC's Eq. 3 to 5), in the policy's last step.";
     bc_loss held_out: "Mean over batch and dimensions of (π(s) − a)², in the policy's last step.";
 };
 
 /// TD3+BC's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     #[serde(flatten)]
@@ -49,11 +47,4 @@ impl BcRegularizer for Config {
         let bc_loss = (actions - of_data)?.sqr()?.mean_all()?;
         Ok([(&bc_loss - (q.mean_all()? * weight)?)?, bc_loss])
     }
-}
-
-#[cfg(test)]
-mod golden {
-    crate::golden::golden_tests!("td3-bc", |golden, device| {
-        crate::td3::golden::check::<super::Config>(golden, device, super::METRICS);
-    });
 }

@@ -1,6 +1,6 @@
-//! Tests of what every algorithm must do, and of the tables that derive from it.
+//! Tests of every algorithm.
 
-use super::golden::{MAKE, devices, goldens, run, table};
+use super::golden::{committed, devices, table};
 use super::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -47,34 +47,42 @@ fn context(seed: u64, device: &Device) -> Context {
         seed,
         precision: Precision::F32,
         device: device.clone(),
+        golden: None,
     }
 }
 
 /// Every algorithm with the hyper-parameters of each of its golden folders, whose networks are
 /// small.
 fn variants() -> Vec<(Definition, toml::Table)> {
-    let of = |known: Definition| {
-        goldens(known.name).into_iter().map(move |golden| (known, table(&golden)))
+    let of = |golden: &golden::Golden| {
+        let definition = ALGORITHMS.iter().find(|known| golden.config["algorithm"] == known.name);
+        definition.map(|definition| (*definition, table(golden)))
     };
-    ALGORITHMS.into_iter().flat_map(of).collect()
+    committed().iter().filter_map(of).collect()
+}
+
+/// The first variant of an algorithm.
+fn variant(name: &str) -> (Definition, toml::Table) {
+    variants().into_iter().find(|(known, _)| known.name == name).unwrap()
 }
 
 fn agent(definition: Definition, table: &toml::Table, context: &Context) -> Agent {
-    Agent::new(definition, table, context.clone()).unwrap()
+    let hyperparameters = Hyperparameters::new(&definition, table.clone()).unwrap();
+    Agent::new(definition, &hyperparameters, context.clone()).unwrap()
 }
 
-/// The items of update number `step`.
-fn items(step: u64, agent: &Agent) -> Vec<u32> {
+/// The indices of update number `step`.
+fn indices(step: u64, agent: &Agent) -> Vec<u32> {
     let first = step as usize * BATCH;
-    (first..first + BATCH).map(|item| (item % agent.items()) as u32).collect()
+    (first..first + BATCH).map(|index| (index % agent.dataset_len()) as u32).collect()
 }
 
 fn train(agent: &mut Agent, steps: u64) -> Vec<Vec<Option<f32>>> {
-    (0..steps).map(|_| agent.update(&items(agent.step(), agent)).unwrap()).collect()
+    (0..steps).map(|_| agent.update(&indices(agent.step(), agent)).unwrap()).collect()
 }
 
 #[test]
-fn a_saved_state_goes_on_bit_for_bit() {
+fn a_saved_state_resumes_bit_for_bit() {
     for (device, (definition, table)) in
         devices().iter().flat_map(|device| variants().into_iter().map(move |v| (device, v)))
     {
@@ -110,7 +118,7 @@ fn a_saved_state_goes_on_bit_for_bit() {
 }
 
 #[test]
-fn a_state_that_does_not_fit_is_refused() {
+fn an_unfit_state_is_refused() {
     let mut variants = variants().into_iter();
     let one = variants.next().unwrap();
     let other = variants.find(|(known, _)| known.name != one.0.name).unwrap();
@@ -134,7 +142,7 @@ fn a_state_that_does_not_fit_is_refused() {
 }
 
 #[test]
-fn the_seed_alone_decides_the_weights() {
+fn weights_are_a_function_of_the_seed() {
     for (definition, table) in variants() {
         let run = |seed| {
             let context = context(seed, &Device::Cpu);
@@ -150,12 +158,11 @@ fn the_seed_alone_decides_the_weights() {
     }
 }
 
-/// What updates measure is in the algorithm's table, once each, and nothing else is there.
 #[test]
-fn a_metric_has_the_same_name_where_it_is_computed_and_in_the_table() {
+fn measured_metrics_are_those_of_the_table() {
     let mut found: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     for (definition, table) in variants() {
-        let mut algorithm = (definition.start)(&table, context(0, &Device::Cpu)).unwrap();
+        let mut algorithm = agent(definition, &table, &context(0, &Device::Cpu)).algorithm;
         for step in 0..STEPS {
             let measured = algorithm.update(step, &Vec::from_iter(0..BATCH as u32)).unwrap();
             let names = BTreeSet::from_iter(measured.iter().map(|(name, _)| *name));
@@ -164,19 +171,24 @@ fn a_metric_has_the_same_name_where_it_is_computed_and_in_the_table() {
         }
     }
     for Definition { name, metrics, .. } in ALGORITHMS {
-        assert_eq!(found[name], metrics.iter().map(|metric| metric.name).collect(), "{name}");
+        assert_eq!(found[*name], metrics.iter().map(|metric| metric.name).collect(), "{name}");
     }
 }
 
 #[test]
-fn every_value_is_finite_and_every_weight_that_is_trained_has_a_gradient() {
+fn metrics_are_finite_and_trained_weights_have_gradients() {
     for (definition, table) in variants() {
         let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
         for values in train(&mut agent, STEPS) {
             assert!(values.iter().flatten().all(|value| value.is_finite()), "{values:?}");
         }
-        for (name, moment) in
-            agent.parts().save().unwrap().iter().filter(|(name, _)| name.starts_with("adam_m"))
+        for (name, moment) in agent
+            .algorithm
+            .state_dict()
+            .save()
+            .unwrap()
+            .iter()
+            .filter(|(name, _)| name.starts_with("adam_m"))
         {
             let moment: Vec<f32> = moment.flatten_all().unwrap().to_vec1().unwrap();
             let zeros = moment.iter().filter(|x| **x == 0.0).count();
@@ -193,20 +205,23 @@ fn every_value_is_finite_and_every_weight_that_is_trained_has_a_gradient() {
     }
 }
 
-/// Weights that are not a number end up in a metric, where the training loop sees it, whatever
-/// maximum or minimum they went through; and neither such a state nor such a policy is handed over.
+/// A NaN among weights reaches a metric, where the training loop sees it, and such a state is not
+/// saved.
 #[test]
-fn a_nan_is_never_dropped() {
+fn a_nan_reaches_a_metric() {
     for (definition, table) in variants() {
-        let count = agent(definition, &table, &context(0, &Device::Cpu)).parts().networks().len();
+        let count = agent(definition, &table, &context(0, &Device::Cpu))
+            .algorithm
+            .state_dict()
+            .networks()
+            .len();
         assert!(count > 1, "{}", definition.name);
         for network in 0..count {
             let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
-            let (name, weights) = agent.parts().networks().swap_remove(network);
+            let (name, weights) = agent.algorithm.state_dict().networks().swap_remove(network);
             weights.change(|values| values.slice_set(&(values * f64::NAN)?, 0, 0)).unwrap();
             let values = train(&mut agent, STEPS);
-            // By these the policy acts, but nothing is learned from them: they are averages of
-            // networks that are watched.
+            // Target networks by which the policy acts, but from which nothing is learned.
             let unread = match definition.name {
                 "align-iql" | "idql" => name == "target_actor",
                 "diffuser" => name.starts_with("target"),
@@ -224,20 +239,19 @@ fn a_nan_is_never_dropped() {
 }
 
 #[test]
-fn a_hyper_parameter_that_is_refused_is_named() {
+fn an_error_names_the_hyper_parameter() {
     for definition in ALGORITHMS {
-        let Some(toml::Value::Table(agent)) =
-            Values::of(&definition).for_task(None).remove("agent")
+        let Some(toml::Value::Table(agent)) = Values::of(definition).for_task(None).remove("agent")
         else {
             panic!("{} has no values", definition.name)
         };
         for key in agent.keys().filter(|key| agent[*key].is_float()) {
             let mut changed = agent.clone();
             changed.insert(key.clone(), "much".into());
-            let error = (definition.check)(&changed).unwrap_err().to_string();
+            let error = (definition.read)(&changed).err().unwrap().to_string();
             assert!(error.contains(&format!("in `{key}`")), "{} {key}: {error}", definition.name);
             changed.remove(key);
-            let error = (definition.check)(&changed).unwrap_err().to_string();
+            let error = (definition.read)(&changed).err().unwrap().to_string();
             assert!(
                 error.contains(&format!("missing field `{key}`")),
                 "{} {key}: {error}",
@@ -248,22 +262,105 @@ fn a_hyper_parameter_that_is_refused_is_named() {
 }
 
 #[test]
-fn metric_names_are_prometheus_names_and_distinct() {
-    for definition in ALGORITHMS {
-        let mut names: Vec<_> = definition.metrics.iter().map(|metric| metric.name).collect();
-        assert!(
-            names.iter().all(|name| name
-                .chars()
-                .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')),
-            "{names:?}"
-        );
-        names.sort_unstable();
-        names.dedup();
-        assert_eq!(names.len(), definition.metrics.len(), "{}", definition.name);
+fn data_without_examples_is_refused_with_a_hint() {
+    let mut single = arrays();
+    (single.terminals, single.timeouts) = (vec![false; 10 * BATCH], vec![true; 10 * BATCH]);
+    let single = Arc::new(Transitions::of(single).unwrap());
+    for (name, words, hint) in [
+        ("onestep", "has a next action", "datasets inspect"),
+        ("rebrac", "has a next action", "datasets inspect"),
+        ("sfbc", "transitions (agent.shortest_episode)", "shortest_episode=1"),
+        ("diffuser", "plans ahead", "horizon"),
+    ] {
+        let (definition, mut table) = variant(name);
+        if name == "sfbc" {
+            table.insert("shortest_episode".to_owned(), 2.into());
+        }
+        let context = Context { transitions: single.clone(), ..context(0, &Device::Cpu) };
+        let hyperparameters = Hyperparameters::new(&definition, table).unwrap();
+        let error = Agent::new(definition, &hyperparameters, context).err().unwrap();
+        assert!(error.to_string().contains(words) && error.hint().contains(hint), "{error}");
+    }
+}
+
+/// Two of five transitions are the last of an episode that is cut off.
+#[test]
+fn transitions_without_a_next_action_are_left_out() {
+    let arrays = Arrays {
+        observation_dim: 1,
+        action_dim: 1,
+        observations: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.0],
+        actions: vec![0.0, 0.1, 0.2, 0.3, 0.4, 0.5],
+        rewards: vec![0.0; 6],
+        next_observations: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+        terminals: vec![false, true, false, false, false, false],
+        timeouts: vec![false, false, false, true, false, true],
+    };
+    let transitions = Arc::new(Transitions::of(arrays).unwrap());
+    let context = Context { transitions, ..context(0, &Device::Cpu) };
+    let rows = context.with_next_action().unwrap();
+    let next = context.next_actions(&rows).unwrap().to_vec2::<f32>().unwrap();
+    assert_eq!((&rows[..], next.concat()), (&[0, 1, 2, 4][..], vec![0.1, 0.0, 0.3, 0.5]));
+}
+
+/// The networks whose optimizers or weights move in each step of a short run.
+#[test]
+fn each_phase_trains_its_networks() {
+    for (name, lengths, phases, expected) in [
+        (
+            "onestep",
+            toml::toml! { behavior = 4 critic = 2 policy = 4 },
+            vec![0, 4, 6],
+            vec![&["behavior"][..], &["critic"], &["actor"]],
+        ),
+        (
+            "dtql",
+            toml::toml! { pretraining = 4 policy = 6 },
+            vec![0, 4],
+            vec![&["critic", "diffusion", "value"], &["actor", "critic", "diffusion", "value"]],
+        ),
+        (
+            "sfbc",
+            toml::toml! { behavior = 3 critic = 2 planning = 3 },
+            vec![0, 3, 5, 8],
+            vec![&["actor"], &["critic"], &[], &["critic"]],
+        ),
+    ] {
+        let (definition, mut table) = variant(name);
+        table.insert("phases".to_owned(), lengths.into());
+        let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
+        assert_eq!(agent.phases(), phases);
+        let moments = |agent: &mut Agent| -> BTreeMap<String, Vec<f32>> {
+            let state = agent.algorithm.state_dict().save().unwrap().into_iter();
+            let moments =
+                state.filter_map(|(name, x)| Some((name.strip_prefix("adam_v.")?.to_owned(), x)));
+            moments.map(|(name, x)| (name, x.flatten_all().unwrap().to_vec1().unwrap())).collect()
+        };
+        for step in 0..STEPS {
+            let before = moments(&mut agent);
+            train(&mut agent, 1);
+            let after = moments(&mut agent);
+            let moved = before.iter().filter(|(name, x)| after[*name] != **x);
+            let networks =
+                BTreeSet::from_iter(moved.map(|(name, _)| name.split('.').next().unwrap()));
+            let phase = phases.partition_point(|first| *first <= step) - 1;
+            assert_eq!(Vec::from_iter(networks), expected[phase], "{name}, step {step}");
+        }
     }
 }
 
 #[test]
-fn golden_folders_are_what_their_script_makes() {
-    run(MAKE, &["--check"]);
+fn contradictory_hyper_parameters_are_refused() {
+    for (name, change, words) in [
+        ("sfbc", toml::toml! { averaged = 7 }, "at most candidates"),
+        ("sfbc", toml::toml! { actor.norm = true }, "actor.norm"),
+        ("diffuser", toml::toml! { replan_every = 1000 }, "at most the horizon"),
+        ("quad", toml::toml! { eta.maximum = -1.0 }, "at least 0"),
+        ("quad", toml::toml! { eta.initial = 1e9 }, "between eta.minimum and eta.maximum"),
+    ] {
+        let (definition, mut table) = variant(name);
+        merge(&mut table, change);
+        let error = (definition.read)(&table).err().unwrap().to_string();
+        assert!(error.contains(words), "{name}: {error}");
+    }
 }

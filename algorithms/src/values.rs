@@ -14,11 +14,10 @@ use crate::Definition;
 /// The file of one algorithm.
 #[derive(Debug, Deserialize)]
 pub struct Values {
-    /// What the algorithm is, in a few words.
+    /// A short description of the algorithm.
     pub about: String,
-    /// What a gradient step costs with the values for `hopper-medium-v2`: billions of additions and
-    /// multiplications in the products of its networks, of which two cores do some 100 to 200 a
-    /// second.
+    /// Cost of a gradient step with the values for `hopper-medium-v2`: billions of additions and
+    /// multiplications in the products of its networks. Two cores do some 100 to 200 a second.
     pub gflop: String,
     /// Patterns of the tasks for which its authors give values.
     pub given: Vec<String>,
@@ -34,7 +33,7 @@ impl Values {
     /// Reads an algorithm's values.
     #[allow(clippy::expect_used)] // The file is part of the program; a test reads each.
     pub fn of(definition: &Definition) -> Self {
-        toml::from_str(definition.settings).expect("the embedded values are valid")
+        toml::from_str(definition.presets).expect("the embedded values are valid")
     }
 
     /// Keys of an experiment for a task; without one, what all tasks share.
@@ -49,7 +48,7 @@ impl Values {
     }
 }
 
-/// Whether a name fits a pattern, in which `*` stands for any letters.
+/// True if a name fits a pattern, in which `*` stands for any letters.
 pub fn fits(pattern: &str, name: &str) -> bool {
     match pattern.split_once('*') {
         None => pattern == name,

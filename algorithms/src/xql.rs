@@ -3,29 +3,19 @@
 //! data, β·ln E exp(Q/β), without a sample of a policy. What its authors' scripts add for single
 //! datasets is in `pairs` and `value_steps`.
 
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-#[path = "golden/xql.rs"]
-mod golden;
-
 use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting};
+use super::definition::{Definition, Metric, Reporting, start};
 use super::hyperparameters::{Count, NotNegative, Positive};
 use super::in_sample::{Common, Helps, ImplicitLosses, InSample, read, scale_down, table};
-use super::random::{Purpose, stream};
 use candle_core::{Result, Tensor};
-use rand::Rng;
-use rand_distr::{Distribution, StandardNormal};
 use serde::Deserialize;
 
-/// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "xql",
-    settings: include_str!("../../presets/xql.toml"),
+    presets: include_str!("../../presets/xql.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
-    check: |table| read::<Config>(table).map(drop),
-    start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
+    read: |table| Ok(start(read::<Config>(table)?, InSample::new)),
 };
 
 /// Bound of the noise on the actions that V sees.
@@ -40,7 +30,7 @@ const METRICS: &[Metric] = &table(Helps {
 });
 
 /// XQL's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     #[serde(flatten)]
@@ -53,56 +43,14 @@ struct Config {
     temperature: Positive,
     /// Error of the critics from which their loss is linear.
     huber: Positive,
-    /// Whether the actor's learning rate falls to 0 along a cosine.
+    /// Decay of the actor's learning rate to 0 along a cosine.
     actor_rate_decays: bool,
     /// Uniform actions per transition that V sees beside the data's.
     random_actions: u8,
     /// Standard deviation of the noise on the data's actions that V sees.
     value_noise: NotNegative,
-    /// Steps of V per update.
+    /// V's steps per update.
     value_steps: Count,
-}
-
-/// The random numbers of one update.
-struct Noise {
-    /// Uniform in ±1, `[n·B, a]`: n = `random_actions` for each state, one after the other.
-    actions: Option<Tensor>,
-    /// Standard normal, `[B, a]`.
-    normal: Option<Tensor>,
-}
-
-impl Config {
-    fn noise(&self, context: &Context, step: u64) -> Result<Noise> {
-        let mut generator = stream(context.seed, Purpose::Noise, step);
-        let (b, a, device) = (context.batch_size, context.action_dim(), &context.device);
-        let (n, noisy) = (usize::from(self.random_actions), *self.value_noise > 0.0);
-        let uniform: Vec<f32> = (0..n * b * a).map(|_| generator.random_range(-1.0..1.0)).collect();
-        let mut normal =
-            || (0..b * a).map(|_| StandardNormal.sample(&mut generator)).collect::<Vec<f32>>();
-        Ok(Noise {
-            actions: (n > 0).then(|| Tensor::from_vec(uniform, (n * b, a), device)).transpose()?,
-            normal: noisy.then(|| Tensor::from_vec(normal(), (b, a), device)).transpose()?,
-        })
-    }
-
-    /// The batch's states and its actions with noise; behind these the states again, with actions
-    /// at random.
-    fn pairs_with(&self, batch: &Minibatch, noise: &Noise) -> Result<(Tensor, Tensor)> {
-        let (mut states, mut actions) = (batch.observations.clone(), batch.actions.clone());
-        if let Some(normal) = &noise.normal {
-            let noise =
-                (normal * f64::from(*self.value_noise))?.clamp(-LARGEST_NOISE, LARGEST_NOISE)?;
-            actions = (actions + noise)?.clamp(-1.0, 1.0)?;
-        }
-        if let Some(random) = &noise.actions {
-            let (b, o) = states.dims2()?;
-            let n = usize::from(self.random_actions);
-            let again = states.unsqueeze(1)?.broadcast_as((b, n, o))?.reshape((n * b, o))?;
-            (states, actions) =
-                (Tensor::cat(&[&states, &again], 0)?, Tensor::cat(&[&actions, random], 0)?);
-        }
-        Ok((states, actions))
-    }
 }
 
 impl ImplicitLosses for Config {
@@ -117,7 +65,6 @@ impl ImplicitLosses for Config {
         (z.broadcast_add(&down)?.exp()? - (z + 1.0)?.broadcast_mul(&down.exp()?)?)?.mean_all()
     }
 
-    /// As IQL's.
     fn weights(&self, advantages: &Tensor) -> Result<Tensor> {
         (advantages * f64::from(*self.temperature))?.exp()
     }
@@ -129,16 +76,31 @@ impl ImplicitLosses for Config {
         ((near.sqr()? * 0.5)? + ((error - near)? * huber)?)?.sum(0)?.mean_all()
     }
 
+    /// The batch's states and its actions with noise, then the states again with random actions.
     fn pairs(
         &self,
         context: &Context,
         step: u64,
         batch: &Minibatch,
     ) -> Result<Option<(Tensor, Tensor)>> {
-        if self.random_actions == 0 && *self.value_noise == 0.0 {
+        let (n, noise) = (usize::from(self.random_actions), f64::from(*self.value_noise));
+        if n == 0 && noise == 0.0 {
             return Ok(None);
         }
-        self.pairs_with(batch, &self.noise(context, step)?).map(Some)
+        let (mut states, mut actions) = (batch.observations.clone(), batch.actions.clone());
+        let (mut random, (b, a)) = (context.random(step), actions.dims2()?);
+        let others = (n > 0).then(|| random.uniform("random_actions", (n * b, a), -1.0..1.0));
+        if noise > 0.0 {
+            let noise = (random.normal("value_noise", (b, a))? * noise)?;
+            actions = (actions + noise.clamp(-LARGEST_NOISE, LARGEST_NOISE)?)?.clamp(-1.0, 1.0)?;
+        }
+        if let Some(others) = others.transpose()? {
+            let (_, o) = states.dims2()?;
+            let again = states.unsqueeze(1)?.broadcast_as((b, n, o))?.reshape((n * b, o))?;
+            states = Tensor::cat(&[&states, &again], 0)?;
+            actions = Tensor::cat(&[&actions, &others], 0)?;
+        }
+        Ok(Some((states, actions)))
     }
 
     fn value_steps(&self) -> u64 {

@@ -113,7 +113,7 @@ def test_a_row_has_all_metrics_of_its_step(hopper_runs, tmp_path):
         file.write('{"step":30,"sec')
     rows = quad_rl.metrics(tmp_path / "cut off")
     assert [row["step"] for row in rows] == [10, 20]
-    assert "train/q_mean" not in rows[0] and {"seconds", "train/q_mean", "evaluation/score_std"} <= rows[1].keys()
+    assert "train/target_q_mean" not in rows[0] and {"seconds", "train/target_q_mean", "evaluation/score_std"} <= rows[1].keys()
     same(of_rows(rows), series(hopper_runs / "seed0"))
     with pytest.raises(FileNotFoundError, match="nothing"):
         quad_rl.metrics(tmp_path / "nothing")

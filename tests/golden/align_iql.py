@@ -21,7 +21,7 @@ AGENT = {
     "candidates": 10,
 }
 HIDDEN = {"narrow": 5, "small": 7, "hopper": 256}  # the actor's
-VARIANTS = "align-iql", "idql"
+FOLDERS = {"align-iql": (20, "small"), "idql": (53, "small")}
 
 
 def make_config(variant, size):

@@ -24,6 +24,7 @@ AGENT = {
     "ema_rate": 0.05,
     "phases": {"cloning": 0, "learning": 1},
 }
+FOLDERS = {"cql": (27, "small"), "cql-lagrange": (28, "small"), "cql-cloning": (29, "small")}
 VARIANTS = {
     "cql": {},
     "cql-lagrange": {"samples": 5, "threshold": 0.5, "least_gap": 4.0, "phases": {"cloning": 1, "learning": 3}},
@@ -129,7 +130,7 @@ def update(config, state, inputs):
     cloning = step * sum(shares.values()) < config["total_steps"] * shares["cloning"]
 
     out = {"targets": targets_of(config, state, inputs), "alpha_prime": 0.0, "alpha": np.exp(state["log_alpha"]["value"][0])}
-    out["q_mean"] = out["targets"].mean()
+    out["target_q_mean"] = out["targets"].mean()
 
     # The policy and α.
     batch = s, a, inputs["policy_noise"]

@@ -24,7 +24,7 @@ SMALL = {"diffusion_steps": 4, "guidance": {"steps": 2, "scale": 0.5, "stop": 1}
 PAPER = {"diffusion_steps": 20, "guidance": {"steps": 2, "scale": 0.1, "stop": 2}, "candidates": 4, "replan_every": 1}
 # The step: one in which the networks that plan move, or in which they become copies.
 STEPS = {"diffuser": 1000, "diffuser-attention": 990}
-VARIANTS = tuple(STEPS)
+FOLDERS = {"diffuser": (40, "small"), "diffuser-attention": (41, "small")}
 NETWORKS = {
     ("diffuser", "small"): {"horizon": 16, "channels": 4, "multipliers": [1, 4], "groups": 2},
     ("diffuser", "hopper"): {"horizon": 32, "channels": 32, "multipliers": [1, 2, 4, 8], "groups": 8},

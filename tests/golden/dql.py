@@ -45,6 +45,7 @@ SIZES = {
     "hopper": {"hidden": 256, "batch_size": 256, "select": 32},
 }
 # The step: the first at which the target actor moves, or the last of its turns before.
+FOLDERS = {"dql": (18, "small"), "dql-max-backup": (19, "small")}
 VARIANTS = {"dql": (1000, {"samples": 1}), "dql-max-backup": (995, {"samples": 10})}
 
 
@@ -120,7 +121,7 @@ def update(config, state, inputs):
     activations = agent["actor"]["activation"], agent["critic"]["activation"]
 
     next_actions, targets = target_values(config, state, inputs)
-    out = {"next_actions": next_actions, "targets": targets, "q_mean": targets.mean()}
+    out = {"next_actions": next_actions, "targets": targets, "target_q_mean": targets.mean()}
 
     # Critics.
     out["critic_loss"], gradients = critic_gradient(state["critic"], s, a, targets, activations[1])

@@ -47,6 +47,7 @@ SIZES = {
     "hopper": {"hidden": 256, "batch_size": 256, "select": 32},
 }
 # The step, of 2,000 of which 500 are pre-training, and what is switched on.
+FOLDERS = {"dtql-pretraining": (27, "small"), "dtql": (28, "small"), "dtql-likelihood": (29, "small")}
 VARIANTS = {
     "dtql-pretraining": (300, {"likelihood": 0.5, "cosine": True}),
     "dtql": (700, {"likelihood": 0.0, "cosine": False}),
@@ -159,7 +160,7 @@ def update(config, state, inputs):
     v, next_v = (fast_value(state["value"], inputs[x], activations["value"]) for x in ("observations", "next_observations"))
     targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * next_v
     q = fast_values(state["critic"], s, a, activations["critic"]).min(0)
-    out = dict(state) | {"targets": targets, "q_mean": targets.mean(), "v_mean": v.mean()}
+    out = dict(state) | {"targets": targets, "target_q_mean": targets.mean(), "v_mean": v.mean()}
     out["value_loss"], gradients = value_gradient(state["value"], s, q, agent["expectile"], activations["value"])
     out |= adam_step(state, "value", gradients, critic_rate, step)
     out["critic_loss"], gradients = critic_gradient(state["critic"], s, a, targets, activations["critic"])

@@ -6,7 +6,7 @@ import numpy as np
 from networks import adam_step, fast_values, follow, near, random_moments, random_network, shape, single
 from onestep import critic_gradient
 
-VARIANTS = ("fqe",)
+FOLDERS = {"fqe": (50, "small")}
 
 
 def make_config(variant, size):
@@ -41,7 +41,7 @@ def update(config, state, inputs):
     )
     moved = adam_step(state, "critic", gradients, agent["learning_rate"], config["step"], agent["weight_decay"])
     target = follow(state["target_critic"], moved["critic"], agent["ema_rate"])
-    out = state | moved | {"target_critic": target, "q_mean": targets.mean(), "critic_loss": loss}
+    out = state | moved | {"target_critic": target, "target_q_mean": targets.mean(), "critic_loss": loss}
     return out, None
 
 

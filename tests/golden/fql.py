@@ -10,6 +10,7 @@ from networks import adam_step, compiled, configuration, ensemble, fast_values, 
 from networks import random_network, shape, single, values
 
 CRITICS = 2
+FOLDERS = {"fql": (56, "small"), "fql-normalized": (57, "small")}
 VARIANTS = {"fql": 700, "fql-normalized": 701}
 SIZES = {
     "narrow": {"hidden": 5, "batch_size": 23, "select": 3},
@@ -102,7 +103,7 @@ def update(config, state, inputs):
     led = flow_actions(config, state["flow"], s, inputs["policy_noise"])
     taken = fast_one_step(state["actor"], s, inputs["policy_noise"], activation)
 
-    out = dict(state) | {"targets": targets, "q_mean": targets.mean(), "flow_actions": np.clip(led, -1, 1)}
+    out = dict(state) | {"targets": targets, "target_q_mean": targets.mean(), "flow_actions": np.clip(led, -1, 1)}
     out["critic_loss"], of_critics = critic_gradient(state["critic"], s, a, targets, critic_activation)
     out["bc_loss"], of_flow = flow_gradient(state["flow"], s, a, inputs["start_noise"], inputs["times"], activation)
     given = state["critic"], s, inputs["policy_noise"], out["flow_actions"], (agent["alpha"], agent["normalize_q"])

@@ -112,7 +112,7 @@ def update_critics(config, state, inputs, network, gradient=critic_gradient):
     loss, gradients = gradient(state["critic"], inputs["observations"], inputs["actions"], targets, activation)
     out = adam_step(state, "critic", gradients, agent["critic_learning_rate"], config["step"])
     target = follow(state["target_critic"], out["critic"], agent["ema_rate"])
-    return out | {"target_critic": target, "critic_loss": loss, "targets": targets, "q_mean": targets.mean()}
+    return out | {"target_critic": target, "critic_loss": loss, "targets": targets, "target_q_mean": targets.mean()}
 
 
 def update(config, state, inputs, update_value, weigh, gradient=critic_gradient):

@@ -8,7 +8,7 @@ import implicit
 from implicit import LARGEST_WEIGHT, RATES, SIZES, act, fast_value, value
 from networks import adam_step, compiled, shape
 
-VARIANTS = ("iql",)
+FOLDERS = {"iql": (13, "small")}
 
 
 def make_config(variant, size):

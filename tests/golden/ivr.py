@@ -10,6 +10,7 @@ from networks import adam_step, compiled
 
 LARGEST_EXPONENT = 5.0
 # SQL's weights are advantages, so some must exceed the largest weight: its values are many times as large.
+FOLDERS = {"sql": (14, "small"), "eql": (15, "small")}
 VARIANTS = {
     "sql": {"divergence": "sparse", "alpha": {"sparse": 40.0, "exponential": 1.5}, "spread": 50},
     "eql": {"divergence": "exponential", "alpha": {"sparse": 40.0, "exponential": 1.5}, "spread": 1.5},

@@ -1,6 +1,6 @@
 """Golden numbers: one update of an algorithm, written a second time with JAX in float64.
 
-    make.py --seed N --out DIR [--variant quad|dac|…|iql] [--size narrow|small|hopper]
+    make.py --seed N --out DIR [--variant quad|dac|…|iql|all] [--size narrow|small|hopper]
     make.py --all      rewrites the committed folders, which stand beside this file
     make.py --check    checks that the committed folders are what it makes now
 
@@ -9,73 +9,20 @@ the papers and that page.
 """
 
 import argparse
+import importlib
 import json
 from pathlib import Path
 
 import numpy as np
 from safetensors.numpy import load_file, save_file
 
-import align_iql
-import cql
-import diffuser
-import dql
-import dtql
-import fqe
-import fql
-import iql
-import ivr
-import onestep
-import quad
-import sfbc
-import td3bc
-import xql
-
 HERE = Path(__file__).parent
 
-# The committed folders: seed, variant, size.
-FOLDERS = {
-    "quad": (1, "quad", "small"),
-    "dac": (2, "dac", "small"),
-    "maxq": (3, "maxq", "small"),
-    "none": (4, "none", "narrow"),
-    "one-sample": (5, "one-sample", "narrow"),
-    "ten-critics": (6, "ten-critics", "narrow"),
-    "constant": (24, "constant", "small"),
-    "mean": (25, "mean", "small"),
-    "shuffled": (26, "shuffled", "small"),
-    "iql": (13, "iql", "small"),
-    "sql": (14, "sql", "small"),
-    "eql": (15, "eql", "small"),
-    "xql": (16, "xql", "small"),
-    "xql-extras": (17, "xql-extras", "small"),
-    "dql": (18, "dql", "small"),
-    "dql-max-backup": (19, "dql-max-backup", "small"),
-    "align-iql": (20, "align-iql", "small"),
-    "idql": (53, "idql", "small"),
-    "onestep-behavior": (21, "onestep-behavior", "small"),
-    "onestep-critic": (22, "onestep-critic", "small"),
-    "onestep-policy": (23, "onestep-policy", "small"),
-    "cql": (27, "cql", "small"),
-    "cql-lagrange": (28, "cql-lagrange", "small"),
-    "cql-cloning": (29, "cql-cloning", "small"),
-    "dtql-pretraining": (27, "dtql-pretraining", "small"),
-    "dtql": (28, "dtql", "small"),
-    "dtql-likelihood": (29, "dtql-likelihood", "small"),
-    "sfbc-behavior": (40, "sfbc-behavior", "small"),
-    "sfbc-critic": (41, "sfbc-critic", "small"),
-    "sfbc-planning": (42, "sfbc-planning", "small"),
-    "diffuser": (40, "diffuser", "small"),
-    "diffuser-attention": (41, "diffuser-attention", "small"),
-    "fqe": (50, "fqe", "small"),
-    "td3-bc": (51, "td3-bc", "small"),
-    "td3-bc-critic": (52, "td3-bc-critic", "small"),
-    "rebrac": (54, "rebrac", "small"),
-    "rebrac-critic": (55, "rebrac-critic", "small"),
-    "fql": (56, "fql", "small"),
-    "fql-normalized": (57, "fql-normalized", "small"),
-}
-MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser, fqe, td3bc, fql
-ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorithm.VARIANTS}
+# The scripts of algorithms beside this file. In each, FOLDERS has seed and size of the committed folder of each variant.
+SCRIPTS = [importlib.import_module(path.stem) for path in sorted(HERE.glob("*.py")) if path.stem != "make"]
+MODULES = [script for script in SCRIPTS if hasattr(script, "FOLDERS")]
+FOLDERS = {variant: made_with for module in MODULES for variant, made_with in module.FOLDERS.items()}
+ALGORITHMS = {variant: module for module in MODULES for variant in module.FOLDERS}
 
 
 def flatten(tree):
@@ -129,7 +76,7 @@ def make(seed, variant, size):
     raise SystemExit(f"{variant} at size {size}: nothing suitable in a thousand draws")
 
 
-def write(folder, seed, variant, size):
+def write(folder, variant, seed, size):
     config, state, inputs, expected = make(seed, variant, size)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
@@ -137,9 +84,9 @@ def write(folder, seed, variant, size):
         save_file(flatten(tensors), folder / f"{name}.safetensors")
 
 
-def check(name, made_with):
+def check(name, seed, size):
     """That a committed folder is what the script makes now, within float32's rounding."""
-    config, *made = make(*made_with)
+    config, *made = make(seed, name, size)
     if json.loads((HERE / name / "config.json").read_text()) != config:
         raise SystemExit(f"{name}: config.json differs")
     for file, room, tensors in zip(("state", "inputs", "expected"), (0, 0, 1e-6), made, strict=True):
@@ -156,21 +103,24 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="folder to write")
-    parser.add_argument("--variant", choices=ALGORITHMS, default="quad")
-    parser.add_argument("--size", choices=quad.SIZES, default="small")
+    parser.add_argument("--variant", choices=[*ALGORITHMS, "all"], default="quad")
+    parser.add_argument("--size", choices=["narrow", "small", "hopper"], default="small")
     parser.add_argument("--all", action="store_true", help="rewrite the committed folders")
     parser.add_argument("--check", action="store_true", help="check the committed folders")
     arguments = parser.parse_args()
     if not (arguments.out or arguments.all or arguments.check):
         parser.error("nothing to do: give --out DIR, --all or --check")
-    if arguments.out:
-        write(arguments.out, arguments.seed, arguments.variant, arguments.size)
+    if arguments.out and arguments.variant == "all":
+        for variant in ALGORITHMS:
+            write(arguments.out / variant, variant, arguments.seed, arguments.size)
+    elif arguments.out:
+        write(arguments.out, arguments.variant, arguments.seed, arguments.size)
     if arguments.all:
         for name, made_with in FOLDERS.items():
-            write(HERE / name, *made_with)
+            write(HERE / name, name, *made_with)
     if arguments.check:
         for name, made_with in FOLDERS.items():
-            check(name, made_with)
+            check(name, *made_with)
         print(f"{len(FOLDERS)} folders are as made")
 
 

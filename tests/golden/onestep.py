@@ -19,6 +19,7 @@ AGENT = {
     "phases": {"behavior": 1, "critic": 2, "policy": 1},
 }
 # The step, of 2,000: the second of the critic's phase is the first at which its target moves.
+FOLDERS = {"onestep-behavior": (21, "small"), "onestep-critic": (22, "small"), "onestep-policy": (23, "small")}
 VARIANTS = {"onestep-behavior": 300, "onestep-critic": 501, "onestep-policy": 1700}
 
 
@@ -82,7 +83,8 @@ def advantages_of(config, state, inputs):
     """Q(s, a) less the mean Q of actions that β draws."""
     s, agent = inputs["observations"], config["agent"]
     mean, log_std = fast_gaussian(state["behavior"], s, agent["behavior"]["activation"])
-    actions = mean + np.exp(log_std) * inputs["behavior_noise"]  # as they are drawn, also beyond ±1
+    noise = inputs["behavior_noise"].swapaxes(0, 1)
+    actions = mean + np.exp(log_std) * noise  # as they are drawn, also beyond ±1
     baseline = q_values(state["critic"], np.broadcast_to(s, actions.shape[:1] + s.shape), actions, config).mean(0)
     return q_values(state["critic"], s, inputs["actions"], config) - baseline
 
@@ -91,7 +93,7 @@ def update(config, state, inputs):
     """All that must come out; and the advantages, in the last phase."""
     agent, (name, step) = config["agent"], phase_of(config)
     s, a = inputs["observations"], inputs["actions"]
-    metrics = "behavior_loss", "critic_loss", "q_mean", "actor_loss", "advantage_mean", "weight_mean", "clipped_share"
+    metrics = "behavior_loss", "critic_loss", "target_q_mean", "actor_loss", "advantage_mean", "weight_mean", "clipped_share"
     out = state | dict.fromkeys(metrics, 0.0)
     activation, rate = agent["critic" if name == "critic" else "behavior"]["activation"], agent["learning_rate"]
 
@@ -102,7 +104,7 @@ def update(config, state, inputs):
 
     if name == "critic":
         out["targets"] = targets = targets_of(config, state, inputs)
-        out["q_mean"] = targets.mean()
+        out["target_q_mean"] = targets.mean()
         out["critic_loss"], gradients = critic_gradient(state[name], s, a, targets, activation)
         out |= adam_step(state, name, gradients, rate, step)
         if (step + 1) % agent["ema_every"] == 0:
@@ -149,7 +151,7 @@ def random_inputs(config, rng, size):
     b, a = config["batch_size"], config["action_dim"]
     inputs = implicit.random_inputs(config, rng, size)
     inputs["next_actions"] = single(rng.uniform(-0.99999, 0.99999, (b, a)))
-    inputs["behavior_noise"] = single(rng.normal(size=(config["agent"]["samples"], b, a)))
+    inputs["behavior_noise"] = single(rng.normal(size=(config["agent"]["samples"], b, a)).swapaxes(0, 1))
     return inputs
 
 

@@ -58,6 +58,17 @@ class Variant(NamedTuple):
     agent: dict  # where it differs from AGENT
 
 
+FOLDERS = {
+    "quad": (1, "small"),
+    "dac": (2, "small"),
+    "maxq": (3, "small"),
+    "none": (4, "narrow"),
+    "one-sample": (5, "narrow"),
+    "ten-critics": (6, "narrow"),
+    "constant": (24, "small"),
+    "mean": (25, "small"),
+    "shuffled": (26, "small"),
+}
 VARIANTS = {
     "quad": Variant(1235, {}),
     "dac": Variant(1000, {"guidance": "dac", "gradient_clip": 100.0}),
@@ -160,7 +171,7 @@ def update(config, state, inputs):
     out = {"schedule.beta": beta[1:], "schedule.alpha_bar": alpha_bar[1:]}
 
     next_actions, targets = target_values(config, state, inputs)
-    out |= {"next_actions": next_actions, "targets": targets, "q_mean": targets.mean()}
+    out |= {"next_actions": next_actions, "targets": targets, "target_q_mean": targets.mean()}
 
     # Critics, and their targets.
     loss, gradients = critic_gradient(state["critic"], s, a, targets, agent["critic"]["activation"])

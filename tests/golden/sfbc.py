@@ -22,6 +22,7 @@ AGENT = {
     "phases": {"behavior": 3, "critic": 2, "planning": 3},
 }
 # The step and all steps. Phases have shares of 3, 2, 3 and 2 tenths; of three planning steps the last one is taken.
+FOLDERS = {"sfbc-behavior": (40, "small"), "sfbc-critic": (41, "small"), "sfbc-planning": (42, "small")}
 VARIANTS = {"sfbc-behavior": (300, 2000), "sfbc-critic": (1700, 2000), "sfbc-planning": (7, 10)}
 HIDDEN = {"narrow": [6, 5], "small": [12, 7, 5], "hopper": [128, 64, 32]}
 FREQUENCIES, EMBEDDING = 16, 32
@@ -163,7 +164,7 @@ def planned(config, inputs, values):
 def update(config, state, inputs):
     """All that must come out; and, in planning, the returns' gains over those without values."""
     agent, step, shares = config["agent"], config["step"], config["agent"]["phases"]
-    out = state | dict.fromkeys(("bc_loss", "critic_loss", "q_mean", "v_mean"), 0.0)
+    out = state | dict.fromkeys(("bc_loss", "critic_loss", "target_q_mean", "v_mean"), 0.0)
     s, a = inputs["observations"], inputs["actions"]
     lengths = [shares[name] for name in ("behavior", "critic", "planning", "critic")]
     begins = [config["total_steps"] * sum(lengths[:i]) // sum(lengths) for i in range(4)]
@@ -180,7 +181,7 @@ def update(config, state, inputs):
     if phase != 2:
         targets = state["targets"]
         loss, gradients = critic_gradient(state["critic"], s, a, targets, agent["critic"]["activation"])
-        out |= {"critic_loss": loss, "q_mean": targets.mean()}
+        out |= {"critic_loss": loss, "target_q_mean": targets.mean()}
         return out | adam_step(state, "critic", gradients, agent["critic_learning_rate"], steps), None
 
     # The last third of all states; values of the others are there.

@@ -11,6 +11,7 @@ from implicit import CRITICS, SIZES, critic_gradient, fast_action, mean_action, 
 from networks import adam_step, compiled, fast_values, follow, near, random_moments, random_network, shape, single, values
 
 # The step: in every second one the policy moves, too; TD3+BC counts from 1.
+FOLDERS = {"td3-bc": (51, "small"), "td3-bc-critic": (52, "small"), "rebrac": (54, "small"), "rebrac-critic": (55, "small")}
 VARIANTS = {"td3-bc": 701, "td3-bc-critic": 700, "rebrac": 700, "rebrac-critic": 701}
 AGENT = {
     "gamma": 0.99,
@@ -75,7 +76,7 @@ def update(config, state, inputs):
     targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * next_q
     critic_loss, gradients = (normed_critic_gradient if rebrac else critic_gradient)(state["critic"], s, a, targets, activation)
     out = state | adam_step(state, "critic", gradients, agent["critic_learning_rate"], step)
-    out |= {"targets": targets, "q_mean": targets.mean(), "critic_loss": critic_loss}
+    out |= {"targets": targets, "target_q_mean": targets.mean(), "critic_loss": critic_loss}
     if step % agent["actor_every"] == (0 if rebrac else agent["actor_every"] - 1):
         moved, weight = (penalized_gradient, "actor_penalty") if rebrac else (actor_gradient, "weight")
         (loss, distance), gradients = moved(state["actor"], out["critic"], s, a, agent[weight], activation)

@@ -8,6 +8,7 @@ import implicit
 from implicit import LARGEST_WEIGHT, RATES, SIZES, act, fast_value, least, value
 from networks import adam_step, compiled, fast_values, single, values
 
+FOLDERS = {"xql": (16, "small"), "xql-extras": (17, "small")}
 VARIANTS = {
     "xql": {"actor_rate_decays": True, "random_actions": 0, "value_noise": 0.0, "value_steps": 1},
     "xql-extras": {"actor_rate_decays": False, "random_actions": 1, "value_noise": 0.1, "value_steps": 2},

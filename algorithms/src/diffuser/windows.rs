@@ -1,9 +1,8 @@
-//! Windows of consecutive transitions in units in which the data has mean 0 and standard deviation
-//! 1, with the returns that follow.
+//! Windows of consecutive transitions, standardized, with the returns from their first steps.
 
-use super::AlgorithmError;
 use crate::context::Context;
-use candle_core::{Device, Result, Tensor};
+use crate::error::AlgorithmError;
+use candle_core::{Result, Tensor};
 use quad_dataset::Transitions;
 use quad_nn::Scaling;
 use std::sync::Arc;
@@ -18,9 +17,8 @@ pub(super) struct Windows {
 }
 
 struct Window {
-    /// Its first transition.
     first: u32,
-    /// Transitions in it: H, or fewer where the episode terminates.
+    /// Transitions: H, or fewer where the episode terminates.
     length: u32,
     /// Σ γ^k·r_k from the first transition to the end of the episode.
     value: f32,
@@ -71,28 +69,32 @@ impl Windows {
         }
     }
 
-    /// How many there are.
     pub fn count(&self) -> usize {
         self.windows.len()
     }
 
-    /// The units of the windows' states and actions.
     pub fn units(&self) -> &Scaling {
         &self.units
     }
 
-    /// The windows of these numbers. After the end of an episode there are zeros, in the data's
+    /// The windows with these indices. After the end of an episode there are zeros, in the data's
     /// units.
-    pub fn batch(&self, items: &[u32], device: &Device) -> Result<Batch> {
+    pub fn batch(&self, indices: &[u32], context: &Context) -> Result<Batch> {
+        #[cfg(test)]
+        if let Some(golden) = &context.golden {
+            let [windows, returns] =
+                ["windows", "returns"].map(|name| golden[name].to_device(&context.device));
+            return Ok(Batch { windows: windows?, returns: returns? });
+        }
         let windows: Vec<&Window> =
-            items.iter().map(|item| &self.windows[*item as usize]).collect();
+            indices.iter().map(|index| &self.windows[*index as usize]).collect();
         let rows: Vec<u32> =
             windows.iter().flat_map(|window| window.first..window.first + window.length).collect();
         let mut batch = quad_dataset::Batch::default();
         self.transitions.gather(&rows, &mut batch);
         let padded = |numbers: &[f32], width: usize| {
             let (mut out, mut rest) =
-                (Vec::with_capacity(items.len() * self.horizon * width), numbers);
+                (Vec::with_capacity(indices.len() * self.horizon * width), numbers);
             for (i, window) in windows.iter().enumerate() {
                 let (mine, others) = rest.split_at(window.length as usize * width);
                 out.extend_from_slice(mine);
@@ -114,8 +116,12 @@ impl Windows {
             steps.flat_map(|(action, state)| action.iter().chain(state)).copied().collect();
         let returns: Vec<f32> = windows.iter().map(|window| window.value).collect();
         Ok(Batch {
-            windows: Tensor::from_vec(numbers, (items.len(), self.horizon, a + o), device)?,
-            returns: Tensor::from_vec(returns, items.len(), device)?,
+            windows: Tensor::from_vec(
+                numbers,
+                (indices.len(), self.horizon, a + o),
+                &context.device,
+            )?,
+            returns: Tensor::from_vec(returns, indices.len(), &context.device)?,
         })
     }
 }

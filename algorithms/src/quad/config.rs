@@ -1,12 +1,12 @@
 //! QUAD's hyper-parameters: the `[agent]` table of a preset.
 
-use crate::algorithm::{AgentError, check};
 use crate::definition::read;
+use crate::error::{AgentError, check};
 use crate::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Steps, UnitInterval};
 use quad_nn::MlpConfig;
 use serde::Deserialize;
 
-/// What pulls the policy away from the data.
+/// Guidance of the policy away from the data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Guidance {
@@ -26,7 +26,7 @@ pub(super) enum Guidance {
     Shuffled,
 }
 
-/// How a critic's values of several sampled next actions become one.
+/// Reduction of a critic's values of several sampled next actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum TargetReduce {
@@ -37,7 +37,7 @@ pub(super) enum TargetReduce {
 }
 
 /// The strength η of behavior cloning, the Lagrangian multiplier of Eq. 19.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Copy, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Eta {
     /// Value at the first step.
@@ -52,10 +52,10 @@ pub(super) struct Eta {
     pub maximum: NotNegative,
 }
 
-/// Everything that decides what one update does.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+/// QUAD's hyper-parameters.
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Quad {
+pub(super) struct Config {
     /// The noise predictor's hidden layers.
     pub actor: MlpConfig,
     /// The critics' hidden layers.
@@ -68,7 +68,6 @@ pub(super) struct Quad {
     pub gamma: UnitInterval,
     /// Pessimism ρ of the lower confidence bound (Eq. 20).
     pub rho: NotNegative,
-    /// What guides the actor.
     pub guidance: Guidance,
     /// Temperature τ of the uncertainty weight (Eq. 24); `inf` gives λ = ν̂²/(ν̂² + δ).
     pub tau: f32,
@@ -78,7 +77,7 @@ pub(super) struct Quad {
     pub lambda: Option<UnitInterval>,
     /// Next actions sampled per next state for the target, S.
     pub samples: Count,
-    /// How their values are combined.
+    /// Reduction of their values.
     pub target_reduce: TargetReduce,
     /// Actions that an evaluated policy draws in each state, N_a (Eq. 25).
     pub candidates: Candidates,
@@ -94,13 +93,13 @@ pub(super) struct Quad {
     pub ema_rate: Rate,
     /// EMA rate of ν̂² (Eq. 23), and of λ's means with guidance `mean`.
     pub nu_ema_rate: Rate,
-    /// The target actor follows in updates whose number, from 0, is a multiple of this …
+    /// The target actor is updated in steps whose number, from 0, is a multiple of this …
     pub actor_ema_every: Steps,
     /// … and above this.
     pub actor_ema_start: u64,
 }
 
-impl Quad {
+impl Config {
     /// Reads a table of them and checks what their types do not say.
     pub fn read(table: &toml::Table) -> Result<Self, AgentError> {
         let config: Self = read(table)?;

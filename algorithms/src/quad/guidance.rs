@@ -1,43 +1,75 @@
-//! The critics' gradients at noisy actions, and how far each is trusted: by λ of Eq. 24, or by what
-//! a control has in its place.
+//! The critics' gradients at noisy actions, and their weight: λ of Eq. 24, or a control in its
+//! place.
 
-use super::config::Guidance;
-use super::{Noise, Quad};
+use super::config::{Config, Guidance};
+use super::noise::Noise;
 use crate::context::Minibatch;
-use crate::diffusion::Networks;
-use candle_core::{DType, Result, Tensor};
-use quad_nn::mean_and_variance;
+use crate::state_dict::{StateDict, write};
+use candle_core::{DType, Device, Result, Tensor};
+use quad_nn::{Ensemble, mean_and_variance};
 
-/// What the critics say about noisy actions, and how far they are trusted; all of it constants.
+/// λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), `[B]`, of ν̂², `[]`, and σ², `[B]`; and the denominator.
+fn lambda(nu_squared: &Tensor, sigma_squared: &Tensor, config: &Config) -> Result<[Tensor; 2]> {
+    let (tau, delta) = (f64::from(config.tau), f64::from(*config.delta));
+    let denominator = sigma_squared.affine(1.0 / tau, delta)?.broadcast_add(nu_squared)?;
+    Ok([denominator.recip()?.broadcast_mul(nu_squared)?, denominator])
+}
+
+/// Guidance at noisy actions; constants.
 pub(super) struct Guide {
     /// ḡ: the mean over critics of ∇_a Q̂_k(s, a^t), over the mean of |Q̂_k(s, a)| (Eq. 10), `[B,
     /// a]`.
     pub gradient: Tensor,
-    /// ν̂² after this batch (Eq. 23), `[]`.
-    pub nu_squared: Tensor,
     /// σ² (Eq. 22), `[B]`.
     pub sigma_squared: Tensor,
-    /// The weight of ḡ: λ (Eq. 24), or a control's, `[B]`.
+    /// The weight of ḡ: λ, or a control's, `[B]`.
     pub lambda: Tensor,
     /// Share of the batch in which δ decides λ, `[]`.
     pub delta_share: Tensor,
-    /// With guidance `mean`, its averages after this batch, `[T]`.
-    pub lambda_means: Option<Tensor>,
+    /// The moving averages after this batch.
+    pub averages: Averages,
 }
 
-impl Quad {
-    /// The target critics' gradients at noisy actions, and the weight of each (Eq. 10 and 21–24).
-    pub(super) fn guide(
+/// Moving averages; below 0 where there is none yet.
+pub(super) struct Averages {
+    /// ν̂² (Eq. 23), `[]`.
+    pub nu_squared: Tensor,
+    /// With guidance `mean`: λ at each t, `[T]`.
+    lambda_means: Option<Tensor>,
+}
+
+impl Averages {
+    pub fn new(config: &Config, device: &Device) -> Result<Self> {
+        let unset = || Tensor::full(-1f32, *config.diffusion_steps, device);
+        let lambda_means = (config.guidance == Guidance::Mean).then(unset).transpose()?;
+        Ok(Self { nu_squared: Tensor::new(-1f32, device)?, lambda_means })
+    }
+
+    /// Takes the values of others.
+    pub fn set(&self, others: &Self) -> Result<()> {
+        write(&self.nu_squared, &others.nu_squared)?;
+        if let (Some(means), Some(others)) = (&self.lambda_means, &others.lambda_means) {
+            write(means, others)?;
+        }
+        Ok(())
+    }
+
+    pub fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {
+        let Self { nu_squared, lambda_means } = self;
+        dict.with("nu_squared", nu_squared).with("lambda_means", lambda_means)
+    }
+
+    /// Guidance by the target critics at noisy actions, for which the actor predicts this noise,
+    /// both `[B, a]`.
+    pub fn guide(
         &self,
-        networks: &Networks,
+        config: &Config,
+        critics: &Ensemble,
         batch: &Minibatch,
-        noisy: &Tensor,
-        predicted: &Tensor,
         noise: &Noise,
+        (noisy, predicted): (&Tensor, &Tensor),
     ) -> Result<Guide> {
-        let critics = &networks.target_critics;
-        let scale =
-            (critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
+        let scale = (batch.values(critics)?.abs()?.mean_all()? + 1e-6)?;
         let gradients =
             critics.action_gradients(&batch.observations, noisy)?.broadcast_div(&scale)?;
 
@@ -46,53 +78,51 @@ impl Quad {
         let alignment = gradients.broadcast_mul(&direction)?.sum(2)?; // l_k = u·g_k, [K, B]
         let (mean, sigma_squared) = mean_and_variance(&alignment)?; // l̄, and σ² of Eq. 22
         let spread = mean.broadcast_sub(&mean.mean_all()?)?.sqr()?.mean_all()?;
-        let nu_squared = match &self.nu_squared {
-            Some(before) => (before + ((spread - before)? * f64::from(*self.config.nu_ema_rate))?)?,
-            None => spread,
-        };
-        let (mut lambda, delta_share) = match self.config.guidance {
+        let before = &self.nu_squared;
+        let average = (before + ((&spread - before)? * f64::from(*config.nu_ema_rate))?)?;
+        let nu_squared = before.lt(0f32)?.where_cond(&spread, &average)?; // Eq. 23
+
+        let (ones, zero) = (sigma_squared.ones_like()?, nu_squared.zeros_like()?);
+        let (mut weight, delta_share) = match config.guidance {
             Guidance::Quad | Guidance::Mean | Guidance::Shuffled => {
-                self.agreement(&sigma_squared, &nu_squared)?
+                let [lambda, denominator] = lambda(&nu_squared, &sigma_squared, config)?;
+                let decided = denominator.lt(100.0 * f64::from(*config.delta))?;
+                (lambda, decided.to_dtype(DType::F32)?.mean_all()?)
             }
-            Guidance::Dac | Guidance::None => {
-                (sigma_squared.ones_like()?, nu_squared.zeros_like()?)
-            }
+            Guidance::Dac | Guidance::None => (ones, zero),
             Guidance::Constant => {
-                let lambda = self.config.lambda.map_or(1.0, |lambda| f64::from(*lambda));
-                (sigma_squared.ones_like()?.affine(lambda, 0.0)?, nu_squared.zeros_like()?)
+                let lambda = config.lambda.map_or(1.0, |lambda| f64::from(*lambda));
+                (ones.affine(lambda, 0.0)?, zero)
             }
         };
         let t = &noise.denoising.t;
+        let lambda_means = self.lambda_means.as_ref();
         let lambda_means =
-            self.lambda_means.as_ref().map(|before| self.followed(before, &lambda, t));
-        let lambda_means = lambda_means.transpose()?;
+            lambda_means.map(|before| means_by_step(before, &weight, t, config)).transpose()?;
         if let Some(means) = &lambda_means {
-            lambda = means.index_select(&(t - t.ones_like()?)?, 0)?;
+            weight = means.index_select(&(t - t.ones_like()?)?, 0)?;
         }
         if let Some(permutation) = &noise.permutation {
-            lambda = lambda.index_select(permutation, 0)?;
+            weight = weight.index_select(permutation, 0)?;
         }
-        let gradient = mean_and_variance(&gradients)?.0;
-        Ok(Guide { gradient, nu_squared, sigma_squared, lambda, delta_share, lambda_means })
+        Ok(Guide {
+            gradient: mean_and_variance(&gradients)?.0,
+            sigma_squared,
+            lambda: weight,
+            delta_share,
+            averages: Averages { nu_squared, lambda_means },
+        })
     }
+}
 
-    /// λ (Eq. 24), `[B]`, and the share of the batch in which δ decides it, `[]`.
-    fn agreement(&self, sigma_squared: &Tensor, nu_squared: &Tensor) -> Result<(Tensor, Tensor)> {
-        let (tau, delta) = (f64::from(self.config.tau), f64::from(*self.config.delta));
-        let denominator = sigma_squared.affine(1.0 / tau, delta)?.broadcast_add(nu_squared)?;
-        let decided = denominator.lt(100.0 * delta)?.to_dtype(DType::F32)?.mean_all()?;
-        Ok((denominator.recip()?.broadcast_mul(nu_squared)?, decided))
-    }
-
-    /// λ's average at each t after this batch, `[T]`: the batch's mean where there is none yet
-    /// (below 0), and as before where the batch has no such t.
-    fn followed(&self, before: &Tensor, lambda: &Tensor, t: &Tensor) -> Result<Tensor> {
-        let steps = Tensor::arange(1, 1 + before.elem_count() as u32, t.device())?.unsqueeze(1)?;
-        let is_of = steps.broadcast_eq(&t.unsqueeze(0)?)?.to_dtype(DType::F32)?; // [T, B]
-        let count = is_of.sum(1)?;
-        let mean = (is_of.broadcast_mul(lambda)?.sum(1)? / count.maximum(1f32)?)?;
-        let rate = f64::from(*self.config.nu_ema_rate);
-        let rate = before.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - rate, rate)?;
-        before + ((mean - before)? * (rate * count.minimum(1f32)?)?)?
-    }
+/// λ's average at each t after this batch, `[T]`: the batch's mean where there is none yet (below
+/// 0), and as before where the batch has no such t.
+fn means_by_step(before: &Tensor, lambda: &Tensor, t: &Tensor, config: &Config) -> Result<Tensor> {
+    let steps = Tensor::arange(1, 1 + before.elem_count() as u32, t.device())?.unsqueeze(1)?;
+    let is_of = steps.broadcast_eq(&t.unsqueeze(0)?)?.to_dtype(DType::F32)?; // [T, B]
+    let count = is_of.sum(1)?;
+    let mean = (is_of.broadcast_mul(lambda)?.sum(1)? / count.maximum(1f32)?)?;
+    let rate = f64::from(*config.nu_ema_rate);
+    let rate = before.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - rate, rate)?;
+    before + ((mean - before)? * (rate * count.minimum(1f32)?)?)?
 }

@@ -1,26 +1,30 @@
-//! What λ does in a batch, and how guidance stands to behavior cloning, in one pass on the CPU.
+//! Metrics of λ and guidance over a batch, computed on the CPU.
 
 use super::guidance::Guide;
 use crate::algorithm::Measured;
 use candle_core::Tensor;
 
-/// Parts of the chain t = 1…T that have a mean of their own.
+/// Metrics of the mean λ over each fifth of the denoising steps.
 const FIFTHS: [&str; 5] =
     ["lambda_fifth_1", "lambda_fifth_2", "lambda_fifth_3", "lambda_fifth_4", "lambda_fifth_5"];
 
-/// What [`measure`] has to know of a batch: ν̂² and δ's share, `[]`; λ and σ², `[B]`; ḡ and the
-/// error ε_θ − ε, `[B, a]`. Nothing without guidance.
-pub(super) fn needed<'a>(guide: Option<&'a Guide>, error: &'a Tensor) -> Vec<&'a Tensor> {
-    let Some(Guide { nu_squared, delta_share, lambda, sigma_squared, gradient, .. }) = guide else {
-        return Vec::new();
-    };
-    vec![nu_squared, delta_share, lambda, sigma_squared, gradient, error]
+/// The tensors from which [`measure`] computes: ν̂², `[]`; λ and σ², `[B]`; ḡ and the error ε_θ − ε,
+/// `[B, a]`.
+pub(super) fn inputs(guide: &Guide, error: Tensor) -> Vec<Tensor> {
+    let Guide { averages, lambda, sigma_squared, gradient, .. } = guide;
+    vec![
+        averages.nu_squared.clone(),
+        lambda.clone(),
+        sigma_squared.clone(),
+        gradient.clone(),
+        error,
+    ]
 }
 
-/// The metrics of guidance, of the numbers of [`needed`], one tensor after the other; none without
-/// guidance. `t` is each sample's, of `steps` T.
+/// The metrics of guidance from the numbers of [`inputs`], one tensor after the other; none without
+/// guidance. `t` is each sample's, in 1..=`steps`.
 pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> Measured {
-    let [nu_squared, delta_share, rows @ ..] = numbers else { return Measured::new() };
+    let [nu_squared, rows @ ..] = numbers else { return Measured::new() };
     let (lambda, rows) = rows.split_at(t.len());
     let (sigma_squared, rows) = rows.split_at(t.len());
     let (gradient, error) = rows.split_at(rows.len() / 2);
@@ -30,7 +34,6 @@ pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> M
     let cosines =
         gradient.chunks(width).zip(error.chunks(width)).map(|(one, other)| cosine(one, other));
     let mut measured = vec![
-        ("delta_share", *delta_share),
         ("lambda_mean", lambda_mean),
         ("lambda_quantile_10", low),
         ("lambda_quantile_50", median),
@@ -77,6 +80,3 @@ fn cosine(one: &[f32], other: &[f32]) -> f32 {
     let size = (dot(one, one) * dot(other, other)).sqrt();
     if size == 0.0 { 0.0 } else { dot(one, other) / size }
 }
-
-#[cfg(test)]
-mod tests;

@@ -1,9 +1,9 @@
-//! What an update of QUAD measures.
+//! The metrics of QUAD.
 
 use crate::definition::{Metric, metrics};
 
 pub(super) const METRICS: &[Metric] = &metrics! {
-    q_mean held_out: "Mean over the batch of the critics' target y (Eq. 20). A value that grows without end is overestimation.";
+    target_q_mean held_out: "Mean over the batch of the critics' target y (Eq. 20). A value that grows without end is overestimation.";
     critic_loss ["critic loss"] held_out: "Mean over critics and batch of (y − Q_k(s, a))² with y = r + γ·mask·Q_LCB(s', a'), Q_LCB = mean_k Q̂_k − ρ·std_k Q̂_k (Eq. 20).";
     bc_loss ["BC loss"] held_out: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))², the behavior-cloning term of Eq. 19 before η. A network that always outputs 0 has loss 1; a policy that knows the data lies well below.";
     actor_loss held_out: "Eq. 19: η·(BC loss) + mean of λ·w(t)·ε_θ·ḡ, where ḡ is the Q-gradient (Eq. 10) over the mean of |Q̂_k(s, a)| and w(t) = √(1 − ᾱ_t).";

@@ -1,5 +1,4 @@
-//! What λ was in a run of QUAD, from its metrics: whether the critics' uncertainty changed the
-//! guidance.
+//! Summary of λ in a run of QUAD: it says if the critics' uncertainty changed the guidance.
 
 use std::collections::BTreeMap;
 
@@ -7,14 +6,13 @@ use serde_json::json;
 
 use crate::definition::{MetricsLine, Summary};
 
-/// The first of so many parts of a run does not count: critics that have learned little agree by
-/// chance.
+/// The first tenth of a run is skipped: critics that have learned little agree by chance.
 const PARTS: u64 = 10;
-/// A weight above this is taken for no weight.
+/// A weight above this counts as none.
 const ONE: f64 = 0.99;
 
-/// What λ was after the first tenth of the steps that a run has made so far. `variant` is the run's
-/// guidance. Without guidance there is nothing to say, nor where the lines hold nothing of λ.
+/// Summarizes λ after the first tenth of the steps done so far, if there was any. `variant` is the
+/// run's guidance.
 pub(super) fn of(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
     let mut lines = Vec::from_iter(
         lines.iter().filter(|line| line.contains_key("variance_ratio") && variant != "none"),
@@ -24,7 +22,8 @@ pub(super) fn of(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
     let from_step = to_step / PARTS + 1;
     lines.retain(|line| step(line) >= from_step);
     let mut sums: BTreeMap<&str, (f64, u32)> = BTreeMap::new();
-    for (name, value) in lines.iter().flat_map(|line| line.iter()).filter(|(name, _)| is_told(name))
+    for (name, value) in
+        lines.iter().flat_map(|line| line.iter()).filter(|(name, _)| is_summarized(name))
     {
         let (sum, count) = sums.entry(name).or_default();
         (*sum, *count) = (*sum + value, *count + 1);
@@ -61,7 +60,7 @@ fn text(means: &BTreeMap<&str, f64>, from_step: u64, to_step: u64) -> String {
     )
 }
 
-fn is_told(name: &str) -> bool {
+fn is_summarized(name: &str) -> bool {
     name.starts_with("lambda_") || ["variance_ratio", "guidance_cosine"].contains(&name)
 }
 

@@ -81,9 +81,9 @@ fn keys(group: &Table) -> Vec<String> {
 
 /// Two patterns with as many letters would contradict each other: neither wins.
 #[test]
-fn in_no_file_two_patterns_are_equally_good_for_a_key() {
+fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
     for definition in ALGORITHMS {
-        let values = Values::of(&definition);
+        let values = Values::of(definition);
         for task in tasks() {
             let groups: Vec<_> =
                 values.groups.iter().filter(|(pattern, _)| fits(pattern, &task)).collect();
@@ -103,7 +103,7 @@ fn in_no_file_two_patterns_are_equally_good_for_a_key() {
 }
 
 #[test]
-fn a_difference_changes_what_it_names_and_nothing_else() {
+fn merging_changes_the_named_keys_alone() {
     let mut table = toml::toml! { a = 1.5 b = [1, 2] [c] d = 1 e = "x" };
     merge(&mut table, toml::toml! { a = 2 b = [3] [c] e = "y" f = true });
     assert_eq!(table, toml::toml! { a = 2.0 b = [3] [c] d = 1 e = "y" f = true });

@@ -217,7 +217,7 @@ fn task_names() -> PossibleValuesParser {
 
 /// The names of algorithms, likewise.
 fn algorithm_names() -> PossibleValuesParser {
-    ALGORITHMS.map(|known| known.name).into()
+    ALGORITHMS.iter().map(|known| known.name).into()
 }
 
 fn parse_preset(text: &str) -> Result<String, String> {

@@ -84,7 +84,7 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     }
     let header = ["algorithm", "what it is", "its authors give values for", "GFLOP a step"];
     let mut of_algorithms = Table::new(&header.map(|name| (name, Left)));
-    for definition in &ALGORITHMS {
+    for definition in ALGORITHMS {
         let values = Values::of(definition);
         of_algorithms.push([
             definition.name.to_owned(),

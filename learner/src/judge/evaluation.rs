@@ -105,7 +105,7 @@ impl Evaluation<'_> {
     }
 
     fn sampler(&self, fqe: &Fqe, seed: u64) -> BatchSampler {
-        BatchSampler::new(fqe.items(), self.data.context(seed).batch_size, seed, 0)
+        BatchSampler::new(fqe.dataset_len(), self.data.context(seed).batch_size, seed, 0)
     }
 
     /// Runs all seeds in parallel, each on its share of the cores: updates this small gain little

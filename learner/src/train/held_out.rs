@@ -61,7 +61,7 @@ impl HeldOut {
 
     /// By batches of this size, which the seed draws, in a run of so many steps.
     pub(super) fn of(agent: Agent, size: usize, seed: u64, steps: u64) -> Self {
-        let mut sampler = BatchSampler::new(agent.items(), size, seed, 0);
+        let mut sampler = BatchSampler::new(agent.dataset_len(), size, seed, 0);
         let batches = (0..BATCHES).map(|_| sampler.next_items().to_vec()).collect();
         Self {
             agent,

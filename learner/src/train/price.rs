@@ -34,8 +34,12 @@ impl Price {
         transitions: Transitions,
     ) -> anyhow::Result<Self> {
         let mut agent = begin(experiment, device, transitions)?;
-        let mut sampler =
-            BatchSampler::new(agent.items(), experiment.batch_size as usize, experiment.seed, 0);
+        let mut sampler = BatchSampler::new(
+            agent.dataset_len(),
+            experiment.batch_size as usize,
+            experiment.seed,
+            0,
+        );
         Ok(Self {
             step: mean_step(&mut agent, &mut sampler, experiment.steps)?,
             snapshot: agent.policy(origin(experiment))?.len() as u64,

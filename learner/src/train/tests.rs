@@ -6,7 +6,9 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use candle_core::Device;
-use quad_algorithms::{Agent, Algorithm, Context, Definition, Measured, Metric, Parts, Reporting};
+use quad_algorithms::{
+    Agent, Algorithm, Context, Definition, Measured, Metric, Reporting, StateDict,
+};
 use quad_dataset::{
     Arrays, BatchSampler, ReadOptions, RewardRule, Scale, Transitions, environment,
 };
@@ -68,7 +70,7 @@ fn transitions() -> Transitions {
 /// Hyper-parameters of the demonstration with small networks.
 fn small(algorithm: &str) -> toml::Table {
     let asked = toml::Table::from_iter([("algorithm".to_owned(), algorithm.into())]);
-    let mut table = resolve("hopper-demo", &asked).unwrap().agent;
+    let mut table = resolve("hopper-demo", &asked).unwrap().agent.to_table();
     for (_, layers) in table.iter_mut() {
         if let Some(hidden) = layers.get_mut("hidden") {
             *hidden = vec![8, 8].into();
@@ -112,7 +114,8 @@ fn run_of(
     stop: bool,
 ) -> Result {
     let mut agent =
-        Agent::new(definition(algorithm).unwrap(), table, context(total_steps)).unwrap();
+        Agent::new(definition(algorithm).unwrap(), &table.clone().into(), context(total_steps))
+            .unwrap();
     if let Some(checkpoint) = from {
         agent.load(&checkpoint.state).unwrap();
     }
@@ -121,7 +124,7 @@ fn run_of(
 
 /// A run of this agent to the plan's end.
 fn run_agent(mut agent: Agent, mut held_out: Option<HeldOut>, plan: Plan, stop: bool) -> Result {
-    let mut sampler = BatchSampler::new(agent.items(), 4, 0, agent.step());
+    let mut sampler = BatchSampler::new(agent.dataset_len(), 4, 0, agent.step());
     let make = Registrar { registry: prometheus::Registry::new() };
     let metrics = TrainingMetrics::new(&make, plan.schedule.steps, agent.metrics()).unwrap();
     let outbox = Outbox::default();
@@ -293,8 +296,8 @@ impl Algorithm for InPhases {
         ))
     }
 
-    fn parts(&mut self) -> Parts<'_> {
-        Parts::default()
+    fn state_dict(&mut self) -> StateDict<'_> {
+        StateDict::default()
     }
 }
 
@@ -305,13 +308,12 @@ const fn metric(name: &'static str) -> Metric {
 fn in_phases() -> Agent {
     let definition = Definition {
         name: "in-phases",
-        settings: "",
+        presets: "",
         metrics: const { &[metric("first"), metric("second")] },
         report: Reporting::PLAIN,
-        check: |_| Ok(()),
-        start: |_, _| Ok(Box::new(InPhases)),
+        read: |_| Ok(Arc::new(|_| Ok(Box::new(InPhases)))),
     };
-    Agent::new(definition, &toml::Table::new(), context(100)).unwrap()
+    Agent::new(definition, &toml::Table::new().into(), context(100)).unwrap()
 }
 
 #[test]
@@ -336,7 +338,7 @@ fn a_row_has_what_its_steps_measured_and_means_of_these_alone() {
 #[test]
 fn the_estimate_of_a_step_is_the_mean_over_all_phases() {
     let mut agent = in_phases();
-    let mut sampler = BatchSampler::new(agent.items(), 4, 0, 0);
+    let mut sampler = BatchSampler::new(agent.dataset_len(), 4, 0, 0);
     assert!(
         mean_step(&mut agent, &mut sampler, 100).unwrap() >= 0.01,
         "the second phase is not in it"

@@ -99,7 +99,7 @@ impl Training {
         }
         let (batch_size, origin) = (experiment.batch_size as usize, origin(&experiment));
         let mut sampler =
-            BatchSampler::new(agent.items(), batch_size, experiment.seed, agent.step());
+            BatchSampler::new(agent.dataset_len(), batch_size, experiment.seed, agent.step());
         let outlets = Outlets {
             metrics: &self.metrics,
             outbox: &self.outbox,

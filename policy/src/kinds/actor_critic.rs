@@ -40,6 +40,18 @@ impl ActorCriticShape {
         }
     }
 
+    /// The shape of a policy of these networks.
+    pub fn of(actor: &Ensemble, critics: &Ensemble) -> Self {
+        let EnsembleShape { members, observation_dim, action_dim, layers, .. } = critics.shape();
+        Self {
+            observation_dim: *observation_dim,
+            action_dim: *action_dim,
+            actor: actor.shape().layers.clone(),
+            critic: layers.clone(),
+            critics: *members,
+        }
+    }
+
     /// The tensors of a policy of these networks, as they are named in a file.
     ///
     /// # Errors

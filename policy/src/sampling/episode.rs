@@ -11,6 +11,8 @@ const POLICY_STREAM: u64 = 2;
 /// not depend on which other episodes share a batch with it.
 pub struct EpisodeState {
     noise: ChaCha8Rng,
+    /// Numbers that come before the generator's.
+    given: Vec<f32>,
     /// Numbers that the policy keeps from one step to the next, such as a plan or a history; none
     /// when an episode begins.
     pub memory: Vec<f32>,
@@ -22,12 +24,21 @@ impl EpisodeState {
     pub fn new(seed: u64) -> Self {
         let mut noise = ChaCha8Rng::seed_from_u64(seed);
         noise.set_stream(POLICY_STREAM);
-        Self { noise, memory: Vec::new() }
+        Self { noise, given: Vec::new(), memory: Vec::new() }
+    }
+
+    /// Begins an episode whose first normal numbers are these, for a comparison with another
+    /// implementation.
+    pub fn with_noise(noise: Vec<f32>) -> Self {
+        Self { given: noise, ..Self::new(0) }
     }
 
     /// Standard normal numbers.
     pub fn fill_normal(&mut self, out: &mut [f32]) {
-        out.fill_with(|| StandardNormal.sample(&mut self.noise));
+        let given = self.given.len().min(out.len());
+        let (first, rest) = out.split_at_mut(given);
+        first.iter_mut().zip(self.given.drain(..given)).for_each(|(x, given)| *x = given);
+        rest.fill_with(|| StandardNormal.sample(&mut self.noise));
     }
 
     /// A number in [0, 1).

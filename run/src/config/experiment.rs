@@ -1,10 +1,10 @@
 //! One experiment, every value of which is checked.
 
-use quad_algorithms::{Definition, Reporting, Variant};
+use quad_algorithms::{Definition, Hyperparameters, Reporting, Variant};
 use quad_dataset::{RewardRule, Scale};
 use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
-use toml::{Table, Value};
+use toml::Value;
 
 use super::error::ConfigError;
 use super::hyperparameters;
@@ -52,7 +52,7 @@ pub struct Experiment {
     /// Name of the learning algorithm.
     pub algorithm: String,
     /// Hyper-parameters of the algorithm.
-    pub agent: Table,
+    pub agent: Hyperparameters,
 }
 
 fn is_zero(share: &f64) -> bool {
@@ -129,7 +129,7 @@ impl Experiment {
         Ok(())
     }
 
-    pub(super) fn validate(&self) -> Result<(), ConfigError> {
+    pub(super) fn check(&mut self) -> Result<(), ConfigError> {
         self.check_ranges()?;
         let (steps, interval) = (self.steps, self.eval_interval);
         let evaluations = self.schedule().evaluations();
@@ -138,8 +138,9 @@ impl Experiment {
             return Err(ConfigError::Evaluations { steps, interval, evaluations, most });
         }
         let algorithm = || self.algorithm.clone();
-        (self.definition()?.check)(&self.agent)
-            .map_err(|source| ConfigError::Hyperparameters { algorithm: algorithm(), source })
+        self.agent = Hyperparameters::new(&self.definition()?, self.agent.to_table())
+            .map_err(|source| ConfigError::Hyperparameters { algorithm: algorithm(), source })?;
+        Ok(())
     }
 }
 

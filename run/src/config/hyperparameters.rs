@@ -32,11 +32,12 @@ pub fn not_given(definition: &Definition, task: &Task) -> Option<String> {
 /// Finds an algorithm by name.
 pub fn algorithm(name: &str) -> Result<Definition, ConfigError> {
     let unknown = || {
-        let names = ALGORITHMS.map(|known| known.name);
-        let hint = format!("{}there are {}", did_you_mean(name, names), names.join(", "));
+        let names = Vec::from_iter(ALGORITHMS.iter().map(|known| known.name));
+        let hint =
+            format!("{}there are {}", did_you_mean(name, names.iter().copied()), names.join(", "));
         ConfigError::Unknown { kind: "algorithm", name: name.to_owned(), hint }
     };
-    ALGORITHMS.into_iter().find(|known| known.name == name).ok_or_else(unknown)
+    ALGORITHMS.iter().find(|known| known.name == name).copied().ok_or_else(unknown)
 }
 
 #[cfg(test)]

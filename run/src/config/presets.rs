@@ -70,10 +70,10 @@ impl Preset {
         {
             table.insert("reward".to_owned(), rule);
         }
-        let experiment: Experiment = table
+        let mut experiment: Experiment = table
             .try_into()
             .map_err(|source| ConfigError::Keys { preset: preset.clone(), source })?;
-        experiment.validate()?;
+        experiment.check()?;
         Ok(experiment)
     }
 

@@ -53,6 +53,8 @@ fn the_command_reproduces_the_experiment() {
     let mut config = config("r", 7);
     config.run.device = Device::Cuda;
     assert!(command_for(&config).unwrap().contains(" --device cuda "));
-    config.experiment.agent.remove("rho").unwrap();
+    let mut agent = config.experiment.agent.to_table();
+    agent.remove("rho").unwrap();
+    config.experiment.agent = agent.into();
     assert_eq!(command_for(&config), None, "a value of the task is missing");
 }

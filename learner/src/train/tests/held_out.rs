@@ -20,7 +20,7 @@ fn beside(algorithm: &str, batch_size: usize, reward: f32) -> Agent {
     };
     let context =
         Context { transitions: Arc::new(Transitions::of(arrays).unwrap()), batch_size, ..context };
-    Agent::new(definition(algorithm).unwrap(), &small(algorithm), context).unwrap()
+    Agent::new(definition(algorithm).unwrap(), &small(algorithm).into(), context).unwrap()
 }
 
 /// By the weights of the moment, in whatever order batches are taken, and without a trace in what
@@ -28,8 +28,10 @@ fn beside(algorithm: &str, batch_size: usize, reward: f32) -> Agent {
 #[test]
 fn held_out_episodes_are_measured_and_not_learned_from() {
     for algorithm in ["quad", "iql"] {
-        let agent =
-            || Agent::new(definition(algorithm).unwrap(), &small(algorithm), context(20)).unwrap();
+        let agent = || {
+            Agent::new(definition(algorithm).unwrap(), &small(algorithm).into(), context(20))
+                .unwrap()
+        };
         let ([mut alone, mut measured], mut held_out) =
             ([agent(), agent()], HeldOut::of(beside(algorithm, 8, 1.0), 8, 0, 20));
         let mut before = Vec::new();
@@ -71,7 +73,8 @@ fn held_out_episodes_are_measured_and_not_learned_from() {
 
 #[test]
 fn an_outlier_in_a_held_out_episode_costs_the_metrics_that_it_is_in() {
-    let agent = || Agent::new(definition("iql").unwrap(), &small("iql"), context(250)).unwrap();
+    let agent =
+        || Agent::new(definition("iql").unwrap(), &small("iql").into(), context(250)).unwrap();
     let held_out = HeldOut::of(beside("iql", 30, 3e19), 30, 0, 250);
     let result = run_agent(agent(), Some(held_out), plan(250, 0), false);
     assert_eq!(result.outcome.unwrap(), Outcome::Completed);

@@ -1,9 +1,8 @@
 //! Tests of experiments.
 
-use super::*;
 use crate::config::resolve;
 use quad_runtime::one_line;
-use toml::toml;
+use toml::{Table, toml};
 
 #[test]
 fn changes_override_the_values_of_the_task() {

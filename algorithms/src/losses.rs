@@ -1,0 +1,80 @@
+//! Losses with the scalars that are measured along with them, and reductions that keep NaN.
+
+use candle_core::{Result, Tensor};
+
+use super::algorithm::Measured;
+
+/// The smallest of the critics' values, `[K, B]` → `[B]`. (`min` ignores NaN; adding 0·sum keeps
+/// it.)
+pub(super) fn smallest(values: &Tensor) -> Result<Tensor> {
+    values.min(0)? + (values.sum(0)? * 0.0)?
+}
+
+/// The largest value along a dimension, which it removes. (`max` ignores NaN; adding 0·sum keeps
+/// it.)
+pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
+    values.max(dimension)? + (values.sum(dimension)? * 0.0)?
+}
+
+/// A loss `[]`, and the scalars `[]` that are measured with it.
+pub(super) struct Loss {
+    pub value: Tensor,
+    /// By name of metric, the loss first.
+    pub scalars: Vec<(&'static str, Tensor)>,
+    /// Tensors of any shape from which metrics are computed on the CPU.
+    pub others: Vec<Tensor>,
+}
+
+impl Loss {
+    /// A loss that is the metric of this name.
+    pub fn new(name: &'static str, value: Tensor) -> Self {
+        Self { scalars: vec![(name, value.clone())], value, others: Vec::new() }
+    }
+
+    /// The critics' loss, and the mean of their targets y `[B]`.
+    pub fn of_critics(value: Tensor, targets: &Tensor) -> Result<Self> {
+        Ok(Self::new("critic_loss", value).with("target_q_mean", targets.mean_all()?))
+    }
+
+    /// Adds a scalar `[]` or `[1]`, if there is one.
+    pub fn with(mut self, name: &'static str, scalar: impl Into<Option<Tensor>>) -> Self {
+        self.scalars.extend(scalar.into().map(|scalar| (name, scalar)));
+        self
+    }
+}
+
+/// The numbers of an update's metrics on their device.
+pub(super) struct Computed {
+    /// Names of the scalars.
+    names: Vec<&'static str>,
+    /// The scalars, then the other numbers, `[n]`.
+    pub numbers: Tensor,
+}
+
+impl Computed {
+    pub fn new(losses: &[Loss]) -> Result<Self> {
+        let scalars = || losses.iter().flat_map(|loss| &loss.scalars);
+        let others = losses.iter().flat_map(|loss| &loss.others);
+        Ok(Self {
+            names: scalars().map(|(name, _)| *name).collect(),
+            numbers: joined(scalars().map(|(_, scalar)| scalar).chain(others))?,
+        })
+    }
+
+    /// Copies the scalars by name and the other numbers, once they are computed.
+    pub fn read(&self) -> Result<(Measured, Vec<f32>)> {
+        let mut scalars = self.numbers.to_vec1()?;
+        let others = scalars.split_off(self.names.len());
+        Ok((self.names.iter().copied().zip(scalars).collect(), others))
+    }
+}
+
+/// The metrics of some losses.
+pub(super) fn measured(losses: &[Loss]) -> Result<Measured> {
+    Ok(Computed::new(losses)?.read()?.0)
+}
+
+/// The numbers of some tensors, one tensor after the other, `[n]`.
+pub(super) fn joined<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Result<Tensor> {
+    Tensor::cat(&tensors.into_iter().map(Tensor::flatten_all).collect::<Result<Vec<_>>>()?, 0)
+}
