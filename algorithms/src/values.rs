@@ -19,8 +19,8 @@ pub struct Values {
     /// Cost of a gradient step with the values for `hopper-medium-v2`: billions of additions and
     /// multiplications in the products of its networks. Two cores do some 100 to 200 a second.
     pub gflop: String,
-    /// Patterns of the tasks for which its authors give values.
-    pub given: Vec<String>,
+    /// Patterns of the tasks for which its authors give values, by benchmark.
+    pub given: BTreeMap<String, Vec<String>>,
     /// Keys of an experiment by pattern.
     #[serde(rename = "for", default)]
     groups: BTreeMap<String, Table>,

@@ -1,8 +1,8 @@
 //! What training refuses to learn from.
 
-use crate::environment::EnvironmentSpec;
 use crate::error::Problem;
 use crate::recording::{Recording, RowKind};
+use crate::tables::environment::EnvironmentSpec;
 
 /// Actions may be this far outside [-1, 1]: what rounding explains is clipped, anything more is
 /// another scale.

@@ -1,12 +1,8 @@
-//! What can go wrong with a dataset. Every message names the file, and where it can the array and
-//! the row.
+//! What can be wrong with a dataset. Messages name the file and, if possible, array and row.
 
 use std::error::Error;
 use std::io;
 use std::path::PathBuf;
-
-use crate::environment;
-use crate::foreign::CONVERT;
 
 /// A source that cannot be read or learned from, or a file that cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -24,16 +20,15 @@ impl DatasetError {
         Self { path: path.into(), problem }
     }
 
-    /// What to do about it.
+    /// Advice on how to mend it.
     pub fn hint(&self) -> String {
         self.problem.hint()
     }
 }
 
-/// What can be wrong with a dataset. Arrays are called by their path in the file; rows count from
-/// 0.
+/// A problem with a dataset. Arrays are named by their path in the file; rows count from 0.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // The sentences say what each is.
+#[allow(missing_docs)] // The messages say what each is.
 pub enum Problem {
     #[error("cannot be opened or written")]
     Io(#[source] io::Error),
@@ -42,7 +37,7 @@ pub enum Problem {
     #[error("a folder without main_data.hdf5, so no Minari dataset that is stored as HDF5")]
     UnknownFolder,
     #[error("{what}, which is none of the formats that are read")]
-    Foreign { what: String, load: &'static str },
+    Foreign { what: String, load: Load },
     #[error("locked: another program has it open for writing, or its file system has no locks")]
     Locked(#[source] hdf5::Error),
     #[error("not closed by the program that wrote it")]
@@ -94,7 +89,9 @@ pub enum Problem {
     #[error("`{array}` is a group of arrays, but must be an array")]
     Group { array: String },
     #[error("recorded in `{claimed}`, which is not `{expected}`")]
-    OtherEnvironment { claimed: String, expected: String },
+    OtherEnvironment { claimed: String, expected: String, is_simulated: bool },
+    #[error("recorded in `OGBench`, which is not `{expected}`")]
+    OtherMaze { expected: String },
     #[error("`{array}` has {found} numbers a row, but `{environment}` has {expected}")]
     Width { array: &'static str, found: usize, expected: usize, environment: String },
     #[error("array `{array}`, row {row}: {value} is not a finite float32{}", such_rows(*.rows))]
@@ -126,45 +123,64 @@ pub enum Problem {
     BadRow { row: usize, array: &'static str, problem: String },
 }
 
-/// How many rows have what the first of them is named for.
+/// How to load a file of a foreign format.
+#[derive(Clone, Copy, Debug)]
+pub enum Load {
+    /// A command of `quad-convert`, without its `--out`.
+    Convert(&'static str),
+    /// Advice on how to load it in Python.
+    Python(&'static str),
+}
+
+/// Number of rows with the same problem, where there are several.
 pub(crate) fn such_rows(rows: usize) -> String {
-    match rows {
-        0 | 1 => String::new(),
-        rows => format!(" ({rows} such rows)"),
-    }
+    if rows > 1 { format!(" ({rows} such rows)") } else { String::new() }
 }
 
 impl Problem {
-    /// What to do about it.
+    /// Advice on how to mend it.
     pub fn hint(&self) -> String {
-        let hint = match self {
-            Self::OtherEnvironment { claimed, expected } => {
-                return other_environment(claimed, expected);
-            }
-            Self::Foreign { load, .. } if load.starts_with(CONVERT) => {
-                return format!(
-                    "with quad_rl installed, `{load} --out my-robot.hdf5` makes a file that is read (docs/data.md)"
-                );
-            }
-            Self::Foreign { load, .. } => {
-                return format!(
-                    "{load}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
-                );
+        if let Self::OtherEnvironment { claimed, expected, is_simulated } = self {
+            return match is_simulated {
+                true => format!("choose a task in {claimed}, or another dataset"),
+                false => format!(
+                    "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a name of \
+                     your own, without evaluations: --task own-data --env NAME"
+                ),
+            };
+        }
+        if let Self::Foreign { load, .. } = self {
+            return match load {
+                Load::Convert(command) => format!(
+                    "with quad_rl installed, `{command} --out my-robot.hdf5` makes a file that is read (docs/data.md)"
+                ),
+                Load::Python(advice) => format!(
+                    "{advice}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
+                ),
+            };
+        }
+        self.advice().to_owned()
+    }
+
+    /// [`Self::hint`] of the problems that always have the same.
+    fn advice(&self) -> &'static str {
+        match self {
+            Self::OtherEnvironment { .. } | Self::Foreign { .. } => "",
+            Self::OtherMaze { .. } => {
+                "choose one of its own tasks, such as antmaze-large-navigate-singletask-task1-v0, or another dataset"
             }
             Self::Width { .. } => {
                 "choose a dataset of that environment, or a task in the environment it was recorded in"
             }
             Self::Io(_) => "check the path and its permissions",
             Self::UnknownFormat => {
-                "a dataset is a D4RL file (.hdf5), a folder of Minari, an OGBench file (.npz), \
-                 or your own HDF5 file as docs/data.md describes"
+                "a dataset is a D4RL file (.hdf5), a folder of Minari, an OGBench file (.npz), or your own HDF5 file as docs/data.md describes"
             }
             Self::UnknownFolder => {
                 "give the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0"
             }
             Self::Truncated { .. } | Self::DamagedHdf5(_) | Self::DamagedNpz(_) => {
-                "the file was cut off or damaged on its way: fetch or copy it again; \
-                 the program that writes one of your own must close it"
+                "the file was cut off or damaged on its way: fetch or copy it again; the program that writes one of your own must close it"
             }
             Self::Locked(_) => {
                 "close it in that program; if none has it open, set HDF5_USE_FILE_LOCKING=FALSE and try again"
@@ -175,8 +191,7 @@ impl Problem {
             Self::Filter { .. } | Self::Elsewhere { .. } => REWRITE,
             Self::Unreadable { .. } => "the file is damaged: fetch or copy it again",
             Self::Oversized { .. } => {
-                "the file is damaged, or most of these rows were never written: fetch or copy it again, or write those alone \
-                 that there are"
+                "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
             }
             Self::Metadata(_) => {
                 "fetch the Minari dataset again; metadata.json is what Minari writes beside the data"
@@ -185,8 +200,7 @@ impl Problem {
                 "see docs/data.md for what the attribute means"
             }
             Self::Missing { array } if array == "rewards" => {
-                "learning needs a reward for each step; a task such as antmaze-large-navigate-singletask-task1-v0 has those of OGBench's \
-                 mazes, and with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds others"
+                "learning needs a reward for each step; a task such as antmaze-large-navigate-singletask-task1-v0 has those of OGBench's mazes, and with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds others"
             }
             Self::Missing { .. } => "docs/data.md says which arrays each kind of file must have",
             Self::Numbers { .. } => {
@@ -203,19 +217,16 @@ impl Problem {
                 "leave out or repair these rows: a single one would spoil every weight"
             }
             Self::ActionOutside { .. } => {
-                "`learner train --scale actions` trains on them: it maps the least and the largest of each number to ±1, and the \
-                 policy's actions back"
+                "`learner train --normalize actions` trains on them: it maps the least and the largest of each number to ±1, and the policy's actions back"
             }
             Self::Group { .. } => {
-                "an observation may be an array or a Dict of arrays, but not a Dict of Dicts: with quad_rl installed, `quad-convert \
-                 FOLDER --out my-robot.hdf5` makes one row of it"
+                "an observation may be an array or a Dict of arrays, but not a Dict of Dicts: with quad_rl installed, `quad-convert FOLDER --out my-robot.hdf5` makes one row of it"
             }
             Self::DiscreteActions { .. } => {
-                "store continuous actions as float32; where they leave [-1, 1], `learner train --scale actions` scales them"
+                "store continuous actions as float32; where they leave [-1, 1], `learner train --normalize actions` scales them"
             }
             Self::Stray { .. } => {
-                "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for \
-                 rows in any other order set the attribute `layout` as docs/data.md describes"
+                "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for rows in any other order set the attribute `layout` as docs/data.md describes"
             }
             Self::Endless { .. } => {
                 "set `timeouts` to 1 at the last row of each episode that did not terminate"
@@ -228,8 +239,7 @@ impl Problem {
             }
             Self::Write(_) => "check that the disk has room and the folder is writable",
             Self::BadRow { .. } => "each row must have the environment's sizes and finite numbers",
-        };
-        hint.to_owned()
+        }
     }
 }
 
@@ -237,20 +247,3 @@ impl Problem {
 const REWRITE: &str = "pip install h5py hdf5plugin; then write it again, with your names for OLD and NEW: python -c \"import h5py, \
     hdf5plugin; a, b = h5py.File('OLD'), h5py.File('NEW', 'w'); b.attrs.update(a.attrs); a.visititems(lambda name, x: \
     b.update({name: x[()]}) if isinstance(x, h5py.Dataset) else None)\"";
-
-/// What a file of OGBench's says that it was recorded in, for want of a name.
-pub(crate) const OGBENCH: &str = "OGBench";
-
-fn other_environment(claimed: &str, expected: &str) -> String {
-    match environment::find(claimed) {
-        _ if claimed == OGBENCH => {
-            "choose one of its own tasks, such as antmaze-large-navigate-singletask-task1-v0, or another dataset"
-                .to_owned()
-        }
-        Ok(_) => format!("choose a task in {claimed}, or another dataset"),
-        Err(_) => format!(
-            "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a name of \
-             your own, without evaluations: --task own-data --env NAME"
-        ),
-    }
-}

@@ -1,6 +1,5 @@
 //! What every format is read into: rows as they were recorded, not judged yet.
 
-use crate::arrays::Names;
 use crate::rounding::Rounding;
 use crate::statistics::{Episode, returns};
 
@@ -16,6 +15,15 @@ pub(crate) enum RowKind {
     Dropped,
     /// No step, but the last state of an episode, to which the row before leads.
     LastState,
+}
+
+/// Names of the numbers of a row; empty lists where a source has none.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Names {
+    /// Names of the numbers of an observation, o.
+    pub observations: Vec<String>,
+    /// Names of the numbers of an action, a.
+    pub actions: Vec<String>,
 }
 
 /// Rows of a dataset, N of them. What follows the last end of an episode is an episode, too, cut

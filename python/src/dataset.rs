@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
-use quad_dataset::{Arrays, DatasetError, Names, inspect, write_own};
+use quad_dataset::{Arrays, DatasetError, Names, benchmarks, inspect, write_own};
 
 use crate::error::with_hint;
 
@@ -49,4 +49,15 @@ pub fn inspect_dataset(py: Python<'_>, path: PathBuf) -> PyResult<(String, Strin
     let inspection = py.detach(|| inspect(path, None)).map_err(|error| refused(&error))?;
     let json = serde_json::to_string(&inspection);
     Ok((json.map_err(|error| PyRuntimeError::new_err(error.to_string()))?, inspection.to_string()))
+}
+
+/// A task's goal (x and y, meters), its reach, and the index in `qpos` of the x that must reach it.
+type Maze = ([f64; 2], f64, usize);
+
+/// A benchmark's tasks: name, dataset and, if that is a maze, what rewards follow from.
+#[pyfunction]
+pub fn benchmark_tasks(benchmark: &str) -> Vec<(String, String, Option<Maze>)> {
+    let tasks = benchmarks::tasks().filter(|task| task.benchmark.name == benchmark);
+    let maze = |task: quad_dataset::MazeTask| (task.goal, task.reach, task.measured);
+    tasks.map(|task| (task.name, task.dataset, task.maze.map(maze))).collect()
 }

@@ -16,7 +16,7 @@ use pyo3::prelude::*;
 #[pymodule]
 mod _quad_rl {
     #[pymodule_export]
-    use crate::dataset::{inspect_dataset, write_dataset};
+    use crate::dataset::{benchmark_tasks, inspect_dataset, write_dataset};
     #[pymodule_export]
     use crate::episodes::Episodes;
     #[pymodule_export]

@@ -15,7 +15,7 @@ SMALL = '{hidden=[24, 24], activation="%s", norm=%s}'
 POLICIES = {
     "quad": [],
     "norm": ["--agent", "critic=" + SMALL % ("silu", "true"), "--agent", "actor=" + SMALL % ("tanh", "true")],
-    "scaled": ["--scale", "actions,states"],
+    "scaled": ["--normalize", "actions,observations"],
     "dql": ["--algorithm", "dql", "--agent", "temperature=0.1"],
     "align-iql": ["--algorithm", "align-iql"],
     "iql": ["--algorithm", "iql"],

@@ -86,10 +86,10 @@ def test_the_learner_trains_on_the_user_s_units(tmp_path):
     given = arrays()
     given["actions"] = given["actions"] * 40 + 100
     dataset = Dataset.from_arrays(**given)
-    assert "--scale actions" in " ".join(dataset.inspect()["problems"])
+    assert "--normalize actions" in " ".join(dataset.inspect()["problems"])
     dataset.save(tmp_path / "data.hdf5")
     snapshot = train(tmp_path / "run", tmp_path / "data.hdf5", "--task", "own-data", "--env", "mine", "--steps", "3",
-                     "--scale", "actions,states")
+                     "--normalize", "actions,observations")
     actions = Policy.load(snapshot).act(given["observations"][:50])
     assert actions.min() > 59.9 and actions.max() < 140.1 and np.ptp(actions) > 20
 

@@ -24,7 +24,7 @@ def snapshot(tmp_path_factory):
     done = {f"torque.{joint}": rng.uniform(-9, 9, 400) for joint in ("elbow", "shoulder")}
     frame = pd.DataFrame({**numbers, **done, "gain": rng.normal(size=400), "run": np.arange(400) // 50})
     Dataset.from_frame(frame, observations=SEEN, actions=[*done], reward="gain", episode="run", terminal="never").save(folder / "log.hdf5")
-    return train(folder / "run", folder / "log.hdf5", "--task", "own-data", "--env", "mine", "--steps", "2", "--scale", "actions")
+    return train(folder / "run", folder / "log.hdf5", "--task", "own-data", "--env", "mine", "--steps", "2", "--normalize", "actions")
 
 
 class Node:

@@ -142,7 +142,7 @@ def test_extreme_uniform_numbers_choose_like_the_policy(snapshots, name, tmp_pat
 ])
 def test_planners(data, flags, tmp_path):
     given = [part for flag in flags for part in ("--agent", flag)]
-    run = train(tmp_path / "run", data, *OWN, "--algorithm", "diffuser", "--scale", "states,actions", *given, layers=False)
+    run = train(tmp_path / "run", data, *OWN, "--algorithm", "diffuser", "--normalize", "observations,actions", *given, layers=False)
     compare(Policy.load(run), tmp_path / "policy.onnx")
 
 
@@ -151,7 +151,7 @@ def test_constant_actions_are_exact_and_constant_observations_ignored(algorithm,
     given = arrays()
     given["observations"][:, 4], given["actions"][:, 1] = 90.0, 0.1
     quad_rl.Dataset.from_arrays(**given).save(tmp_path / "data.hdf5")
-    units = ["--scale", "states,actions,rewards"]
+    units = ["--normalize", "observations,actions,rewards"]
     policy = Policy.load(train(tmp_path / "run", tmp_path / "data.hdf5", *OWN, "--algorithm", algorithm, *units, layers=False))
     compare(policy, tmp_path / "policy.onnx")
     session, states = onnxruntime.InferenceSession(tmp_path / "policy.onnx"), batches()[2]

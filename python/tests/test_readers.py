@@ -254,8 +254,7 @@ def test_ogbench_mazes(maze, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_ogbench_leaves_other_tasks_to_its_library(tmp_path):
-    """antsoccer, as the meshes of its manipulators take a minute to load."""
+def test_ogbench_soccer(tmp_path):
     import ogbench
 
     rng, n = np.random.default_rng(0), 60

@@ -66,7 +66,7 @@ dataset.save("y")
 problems = dataset.inspect()["problems"]
 rows: list[dict[str, object]] = [dict(row) for row in quad_rl.runs("z")]
 value: float = quad_rl.metrics("z")[0]["train/target_q_mean"]
-run: quad_rl.Run = quad_rl.train(dataset, run_dir="r", steps=5, scale="states", fresh=True, set={"batch_size": 64})
+run: quad_rl.Run = quad_rl.train(dataset, run_dir="r", steps=5, normalize="observations", fresh=True, set={"batch_size": 64})
 policy, address, score = run.policy(step=5), run.page.upper(), run.scores[-1]["score"] + run.metrics[0]["step"]
 """
 WRONG = """

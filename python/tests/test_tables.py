@@ -151,8 +151,8 @@ def test_names_go_into_the_file_and_the_policy(snapshots, tmp_path):
         assert list(file.attrs["observation_names"]) == ["x", "v"] and list(file.attrs["action_names"]) == ["torque"]
     inspected = subprocess.run(["learner", "datasets", "inspect", "--json", tmp_path / "log.hdf5"], capture_output=True)
     assert json.loads(inspected.stdout)["observation_names"] == ["x", "v"]
-    snapshot = train(tmp_path / "run", tmp_path / "log.hdf5", "--task", "own-data", "--env", "mine", "--steps", "2", "--scale",
-                     "actions,states")
+    snapshot = train(tmp_path / "run", tmp_path / "log.hdf5", "--task", "own-data", "--env", "mine", "--steps", "2", "--normalize",
+                     "actions,observations")
     policy = Policy.load(snapshot)
     assert (policy.observation_names, policy.action_names) == (["x", "v"], ["torque"])
     seen = frame[["x", "v"]]
@@ -211,7 +211,7 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys):
         assert status == 1 and told in said, said
     status, page = convert(*log, "--reward", "step-cost", "--success", "all", "--continuous", "--apart", "repeated")
     assert status == 0 and "3 of 3 names are those of several episodes: 6 in all" in page
-    assert "--scale actions" in page and "6 of 6 episodes are successes" in page, "what the inspection doubts is shown, too"
+    assert "--normalize actions" in page and "6 of 6 episodes are successes" in page, "what the inspection doubts is shown, too"
     (tmp_path / "none-huge-v0.npz").touch()
     for message, words in {
         "needs --actions and --reward": [tmp_path / "log.csv", "--observations", "x", "--episode", "run"],

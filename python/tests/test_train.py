@@ -22,10 +22,10 @@ SMALL = {"algorithm": "iql", "agent": {"actor": {"hidden": [16]}, "critic.hidden
 
 
 def test_trains_like_the_program(data, tmp_path, capsys):
-    run = quad_rl.train(quad_rl.Dataset.from_arrays(**arrays()), run_dir=tmp_path / "run", steps=300, scale="actions,states",
+    run = quad_rl.train(quad_rl.Dataset.from_arrays(**arrays()), run_dir=tmp_path / "run", steps=300, normalize="actions,observations",
                         set={"batch_size": 32}, **SMALL)
     flags = ["--agent", "actor={hidden=[16]}", "--agent", "critic={hidden=[16]}", "--agent", "value={hidden=[16]}"]
-    flags += ["--algorithm", "iql", "--steps", "300", "--scale", "actions,states"]
+    flags += ["--algorithm", "iql", "--steps", "300", "--normalize", "actions,observations"]
     train(tmp_path / "program", data, "--task", "own-data", *flags)
     same = ["learner", "verify", run.folder, "--same-as", tmp_path / "program"]
     compared = subprocess.run(same, capture_output=True, text=True, timeout=600)
@@ -39,7 +39,7 @@ def test_trains_like_the_program(data, tmp_path, capsys):
         run.policy(7)
 
     with pytest.raises(RuntimeError, match=r"^there is a run of another configuration .*steps: 300 there, 400 here.*\nhint: "):
-        quad_rl.train(data, run_dir=run.folder, steps=400, scale="actions,states", set={"batch_size": 32}, **SMALL)
+        quad_rl.train(data, run_dir=run.folder, steps=400, normalize="actions,observations", set={"batch_size": 32}, **SMALL)
     with pytest.raises(RuntimeError, match=r"^cannot read .*nothing.hdf5(.|\n)*\nhint: "):
         quad_rl.train(tmp_path / "nothing.hdf5", run_dir=tmp_path / "other")
     with pytest.raises(RuntimeError, match="unexpected argument '--color'"):

@@ -9,7 +9,7 @@ fn values() -> Values {
     let file = toml! {
         about = "an example"
         gflop = "1"
-        given = ["*-v2", "antmaze-*"]
+        given.D4RL = ["*-v2", "antmaze-*"]
         steps = 1
         seed = 0
         [agent]
@@ -65,7 +65,7 @@ fn tasks() -> Vec<String> {
         .unwrap()
         .iter()
         .map(|task| task["name"].as_str().unwrap().to_owned());
-    named.chain(quad_dataset::ogbench::tasks().map(|names| names.task)).collect()
+    named.chain(quad_dataset::benchmarks::tasks().map(|task| task.name)).collect()
 }
 
 /// The keys of a group, those of its tables with a dot.
@@ -96,7 +96,7 @@ fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
             let different: std::collections::BTreeSet<_> = keys.iter().collect();
             assert_eq!(different.len(), keys.len(), "{} for {}: {keys:?}", definition.name, task);
         }
-        for pattern in values.groups.keys().chain(&values.given) {
+        for pattern in values.groups.keys().chain(values.given.values().flatten()) {
             assert!(tasks().iter().any(|task| fits(pattern, task)), "no task fits {pattern}");
         }
     }

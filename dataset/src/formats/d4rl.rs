@@ -1,10 +1,10 @@
 //! D4RL's HDF5 files, of all its versions, and AntMaze's.
 
-use crate::environment::EnvironmentSpec;
 use crate::error::Problem;
-use crate::hdf5_file::Hdf5File;
+use crate::formats::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
 use crate::rounding::Rounding;
+use crate::tables::environment::EnvironmentSpec;
 
 /// Reads `observations`, `actions`, `rewards`, `terminals` and, if there, `timeouts` by the rules
 /// of D4RL's `qlearning_dataset`: the next observation is the following row's, whatever the file
@@ -29,7 +29,7 @@ pub(super) fn read(
     };
     // A recording continues after the goal: only its timeouts end an episode.
     let goal =
-        environment.is_some_and(|environment| environment.goal.is_some()) || file.has("infos/goal");
+        environment.is_some_and(|environment| environment.maze.is_some()) || file.has("infos/goal");
     let until_timeout = goal && timeouts.contains(&true);
     let ends = terminals
         .iter()

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::array::Array;
-use crate::environment;
 use crate::error::{DatasetError, Problem};
-use crate::hdf5_file::Hdf5File;
+use crate::formats::array::Array;
+use crate::formats::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
+use crate::tables::environment;
 
 /// The file with the data; `metadata.json` lies beside it.
 pub(super) const DATA_FILE: &str = "main_data.hdf5";

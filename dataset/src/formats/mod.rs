@@ -1,24 +1,31 @@
 //! The formats that are read, each to one [`Recording`].
 
+mod array;
+pub(crate) mod arrays;
 mod d4rl;
+pub(crate) mod d4rl_writer;
+mod foreign;
+pub(crate) mod hdf5_file;
 mod minari;
+mod new_file;
+mod npz_file;
 mod ogbench;
 mod own;
+pub(crate) mod recorded;
 
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use crate::environment::{self, EnvironmentSpec, Goal};
-use crate::error::{DatasetError, OGBENCH, Problem};
-use crate::foreign;
-use crate::hdf5_file::{self, Hdf5File};
-use crate::npz_file::{self, NpzFile};
-use crate::ogbench::MazeTask;
+use self::hdf5_file::Hdf5File;
+use self::npz_file::NpzFile;
+use crate::error::{DatasetError, Problem};
 use crate::recording::Recording;
+use crate::tables::benchmarks::{self, Format};
+use crate::tables::environment::{self, EnvironmentSpec};
+use crate::tables::maze::MazeTask;
 
 pub use minari::minari_folder;
-pub(crate) use own::{ACTION_NAMES, LAYOUT as OWN_LAYOUT, OBSERVATION_NAMES};
 
 /// The file with a source's data: for a folder of Minari's the one that is in it, else the path
 /// itself.
@@ -53,12 +60,10 @@ impl Source {
         file.take(foreign::START)
             .read_to_end(&mut start)
             .map_err(|source| error(Problem::Io(source)))?;
-        match &start {
-            start if start.starts_with(hdf5_file::SIGNATURE) => Self::hdf5(Hdf5File::open(path)?),
-            start if start.starts_with(npz_file::SIGNATURE) => {
-                Ok(Self::OgBench(NpzFile::open(path)?))
-            }
-            _ => Err(error(foreign::of_start(&start))),
+        match Format::of(&start) {
+            Some(Format::Hdf5) => Self::hdf5(Hdf5File::open(path)?),
+            Some(Format::Npz) => Ok(Self::OgBench(NpzFile::open(path)?)),
+            None => Err(error(foreign::of_start(&start))),
         }
     }
 
@@ -106,17 +111,23 @@ impl Source {
     }
 
     /// Refuses another environment's recording. Environments that share their physics suit each
-    /// other. OGBench's files do not name theirs, but its mazes, whose sizes are those of D4RL's,
-    /// have other starts and goals.
+    /// other. OGBench's files do not name theirs, but none is from a maze whose rewards do not
+    /// follow from the observations.
     pub(crate) fn check_environment(&self, asked: &EnvironmentSpec) -> Result<(), Problem> {
-        let has_other_goals = asked.goal.is_some_and(|goal| goal != Goal::OfTask);
-        let maze_of_ogbench =
-            (matches!(self, Self::OgBench(_)) && has_other_goals).then(|| OGBENCH.to_owned());
-        let Some(claimed) = self.environment().or(maze_of_ogbench) else { return Ok(()) };
+        let expected = asked.name.clone();
+        let is_other_maze = asked.maze.is_some() && benchmarks::relabeling(&asked.name).is_none();
+        if matches!(self, Self::OgBench(_)) && is_other_maze {
+            return Err(Problem::OtherMaze { expected });
+        }
+        let Some(claimed) = self.environment() else { return Ok(()) };
         let simulation = environment::find(&claimed).map(EnvironmentSpec::simulation);
         match simulation == Ok(asked.simulation()) {
             true => Ok(()),
-            false => Err(Problem::OtherEnvironment { claimed, expected: asked.name.clone() }),
+            false => Err(Problem::OtherEnvironment {
+                claimed,
+                expected,
+                is_simulated: simulation.is_ok(),
+            }),
         }
     }
 

@@ -1,10 +1,10 @@
 //! OGBench's npz files.
 
 use crate::error::Problem;
-use crate::npz_file::NpzFile;
-use crate::ogbench::MazeTask;
+use crate::formats::npz_file::NpzFile;
 use crate::recording::{Recording, RowKind};
 use crate::rounding::Rounding;
+use crate::tables::maze::MazeTask;
 
 /// Reads `observations`, `actions`, `terminals`, `rewards` unless they follow from a `task`, and,
 /// if there, `masks`.

@@ -1,7 +1,7 @@
 //! The custom layout: HDF5, one row a transition.
 
 use crate::error::Problem;
-use crate::hdf5_file::Hdf5File;
+use crate::formats::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
 use crate::rounding::Rounding;
 

@@ -1,12 +1,12 @@
 //! What looks wrong with a dataset, though training puts up with it.
 
-use crate::environment::EnvironmentSpec;
 use crate::error::such_rows;
 use crate::formats::Source;
+use crate::normalize::Normalize;
 use crate::recording::Recording;
-use crate::reward::RewardRule;
-use crate::scale::Scale;
-use crate::{checks, doubts};
+use crate::tables::environment::EnvironmentSpec;
+use crate::tables::reward::RewardRule;
+use crate::{checks, warnings};
 
 /// Nothing that walks through a maze comes further in one step of a tenth of a second.
 const LONGEST_STEP: f32 = 1.0;
@@ -27,7 +27,7 @@ pub(super) fn findings(
             None => "no array `timeouts`: only a terminal is taken to end an episode".to_owned(),
         });
     }
-    let of_ends = doubts::of_ends(recording);
+    let of_ends = warnings::of_ends(recording);
     if of_ends.is_empty() {
         let strays = checks::strays(recording).filter(|(_, refused)| !refused);
         findings.extend(strays.map(|(problem, _)| format!("{problem}; is a timeout missing?")));
@@ -36,10 +36,11 @@ pub(super) fn findings(
     findings.extend(of_ends);
     let outside = checks::actions_outside(recording);
     findings.extend(
-        outside.map(|problem| format!("{problem}; `learner train --scale actions` trains on it")),
+        outside
+            .map(|problem| format!("{problem}; `learner train --normalize actions` trains on it")),
     );
     let rule = environment.map_or(RewardRule::AsIs, |environment| environment.reward);
-    findings.extend(doubts::of_numbers(recording, Scale::default(), rule));
+    findings.extend(warnings::of_numbers(recording, Normalize::default(), rule));
     findings
 }
 

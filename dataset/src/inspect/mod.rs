@@ -12,13 +12,13 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use crate::checks;
-use crate::environment::{self, EnvironmentSpec};
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
-use crate::ogbench;
 use crate::recording::RowKind;
-use crate::reward::RewardScaling;
 use crate::statistics::Extent;
+use crate::tables::benchmarks;
+use crate::tables::environment::{self, EnvironmentSpec};
+use crate::tables::reward::RewardScaling;
 
 pub use histogram::Histogram;
 
@@ -87,7 +87,7 @@ pub struct Inspection {
     pub lengths: Histogram,
     /// What is wrong, one sentence each: first what training refuses, then what it puts up with.
     pub problems: Vec<String>,
-    /// Whether `learner train` refuses it, also with `--scale actions`.
+    /// Whether `learner train` refuses it, also with `--normalize actions`.
     pub refused: bool,
 }
 
@@ -152,7 +152,7 @@ pub fn inspect(
     let mut source = Source::open(path)?;
     let claimed = source.environment();
     let spec = environment.or_else(|| environment::find(claimed.as_deref()?).ok());
-    let recording = source.read(spec, spec.and_then(|spec| ogbench::maze_task(&spec.name)))?;
+    let recording = source.read(spec, spec.and_then(|spec| benchmarks::relabeling(&spec.name)))?;
 
     let other = environment.and_then(|environment| source.check_environment(environment).err());
     let refused: Vec<Problem> =

@@ -8,7 +8,7 @@ use hdf5::H5Type;
 use hdf5::types::FixedAscii;
 use ndarray::ArrayViewD;
 use quad_dataset::{
-    DatasetError, Problem, ReadOptions, RecordedRows, RewardRule, Scale, Transitions,
+    DatasetError, Normalize, Problem, ReadOptions, RecordedRows, RewardRule, Transitions,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -262,7 +262,7 @@ fn returns_without_any_spread() {
         environment: Some(hopper()),
         task: None,
         reward: RewardRule::Locomotion,
-        scale: Scale::default(),
+        normalize: Normalize::default(),
     };
     let error = Transitions::read(subject.path(), &options).err().unwrap();
     assert!(matches!(error.problem, Problem::SameReturns), "{error}");

@@ -13,7 +13,7 @@ fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>
     let out = folder.path().join("reference.hdf5");
     let limit = environment.map_or(0, |environment| environment.max_episode_steps).to_string();
     let goal =
-        if environment.is_some_and(|environment| environment.goal.is_some()) { "1" } else { "0" };
+        if environment.is_some_and(|environment| environment.maze.is_some()) { "1" } else { "0" };
     if peers(&["reference", path.to_str().unwrap(), &limit, goal, out.to_str().unwrap()]) {
         compare(path, environment, &out);
     }

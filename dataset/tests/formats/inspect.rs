@@ -94,7 +94,7 @@ fn everything_that_is_wrong_is_named_at_once() {
             "`actions` has 2 numbers a row, but `hopper` has 3",
             "array `observations`, row 5: NaN is not a finite float32 (2 such rows)",
             "array `rewards`, row 8: NaN is not a finite float32",
-            "array `actions`, row 2: the action 7.5 is outside [-1, 1]; `learner train --scale actions` trains on it",
+            "array `actions`, row 2: the action 7.5 is outside [-1, 1]; `learner train --normalize actions` trains on it",
         ]
     );
     assert!(inspection.refused && inspection.to_string().contains("training refuses this dataset"));

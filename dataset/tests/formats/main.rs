@@ -7,22 +7,23 @@ use std::process::Command;
 
 use hdf5::H5Type;
 use ndarray::ArrayViewD;
-use quad_dataset::ogbench::maze_task;
+use quad_dataset::benchmarks::relabeling;
 use quad_dataset::{
-    Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment,
+    Batch, DatasetError, EnvironmentSpec, Normalize, ReadOptions, RewardRule, Transitions,
+    environment,
 };
 use tempfile::{TempDir, tempdir};
 
 mod broken;
 mod d4rl;
-mod doubts;
 mod foreign;
 mod inspect;
 mod minari;
+mod normalize;
 mod ogbench;
 mod own;
 mod round_trip;
-mod scale;
+mod warnings;
 
 fn hopper() -> &'static EnvironmentSpec {
     environment::find("hopper").unwrap()
@@ -40,8 +41,8 @@ fn shared(path: &str) -> Option<PathBuf> {
 
 /// A task of OGBench's is the environment's.
 fn options(environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> ReadOptions {
-    let task = environment.and_then(|environment| maze_task(&environment.name));
-    ReadOptions { environment, task, reward, scale: Scale::default() }
+    let task = environment.and_then(|environment| relabeling(&environment.name));
+    ReadOptions { environment, task, reward, normalize: Normalize::default() }
 }
 
 fn read(

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use quad_dataset::{
-    DatasetError, ReadOptions, RewardRule, Scale, Transitions, environment, ogbench,
+    DatasetError, Normalize, ReadOptions, RewardRule, Transitions, benchmarks, environment,
 };
 use tempfile::{TempDir, tempdir};
 
@@ -46,8 +46,8 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
     if !peers(&["ogbench-mazes", folder.path().to_str().unwrap()]) {
         return;
     }
-    let environments: BTreeSet<String> = ogbench::tasks()
-        .filter(|task| task.dataset.is_some())
+    let environments: BTreeSet<String> = benchmarks::tasks()
+        .filter(|task| task.maze.is_some())
         .map(|task| task.environment)
         .collect();
     assert_eq!(environments.len(), 11 * 6);
@@ -55,14 +55,14 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
         let place = name.split("-singletask").next().unwrap();
         let file = hdf5::File::open(folder.path().join(format!("{name}.hdf5"))).unwrap();
         let array = |array: &str| file.dataset(array).unwrap().read_raw::<f32>().unwrap();
-        let task = ogbench::maze_task(&name);
+        let task = benchmarks::relabeling(&name);
         assert_eq!(task.unwrap().start.map(|x| x as f32).to_vec(), array("start"), "{name}");
         let environment = environment::find(&name).ok();
         let options = ReadOptions {
             environment,
             task,
             reward: RewardRule::Subtract1,
-            scale: Scale::default(),
+            normalize: Normalize::default(),
         };
         let transitions =
             Transitions::read(folder.path().join(format!("{place}.npz")), &options).unwrap();

@@ -138,7 +138,7 @@ fn arrays_are_written_and_read_again() {
     );
     assert_eq!(inspection.action_range.max, 30.0);
     assert!(
-        !inspection.refused && inspection.problems[0].contains("--scale actions"),
+        !inspection.refused && inspection.problems[0].contains("--normalize actions"),
         "{:?}",
         inspection.problems
     );
@@ -147,7 +147,7 @@ fn arrays_are_written_and_read_again() {
         error.to_string().ends_with("the action 24.5 is outside [-1, 1] (6 such rows)"),
         "{error}"
     );
-    assert!(error.hint().contains("--scale actions"), "{}", error.hint());
+    assert!(error.hint().contains("--normalize actions"), "{}", error.hint());
 
     let small = Arrays { actions: vec![0.25; 12], ..arrays() };
     write_own(&path, small.clone(), names.clone()).unwrap();

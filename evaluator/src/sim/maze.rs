@@ -1,141 +1,101 @@
-//! Mazes: a four-legged ant, or a ball, comes through a maze to a goal that it does not observe.
+//! Mazes: a robot comes through a maze to a goal that it does not observe.
 //!
-//! The mazes, the ant and the rules are those of D4RL's antmaze-*-v0 and antmaze-*-v2:
+//! Positions are in meters and radians, velocities per second. The table of benchmarks
+//! (`dataset/benchmarks.toml`) has a benchmark's robots, mazes and rules; the world's origin is the
+//! center of the cell (1, 1).
 //!
+//! The ant is D4RL's:
 //! - qpos (15): the torso's x, y, z and quaternion (w first), then hip and ankle of legs 1 to 4;
-//!   qvel (14): the torso's linear and angular velocities, then the joints'. Meters and radians,
-//!   per second.
+//!   qvel (14): the torso's linear and angular velocities, then the joints'.
 //! - Observation (29): qpos and qvel. The goal is not part of it.
 //! - Action (8): torques of hip and ankle of legs 4, 1, 2 and 3, as fractions of 30 Nm, clipped to
 //!   ±1; held for 0.1 s.
-//! - An episode begins in the maze's `R` and ends in the step that brings the torso's center within
-//!   0.5 m of the goal. The reward of that step is 1, of every other 0. Only the goal and the time
-//!   limit end an episode: an ant on its back continues.
-//! - The goal lies around the corner of cell `G`: on each axis max(0, the cell's center + U(0, 1) +
-//!   U(0, 0.5)), drawn when the table says ([`Goal`]).
 //!
-//! OGBench's antmaze-*-singletask-* differ in three things: the episode begins within 1 m, on each
-//! axis, of the center of the task's own cell; the goal is the center of another; and a step is
-//! judged where it begins, so that an episode ends one step after the ant has come there. Rewards
-//! are 1 more than OGBench's, so that a return is 0 or 1, too.
+//! OGBench's point is a ball that observes x and y. An action (2) puts it at once as much further,
+//! as fractions of 0.2 m on each axis, without any velocity; then walls push it back for 0.1 s.
 //!
-//! OGBench's pointmaze-*-singletask-* have a ball in place of the ant. It observes x and y. An
-//! action (2) puts it at once as much further, as fractions of 0.2 m on each axis, without any
-//! velocity; then walls push it back for 0.1 s. It is at the goal within 1 m.
+//! The reward of a step that reaches the goal is 1, of every other 0. Only the goal and the time
+//! limit end an episode: an ant on its back continues. A goal that is drawn lies, on each axis, at
+//! max(0, the center of its cell + U(0, 1) + U(0, 0.5)). Where a step is judged by the state before
+//! it, an episode ends one step after the robot reached the goal.
 
-use quad_dataset::environment::Goal;
-use quad_dataset::ogbench::{self, ANT_REACH, CELL, MazeTask};
-use quad_dataset::{EnvironmentSpec, Noise};
+use quad_dataset::{CELL, EnvironmentSpec, GoalDraw, Judged, MazeTask, Robot};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::physics::{Drive, Physics};
+use super::physics::Physics;
 use super::simulation::{Body, Task};
 
-/// The stream that a goal is drawn from, among those of an episode's or an environment's seed.
+/// Random stream of a goal, of an episode's or an environment's seed.
 const GOAL_STREAM: u64 = 4;
-/// The stream that a start is drawn from, likewise.
+/// Random stream of a start.
 const START_STREAM: u64 = 5;
-/// Where the model of a robot on its floor has the walls.
+/// Placeholder of the walls in a robot's model.
 const WALLS: &str = "<!-- walls -->";
-/// How far from its cell's center, on each axis, an episode of OGBench's begins, meters.
-const START_NOISE: f64 = 1.0;
-/// Steps of the model that a control is held for, of 0.02 s each.
-pub(super) const FRAME_SKIP: usize = 5;
-/// How both robots begin. The ball's observation has no room for velocities.
-pub(super) const BODY: Body = Body {
-    noise: Noise::NormalVelocities(0.1),
-    hidden_positions: 0,
-    observed_velocity: f64::INFINITY,
-};
 
-/// What moves through a maze.
-#[derive(Clone, Copy)]
-pub(super) struct Robot {
-    /// The name of its model, on a floor without walls.
-    pub model: &'static str,
-    /// How its actions move it.
-    pub drive: Drive,
+/// Initial state and observation of a robot: as much of it as the observation has room for.
+pub(super) fn body(robot: &Robot) -> Body {
+    Body { noise: robot.noise, hidden_positions: 0, observed_velocity: f64::INFINITY }
 }
 
-impl Robot {
-    /// The robot of an environment in a maze, by the environment's name.
-    pub fn of(environment: &str) -> Self {
-        match environment.starts_with("pointmaze-") {
-            true => Self { model: "point", drive: Drive::Displacement(0.2) },
-            false => Self { model: "ant", drive: Drive::Motors },
+/// The model of a robot and its floor, with a box for each wall of a maze, half a cell high.
+pub(super) fn mjcf(robot: &str, map: &[String]) -> String {
+    let mut walls = String::new();
+    for (i, row) in map.iter().enumerate() {
+        for (j, _) in row.bytes().enumerate().filter(|(_, cell)| *cell == b'1') {
+            let [x, y] = [j, i].map(|cell| (cell as f64 - 1.0) * CELL);
+            walls += &format!("<geom class=\"wall\" pos=\"{x} {y} 1\"/>\n    ");
         }
     }
+    robot.replacen(WALLS, walls.trim_end(), 1)
 }
 
-/// A maze's map, as its row in the table has it. The world's origin is the center of the cell (1,
-/// 1), which is the start.
-#[derive(Clone, Copy)]
-pub(super) struct Maze(pub &'static [String]);
-
-impl Maze {
-    /// The centers (x, y) of the cells of a kind.
-    fn centers(self, kind: u8) -> impl Iterator<Item = [f64; 2]> {
-        self.0.iter().enumerate().flat_map(move |(i, row)| {
-            let cells = row.bytes().enumerate().filter(move |&(_, cell)| cell == kind);
-            cells.map(move |(j, _)| [(j as f64 - 1.0) * CELL, (i as f64 - 1.0) * CELL])
-        })
-    }
-
-    /// The model: `robot`, which has a floor, and a box for each wall, half a cell high.
-    pub fn mjcf(self, robot: &str) -> String {
-        let walls: String = self
-            .centers(b'1')
-            .map(|[x, y]| format!("<geom class=\"wall\" pos=\"{x} {y} 1\"/>\n    "))
-            .collect();
-        robot.replacen(WALLS, walls.trim_end(), 1)
-    }
-
-    /// Draws a goal.
-    fn draw_goal(self, seed: u64) -> [f64; 2] {
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        random.set_stream(GOAL_STREAM);
-        let center = self.centers(b'G').next().unwrap_or_default();
-        center.map(|x| (x + random.random_range(0.0..1.0) + random.random_range(0.0..0.5)).max(0.0))
-    }
-}
-
-/// The way to a goal.
+/// A task in a maze, and the goal of the current episode.
 pub(super) struct Navigation {
-    maze: Maze,
+    task: MazeTask,
     goal: [f64; 2],
-    is_redrawn: bool,
-    task: Option<MazeTask>,
 }
 
 impl Navigation {
     /// `environment_seed` is the seed of a goal that all episodes share.
-    pub fn new(maze: Maze, spec: &EnvironmentSpec, environment_seed: u64) -> Self {
-        let task = ogbench::maze_task(&spec.name);
-        let goal = task.map_or_else(|| maze.draw_goal(environment_seed), |task| task.goal);
-        Self { maze, goal, is_redrawn: spec.goal == Some(Goal::EachEpisode), task }
+    #[allow(clippy::expect_used)] // The table is part of the program, and a test makes each of its environments.
+    pub fn new(spec: &EnvironmentSpec, environment_seed: u64) -> Self {
+        let task = spec.maze.expect("a maze has a task");
+        let goal = match task.draw {
+            GoalDraw::Fixed => task.goal,
+            _ => draw_goal(&task, environment_seed),
+        };
+        Self { task, goal }
     }
+}
+
+fn draw_goal(task: &MazeTask, seed: u64) -> [f64; 2] {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    random.set_stream(GOAL_STREAM);
+    task.goal.map(|x| (x + random.random_range(0.0..1.0) + random.random_range(0.0..0.5)).max(0.0))
 }
 
 impl Task for Navigation {
     fn judge(&self, from: [f64; 2], physics: &Physics) -> (f64, bool) {
-        let place =
-            if self.task.is_some() { from } else { [0, 1].map(|axis| physics.qpos()[axis]) };
-        let [dx, dy] = [0, 1].map(|axis| place[axis] - self.goal[axis]);
-        let reached = (dx * dx + dy * dy).sqrt() <= self.task.map_or(ANT_REACH, |task| task.reach);
+        let position = match self.task.judged {
+            Judged::BeforeStep => from,
+            Judged::AfterStep => [0, 1].map(|axis| physics.qpos()[axis]),
+        };
+        let reached = self.task.is_reached(position, self.goal);
         (f64::from(u8::from(reached)), reached)
     }
 
     fn begin(&mut self, seed: u64) {
-        if self.is_redrawn {
-            self.goal = self.maze.draw_goal(seed);
+        if self.task.draw == GoalDraw::EachEpisode {
+            self.goal = draw_goal(&self.task, seed);
         }
     }
 
     fn start(&self, seed: u64) -> Option<[f64; 2]> {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(START_STREAM);
-        self.task.map(|task| task.start.map(|x| x + random.random_range(-START_NOISE..START_NOISE)))
+        let noise = self.task.start_noise?;
+        Some(self.task.start.map(|x| x + random.random_range(-noise..noise)))
     }
 
     fn set_goal(&mut self, goal: &[f64]) {

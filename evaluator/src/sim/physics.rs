@@ -7,7 +7,7 @@ use mujoco_rs::logging::set_log_handler;
 use mujoco_rs::wrappers::mj_data::{MjData, MjtWarning};
 use mujoco_rs::wrappers::mj_logging::MjLogMessage;
 use mujoco_rs::wrappers::mj_model::MjModel;
-use quad_dataset::Noise;
+use quad_dataset::{Drive, Noise};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
@@ -38,16 +38,6 @@ pub(super) fn model(
 /// Replaces MuJoCo's own handler, which appends to `MUJOCO_LOG.TXT` in the working directory.
 fn log(message: &MjLogMessage) {
     tracing::debug!(target: "mujoco", "{}", message.subject());
-}
-
-/// What an action does.
-#[derive(Clone, Copy)]
-pub(super) enum Drive {
-    /// Its numbers are torques, as fractions of each motor's strongest.
-    Motors,
-    /// Before a step they are added to the positions, as fractions of so many meters, and
-    /// velocities become 0.
-    Displacement(f64),
 }
 
 /// The state of one simulation; many share a model.

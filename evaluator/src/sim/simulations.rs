@@ -1,49 +1,16 @@
 //! Makes environments by their rows in the dataset crate's table ([`EnvironmentSpec`]).
 
-use quad_dataset::Planar;
 use quad_dataset::environment::{self, EnvironmentSpec};
+use quad_dataset::{Drive, Simulator};
 
 use super::environment::{Environment, EnvironmentError, Environments};
-use super::maze::{self, Maze, Navigation, Robot};
-use super::physics::{self, Drive, Physics};
+use super::maze::{self, Navigation};
+use super::physics::{self, Physics};
 use super::planar;
 use super::simulation::Simulation;
 
 /// The models in `evaluator/assets` by their names, as MJCF, which the build lists.
 static MODELS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/models.rs"));
-
-/// What simulates an environment, and the name that its compiled model is kept under.
-struct Kind {
-    name: &'static str,
-    rules: Rules,
-}
-
-enum Rules {
-    Planar(&'static Planar),
-    Maze(Maze),
-}
-
-impl Kind {
-    #[allow(clippy::expect_used)] // The table is part of the program, and the test here makes each of its environments.
-    fn of(spec: &EnvironmentSpec) -> Self {
-        let row = environment::find(spec.simulation()).expect("a simulation is a row of the table");
-        let planar = row.planar.as_ref().map(Rules::Planar);
-        let rules = planar.or_else(|| row.maze.as_deref().map(|map| Rules::Maze(Maze(map))));
-        Self { name: &row.name, rules: rules.expect("its row is a planar robot or a maze") }
-    }
-
-    #[allow(clippy::expect_used)] // As above.
-    fn mjcf(&self) -> String {
-        let file = |name: &str| {
-            let found = MODELS.iter().find(|(model, _)| *model == name);
-            found.expect("evaluator/assets has the model").1
-        };
-        match self.rules {
-            Rules::Planar(_) => file(self.name).to_owned(),
-            Rules::Maze(maze) => maze.mjcf(file(Robot::of(self.name).model)),
-        }
-    }
-}
 
 /// Makes the simulation of an environment. Simulations of one model share the compiled model, so a
 /// second one costs little.
@@ -58,24 +25,19 @@ pub fn make(
     spec: &'static EnvironmentSpec,
     environment_seed: u64,
 ) -> Result<Simulation, EnvironmentError> {
-    let kind = Kind::of(spec);
-    let model = physics::model(kind.name, || kind.mjcf())?;
-    Ok(match kind.rules {
-        Rules::Planar(robot) => Simulation::new(
-            Physics::new(model, robot.frame_skip, Drive::Motors)?,
-            planar::body(robot),
-            Box::new(robot),
-            spec,
-        ),
-        Rules::Maze(maze) => {
-            let (task, drive) =
-                (Navigation::new(maze, spec, environment_seed), Robot::of(kind.name).drive);
-            Simulation::new(
-                Physics::new(model, maze::FRAME_SKIP, drive)?,
-                maze::BODY,
-                Box::new(task),
-                spec,
-            )
+    let model = physics::model(spec.simulation(), || mjcf(spec))?;
+    let (frame_skip, drive) = match &spec.simulator {
+        Simulator::Planar(robot) => (robot.frame_skip, Drive::Motors),
+        Simulator::Maze(robot, _) => (robot.frame_skip, robot.drive),
+    };
+    let physics = Physics::new(model, frame_skip, drive)?;
+    Ok(match &spec.simulator {
+        Simulator::Planar(robot) => {
+            Simulation::new(physics, planar::body(robot), Box::new(robot), spec)
+        }
+        Simulator::Maze(robot, _) => {
+            let task = Navigation::new(spec, environment_seed);
+            Simulation::new(physics, maze::body(robot), Box::new(task), spec)
         }
     })
 }
@@ -104,8 +66,16 @@ impl Environments for Simulations {
 }
 
 /// The MJCF text that an environment's model is compiled from.
+#[allow(clippy::expect_used)] // The table is part of the program, and the test here makes each of its environments.
 pub fn mjcf(spec: &EnvironmentSpec) -> String {
-    Kind::of(spec).mjcf()
+    let file = |name: &str| {
+        let found = MODELS.iter().find(|(model, _)| *model == name);
+        found.expect("evaluator/assets has the model").1
+    };
+    match spec.simulator {
+        Simulator::Planar(_) => file(spec.simulation()).to_owned(),
+        Simulator::Maze(robot, map) => maze::mjcf(file(&robot.name), map),
+    }
 }
 
 #[cfg(test)]

@@ -55,11 +55,11 @@ pub struct TrainArgs {
     /// is missing), or minari:ID [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Option<String>,
-    /// Scale some of these: actions from their least and largest value to ±1, states to mean 0 and
-    /// standard deviation 1, rewards to a mean square of 1; the policy still takes and gives the
-    /// data's own units
-    #[arg(long, value_name = "actions,states,rewards", value_delimiter = ',', value_parser = ["actions", "states", "rewards"], hide_possible_values = true)]
-    scale: Vec<String>,
+    /// Normalize some of these: actions from their least and largest value to ±1, observations to
+    /// mean 0 and standard deviation 1, rewards to a mean square of 1; the policy still takes and
+    /// gives the data's own units
+    #[arg(long, value_name = "actions,observations,rewards", value_delimiter = ',', value_parser = ["actions", "observations", "rewards"], hide_possible_values = true)]
+    normalize: Vec<String>,
     /// Share of the episodes to keep out of training; losses and values on them are in the metrics,
     /// as held_out_… [default: the task's, 0.1 for own-data, else 0]
     #[arg(long, value_name = "SHARE")]
@@ -161,10 +161,10 @@ impl TrainArgs {
             ("environment", self.env.clone().map(Value::from)),
             ("dataset", self.dataset.clone().map(Value::from)),
             (
-                "scale",
-                Some(&self.scale)
-                    .filter(|scale| !scale.is_empty())
-                    .map(|scale| Value::from(scale.clone())),
+                "normalize",
+                Some(&self.normalize)
+                    .filter(|columns| !columns.is_empty())
+                    .map(|columns| Value::from(columns.clone())),
             ),
             ("hold_out", self.hold_out.map(Value::from)),
             ("steps", number(flags.steps)),

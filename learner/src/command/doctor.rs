@@ -2,6 +2,7 @@
 
 use std::path::{Path, absolute};
 
+use quad_dataset::benchmarks;
 use quad_policy::Precision;
 use quad_run::folder::Lock;
 use quad_runtime::doctor::{self, Findings};
@@ -27,15 +28,17 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
         "another folder is chosen by --run-dir",
     );
     locks(&mut findings, &args.run_dir);
-    match data::cache::d4rl() {
-        Ok(folder) => doctor::folder(
-            &mut findings,
-            "datasets",
-            &folder,
-            "D4RL_DATASET_DIR chooses another folder",
-        ),
-        Err(error) => {
-            findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR")
+    for benchmark in benchmarks::all() {
+        let Some(variable) = &benchmark.cache.variable else { continue };
+        match data::cache::folder(benchmark) {
+            Ok(folder) => {
+                let hint = format!("{variable} chooses another folder");
+                doctor::folder(&mut findings, "datasets", &folder, &hint);
+            }
+            Err(error) => {
+                let hint = format!("name a folder in {variable}");
+                findings.warn("datasets", format!("{error:#}"), &hint);
+            }
         }
     }
     let folder = certificates_folder(args.certificates.clone());

@@ -16,7 +16,7 @@ use anyhow::anyhow;
 use clap::CommandFactory;
 use clap_complete::Shell;
 use quad_algorithms::{ALGORITHMS, Definition, Metric, Values};
-use quad_dataset::{DatasetError, environment};
+use quad_dataset::{DatasetError, benchmarks, environment};
 use quad_run::config::{ConfigError, Preset, hyperparameters, tasks};
 use quad_run::folder::{RunDirError, verify};
 use quad_run::status::list;
@@ -86,10 +86,12 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     let mut of_algorithms = Table::new(&header.map(|name| (name, Left)));
     for definition in ALGORITHMS {
         let values = Values::of(definition);
+        let given = values.given.iter();
+        let given = given.map(|(benchmark, tasks)| format!("{benchmark}: {}", tasks.join(", ")));
         of_algorithms.push([
             definition.name.to_owned(),
             values.about,
-            values.given.join(", "),
+            given.collect::<Vec<_>>().join("; "),
             values.gflop,
         ]);
     }
@@ -204,10 +206,15 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
             for dataset in cache::list() {
                 table.push(dataset?);
             }
-            let (d4rl, ogbench) = (cache::d4rl()?, cache::ogbench()?);
-            let folders =
-                format!("cache folders: {}, and of OGBench {}", d4rl.display(), ogbench.display());
-            print(&format!("{}\n{folders}", table.render(Style::Text)))
+            let mut folders = Vec::new();
+            for benchmark in benchmarks::all() {
+                folders.push(format!(
+                    "{} of {}",
+                    cache::folder(benchmark)?.display(),
+                    benchmark.name
+                ));
+            }
+            print(&format!("{}\ncache folders: {}", table.render(Style::Text), folders.join(", ")))
         }
         DatasetsCommand::Fetch { name } => {
             print(&Source::named(name)?.obtain()?.path.display().to_string())

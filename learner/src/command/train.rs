@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{Split, Task, environment, ogbench};
+use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{
@@ -40,12 +40,17 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         .dataset
         .clone()
         .ok_or_else(|| anyhow!("preset {} names no dataset", preset.label));
-    let missing = match preset.task_name() {
-        name if ogbench::is_ogbench(name) => format!(
-            "its rewards come from OGBench's simulator: with quad_rl and ogbench installed, `quad-convert ogbench:{name} --out \
-             FILE` makes a file for --dataset FILE"
+    let benchmark = preset.task.and_then(|task| task.benchmark);
+    let missing = match benchmark
+        .and_then(|benchmark| Some((benchmark, benchmark.converter.as_ref()?)))
+    {
+        Some((benchmark, converter)) => format!(
+            "its rewards come from {}'s simulator: with quad_rl and {converter} installed, `quad-convert {converter}:{} --out \
+             FILE` makes a file for --dataset FILE",
+            benchmark.name,
+            preset.task_name()
         ),
-        _ => record_hint(&experiment),
+        None => record_hint(&experiment),
     };
     let source = Source::parse(&named.hint(missing)?)?;
     source.check_environment(&experiment.environment)?;
@@ -111,7 +116,7 @@ fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
 
 /// A hint for a run without a dataset.
 fn record_hint(Experiment { environment: name, .. }: &Experiment) -> String {
-    let is_recorded = environment::find(name).is_ok_and(|spec| spec.goal.is_none());
+    let is_recorded = environment::find(name).is_ok_and(|spec| spec.maze.is_none());
     let other = match is_recorded {
         true => format!("`evaluator collect --env {name} --out FILE` records one"),
         false => "docs/data.md says what it may be".to_owned(),

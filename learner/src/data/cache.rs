@@ -1,40 +1,29 @@
-//! The folders in which D4RL and OGBench keep their files, shared with everything else that uses
-//! these.
+//! The folders in which benchmarks keep their files, shared with everything else that uses these.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
 use indicatif::HumanBytes;
+use quad_dataset::benchmarks::{Benchmark, Cache};
 use quad_dataset::{NamedDataset, catalog};
 use quad_runtime::Hint;
 
 use super::partial::left_of;
 
-/// The environment variable that names another folder than the one in the home folder; D4RL's.
-const VARIABLE: &str = "D4RL_DATASET_DIR";
-
-/// Where D4RL keeps its files.
-pub fn d4rl() -> anyhow::Result<PathBuf> {
-    match std::env::var_os(VARIABLE).filter(|folder| !folder.is_empty()) {
-        Some(folder) => Ok(folder.into()),
-        None => in_home(".d4rl/datasets").hint(format!("name a folder in {VARIABLE}")),
+/// The folder of a benchmark's files.
+pub fn folder(benchmark: &Benchmark) -> anyhow::Result<PathBuf> {
+    let Cache { folder, variable } = &benchmark.cache;
+    let named = variable.as_ref().and_then(std::env::var_os).filter(|named| !named.is_empty());
+    if let Some(named) = named {
+        return Ok(named.into());
     }
-}
-
-/// Where OGBench keeps its files.
-pub fn ogbench() -> anyhow::Result<PathBuf> {
-    in_home(".ogbench/data").hint("name a home folder in HOME")
-}
-
-/// Where a dataset belongs.
-pub fn of(dataset: &NamedDataset) -> anyhow::Result<PathBuf> {
-    if dataset.is_ogbench() { ogbench() } else { d4rl() }
-}
-
-fn in_home(folder: &str) -> anyhow::Result<PathBuf> {
+    let hint = variable.as_ref().map_or("name a home folder in HOME".to_owned(), |variable| {
+        format!("name a folder in {variable}")
+    });
     let home = std::env::home_dir().filter(|home| !home.as_os_str().is_empty());
     home.map(|home| home.join(folder))
         .ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
+        .hint(hint)
 }
 
 /// The catalog: name, environment, size, and what of it is in its folder already. Checksums are not
@@ -43,7 +32,7 @@ pub fn list() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
     catalog::all().iter().map(|dataset| {
         let size =
             dataset.bytes.map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string());
-        let path = of(dataset)?.join(&dataset.file);
+        let path = folder(dataset.benchmark)?.join(&dataset.file);
         Ok([dataset.name.clone(), dataset.environment.clone(), size, state(dataset, &path)])
     })
 }

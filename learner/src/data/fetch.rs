@@ -142,15 +142,14 @@ fn check(dataset: &NamedDataset, partial: &mut Partial) -> Result<String, Failur
 
 /// The file cannot be read or written here.
 fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
-    let hint = match error.kind() {
-        _ if dataset.is_ogbench() => {
-            "make the folder a link to one that you may write to and that has room"
+    let hint = match (&dataset.benchmark.cache.variable, error.kind()) {
+        (None, _) => {
+            "make the folder a link to one that you may write to and that has room".to_owned()
         }
-        ErrorKind::StorageFull => {
-            "make room, or name a folder on another disk in D4RL_DATASET_DIR; what has arrived is kept and will be \
-             continued"
-        }
-        _ => "name a folder that you may write to in D4RL_DATASET_DIR",
+        (Some(variable), ErrorKind::StorageFull) => format!(
+            "make room, or name a folder on another disk in {variable}; what has arrived is kept and will be continued"
+        ),
+        (Some(variable), _) => format!("name a folder that you may write to in {variable}"),
     };
     hinted(
         Error::new(error).context(format!(

@@ -3,7 +3,9 @@
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{DatasetError, HoldOut, ReadOptions, Split, Transitions, environment, ogbench};
+use quad_dataset::{
+    DatasetError, HoldOut, ReadOptions, Split, Transitions, benchmarks, environment,
+};
 use quad_run::config::Experiment;
 use quad_runtime::Hint;
 
@@ -15,17 +17,17 @@ use quad_runtime::Hint;
 pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
     let options = ReadOptions {
         environment: environment::find(&experiment.environment).ok(),
-        task: ogbench::maze_task(&experiment.environment),
+        task: benchmarks::relabeling(&experiment.environment),
         reward: experiment.reward,
-        scale: experiment.scale,
+        normalize: experiment.normalize,
     };
     let hold_out = HoldOut::Share { share: experiment.hold_out, seed: experiment.seed };
     let result = Transitions::read_split(path, &options, hold_out);
     let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
     let split =
         result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;
-    for doubt in split.training.doubts() {
-        tracing::warn!("{}: {doubt}", path.display());
+    for warning in split.training.warnings() {
+        tracing::warn!("{}: {warning}", path.display());
     }
     let (there, batch) = (split.training.len(), experiment.batch_size);
     if there < batch as usize {

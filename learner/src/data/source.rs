@@ -82,7 +82,7 @@ impl Source {
         match self {
             Self::Named(dataset) => {
                 let mirror = std::env::var(MIRROR).ok().filter(|mirror| !mirror.is_empty());
-                Fetcher::new(mirror).fetch(dataset, &cache::of(dataset)?)
+                Fetcher::new(mirror).fetch(dataset, &cache::folder(dataset.benchmark)?)
             }
             Self::Minari(id) => {
                 let path = quad_dataset::minari_folder(id);

@@ -7,8 +7,8 @@ use anyhow::{Context as _, anyhow};
 use candle_core::Device;
 use quad_algorithms::{Context, Fqe};
 use quad_dataset::{
-    Batch, DatasetError, HoldOut, ReadOptions, RewardRule, Scale, Split, Transitions, environment,
-    ogbench,
+    Batch, DatasetError, HoldOut, Normalize, ReadOptions, RewardRule, Split, Transitions,
+    benchmarks, environment,
 };
 use quad_policy::Precision;
 use quad_runtime::Hint;
@@ -81,9 +81,9 @@ impl Data {
         };
         let options = ReadOptions {
             environment: environment::find(environment).ok(),
-            task: ogbench::maze_task(environment),
+            task: benchmarks::relabeling(environment),
             reward: RewardRule::AsIs,
-            scale: Scale { actions: true, states: true, rewards: false },
+            normalize: Normalize { actions: true, observations: true, rewards: false },
         };
         let split = Transitions::read_split(&dataset.path, &options, hold_out)
             .hint_of(DatasetError::hint)?;

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use quad_dataset::{Goal, environment};
+use quad_dataset::{GoalDraw, environment};
 use quad_run::config::Device;
 use quad_run::config::settings::{self, Settings, differences};
 use quad_run::results::departures::{as_given, departures};
@@ -202,7 +202,8 @@ fn report(
     let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
     let published = published::scores(&first.task);
     let environment = environment::find(&first.config.experiment.environment);
-    let has_one_goal = environment.is_ok_and(|known| known.goal == Some(Goal::EachInstance));
+    let has_one_goal = environment
+        .is_ok_and(|known| known.maze.is_some_and(|maze| maze.draw == GoalDraw::EachInstance));
     let unfinished = counted.iter().filter(|run| !run.is_complete());
     let departures = match published.is_empty() {
         true => Vec::new(),

@@ -10,7 +10,7 @@ use quad_algorithms::{
     Agent, Algorithm, Context, Definition, Measured, Metric, Reporting, StateDict,
 };
 use quad_dataset::{
-    Arrays, BatchSampler, ReadOptions, RewardRule, Scale, Transitions, environment,
+    Arrays, BatchSampler, Normalize, ReadOptions, RewardRule, Transitions, environment,
 };
 use quad_nn::Tensors;
 use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision};
@@ -61,7 +61,7 @@ fn transitions() -> Transitions {
             environment: Some(hopper),
             task: None,
             reward: RewardRule::Locomotion,
-            scale: Scale::default(),
+            normalize: Normalize::default(),
         },
     )
     .unwrap()

@@ -87,7 +87,7 @@ fn write_reported() {
     unlike("dataset.mean_return", 21.0.into());
     unlike("experiment.agent.eta.threshold", 1.0.into());
     unlike("experiment.reward", "as-is".into());
-    unlike("experiment.scale", vec!["states"].into());
+    unlike("experiment.normalize", vec!["observations"].into());
     // The same file in another place.
     unlike("dataset.path", "elsewhere.hdf5".into());
     // The evaluation after 50,000 steps is none of the last 50,000.
@@ -108,7 +108,7 @@ fn write_published() {
         .remove(0)
         .set("experiment.dataset", "x.hdf5")
         .set("experiment.agent.tau", 1.0)
-        .set("experiment.scale", vec!["states"]);
+        .set("experiment.normalize", vec!["observations"]);
     changed.write("departures/changed");
     // The named file in another place, known by its checksum.
     let sha256 = "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b";

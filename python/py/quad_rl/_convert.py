@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:  # A source's library may raise anything, such as httpx's errors without a network.
         print(f"quad-convert: {source} cannot be read: {type(error).__name__}: {error}", file=sys.stderr)
         return 1
-    _print(f"{dataset}\n\nwritten to {out}: learner train --task own-data --env my-robot --dataset {out} --scale actions,states")
+    _print(f"{dataset}\n\nwritten to {out}: learner train --task own-data --env my-robot --dataset {out} --normalize actions,observations")
     return 0
 
 

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import json
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_rl import _quad_rl
-from quad_rl._rows import Rows, episode_rows, followed, rows_of
+from quad_rl._rows import Rows, Source, followed, rows_of, rows_of_episodes
 from quad_rl.readers import d3rlpy, frame, lerobot, minari, ogbench, robomimic
+
+P = ParamSpec("P")
+
+
+def _dataset_by(read: Callable[P, Source]) -> Callable[P, Dataset]:
+    """The function of a reader, with a `Dataset` as its result."""
+
+    @functools.wraps(read)
+    def made(*args: P.args, **kwargs: P.kwargs) -> Dataset:
+        return Dataset(*read(*args, **kwargs))
+
+    made.__signature__ = inspect.signature(read).replace(return_annotation="Dataset")  # type: ignore[attr-defined]
+    return made
 
 
 class Dataset:
@@ -24,12 +38,12 @@ class Dataset:
     `print` shows what is in it, what looks wrong, and `notes`, what to know of how a source was read.
     """
 
-    from_d3rlpy = staticmethod(d3rlpy.from_d3rlpy)
-    from_frame = staticmethod(frame.from_frame)
-    from_lerobot = staticmethod(lerobot.from_lerobot)
-    from_minari = staticmethod(minari.from_minari)
-    from_ogbench = staticmethod(ogbench.from_ogbench)
-    from_robomimic = staticmethod(robomimic.from_robomimic)
+    from_d3rlpy = staticmethod(_dataset_by(d3rlpy.from_d3rlpy))
+    from_frame = staticmethod(_dataset_by(frame.from_frame))
+    from_lerobot = staticmethod(_dataset_by(lerobot.from_lerobot))
+    from_minari = staticmethod(_dataset_by(minari.from_minari))
+    from_ogbench = staticmethod(_dataset_by(ogbench.from_ogbench))
+    from_robomimic = staticmethod(_dataset_by(robomimic.from_robomimic))
 
     def __init__(
         self, rows: Rows, names: tuple[list[str], list[str]] = ([], []), notes: Iterable[str] = ()
@@ -50,7 +64,7 @@ class Dataset:
     ) -> Dataset:
         """N steps, a row each, in the order of recording.
 
-        observations: [N, o], before each step. actions: [N, a], as applied, in any unit (`learner train --scale actions`
+        observations: [N, o], before each step. actions: [N, a], as applied, in any unit (`learner train --normalize actions`
             maps what is outside [-1, 1]). rewards: [N].
         terminations: [N], true where the task itself was over after the step: nothing more is to be gained from there.
         truncations: [N], true where an episode was cut off that could have gone on.
@@ -77,13 +91,7 @@ class Dataset:
 
         Raises ValueError as `from_arrays`, with the episode, counted from 0.
         """
-        parts = [episode_rows(f"episode {i}: ", episode) for i, episode in enumerate(episodes)]
-        if not parts:
-            raise ValueError("there is no episode")
-        try:
-            return Dataset(Rows(*(np.concatenate(arrays) for arrays in zip(*parts))))
-        except ValueError as error:
-            raise ValueError(f"all episodes must have observations and actions of the same size: {error}") from None
+        return Dataset(rows_of_episodes(episodes))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes an HDF5 file in the layout for own data, once it is whole; one that is there is replaced.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,24 @@ class Rows(NamedTuple):
     next_observations: NDArray[np.float32]
     terminals: NDArray[np.bool_]
     timeouts: NDArray[np.bool_]
+
+
+class Source(NamedTuple):
+    """Contents of another program's data."""
+
+    rows: Rows
+    names: tuple[list[str], list[str]] = ([], [])  # Of the numbers of an observation, and of an action.
+    notes: list[str] = []  # What to know of how it was read.
+
+
+def rows_of_episodes(episodes: Iterable[Any]) -> Rows:
+    parts = [episode_rows(f"episode {i}: ", episode) for i, episode in enumerate(episodes)]
+    if not parts:
+        raise ValueError("there is no episode")
+    try:
+        return Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
+    except ValueError as error:
+        raise ValueError(f"all episodes must have observations and actions of the same size: {error}") from None
 
 
 def episode_rows(where: str, episode: Any) -> Rows:

@@ -1,7 +1,7 @@
 //! One experiment, every value of which is checked.
 
 use quad_algorithms::{Definition, Hyperparameters, Reporting, Variant};
-use quad_dataset::{RewardRule, Scale};
+use quad_dataset::{Normalize, RewardRule};
 use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
 use toml::Value;
@@ -31,7 +31,7 @@ pub struct Experiment {
     /// Columns that are normalized for the networks. Snapshots contain the maps, so policies take
     /// and return the data's units.
     #[serde(default)]
-    pub scale: Scale,
+    pub normalize: Normalize,
     /// Fraction of the episodes that is kept out of training and measured on. The seed decides
     /// which episodes these are.
     #[serde(default, skip_serializing_if = "is_zero")]

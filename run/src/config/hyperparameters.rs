@@ -1,7 +1,6 @@
 //! Algorithms by name, and the tasks for which their authors give values.
 
 use quad_algorithms::{ALGORITHMS, Definition, Values, fits};
-use quad_dataset::ogbench::is_ogbench;
 
 use super::error::ConfigError;
 use super::nearest::did_you_mean;
@@ -10,12 +9,9 @@ use super::tasks::Task;
 /// Whether an algorithm's authors give no values for a benchmark's task. A task without a dataset
 /// of its own is no benchmark's.
 fn lacks(values: &Values, task: &Task) -> bool {
-    // OGBench numbers its tasks apart from D4RL: a pattern like `*-v0` is not about them unless it
-    // says so.
-    let is_about = |pattern: &String| {
-        is_ogbench(pattern) == is_ogbench(&task.name) && fits(pattern, &task.name)
-    };
-    task.text("dataset").is_some() && !values.given.iter().any(is_about)
+    let given = task.benchmark.and_then(|benchmark| values.given.get(&benchmark.name));
+    let is_given = given.into_iter().flatten().any(|pattern| fits(pattern, &task.name));
+    task.text("dataset").is_some() && !is_given
 }
 
 /// A warning about a task for which an algorithm's authors give no values.

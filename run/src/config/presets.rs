@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use quad_algorithms::{ALGORITHMS, Definition, Values};
-use quad_dataset::{RewardRule, environment, ogbench};
+use quad_dataset::environment;
 use toml::{Table, Value};
 
 use super::error::ConfigError;
@@ -66,7 +66,7 @@ impl Preset {
             return Err(ConfigError::NoEnvironment(preset.clone()));
         };
         if !table.contains_key("reward")
-            && let Ok(rule) = Value::try_from(reward_rule(&text_of(environment)))
+            && let Ok(rule) = Value::try_from(environment::reward_rule(&text_of(environment)))
         {
             table.insert("reward".to_owned(), rule);
         }
@@ -81,15 +81,6 @@ impl Preset {
     fn algorithm(&self, changes: &Table) -> Result<Definition, ConfigError> {
         let name = changes.get("algorithm").or_else(|| self.own.get("algorithm"));
         name.map_or(Ok(ALGORITHMS[0]), |name| hyperparameters::algorithm(&text_of(name)))
-    }
-}
-
-/// The usual reward rule of an environment.
-fn reward_rule(name: &str) -> RewardRule {
-    match environment::find(name) {
-        Ok(spec) => spec.reward,
-        Err(_) if ogbench::maze_task(name).is_some() => RewardRule::Subtract1,
-        Err(_) => RewardRule::AsIs,
     }
 }
 

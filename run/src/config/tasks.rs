@@ -1,8 +1,9 @@
-//! Tasks by name: the table `presets/tasks.toml`, and OGBench's.
+//! Tasks by name: the table `presets/tasks.toml`, and those that benchmarks name by a rule.
 
 use std::sync::LazyLock;
 
-use quad_dataset::ogbench::{self, TaskNames};
+use quad_dataset::benchmarks::{self, Benchmark, BenchmarkTask};
+use quad_dataset::catalog;
 use serde::Deserialize;
 use toml::Table;
 
@@ -17,6 +18,9 @@ pub struct Task {
     /// Remark in the list of tasks.
     #[serde(default)]
     pub about: String,
+    /// Benchmark that has it.
+    #[serde(skip)]
+    pub benchmark: Option<&'static Benchmark>,
     /// Whether the list of tasks shows it; a similar task stands for the others.
     #[serde(default = "yes")]
     pub is_listed: bool,
@@ -41,18 +45,31 @@ struct Tasks {
 static TASKS: LazyLock<Vec<Task>> = LazyLock::new(|| {
     let tasks: Tasks = toml::from_str(include_str!("../../../presets/tasks.toml"))
         .expect("the embedded table is valid");
-    tasks.task.into_iter().chain(ogbench::tasks().map(Task::from)).collect()
+    let listed = tasks.task.into_iter().map(|task| {
+        let benchmark = task.text("dataset").and_then(catalog::find).map(|known| known.benchmark);
+        Task { benchmark, ..task }
+    });
+    listed.chain(benchmarks::tasks().map(Task::from)).collect()
 });
 
-impl From<TaskNames> for Task {
-    fn from(TaskNames { task, environment, dataset, is_default }: TaskNames) -> Self {
+impl From<BenchmarkTask> for Task {
+    fn from(task: BenchmarkTask) -> Self {
+        let BenchmarkTask { name, benchmark, environment, dataset, maze, is_default } = task;
+        let dataset = maze.map(|_| dataset);
         let about = match dataset {
             Some(_) => "the default of -task1 to -task5",
             None => "likewise; its data needs quad-convert",
         };
         let mut keys = Table::from_iter([("environment".to_owned(), environment.into())]);
         keys.extend(dataset.map(|dataset| ("dataset".to_owned(), dataset.into())));
-        Self { name: task, about: about.to_owned(), is_listed: is_default, values: None, keys }
+        Self {
+            name,
+            about: about.to_owned(),
+            benchmark: Some(benchmark),
+            is_listed: is_default,
+            values: None,
+            keys,
+        }
     }
 }
 

@@ -3,8 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
-use quad_dataset::ogbench::is_ogbench;
+use quad_algorithms::fits;
 use serde::{Deserialize, Serialize};
+
+use crate::config::tasks;
 
 /// The published score of a method on a task.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -51,6 +53,8 @@ type Scores = BTreeMap<String, BTreeMap<String, Vec<f64>>>;
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Tables {
+    /// Benchmark of its tasks.
+    benchmark: String,
     /// Training seeds per score.
     seeds: usize,
     /// Final evaluations averaged.
@@ -77,7 +81,7 @@ struct Method {
 #[serde(deny_unknown_fields)]
 struct KnownRemark {
     methods: Vec<String>,
-    /// Prefixes of its tasks; empty: all tasks.
+    /// Patterns of its tasks; empty: all tasks.
     #[serde(default)]
     tasks: Vec<String>,
     /// [`Remark::instead`] by task.
@@ -94,7 +98,7 @@ impl KnownRemark {
         let is_of_task = match (self.tasks.is_empty(), self.instead.is_empty()) {
             (true, true) => true,
             (true, false) => self.instead.contains_key(task),
-            (false, _) => self.tasks.iter().any(|start| task.starts_with(start)),
+            (false, _) => self.tasks.iter().any(|pattern| fits(pattern, task)),
         };
         let is_on = is_of_task && self.methods.iter().any(|known| known == method);
         let instead = self.instead.get(task).copied();
@@ -142,11 +146,12 @@ pub fn seeds(task: &str) -> usize {
     of_task(task).next().map_or(1, |tables| tables.seeds)
 }
 
-/// Number of final evaluations averaged for a score. If nothing is published, it is that of FQL's
-/// authors in OGBench, else the QUAD paper's.
+/// Number of final evaluations averaged for a score. If nothing is published, it is that of the
+/// first source for the task's benchmark, else the QUAD paper's.
 pub fn last(task: &str) -> usize {
-    let [paper, .., of_ogbench] = &*SOURCES;
-    let unpublished = if is_ogbench(task) { of_ogbench } else { paper };
+    let benchmark = tasks::named(task).ok().and_then(|task| task.benchmark);
+    let is_like = |tables: &&Tables| Some(&tables.benchmark) == benchmark.map(|known| &known.name);
+    let unpublished = SOURCES.iter().find(is_like).unwrap_or(&SOURCES[0]);
     of_task(task).next().unwrap_or(unpublished).last
 }
 

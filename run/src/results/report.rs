@@ -132,7 +132,7 @@ impl RunReport {
     /// [`Self::measure`] with its unit; in a maze, the fraction of episodes that reach the goal.
     pub fn measure_with_unit(&self) -> &'static str {
         match environment::find(&self.config.experiment.environment) {
-            Ok(known) if known.goal.is_some() => "success rate in %",
+            Ok(known) if known.maze.is_some() => "success rate in %",
             Ok(_) => "D4RL-normalized score",
             Err(_) => self.measure(),
         }

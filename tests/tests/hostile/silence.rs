@@ -51,10 +51,8 @@ async fn a_peer_that_reads_nothing_blocks_neither_jobs_nor_snapshots() {
     let _evaluator = scratch.evaluator("steady", &learner.endpoint());
     learner.wait_for_scores(0);
     let mut command = Command::new(env::current_exe().unwrap());
-    command.args([
-        "--exact",
-        "silence::a_peer_that_reads_nothing_blocks_neither_jobs_nor_snapshots",
-    ]);
+    command
+        .args(["--exact", "silence::a_peer_that_reads_nothing_blocks_neither_jobs_nor_snapshots"]);
     command.env(STRANGER, learner.endpoint()).current_dir(scratch.path());
     let stranger = Process::start("stranger", scratch.path(), command);
     learner.process.wait_for_log("evaluator stranger is here", PATIENCE);

@@ -83,14 +83,14 @@ fn large_actions_are_learned_and_given_in_the_robots_units() {
     let refused = |flags: &str, sentence: &str, hint: &str| {
         assert_refused(&training(data, run, flags).output().unwrap(), sentence, hint);
     };
-    refused("--scale states", "outside [-1, 1]", "--scale actions");
+    refused("--normalize observations", "outside [-1, 1]", "--normalize actions");
     let inspected = command(&format!("learner datasets inspect {data}")).output().unwrap();
     assert_eq!(inspected.status.code(), Some(1), "it has a problem");
     let inspected = String::from_utf8(inspected.stdout).unwrap();
     assert!(inspected.contains("it can be trained on"), "{inspected}");
-    assert!(inspected.contains("--scale actions"), "{inspected}");
+    assert!(inspected.contains("--normalize actions"), "{inspected}");
 
-    train(data, run, "--scale actions,states");
+    train(data, run, "--normalize actions,observations");
     let file = fs::read(run_dir.join("snapshots/step_000000020.safetensors")).unwrap();
     let scaling = Header::<Origin>::read(&file).unwrap().scaling.unwrap();
     let (of_actions, of_states) = (scaling.actions.unwrap(), scaling.observations.unwrap());
@@ -105,8 +105,8 @@ fn large_actions_are_learned_and_given_in_the_robots_units() {
     assert!(actions.iter().all(|action| action.abs() <= 30.001), "{actions:?}");
     assert!(actions.iter().any(|action| action.abs() > 5.0), "in the robot's units: {actions:?}");
 
-    let changed = r#"scale: ["actions", "states"] there, ["actions"] here"#;
-    refused("--scale actions", changed, "");
+    let changed = r#"normalize: ["actions", "observations"] there, ["actions"] here"#;
+    refused("--normalize actions", changed, "");
 }
 
 #[test]

@@ -47,7 +47,7 @@ fn a_snapshot_gets_the_scores_that_its_run_has() {
     for (name, precision, scale) in [
         ("exact", "f32", &[][..]),
         ("rounded", "bf16", &[]),
-        ("scaled", "f32", &["--scale", "states,actions"]),
+        ("scaled", "f32", &["--normalize", "observations,actions"]),
     ] {
         let learner = run(&scratch, name, precision, scale);
         let steps = SETTING.evaluated_steps();

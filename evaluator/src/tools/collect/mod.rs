@@ -15,7 +15,7 @@ use std::time::Instant;
 
 use anyhow::anyhow;
 use quad_dataset::environment::{all, find};
-use quad_dataset::{Collect, D4rlWriter, EnvironmentSpec, Metadata, Recipe};
+use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata, Recipe};
 use quad_runtime::Hint;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -65,12 +65,9 @@ pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
 }
 
 fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {
-    match &spec.collect {
-        Collect::Recipe(recipe) => Ok(recipe),
-        Collect::None(reason) => {
-            Err(anyhow!("no dataset can be recorded in {}: {reason}", spec.name))
-        }
-    }
+    spec.collect.as_ref().ok_or_else(|| {
+        anyhow!("no dataset can be recorded in {}: linear policies cannot solve a maze", spec.name)
+    })
 }
 
 /// Trains, then records at least `transitions` transitions, in whole episodes, to `path`.

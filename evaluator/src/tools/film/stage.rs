@@ -6,7 +6,7 @@ use mujoco_rs::wrappers::mj_rendering::{MjrContext, MjrRectangle, MjtFont, MjtGr
 use mujoco_rs::wrappers::mj_visualization::{
     MjtRndFlag, MjvCamera, MjvOption, MjvPerturb, MjvScene,
 };
-use quad_dataset::EnvironmentSpec;
+use quad_dataset::{CELL, EnvironmentSpec};
 
 use super::episode::{Episode, Pose};
 use super::gl::Gl;
@@ -34,10 +34,6 @@ const LOOKS: &str = r#"
 const ROBOT: [[f32; 3]; 2] = [[0.93, 0.49, 0.15], [0.16, 0.38, 0.66]];
 const WALL: [f32; 4] = [0.8, 0.7, 0.55, 1.0];
 const GOAL: [f32; 4] = [0.85, 0.15, 0.2, 0.6];
-/// Radius of the ball at a goal, meters.
-const GOAL_RADIUS: f64 = 0.5;
-/// Side of a wall, meters.
-const CELL: f64 = 4.0;
 /// Capacity of a scene for geometries beyond the model's: the goal, and those that MuJoCo adds.
 const EXTRA_GEOMS: usize = 100;
 /// Distance at which a free camera, whose vertical angle is 45°, sees all of an object of height 1.
@@ -52,6 +48,8 @@ pub struct Stage {
     scene: MjvScene,
     data: MjData<Box<MjModel>>,
     camera: MjvCamera,
+    /// Radius of the ball at a goal, meters.
+    reach: f64,
     layout: Layout,
     _gl: Gl,
 }
@@ -70,7 +68,8 @@ impl Stage {
         scene.flags_mut()[MjtRndFlag::mjRND_SHADOW as usize] = u8::from(camera.trackbodyid >= 0);
         let data = MjData::try_new(model)
             .map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
-        Ok(Self { context, scene, data, camera, layout, _gl: gl })
+        let reach = spec.maze.map_or(0.0, |maze| maze.reach);
+        Ok(Self { context, scene, data, camera, reach, layout, _gl: gl })
     }
 
     /// The picture of all episodes after `steps` steps.
@@ -97,7 +96,7 @@ impl Stage {
         let (option, perturb) = (MjvOption::default(), MjvPerturb::default());
         self.scene.update(&mut self.data, &option, &perturb, &mut self.camera);
         if let Some([x, y]) = pose.goal {
-            let (size, at) = ([GOAL_RADIUS; 3], [x, y, GOAL_RADIUS]);
+            let (size, at) = ([self.reach; 3], [x, y, self.reach]);
             let (shape, color) = (MjtGeom::mjGEOM_SPHERE, Some(GOAL));
             // SAFETY: it has no material, texture or object, and the scene has capacity for it.
             unsafe { self.scene.create_geom(shape, Some(size), Some(at), None, color) };
@@ -171,7 +170,7 @@ mod tests {
             let floor = model.name_to_id(MjtObjBase::mjOBJ_GEOM, "floor").unwrap();
             assert_eq!(model.geom_matid()[floor], 0, "{}: the floor is a checkerboard", spec.name);
             let camera = camera(&model, 4.0 / 3.0);
-            let (above, maze) = (camera.elevation < -45.0, spec.goal.is_some());
+            let (above, maze) = (camera.elevation < -45.0, spec.maze.is_some());
             assert_eq!((above, camera.trackbodyid == 1), (maze, !maze), "{}", spec.name);
         }
     }

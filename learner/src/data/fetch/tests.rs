@@ -38,6 +38,7 @@ fn status(status: &str) -> Answer {
 fn dataset(addresses: &[&Server]) -> NamedDataset {
     NamedDataset {
         name: "hopper-small-v2".to_owned(),
+        benchmark: quad_dataset::benchmarks::find("D4RL").unwrap(),
         environment: "hopper".to_owned(),
         file: "file.hdf5".to_owned(),
         bytes: Some(200_008),

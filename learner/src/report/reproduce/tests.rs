@@ -35,7 +35,7 @@ fn the_command_reproduces_the_experiment() {
     for (changes, words) in [
         (toml::Table::new(), ""),
         (
-            toml! { seed = 3 dataset = "a folder/$(it).hdf5" scale = ["actions"] batch_size = 64 },
+            toml! { seed = 3 dataset = "a folder/$(it).hdf5" normalize = ["actions"] batch_size = 64 },
             "",
         ),
         (

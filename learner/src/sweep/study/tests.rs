@@ -114,7 +114,7 @@ fn all_that_is_wrong_is_told_at_once() {
     );
     refused(
         &format!(
-            "axes = {{ {task}, scale = [['states'], ['states', 'actions', 'states']], agent.actor.hidden = [[{}]] }}",
+            "axes = {{ {task}, normalize = [['observations'], ['observations', 'actions', 'observations']], agent.actor.hidden = [[{}]] }}",
             "1000, ".repeat(20)
         ),
         &["1 to 64", "axis `method`"],

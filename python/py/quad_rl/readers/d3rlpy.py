@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from quad_rl import _dataset
+from quad_rl._rows import Source, rows_of_episodes
 
 
-def from_d3rlpy(dataset: Any) -> _dataset.Dataset:
+def from_d3rlpy(dataset: Any) -> Source:
     """An MDPDataset, or another ReplayBuffer, of d3rlpy 2.
 
     Steps are those that d3rlpy learns from: an episode is terminal at its last step if it is `terminated`; the last step of
@@ -19,4 +19,4 @@ def from_d3rlpy(dataset: Any) -> _dataset.Dataset:
             raise ValueError("observations are tuples, but only rows of numbers are learned from")
         arrays = {name: getattr(episode, name) for name in ("observations", "actions", "rewards")}
         episodes.append({**arrays, "terminated": bool(episode.terminated), "truncated": False})
-    return _dataset.Dataset.from_episodes(episodes)
+    return Source(rows_of_episodes(episodes))

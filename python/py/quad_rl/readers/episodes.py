@@ -1,4 +1,4 @@
-"""From a source's episodes to a Dataset: which columns are seen, what is rewarded, what ends the task."""
+"""From a source's episodes to transitions: observed columns, rewards, and ends of the task."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, Union
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_rl import _dataset
-from quad_rl._rows import Rows, episode_rows, plain
+from quad_rl._rows import Rows, Source, episode_rows, plain
 
 # A word or the name of a column, or a function of an episode, which is a dictionary of its columns, T rows each, and `episode`,
 # its number or name.
@@ -62,7 +61,7 @@ def width(array: NDArray[Any]) -> int:
 
 def dataset(
     log: Log, observations: Sequence[str], actions: Sequence[str], reward: Rule, success: Success, terminate: Rule
-) -> _dataset.Dataset:
+) -> Source:
     """The transitions of a source. Raises ValueError, with a hint, for what it does not have and nothing else says."""
     if isinstance(observations, str) or isinstance(actions, str):
         raise ValueError("observations and actions are lists of columns")
@@ -98,7 +97,7 @@ def dataset(
     if empty:
         notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
     names = [[name for column in columns for name in _names(log, column)] for columns in (observations, actions)]
-    return _dataset.Dataset(Rows(*(np.concatenate(arrays) for arrays in zip(*parts))), (names[0], names[1]), notes)
+    return Source(Rows(*(np.concatenate(arrays) for arrays in zip(*parts))), (names[0], names[1]), notes)
 
 
 def _check(log: Log, name: str) -> None:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_rl import _dataset
 from quad_rl._extras import library
-from quad_rl._rows import plain
+from quad_rl._rows import Source, plain
 from quad_rl.readers.arrow import array_of
 from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
 
@@ -30,7 +29,7 @@ def from_frame(
     success: Success = None,
     apart: str | None = None,
     continuous: bool = False,
-) -> _dataset.Dataset:
+) -> Source:
     """A table with a row for each step, in the order of recording.
 
     frame: a data frame (pandas, Polars, a pyarrow Table, a dictionary of arrays), or the path of a CSV or Parquet file, which

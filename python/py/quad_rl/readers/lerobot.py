@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_rl import _dataset
 from quad_rl._extras import library
+from quad_rl._rows import Source
 from quad_rl.readers.arrow import array_of
 from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
 
@@ -37,7 +37,7 @@ def from_lerobot(
     terminate: Rule = None,
     task: str | None = None,
     continuous: bool = False,
-) -> _dataset.Dataset:
+) -> Source:
     """A LeRobot dataset, v3.0 or v2.x: the folder with `meta/info.json`. Needs pyarrow.
 
     observations: its features that are seen, in this order, such as ["observation.state"]; no images or videos. Their numbers

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_rl import _dataset
 from quad_rl._extras import needing
+from quad_rl._rows import Source
 from quad_rl.readers.episodes import Episode, Log, dataset
 from quad_rl.readers.hdf5 import opened
 
 _ACTIONS, _REWARDS, _TERMINATIONS = "actions", "rewards", "terminations"
 
 
-def from_minari(id_or_folder: str | PathLike[str]) -> _dataset.Dataset:
+def from_minari(id_or_folder: str | PathLike[str]) -> Source:
     """A dataset of Minari, stored as HDF5, Arrow or Parquet. Needs minari, with what it needs for that storage.
 
     id_or_folder: an id such as "mujoco/hopper/medium-v0", which Minari downloads if it is not on this machine; or the folder of
@@ -33,7 +33,7 @@ def from_minari(id_or_folder: str | PathLike[str]) -> _dataset.Dataset:
         return _read(Path(id_or_folder))
 
 
-def _read(place: Path) -> _dataset.Dataset:
+def _read(place: Path) -> Source:
     minari: Any = importlib.import_module("minari")
 
     folders = [place / "data", place]

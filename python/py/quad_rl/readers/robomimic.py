@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_rl import _dataset
+from quad_rl._rows import Source
 from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
 from quad_rl.readers.hdf5 import opened
 
@@ -26,7 +26,7 @@ def from_robomimic(
     terminate: Rule = None,
     filter: str | None = None,
     continuous: bool = False,
-) -> _dataset.Dataset:
+) -> Source:
     """A file of robomimic or of what writes its layout (robosuite, RoboCasa, mimicgen, Isaac Lab). Needs h5py.
 
     observations: the keys below `obs` that are seen, in this order, such as ["object", "robot0_eef_pos"]; no images. Where `obs`

@@ -148,21 +148,21 @@ impl Cart {
     }
 
     /// The only thing that is said of it.
-    fn doubt(&self, own: bool) -> String {
-        let doubts = self.doubts(own);
-        assert_eq!(doubts.len(), 1, "{doubts:?}");
-        doubts[0].clone()
+    fn warning(&self, own: bool) -> String {
+        let warnings = self.warnings(own);
+        assert_eq!(warnings.len(), 1, "{warnings:?}");
+        warnings[0].clone()
     }
 
     /// What is said of it in each layout, by `inspect` and by who trains on it, who both say the
     /// same.
-    fn doubts(&self, own: bool) -> Vec<String> {
+    fn warnings(&self, own: bool) -> Vec<String> {
         let folder = tempdir().unwrap();
         let path = folder.path().join("cart.hdf5");
         self.write(&path, own);
         let inspection = inspect(&path, None).unwrap();
         assert!(!inspection.refused);
-        assert_eq!(try_read(&path, None).unwrap().doubts(), inspection.problems);
+        assert_eq!(try_read(&path, None).unwrap().warnings(), inspection.problems);
         inspection.problems
     }
 }

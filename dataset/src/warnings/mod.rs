@@ -1,4 +1,4 @@
-//! What can be trained on, though nothing good may come of it: each doubt is written here once, for
+//! What can be trained on, though nothing good may come of it: each warning is written here once, for
 //! every format, for who inspects data and for who trains on it.
 //!
 //! `ends` is what flags may really be, and `resets` whether they stand in the right row; `copied`
@@ -14,44 +14,52 @@ mod rest;
 mod rewards;
 mod sizes;
 
+use crate::normalize::Normalize;
 use crate::recording::{Recording, RowKind};
-use crate::reward::RewardRule;
-use crate::scale::Scale;
+use crate::tables::reward::RewardRule;
 
 /// Rows that tell enough of a recording: so many of them, evenly spread.
 const ENOUGH: usize = 20_000;
 
-/// One sentence for each doubt. `scale` is what of it is scaled, `rule` what becomes of rewards.
-pub(crate) fn doubts(recording: &Recording, scale: Scale, rule: RewardRule) -> Vec<String> {
-    let mut doubts = of_ends(recording);
-    doubts.extend(of_numbers(recording, scale, rule));
-    doubts
+/// One sentence for each warning.
+pub(crate) fn warnings(
+    recording: &Recording,
+    normalize: Normalize,
+    rule: RewardRule,
+) -> Vec<String> {
+    let mut warnings = of_ends(recording);
+    warnings.extend(of_numbers(recording, normalize, rule));
+    warnings
 }
 
-/// Doubts about where episodes end.
+/// Warnings about where episodes end.
 pub(crate) fn of_ends(recording: &Recording) -> Vec<String> {
     match ends::meaning(recording) {
-        Some(doubt) => vec![doubt],
+        Some(warning) => vec![warning],
         None => resets::out_of_step(recording),
     }
 }
 
-/// Doubts about the numbers of rows.
-pub(crate) fn of_numbers(recording: &Recording, scale: Scale, rule: RewardRule) -> Vec<String> {
+/// Warnings about the numbers of rows.
+pub(crate) fn of_numbers(
+    recording: &Recording,
+    normalize: Normalize,
+    rule: RewardRule,
+) -> Vec<String> {
     let copied = copied::actions(recording);
     let rest = rest::observations(recording);
     let late =
         if copied.is_some() || rest.is_some() { None } else { late::observations(recording) };
-    let mut doubts = Vec::from_iter(rewards::alike(recording));
-    if doubts.is_empty() {
-        doubts.extend(rewards::after_goal(recording));
-        // A task's rule, or a scale, decides the size already.
-        let is_own = rule == RewardRule::AsIs && !scale.rewards;
-        doubts.extend(if is_own { rewards::size(recording) } else { None });
+    let mut warnings = Vec::from_iter(rewards::alike(recording));
+    if warnings.is_empty() {
+        warnings.extend(rewards::after_goal(recording));
+        // A task's rule or the normalization decides the size already.
+        let is_own = rule == RewardRule::AsIs && !normalize.rewards;
+        warnings.extend(if is_own { rewards::size(recording) } else { None });
     }
-    doubts.extend(copied.into_iter().chain(rest).chain(late));
-    doubts.extend(sizes::columns(recording, scale));
-    doubts
+    warnings.extend(copied.into_iter().chain(rest).chain(late));
+    warnings.extend(sizes::columns(recording, normalize));
+    warnings
 }
 
 /// Columns by their numbers and, where they have some, their names.

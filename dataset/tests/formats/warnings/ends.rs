@@ -7,15 +7,15 @@ fn a_mask_or_a_discount_in_place_of_the_flag() {
     for own in [false, true] {
         let mut cart = mass(60, 0.1);
         cart.terminals.iter_mut().for_each(|terminal| *terminal = !*terminal);
-        let doubt = cart.doubt(own);
-        assert!(doubt.starts_with("array `terminals`: says in 9"), "{doubt}");
+        let warning = cart.warning(own);
+        assert!(warning.starts_with("array `terminals`: says in 9"), "{warning}");
         assert!(
-            doubt.contains("a mask or a discount (1 − done) in place of the flag? write 1 − it"),
-            "{doubt}"
+            warning.contains("a mask or a discount (1 − done) in place of the flag? write 1 − it"),
+            "{warning}"
         );
         // Of episodes that are all cut off, the mask is 1 everywhere.
         cart.terminals.fill(true);
-        assert!(cart.doubt(own).starts_with("array `terminals`: says in 100 % of the rows"));
+        assert!(cart.warning(own).starts_with("array `terminals`: says in 100 % of the rows"));
     }
 }
 
@@ -31,11 +31,11 @@ fn a_success_that_stays_set() {
                 since = 0;
             }
         }
-        let doubt = cart.doubt(own);
+        let warning = cart.warning(own);
         assert!(
-            doubt
+            warning
                 .contains("a success that stays set after the goal? end each episode at the first"),
-            "{doubt}"
+            "{warning}"
         );
     }
 }
@@ -49,12 +49,15 @@ fn a_time_limit_in_place_of_the_end() {
         assert!(count(&limits) >= 5, "{}", count(&limits));
         cart.terminals = terminals.iter().zip(&limits).map(|(one, other)| *one || *other).collect();
         cart.timeouts.fill(false);
-        let doubt = cart.doubt(own);
+        let warning = cart.warning(own);
         let expected = format!(
             "array `terminals`: {} of 30 episodes that terminate do so after exactly 60 steps",
             count(&limits)
         );
-        assert!(doubt.starts_with(&expected) && doubt.contains("set `timeouts` there"), "{doubt}");
+        assert!(
+            warning.starts_with(&expected) && warning.contains("set `timeouts` there"),
+            "{warning}"
+        );
     }
 }
 
@@ -66,18 +69,18 @@ fn rows_after_the_goal() {
         cart.rewards[row] = f32::from(number >= 3);
         number = if cart.terminals[row] || cart.timeouts[row] { 0 } else { number + 1 };
     }
-    let doubt = cart.doubt(true);
+    let warning = cart.warning(true);
     assert!(
-        doubt.starts_with("array `rewards`: 90.6") && doubt.contains("few lead to it"),
-        "{doubt}"
+        warning.starts_with("array `rewards`: 90.6") && warning.contains("few lead to it"),
+        "{warning}"
     );
-    assert_eq!(cart.doubt(false), doubt);
+    assert_eq!(cart.warning(false), warning);
     // A fall costs something, and most rows are before it.
     cart.rewards
         .iter_mut()
         .zip(&cart.terminals)
         .for_each(|(reward, fall)| *reward = f32::from(!fall));
-    assert_eq!(cart.doubts(true), [""; 0]);
+    assert_eq!(cart.warnings(true), [""; 0]);
 }
 
 #[test]
@@ -89,15 +92,15 @@ fn flags_that_are_a_row_out_of_step_with_the_resets() {
         for own in [false, true] {
             let mut cart = Cart::new(false);
             flags(&mut cart).rotate_right(1);
-            assert!(cart.doubt(own).starts_with(&format!("array `{name}`: one row late")));
+            assert!(cart.warning(own).starts_with(&format!("array `{name}`: one row late")));
             flags(&mut cart).rotate_left(2);
-            assert!(cart.doubt(own).starts_with(&format!("array `{name}`: one row early")));
+            assert!(cart.warning(own).starts_with(&format!("array `{name}`: one row early")));
         }
     }
     // Where resets do not show, nothing is known of flags.
     let mut kept = Cart::new(true);
     kept.timeouts.rotate_right(1);
-    assert_eq!(kept.doubts(false), [""; 0]);
+    assert_eq!(kept.warnings(false), [""; 0]);
 }
 
 #[test]
@@ -107,5 +110,5 @@ fn crashes_are_no_resets() {
     for row in (1..cart.rewards.len()).filter(|&row| cart.terminals[row]) {
         cart.observations[row * O] += 3.0;
     }
-    assert_eq!(cart.doubts(false), [""; 0]);
+    assert_eq!(cart.warnings(false), [""; 0]);
 }

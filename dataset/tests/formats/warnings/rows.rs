@@ -29,25 +29,25 @@ fn moved(cart: &Cart, from: impl Fn(usize, usize) -> usize) -> Cart {
 fn observations_that_rest_while_actions_change() {
     for own in [false, true] {
         let chunks = moved(&mass(60, 0.1), |row, number| row - number % 10);
-        let doubt = chunks.doubt(own);
-        assert!(doubt.starts_with("array `observations`: does not change in 90."), "{doubt}");
-        assert!(doubt.contains("a chunk's start"), "{doubt}");
+        let warning = chunks.warning(own);
+        assert!(warning.starts_with("array `observations`: does not change in 90."), "{warning}");
+        assert!(warning.contains("a chunk's start"), "{warning}");
         let pairs = moved(&mass(60, 0.1), |row, number| row - number % 2);
-        assert!(pairs.doubt(own).starts_with("array `observations`: does not change in"));
+        assert!(pairs.warning(own).starts_with("array `observations`: does not change in"));
     }
     // A robot that stands still is told to.
     let mut still = moved(&mass(60, 0.1), |row, number| row - number % 10);
     still.actions.chunks_exact_mut(2).for_each(|action| action.copy_from_slice(&[0.25, 0.5]));
-    assert!(!still.doubts(true).iter().any(|doubt| doubt.contains("does not change")));
+    assert!(!still.warnings(true).iter().any(|warning| warning.contains("does not change")));
 }
 
 #[test]
 fn next_observations_that_are_the_rows_own() {
     let mut cart = mass(60, 0.1);
     cart.next_observations = cart.observations.clone();
-    let doubts = cart.doubts_of_inspect();
-    assert!(doubts.iter().any(|doubt| {
-        doubt.starts_with("array `next_observations`: is the observation of its own row in 100 %")
+    let warnings = cart.doubts_of_inspect();
+    assert!(warnings.iter().any(|warning| {
+        warning.starts_with("array `next_observations`: is the observation of its own row in 100 %")
     }));
 }
 
@@ -61,9 +61,9 @@ fn actions_that_are_the_state() {
         for (action, observation) in actions.chunks_exact_mut(2).zip(observations.chunks_exact(O)) {
             action.copy_from_slice(&[unit * observation[1], unit * observation[0]]);
         }
-        let doubts = cart.doubts_of_inspect_in(own);
+        let warnings = cart.doubts_of_inspect_in(own);
         let expected = "array `actions`: columns 0, 1 copied from columns 1, 0 of the same row's observation (in 100.0 %";
-        assert!(doubts.iter().any(|doubt| doubt.starts_with(expected)), "{doubts:?}");
+        assert!(warnings.iter().any(|warning| warning.starts_with(expected)), "{warnings:?}");
     }
     // The state of the next row is a command like others.
     let mut cart = mass(60, 0.1);
@@ -72,7 +72,7 @@ fn actions_that_are_the_state() {
     {
         action.copy_from_slice(&next[..2]);
     }
-    assert!(!cart.doubts_of_inspect().iter().any(|doubt| doubt.contains("copied")));
+    assert!(!cart.doubts_of_inspect().iter().any(|warning| warning.contains("copied")));
     // A gripper's state equals its command but where it moves.
     let mut cart = mass(60, 0.1);
     let open = |row: usize| f32::from(u8::from(row % 40 < 20));
@@ -81,7 +81,7 @@ fn actions_that_are_the_state() {
         cart.next_observations[row * O + 3] = open(row + 1);
         cart.actions[row * 2 + 1] = open(row + 1);
     }
-    assert!(!cart.doubts_of_inspect().iter().any(|doubt| doubt.contains("copied")));
+    assert!(!cart.doubts_of_inspect().iter().any(|warning| warning.contains("copied")));
 }
 
 #[test]
@@ -92,11 +92,13 @@ fn observations_that_are_a_row_late() {
         let is_last = |row: usize| sound.terminals[row] || sound.timeouts[row];
         let late = moved(&sound, |row, _| if is_last(row) { row } else { (row + 1).min(last) });
         for own in [false, true] {
-            assert_eq!(sound.doubts(own), [""; 0]);
-            let doubts = late.doubts_of_inspect_in(own);
+            assert_eq!(sound.warnings(own), [""; 0]);
+            let warnings = late.doubts_of_inspect_in(own);
             assert!(
-                doubts.iter().any(|doubt| doubt.starts_with("array `observations`: one row late?")),
-                "{doubts:?}"
+                warnings
+                    .iter()
+                    .any(|warning| warning.starts_with("array `observations`: one row late?")),
+                "{warnings:?}"
             );
         }
     }

@@ -4,8 +4,8 @@
 use super::ends::MOST_AFTER_GOAL;
 use super::{percent, short};
 use crate::recording::Recording;
-use crate::reward::RewardScaling;
 use crate::statistics::Extent;
+use crate::tables::reward::RewardScaling;
 
 /// Differences that are smaller, of the rewards' size, are lost in float32 by critics, whose values
 /// are some hundred times as large.
@@ -102,7 +102,7 @@ pub(super) fn size(recording: &Recording) -> Option<String> {
     let returns = Extent::of(recording.episodes().iter().map(|episode| episode.sum));
     Some(format!(
         "array `rewards`: of size {} a step (root mean square; episodes return {} to {}), where methods are made for about 1: \
-         {weights}; `learner train --scale rewards` divides them by it",
+         {weights}; `learner train --normalize rewards` divides them by it",
         short(size),
         short(returns.min),
         short(returns.max)

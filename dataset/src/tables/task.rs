@@ -1,6 +1,6 @@
 //! What a run is about: an environment by its name, known here or not.
 
-use crate::environment::{self, EnvironmentSpec};
+use crate::tables::environment::{self, EnvironmentSpec};
 
 /// Where a run's data is from and where its policies act. An environment that is not in the table
 /// has the sizes of its dataset, no known time limit, and no reference returns.

@@ -6,42 +6,44 @@ use std::path::Path;
 
 use serde_json::Value;
 
+use crate::error::Load::{self, Convert, Python};
 use crate::error::Problem;
 
 /// How many bytes of a file tell what it is.
 pub(crate) const START: u64 = 256;
 
-/// How a hint begins that names all there is to do.
-pub(crate) const CONVERT: &str = "quad-convert";
-
-const TABLE: &str = "quad-convert FILE --observations COLUMN … --actions COLUMN … --reward COLUMN --episode COLUMN --terminal COLUMN";
-const PICKLE: &str =
-    "load it by pickle.load, if you trust who wrote it: a pickle can run any program";
+const TABLE: Load = Convert(
+    "quad-convert FILE --observations COLUMN … --actions COLUMN … --reward COLUMN --episode COLUMN --terminal COLUMN",
+);
+const PICKLE: Load =
+    Python("load it by pickle.load, if you trust who wrote it: a pickle can run any program");
 
 /// How files begin, what such a file is, and how to load it.
-const STARTS: [(&[u8], &str, &str); 8] = [
+const STARTS: [(&[u8], &str, Load); 8] = [
     (b"PAR1", "a Parquet file", TABLE),
-    (b"ARROW1", "an Arrow file", "load it by pandas.read_feather"),
+    (b"ARROW1", "an Arrow file", Python("load it by pandas.read_feather")),
     (b"\x80\x02", "a Python pickle", PICKLE),
     (b"\x80\x03", "a Python pickle", PICKLE),
     (b"\x80\x04", "a Python pickle", PICKLE),
     (b"\x80\x05", "a Python pickle", PICKLE),
-    (b"\x93NUMPY", "a single NumPy array", "load it by numpy.load"),
+    (b"\x93NUMPY", "a single NumPy array", Python("load it by numpy.load")),
     (
         b"MATLAB",
         "a MATLAB file",
-        "load it by scipy.io.loadmat or, if it is of version 7.3, by h5py, which transposes arrays",
+        Python(
+            "load it by scipy.io.loadmat or, if it is of version 7.3, by h5py, which transposes arrays",
+        ),
     ),
 ];
 
-fn foreign(what: impl Into<String>, load: &'static str) -> Problem {
+fn foreign(what: impl Into<String>, load: Load) -> Problem {
     Problem::Foreign { what: what.into(), load }
 }
 
 /// What a file is that is neither HDF5 nor a zip archive, by its first [`START`] bytes.
 pub(crate) fn of_start(start: &[u8]) -> Problem {
     if let Some((_, what, load)) = STARTS.iter().find(|(bytes, _, _)| start.starts_with(bytes)) {
-        return foreign(*what, load);
+        return foreign(*what, *load);
     }
     // A character that the last of these bytes cuts in two is left out.
     let text = start.utf8_chunks().next().filter(|chunk| start.len() - chunk.valid().len() < 4);
@@ -52,7 +54,7 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
             Problem::UnknownFormat
         }
         text if text.starts_with(['{', '[']) => {
-            foreign("a JSON file", "load it by json.load or pandas.read_json")
+            foreign("a JSON file", Python("load it by json.load or pandas.read_json"))
         }
         _ if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", TABLE),
         _ => Problem::UnknownFormat,
@@ -66,14 +68,16 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
         json[key].as_str().map(str::to_owned)
     };
     if let Some(version) = text("meta/info.json", "codebase_version") {
-        let load = "quad-convert FOLDER --observations observation.state --reward step-cost --success EPISODE …";
+        let load = Convert(
+            "quad-convert FOLDER --observations observation.state --reward step-cost --success EPISODE …",
+        );
         return foreign(format!("a LeRobot dataset of version {version}"), load);
     }
     let format =
         text("data/metadata.json", "data_format").or_else(|| text("metadata.json", "data_format"));
     match format.filter(|format| format != "hdf5") {
         Some(format) => {
-            foreign(format!("a Minari dataset stored as {format}"), "quad-convert FOLDER")
+            foreign(format!("a Minari dataset stored as {format}"), Convert("quad-convert FOLDER"))
         }
         None => Problem::UnknownFolder,
     }
@@ -87,10 +91,10 @@ pub(crate) fn of_group(
 ) -> Option<Problem> {
     let demonstration = members.iter().find(|name| name.starts_with("demo_"))?;
     Some(match within(demonstration).iter().any(|name| name == "rewards") {
-        true => foreign("a robomimic file", "quad-convert FILE --observations KEY …"),
+        true => foreign("a robomimic file", Convert("quad-convert FILE --observations KEY …")),
         false => foreign(
             "a file in robomimic's layout without rewards, as Isaac Lab's recorder writes it",
-            "quad-convert FILE --observations KEY … --reward success-at-end --success all",
+            Convert("quad-convert FILE --observations KEY … --reward success-at-end --success all"),
         ),
     })
 }
@@ -100,7 +104,7 @@ pub(crate) fn of_archive(files: &[impl AsRef<str>]) -> Option<Problem> {
     let has = |ending: &str| files.iter().any(|name| name.as_ref().ends_with(ending));
     match (has(".npy"), has("data.pkl")) {
         (true, _) => None,
-        (false, true) => Some(foreign("a PyTorch file", "load it by torch.load")),
+        (false, true) => Some(foreign("a PyTorch file", Python("load it by torch.load"))),
         (false, false) => Some(Problem::UnknownFormat),
     }
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use quad_dataset::{
-    Arrays, Batch, HoldOut, Names, ReadOptions, RewardRule, Scale, Transitions, write_own,
+    Arrays, Batch, HoldOut, Names, Normalize, ReadOptions, RewardRule, Transitions, write_own,
 };
 use tempfile::{TempDir, tempdir};
 
@@ -39,18 +39,19 @@ fn file() -> (TempDir, PathBuf) {
     (folder, path)
 }
 
-fn options(scale: Scale) -> ReadOptions {
-    ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale }
+fn options(normalize: Normalize) -> ReadOptions {
+    ReadOptions { normalize, ..ReadOptions::default() }
 }
 
-fn scaled(actions: bool, states: bool) -> Transitions {
-    Transitions::read(file().1, &options(Scale { actions, states, rewards: false })).unwrap()
+fn normalized(actions: bool, observations: bool) -> Transitions {
+    Transitions::read(file().1, &options(Normalize { actions, observations, rewards: false }))
+        .unwrap()
 }
 
 /// The expected numbers are NumPy's: (x - x.mean(0)) / x.std(0), in float64.
 #[test]
-fn states_have_mean_0_and_deviation_1() {
-    let transitions = scaled(true, true);
+fn observations_have_mean_0_and_deviation_1() {
+    let transitions = normalized(true, true);
     let Batch { observations, next_observations, .. } = all(&transitions);
     #[rustfmt::skip]
     let expected = [
@@ -82,8 +83,8 @@ fn rows_that_are_not_learned_from_do_not_count() {
     put(&file, "terminals", &[4], &[false; 4]);
     put(&file, "timeouts", &[4], &[false, true, false, false]);
     drop(file);
-    let scale = Scale { states: true, ..Scale::default() };
-    let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale };
+    let normalize = Normalize { observations: true, ..Normalize::default() };
+    let options = ReadOptions { normalize, ..ReadOptions::default() };
     // Neither the timeout nor the last row makes a transition.
     let affine =
         Transitions::read(&path, &options).unwrap().scaling().observations.clone().unwrap();
@@ -92,7 +93,7 @@ fn rows_that_are_not_learned_from_do_not_count() {
 
 #[test]
 fn actions_reach_from_least_to_largest() {
-    let transitions = scaled(true, false);
+    let transitions = normalized(true, false);
     let batch = all(&transitions);
     // As unscaled ones they are kept a little within ±1.
     assert_close("actions", &batch.actions, &[-0.999_99, 0.0, 0.0, 0.0, -0.25, 0.0, 0.999_99, 0.0]);
@@ -107,23 +108,24 @@ fn actions_reach_from_least_to_largest() {
     assert_eq!(batch.rewards, arrays().rewards);
     // What follows what is told by the numbers of the file.
     assert_eq!(transitions.episodes().len(), 1, "as without scaling");
-    assert_eq!(scaled(true, true).episodes(), transitions.episodes());
+    assert_eq!(normalized(true, true).episodes(), transitions.episodes());
 }
 
 #[test]
-fn states_alone_leave_the_range_of_actions_to_be_checked() {
+fn observations_alone_leave_the_range_of_actions_to_be_checked() {
     let (_folder, path) = file();
-    let error = Transitions::read(path, &options(Scale { states: true, ..Scale::default() }))
-        .err()
-        .unwrap();
+    let error =
+        Transitions::read(path, &options(Normalize { observations: true, ..Normalize::default() }))
+            .err()
+            .unwrap();
     assert!(error.to_string().contains("the action -30 is outside [-1, 1]"), "{error}");
 }
 
 #[test]
 fn rewards_have_a_mean_square_of_1() {
     let (_folder, path) = file();
-    let scale = Scale { actions: true, states: false, rewards: true };
-    let transitions = Transitions::read(&path, &options(scale)).unwrap();
+    let normalize = Normalize { actions: true, observations: false, rewards: true };
+    let transitions = Transitions::read(&path, &options(normalize)).unwrap();
     let size = 7.5_f32.sqrt(); // of 1, 2, 3 and 4
     assert_eq!(transitions.scaling().rewards, Some(size));
     assert_close(
@@ -133,7 +135,7 @@ fn rewards_have_a_mean_square_of_1() {
     );
     assert_eq!(transitions.statistics().return_mean, 10.0, "as they were recorded");
     // After the rule of the task.
-    let rule = ReadOptions { reward: RewardRule::CenterTimes4, ..options(scale) };
+    let rule = ReadOptions { reward: RewardRule::CenterTimes4, ..options(normalize) };
     let ruled = Transitions::read(&path, &rule).unwrap();
     assert_close(
         "ruled",
@@ -142,14 +144,15 @@ fn rewards_have_a_mean_square_of_1() {
     );
     write_own(&path, Arrays { rewards: vec![0.0; 4], ..arrays() }, Names::default()).unwrap();
     assert_eq!(
-        Transitions::read(&path, &options(scale)).unwrap().scaling().rewards,
+        Transitions::read(&path, &options(normalize)).unwrap().scaling().rewards,
         None,
         "0 has no size"
     );
     // What is held out is in the same unit.
     let whole = Arrays { timeouts: vec![false, true, false, true], ..arrays() };
     write_own(&path, whole, Names::default()).unwrap();
-    let split = Transitions::read_split(&path, &options(scale), HoldOut::Episodes(&[1])).unwrap();
+    let split =
+        Transitions::read_split(&path, &options(normalize), HoldOut::Episodes(&[1])).unwrap();
     let size = 2.5_f32.sqrt(); // of 1 and 2
     assert_eq!(split.training.scaling().rewards, Some(size));
     assert_close("held out", &all(&split.held_out.unwrap()).rewards, &[3.0 / size, 4.0 / size]);

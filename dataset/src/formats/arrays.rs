@@ -8,19 +8,10 @@ use hdf5::types::VarLenUnicode;
 
 use crate::checks;
 use crate::error::{DatasetError, Problem};
-use crate::formats::{ACTION_NAMES, OBSERVATION_NAMES, OWN_LAYOUT};
-use crate::new_file::{Column, NewFile};
-use crate::recording::{Recording, RowKind};
+use crate::formats::new_file::{Column, NewFile};
+use crate::formats::own::{self, ACTION_NAMES, OBSERVATION_NAMES};
+use crate::recording::{Names, Recording, RowKind};
 use crate::rounding::Rounding;
-
-/// What a source calls the numbers of its rows. An empty list where they have no names.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Names {
-    /// Names of the numbers of an observation, o.
-    pub observations: Vec<String>,
-    /// Names of the numbers of an action, a.
-    pub actions: Vec<String>,
-}
 
 /// Transitions in memory, N of them, in the order of their episodes.
 #[derive(Clone, Debug, Default)]
@@ -106,7 +97,7 @@ pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result
 }
 
 fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
-    let layout = VarLenUnicode::from_str(OWN_LAYOUT).map_err(|error| error.to_string())?;
+    let layout = VarLenUnicode::from_str(own::LAYOUT).map_err(|error| error.to_string())?;
     file.hdf5.new_attr::<VarLenUnicode>().create("layout")?.write_scalar(&layout)?;
     for (name, texts) in [
         (OBSERVATION_NAMES, &recording.names.observations),

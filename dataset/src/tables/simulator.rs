@@ -1,6 +1,45 @@
-//! The numbers in an environment's row by which evaluators simulate it and record data in it.
+//! The numbers by which evaluators simulate an environment and record data in it.
 
 use serde::Deserialize;
+
+/// How an environment is simulated.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Simulator {
+    /// A robot that runs in a vertical plane.
+    Planar(Planar),
+    /// A robot in a maze of these rows of cells along +y, in them cells along +x: 1 wall, 0 free.
+    #[serde(skip)]
+    Maze(&'static Robot, &'static [String]),
+}
+
+/// A robot that moves through mazes.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Robot {
+    /// Name of its model.
+    pub name: String,
+    pub(super) observation_dim: usize,
+    pub(super) action_dim: usize,
+    pub(super) qpos_dim: usize,
+    pub(super) qvel_dim: usize,
+    /// Steps of the model that a control is held for.
+    pub frame_skip: usize,
+    /// Noise on the initial state.
+    pub noise: Noise,
+    /// Effect of its actions.
+    pub drive: Drive,
+}
+
+/// Effect of an action.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Drive {
+    /// Torques, as fractions of each motor's strongest.
+    Motors,
+    /// Displacements before a step, as fractions of this many meters; velocities become 0.
+    Displacement(f64),
+}
 
 /// A robot in a vertical plane that is rewarded for running along x. Positions begin with its x, z
 /// (meters) and pitch (radians); a policy observes all but x, then the velocities.
@@ -27,7 +66,7 @@ fn unlimited() -> f64 {
     f64::INFINITY
 }
 
-/// Noise on the initial state: added to each position and velocity that the model begins with.
+/// Noise that is added to each position and velocity of the initial state.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Noise {
@@ -54,7 +93,7 @@ impl Healthy {
     /// Whether an episode continues in a state. False for NaN, because no comparison with NaN
     /// holds.
     pub fn contains(&self, qpos: &[f64], qvel: &[f64]) -> bool {
-        let within = |(least, most): (f64, f64), value: f64| value > least && value < most;
+        let within = |(min, max): (f64, f64), value: f64| value > min && value < max;
         let mut others = qpos[2..].iter().chain(qvel);
         within(self.z, qpos[1])
             && within(self.pitch, qpos[2])
@@ -62,17 +101,7 @@ impl Healthy {
     }
 }
 
-/// Whether a dataset of mediocre behavior can be recorded in an environment.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Collect {
-    /// How.
-    Recipe(Recipe),
-    /// Why not.
-    None(String),
-}
-
-/// How a dataset is recorded.
+/// Recipe by which a dataset of mediocre behavior is recorded.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {

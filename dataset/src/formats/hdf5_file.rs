@@ -12,12 +12,10 @@ use hdf5::dataset::Layout;
 use hdf5::types::{FixedAscii, FixedUnicode, TypeDescriptor, VarLenAscii, VarLenUnicode};
 use hdf5::{Container, H5Type, IndexType, IterationOrder, LinkType};
 
-use crate::array::Array;
 use crate::error::{DatasetError, Problem};
-use crate::foreign;
-
-/// The first bytes of an HDF5 file.
-pub const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
+use crate::formats::array::Array;
+use crate::formats::foreign;
+use crate::tables::benchmarks::Format;
 
 /// deflate shrinks by a factor of 1032 at most, so more than that in an array is a lie about its
 /// size.
@@ -229,7 +227,7 @@ fn unreadable(array: &str, source: hdf5::Error) -> Problem {
 
 /// Why HDF5 refuses a file of `bytes` bytes that begins like this.
 fn refusal(file: &File, start: &[u8], bytes: u64, source: hdf5::Error) -> Problem {
-    if !start.starts_with(SIGNATURE) {
+    if Format::of(start) != Some(Format::Hdf5) {
         return foreign::of_start(start);
     }
     if file.try_lock_shared().is_err() {

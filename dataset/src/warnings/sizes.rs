@@ -1,8 +1,8 @@
 //! Numbers that are too far from ±1, or change too little, to be learned from as they are.
 
 use super::{named, short};
+use crate::normalize::Normalize;
 use crate::recording::{Recording, RowKind};
-use crate::scale::Scale;
 
 /// The largest root mean square of a number of the observations that nothing is said of. Where one
 /// of a cart's four was this large, IQL's critic loss after 3,000 steps was twice that with all
@@ -14,38 +14,38 @@ const SMALLEST: f64 = 1e-3;
 const ROUNDING: f64 = 1e-6;
 
 /// Sentences on the columns of observations and actions that are not to be scaled.
-pub(super) fn columns(recording: &Recording, scale: Scale) -> Vec<String> {
+pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String> {
     let Recording { observation_dim, action_dim, observations, actions, kinds, names, .. } =
         recording;
-    let mut doubts = Vec::new();
-    if !scale.states {
+    let mut warnings = Vec::new();
+    if !normalize.observations {
         let columns =
             moments(observations, *observation_dim, |row| kinds[row] == RowKind::Transition);
         let (large, largest) = most(&columns, |[size, _]| (size > LARGEST).then_some(size));
-        doubts.extend((!large.is_empty()).then(|| {
+        warnings.extend((!large.is_empty()).then(|| {
             format!(
-                "array `observations`: far from ±1 in {}, of size {largest:.0}, which spoils training; `learner train --scale states` \
+                "array `observations`: far from ±1 in {}, of size {largest:.0}, which spoils training; `learner train --normalize observations` \
                  trains on it",
                 named(&large, &names.observations)
             )
         }));
-        doubts.extend(small("observations", &columns, &names.observations, "states"));
+        warnings.extend(small("observations", &columns, &names.observations));
     }
-    if !scale.actions {
+    if !normalize.actions {
         let columns = moments(actions, *action_dim, |row| kinds[row] != RowKind::LastState);
-        doubts.extend(small("actions", &columns, &names.actions, "actions"));
+        warnings.extend(small("actions", &columns, &names.actions));
     }
-    doubts
+    warnings
 }
 
 /// Columns that change, but hardly.
-fn small(array: &str, columns: &[[f64; 2]], names: &[String], scale: &str) -> Option<String> {
+fn small(array: &str, columns: &[[f64; 2]], names: &[String]) -> Option<String> {
     let changes = |[size, deviation]: [f64; 2]| deviation < SMALLEST && deviation > ROUNDING * size;
     let (small, largest) = most(columns, |column| changes(column).then_some(column[1]));
     (!small.is_empty()).then(|| {
         format!(
             "array `{array}`: hardly changes in {}, by a standard deviation of {}, which networks do not tell from 0; `learner train \
-             --scale {scale}` trains on it",
+             --normalize {array}` trains on it",
             named(&small, names),
             short(largest)
         )

@@ -1,21 +1,25 @@
 //! From a source's rows to transitions (s, a, r, s', mask).
 
+pub mod hold_out;
+pub mod sampler;
+pub mod statistics;
+
 use std::ops::Range;
 use std::path::Path;
 
 use quad_kernels::scaling::Scaling;
 
-use crate::arrays::{Arrays, Names};
-use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
-use crate::hold_out::{HoldOut, Split};
-use crate::ogbench::MazeTask;
-use crate::recording::Recording;
-use crate::reward::{RewardRule, RewardScaling};
-use crate::scale::{self, Scale};
-use crate::statistics::Statistics;
-use crate::{checks, doubts};
+use crate::formats::arrays::Arrays;
+use crate::normalize::{self, Normalize};
+use crate::recording::{Names, Recording};
+use crate::tables::environment::EnvironmentSpec;
+use crate::tables::maze::MazeTask;
+use crate::tables::reward::{RewardRule, RewardScaling};
+use crate::{checks, warnings};
+use hold_out::HoldOut;
+use statistics::Statistics;
 
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
@@ -52,8 +56,8 @@ impl Batch {
     }
 }
 
-/// How a source is to be read.
-#[derive(Clone, Copy, Debug)]
+/// Options of reading a source.
+#[derive(Clone, Copy, Debug, Default)]
 pub struct ReadOptions {
     /// The environment it was recorded in, if it is known: sizes, time limit and reference returns
     /// come from there. Else the source's own sizes count, and without timeouts nothing is cut off.
@@ -64,7 +68,7 @@ pub struct ReadOptions {
     /// What happens to its rewards.
     pub reward: RewardRule,
     /// What is scaled; actions that are not must lie within [-1, 1].
-    pub scale: Scale,
+    pub normalize: Normalize,
 }
 
 /// Transitions to learn from, in the order of the recording. They do not change, so threads can
@@ -97,9 +101,20 @@ pub struct Transitions {
     /// Whether the goal was reached earlier in the recorded episode; N.
     past_goal: Vec<bool>,
     statistics: Statistics,
-    doubts: Vec<String>,
+    warnings: Vec<String>,
     scaling: Scaling,
     names: Names,
+}
+
+/// Transitions to learn from, and episodes that are kept out of training.
+pub struct Split {
+    /// To learn from: statistics, scaling and warnings are of these alone.
+    pub training: Transitions,
+    /// Episodes that are kept out, in the same units; none if the share is 0 or there is but one
+    /// episode.
+    pub held_out: Option<Transitions>,
+    /// Their numbers, from 0 in the order of the file.
+    pub episodes: Vec<usize>,
 }
 
 impl Transitions {
@@ -135,12 +150,7 @@ impl Transitions {
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
-        let options = ReadOptions {
-            environment: None,
-            task: None,
-            reward: RewardRule::AsIs,
-            scale: Scale::default(),
-        };
+        let options = ReadOptions::default();
         Ok(Self::split(recording, &options, HoldOut::NONE).map_err(error)?.training)
     }
 
@@ -149,9 +159,9 @@ impl Transitions {
         options: &ReadOptions,
         hold_out: HoldOut<'_>,
     ) -> Result<Split, Problem> {
-        let ReadOptions { environment, reward, scale, .. } = *options;
+        let ReadOptions { environment, reward, normalize, .. } = *options;
         let problems = checks::problems(&recording, environment);
-        let outside = if scale.actions { None } else { checks::actions_outside(&recording) };
+        let outside = if normalize.actions { None } else { checks::actions_outside(&recording) };
         if let Some(problem) = problems.into_iter().chain(outside).next() {
             return Err(problem);
         }
@@ -164,11 +174,11 @@ impl Transitions {
         };
         let rewards =
             reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
-        let scaling = scale.of(&recording, rewards);
+        let scaling = normalize.scaling(&recording, rewards);
         let held_out =
             held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
-        let doubts = doubts::doubts(&recording, scale, reward);
-        let training = Self { doubts, ..Self::new(recording, environment, rewards, scaling) };
+        let warnings = warnings::warnings(&recording, normalize, reward);
+        let training = Self { warnings, ..Self::new(recording, environment, rewards, scaling) };
         Ok(Split {
             training,
             held_out: held_out.filter(|held_out| !held_out.rows.is_empty()),
@@ -186,7 +196,7 @@ impl Transitions {
         let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
         let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
         let past_goal = recording.past_goal();
-        scale::apply(&scaling, &mut recording);
+        normalize::apply(&scaling, &mut recording);
         let Recording {
             observation_dim, action_dim, observations, mut actions, mut rewards, ..
         } = recording;
@@ -206,7 +216,7 @@ impl Transitions {
             goes_on,
             past_goal,
             statistics,
-            doubts: Vec::new(),
+            warnings: Vec::new(),
             scaling,
             names: recording.names,
         }
@@ -244,12 +254,12 @@ impl Transitions {
     pub fn standard_units(&self) -> Scaling {
         let counts = |row: usize| self.rows.binary_search(&(row as u32)).is_ok();
         Scaling {
-            observations: Some(scale::standard_units(
+            observations: Some(normalize::standard_units(
                 &self.observations,
                 self.observation_dim,
                 counts,
             )),
-            actions: Some(scale::standard_units(&self.actions, self.action_dim, counts)),
+            actions: Some(normalize::standard_units(&self.actions, self.action_dim, counts)),
             rewards: None,
         }
     }
@@ -260,8 +270,8 @@ impl Transitions {
     }
 
     /// What makes it doubtful that anything good is learned from them, one sentence each.
-    pub fn doubts(&self) -> &[String] {
-        &self.doubts
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
     }
 
     /// The number of the transition that follows this one (below [`len`](Self::len)) in its

@@ -6,10 +6,10 @@ use std::str::FromStr;
 use hdf5::H5Type;
 use hdf5::types::VarLenUnicode;
 
-use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
-use crate::new_file::{CHUNK_ROWS, Column, NewFile};
-use crate::recorded::Row;
+use crate::formats::new_file::{CHUNK_ROWS, Column, NewFile};
+use crate::formats::recorded::Row;
+use crate::tables::environment::EnvironmentSpec;
 
 /// Where the rows came from; ends up under `metadata/`.
 #[derive(Clone, Debug)]

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use crate::environment::{self, EnvironmentSpec};
 use crate::error::{DatasetError, Problem};
-use crate::hdf5_file::Hdf5File;
+use crate::formats::hdf5_file::Hdf5File;
+use crate::tables::environment::{self, EnvironmentSpec};
 
 /// One recorded step, in the simulator's precision.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -85,7 +85,7 @@ impl RecordedRows {
             timeouts: file.flags("timeouts", rows)?,
             qpos: table("infos/qpos", environment.qpos_dim)?,
             qvel: table("infos/qvel", environment.qvel_dim)?,
-            goals: environment.goal.map(|_| table("infos/goal", GOAL_DIM)).transpose()?,
+            goals: environment.maze.map(|_| table("infos/goal", GOAL_DIM)).transpose()?,
         })
     }
 

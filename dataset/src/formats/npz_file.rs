@@ -9,12 +9,9 @@ use npyz::{DType, Deserialize, NpyFile, Order, TypeChar};
 use zip::ZipArchive;
 use zip::result::ZipError;
 
-use crate::array::Array;
 use crate::error::{DatasetError, Problem};
-use crate::foreign;
-
-/// The first bytes of a zip file.
-pub(crate) const SIGNATURE: &[u8] = b"PK";
+use crate::formats::array::Array;
+use crate::formats::foreign;
 
 /// An open npz archive.
 pub(crate) struct NpzFile {

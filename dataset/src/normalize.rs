@@ -1,67 +1,61 @@
-//! What networks see of observations, actions and rewards: a recording's own numbers, or these
-//! scaled by what the data holds.
+//! Normalization of observations, actions and rewards by statistics of the data.
 
 use quad_kernels::scaling::{Affine, Scaling};
 use serde::{Deserialize, Serialize};
 
 use crate::recording::{Recording, RowKind};
-use crate::reward::RewardScaling;
+use crate::tables::reward::RewardScaling;
 
-/// What is scaled before training; a file has it as a list of [`Scaled`], in any order.
+/// Data to be normalized before training. In files it is a list of names, in any order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "Vec<Scaled>", into = "Vec<Scaled>")]
-pub struct Scale {
-    /// Each number of an action, so that the least and the largest of the data become -1 and 1.
+#[serde(from = "Vec<Column>", into = "Vec<Column>")]
+pub struct Normalize {
+    /// Each number of an action, so that its least and largest value become -1 and 1.
     pub actions: bool,
-    /// Each number of an observation, so that those of the data have mean 0 and standard deviation
-    /// 1.
-    pub states: bool,
-    /// Rewards, so that the mean of their squares is 1 after the reward rule.
+    /// Each number of an observation, to mean 0 and standard deviation 1.
+    pub observations: bool,
+    /// Rewards after the reward rule, to a mean square of 1.
     pub rewards: bool,
 }
 
-/// What can be scaled, by its name.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Scaled {
-    /// Actions.
+enum Column {
     Actions,
-    /// Observations.
-    States,
-    /// Rewards.
+    Observations,
     Rewards,
 }
 
-impl From<Vec<Scaled>> for Scale {
-    fn from(names: Vec<Scaled>) -> Self {
-        let has = |name| names.contains(&name);
-        Self {
-            actions: has(Scaled::Actions),
-            states: has(Scaled::States),
-            rewards: has(Scaled::Rewards),
-        }
+impl From<Vec<Column>> for Normalize {
+    fn from(columns: Vec<Column>) -> Self {
+        let [actions, observations, rewards] =
+            [Column::Actions, Column::Observations, Column::Rewards]
+                .map(|column| columns.contains(&column));
+        Self { actions, observations, rewards }
     }
 }
 
-impl From<Scale> for Vec<Scaled> {
-    fn from(Scale { actions, states, rewards }: Scale) -> Self {
-        [(actions, Scaled::Actions), (states, Scaled::States), (rewards, Scaled::Rewards)]
-            .into_iter()
-            .filter_map(|(is, name)| is.then_some(name))
-            .collect()
+impl From<Normalize> for Vec<Column> {
+    fn from(Normalize { actions, observations, rewards }: Normalize) -> Self {
+        let columns = [
+            (actions, Column::Actions),
+            (observations, Column::Observations),
+            (rewards, Column::Rewards),
+        ];
+        columns.into_iter().filter_map(|(is, column)| is.then_some(column)).collect()
     }
 }
 
-impl Scale {
-    /// The maps for a recording whose numbers are finite. Observations count where a transition
-    /// begins, actions wherever one was taken, rewards where there is a transition.
-    pub(crate) fn of(self, recording: &Recording, rule: RewardScaling) -> Scaling {
+impl Normalize {
+    /// Offsets and scales for a recording whose numbers are finite. Observations count where a
+    /// transition begins, actions wherever one was taken, rewards where there is a transition.
+    pub(crate) fn scaling(self, recording: &Recording, rule: RewardScaling) -> Scaling {
         let Recording { observation_dim, action_dim, observations, actions, kinds, .. } = recording;
         let is_transition = |row: usize| kinds[row] == RowKind::Transition;
         let is_step = |row: usize| kinds[row] != RowKind::LastState;
         Scaling {
             observations: self
-                .states
+                .observations
                 .then(|| affine(observations, *observation_dim, is_transition, standard)),
             actions: self.actions.then(|| affine(actions, *action_dim, is_step, unit_range)),
             // Rewards that are all 0 have no size.
@@ -70,8 +64,7 @@ impl Scale {
     }
 }
 
-/// The map with which each column of these numbers has mean 0 and standard deviation 1 over the
-/// rows that count.
+/// The map by which each column has mean 0 and standard deviation 1 over the rows that count.
 pub(crate) fn standard_units(
     values: &[f32],
     width: usize,
@@ -91,8 +84,7 @@ pub(crate) fn apply(scaling: &Scaling, recording: &mut Recording) {
     }
 }
 
-/// The map of each column, by the offset and the scale that `of` finds for its numbers in the rows
-/// that count.
+/// The map of each column, whose offset and scale `of` finds from the rows that count.
 fn affine(
     values: &[f32],
     width: usize,
@@ -111,11 +103,11 @@ fn affine(
     Affine { offset, scale }
 }
 
-/// Mean and standard deviation.
+/// Mean and standard deviation of a column.
 fn standard(values: &[f64]) -> (f64, f64) {
-    let (least, largest) = range(values);
-    if least == largest {
-        return (least, 0.0); // By rounding, the deviation might not be 0.
+    let (min, max) = range(values);
+    if min == max {
+        return (min, 0.0); // By rounding, the deviation might not be 0.
     }
     let count = values.len() as f64;
     let mean = values.iter().sum::<f64>() / count;
@@ -123,15 +115,14 @@ fn standard(values: &[f64]) -> (f64, f64) {
     (mean, variance.sqrt())
 }
 
-/// The middle of the range, and half its width.
+/// Middle and half width of a column's range.
 fn unit_range(values: &[f64]) -> (f64, f64) {
-    let (least, largest) = range(values);
-    ((least + largest) / 2.0, (largest - least) / 2.0)
+    let (min, max) = range(values);
+    ((min + max) / 2.0, (max - min) / 2.0)
 }
 
-/// The least and the largest.
 fn range(values: &[f64]) -> (f64, f64) {
-    values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(least, largest), &x| {
-        (x.min(least), x.max(largest))
-    })
+    values
+        .iter()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(min, max), &x| (x.min(min), x.max(max)))
 }

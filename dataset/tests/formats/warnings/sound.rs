@@ -8,7 +8,7 @@ use crate::shared;
 
 fn nothing_is_said(name: &str, cart: &Cart) {
     for own in [false, true] {
-        assert_eq!(cart.doubts(own), [""; 0], "{name}, own: {own}");
+        assert_eq!(cart.warnings(own), [""; 0], "{name}, own: {own}");
     }
 }
 

@@ -1,6 +1,6 @@
 //! Numbers that are too large, too small, or all alike.
 
-use quad_dataset::{ReadOptions, RewardRule, Scale, Transitions, inspect};
+use quad_dataset::{Normalize, ReadOptions, RewardRule, Transitions, inspect};
 use tempfile::tempdir;
 
 use super::{Cart, O};
@@ -10,24 +10,24 @@ fn rewards_that_are_all_alike() {
     let mut cart = Cart::new(false);
     cart.rewards.fill(1.0);
     let expected = "array `rewards`: all are alike (1), so nothing distinguishes good from bad but how soon an episode terminates";
-    assert_eq!(cart.doubts(true), [expected]);
+    assert_eq!(cart.warnings(true), [expected]);
     cart.rewards.fill(0.0);
     assert_eq!(
-        cart.doubts(false),
+        cart.warnings(false),
         ["array `rewards`: all are alike (0), so nothing distinguishes good from bad"]
     );
     cart.rewards[70] = 1e-1;
-    assert_eq!(cart.doubts(false), [""; 0]);
+    assert_eq!(cart.warnings(false), [""; 0]);
     cart.rewards
         .iter_mut()
         .enumerate()
         .for_each(|(row, reward)| *reward = (0.1 + 1e-9 * row as f64) as f32);
-    assert!(cart.doubt(false).starts_with("array `rewards`: all are alike (0.1)"));
+    assert!(cart.warning(false).starts_with("array `rewards`: all are alike (0.1)"));
     cart.rewards
         .iter_mut()
         .enumerate()
         .for_each(|(row, reward)| *reward = (0.1 + 1e-7 * row as f64) as f32);
-    assert_eq!(cart.doubts(false), [""; 0]);
+    assert_eq!(cart.warnings(false), [""; 0]);
 }
 
 #[test]
@@ -36,8 +36,8 @@ fn observations_too_large_or_too_small_to_train_on_as_they_are() {
     cart.observe(|row| {
         (row[1], row[2], row[3]) = (1e6 + 1e3 * row[1], 50.0 + 1e-4 * row[2], 90.0 * row[3])
     });
-    let doubts = cart.doubts(true);
-    let [large, small] = &doubts[..] else { panic!("{doubts:?}") };
+    let warnings = cart.warnings(true);
+    let [large, small] = &warnings[..] else { panic!("{warnings:?}") };
     assert!(
         large.starts_with("array `observations`: far from ±1 in column 1, of size 999980, which"),
         "{large}"
@@ -48,24 +48,27 @@ fn observations_too_large_or_too_small_to_train_on_as_they_are() {
         ),
         "{small}"
     );
-    assert!(large.contains("--scale states") && small.contains("--scale states"), "{doubts:?}");
-    assert_eq!(scaled(&cart, Scale { states: true, ..Scale::default() }), [""; 0]);
+    assert!(
+        large.contains("--normalize observations") && small.contains("--normalize observations"),
+        "{warnings:?}"
+    );
+    assert_eq!(scaled(&cart, Normalize { observations: true, ..Normalize::default() }), [""; 0]);
     cart.observe(|row| (row[1], row[2]) = (1e-6 * (row[1] - 1e6), 0.0));
-    assert!(cart.doubt(true).starts_with("array `observations`: hardly changes in column 1"));
+    assert!(cart.warning(true).starts_with("array `observations`: hardly changes in column 1"));
     cart.observe(|row| row[1] *= 1e4);
-    assert_eq!(cart.doubts(true), [""; 0]);
+    assert_eq!(cart.warnings(true), [""; 0]);
 }
 
 #[test]
 fn actions_too_small_to_learn() {
     let mut cart = Cart::new(false);
     cart.actions.chunks_exact_mut(2).for_each(|action| action[1] *= 1e-4);
-    let doubt = cart.doubt(true);
+    let warning = cart.warning(true);
     assert!(
-        doubt.starts_with("array `actions`: hardly changes in column 1")
-            && doubt.contains("--scale actions")
+        warning.starts_with("array `actions`: hardly changes in column 1")
+            && warning.contains("--normalize actions")
     );
-    assert_eq!(scaled(&cart, Scale { actions: true, ..Scale::default() }), [""; 0]);
+    assert_eq!(scaled(&cart, Normalize { actions: true, ..Normalize::default() }), [""; 0]);
 }
 
 #[test]
@@ -73,28 +76,28 @@ fn rewards_of_a_size_that_methods_are_not_made_for() {
     let mut cart = Cart::new(false);
     let scale = |cart: &mut Cart, by: f32| cart.rewards.iter_mut().for_each(|reward| *reward *= by);
     scale(&mut cart, 400.0);
-    let doubt = cart.doubt(true);
+    let warning = cart.warning(true);
     assert!(
-        doubt.starts_with("array `rewards`: of size") && doubt.contains("episodes return -"),
-        "{doubt}"
+        warning.starts_with("array `rewards`: of size") && warning.contains("episodes return -"),
+        "{warning}"
     );
-    assert!(doubt.contains("`learner train --scale rewards`"), "{doubt}");
-    assert_eq!(scaled(&cart, Scale { rewards: true, ..Scale::default() }), [""; 0]);
+    assert!(warning.contains("`learner train --normalize rewards`"), "{warning}");
+    assert_eq!(scaled(&cart, Normalize { rewards: true, ..Normalize::default() }), [""; 0]);
     scale(&mut cart, 1e-6);
-    assert!(cart.doubt(false).contains("1 for good and bad actions alike"));
+    assert!(cart.warning(false).contains("1 for good and bad actions alike"));
     // Few rewards of an ordinary size are none that are small.
     cart.rewards.fill(0.0);
     cart.rewards[100] = 1.0;
-    assert_eq!(cart.doubts(false), [""; 0]);
+    assert_eq!(cart.warnings(false), [""; 0]);
 }
 
 /// What is said of it to who trains on it with this scale.
-fn scaled(cart: &Cart, scale: Scale) -> Vec<String> {
+fn scaled(cart: &Cart, normalize: Normalize) -> Vec<String> {
     let folder = tempdir().unwrap();
     let path = folder.path().join("cart.hdf5");
     cart.write(&path, true);
-    let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale };
-    Transitions::read(&path, &options).unwrap().doubts().to_vec()
+    let options = ReadOptions { normalize, ..ReadOptions::default() };
+    Transitions::read(&path, &options).unwrap().warnings().to_vec()
 }
 
 #[test]
@@ -104,7 +107,7 @@ fn numbers_that_never_change_are_named() {
     let mut cart = Cart::new(false);
     cart.observe(|row| (row[1], row[3]) = (0.1, 90.0));
     cart.actions.chunks_exact_mut(2).for_each(|action| action[1] = 0.3);
-    assert_eq!(cart.doubts(true), [""; 0]);
+    assert_eq!(cart.warnings(true), [""; 0]);
     cart.write(&path, true);
     let inspection = inspect(&path, None).unwrap();
     assert_eq!(
@@ -146,6 +149,6 @@ fn an_array_that_was_rounded_is_in_step_with_the_other() {
             observations: cart.observations.iter().map(round).collect(),
             ..Cart::new(false)
         };
-        assert_eq!(other.doubts(own), [""; 0]);
+        assert_eq!(other.warnings(own), [""; 0]);
     }
 }

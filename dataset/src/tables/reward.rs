@@ -6,13 +6,14 @@ use crate::recording::Recording;
 
 /// What happens to the rewards of a file. Statistics and scores are always of the rewards as they
 /// were recorded.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RewardRule {
     /// `r · 1000 / (max - min trajectory return)`: IQL's and DAC's rule for locomotion. On returns
     /// of 0 and 1, as in AntMaze, it is `r · 1000`.
     #[serde(rename = "locomotion")]
     Locomotion,
     /// `r`: the rewards as they were recorded.
+    #[default]
     #[serde(rename = "as-is")]
     AsIs,
     /// `r - 1`: IQL's rule for AntMaze. Each step before the goal costs 1.

@@ -7,7 +7,6 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
 use crate::recording::{Recording, RowKind};
-use crate::transitions::Transitions;
 
 /// Keeps these draws apart from other uses of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"hold out");
@@ -24,17 +23,6 @@ pub enum HoldOut<'a> {
     },
     /// Those of these numbers, from 0 in the order of the file.
     Episodes(&'a [usize]),
-}
-
-/// Transitions to learn from, and episodes that are kept out of training.
-pub struct Split {
-    /// To learn from: statistics, scaling and doubts are of these alone.
-    pub training: Transitions,
-    /// Episodes that are kept out, in the same units; none if the share is 0 or there is but one
-    /// episode.
-    pub held_out: Option<Transitions>,
-    /// Their numbers, from 0 in the order of the file.
-    pub episodes: Vec<usize>,
 }
 
 impl HoldOut<'_> {

@@ -1,0 +1,168 @@
+//! The environments that evaluators simulate: the table `environments.toml`, and the mazes of
+//! [`benchmarks`].
+
+use std::sync::LazyLock;
+
+use serde::Deserialize;
+
+use super::benchmarks::{self, BenchmarkEnvironment};
+use super::maze::MazeTask;
+use super::reward::RewardRule;
+use super::simulator::{Recipe, Simulator};
+
+/// An environment that is simulated.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EnvironmentSpec {
+    /// Name on command lines, in files and on the wire.
+    pub name: String,
+    #[serde(skip)]
+    simulation: Option<String>,
+    /// Ids in Gymnasium of environments with the same simulation.
+    #[serde(default)]
+    pub gymnasium: Vec<String>,
+    /// Numbers in an observation.
+    pub observation_dim: usize,
+    /// Numbers in an action, each within ±1.
+    pub action_dim: usize,
+    /// Numbers in MuJoCo's `qpos`.
+    pub qpos_dim: usize,
+    /// Numbers in MuJoCo's `qvel`.
+    pub qvel_dim: usize,
+    /// Steps after which an episode is cut off (a timeout, not a termination).
+    pub max_episode_steps: usize,
+    /// Undiscounted returns that score 0 (D4RL's random policy) and 100 (D4RL's expert).
+    reference_returns: (f64, f64),
+    /// Rule for a dataset's rewards, unless a task or an algorithm has another.
+    pub reward: RewardRule,
+    /// Task in a maze.
+    #[serde(skip)]
+    pub maze: Option<MazeTask>,
+    /// Robot and its surroundings.
+    pub simulator: Simulator,
+    /// Recipe for recording a dataset in it, if there is one.
+    pub collect: Option<Recipe>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Table {
+    environment: Vec<EnvironmentSpec>,
+}
+
+#[allow(clippy::expect_used)] // The table is part of the program; the first test here reads it.
+static ENVIRONMENTS: LazyLock<Vec<EnvironmentSpec>> = LazyLock::new(|| {
+    let table: Table = toml::from_str(include_str!("../../environments.toml"))
+        .expect("the embedded table is valid");
+    let mazes = benchmarks::environments().iter().filter_map(EnvironmentSpec::of_maze);
+    table.environment.into_iter().chain(mazes).collect()
+});
+
+/// All environments.
+pub fn all() -> &'static [EnvironmentSpec] {
+    &ENVIRONMENTS
+}
+
+/// The name of no environment.
+#[derive(Debug, PartialEq, thiserror::Error)]
+#[error("unknown environment `{name}`; known: {}", names().join(", "))]
+pub struct UnknownEnvironment {
+    /// The unknown name.
+    pub name: String,
+}
+
+/// The names of all environments.
+pub fn names() -> Vec<&'static str> {
+    all().iter().map(|environment| environment.name.as_str()).collect()
+}
+
+/// The environment of that name.
+pub fn find(name: &str) -> Result<&'static EnvironmentSpec, UnknownEnvironment> {
+    all()
+        .iter()
+        .find(|environment| environment.name == name)
+        .ok_or_else(|| UnknownEnvironment { name: name.to_owned() })
+}
+
+/// The environment whose simulation Gymnasium has under that id, such as `Hopper-v5`.
+pub(crate) fn find_gymnasium(id: &str) -> Option<&'static EnvironmentSpec> {
+    all().iter().find(|environment| environment.gymnasium.iter().any(|known| known == id))
+}
+
+/// Name of the physics of an environment, simulated here or not.
+pub fn simulation_of(name: &str) -> String {
+    match (find(name), benchmarks::environment(name)) {
+        (Ok(spec), _) => spec.simulation().to_owned(),
+        (_, Some(environment)) => environment.simulation.clone(),
+        _ => name.to_owned(),
+    }
+}
+
+/// Rule for the rewards of an environment's datasets, simulated here or not.
+pub fn reward_rule(name: &str) -> RewardRule {
+    match (find(name), benchmarks::environment(name)) {
+        (Ok(spec), _) => spec.reward,
+        (_, Some(environment)) => environment.reward(),
+        _ => RewardRule::AsIs,
+    }
+}
+
+impl EnvironmentSpec {
+    /// A maze with a robot that is simulated.
+    fn of_maze(environment: &BenchmarkEnvironment) -> Option<Self> {
+        let simulator = environment.simulator.clone()?;
+        let Simulator::Maze(robot, _) = simulator else { return None };
+        Some(Self {
+            name: environment.name.clone(),
+            simulation: Some(environment.simulation.clone()),
+            gymnasium: Vec::new(),
+            observation_dim: robot.observation_dim,
+            action_dim: robot.action_dim,
+            qpos_dim: robot.qpos_dim,
+            qvel_dim: robot.qvel_dim,
+            max_episode_steps: environment.max_episode_steps,
+            reference_returns: (0.0, 1.0),
+            reward: environment.reward(),
+            maze: Some(environment.task?),
+            simulator,
+            collect: None,
+        })
+    }
+
+    /// Name of the physics, which several environments may share.
+    pub fn simulation(&self) -> &str {
+        self.simulation.as_deref().unwrap_or(&self.name)
+    }
+
+    /// D4RL's normalized score of an undiscounted return: `100 · (R - min) / (max - min)`.
+    pub fn normalized_score(&self, episode_return: f64) -> f64 {
+        let (min, max) = self.reference_returns;
+        100.0 * (episode_return - min) / (max - min)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_is_consistent() {
+        assert_eq!(all().len(), 3 + 3 * 2 + 6 * 6);
+        for spec in all() {
+            let name = &spec.name;
+            assert_eq!(find(name), Ok(spec), "names are unique");
+            let physics = find(spec.simulation()).unwrap();
+            assert_eq!(
+                (spec.qpos_dim, &spec.simulator),
+                (physics.qpos_dim, &physics.simulator),
+                "{name}"
+            );
+            assert!(spec.reference_returns.1 > spec.reference_returns.0, "{name}");
+            let Some(recipe) = &spec.collect else { continue };
+            let (bounds, shares): (Vec<f64>, Vec<f64>) = recipe.mixture.iter().copied().unzip();
+            assert!(bounds.is_sorted() && bounds[0] == f64::NEG_INFINITY, "{name}: {bounds:?}");
+            assert!((shares.iter().sum::<f64>() - 1.0).abs() < 1e-9, "{name}: {shares:?}");
+            assert!(recipe.searches > 0 && recipe.steps_per_transition > 0, "{name}");
+        }
+    }
+}
