@@ -40,12 +40,12 @@ const ALLOWED: [(&str, &str, &str); 13] = [
         "fs::read_to_string(path)",
         "the user names it; it may be a pipe of a shell",
     ),
-    ("dataset/src/hdf5_file.rs", "File::open(path)", "data that the user names"),
-    ("dataset/src/npz_file.rs", "File::open(path)", "data that the user names"),
+    ("dataset/src/formats/hdf5_file.rs", "File::open(path)", "data that the user names"),
+    ("dataset/src/formats/npz_file.rs", "File::open(path)", "data that the user names"),
     ("dataset/src/formats/mod.rs", "File::open(", "data that the user names"),
     ("dataset/src/formats/minari.rs", "fs::read(&path)", "data that the user names"),
-    ("dataset/src/foreign.rs", "fs::read(folder", "data that the user names"),
-    ("dataset/src/new_file.rs", "File::open(&partial)", "what it has just made"),
+    ("dataset/src/formats/foreign.rs", "fs::read(folder", "data that the user names"),
+    ("dataset/src/formats/new_file.rs", "File::open(&partial)", "what it has just made"),
 ];
 
 /// The lines before the tests of a source that have one of [`CALLS`], without comments.

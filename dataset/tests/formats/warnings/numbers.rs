@@ -1,6 +1,6 @@
 //! Numbers that are too large, too small, or all alike.
 
-use quad_dataset::{Normalize, ReadOptions, RewardRule, Transitions, inspect};
+use quad_dataset::{Normalize, ReadOptions, Transitions, inspect};
 use tempfile::tempdir;
 
 use super::{Cart, O};
