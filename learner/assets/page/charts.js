@@ -1,16 +1,15 @@
-// Charts of lines over gradient steps, with bands where points have a spread. They are kept and changed as data comes, so that
-// a view that was chosen stays.
+// Charts of lines over gradient steps, with error bands. Charts are updated in place, so that they stay zoomed.
 
-// Colors that stay apart for most color-blind readers (Okabe and Ito); the last one suits dark and light.
+// Okabe and Ito's colors, which most color-blind readers can tell apart, and a gray for both color schemes.
 const COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#888888"];
 const charts = new Map();
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
 export function element(tag, text = "", attributes = {}) {
-  const made = document.createElement(tag);
-  made.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  return made;
+  const node = document.createElement(tag);
+  node.textContent = text;
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  return node;
 }
 
 export function number(value) {
@@ -24,7 +23,7 @@ function short(step) {
   return step >= 1e4 ? `${number(step / 1e3)} k` : number(step);
 }
 
-// A line's color is part of its style, which the page's policy lets scripts set.
+// Scripts may set a line's color as a style; the page's policy forbids styles in HTML.
 function legend({ series, x }) {
   const lines = document.createDocumentFragment();
   for (const { label, color, y } of series.filter((one) => one.isVisible)) {
@@ -45,19 +44,19 @@ function colors() {
 }
 dark.addEventListener("change", () => charts.forEach(({ graph }) => graph.updateOptions(colors())));
 
-// Points of several lines as rows: x, and [value, spread] of each line.
+// Rows for Dygraph: x, and [value, error] of each line.
 function rows(lines) {
   const byStep = new Map();
   lines.forEach(({ points }, index) => {
-    for (const [step, value, spread] of points) {
+    for (const [step, value, error] of points) {
       if (!byStep.has(step)) byStep.set(step, Array.from(lines, () => [null, null]));
-      byStep.get(step)[index] = [value, spread ?? 0];
+      byStep.get(step)[index] = [value, error ?? 0];
     }
   });
   return [...byStep].sort(([one], [other]) => one - other).map(([step, values]) => [step, ...values]);
 }
 
-// Shows lines, each { label, points: [[step, value, spread]] }, in a chart that `key` names.
+// Makes or updates the chart `key` of lines { label, points: [[step, value, error]] }.
 export function chart(parent, key, title, about, lines) {
   const file = rows(lines);
   const labels = ["step", ...lines.map(({ label }) => label)];
@@ -65,7 +64,7 @@ export function chart(parent, key, title, about, lines) {
   if (!charts.has(key)) {
     const figure = element("figure");
     const caption = element("figcaption", title);
-    caption.append(element("p", about, { class: "quiet" }));
+    caption.append(element("p", about, { class: "muted" }));
     const [place, names] = [element("div", "", { class: "chart", role: "img" }), element("div", "", { class: "legend" })];
     figure.append(caption, place, names);
     parent.append(figure);
@@ -77,18 +76,17 @@ export function chart(parent, key, title, about, lines) {
     });
     charts.set(key, { graph, figure, place, shown: "" });
   }
-  const known = charts.get(key);
+  const entry = charts.get(key);
   const shown = JSON.stringify([labels, file.length, file.at(-1)]);
-  if (shown !== known.shown) {
-    known.shown = shown;
-    known.graph.updateOptions({ file, labels, drawPoints: file.length < 60 });
-    known.place.setAttribute("aria-label", `${title}, newest values: ${last}`);
+  if (shown !== entry.shown) {
+    entry.shown = shown;
+    entry.graph.updateOptions({ file, labels, drawPoints: file.length < 60 });
+    entry.place.setAttribute("aria-label", `${title}, newest values: ${last}`);
   }
   return key;
 }
 
-// Takes away the charts that are not among those.
-export function keep(keys) {
+export function removeAllBut(keys) {
   for (const [key, { graph, figure }] of charts) {
     if (keys.has(key)) continue;
     graph.destroy();

@@ -1,16 +1,16 @@
-// Asks the learner what there is, and shows it. Nothing that it says is taken for HTML: all of it becomes text.
+// Polls the learner's API and shows the answers as text, never as HTML.
 
-import { chart, element, keep, number } from "./charts.js";
+import { chart, element, number, removeAllBut } from "./charts.js";
 
-const EVERY = 2000;
-const RATE_OVER = 15000;
+const POLL_INTERVAL_MS = 2000;
+const SPEED_WINDOW_MS = 15000;
 const $ = (id) => document.getElementById(id);
-const shown = new Set(asked());
-const samples = [];
-let list = "";
+const selected = new Set(fromHash());
+const samples = []; // [time, step]
+let lastRuns = "";
 
-// The runs that the address names as a JSON list; any other end of an address names none.
-function asked() {
+// Names of runs in the address's fragment, a JSON list.
+function fromHash() {
   try {
     const names = JSON.parse(decodeURIComponent(location.hash.slice(1)));
     return Array.isArray(names) ? names : [];
@@ -19,17 +19,17 @@ function asked() {
   }
 }
 
-// The answer, or nothing where there is none.
-async function ask(path) {
+// null for 404.
+async function fetchJson(path) {
   const response = await fetch(path, { cache: "no-store" });
   if (!response.ok && response.status !== 404) throw new Error(`${path} answers ${response.status}`);
   return response.ok ? response.json() : null;
 }
 
 function row(...cells) {
-  const made = element("tr");
-  for (const cell of cells) made.append(cell instanceof Node ? cell : element("td", cell ?? "–"));
-  return made;
+  const row = element("tr");
+  for (const cell of cells) row.append(cell instanceof Node ? cell : element("td", cell ?? "–"));
+  return row;
 }
 
 function right(text) {
@@ -37,41 +37,41 @@ function right(text) {
 }
 
 function facts(pairs, attributes = {}) {
-  const made = element("dl", "", attributes);
+  const list = element("dl", "", attributes);
   for (const [name, value] of pairs) {
     const fact = element("div");
     fact.append(element("dt", name), element("dd", value));
-    made.append(fact);
+    list.append(fact);
   }
-  return made;
+  return list;
 }
 
 function showRuns(runs) {
-  const only = runs.length === 1 && !runs[0].error;
-  $("list").hidden = only;
-  if (only) {
-    shown.clear();
-    shown.add(runs[0].name);
-  } else if (!list && shown.size === 0) {
-    runs.filter((run) => run.at_work).forEach((run) => shown.add(run.name));
+  const isSingle = runs.length === 1 && !runs[0].error;
+  $("list").hidden = isSingle;
+  if (isSingle) {
+    selected.clear();
+    selected.add(runs[0].name);
+  } else if (!lastRuns && selected.size === 0) {
+    runs.filter((run) => run.at_work).forEach((run) => selected.add(run.name));
   }
   const newest = JSON.stringify(runs);
-  if (newest === list) return;
-  list = newest;
+  if (newest === lastRuns) return;
+  lastRuns = newest;
   const focused = document.activeElement?.dataset?.run;
   $("runs").replaceChildren(...runs.map((run) => {
     if (run.error) return row("", run.name, element("td", run.error, { class: "bad", colspan: 4 }));
     const tick = element("input", "", { type: "checkbox", "data-run": run.name, "aria-label": `show ${run.name}` });
-    tick.checked = shown.has(run.name);
+    tick.checked = selected.has(run.name);
     tick.addEventListener("change", () => {
-      shown[tick.checked ? "add" : "delete"](run.name);
-      location.hash = encodeURIComponent(JSON.stringify([...shown]));
+      selected[tick.checked ? "add" : "delete"](run.name);
+      location.hash = encodeURIComponent(JSON.stringify([...selected]));
       refresh();
     });
     const [box, name] = [element("td"), element("td")];
     box.append(tick);
-    const local = run.page?.startsWith("http://") && ["localhost", "127.0.0.1"].includes(location.hostname);
-    name.append(local ? element("a", run.name, { href: run.page }) : run.name);
+    const isLocal = run.page?.startsWith("http://") && ["localhost", "127.0.0.1"].includes(location.hostname);
+    name.append(isLocal ? element("a", run.name, { href: run.page }) : run.name);
     const score = run.score === null ? "–" : `${run.score.toFixed(1)} @${run.score_step}`;
     return row(box, name, run.task, run.method, run.state + (run.at_work ? ", at work" : ""), right(score));
   }));
@@ -80,19 +80,19 @@ function showRuns(runs) {
 
 function showCharts(runs) {
   const kept = new Set();
-  const named = (run, label) => (runs.length === 1 ? label : [run.run, label].filter(Boolean).join(" "));
-  const scores = runs.map((run) => ({ label: named(run, "") || "mean", points: run.evaluations.filter((one) => one[4]) }));
+  const labeled = (run, label) => (runs.length === 1 ? label : [run.run, label].filter(Boolean).join(" "));
+  const scores = runs.map((run) => ({ label: labeled(run, "") || "mean", points: run.evaluations.filter((one) => one[4]) }));
   if (scores.some(({ points }) => points.length)) {
     const data = runs.length === 1 ? `; the data's own episodes have ${number(runs[0].dataset_score)}` : "";
     const about = `Mean over an evaluation's episodes, ± their standard deviation${data}.`;
     const measure = runs.every((run) => run.measure === "return") ? "Return" : "Score";
     kept.add(chart($("score"), "score", measure, about, scores));
   }
-  const rates = runs.map((run) => ({ label: named(run, "") || "steps/s", points: rate(run.history.rows) }));
-  if (rates.some(({ points }) => points.length)) {
-    kept.add(chart($("metrics"), "rate", "Gradient steps per second", "", rates));
+  const speeds = runs.map((run) => ({ label: labeled(run, "") || "steps/s", points: rates(run.history.rows) }));
+  if (speeds.some(({ points }) => points.length)) {
+    kept.add(chart($("metrics"), "rate", "Gradient steps per second", "", speeds));
   }
-  // Metrics whose names differ in a number at their end share a chart.
+  // Metrics whose names differ only in a final number share a chart.
   const groups = new Map();
   for (const run of runs) {
     for (const { name, help } of run.metrics) {
@@ -102,16 +102,17 @@ function showCharts(runs) {
       const [, stem, end] = /^(.*?)(?:_(\d+))?$/.exec(name);
       if (!groups.has(stem)) groups.set(stem, { helps: new Set(), lines: [] });
       groups.get(stem).helps.add(help);
-      groups.get(stem).lines.push({ label: named(run, end ?? "") || stem, points });
+      groups.get(stem).lines.push({ label: labeled(run, end ?? "") || stem, points });
     }
   }
   for (const [stem, { helps, lines }] of groups) kept.add(chart($("metrics"), stem, stem, [...helps].join(" "), lines));
-  keep(kept);
+  removeAllBut(kept);
 }
 
-function rate(rows) {
-  const between = (before, after) => [after[0], (after[0] - before[0]) / (after[1] - before[1])];
-  return rows.slice(1).map((after, index) => between(rows[index], after)).filter(([, value]) => Number.isFinite(value) && value > 0);
+// [step, gradient steps per second] between rows.
+function rates(rows) {
+  const rate = (before, after) => [after[0], (after[0] - before[0]) / (after[1] - before[1])];
+  return rows.slice(1).map((after, index) => rate(rows[index], after)).filter(([, value]) => Number.isFinite(value) && value > 0);
 }
 
 function showDetails(runs) {
@@ -144,7 +145,7 @@ function showLive(live) {
   if (!live) return;
   const now = performance.now();
   samples.push([now, live.step]);
-  while (samples.length > 2 && now - samples[0][0] > RATE_OVER) samples.shift();
+  while (samples.length > 2 && now - samples[0][0] > SPEED_WINDOW_MS) samples.shift();
   const speed = (1000 * (live.step - samples[0][1])) / (now - samples[0][0]);
   const left = live.step >= live.steps ? "trained" : speed > 0 ? `${duration((live.steps - live.step) / speed)} left` : "…";
   [$("progress").value, $("progress").max] = [live.step, live.steps];
@@ -162,9 +163,9 @@ function showLive(live) {
 
 async function refresh() {
   try {
-    const [runs, live] = await Promise.all([ask("api/runs"), ask("api/live")]);
+    const [runs, live] = await Promise.all([fetchJson("api/runs"), fetchJson("api/live")]);
     showRuns(runs);
-    const answers = await Promise.all([...shown].map((name) => ask(`api/run/${encodeURIComponent(name)}`)));
+    const answers = await Promise.all([...selected].map((name) => fetchJson(`api/run/${encodeURIComponent(name)}`)));
     const found = answers.filter((run) => run && !run.error);
     if (!live) $("health").textContent = answers.map((run) => run?.error ?? "").filter(Boolean).join("\n");
     $("title").textContent = document.title = runs.length === 1 ? (live?.run ?? runs[0].name) : `${runs.length} runs`;
@@ -172,14 +173,14 @@ async function refresh() {
     showCharts(found);
     showDetails(found);
   } catch (error) {
-    $("health").textContent = `There is no new answer (${error.message}). What is shown may be old.`;
+    $("health").textContent = `The learner does not answer (${error.message}). What is shown may be old.`;
     $("health").className = "bad";
   }
 }
 
-async function follow() {
+async function poll() {
   if (!document.hidden) await refresh();
-  setTimeout(follow, EVERY);
+  setTimeout(poll, POLL_INTERVAL_MS);
 }
 document.addEventListener("visibilitychange", () => document.hidden || refresh());
-follow();
+poll();

@@ -44,16 +44,13 @@ impl Data {
         let first = &snapshots.first().context("there is no policy to judge")?.config;
         let run = &first.run.name;
         let environment = &first.experiment.environment;
-        for Snapshot { config: other, .. } in snapshots {
-            if other.dataset.sha256 != first.dataset.sha256 {
-                let other = &other.run.name;
+        for Snapshot { config, .. } in snapshots {
+            let (other, theirs) = (&config.run.name, &config.experiment.environment);
+            if config.dataset.sha256 != first.dataset.sha256 {
                 return Err(anyhow!("{run} and {other} have not learned from the same data"))
                     .hint("judge them apart: values that come from different data do not compare");
             }
-        }
-        for Snapshot { config: other, .. } in snapshots {
-            if other.experiment.environment != *environment {
-                let (other, theirs) = (&other.run.name, &other.experiment.environment);
+            if theirs != environment {
                 return Err(anyhow!(
                     "{run} is of the environment {environment}, {other} of {theirs}"
                 ))
@@ -231,11 +228,8 @@ mod tests {
             })
             .unwrap()
         };
-        let split = Split {
-            training: transitions(&[false]),
-            held_out: Some(transitions(&[true, false])),
-            episodes: vec![1, 2],
-        };
+        let (training, held_out) = (transitions(&[false]), Some(transitions(&[true, false])));
+        let split = Split { training, held_out, episodes: vec![1, 2] };
         let data = Data::of(split, String::new(), String::new()).unwrap();
         let units = Units { offset: 100.0, scale: 10.0, least: 0.0, most: 1000.0 };
         let fqes = [0, 1].map(|seed| {

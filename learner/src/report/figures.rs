@@ -12,6 +12,7 @@ use quad_run::results::statistics::{self, Estimate, Runs};
 use quad_runtime::Hint;
 
 use super::groups::GroupReport;
+use super::methods::MethodReport;
 use super::plot::{Line, Plot};
 use super::summary::Report;
 
@@ -99,34 +100,30 @@ fn curves(task: &str, groups: &[&GroupReport]) -> Plot {
 fn curve(group: &GroupReport) -> Line {
     let mut runs: Vec<BTreeMap<u64, f64>> = Vec::new();
     for run in &group.runs {
-        let complete = run.evaluations.iter().filter(|evaluation| evaluation.complete);
+        let complete = run.evaluations.iter().filter(|it| it.complete);
         runs.push(complete.map(|it| (it.step, it.score.mean)).collect());
     }
     let mut steps = Vec::from_iter(runs[0].keys());
     steps.retain(|step| runs.iter().all(|run| run.contains_key(step)));
-    let scores = runs.iter().map(|run| Vec::from_iter(steps.iter().map(|step| run[step])));
-    let scores = Vec::from_iter(scores);
-    let seeds: Runs<&[f64]> = vec![scores.iter().map(Vec::as_slice).collect()];
-    let means = |drawn: &[Runs<&[f64]>]| {
-        let seeds = &drawn[0][0];
-        let mean = |at: usize| seeds.iter().map(|scores| scores[at]).sum::<f64>();
-        (0..steps.len()).map(|at| mean(at) / seeds.len() as f64).collect()
-    };
-    let means = statistics::estimates(&[&seeds], means);
+    let seeds: Runs<&BTreeMap<u64, f64>> = vec![runs.iter().collect()];
+    let means = statistics::estimates(&[&seeds], |drawn: &[Runs<&BTreeMap<u64, f64>>]| {
+        let runs = &drawn[0][0];
+        let mean = |step| runs.iter().map(|run| run[step]).sum::<f64>() / runs.len() as f64;
+        steps.iter().copied().map(mean).collect()
+    });
     let plural = if group.runs.len() == 1 { "" } else { "s" };
-    let part = if group.reached.is_some() { ", not complete" } else { "" };
-    Line {
-        label: format!("{} ({} seed{plural}{part})", group.method, group.runs.len()),
-        points: steps.iter().map(|step| **step as f64).zip(means).collect(),
-    }
+    let part = group.reached.map_or("", |_| ", not complete");
+    let label = format!("{} ({} seed{plural}{part})", group.method, group.runs.len());
+    Line { label, points: steps.iter().map(|step| **step as f64).zip(means).collect() }
 }
 
 fn profiles(report: &Report) -> Plot {
     let mut lines = Vec::new();
-    for method in report.study.iter().filter(|method| !method.profile.is_empty()) {
-        let points = method.profile.iter().map(|point| (point.threshold, point.share)).collect();
-        lines.push(Line { label: method.method.clone(), points });
+    for MethodReport { method, profile, .. } in &report.study {
+        let points = profile.iter().map(|point| (point.threshold, point.share)).collect();
+        lines.push(Line { label: method.clone(), points });
     }
+    lines.retain(|line| !line.points.is_empty());
     Plot {
         title: "Performance profile, with its 95 % interval".to_owned(),
         x: "D4RL-normalized score",
@@ -142,8 +139,9 @@ fn profiles(report: &Report) -> Plot {
 fn over(axis: Axis, algorithm: &str, by_task: &BTreeMap<&str, Vec<&GroupReport>>) -> Plot {
     let mut panels = Vec::new();
     for (task, groups) in by_task {
-        let of_algorithm = groups.iter().copied().filter(|group| group.algorithm == algorithm);
-        panels.push(over_on_task(axis, task, &Vec::from_iter(of_algorithm)));
+        let mut groups = groups.clone();
+        groups.retain(|group| group.algorithm == algorithm);
+        panels.push(over_on_task(axis, task, &groups));
     }
     panels.retain(|panel| !panel.is_empty());
     match panels.len() {

@@ -1,4 +1,4 @@
-//! What runs are called: by the values of all axes, such as `hopper-demo-quad-tau0.1-seed3`.
+//! Names of runs, by the values of all axes: `hopper-demo-quad-tau0.1-seed3`.
 
 use std::path::Path;
 
@@ -6,22 +6,19 @@ use toml::Value;
 
 use super::axes::Combination;
 
-/// The name of a combination. The seed comes last, the other axes in their order. An axis of one
-/// value is in it, too, so that further values change no name.
+/// The name of a combination, the seed last. It includes axes of one value, so that further values
+/// change no name.
 pub(super) fn name(combination: &Combination<'_>) -> String {
-    let is_seed = |(key, _): &&(&str, &Value)| *key == "seed";
-    let (seed, others): (Vec<_>, Vec<_>) = combination.iter().partition(is_seed);
+    let (seed, others): (Vec<_>, Vec<_>) = combination.iter().partition(|(key, _)| *key == "seed");
     let parts = others.into_iter().chain(seed).map(|(key, value)| part(key, value, combination));
     parts.collect::<Vec<_>>().join("-")
 }
 
 fn part(key: &str, value: &Value, combination: &Combination<'_>) -> String {
-    let file =
-        |text: &str| Path::new(text).file_stem().map(|stem| stem.to_string_lossy().into_owned());
     match (key, value.as_str()) {
         ("task" | "method" | "algorithm", Some(word)) => allowed(word),
         ("preset" | "dataset", Some(path)) if path.contains(['/', '.']) => {
-            allowed(&file(path).unwrap_or_default())
+            allowed(&Path::new(path).file_stem().unwrap_or_default().to_string_lossy())
         }
         ("preset" | "dataset", Some(word)) => allowed(word),
         (key, Some(word)) => format!("{}-{}", short(key, combination), allowed(word)),
@@ -29,15 +26,14 @@ fn part(key: &str, value: &Value, combination: &Combination<'_>) -> String {
     }
 }
 
-/// The last part of a key, unless another axis has the same.
+/// The last part of a key, or the key if another axis ends like it.
 fn short<'a>(key: &'a str, combination: &Combination<'_>) -> &'a str {
-    let last = |key: &'a str| key.rsplit('.').next().unwrap_or(key);
-    let same =
-        combination.iter().filter(|(other, _)| other.rsplit('.').next() == Some(last(key))).count();
-    if same > 1 { key } else { last(key) }
+    let last = key.rsplit('.').next();
+    let same = combination.iter().filter(|(other, _)| other.rsplit('.').next() == last);
+    if same.count() > 1 { key } else { last.unwrap_or(key) }
 }
 
-/// With a dash for each row of characters that no name may have.
+/// With a dash for each sequence of characters that are not allowed in a name.
 fn allowed(text: &str) -> String {
     let parts = text.split(|c: char| !(c.is_ascii_alphanumeric() || "._-".contains(c)));
     parts.filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-")

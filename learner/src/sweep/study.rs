@@ -1,8 +1,8 @@
-//! A study's file: what its runs share, the axes, and rules; and the runs that follow from it, all
-//! of them checked.
+//! Study files, and the runs that follow from them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+use std::slice;
 
 use anyhow::{Context, anyhow, ensure};
 use quad_protocol::Name;
@@ -10,174 +10,169 @@ use quad_run::config::{ConfigError, Experiment, Preset, did_you_mean, settings, 
 use quad_run::folder::RunDir;
 use quad_run::results::RunReport;
 use quad_run::status::State;
-use quad_runtime::{Hint, hinted, hints, one_line};
+use quad_runtime::{Hint, hinted, one_line};
 use serde::Deserialize;
 use toml::{Table, Value};
 use tracing::warn;
 
 use super::axes::{Combination, axes, combinations};
 use super::names;
-use super::rules::{Narrower, Rules};
+use super::rules;
 use crate::data::Source;
 
-/// Keys that are no keys of an experiment: the first two say what a run begins from, the third
-/// names a table of changes.
-const BEGIN: [&str; 2] = ["task", "preset"];
+/// Keys of [run] and [axes] that are no keys of an experiment: a run's preset, and a table of
+/// changes.
+const PRESETS: [&str; 2] = ["task", "preset"];
 const METHOD: &str = "method";
 
 const HELP: &str =
     "studies/demo.toml is an example, studies/README.md has what may stand in the file";
 
-/// The file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct File {
     /// The question, in a sentence.
     about: String,
-    /// What all runs share: keys as after `--set`, and `task` or `preset`.
+    /// Common changes: keys as after `--set`, and `task` or `preset`.
     #[serde(default)]
     run: Table,
     /// Lists of values by key; each combination is a run.
     axes: Table,
-    /// What each value of the axis `method` changes.
+    /// Changes for each value of the axis `method`.
     #[serde(default)]
     method: BTreeMap<String, Table>,
+    /// If there are any, only combinations that match one of them are runs.
     #[serde(default)]
     only: Vec<Table>,
+    /// Combinations that match one of them are no runs.
     #[serde(default)]
     except: Vec<Table>,
 }
 
-/// All that is wrong with a file.
-struct Wrong {
-    what: Vec<String>,
-    /// What to do about it.
-    advice: BTreeSet<String>,
-}
+/// All problems of a file, and hints.
+type Problems = (Vec<String>, BTreeSet<String>);
 
-impl From<Vec<String>> for Wrong {
-    fn from(what: Vec<String>) -> Self {
-        Self { what, advice: BTreeSet::new() }
-    }
-}
-
-/// A study.
 #[derive(Debug)]
 pub(crate) struct Study {
-    /// The file's name without its ending.
+    /// The file's name without its extension.
     pub name: String,
-    /// The question.
     pub about: String,
-    /// Its runs, in the order of their numbers.
     pub runs: Vec<PlannedRun>,
 }
 
-/// One run of a study.
 #[derive(Clone, Debug)]
 pub(crate) struct PlannedRun {
-    /// Its number, from 0.
+    /// Number in the study, from 0.
     pub index: usize,
-    /// Its folder's name.
     pub name: String,
-    /// What it begins from: a task, or a file of the user's.
+    /// A task, or a file of the user's.
     pub preset: String,
-    /// What it changes in that.
     pub changes: Table,
-    /// Both together.
+    /// The preset with its changes.
     pub experiment: Experiment,
-    /// What it learns from.
     pub source: Source,
 }
 
 impl PlannedRun {
-    /// How far the run in a folder is.
-    ///
-    /// # Errors
-    /// A run with other settings is there.
+    /// The state of the run in a folder. Fails if that is a run with other settings.
     pub fn state(&self, dir: &Path) -> anyhow::Result<State> {
         if !RunDir::is_occupied(dir) {
             return Ok(RunDir::at(dir).failure().map_or(State::NotBegun, |_| State::Failed(0)));
         }
-        let read = RunReport::scored(dir).inspect_err(|error| warn!("{}", one_line(error)));
-        let Ok(report) = read else { return Ok(State::Unreadable) };
-        let (there, planned) = (&report.config.experiment, &self.experiment);
-        let (old, new) = (settings::of_experiment(there), settings::of_experiment(planned));
-        let mut differences: Vec<_> =
-            settings::differences(&old, &new).map(String::as_str).collect();
-        if there.dataset != planned.dataset {
+        let report = match RunReport::scored(dir) {
+            Ok(report) => report,
+            Err(error) => {
+                warn!("{}", one_line(&error));
+                return Ok(State::Unreadable);
+            }
+        };
+        let existing = &report.config.experiment;
+        let [old, new] = [existing, &self.experiment].map(settings::of_experiment);
+        let differences = settings::differences(&old, &new).map(String::as_str);
+        let mut differences = Vec::from_iter(differences);
+        if existing.dataset != self.experiment.dataset {
             differences.push("dataset");
         }
-        if !differences.is_empty() {
-            let (path, keys) = (dir.display(), differences.join(", "));
-            let hint = "give the study's file another name, choose another folder for it, or move that folder away";
-            return Err(hinted(
-                anyhow!("{path} has a run of other settings than the study's: {keys}"),
-                hint,
-            ));
+        if differences.is_empty() {
+            return Ok(State::of(&report)?);
         }
-        Ok(State::of(&report)?)
+        let (path, keys) = (dir.display(), differences.join(", "));
+        Err(anyhow!("{path} has a run of other settings than the study's: {keys}")).hint(
+            "give the study's file another name, choose another folder for it, or move that folder away",
+        )
     }
 }
 
 impl Study {
-    /// Reads a file and resolves every run as `learner train` would. `only` has values of axes, one
-    /// of which a run must have of each that is named; `set` has keys that all runs change.
-    ///
-    /// # Errors
-    /// Everything that is wrong in it, at once.
+    /// Reads a file and resolves every run as `learner train` would. `only` selects values of axes,
+    /// `set` changes keys of all runs. Reports all problems at once.
     pub fn read(path: &Path, only: &[Table], set: &[Table]) -> anyhow::Result<Self> {
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("cannot read {}", path.display()))
             .hint(HELP)?;
-        let cannot = || format!("{} cannot be used", path.display());
-        let file: File = toml::from_str(&text).with_context(cannot).hint(HELP)?;
-        let name =
-            path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        let refuse = |Wrong { what, advice }: Wrong| {
-            let advice =
-                advice.iter().map(String::as_str).chain([HELP]).collect::<Vec<_>>().join("; ");
-            hinted(anyhow!("{}:\n  {}", cannot(), what.join("\n  ")), advice)
-        };
-        let runs = file.runs(only, set).map_err(refuse)?;
+        let unusable = format!("{} cannot be used", path.display());
+        let file: File = toml::from_str(&text).with_context(|| unusable.clone()).hint(HELP)?;
+        let runs = file.runs(only, set).map_err(|(problems, hints)| {
+            let mut hints = Vec::from_iter(hints);
+            hints.push(HELP.to_owned());
+            hinted(anyhow!("{unusable}:\n  {}", problems.join("\n  ")), hints.join("; "))
+        })?;
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Ok(Self { name, about: file.about, runs })
     }
 }
 
 impl File {
-    fn runs(&self, only: &[Table], set: &[Table]) -> Result<Vec<PlannedRun>, Wrong> {
-        let axes = axes(&self.axes)?;
+    fn runs(&self, only: &[Table], set: &[Table]) -> Result<Vec<PlannedRun>, Problems> {
+        let no_hints = |problems| (problems, BTreeSet::new());
+        let axes = axes(&self.axes).map_err(no_hints)?;
         let all = combinations(&axes);
-        let rules = Rules { only: &self.only, except: &self.except };
-        let narrower = Narrower::new(only);
-        let wrong = [rules.wrong(&all), narrower.wrong(&all)].concat();
-        if !wrong.is_empty() {
-            return Err(wrong.into());
+        let (merged, mut problems) = (rules::merge(only), Vec::new());
+        for (name, tables) in [
+            ("a rule [[only]]", &self.only[..]),
+            ("a rule [[except]]", &self.except),
+            ("--only", slice::from_ref(&merged)),
+        ] {
+            let found = tables.iter().filter_map(|rule| rules::problem(rule, &all));
+            problems.extend(found.map(|problem| format!("{name} {problem}")));
         }
-        let allowed = all.into_iter().filter(|combination| rules.allow(combination)).enumerate();
-        let allowed =
-            Vec::from_iter(allowed.filter(|(_, combination)| narrower.allows(combination)));
-        let (mut runs, mut wrong) =
-            (Vec::<PlannedRun>::new(), BTreeMap::<String, Vec<String>>::new());
-        let mut advice = BTreeSet::new();
-        for (index, combination) in allowed {
-            let name = names::name(&combination);
-            match self.run(index, name.clone(), &combination, set) {
-                Ok(run) if runs.iter().any(|other| other.name == run.name) => {
-                    wrong.entry("two runs have this name".to_owned()).or_default().push(name);
-                }
-                Ok(run) => runs.push(run),
-                Err(error) => {
-                    advice.extend(hints(&error).map(str::to_owned));
-                    wrong.entry(sentence(&error)).or_default().push(name);
-                }
+        if !problems.is_empty() {
+            return Err(no_hints(problems));
+        }
+        let is_run = |combination: &Combination<'_>| {
+            let any = |rules: &[Table]| rules.iter().any(|rule| rules::matches(rule, combination));
+            (self.only.is_empty() || any(&self.only)) && !any(&self.except)
+        };
+        let (mut runs, mut hints) = (Vec::<PlannedRun>::new(), BTreeSet::new());
+        let mut names_by_problem = BTreeMap::<String, Vec<String>>::new();
+        for (index, combination) in all.into_iter().filter(is_run).enumerate() {
+            if !rules::matches(&merged, &combination) {
+                continue;
             }
+            let name = names::name(&combination);
+            let problem = match self.run(index, name.clone(), &combination, set) {
+                Ok(run) if runs.iter().any(|other| other.name == run.name) => {
+                    "two runs have this name".to_owned()
+                }
+                Ok(run) => {
+                    runs.push(run);
+                    continue;
+                }
+                Err(error) => {
+                    hints.extend(quad_runtime::hints(&error).map(str::to_owned));
+                    sentence(&error)
+                }
+            };
+            names_by_problem.entry(problem).or_default().push(name);
         }
-        if runs.is_empty() && wrong.is_empty() {
-            return Err(vec!["the rules leave no run".to_owned()].into());
+        if runs.is_empty() && names_by_problem.is_empty() {
+            return Err(no_hints(vec!["the rules leave no run".to_owned()]));
         }
-        let what: Vec<_> =
-            wrong.into_iter().map(|(what, names)| format!("{}: {what}", some_of(&names))).collect();
-        if what.is_empty() { Ok(runs) } else { Err(Wrong { what, advice }) }
+        if names_by_problem.is_empty() {
+            return Ok(runs);
+        }
+        let line = |(problem, names): (_, Vec<_>)| format!("{}: {problem}", some_of(&names));
+        Err((names_by_problem.into_iter().map(line).collect(), hints))
     }
 
     fn run(
@@ -191,61 +186,57 @@ impl File {
             "name long values by an axis `method`, which has a table of changes for each name",
         )?;
         let mut changes = self.changes(combination, set)?;
-        let begin: Vec<Value> = BEGIN.iter().filter_map(|key| changes.remove(*key)).collect();
-        let [Value::String(preset)] = &begin[..] else {
+        let presets = Vec::from_iter(PRESETS.iter().filter_map(|key| changes.remove(*key)));
+        let [Value::String(preset)] = &presets[..] else {
             return Err(anyhow!("it needs one of task and preset"))
                 .hint("[run] may have it, or an axis");
         };
         let experiment = Preset::read(preset)
             .and_then(|preset| preset.resolve(&changes))
             .hint_of(ConfigError::hint)?;
-        let dataset = experiment.dataset.as_deref().ok_or_else(|| anyhow!("it names no dataset"));
+        let dataset = experiment.dataset.as_deref().context("it names no dataset");
         let source = Source::parse(dataset.hint("add to [run] a line dataset = \"FILE\"")?)?;
         source.check_environment(&experiment.environment)?;
         Ok(PlannedRun { index, name, preset: preset.clone(), changes, experiment, source })
     }
 
-    /// What a combination changes: its values and those of the command line, over those of its
-    /// method, over those that all runs share.
+    /// Changes of a combination. Later tables override earlier ones: [run], method, command line,
+    /// axes.
     fn changes(
         &self,
         combination: &Combination<'_>,
         command_line: &[Table],
     ) -> anyhow::Result<Table> {
-        let method = combination
-            .iter()
-            .find(|(key, _)| *key == METHOD)
-            .map(|(_, value)| self.method(value))
-            .transpose()?;
+        let mut tables = vec![(&self.run, "[run]")];
+        if let Some((_, name)) = combination.iter().find(|(key, _)| *key == METHOD) {
+            tables.push((self.method(name)?, "its method"));
+        }
+        tables.extend(command_line.iter().map(|table| (table, "--set")));
         let mut changes = Table::new();
-        let tables =
-            [(&self.run, "[run]")].into_iter().chain(method.map(|method| (method, "its method")));
-        for (table, source) in tables.chain(command_line.iter().map(|table| (table, "--set"))) {
+        for (table, source) in tables {
             for (key, value) in tables::keys(table) {
-                let twice = combination.iter().any(|(axis, _)| *axis == key);
-                ensure!(!twice, "{key} is an axis, and {source} has it, too");
+                let is_axis = combination.iter().any(|(axis, _)| *axis == key);
+                ensure!(!is_axis, "{key} is an axis, and {source} has it, too");
                 set(&mut changes, &key, value);
             }
         }
-        combination
-            .iter()
-            .filter(|(key, _)| *key != METHOD)
-            .for_each(|(key, value)| set(&mut changes, key, value));
+        for (key, value) in combination.iter().filter(|(key, _)| *key != METHOD) {
+            set(&mut changes, key, value);
+        }
         Ok(changes)
     }
 
     fn method(&self, value: &Value) -> anyhow::Result<&Table> {
-        let known = || self.method.keys().map(String::as_str);
         let name = value.as_str().unwrap_or_default();
-        let hint =
-            || format!("{}add [method.{name}], with what it changes", did_you_mean(name, known()));
-        self.method
-            .get(name)
-            .ok_or_else(|| hinted(anyhow!("there is no table [method.{name}]"), hint()))
+        self.method.get(name).ok_or_else(|| {
+            let similar = did_you_mean(name, self.method.keys().map(String::as_str));
+            let hint = format!("{similar}add [method.{name}], with what it changes");
+            hinted(anyhow!("there is no table [method.{name}]"), hint)
+        })
     }
 }
 
-/// Lays a value over a table at a dotted key.
+/// Sets a dotted key.
 fn set(table: &mut Table, key: &str, value: &Value) {
     let below = |inner, part: &str| Value::Table(Table::from_iter([(part.to_owned(), inner)]));
     if let Value::Table(change) = key.rsplit('.').fold(value.clone(), below) {
@@ -253,7 +244,7 @@ fn set(table: &mut Table, key: &str, value: &Value) {
     }
 }
 
-/// An error with its causes, of which some quote theirs, in one line.
+/// An error in one line, with the causes that it does not quote.
 fn sentence(error: &anyhow::Error) -> String {
     let mut sentence = String::new();
     for cause in error.chain() {
