@@ -31,13 +31,20 @@ const MAX_QUERIES: usize = 64;
 /// Only the page's own files are loaded, and no inline script runs.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; base-uri 'none'; \
                       form-action 'none'; frame-ancestors 'none'";
+
+macro_rules! asset {
+    ($file:literal) => {
+        include_str!(concat!("../../assets/page/", $file))
+    };
+}
+
 const FILES: [(&str, &str, &str); 6] = [
-    ("/", "text/html; charset=utf-8", include_str!("../../assets/page/index.html")),
-    ("/page.css", "text/css", include_str!("../../assets/page/page.css")),
-    ("/page.js", "text/javascript", include_str!("../../assets/page/page.js")),
-    ("/charts.js", "text/javascript", include_str!("../../assets/page/charts.js")),
-    ("/dygraph.css", "text/css", include_str!("../../assets/page/dygraph.min.css")),
-    ("/dygraph.js", "text/javascript", include_str!("../../assets/page/dygraph.min.js")),
+    ("/", "text/html; charset=utf-8", asset!("index.html")),
+    ("/page.css", "text/css", asset!("page.css")),
+    ("/page.js", "text/javascript", asset!("page.js")),
+    ("/charts.js", "text/javascript", asset!("charts.js")),
+    ("/dygraph.css", "text/css", asset!("dygraph.min.css")),
+    ("/dygraph.js", "text/javascript", asset!("dygraph.min.js")),
 ];
 
 /// Describes a learner's current state.
