@@ -1,6 +1,6 @@
 //! Tests of experiments.
 
-use crate::config::resolve;
+use crate::config::{Experiment, resolve};
 use quad_runtime::one_line;
 use toml::{Table, toml};
 
