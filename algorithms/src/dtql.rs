@@ -170,8 +170,8 @@ impl Dtql {
         let Networks { critic, value, .. } = &self.networks;
         let next = state_value(&value.detach(), &batch.next_observations)?;
         let targets = batch.target(*self.config.gamma, &next)?;
-        let q = batch.values(&critic)?;
-        let v = state_value(&value, &batch.observations)?;
+        let q = batch.values(critic)?;
+        let v = state_value(value, &batch.observations)?;
         let value_loss = expectile_loss(&(smallest(&q.detach())? - &v)?, *self.config.expectile)?;
         let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * TWIN as f64)?;
         Ok([

@@ -184,7 +184,7 @@ impl Fqe {
         let of_network =
             targets.affine(1.0 / self.units.scale, -self.units.offset / self.units.scale)?;
         let critic = &mut self.networks.critic;
-        let loss = batch.squared_error(&critic, &of_network)?;
+        let loss = batch.squared_error(critic, &of_network)?;
         critic.minimize(&loss, AdamStep::after(step, *self.config.learning_rate))?;
         critic.soft_update(*self.config.ema_rate)?;
         measured(&[Loss::of_critics(loss, &targets)?])
@@ -193,7 +193,7 @@ impl Fqe {
     /// y = r + γ·mask·Q̂(s', a'), clipped to the bounds of the units; `[B]`.
     fn targets(&self, batch: &Minibatch, next_actions: &Tensor) -> Result<Tensor> {
         let critic = &self.networks.critic.target;
-        let next = batch.next_values(&critic, next_actions)?.squeeze(0)?;
+        let next = batch.next_values(critic, next_actions)?.squeeze(0)?;
         let next = next.affine(self.units.scale, self.units.offset)?;
         batch
             .target(*self.config.gamma, &next)?

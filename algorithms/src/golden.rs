@@ -71,14 +71,15 @@ fn numbers(golden: &Golden, name: &str) -> Vec<f32> {
 
 /// Random transitions in one episode, for an algorithm that learns from windows.
 fn episode((o, a): (usize, usize), n: usize) -> Arrays {
-    let numbers = |width: usize| (0..n * width).map(|i| (i as f32).sin()).collect();
+    let numbers = |count: usize| Vec::from_iter((0..count).map(|i| (i as f32).sin()));
+    let states = numbers((n + 1) * o);
     Arrays {
         observation_dim: o,
         action_dim: a,
-        observations: numbers(o),
-        actions: numbers(a),
-        rewards: numbers(1),
-        next_observations: numbers(o),
+        next_observations: states[o..].to_vec(),
+        observations: states[..n * o].to_vec(),
+        actions: numbers(n * a),
+        rewards: numbers(n),
         terminals: vec![false; n],
         timeouts: (1..=n).map(|i| i == n).collect(),
     }

@@ -155,7 +155,7 @@ impl<L: ImplicitLosses> InSample<L> {
         let Networks { critic, value, .. } = &self.networks;
         let next = state_value(&value.detach(), &batch.next_observations)?;
         let targets = batch.target(*self.losses.common().gamma, &next)?;
-        let loss = self.losses.critic_loss(&batch.values(&critic)?, &targets)?;
+        let loss = self.losses.critic_loss(&batch.values(critic)?, &targets)?;
         Loss::of_critics(loss, &targets)
     }
 }

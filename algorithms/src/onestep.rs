@@ -176,7 +176,7 @@ impl Algorithm for Onestep {
         match phase {
             0 => {
                 behavior.minimize(&loss.value, adam)?;
-                actor.network.soft_update(&behavior, 1.0)?; // all the way
+                actor.network.soft_update(behavior, 1.0)?; // all the way
             }
             1 => {
                 critic.minimize(&loss.value, adam)?;

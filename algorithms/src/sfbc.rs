@@ -276,7 +276,7 @@ impl Algorithm for Sfbc {
             evaluations: *self.config.evaluations,
         };
         let Networks { actor, critic } = &self.networks;
-        let tensors = ScorePolicy::tensors(&actor, &critic)?;
+        let tensors = ScorePolicy::tensors(actor, critic)?;
         Ok((PolicyConfig::Score { shape, choice }, tensors))
     }
 
