@@ -12,7 +12,7 @@ const MAX_ROWS: usize = 500;
 const SIGNIFICANT_DIGITS: usize = 5;
 
 /// The contents of `metrics.jsonl`. A row is the mean of `stride` lines.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 pub(super) struct History {
     #[serde(skip)]
     path: PathBuf,
@@ -39,7 +39,7 @@ struct Row {
 
 impl History {
     pub fn of(path: PathBuf) -> Self {
-        Self { path, offset: 0, stride: 1, lines: 0, names: Vec::new(), rows: Vec::new() }
+        Self { path, stride: 1, ..Self::default() }
     }
 
     /// Reads the file's new lines. A resumed learner repeats the steps since its checkpoint: they

@@ -33,6 +33,7 @@ pub(super) enum Query {
 /// A query and the channel for its answer: JSON, or nothing if there is no such run.
 pub(super) type Request = (Query, oneshot::Sender<Option<Bytes>>);
 
+#[derive(Default)]
 pub(super) struct Reader {
     root: PathBuf,
     list: Cache,
@@ -54,7 +55,7 @@ impl Cache {
 
 impl Reader {
     pub fn new(root: PathBuf) -> Self {
-        Self { root, list: Cache::default(), dirs: HashMap::new(), runs: HashMap::new() }
+        Self { root, ..Self::default() }
     }
 
     /// Answers until the web server is dropped.
@@ -94,8 +95,8 @@ impl Reader {
         if self.runs.len() >= MAX_RUNS && !self.runs.contains_key(&name) {
             self.runs.clear();
         }
-        let (run, cache) =
-            self.runs.entry(name).or_insert_with(|| (RunPage::of(dir), Cache::default()));
+        let new = || (RunPage::of(dir), Cache::default());
+        let (run, cache) = self.runs.entry(name).or_insert_with(new);
         let read = || run.read().unwrap_or_else(|error| json!({ "error": format!("{error:#}") }));
         Some(cache.get(RUN_LIFETIME, read))
     }

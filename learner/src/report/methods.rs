@@ -93,7 +93,8 @@ pub fn aggregate(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>)
 }
 
 fn of_method(method: &Method) -> MethodReport {
-    use statistics::{interquartile_mean, mean_of_means, median_of_means, optimality_gap};
+    use statistics::{fraction_above, interquartile_mean, mean_of_means};
+    use statistics::{median_of_means, optimality_gap};
     let first = method[0];
     let runs: Runs = method.iter().map(|group| group.scores.clone()).collect();
     let count = if first.normalized { 61 } else { 0 };
@@ -101,7 +102,7 @@ fn of_method(method: &Method) -> MethodReport {
     let statistics = |drawn: &[Runs]| {
         let of = [interquartile_mean, mean_of_means, median_of_means, optimality_gap];
         let mut values = Vec::from_iter(of.map(|of| of(&drawn[0])));
-        values.extend(thresholds.iter().map(|at| statistics::fraction_above(&drawn[0], *at)));
+        values.extend(thresholds.iter().map(|at| fraction_above(&drawn[0], *at)));
         values
     };
     let estimates = statistics::estimates(&[&runs], statistics);

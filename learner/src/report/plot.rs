@@ -163,7 +163,8 @@ impl Plot {
             .light_line_style(WHITE)
             .draw()?;
         for (name, y) in &self.references {
-            let (ends, style) = ([(x.start, *y), (x.end, *y)], REFERENCE.stroke_width(2 * scale));
+            let ends = [(x.start, *y), (x.end, *y)];
+            let style = REFERENCE.stroke_width(2 * scale);
             let line = DashedLineSeries::new(ends, 6 * scale, 4 * scale, style);
             chart.draw_series(line)?.label(name).legend(legend(REFERENCE, scale));
         }
@@ -193,12 +194,16 @@ impl Plot {
         let mut y = 0.0..0.01;
         for (at, estimate) in points {
             extend(&mut x, *at);
-            let ends = [estimate.low, estimate.high].into_iter().flatten();
-            ends.chain([estimate.value]).for_each(|value| extend(&mut y, value));
+            extend(&mut y, estimate.low.unwrap_or(estimate.value));
+            extend(&mut y, estimate.value);
+            extend(&mut y, estimate.high.unwrap_or(estimate.value));
         }
-        self.references.iter().for_each(|(_, value)| extend(&mut y, *value));
-        let labels = if self.is_falling { 0 } else { self.lines.len() + self.references.len() };
-        y.end = y.start + (y.end - y.start) * (1.05 + 0.05 * labels as f64);
+        for (_, value) in &self.references {
+            extend(&mut y, *value);
+        }
+        let labels = self.lines.len() + self.references.len();
+        let room = if self.is_falling { 0.0 } else { 0.05 * labels as f64 };
+        y.end = y.start + (y.end - y.start) * (1.05 + room);
         (x, y)
     }
 }
