@@ -38,7 +38,7 @@ fn a_partial_line_is_read_when_it_is_complete() {
     let (first, whole) = (lines(1..=3), lines(1..=4));
     assert_eq!(rows(&history(&[])), "[]");
     let half = whole[..first.len() + 9].to_owned();
-    let known = history(&[half.clone()]);
+    let known = history(std::slice::from_ref(&half));
     assert_eq!(known.names, ["eta", "loss"]);
     let expected = "[[100.0,2.0,1.0,1.0],[200.0,4.0,0.0,0.5],[300.0,6.0,1.0,0.33333]";
     assert_eq!(rows(&known), format!("{expected}]"));
