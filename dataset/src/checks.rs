@@ -1,4 +1,4 @@
-//! What training refuses to learn from.
+//! Problems for which training refuses a dataset.
 
 use crate::error::Problem;
 use crate::recording::{Recording, RowKind};
@@ -13,7 +13,7 @@ const ACTION_TOLERANCE: f32 = 1e-3;
 /// than that of recording have nearly all.
 const MOST_STRAYS: f64 = 0.01;
 
-/// Everything that is wrong with a recording as data of that environment, the gravest first.
+/// All problems of a recording as data of an environment, the gravest first.
 pub(crate) fn problems(
     recording: &Recording,
     environment: Option<&EnvironmentSpec>,

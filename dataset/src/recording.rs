@@ -1,4 +1,4 @@
-//! What every format is read into: rows as they were recorded, not judged yet.
+//! Rows of a dataset of any format, as they were recorded.
 
 use crate::rounding::Rounding;
 use crate::statistics::{Episode, returns};
@@ -6,7 +6,7 @@ use crate::statistics::{Episode, returns};
 /// Two rows whose observations differ by more than this do not follow one another.
 const SAME_OBSERVATION: f64 = 1e-6;
 
-/// What a row is good for.
+/// Use of a row in training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum RowKind {
     /// A step to learn from.

@@ -1,4 +1,4 @@
-//! What looks wrong with a dataset, though training puts up with it.
+//! Problems of a dataset that training accepts.
 
 use crate::error::such_rows;
 use crate::formats::Source;
@@ -8,7 +8,7 @@ use crate::tables::environment::EnvironmentSpec;
 use crate::tables::reward::RewardRule;
 use crate::{checks, warnings};
 
-/// Nothing that walks through a maze comes further in one step of a tenth of a second.
+/// Farthest that a robot in a maze moves in a step of 0.1 s, meters.
 const LONGEST_STEP: f32 = 1.0;
 
 /// One sentence for each kind of thing.

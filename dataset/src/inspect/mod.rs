@@ -1,4 +1,4 @@
-//! What a person needs to know of a dataset before spending a day of training on it.
+//! A description of a dataset for people.
 //!
 //! `findings` is what looks wrong though training puts up with it, `histogram` counts, and `page`
 //! is how it all looks.

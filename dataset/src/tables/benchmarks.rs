@@ -60,7 +60,7 @@ impl Format {
         }
     }
 
-    fn extension(self) -> &'static str {
+    pub(super) fn extension(self) -> &'static str {
         match self {
             Self::Hdf5 => "hdf5",
             Self::Npz => "npz",
@@ -307,24 +307,6 @@ pub fn tasks() -> impl Iterator<Item = BenchmarkTask> {
     })
 }
 
-/// A dataset that is named by a rule.
-pub(super) struct BenchmarkDataset {
-    pub name: String,
-    pub benchmark: &'static Benchmark,
-    pub environment: String,
-    pub file: String,
-}
-
-/// All datasets that are named by a rule and can be learned from.
-pub(super) fn datasets() -> impl Iterator<Item = BenchmarkDataset> {
-    tasks().filter(|task| task.is_default && task.maze.is_some()).map(|task| BenchmarkDataset {
-        file: format!("{}.{}", task.dataset, task.benchmark.format.extension()),
-        name: task.dataset,
-        benchmark: task.benchmark,
-        environment: task.environment,
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -363,8 +345,8 @@ mod tests {
 
     #[test]
     fn tasks_and_datasets_are_those_that_are_published() {
-        let (all, datasets) = (Vec::from_iter(tasks()), Vec::from_iter(datasets()));
-        assert_eq!((all.len(), datasets.len()), (42 * 6, 24));
+        let all = Vec::from_iter(tasks());
+        assert_eq!(all.len(), 42 * 6);
         let names = |at: usize| (&*all[at].name, &*all[at].environment, &*all[at].dataset);
         let (task, environment) =
             ("antmaze-medium-navigate-singletask-task1-v0", "antmaze-medium-singletask-task1-v0");
@@ -373,6 +355,5 @@ mod tests {
             ("puzzle-4x6-noisy-singletask-task5-v0", "puzzle-4x6-singletask-task5-v0");
         assert_eq!(names(42 * 6 - 1), (task, environment, "puzzle-4x6-noisy-v0"));
         assert!(all.iter().all(|task| task.name != "antmaze-giant-explore-singletask-v0"));
-        assert_eq!(datasets[23].file, "antsoccer-medium-stitch-v0.npz");
     }
 }

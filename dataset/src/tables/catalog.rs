@@ -77,10 +77,12 @@ static DATASETS: LazyLock<Vec<NamedDataset>> = LazyLock::new(|| {
             dataset.into_iter().map(move |row| row.hosted(benchmark, &host))
         },
     );
-    let named = benchmarks::datasets().filter_map(|dataset| {
-        let (name, environment, file) = (dataset.name, dataset.environment, dataset.file);
+    let named = benchmarks::tasks().filter(|task| task.is_default && task.maze.is_some());
+    let named = named.filter_map(|task| {
+        let (name, environment) = (task.dataset, task.environment);
+        let file = format!("{name}.{}", task.benchmark.format.extension());
         let row = Row { name, environment, file, bytes: None, sha256: None };
-        Some(row.hosted(dataset.benchmark, dataset.benchmark.host()?))
+        Some(row.hosted(task.benchmark, task.benchmark.host()?))
     });
     listed.chain(named).collect()
 });
@@ -130,6 +132,7 @@ mod tests {
                 "{name}"
             );
         }
+        assert_eq!(all().len(), 54);
         let address =
             "https://rail.eecs.berkeley.edu/datasets/ogbench/antsoccer-medium-stitch-v0.npz";
         assert_eq!(find("antsoccer-medium-stitch-v0").unwrap().addresses, [address]);

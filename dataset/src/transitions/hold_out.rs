@@ -14,11 +14,11 @@ const PURPOSE: u64 = u64::from_be_bytes(*b"hold out");
 /// Which episodes are kept out.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum HoldOut<'a> {
-    /// A share of them, between 0, which keeps none out, and 1.
-    Share {
-        /// How large it is.
-        share: f64,
-        /// Decides, with the number of episodes, which they are.
+    /// A fraction of them, between 0, which keeps none out, and 1.
+    Fraction {
+        /// The fraction.
+        fraction: f64,
+        /// Seed of the choice.
         seed: u64,
     },
     /// Those of these numbers, from 0 in the order of the file.
@@ -30,20 +30,21 @@ impl HoldOut<'_> {
     pub(crate) const NONE: Self = Self::Episodes(&[]);
 
     pub(crate) fn is_none(self) -> bool {
-        matches!(self, Self::Share { share: 0.0, .. } | Self::Episodes([]))
+        matches!(self, Self::Fraction { fraction: 0.0, .. } | Self::Episodes([]))
     }
 }
 
 /// Numbers of the episodes that are kept out, from 0 in the order of the recording, in ascending
-/// order. Where the share is not 0 there is at least one, and one is left to learn from.
+/// order. Where the fraction is not 0 there is at least one, and one is left to learn from.
 pub(crate) fn chosen(hold_out: HoldOut<'_>, episodes: usize) -> Vec<usize> {
-    let (share, seed) = match hold_out {
-        HoldOut::Share { share, seed } => (share, seed),
+    let (fraction, seed) = match hold_out {
+        HoldOut::Fraction { fraction, seed } => (fraction, seed),
         HoldOut::Episodes(numbers) => return numbers.to_vec(),
     };
     let mut numbers = Vec::from_iter(0..episodes);
     numbers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed ^ PURPOSE));
-    let count = if share > 0.0 { ((share * episodes as f64).round() as usize).max(1) } else { 0 };
+    let count =
+        if fraction > 0.0 { ((fraction * episodes as f64).round() as usize).max(1) } else { 0 };
     numbers.truncate(count.min(episodes.saturating_sub(1)));
     numbers.sort_unstable();
     numbers
@@ -142,7 +143,7 @@ mod tests {
         ]);
         (whole.ends[1], whole.terminals[1], whole.ends[3]) = (true, true, true);
         assert_eq!(whole.rows_of_episodes(), [0..2, 2..4, 4..6, 6..7]);
-        let (mut seen, hold_out) = (Vec::new(), |seed| HoldOut::Share { share: 0.25, seed });
+        let (mut seen, hold_out) = (Vec::new(), |seed| HoldOut::Fraction { fraction: 0.25, seed });
         for seed in 0..20 {
             let (training, held_out, out) = whole.hold_out(hold_out(seed));
             assert_eq!(out.len(), 1);
@@ -175,7 +176,8 @@ mod tests {
 
     #[test]
     fn one_episode_is_left_to_learn_from() {
-        let count = |share, episodes| chosen(HoldOut::Share { share, seed: 0 }, episodes).len();
+        let count =
+            |fraction, episodes| chosen(HoldOut::Fraction { fraction, seed: 0 }, episodes).len();
         assert_eq!(
             [count(0.0, 10), count(0.1, 10), count(0.01, 10), count(0.9, 2), count(0.5, 1)],
             [0, 1, 1, 1, 0]

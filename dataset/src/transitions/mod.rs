@@ -24,8 +24,7 @@ use statistics::Statistics;
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
 
-/// B transitions, each array row by row. Reused from step to step; make the first one with
-/// `Batch::default()`.
+/// A mini-batch of B transitions, each array row by row.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Batch {
     /// s, B × o.
@@ -38,7 +37,7 @@ pub struct Batch {
     pub next_observations: Vec<f32>,
     /// 0 where the episode terminated, else 1; B.
     pub masks: Vec<f32>,
-    /// B.
+    /// Number of transitions, B.
     pub size: usize,
 }
 
@@ -62,12 +61,11 @@ pub struct ReadOptions {
     /// The environment it was recorded in, if it is known: sizes, time limit and reference returns
     /// come from there. Else the source's own sizes count, and without timeouts nothing is cut off.
     pub environment: Option<&'static EnvironmentSpec>,
-    /// The task in a maze of OGBench's that rewards and masks are to be of; else they are the
-    /// source's.
+    /// Task in a maze from which rewards and masks follow; else they are the source's.
     pub task: Option<MazeTask>,
-    /// What happens to its rewards.
+    /// Rule for its rewards.
     pub reward: RewardRule,
-    /// What is scaled; actions that are not must lie within [-1, 1].
+    /// Columns to normalize; actions that are not normalized must lie within [-1, 1].
     pub normalize: Normalize,
 }
 
@@ -238,13 +236,13 @@ impl Transitions {
         self.action_dim
     }
 
-    /// How the numbers here, which are the networks', follow from those of the recording; rewards
-    /// after the reward rule.
+    /// Offsets and scales between the recording's numbers and those here; rewards are scaled after
+    /// the reward rule.
     pub fn scaling(&self) -> &Scaling {
         &self.scaling
     }
 
-    /// What the source calls the numbers of its observations and actions.
+    /// Names of the numbers of observations and actions.
     pub fn names(&self) -> &Names {
         &self.names
     }
@@ -269,7 +267,7 @@ impl Transitions {
         &self.statistics
     }
 
-    /// What makes it doubtful that anything good is learned from them, one sentence each.
+    /// Signs that little can be learned from them, one sentence each.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }

@@ -1,5 +1,4 @@
-//! What a flag may really be that should say where a task is over: a mask or discount, a success
-//! that stays set, a time limit.
+//! Flags that do not mark the end of a task: masks, discounts, successes that stay set.
 
 use super::percent;
 use crate::recording::Recording;
@@ -13,11 +12,6 @@ pub(super) const MOST_AFTER_GOAL: f64 = 0.8;
 /// Steps after which states are as far apart as any two are 1 long, those of a robot that goes on
 /// much less.
 const RESET: f64 = 0.5;
-/// Fewest steps of a time limit, and fewest episodes that reach it: also one in this many.
-const SHORTEST_LIMIT: usize = 10;
-const FEWEST_AT_LIMIT: usize = 5;
-const SHARE_AT_LIMIT: usize = 10;
-
 /// One sentence, if flags do not seem to be what they should be.
 pub(super) fn meaning(recording: &Recording) -> Option<String> {
     let steps = (0..recording.rows()).filter(|&row| recording.is_step(row)).count();
@@ -32,7 +26,7 @@ pub(super) fn meaning(recording: &Recording) -> Option<String> {
             )
         });
     }
-    stays_set(recording, steps).or_else(|| time_limit(recording))
+    stays_set(recording, steps)
 }
 
 /// Flags that are set while states go on.
@@ -64,36 +58,6 @@ fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
          learn of nothing that follows",
         percent(terminals, steps)
     ))
-}
-
-/// Episodes that terminate after the same number of steps, and none after more, where nothing says
-/// that one was cut off.
-fn time_limit(recording: &Recording) -> Option<String> {
-    if recording.timeouts.contains(&true) {
-        return None;
-    }
-    let (mut lengths, mut length) = (Vec::new(), 0);
-    for row in (0..recording.rows()).filter(|&row| recording.is_step(row)) {
-        length += 1;
-        if recording.ends[row] {
-            lengths.extend(recording.terminals[row].then_some(length));
-            length = 0;
-        }
-    }
-    let longest = lengths.iter().copied().max().filter(|longest| *longest >= SHORTEST_LIMIT)?;
-    let at = lengths.iter().filter(|length| **length == longest).count();
-    // Without a limit, there are more that are a little shorter.
-    let below =
-        lengths.iter().filter(|length| (longest - longest / 10..longest).contains(*length)).count();
-    let is_limit = at >= FEWEST_AT_LIMIT && at * SHARE_AT_LIMIT >= lengths.len() && at > 2 * below;
-    is_limit.then(|| {
-        format!(
-            "array `{}`: {at} of {} episodes that terminate do so after exactly {longest} steps, and none later; a time limit? \
-             set `timeouts` there in its place, or critics learn that nothing follows",
-            recording.terminal_array,
-            lengths.len()
-        )
-    })
 }
 
 /// The mean squared step from these rows to the next, over that between any two rows: the median of

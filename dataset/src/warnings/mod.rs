@@ -1,10 +1,9 @@
-//! What can be trained on, though nothing good may come of it: each warning is written here once, for
-//! every format, for who inspects data and for who trains on it.
+//! Warnings about data from which little can be learned, for every format.
 //!
-//! `ends` is what flags may really be, and `resets` whether they stand in the right row; `copied`
-//! is actions that are the state, `rest` observations that do not move, `late` such that are a row
-//! late; `rewards` and `sizes` are about the numbers. A sentence names the array, the share or
-//! number of rows, what it may be, and what to do.
+//! `ends` are flags with another meaning, `resets` flags in the wrong row; `copied` are actions
+//! that equal the state, `rest` observations that do not move, `late` observations that are a row
+//! late; `rewards` and `sizes` are about magnitudes. A warning names the array, the fraction or
+//! number of rows, a likely cause, and a remedy.
 
 mod copied;
 mod ends;

@@ -21,7 +21,7 @@ pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
         reward: experiment.reward,
         normalize: experiment.normalize,
     };
-    let hold_out = HoldOut::Share { share: experiment.hold_out, seed: experiment.seed };
+    let hold_out = HoldOut::Fraction { fraction: experiment.hold_out, seed: experiment.seed };
     let result = Transitions::read_split(path, &options, hold_out);
     let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
     let split =

@@ -72,7 +72,7 @@ impl Data {
             warn!(
                 "no run has held out episodes (--hold-out), so the policies are judged in some that they have learned from"
             );
-            HoldOut::Share { share: HELD_OUT, seed: 0 }
+            HoldOut::Fraction { fraction: HELD_OUT, seed: 0 }
         } else {
             HoldOut::Episodes(&episodes)
         };

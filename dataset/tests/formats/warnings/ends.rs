@@ -41,27 +41,6 @@ fn a_success_that_stays_set() {
 }
 
 #[test]
-fn a_time_limit_in_place_of_the_end() {
-    for own in [false, true] {
-        let mut cart = mass(60, 0.1);
-        let (terminals, limits) = (cart.terminals.clone(), cart.timeouts.clone());
-        let count = |flags: &[bool]| flags.iter().filter(|flag| **flag).count();
-        assert!(count(&limits) >= 5, "{}", count(&limits));
-        cart.terminals = terminals.iter().zip(&limits).map(|(one, other)| *one || *other).collect();
-        cart.timeouts.fill(false);
-        let warning = cart.warning(own);
-        let expected = format!(
-            "array `terminals`: {} of 30 episodes that terminate do so after exactly 60 steps",
-            count(&limits)
-        );
-        assert!(
-            warning.starts_with(&expected) && warning.contains("set `timeouts` there"),
-            "{warning}"
-        );
-    }
-}
-
-#[test]
 fn rows_after_the_goal() {
     let mut cart = Cart::new(false);
     let mut number = 0;

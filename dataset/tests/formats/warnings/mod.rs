@@ -134,28 +134,22 @@ impl Cart {
         }
     }
 
-    /// What `inspect` says of it in the custom layout, whether or not it can be trained on as it
-    /// is.
-    fn doubts_of_inspect(&self) -> Vec<String> {
-        self.doubts_of_inspect_in(true)
-    }
-
-    fn doubts_of_inspect_in(&self, own: bool) -> Vec<String> {
+    /// Problems that `inspect` finds in one of the layouts.
+    fn problems(&self, own: bool) -> Vec<String> {
         let folder = tempdir().unwrap();
         let path = folder.path().join("cart.hdf5");
         self.write(&path, own);
         inspect(&path, None).unwrap().problems
     }
 
-    /// The only thing that is said of it.
+    /// Its only warning.
     fn warning(&self, own: bool) -> String {
         let warnings = self.warnings(own);
         assert_eq!(warnings.len(), 1, "{warnings:?}");
         warnings[0].clone()
     }
 
-    /// What is said of it in each layout, by `inspect` and by who trains on it, who both say the
-    /// same.
+    /// Warnings in one of the layouts, which `inspect` and `Transitions` have alike.
     fn warnings(&self, own: bool) -> Vec<String> {
         let folder = tempdir().unwrap();
         let path = folder.path().join("cart.hdf5");

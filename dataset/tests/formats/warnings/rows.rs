@@ -45,7 +45,7 @@ fn observations_that_rest_while_actions_change() {
 fn next_observations_that_are_the_rows_own() {
     let mut cart = mass(60, 0.1);
     cart.next_observations = cart.observations.clone();
-    let warnings = cart.doubts_of_inspect();
+    let warnings = cart.problems(true);
     assert!(warnings.iter().any(|warning| {
         warning.starts_with("array `next_observations`: is the observation of its own row in 100 %")
     }));
@@ -61,7 +61,7 @@ fn actions_that_are_the_state() {
         for (action, observation) in actions.chunks_exact_mut(2).zip(observations.chunks_exact(O)) {
             action.copy_from_slice(&[unit * observation[1], unit * observation[0]]);
         }
-        let warnings = cart.doubts_of_inspect_in(own);
+        let warnings = cart.problems(own);
         let expected = "array `actions`: columns 0, 1 copied from columns 1, 0 of the same row's observation (in 100.0 %";
         assert!(warnings.iter().any(|warning| warning.starts_with(expected)), "{warnings:?}");
     }
@@ -72,7 +72,7 @@ fn actions_that_are_the_state() {
     {
         action.copy_from_slice(&next[..2]);
     }
-    assert!(!cart.doubts_of_inspect().iter().any(|warning| warning.contains("copied")));
+    assert!(!cart.problems(true).iter().any(|warning| warning.contains("copied")));
     // A gripper's state equals its command but where it moves.
     let mut cart = mass(60, 0.1);
     let open = |row: usize| f32::from(u8::from(row % 40 < 20));
@@ -81,7 +81,7 @@ fn actions_that_are_the_state() {
         cart.next_observations[row * O + 3] = open(row + 1);
         cart.actions[row * 2 + 1] = open(row + 1);
     }
-    assert!(!cart.doubts_of_inspect().iter().any(|warning| warning.contains("copied")));
+    assert!(!cart.problems(true).iter().any(|warning| warning.contains("copied")));
 }
 
 #[test]
@@ -93,7 +93,7 @@ fn observations_that_are_a_row_late() {
         let late = moved(&sound, |row, _| if is_last(row) { row } else { (row + 1).min(last) });
         for own in [false, true] {
             assert_eq!(sound.warnings(own), [""; 0]);
-            let warnings = late.doubts_of_inspect_in(own);
+            let warnings = late.problems(own);
             assert!(
                 warnings
                     .iter()
