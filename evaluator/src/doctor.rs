@@ -128,7 +128,7 @@ async fn problem_of(session: &Session, run: &Name) -> anyhow::Result<Option<Stri
             let answer = decode_from::<JobReply>(payload.len(), payload.reader());
             answer.err().map(|error| error.to_string())
         }
-        // A learner of another version cannot read the claim, and says so.
+        // A learner of another version answers with an error.
         Err(error) => {
             Some(String::from_utf8_lossy(&error.payload().to_bytes()).chars().take(200).collect())
         }

@@ -1,5 +1,4 @@
-//! An evaluator refuses jobs by the memory that a policy says it takes, which is the memory that it
-//! takes.
+//! Policies take no more memory than they declare, by which an evaluator refuses jobs.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::alloc::{GlobalAlloc, Layout, System};

@@ -196,12 +196,9 @@ impl RunClient {
         let step = report.step;
         match self.connection.deliver(report, timeout).await? {
             ScoreReply::Recorded { new, duplicates, .. } => {
-                let mut sum = 0.0;
-                for episode in &report.episodes {
-                    metrics.episode_score.observe(episode.score);
-                    sum += episode.score;
-                }
-                let mean = sum / report.episodes.len().max(1) as f64;
+                let scores = report.episodes.iter().map(|episode| episode.score);
+                let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
+                scores.for_each(|score| metrics.episode_score.observe(score));
                 info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
                 metrics.job(JobOutcome::Scored);
                 self.claimed = None;

@@ -63,7 +63,7 @@ Examples:
 
 RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
-/// Evaluate the snapshots that learners publish, until told to stop
+/// Evaluate the snapshots that learners publish, until stopped
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct ServeArgs {

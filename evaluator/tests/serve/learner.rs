@@ -44,7 +44,7 @@ impl Event {
     }
 }
 
-/// The learner's reaction to scores and claims.
+/// Reaction to scores, claims and returned jobs.
 #[derive(Clone, Copy, PartialEq)]
 pub enum Behavior {
     Records,

@@ -42,12 +42,12 @@ pub struct ScoreArgs {
     /// scored on the same episodes [default: the snapshot's]
     #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = value_parser!(u32).range(1..=MOST_CANDIDATES))]
     pub candidates: Vec<u32>,
-    /// How the policy chooses among the sampled actions: best, softmax:TEMPERATURE (a draw),
-    /// average:TEMPERATURE:ACTIONS (the mean of so many draws) or nearest (to a value function)
+    /// Rule of choice among the sampled actions: best, softmax:TEMPERATURE (a draw),
+    /// average:TEMPERATURE:ACTIONS (the mean of several draws) or nearest (to a value function)
     /// [default: the snapshot's]
     #[arg(long, value_name = "RULE")]
     pub rule: Option<Rule>,
-    /// How the critics' values of an action are combined: mean or min [default: the snapshot's]
+    /// Combination of the critics' values of an action: mean or min [default: the snapshot's]
     #[arg(long, value_name = "NAME")]
     pub value: Option<Aggregate>,
     /// Seed from which, with the snapshot's step, the episodes' seeds follow [default: the run's]

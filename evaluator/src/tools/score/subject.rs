@@ -31,7 +31,7 @@ pub struct Subject {
 }
 
 impl Subject {
-    /// Reads a file; the command line's options replace what it says. Returns its policy once for
+    /// Reads a file, whose values the command line's options replace. Returns its policy once for
     /// each way to choose that the command line asks for.
     pub fn read(path: &Path, args: &ScoreArgs) -> anyhow::Result<Vec<Self>> {
         let name = path.display();
