@@ -163,7 +163,7 @@ def test_a_failure_to_show_progress_does_not_stop_the_learner(monkeypatch):
         def write(self, text):
             raise BrokenPipeError
 
-    monkeypatch.setattr(_train, "_said", lambda process: [("INFO", "page: http://127.0.0.1:1/"), ("", "error: no")])
+    monkeypatch.setattr(_train, "_log", lambda process: [("INFO", "page: http://127.0.0.1:1/"), ("", "error: no")])
     closed = io.StringIO()
     closed.close()
     for stream in (Gone(), closed, None):
@@ -180,7 +180,7 @@ def test_the_bar_overwrites_its_line(monkeypatch):
 
     said = [("INFO", "page: http://127.0.0.1:1/"), ("INFO", "step 50/100 (50 %), 9 seconds left"), ("WARN", "hot"),
             ("INFO", "step 100/100 (100 %), done"), ("INFO", "training is done"), ("", "error: no")]
-    monkeypatch.setattr(_train, "_said", lambda process: said)
+    monkeypatch.setattr(_train, "_log", lambda process: said)
     monkeypatch.setattr(sys, "stderr", Screen())
     error = []
     _train._Display().follow(None, error)

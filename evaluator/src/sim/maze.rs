@@ -24,7 +24,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::physics::Physics;
-use super::simulation::{Body, Task};
+use super::simulation::{RobotSpec, Task};
 
 /// Random stream of a goal, of an episode's or an environment's seed.
 const GOAL_STREAM: u64 = 4;
@@ -33,9 +33,15 @@ const START_STREAM: u64 = 5;
 /// Placeholder of the walls in a robot's model.
 const WALLS: &str = "<!-- walls -->";
 
-/// Initial state and observation of a robot: as much of it as the observation has room for.
-pub(super) fn body(robot: &Robot) -> Body {
-    Body { noise: robot.noise, hidden_positions: 0, observed_velocity: f64::INFINITY }
+/// The robot observes all positions, then as many velocities as the observation has room for.
+pub(super) fn robot(robot: &Robot) -> RobotSpec {
+    RobotSpec {
+        frame_skip: robot.frame_skip,
+        drive: robot.drive,
+        noise: robot.noise,
+        hidden_positions: 0,
+        observed_velocity: f64::INFINITY,
+    }
 }
 
 /// The model of a robot and its floor, with a box for each wall of a maze, half a cell high.
@@ -113,87 +119,80 @@ mod tests {
 
     use crate::sim::make;
 
-    /// The goals of some episodes of one ant.
-    fn goals(name: &str, environment_seed: u64, seeds: &[u64]) -> Vec<Vec<f64>> {
+    /// Goals of some episodes of one ant.
+    fn goals(name: &str, environment_seed: u64, seeds: &[u64]) -> Vec<[f64; 2]> {
         let mut ant = make(find(name).unwrap(), environment_seed).unwrap();
         let goal = |&seed: &u64| {
             ant.reset(seed);
-            ant.goal().unwrap().to_vec()
+            ant.goal().unwrap().try_into().unwrap()
         };
         seeds.iter().map(goal).collect()
     }
 
     #[test]
-    fn a_goal_is_of_the_environment_s_seed_or_drawn_for_the_episode() {
+    fn a_goal_is_drawn_for_the_environment_or_for_each_episode() {
         for size in ["umaze", "medium", "large"] {
-            let kept = format!("antmaze-{size}-v0");
-            let goal = goals(&kept, 5, &[1]);
-            assert_eq!(goals(&kept, 5, &[2, 3]), [goal[0].clone(), goal[0].clone()]);
-            assert_ne!(goals(&kept, 6, &[1]), goal);
+            let name = format!("antmaze-{size}-v0");
+            let goal = goals(&name, 5, &[1])[0];
+            assert_eq!(goals(&name, 5, &[2, 3]), [goal; 2]);
+            assert_ne!(goals(&name, 6, &[1]), [goal]);
 
-            let drawn = format!("antmaze-{size}");
-            let mut two = goals(&drawn, 5, &[1, 2]);
-            assert_ne!(two[0], two[1]);
-            two.reverse();
-            assert_eq!(goals(&drawn, 6, &[2, 1]), two);
+            let name = format!("antmaze-{size}");
+            let [one, other] = goals(&name, 5, &[1, 2])[..] else { panic!() };
+            assert_ne!(one, other);
+            assert_eq!(goals(&name, 6, &[2, 1]), [other, one]);
         }
     }
 
     #[test]
-    fn a_task_of_ogbench_has_its_start_and_its_goal_and_ends_a_step_after() {
+    fn a_task_of_ogbench_has_its_start_and_its_goal_and_ends_a_step_later() {
         let spec = find("antmaze-giant-singletask-task3-v0").unwrap();
         let mut ant = make(spec, 0).unwrap();
-        let mut starts = [[f64::INFINITY, f64::NEG_INFINITY]; 2];
-        for seed in 0..200 {
-            ant.reset(seed);
-            assert_eq!(ant.goal(), Some(&[0.0, 0.0][..]));
-            for ([least, most], (x, center)) in
-                starts.iter_mut().zip(ant.qpos().iter().zip([52.0, 28.0]))
-            {
-                (*least, *most) = (least.min(x - center), most.max(x - center));
+        for (axis, center) in [(0, 52.0), (1, 28.0)] {
+            let mut starts = Vec::new();
+            for seed in 0..200 {
+                ant.reset(seed);
+                assert_eq!(ant.goal(), Some(&[0.0, 0.0][..]));
+                starts.push(ant.qpos()[axis] - center);
             }
+            starts.sort_by(f64::total_cmp);
+            assert!((-1.0..-0.95).contains(&starts[0]), "{starts:?}");
+            assert!((0.95..1.0).contains(&starts[199]), "{starts:?}");
         }
-        assert!(
-            starts
-                .iter()
-                .all(|[least, most]| (-1.0..-0.95).contains(least) && (0.95..1.0).contains(most))
-        );
-        let [mut qpos, qvel] = [ant.qpos().to_vec(), vec![0.0; 14]];
+        let (mut qpos, mut qvel) = (ant.qpos().to_vec(), [0.0; 14]);
         qpos[..2].copy_from_slice(&[0.0, 0.51]);
-        let mut step = |velocity: f64| {
-            let mut qvel = qvel.clone();
+        // It comes to the goal, or leaves it.
+        for (velocity, reaches) in [(-1.0, true), (1.0, false)] {
             qvel[1] = velocity;
             ant.set_state(&qpos, &qvel);
-            let [first, second] = [ant.step(&[0.0; 8]), ant.step(&[0.0; 8])];
-            [(first.reward, first.terminated), (second.reward, second.terminated)]
-        };
-        assert_eq!(step(-1.0), [(0.0, false), (1.0, true)], "it comes there");
-        assert_eq!(step(1.0), [(0.0, false), (0.0, false)], "it leaves");
+            assert!(!ant.step(&[0.0; 8]).terminated);
+            let step = ant.step(&[0.0; 8]);
+            let reward = f64::from(u8::from(reaches));
+            assert_eq!((step.reward, step.terminated), (reward, reaches));
+        }
     }
 
     #[test]
     fn goals_lie_beyond_the_center_of_their_cell() {
         let seeds: Vec<u64> = (0..500).collect();
-        for (name, center) in
-            [("umaze", [0.0, 8.0]), ("medium", [20.0, 20.0]), ("large", [32.0, 24.0])]
-        {
-            let goals = goals(&format!("antmaze-{name}"), 0, &seeds);
-            for axis in [0, 1] {
-                let beyond: Vec<f64> = goals.iter().map(|goal| goal[axis] - center[axis]).collect();
-                let mean = beyond.iter().sum::<f64>() / beyond.len() as f64;
-                let variance =
-                    beyond.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / beyond.len() as f64;
-                assert!(beyond.iter().all(|x| (0.0..1.5).contains(x)));
-                assert!((mean - 0.75).abs() < 0.05, "{mean}");
-                assert!(
-                    (variance - (1.0 + 0.25) / 12.0).abs() < 0.015,
-                    "{variance}: two uniform draws"
-                );
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        let product = |a: &[f64], b: &[f64]| {
+            let products = a.iter().zip(b).map(|(a, b)| (a - 0.75) * (b - 0.75));
+            mean(&Vec::from_iter(products))
+        };
+        let centers = [[0.0, 8.0], [20.0, 20.0], [32.0, 24.0]];
+        for (size, center) in ["umaze", "medium", "large"].into_iter().zip(centers) {
+            let goals = goals(&format!("antmaze-{size}"), 0, &seeds);
+            let beyond = |axis: usize| goals.iter().map(move |goal| goal[axis] - center[axis]);
+            let [x, y] = [0, 1].map(|axis| Vec::from_iter(beyond(axis)));
+            for values in [&x, &y] {
+                assert!(values.iter().all(|value| (0.0..1.5).contains(value)));
+                assert!((mean(values) - 0.75).abs() < 0.05);
+                // The sum of two uniform draws.
+                let variance = product(values, values);
+                assert!((variance - (1.0 + 0.25) / 12.0).abs() < 0.015, "{variance}");
             }
-            let products = goals
-                .iter()
-                .map(|goal| (goal[0] - center[0] - 0.75) * (goal[1] - center[1] - 0.75));
-            assert!(products.sum::<f64>().abs() / 500.0 < 0.02, "the axes are drawn apart");
+            assert!(product(&x, &y).abs() < 0.02, "the axes are independent");
         }
     }
 }

@@ -15,14 +15,19 @@
 //! - The episode terminates when the robot is not `healthy`, and is truncated after
 //!   `max_episode_steps`.
 
-use quad_dataset::Planar;
+use quad_dataset::{Drive, Planar};
 
 use super::physics::Physics;
-use super::simulation::{Body, Task};
+use super::simulation::{RobotSpec, Task};
 
-/// What every planar robot's policy observes and begins with.
-pub(super) fn body(robot: &Planar) -> Body {
-    Body { noise: robot.noise, hidden_positions: 1, observed_velocity: robot.observed_velocity }
+pub(super) fn robot(planar: &Planar) -> RobotSpec {
+    RobotSpec {
+        frame_skip: planar.frame_skip,
+        drive: Drive::Motors,
+        noise: planar.noise,
+        hidden_positions: 1,
+        observed_velocity: planar.observed_velocity,
+    }
 }
 
 impl Task for &'static Planar {

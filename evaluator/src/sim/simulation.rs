@@ -4,7 +4,10 @@
 //! simulation that diverges, and an action that is not a number (which is not applied). So every
 //! return is finite.
 
-use quad_dataset::{EnvironmentSpec, Noise};
+use std::sync::Arc;
+
+use mujoco_rs::wrappers::mj_model::MjModel;
+use quad_dataset::{Drive, EnvironmentSpec, Noise};
 
 use super::environment::{Environment, EnvironmentError, Step};
 use super::physics::Physics;
@@ -30,8 +33,11 @@ pub(super) trait Task: Send {
     }
 }
 
-/// A robot's initial noise, and its observation: positions, then velocities.
-pub(super) struct Body {
+/// A robot in its simulation. It observes positions, then velocities.
+pub(super) struct RobotSpec {
+    /// Steps of the model that a control is held for.
+    pub frame_skip: usize,
+    pub drive: Drive,
     /// Noise on the initial state.
     pub noise: Noise,
     /// Number of first positions that are not observed.
@@ -46,7 +52,7 @@ pub(super) struct Body {
 /// them to `f32` for the policy.
 pub struct Simulation {
     physics: Physics,
-    body: Body,
+    robot: RobotSpec,
     task: Box<dyn Task>,
     observation: Vec<f64>,
     steps: usize,
@@ -56,20 +62,21 @@ pub struct Simulation {
 impl Simulation {
     /// The first [`reset`](Self::reset) starts it.
     pub(super) fn new(
-        physics: Physics,
-        body: Body,
+        model: Arc<MjModel>,
+        robot: RobotSpec,
         task: Box<dyn Task>,
         spec: &'static EnvironmentSpec,
-    ) -> Self {
+    ) -> Result<Self, EnvironmentError> {
+        let physics = Physics::new(model, robot.frame_skip, robot.drive)?;
         let observation = vec![0.0; spec.observation_dim];
-        Self { physics, body, task, observation, steps: 0, spec }
+        Ok(Self { physics, robot, task, observation, steps: 0, spec })
     }
 
     /// Starts an episode, which is a function of its seed and its actions only.
     pub fn reset(&mut self, seed: u64) {
         self.task.begin(seed);
         let start = self.task.start(seed);
-        self.physics.reset(seed, self.body.noise, start);
+        self.physics.reset(seed, self.robot.noise, start);
         self.start();
     }
 
@@ -127,8 +134,8 @@ impl Simulation {
     }
 
     fn observe(&mut self) {
-        let limit = self.body.observed_velocity;
-        let visible = &self.physics.qpos()[self.body.hidden_positions..];
+        let limit = self.robot.observed_velocity;
+        let visible = &self.physics.qpos()[self.robot.hidden_positions..];
         let (positions, velocities) = self.observation.split_at_mut(visible.len());
         positions.copy_from_slice(visible);
         for (observed, velocity) in velocities.iter_mut().zip(self.physics.qvel()) {

@@ -1,45 +1,32 @@
 //! Makes environments by their rows in the dataset crate's table ([`EnvironmentSpec`]).
 
+use quad_dataset::Simulator;
 use quad_dataset::environment::{self, EnvironmentSpec};
-use quad_dataset::{Drive, Simulator};
 
 use super::environment::{Environment, EnvironmentError, Environments};
 use super::maze::{self, Navigation};
-use super::physics::{self, Physics};
+use super::physics;
 use super::planar;
-use super::simulation::Simulation;
+use super::simulation::{Simulation, Task};
 
 /// The models in `evaluator/assets` by their names, as MJCF, which the build lists.
 static MODELS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/models.rs"));
 
-/// Makes the simulation of an environment. Simulations of one model share the compiled model, so a
-/// second one costs little.
-///
-/// `environment_seed` is the seed of what the environment draws once and keeps over all episodes,
-/// if anything.
-///
-/// # Errors
-///
-/// MuJoCo fails.
+/// Makes the simulation of an environment. Simulations of one model share the compiled model.
+/// `environment_seed` decides what the environment draws once for all episodes, if anything.
 pub fn make(
     spec: &'static EnvironmentSpec,
     environment_seed: u64,
 ) -> Result<Simulation, EnvironmentError> {
     let model = physics::model(spec.simulation(), || mjcf(spec))?;
-    let (frame_skip, drive) = match &spec.simulator {
-        Simulator::Planar(robot) => (robot.frame_skip, Drive::Motors),
-        Simulator::Maze(robot, _) => (robot.frame_skip, robot.drive),
-    };
-    let physics = Physics::new(model, frame_skip, drive)?;
-    Ok(match &spec.simulator {
-        Simulator::Planar(robot) => {
-            Simulation::new(physics, planar::body(robot), Box::new(robot), spec)
-        }
+    let (robot, task): (_, Box<dyn Task>) = match &spec.simulator {
+        Simulator::Planar(planar) => (planar::robot(planar), Box::new(planar)),
         Simulator::Maze(robot, _) => {
             let task = Navigation::new(spec, environment_seed);
-            Simulation::new(physics, maze::body(robot), Box::new(task), spec)
+            (maze::robot(robot), Box::new(task))
         }
-    })
+    };
+    Simulation::new(model, robot, task, spec)
 }
 
 /// The environments that this program simulates, for evaluators.
@@ -51,7 +38,8 @@ impl Environments for Simulations {
     }
 
     fn sizes(&self, name: &str) -> Option<(usize, usize)> {
-        environment::find(name).ok().map(|spec| (spec.observation_dim, spec.action_dim))
+        let spec = environment::find(name).ok()?;
+        Some((spec.observation_dim, spec.action_dim))
     }
 
     fn make(
@@ -59,8 +47,8 @@ impl Environments for Simulations {
         name: &str,
         environment_seed: u64,
     ) -> Result<Box<dyn Environment>, EnvironmentError> {
-        let spec =
-            environment::find(name).map_err(|_| EnvironmentError::NotSimulated(name.to_owned()))?;
+        let unknown = |_| EnvironmentError::NotSimulated(name.to_owned());
+        let spec = environment::find(name).map_err(unknown)?;
         Ok(Box::new(make(spec, environment_seed)?))
     }
 }
@@ -85,18 +73,10 @@ mod tests {
     #[test]
     fn every_environment_of_the_table_is_simulated() {
         for spec in environment::all() {
-            let environment = make(spec, 0).unwrap();
-            let sizes = (
-                environment.observation().len(),
-                environment.qpos().len(),
-                environment.qvel().len(),
-            );
-            assert_eq!(
-                sizes,
-                (spec.observation_dim, spec.qpos_dim, spec.qvel_dim),
-                "{}",
-                spec.name
-            );
+            let simulation = make(spec, 0).unwrap();
+            let sizes = [simulation.observation(), simulation.qpos(), simulation.qvel()];
+            let expected = [spec.observation_dim, spec.qpos_dim, spec.qvel_dim];
+            assert_eq!(sizes.map(<[f64]>::len), expected, "{}", spec.name);
         }
     }
 }
