@@ -6,18 +6,8 @@ use prometheus::{
     Counter, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry,
 };
 
-/// The end of a job.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum JobOutcome {
-    /// The learner acknowledged its scores.
-    Scored,
-    /// The evaluator leaves and hands the job back, or the learner refused the scores or never came
-    /// back.
-    Abandoned,
-    /// The evaluator could not use its weights or its environment, the policy could not act, or a
-    /// return does not count.
-    Failed,
-}
+/// Ends of a job.
+const OUTCOMES: [&str; 3] = ["scored", "abandoned", "failed"];
 
 /// The metrics of one evaluator process.
 #[derive(Clone)]
@@ -73,20 +63,26 @@ impl Metrics {
             rejected_messages: labeled("rejected_messages_total", rejected, "reason")?,
             registry: registry.clone(),
         };
-        for outcome in ["scored", "abandoned", "failed"] {
+        for outcome in OUTCOMES {
             metrics.jobs.with_label_values(&[outcome]);
         }
         Ok(metrics)
     }
 
-    /// Counts a job that has ended.
-    pub fn job(&self, outcome: JobOutcome) {
-        let label = match outcome {
-            JobOutcome::Scored => "scored",
-            JobOutcome::Abandoned => "abandoned",
-            JobOutcome::Failed => "failed",
-        };
-        self.jobs.with_label_values(&[label]).inc();
+    /// Counts a job whose scores the learner acknowledged.
+    pub fn job_scored(&self) {
+        self.jobs.with_label_values(&["scored"]).inc();
+    }
+
+    /// Counts a job that the leaving evaluator hands back, or whose scores the learner refused or
+    /// never fetched.
+    pub fn job_abandoned(&self) {
+        self.jobs.with_label_values(&["abandoned"]).inc();
+    }
+
+    /// Counts a job whose weights, environment or policy failed.
+    pub fn job_failed(&self) {
+        self.jobs.with_label_values(&["failed"]).inc();
     }
 
     /// Counts a message that the evaluator did not use. The reasons are a fixed list, because the

@@ -16,7 +16,7 @@ use super::discovery::Found;
 use super::query::{QueryError, blocking};
 use super::scheduler::Turn;
 use super::snapshot::{Listener, Snapshots};
-use crate::metrics::{JobOutcome, Metrics};
+use crate::metrics::Metrics;
 
 /// Shortest and longest pause that a learner without work may ask for.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
@@ -200,7 +200,7 @@ impl RunClient {
                 let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
                 scores.for_each(|score| metrics.episode_score.observe(score));
                 info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
-                metrics.job(JobOutcome::Scored);
+                metrics.job_scored();
                 self.claimed = None;
                 self.last_warning.clear();
                 self.turn.done(Instant::now(), Duration::ZERO);
@@ -208,7 +208,7 @@ impl RunClient {
             }
             ScoreReply::Refused { reason, .. } => {
                 warn!(%run, step, "the learner refused the scores: {reason}");
-                metrics.job(JobOutcome::Abandoned);
+                metrics.job_abandoned();
                 self.return_job(Some(format!("it refused the scores: {reason}")));
                 self.hand_back(timeout).await
             }
@@ -218,7 +218,7 @@ impl RunClient {
     /// Hands back the claimed job, which this evaluator could not run; if there is no answer,
     /// [`deliver`](Self::deliver) tries again.
     pub async fn fail(&mut self, reason: &str) {
-        self.connection.metrics.job(JobOutcome::Failed);
+        self.connection.metrics.job_failed();
         self.return_job(Some(reason.chars().take(MAX_REASON_LEN).collect()));
         if let Err(error) = self.hand_back(ANSWER_TIMEOUT).await {
             debug!(run = %self.connection.run, "{error}");
@@ -277,7 +277,7 @@ impl RunClient {
         self.snapshots.forget(run);
         if let Some(report) = self.scores() {
             warn!(%run, step = report.step, "the learner did not return; its scores are dropped");
-            metrics.job(JobOutcome::Abandoned);
+            metrics.job_abandoned();
         }
     }
 }

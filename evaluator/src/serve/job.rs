@@ -9,7 +9,7 @@ use quad_protocol::{EpisodeScore, Job};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-use crate::metrics::{JobOutcome, Metrics};
+use crate::metrics::Metrics;
 use crate::sim::{Environments, Rollout};
 
 /// Most episodes of a job: each is a simulation. A learner gives forty at most.
@@ -107,7 +107,7 @@ fn run(
     let mut rollout = Rollout::new(make, sizes, &job.seeds, |seed| policy.begin(seed))?;
     while !rollout.is_done() {
         if tx.is_closed() {
-            metrics.job(JobOutcome::Abandoned);
+            metrics.job_abandoned();
             anyhow::bail!("it was canceled");
         }
         if started.elapsed() > longest {

@@ -13,14 +13,15 @@ use std::fmt;
 use std::path::Path;
 use std::time::Instant;
 
-use anyhow::anyhow;
+use anyhow::Context;
 use quad_dataset::environment::{all, find};
-use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata, Recipe};
+use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata};
 use quad_runtime::Hint;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 const OUT: &str = "choose a file with --out in a folder that you may write to";
+const NO_RECIPE: &str = "linear policies cannot solve a maze";
 const MUJOCO: &str =
     "deploy/setup.sh installs the version of MuJoCo that this program was built for";
 
@@ -54,20 +55,12 @@ impl fmt::Display for Summary {
 pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
     let problem = match find(name) {
         Err(_) => format!("there is no environment `{name}`"),
-        Ok(spec) => match recipe(spec) {
-            Ok(_) => return Ok(spec),
-            Err(error) => error.to_string(),
-        },
+        Ok(spec) if spec.collect.is_some() => return Ok(spec),
+        Ok(_) => format!("no dataset can be recorded in {name}: {NO_RECIPE}"),
     };
-    let possible = all().iter().filter(|spec| recipe(spec).is_ok());
+    let possible = all().iter().filter(|spec| spec.collect.is_some());
     let names = Vec::from_iter(possible.map(|spec| spec.name.as_str()));
     Err(format!("{problem}; datasets can be recorded in {}", names.join(", ")))
-}
-
-fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {
-    spec.collect.as_ref().ok_or_else(|| {
-        anyhow!("no dataset can be recorded in {}: linear policies cannot solve a maze", spec.name)
-    })
 }
 
 /// Trains, then records at least `transitions` transitions, in whole episodes, to `path`.
@@ -78,7 +71,7 @@ pub fn collect(
     seed: u64,
 ) -> anyhow::Result<Summary> {
     let start = Instant::now();
-    let recipe = recipe(spec)?;
+    let recipe = spec.collect.as_ref().context(NO_RECIPE)?;
     let mut writer = D4rlWriter::create(path, spec).hint(OUT)?;
 
     let random = |index| stream(seed, RECORD_STREAM + 1 + index);
