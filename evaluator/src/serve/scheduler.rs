@@ -57,37 +57,22 @@ pub fn next<'a, K>(runs: impl Iterator<Item = (K, &'a Turn)>, now: Instant) -> O
 mod tests {
     use super::*;
 
-    #[derive(Clone, Copy)]
-    enum Kind {
-        /// Each turn takes a second and succeeds.
-        Works,
-        /// Each turn takes five seconds without an answer.
-        Silent,
-        /// The learner answers at once that it has no work.
-        Idle,
-    }
-
-    /// Counts the turns of each run in ten minutes.
-    fn turns<const N: usize>(kinds: [Kind; N]) -> [u32; N] {
+    /// Counts the turns in ten minutes of runs with the seconds that a turn takes and the pause
+    /// after it; `None` if a turn fails.
+    fn turns<const N: usize>(runs: [(u64, Option<u64>); N]) -> [u32; N] {
         let start = Instant::now();
         let mut now = start;
-        let (mut turns, mut counts) = (kinds.map(|_| Turn::new(start)), [0; N]);
+        let (mut turns, mut counts) = (runs.map(|_| Turn::new(start)), [0; N]);
         while now - start < Duration::from_secs(600) {
             let Some(i) = next(turns.iter().enumerate(), now) else {
                 now += Duration::from_millis(10);
                 continue;
             };
             counts[i] += 1;
-            match kinds[i] {
-                Kind::Works => {
-                    now += Duration::from_secs(1);
-                    turns[i].done(now, Duration::ZERO);
-                }
-                Kind::Silent => {
-                    now += Duration::from_secs(5);
-                    turns[i].failed(now);
-                }
-                Kind::Idle => turns[i].done(now, Duration::from_secs(1)),
+            now += Duration::from_secs(runs[i].0);
+            match runs[i].1 {
+                Some(pause) => turns[i].done(now, Duration::from_secs(pause)),
+                None => turns[i].failed(now),
             }
         }
         counts
@@ -95,11 +80,12 @@ mod tests {
 
     #[test]
     fn runs_take_turns() {
-        let [one, idle, other] = turns([Kind::Works, Kind::Idle, Kind::Works]);
+        let [one, idle, other] = turns([(1, Some(0)), (0, Some(1)), (1, Some(0))]);
         assert!(one.abs_diff(other) <= 1 && one + other >= 600, "{one} {other}");
         assert!(idle >= 150, "an idle learner is asked again: {idle}");
-        let [working, silent] = turns([Kind::Works, Kind::Silent]);
-        assert!(working >= 290 && silent >= 50, "half of the time is left: {working} {silent}");
+        // A learner that does not answer leaves half of the time to the others.
+        let [working, silent] = turns([(1, Some(0)), (5, None)]);
+        assert!(working >= 290 && silent >= 50, "{working} {silent}");
     }
 
     #[test]

@@ -1,12 +1,9 @@
 //! Simulation: environments, and batches of episodes.
 //!
 //! Owns the compiled MuJoCo models, which the process shares. Everything runs on the calling
-//! thread; a rollout shares the physics among rayon's threads. `serve` and `tools` call this
-//! module; it calls neither, and knows nothing of the network.
+//! thread; a rollout shares the physics among rayon's threads.
 //!
 //! # Layout
-//!
-//! In reading order:
 //!
 //! - `environment`: the traits of an environment; `simulation`: an environment that this program
 //!   simulates; `physics`: drives MuJoCo for it.

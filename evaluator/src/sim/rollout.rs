@@ -37,13 +37,11 @@ struct Episode {
 /// Effort of one step of a batch.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Stepped {
-    /// Environment steps taken.
     pub steps: u64,
     /// Episodes that have ended.
     pub ended: u32,
     /// Time spent in the policy.
     pub select: Duration,
-    /// Time spent in the simulations.
     pub physics: Duration,
 }
 

@@ -29,14 +29,14 @@ impl Gl {
             .map_err(|error| anyhow::anyhow!("{error}"))?;
         // SAFETY: this platform takes no native display.
         let display = unsafe {
-            egl.get_platform_display(SURFACELESS, egl::DEFAULT_DISPLAY, &[egl::ATTRIB_NONE])
-        }?;
+            egl.get_platform_display(SURFACELESS, egl::DEFAULT_DISPLAY, &[egl::ATTRIB_NONE])?
+        };
         egl.initialize(display)?;
         egl.bind_api(egl::OPENGL_API)?;
         let wanted =
             [egl::SURFACE_TYPE, egl::PBUFFER_BIT, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
-        let config =
-            egl.choose_first_config(display, &wanted)?.context("it does not support OpenGL")?;
+        let config = egl.choose_first_config(display, &wanted)?;
+        let config = config.context("it does not support OpenGL")?;
         let context = egl.create_context(display, config, None, &[egl::NONE])?;
         egl.make_current(display, None, None, Some(context))?;
         Ok(Self { _egl: egl })
