@@ -44,7 +44,7 @@ pub enum JobReply {
     /// The answer to [`JobRequest::HandBack`].
     HandedBack {
         incarnation: u64,
-        /// Whether the evaluator still had the job.
+        /// True if the evaluator still had the job.
         accepted: bool,
     },
 }
@@ -61,10 +61,10 @@ impl JobReply {
 
 /// Episodes to run with one snapshot.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[allow(missing_docs)] // The names say it.
 pub struct Job {
     /// Number within the learner's incarnation.
     pub id: u64,
-    /// Name of the run.
     pub run: Name,
     /// The learner's incarnation.
     pub incarnation: u64,
@@ -72,7 +72,6 @@ pub struct Job {
     pub step: u64,
     /// Hash of the snapshot's file.
     pub weights: Hash,
-    /// Name of the environment.
     pub environment: String,
     /// Seed of what an environment draws once for all episodes (AntMaze-v0: its goal); the same for
     /// a whole run.

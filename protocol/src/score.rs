@@ -28,7 +28,7 @@ impl EpisodeScore {
     /// statistics.
     pub const LARGEST: f64 = 1e12;
 
-    /// Whether a return or a score is finite and no larger than [`LARGEST`](Self::LARGEST).
+    /// True if a return or a score is finite and no larger than [`LARGEST`](Self::LARGEST).
     pub fn counts(value: f64) -> bool {
         value.abs() <= Self::LARGEST
     }

@@ -14,7 +14,7 @@ pub struct ArrayLike<'py> {
     array: PyArrayLikeDyn<'py, f32, AllowTypeChange>,
     /// Columns of a table, such as pandas's, or keys of a dictionary.
     columns: Vec<String>,
-    /// Whether it was a dictionary, whose order does not count.
+    /// True if it was a dictionary, whose order does not count.
     by_name: bool,
 }
 
@@ -41,7 +41,7 @@ pub struct Rows<'a> {
     pub values: Cow<'a, [f32]>,
     /// Number of rows; 1 for an array of one axis.
     pub count: usize,
-    /// Whether the array has one axis.
+    /// True if the array has one axis.
     pub single: bool,
 }
 

@@ -90,10 +90,12 @@ pub fn replace(target: &Path, bytes: &[u8]) -> io::Result<()> {
         })
 }
 
-/// Removes a file if it exists.
-pub(crate) fn remove_if_there(path: &Path) -> io::Result<()> {
-    fs::remove_file(path)
-        .or_else(|error| if error.kind() == ErrorKind::NotFound { Ok(()) } else { Err(error) })
+/// `None` if a file or folder does not exist.
+pub(crate) fn optional<T>(result: io::Result<T>) -> io::Result<Option<T>> {
+    match result {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        other => other.map(Some),
+    }
 }
 
 /// Removes the partial files of killed processes in a folder.

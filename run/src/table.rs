@@ -4,14 +4,14 @@ use std::fmt::Alignment::{self, Right};
 
 use serde::Serialize;
 
-/// How a report is written.
+/// Format of a report.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Style {
-    /// For a terminal.
+    /// Aligned columns.
     Text,
-    /// For a document.
+    /// Markdown.
     Markdown,
-    /// For a paper; tables need its package booktabs.
+    /// LaTeX with the package booktabs.
     Latex,
 }
 

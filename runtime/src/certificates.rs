@@ -134,12 +134,12 @@ impl Certificates {
         Ok(Self { folder: folder.to_owned(), expires, hosts })
     }
 
-    /// Whether the operator should renew the certificate.
+    /// True if the operator should renew the certificate.
     pub(crate) fn expire_soon(&self) -> bool {
         self.expires.timestamp() - ASN1Time::now().timestamp() < EXPIRES_SOON * 24 * 60 * 60
     }
 
-    /// Whether only programs on this machine can connect to the owner.
+    /// True if only programs on this machine can connect to the owner.
     pub(crate) fn is_for_this_machine_alone(&self) -> bool {
         self.hosts.iter().all(|host| is_this_machine(host))
     }
@@ -217,7 +217,7 @@ fn hosts(certificate: &X509Certificate<'_>) -> Vec<String> {
     names.iter().flat_map(|names| &names.value.general_names).filter_map(host).collect()
 }
 
-/// Whether a host is only this machine's name for itself.
+/// True if a host is only this machine's name for itself.
 pub(crate) fn is_this_machine(host: &str) -> bool {
     host == "localhost" || host.parse().is_ok_and(|host: IpAddr| host.is_loopback())
 }

@@ -95,7 +95,7 @@ impl Endpoints {
         self.for_others().filter(|_| is_local)
     }
 
-    /// Whether the system chooses a port.
+    /// True if the system chooses a port.
     pub(crate) fn has_open_port(&self) -> bool {
         self.listen.iter().any(|endpoint| address_of(endpoint).ends_with(":0"))
     }

@@ -26,7 +26,7 @@ impl Health {
         self.problems_at(Instant::now())
     }
 
-    /// Whether the component of this name should have reported that it is alive, and has not.
+    /// True if the component of this name should have reported that it is alive, and has not.
     pub fn is_silent(&self, name: &str) -> bool {
         let now = Instant::now();
         let mut named = lock(&self.components).clone();

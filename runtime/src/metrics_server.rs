@@ -167,7 +167,7 @@ fn own_names(name: &str, resolver: &str) -> Vec<String> {
     domains.chain([first.to_owned(), name.to_owned()]).collect()
 }
 
-/// Whether `host` is an address, `localhost`, or one of our own names.
+/// True if `host` is an address, `localhost`, or one of our own names.
 fn names_us(host: &str, own_names: &[String]) -> bool {
     let Ok(authority) = host.parse::<Authority>() else { return false };
     let name = authority.host().trim_matches(['[', ']']);

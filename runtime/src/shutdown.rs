@@ -91,7 +91,7 @@ fn listen() -> Vec<(&'static str, Signal)> {
     prepared.collect()
 }
 
-/// Whether the process ignores a signal, as `nohup` makes it ignore SIGHUP.
+/// True if the process ignores a signal, as `nohup` makes it ignore SIGHUP.
 fn is_ignored(kind: SignalKind) -> bool {
     // SAFETY: with a null new action, sigaction only writes the current action to `set`.
     #[allow(unsafe_code)]

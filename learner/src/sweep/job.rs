@@ -202,7 +202,7 @@ mod tests {
         {
             let dir = RunDir::at(&job.dir);
             dir.clear_failure().unwrap();
-            failure.map(|failure| dir.mark_failed(failure).unwrap());
+            failure.into_iter().for_each(|failure| dir.mark_failed(failure).unwrap());
             let End::Failed(said) = job.conclude(killed(), false) else { panic!("{reason}") };
             assert!(said.starts_with(&format!("seed0: {reason}")), "{said}");
             assert_eq!(dir.failure().as_deref(), Some(reason));

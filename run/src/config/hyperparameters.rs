@@ -6,7 +6,7 @@ use super::error::ConfigError;
 use super::nearest::did_you_mean;
 use super::tasks::Task;
 
-/// Whether an algorithm's authors give no values for a benchmark's task. A task without a dataset
+/// True if an algorithm's authors give no values for a benchmark's task. A task without a dataset
 /// of its own is no benchmark's.
 fn lacks(values: &Values, task: &Task) -> bool {
     let given = task.benchmark.and_then(|benchmark| values.given.get(&benchmark.name));

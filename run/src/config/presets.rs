@@ -84,7 +84,7 @@ impl Preset {
     }
 }
 
-/// Whether a preset is the path of a file, not the name of a task.
+/// True if a preset is the path of a file, not the name of a task.
 pub fn is_path(preset: &str) -> bool {
     preset.ends_with(".toml")
 }

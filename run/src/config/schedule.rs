@@ -10,7 +10,7 @@ pub struct Schedule {
 }
 
 impl Schedule {
-    /// Whether the policy after a gradient step is evaluated.
+    /// True if the policy after a gradient step is evaluated.
     pub fn is_evaluated(&self, step: u64) -> bool {
         let is_due = step == self.steps || step.is_multiple_of(self.eval_interval);
         self.eval_interval > 0 && (1..=self.steps).contains(&step) && is_due

@@ -21,7 +21,7 @@ pub struct Task {
     /// Benchmark that has it.
     #[serde(skip)]
     pub benchmark: Option<&'static Benchmark>,
-    /// Whether the list of tasks shows it; a similar task stands for the others.
+    /// True if the list of tasks shows it; a similar task stands for the others.
     #[serde(default = "yes")]
     pub is_listed: bool,
     /// The task whose values of algorithms apply, if not its own.

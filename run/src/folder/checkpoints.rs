@@ -2,7 +2,6 @@
 
 use std::cmp::Reverse;
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 
 use quad_protocol::Hash;
@@ -79,12 +78,10 @@ impl Checkpoints {
 
     /// The files of all checkpoints, the newest first.
     fn files(&self) -> Result<Vec<PathBuf>, RunDirError> {
-        let entries = match fs::read_dir(&self.folder) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            other => other.map_err(io_error("read", &self.folder))?,
-        };
-        let mut files: Vec<_> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
-        files.retain(|path| step(path).is_some());
+        let entries = files::optional(fs::read_dir(&self.folder));
+        let entries = entries.map_err(io_error("read", &self.folder))?.into_iter().flatten();
+        let paths = entries.flatten().map(|entry| entry.path());
+        let mut files = Vec::from_iter(paths.filter(|path| step(path).is_some()));
         files.sort_unstable_by_key(|path| Reverse(step(path)));
         Ok(files)
     }

@@ -1,6 +1,5 @@
 //! Contents of a run's files: a line of each log, and the learner's addresses.
 
-use std::io::ErrorKind;
 use std::path::Path;
 
 use quad_algorithms::MetricsLine;
@@ -22,26 +21,22 @@ pub struct RunEndpoints {
     pub page: String,
 }
 
-/// A line of `scores.jsonl`.
+/// A line of `scores.jsonl`: an episode's score.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[allow(missing_docs)] // As in `EpisodeScore`.
 pub struct ScoreLine {
     /// Gradient step of the evaluated snapshot.
     pub step: u64,
-    /// Seed of the episode.
     pub seed: u64,
-    /// Undiscounted return.
     #[serde(rename = "return")]
     pub episode_return: f64,
-    /// Environment steps.
     pub length: u32,
-    /// D4RL-normalized score.
     pub score: f64,
     /// BLAKE3 of the snapshot's file.
     pub weights: String,
     /// Arithmetic of the policy, e.g. `f32-avx2` or `bf16-amx`; empty in older lines.
     #[serde(default)]
     pub precision: String,
-    /// Name of the evaluator.
     pub evaluator: String,
 }
 
@@ -71,11 +66,9 @@ impl ScoreLine {
 /// Reads the complete lines of `metrics.jsonl` in a run folder; a missing file has none.
 pub fn read_metrics(folder: &Path) -> Result<Vec<MetricsLine>, RunDirError> {
     let path = folder.join("metrics.jsonl");
-    match files::read_text(&path) {
-        Ok(text) => Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()),
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
-        Err(error) => Err(io_error("read", &path)(error)),
-    }
+    let text = files::optional(files::read_text(&path)).map_err(io_error("read", &path))?;
+    let parse = |line| serde_json::from_str(line).ok();
+    Ok(text.unwrap_or_default().lines().filter_map(parse).collect())
 }
 
 #[cfg(test)]

@@ -65,7 +65,7 @@ impl Lock {
         }
     }
 
-    /// Whether files in a folder can be locked, tried with a temporary file.
+    /// True if files in a folder can be locked, tried with a temporary file.
     pub fn is_possible(folder: &Path) -> io::Result<bool> {
         let path = folder.join(format!(".lock-{:08x}", rand::random::<u32>()));
         let locked = files::append(&path)?.try_lock();
@@ -77,7 +77,7 @@ impl Lock {
         }
     }
 
-    /// Whether a process has the exclusive lock. On file systems without locks, a process that was
+    /// True if a process has the exclusive lock. On file systems without locks, a process that was
     /// killed may still seem to have it.
     pub fn is_taken(path: &Path) -> bool {
         let Ok(file) = files::open(path) else { return false };
@@ -121,7 +121,7 @@ impl Drop for Claim {
     }
 }
 
-/// Whether the file system has no locks: the system does not know them, or asks a server that does
+/// True if the file system has no locks: the system does not know them, or asks a server that does
 /// not.
 fn means_no_locks(error: &io::Error) -> bool {
     error.kind() == ErrorKind::Unsupported || Errno::from_io_error(error) == Some(Errno::NOLCK)

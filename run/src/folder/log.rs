@@ -17,7 +17,7 @@ pub struct Log {
     file: File,
     /// Length of the complete lines, bytes.
     length: u64,
-    /// Whether an incomplete line may follow them.
+    /// True if an incomplete line may follow them.
     torn: bool,
     /// A log with a lock is synchronized after each write. The run's other log has the same writer
     /// and needs no lock.
@@ -38,7 +38,7 @@ impl Log {
         Ok(log)
     }
 
-    /// Whether it has no complete line.
+    /// True if it has no complete line.
     pub fn is_empty(&self) -> bool {
         self.length == 0
     }
@@ -104,10 +104,7 @@ impl Log {
 /// Reads the complete lines of a file beyond its first `read` bytes, and adds their length to
 /// `read`. A missing file has none; a file that has become shorter is read from its beginning.
 pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
-    let mut file = match files::open(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        opened => opened?,
-    };
+    let Some(mut file) = files::optional(files::open(path))? else { return Ok(Vec::new()) };
     if file.metadata()?.len() < *read {
         *read = 0;
     }

@@ -40,7 +40,7 @@ pub struct RunDir {
 }
 
 impl RunDir {
-    /// Whether there is a run in the folder.
+    /// True if there is a run in the folder.
     pub fn is_occupied(path: &Path) -> bool {
         path.join(CONFIG).exists()
     }
@@ -86,7 +86,7 @@ impl RunDir {
         &self.path
     }
 
-    /// Whether a learner is at work in it, by its lock on `scores.jsonl`.
+    /// True if a learner is at work in it, by its lock on `scores.jsonl`.
     pub fn is_in_use(&self) -> bool {
         Lock::is_taken(&self.path.join(SCORES))
     }
@@ -159,7 +159,8 @@ impl RunDir {
 
     fn remove(&self, name: &str) -> Result<(), RunDirError> {
         let path = self.path.join(name);
-        files::remove_if_there(&path).map_err(io_error("remove", &path))
+        let removed = files::optional(fs::remove_file(&path));
+        removed.map(drop).map_err(io_error("remove", &path))
     }
 
     /// Reads a JSON file of the folder.
@@ -230,17 +231,14 @@ impl RunDir {
     /// The gradient steps of the snapshots, in ascending order. Links do not count.
     pub fn snapshots(&self) -> Result<Vec<u64>, RunDirError> {
         let folder = self.path.join(SNAPSHOTS);
-        let entries = match fs::read_dir(&folder) {
-            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
-            entries => entries.map_err(io_error("read", &folder))?,
-        };
+        let entries = files::optional(fs::read_dir(&folder)).map_err(io_error("read", &folder))?;
         let step = |entry: io::Result<DirEntry>| {
             let entry =
                 entry.ok().filter(|entry| entry.file_type().is_ok_and(|it| it.is_file()))?;
             let name = entry.file_name();
             name.to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok()
         };
-        let mut steps: Vec<u64> = entries.filter_map(step).collect();
+        let mut steps: Vec<u64> = entries.into_iter().flatten().filter_map(step).collect();
         steps.sort_unstable();
         Ok(steps)
     }
@@ -287,10 +285,8 @@ impl RunDir {
     /// Reads the complete lines of `scores.jsonl`; a missing file has none.
     pub fn read_scores(&self) -> Result<Vec<ScoreLine>, RunDirError> {
         let path = self.path.join(SCORES);
-        let text = match files::read_text(&path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
-            other => other.map_err(io_error("read", &path))?,
-        };
+        let text = files::optional(files::read_text(&path)).map_err(io_error("read", &path))?;
+        let text = text.unwrap_or_default();
         let complete = text.rfind('\n').map_or("", |end| &text[..end]);
         let parse = |(index, line): (usize, &str)| {
             serde_json::from_str(line).map_err(|error| content(&path, Some(index + 1), error))

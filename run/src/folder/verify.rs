@@ -32,7 +32,7 @@ pub struct Findings {
 }
 
 impl Findings {
-    /// Whether there are no violations.
+    /// True if there are no violations.
     pub fn all_held(&self) -> bool {
         self.wrong.is_empty()
     }
@@ -75,13 +75,13 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
         let name = format!("step {step}, seed {seed}");
         let read = || hash(&dir, step).ok().map(|hash| hash.to_string());
-        match hashes.entry(step).or_insert_with(read) {
-            None => found.add("scored, but the snapshot is gone", name.clone()),
-            Some(hash) if *hash != weights => {
-                found.add("scored with other weights than are on disk", name.clone())
+        let kind = match hashes.entry(step).or_insert_with(read) {
+            None => Some("scored, but the snapshot is gone"),
+            Some(hash) => {
+                (*hash != weights).then_some("scored with other weights than are on disk")
             }
-            Some(_) => {}
-        }
+        };
+        kind.into_iter().for_each(|kind| found.add(kind, name.clone()));
         if !(episode_return.is_finite() && score.is_finite()) {
             found.add("not a number", name.clone());
         }
@@ -98,13 +98,9 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     if missing > 0 {
         // A run without end plans more episodes than memory holds.
         let unscored = |(step, seed): &(u64, u64)| !seen.contains(&(*step, *seed));
-        let all = schedule
-            .evaluated_steps()
-            .flat_map(|step| planned(step).into_iter().map(move |seed| (step, seed)));
-        let first = all
-            .filter(unscored)
-            .take(LISTED)
-            .map(|(step, seed)| format!("step {step}, seed {seed}"));
+        let seeds = |step| planned(step).into_iter().map(move |seed| (step, seed));
+        let first = schedule.evaluated_steps().flat_map(seeds).filter(unscored).take(LISTED);
+        let first = first.map(|(step, seed)| format!("step {step}, seed {seed}"));
         found.wrong.insert("without a score", (missing, first.collect()));
     }
     Ok(found)
@@ -123,9 +119,8 @@ pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> 
     for key in settings::differences(&a, &b) {
         found.add("settings that differ", key.clone());
     }
-    let by_key = |lines: Vec<ScoreLine>| -> BTreeMap<(u64, u64), ScoreLine> {
-        lines.into_iter().map(|line| ((line.step, line.seed), line)).collect()
-    };
+    let with_key = |line: ScoreLine| ((line.step, line.seed), line);
+    let by_key = |lines: Vec<ScoreLine>| BTreeMap::from_iter(lines.into_iter().map(with_key));
     let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
     found.expected = ours.len() as u64;
     for (key @ (step, seed), line) in &ours {
@@ -151,11 +146,8 @@ pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> 
 
 fn compare_snapshots(dir: &RunDir, other: &RunDir) -> Result<Findings, RunDirError> {
     let (ours, theirs) = (dir.snapshots()?, other.snapshots()?);
-    let mut found = Findings {
-        what: "snapshots are compared",
-        expected: ours.len() as u64,
-        ..Findings::default()
-    };
+    let (what, expected) = ("snapshots are compared", ours.len() as u64);
+    let mut found = Findings { what, expected, ..Findings::default() };
     if ours.is_empty() {
         // A complete run has at least one.
         found.add("nothing to compare", format!("{} has no snapshot", dir.path().display()));

@@ -73,7 +73,7 @@ fn without_seed(experiment: &Experiment) -> Settings {
     settings
 }
 
-/// Whether a run learned from the dataset of that name, by its hash or its name.
+/// True if a run learned from the dataset of that name, by its hash or its name.
 fn is_trained_on(run: &RunReport, dataset: &str) -> bool {
     let known = catalog::find(dataset).and_then(|known| known.sha256.as_ref());
     let same_file = known.is_some() && run.config.dataset.sha256.as_ref() == known;

@@ -13,7 +13,7 @@ pub struct EvaluationReport {
     pub step: u64,
     /// Scored episodes.
     pub episodes: usize,
-    /// Whether all episodes are scored.
+    /// True if all episodes are scored.
     pub complete: bool,
     /// Score over the episodes: D4RL-normalized, or the return where the environment has no
     /// reference returns.

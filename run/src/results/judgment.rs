@@ -63,7 +63,7 @@ pub struct Judgment {
     /// Root mean square distance of its actions from the data's in the judged episodes, in standard
     /// deviations of the data's.
     pub distance: f64,
-    /// Whether its training had none of the judged episodes.
+    /// True if its training had none of the judged episodes.
     pub unseen: bool,
     /// The value of the behavior that recorded the data, estimated like the policy's.
     pub behavior: Estimate,
@@ -111,7 +111,7 @@ pub struct Ranking {
     pub behavior: Estimate,
     /// The behavior's recorded value.
     pub recorded: f64,
-    /// Whether the policies' values differ by more than the error of the behavior's estimate and the
+    /// True if the policies' values differ by more than the error of the behavior's estimate and the
     /// noise of seeds.
     pub can_rank: bool,
     /// The conclusion in words.
@@ -179,7 +179,7 @@ impl Ranking {
     }
 }
 
-/// Whether policies of these values, in descending order, can be told apart, and the reason.
+/// Decides if policies of these values, in descending order, can be ranked; also returns the reason.
 fn verdict(values: &[Spread], seeds: u64, behavior: &Estimate, recorded: f64) -> (bool, String) {
     let (Some(most), Some(least)) = (values.first(), values.last()) else {
         return (false, "It cannot rank them: no estimate can be relied on.".to_owned());

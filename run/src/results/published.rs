@@ -34,7 +34,7 @@ pub struct Remark {
     pub reason: &'static str,
     /// The figure at the end of the explanation, if it ends with one.
     pub instead: Option<f64>,
-    /// Whether the score is the best of several, selected by the reported returns.
+    /// True if the score is the best of several, selected by the reported returns.
     pub selected: bool,
 }
 

@@ -14,6 +14,7 @@ use crate::config::RunConfig;
 
 /// The results of one run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[allow(missing_docs)] // The names say it.
 pub struct RunReport {
     /// The run's folder.
     pub dir: PathBuf,
@@ -21,18 +22,16 @@ pub struct RunReport {
     pub run: String,
     /// The task, or the name of a user's file that names no task.
     pub task: String,
-    /// The algorithm.
     pub algorithm: String,
     /// The variant of the algorithm, such as QUAD's guidance `quad`, `dac` or `none`; else the
     /// algorithm's name.
     pub variant: String,
     /// The most important hyper-parameters, as text.
     pub agent: String,
-    /// Seed.
     pub seed: u64,
     /// Gradient steps.
     pub steps: u64,
-    /// Whether scores are D4RL-normalized; else they are returns.
+    /// True if scores are D4RL-normalized; else they are returns.
     pub normalized: bool,
     /// Precision of the policies that were scored; several if evaluators differed.
     pub scored_in: String,
@@ -44,10 +43,8 @@ pub struct RunReport {
     pub episodes_missing: u64,
     /// Mean score of the last 3 complete evaluations; absent if there are fewer.
     pub mean_last_3: Option<f64>,
-    /// Mean score of the last 5 complete evaluations; absent if there are fewer.
     pub mean_last_5: Option<f64>,
-    /// Mean score of the complete evaluations in the last 50,000 steps; absent for runs that are
-    /// not longer.
+    /// Absent for runs that are not longer.
     pub mean_last_50000_steps: Option<f64>,
     /// The algorithm's summary of its metrics, such as of QUAD's λ.
     #[serde(flatten)]
@@ -55,16 +52,14 @@ pub struct RunReport {
     /// The variant's label in tables and figures.
     #[serde(skip)]
     pub label: String,
-    /// Whether evaluators define the score themselves, such as success.
+    /// True if evaluators define the score themselves, such as success.
     #[serde(skip)]
     pub(super) own_score: bool,
     /// Each precision of the policies that were scored.
     #[serde(skip)]
     pub precisions: BTreeSet<String>,
-    /// Results of `learner judge`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub judgments: Vec<Judgment>,
-    /// The run's configuration.
     #[serde(skip)]
     pub config: RunConfig,
 }
@@ -76,7 +71,7 @@ impl RunReport {
         if published::last(&self.task) == 3 { self.mean_last_3 } else { self.mean_last_5 }
     }
 
-    /// Whether every episode of every evaluation has its score.
+    /// True if every episode of every evaluation has its score.
     pub fn is_complete(&self) -> bool {
         self.episodes_missing == 0
     }

@@ -36,7 +36,7 @@ struct Listed {
     step: u64,
     steps: u64,
     state: String,
-    /// Whether a learner is at work.
+    /// True if a learner is at work.
     at_work: bool,
     /// Gradient step and mean score of the last complete evaluation.
     score_step: Option<u64>,
