@@ -1,7 +1,5 @@
-//! What faults must not do: lose a score, count one twice, or change a bit of the run.
-//!
-//! A short version of each test runs with all others. Of the long ones, which are ignored,
-//! CONTRIBUTING.md has a table.
+//! Faults must not lose a score, count one twice, or change a bit of the run. CONTRIBUTING.md has a
+//! table of the long tests, which are ignored.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 mod chaos;

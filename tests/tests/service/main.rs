@@ -1,7 +1,4 @@
-//! How learners and evaluators work together: which runs an evaluator serves, what it does while it
-//! waits, how both leave, and that many evaluators can work for one learner.
-//!
-//! CONTRIBUTING.md has a table of the long tests, which are ignored.
+//! Learners and evaluators at work together, and how both leave.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 mod crowds;
