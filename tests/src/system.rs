@@ -17,7 +17,6 @@ use crate::setting::Setting;
 mod hopper;
 use hopper::write_hopper;
 
-/// A temporary folder.
 pub struct Scratch {
     folder: TempDir,
 }
