@@ -7,7 +7,8 @@
 //! - `cli` is the command line; [`command`] runs a command, up to its exit code.
 //! - `sweep` runs many runs, each as a process.
 //! - `live` is a run at work: threads, main loop, Zenoh.
-//! - `local_evaluators` are evaluators that a learner or a sweep starts itself.
+//! - `local_evaluators` are evaluators that a learner or a sweep starts itself; `children` are
+//!   processes that end with this one.
 //! - `page` shows runs in a browser.
 //! - `report` summarizes scores as tables and figures.
 //! - `judge` ranks policies without a simulator.
@@ -19,8 +20,10 @@
 //! Below it: the crate `quad_run` has the folder, settings and results of a run, `quad_algorithms`
 //! the algorithms.
 
+#![allow(missing_docs)]
 #![deny(unsafe_code)]
 
+mod children;
 pub mod cli;
 pub mod command;
 mod data;

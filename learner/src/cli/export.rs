@@ -1,7 +1,6 @@
 //! The arguments of `learner export`.
 
 use std::path::PathBuf;
-use std::str::FromStr;
 
 use clap::Args;
 
@@ -15,14 +14,13 @@ Examples:
 
 `evaluator score`, `quad_rl.Policy.load` and `quad_rl.export_onnx` read the file (docs/deploying.md).";
 
-/// Arguments of `learner export`.
 #[derive(Debug, Args)]
 pub struct ExportArgs {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     pub run: PathBuf,
     /// Which snapshot: that of a gradient step, `best`, the one with the best evaluation, or `last`
-    #[arg(long, value_name = "N|best|last", default_value = "last")]
+    #[arg(long, value_name = "N|best|last", default_value = "last", value_parser = parse_at)]
     pub step: At,
     /// The file to write
     #[arg(long, value_name = "FILE")]
@@ -32,28 +30,21 @@ pub struct ExportArgs {
     pub license: Option<String>,
 }
 
-/// Which snapshot of a run.
+/// A snapshot of a run: after a gradient step, the one with the best evaluation, or the last.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum At {
-    /// The one after a gradient step.
     Step(u64),
-    /// The one with the best evaluation.
     Best,
-    /// The last one.
     Last,
 }
 
-impl FromStr for At {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "best" => Ok(Self::Best),
-            "last" => Ok(Self::Last),
-            number => number
-                .parse()
-                .map(Self::Step)
-                .map_err(|_| format!("{number} is no step, and neither best nor last")),
-        }
+fn parse_at(text: &str) -> Result<At, String> {
+    match text {
+        "best" => Ok(At::Best),
+        "last" => Ok(At::Last),
+        number => number
+            .parse()
+            .map(At::Step)
+            .map_err(|_| format!("{number} is no step, and neither best nor last")),
     }
 }

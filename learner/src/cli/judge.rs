@@ -19,7 +19,6 @@ This is a ranking, not a score: values are estimated from the data alone, by fit
 rank the policies (docs/deploying.md). It keeps what it finds in the runs' folders, for `learner report`, and the same command does
 not compute it again.";
 
-/// Arguments of `learner judge`.
 #[derive(Debug, Args)]
 pub struct JudgeArgs {
     /// Folders of runs, of which the last snapshot is judged, or snapshots, like

@@ -1,4 +1,4 @@
-//! The command line: what the user typed, with every word that scripts rely on.
+//! The command line.
 
 mod export;
 mod judge;
@@ -34,12 +34,10 @@ failed.";
 #[derive(Debug, Parser)]
 #[command(name = "learner", version, arg_required_else_help = true)]
 pub struct Cli {
-    /// What to do.
     #[command(subcommand)]
     pub command: Command,
 }
 
-/// What the learner can do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Train on a dataset, publish snapshots, give evaluators their jobs, and keep the run in a
@@ -80,7 +78,6 @@ pub enum Command {
     },
 }
 
-/// Arguments of `learner presets`.
 #[derive(Debug, Args)]
 pub struct PresetsArgs {
     /// Print every value for this task, or for a preset file of your own, as a complete preset file
@@ -95,7 +92,6 @@ pub struct PresetsArgs {
     pub algorithm: Option<String>,
 }
 
-/// What `learner datasets` can do.
 #[derive(Debug, Subcommand)]
 pub enum DatasetsCommand {
     /// Print all names, and which files are on this machine
@@ -110,7 +106,6 @@ pub enum DatasetsCommand {
     Inspect(InspectArgs),
 }
 
-/// Arguments of `learner datasets inspect`.
 #[derive(Debug, Args)]
 #[command(after_help = "The exit code is 1 if something is wrong with the dataset.")]
 pub struct InspectArgs {
@@ -126,7 +121,6 @@ pub struct InspectArgs {
     pub json: bool,
 }
 
-/// Arguments of `learner verify`.
 #[derive(Debug, Args)]
 #[command(after_help = "The exit code is 1 if a promise has not held.")]
 pub struct VerifyArgs {
@@ -139,7 +133,6 @@ pub struct VerifyArgs {
     pub same_as: Option<PathBuf>,
 }
 
-/// Arguments of `learner doctor`.
 #[derive(Debug, Args)]
 #[command(after_help = DOCTOR_NOTE)]
 pub struct DoctorArgs {
@@ -159,7 +152,6 @@ pub struct DoctorArgs {
     pub json: bool,
 }
 
-/// Arguments of `learner list`.
 #[derive(Debug, Args)]
 #[command(after_help = "The exit code is 1 if a run cannot be read.")]
 pub struct ListArgs {
@@ -171,7 +163,6 @@ pub struct ListArgs {
     pub json: bool,
 }
 
-/// Arguments of `learner page`.
 #[derive(Debug, Args)]
 pub struct PageArgs {
     /// Run folder, or folder with runs below it
@@ -182,7 +173,6 @@ pub struct PageArgs {
     pub http: SocketAddr,
 }
 
-/// Arguments of `learner report`.
 #[derive(Debug, Args)]
 pub struct ReportArgs {
     /// Run folders, or folders with runs below them
@@ -210,12 +200,10 @@ pub struct ReportArgs {
     pub figures: Option<PathBuf>,
 }
 
-/// The names of tasks, which clap checks and shells complete.
 fn task_names() -> PossibleValuesParser {
     tasks::all().iter().map(|task| &*task.name).into()
 }
 
-/// The names of algorithms, likewise.
 fn algorithm_names() -> PossibleValuesParser {
     ALGORITHMS.iter().map(|known| known.name).into()
 }

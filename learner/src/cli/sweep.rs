@@ -33,7 +33,6 @@ fails does not end the others. The same command continues the runs that are not 
 complete, 1 if a run has failed, 75 if runs are left for the same command. At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learners save checkpoints, and
 the sweep ends within 18 s.";
 
-/// Arguments of `learner sweep`.
 #[derive(Debug, Args)]
 pub struct SweepArgs {
     /// The study: axes whose values are combined, and which combinations are runs
@@ -75,31 +74,37 @@ pub struct SweepArgs {
     pub connect: Option<String>,
 }
 
-/// A part of a study's runs.
+/// A part of a study's runs: index of the part, from 0, and number of parts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Shard {
-    /// Index of the part, from 0.
-    part: usize,
-    /// Number of parts.
-    parts: usize,
-}
+pub struct Shard(usize, usize);
 
 impl Shard {
-    /// Whether this part includes the run at this place among all, from 0.
-    pub fn has(self, place: usize) -> bool {
-        place % self.parts == self.part
+    /// Whether this part has the run at this index among all.
+    pub fn has(self, index: usize) -> bool {
+        index % self.1 == self.0
     }
 }
 
 fn parse_shard(text: &str) -> Result<Shard, String> {
-    let parsed = text
-        .split_once('/')
-        .and_then(|(part, parts)| Some((part.parse().ok()?, parts.parse().ok()?)));
-    match parsed {
-        Some((part, parts)) if (1..=parts).contains(&part) => Ok(Shard { part: part - 1, parts }),
+    let numbers = text.split_once('/').map(|(part, parts)| (part.parse(), parts.parse()));
+    match numbers {
+        Some((Ok(part), Ok(parts))) if (1..=parts).contains(&part) => Ok(Shard(part - 1, parts)),
         _ => Err("write it like 2/3, the second of three parts".to_owned()),
     }
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_run_is_in_one_shard() {
+        let shards = ["1/3", "2/3", "3/3"].map(|text| parse_shard(text).unwrap());
+        for index in 0..20 {
+            assert_eq!(shards.iter().filter(|shard| shard.has(index)).count(), 1, "{index}");
+        }
+        for wrong in ["0/3", "4/3", "1", "1/0", "a/b", "-1/3"] {
+            assert!(parse_shard(wrong).unwrap_err().contains("2/3"), "{wrong}");
+        }
+    }
+}

@@ -33,7 +33,6 @@ At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learner saves a checkpoint and ends wi
 command continues from the newest checkpoint in the run's folder. On the same machine an interrupted run ends with the same
 weights, bit for bit, as a run without interruption.";
 
-/// Arguments of `learner train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
     /// The task: an environment, a dataset, and the algorithm's values for them (`learner presets`
@@ -118,7 +117,6 @@ pub struct TrainArgs {
     overrides: OverrideArgs,
 }
 
-/// Flags that replace the algorithm's value for the task.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Instead of the algorithm's value for the task")]
 struct OverrideArgs {
@@ -141,43 +139,33 @@ struct OverrideArgs {
 }
 
 impl TrainArgs {
-    /// What the run starts from: the name of a task, or the path of a file.
+    /// The name of a task, or the path of a preset file.
     pub fn preset(&self) -> &str {
-        // clap sees to it that there is one of them.
+        // clap requires one of them.
         self.task.as_deref().or(self.preset.as_deref()).unwrap_or_default()
     }
 
-    /// The values that the command line changes. If it gives a value twice, `--agent` wins over
-    /// `--set`, and a flag of its own over both.
+    /// The values that the command line changes: `--agent` overrides `--set`, and other flags
+    /// override both.
     pub fn changes(&self) -> Table {
-        let flags = &self.overrides;
-        let number = |value: Option<i64>| value.map(Value::from);
         let mut changes = Table::new();
         for change in self.set.iter().chain(&self.agent) {
             tables::merge(&mut changes, change.clone());
         }
-        for (key, value) in [
-            ("algorithm", self.algorithm.clone().map(Value::from)),
-            ("environment", self.env.clone().map(Value::from)),
-            ("dataset", self.dataset.clone().map(Value::from)),
-            (
-                "normalize",
-                Some(&self.normalize)
-                    .filter(|columns| !columns.is_empty())
-                    .map(|columns| Value::from(columns.clone())),
-            ),
-            ("hold_out", self.hold_out.map(Value::from)),
-            ("steps", number(flags.steps)),
-            ("eval_interval", number(flags.eval_interval)),
-            ("episodes", number(flags.episodes)),
-            ("seed", number(flags.seed)),
-            ("precision", flags.precision.map(|precision| precision.name().into())),
-        ] {
+        let mut set = |key: &str, value: Option<Value>| {
             changes.extend(value.map(|value| (key.to_owned(), value)));
-        }
+        };
+        set("algorithm", self.algorithm.clone().map(Value::from));
+        set("environment", self.env.clone().map(Value::from));
+        set("dataset", self.dataset.clone().map(Value::from));
+        set("normalize", (!self.normalize.is_empty()).then(|| self.normalize.clone().into()));
+        set("hold_out", self.hold_out.map(Value::from));
+        let flags = &self.overrides;
+        set("steps", flags.steps.map(Value::from));
+        set("eval_interval", flags.eval_interval.map(Value::from));
+        set("episodes", flags.episodes.map(Value::from));
+        set("seed", flags.seed.map(Value::from));
+        set("precision", flags.precision.map(|precision| precision.name().into()));
         changes
     }
 }
-
-#[cfg(test)]
-mod tests;

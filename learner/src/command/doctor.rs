@@ -11,34 +11,22 @@ use quad_runtime::{DEFAULT_PORT, Endpoints, Role, certificates_folder};
 use crate::cli::DoctorArgs;
 use crate::data;
 
-/// Runs all checks.
-///
-/// # Errors
-/// A check cannot run; a finding is no error.
+/// A finding is no error; a check that cannot run is.
 pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let mut findings = Findings::default();
     doctor::threads(&mut findings);
     let fastest = if Precision::Bf16.is_available() { "bf16, by --precision bf16" } else { "f32" };
     findings.ok("precision", format!("this CPU is fastest in {fastest}"));
     hdf5(&mut findings);
-    doctor::folder(
-        &mut findings,
-        "run folder",
-        &args.run_dir,
-        "another folder is chosen by --run-dir",
-    );
+    let elsewhere = "another folder is chosen by --run-dir";
+    doctor::folder(&mut findings, "run folder", &args.run_dir, elsewhere);
     locks(&mut findings, &args.run_dir);
     for benchmark in benchmarks::all() {
         let Some(variable) = &benchmark.cache.variable else { continue };
+        let hint = format!("{variable} chooses another folder");
         match data::cache::folder(benchmark) {
-            Ok(folder) => {
-                let hint = format!("{variable} chooses another folder");
-                doctor::folder(&mut findings, "datasets", &folder, &hint);
-            }
-            Err(error) => {
-                let hint = format!("name a folder in {variable}");
-                findings.warn("datasets", format!("{error:#}"), &hint);
-            }
+            Ok(folder) => doctor::folder(&mut findings, "datasets", &folder, &hint),
+            Err(error) => findings.warn("datasets", format!("{error:#}"), &hint),
         }
     }
     let folder = certificates_folder(args.certificates.clone());
@@ -48,8 +36,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
         doctor::port(&mut findings, DEFAULT_PORT);
         return Ok(findings);
     };
-    let endpoints =
-        Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
+    let connect = vec![endpoint.clone()];
+    let endpoints = Endpoints { connect, certificates, ..Endpoints::default() };
     doctor::connected(&mut findings, &endpoints, async |_, _| anyhow::Ok(()))?;
     Ok(findings)
 }
@@ -57,24 +45,27 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
 fn locks(findings: &mut Findings, run_dir: &Path) {
     let path = absolute(run_dir).unwrap_or_else(|_| run_dir.to_owned());
     let folder = path.ancestors().find(|folder| folder.is_dir()).unwrap_or(&path);
+    let shown = folder.display();
     match Lock::is_possible(folder) {
-        Ok(true) => findings.ok("locks", format!("files have locks in {}", folder.display())),
-        Ok(false) => findings.warn(
-            "locks",
-            format!("files have no locks in {}", folder.display()),
-            "a learner keeps others out by a file scores.host instead: after the end of a host that had it, remove it",
-        ),
-        Err(error) => findings.fail("locks", format!("{}: {error}", folder.display()), "choose another --run-dir"),
+        Ok(true) => findings.ok("locks", format!("files have locks in {shown}")),
+        Ok(false) => {
+            let found = format!("files have no locks in {shown}");
+            let hint = "a learner keeps others out by a file scores.host instead: after the end of a host that had it, \
+                        remove it";
+            findings.warn("locks", found, hint);
+        }
+        Err(error) => {
+            findings.fail("locks", format!("{shown}: {error}"), "choose another --run-dir")
+        }
     }
 }
 
 fn hdf5(findings: &mut Findings) {
     match quad_dataset::hdf5_library() {
         (version, true) => findings.ok("HDF5", format!("{version}, with compression")),
-        (version, false) => findings.fail(
-            "HDF5",
-            format!("{version}, without zlib"),
-            "install Debian's libhdf5-103-1",
-        ),
+        (version, false) => {
+            let found = format!("{version}, without zlib");
+            findings.fail("HDF5", found, "install Debian's libhdf5-103-1");
+        }
     }
 }

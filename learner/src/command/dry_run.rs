@@ -11,14 +11,11 @@ use quad_runtime::print;
 
 use crate::train::Price;
 
-/// Measures the cost and prints the file.
-///
-/// # Errors
-/// The run cannot start with these transitions.
 pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
     let (experiment, steps) = (&config.experiment, config.experiment.steps);
     let price = Price::measure(experiment, config.run.device, transitions)?;
-    let (milliseconds, hours) = (price.step * 1e3, price.step * steps as f64 / 3600.0);
+    let (milliseconds, hours) =
+        (price.step_seconds * 1e3, price.step_seconds * steps as f64 / 3600.0);
     print(&format!(
         "# folder: {}\n# data: {}\n# time: {milliseconds:.1} ms a gradient step, measured over a second; {hours:.2} hours for \
          all {steps}\n# memory: {}, without evaluators\n# disk: {} for snapshots and checkpoints\n\n{}",
@@ -30,7 +27,7 @@ pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> an
     ))
 }
 
-/// The peak memory of this process, bytes.
+/// Peak memory of this process in bytes.
 fn peak_memory() -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;

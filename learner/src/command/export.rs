@@ -1,4 +1,4 @@
-//! `learner export`: a policy's file that says all that its run's folder knows of it.
+//! `learner export`: a policy's file with its data, score and settings in the header.
 
 use anyhow::{Context, anyhow};
 use quad_policy::{Header, PolicyError, read_tensors};
@@ -13,10 +13,6 @@ use tracing::warn;
 use crate::cli::{At, ExportArgs};
 use crate::data::Source;
 
-/// Writes the file.
-///
-/// # Errors
-/// The run or its snapshot cannot be read, or the file cannot be written.
 pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let (mut report, lines) = RunReport::with_scores(&args.run)?;
     let folder = RunDir::at(&args.run);
@@ -24,23 +20,26 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let (step, what) = match args.step {
         At::Step(step) => (Some(step), "after that step"),
         At::Last => (steps.last().copied(), "yet"),
-        At::Best => (report.best().map(|best| best.step), "with a complete evaluation"),
+        At::Best => {
+            let best = report.best().map(|best| best.step);
+            (best, "with a complete evaluation")
+        }
     };
+    let run = args.run.display();
     let Some(step) = step.filter(|step| steps.contains(step)) else {
-        let there = Vec::from_iter(steps.iter().map(u64::to_string)).join(", ");
-        return Err(anyhow!("{} has no snapshot {what}", args.run.display()))
-            .hint(format!("its snapshots are of the steps {there}; name one: --step N"));
+        let steps = Vec::from_iter(steps.iter().map(u64::to_string)).join(", ");
+        let hint = format!("its snapshots are of the steps {steps}; name one: --step N");
+        return Err(anyhow!("{run} has no snapshot {what}")).hint(hint);
     };
     let file = folder.read_snapshot(step)?;
     let read = || Ok((Header::<Origin>::read(&file)?, read_tensors(&file)?));
-    let (header, tensors) = read().map_err(|error: PolicyError| {
-        anyhow!("{} is not a policy: {error}", folder.snapshot_path(step).display())
-    })?;
+    let path = folder.snapshot_path(step);
+    let (header, tensors) = read()
+        .map_err(|error: PolicyError| anyhow!("{} is not a policy: {error}", path.display()))?;
     let weights = Hash::of(&file).to_string();
     if lines.iter().any(|line| line.step == step && line.weights != weights) {
         warn!(
-            "the file has no score: that of step {step} is of other weights (learner verify {})",
-            args.run.display()
+            "the file has no score: that of step {step} is of other weights (learner verify {run})"
         );
         report.evaluations.retain(|evaluation| evaluation.step != step);
     }
@@ -49,10 +48,11 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
     let name = args.out.display();
     files::replace(&args.out, &exported).with_context(|| format!("cannot export to {name}"))?;
-    print(&format!("{name}: {} @ {step}, {} bytes", report.run, exported.len()))
+    let (run, bytes) = (&report.run, exported.len());
+    print(&format!("{name}: {run} @ {step}, {bytes} bytes"))
 }
 
-/// What the run's folder knows.
+/// The description in the file's header.
 fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
     let (data, experiment) = (&report.config.dataset, &report.config.experiment);
     let name = experiment.dataset.clone().unwrap_or_default();
@@ -95,7 +95,7 @@ mod tests {
     use crate::fixtures::config;
 
     #[test]
-    fn a_license_that_is_named_stands_before_the_datasets_own() {
+    fn the_license_option_overrides_the_datasets_license() {
         let folder = tempfile::tempdir().unwrap();
         let mut config = config("run", 0);
         config.experiment.dataset = Some("hopper-medium-v2".to_owned());

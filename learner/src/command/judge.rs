@@ -1,7 +1,6 @@
 //! `learner judge`: ranks policies by the data alone.
 
 use quad_run::table::{Block, Style};
-use quad_runtime::{json, print};
 
 use crate::cli::JudgeArgs;
 use crate::judge::{Budget, judge};
@@ -9,6 +8,6 @@ use crate::judge::{Budget, judge};
 pub fn run(args: &JudgeArgs) -> anyhow::Result<()> {
     let JudgeArgs { policies, gamma, steps, seeds, json: as_json } = args;
     let ranking = judge(policies, *gamma, Budget { steps: *steps, seeds: *seeds })?;
-    let text = |part: Block| part.render(Style::Text);
-    print(&if *as_json { json(&ranking)? } else { ranking.blocks().map(text).join("\n") })
+    let text = |block: Block| block.render(Style::Text);
+    super::show(*as_json, &ranking, || ranking.blocks().map(text).join("\n"))
 }

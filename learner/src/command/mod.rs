@@ -15,13 +15,15 @@ use std::fmt::Alignment::{Left, Right};
 use anyhow::anyhow;
 use clap::CommandFactory;
 use clap_complete::Shell;
-use quad_algorithms::{ALGORITHMS, Definition, Metric, Values};
+use quad_algorithms::{ALGORITHMS, Definition, Values};
 use quad_dataset::{DatasetError, benchmarks, environment};
 use quad_run::config::{ConfigError, Preset, hyperparameters, tasks};
-use quad_run::folder::{RunDirError, verify};
+use quad_run::folder::RunDirError;
+use quad_run::folder::verify::{self, Findings};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, hinted, json, print, unfinished};
+use serde::Serialize;
 use tracing::{info, warn};
 
 use crate::cli::{
@@ -31,10 +33,6 @@ use crate::cli::{
 use crate::data::{Source, cache};
 use crate::report::{Report, draw_all, write_html};
 
-/// Runs the command.
-///
-/// # Errors
-/// The command failed, or a check failed.
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
     let done = match &cli.command {
         Command::Train(args) => train::train(args),
@@ -50,80 +48,87 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Doctor(args) => examine(args),
         Command::Completions { shell } => completions(*shell),
     };
-    done.map_err(|error| match error.downcast_ref() {
-        // The learner that is at work there may complete the run, or leave it to this command.
-        Some(in_use @ RunDirError::InUse(_)) => {
-            let hint = in_use.hint();
-            unfinished(error, hint)
+    done.map_err(|error| {
+        let Some(cause) = error.downcast_ref::<RunDirError>() else { return error };
+        let hint = cause.hint();
+        match cause {
+            // The learner that is at work there may complete the run, or leave it to this command.
+            RunDirError::InUse(_) => unfinished(error, hint),
+            _ => hinted(error, hint),
         }
-        Some(other) => {
-            let hint = other.hint();
-            hinted(error, hint)
-        }
-        None => error,
     })
+}
+
+/// Prints a result as JSON or as text.
+fn show(
+    as_json: bool,
+    result: &impl Serialize,
+    text: impl FnOnce() -> String,
+) -> anyhow::Result<()> {
+    print(&if as_json { json(result)? } else { text() })
 }
 
 fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     if let Some(preset) = &args.preset {
-        return print_preset(
-            &Preset::read(preset).hint_of(ConfigError::hint)?,
-            args.algorithm.as_deref(),
-        );
+        let preset = Preset::read(preset).hint_of(ConfigError::hint)?;
+        return print_preset(&preset, args.algorithm.as_deref());
     }
     if args.metrics {
         return print_metrics(args.algorithm.as_deref());
     }
     let header = ["task", "environment", "dataset", "what it is"];
-    let mut of_tasks = Table::new(&header.map(|name| (name, Left)));
+    let mut task_table = Table::new(&header.map(|name| (name, Left)));
     for task in tasks::all().iter().filter(|task| task.is_listed) {
-        let word = |key| task.text(key).unwrap_or("-");
-        of_tasks.push(
-            [&*task.name, word("environment"), word("dataset"), &task.about].map(str::to_owned),
-        );
+        let [environment, dataset] =
+            ["environment", "dataset"].map(|key| task.text(key).unwrap_or("-"));
+        task_table.push([&*task.name, environment, dataset, &task.about].map(str::to_owned));
     }
     let header = ["algorithm", "what it is", "its authors give values for", "GFLOP a step"];
-    let mut of_algorithms = Table::new(&header.map(|name| (name, Left)));
+    let mut algorithms = Table::new(&header.map(|name| (name, Left)));
     for definition in ALGORITHMS {
-        let values = Values::of(definition);
-        let given = values.given.iter();
+        let Values { about, given, gflop, .. } = Values::of(definition);
+        let given = given.iter();
         let given = given.map(|(benchmark, tasks)| format!("{benchmark}: {}", tasks.join(", ")));
-        of_algorithms.push([
-            definition.name.to_owned(),
-            values.about,
-            given.collect::<Vec<_>>().join("; "),
-            values.gflop,
-        ]);
+        let given = Vec::from_iter(given).join("; ");
+        algorithms.push([definition.name.to_owned(), about, given, gflop]);
     }
-    print(&format!("{}\n{}", of_tasks.render(Style::Text), of_algorithms.render(Style::Text)))
+    print(&format!("{}\n{}", task_table.render(Style::Text), algorithms.render(Style::Text)))
 }
 
-/// What algorithms measure, or the one of that name.
+/// Prints the metrics of all algorithms, or of one.
 fn print_metrics(algorithm: Option<&str>) -> anyhow::Result<()> {
-    let asked = |known: &&Definition| algorithm.is_none_or(|name| known.name == name);
-    let tables = ALGORITHMS.iter().filter(asked).map(|Definition { name, metrics, .. }| {
+    let mut tables = Vec::new();
+    for Definition { name, metrics, .. } in ALGORITHMS {
+        if algorithm.is_some_and(|asked| asked != *name) {
+            continue;
+        }
         let mut table = Table::new(&[*name, "held out", "what it is"].map(|title| (title, Left)));
-        let held_out = |metric: &Metric| if metric.held_out { "yes" } else { "" };
-        metrics
-            .iter()
-            .for_each(|it| table.push([it.name, held_out(it), it.help].map(str::to_owned)));
-        table.render(Style::Text)
-    });
-    print(&Vec::from_iter(tables).join("\n"))
+        for metric in *metrics {
+            let held_out = if metric.held_out { "yes" } else { "" };
+            table.push([metric.name, held_out, metric.help].map(str::to_owned));
+        }
+        tables.push(table.render(Style::Text));
+    }
+    print(&tables.join("\n"))
 }
 
 fn print_preset(preset: &Preset, algorithm: Option<&str>) -> anyhow::Result<()> {
     let changes = algorithm.map(|name| ("algorithm".to_owned(), name.into()));
     let experiment = preset.resolve(&changes.into_iter().collect()).hint_of(ConfigError::hint)?;
-    let definition = experiment.definition()?;
-    let not_given = preset.task.and_then(|task| hyperparameters::not_given(&definition, task));
-    let comment = not_given.map(|sentence| format!("# {sentence}\n\n")).unwrap_or_default();
-    print(&(comment + &toml::to_string(&experiment)?))
+    let mut text = toml::to_string(&experiment)?;
+    if let Some(task) = preset.task
+        && let Some(warning) = hyperparameters::not_given(&experiment.definition()?, task)
+    {
+        text = format!("# {warning}\n\n{text}");
+    }
+    print(&text)
 }
 
 fn report(args: &ReportArgs) -> anyhow::Result<()> {
     let report = Report::read(&args.dirs, args.select)?;
-    report.unreadable.iter().for_each(|error| warn!("not in this report: {error}"));
+    for error in &report.unreadable {
+        warn!("not in this report: {error}");
+    }
     if let Some(folder) = &args.figures {
         draw_all(folder, &report)?;
         info!("figures: {}", folder.display());
@@ -137,36 +142,37 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
         (_, true) => Style::Latex,
         _ => Style::Text,
     };
-    print(&if args.json { json(&report)? } else { report.render(style) })?;
+    show(args.json, &report, || report.render(style))?;
     all_readable(report.unreadable.len())
 }
 
-/// An error if that many folders could not be read, after all else was done.
+/// Fails, after all else was done, if folders could not be read.
 fn all_readable(unreadable: usize) -> anyhow::Result<()> {
-    let hint = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode is \
-                scored again";
     if unreadable == 0 {
-        Ok(())
-    } else {
-        Err(anyhow!("{unreadable} folders cannot be read")).hint(hint)
+        return Ok(());
     }
+    Err(anyhow!("{unreadable} folders cannot be read")).hint(
+        "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode is \
+         scored again",
+    )
 }
 
 fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
     let mut all_held = true;
+    let mut report = |about: String, findings: Findings| {
+        all_held &= findings.all_held();
+        print(&format!("{about}{findings}"))
+    };
     for dir in &args.dirs {
-        let about =
-            if args.dirs.len() > 1 { format!("{}: ", dir.display()) } else { String::new() };
-        let mut findings = vec![(about, verify::verify(dir)?)];
+        let about = match args.dirs.len() {
+            1 => String::new(),
+            _ => format!("{}: ", dir.display()),
+        };
+        report(about, verify::verify(dir)?)?;
         if let Some(other) = &args.same_as {
-            findings.extend(
-                verify::compare(dir, other)?
-                    .map(|found| (format!("with {}: ", other.display()), found)),
-            );
-        }
-        for (about, found) in &findings {
-            print(&format!("{about}{found}"))?;
-            all_held &= found.all_held();
+            for findings in verify::compare(dir, other)? {
+                report(format!("with {}: ", other.display()), findings)?;
+            }
         }
     }
     anyhow::ensure!(all_held, "not everything held");
@@ -175,13 +181,10 @@ fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
 
 fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
     let entries = list::list(&args.dirs);
-    print(&if args.json { json(&entries)? } else { list::table(&entries) })?;
-    let unreadable: Vec<_> = entries.iter().filter_map(list::Entry::unreadable).collect();
-    anyhow::ensure!(
-        unreadable.is_empty(),
-        "some runs cannot be read:\n  {}",
-        unreadable.join("\n  ")
-    );
+    show(args.json, &entries, || list::table(&entries))?;
+    let unreadable =
+        Vec::from_iter(entries.iter().filter_map(list::Entry::unreadable)).join("\n  ");
+    anyhow::ensure!(unreadable.is_empty(), "some runs cannot be read:\n  {unreadable}");
     Ok(())
 }
 
@@ -193,7 +196,7 @@ fn completions(shell: Shell) -> anyhow::Result<()> {
 
 fn examine(args: &DoctorArgs) -> anyhow::Result<()> {
     let findings = doctor::examine(args)?;
-    print(&if args.json { json(&findings)? } else { findings.to_string() })?;
+    show(args.json, &findings, || findings.to_string())?;
     Ok(findings.verdict()?)
 }
 
@@ -208,13 +211,11 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
             }
             let mut folders = Vec::new();
             for benchmark in benchmarks::all() {
-                folders.push(format!(
-                    "{} of {}",
-                    cache::folder(benchmark)?.display(),
-                    benchmark.name
-                ));
+                let folder = cache::folder(benchmark)?;
+                folders.push(format!("{} of {}", folder.display(), benchmark.name));
             }
-            print(&format!("{}\ncache folders: {}", table.render(Style::Text), folders.join(", ")))
+            let (table, folders) = (table.render(Style::Text), folders.join(", "));
+            print(&format!("{table}\ncache folders: {folders}"))
         }
         DatasetsCommand::Fetch { name } => {
             print(&Source::named(name)?.obtain()?.path.display().to_string())
@@ -223,7 +224,6 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
     }
 }
 
-/// Prints what a dataset contains; one with problems is an error.
 fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let source = Source::parse(&args.dataset)?;
     let environment = args.env.or_else(|| environment::find(&source.entry()?.environment).ok());
@@ -232,8 +232,8 @@ fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
         source => source.obtain()?.path,
     };
     let inspection = quad_dataset::inspect(&path, environment).hint_of(DatasetError::hint)?;
-    print(&if args.json { json(&inspection)? } else { inspection.to_string() })?;
-    let problems = inspection.problems.len();
-    anyhow::ensure!(problems == 0, "{problems} problems in {}", inspection.path.display());
+    show(args.json, &inspection, || inspection.to_string())?;
+    let (problems, path) = (inspection.problems.len(), inspection.path.display());
+    anyhow::ensure!(problems == 0, "{problems} problems in {path}");
     Ok(())
 }

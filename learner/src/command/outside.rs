@@ -1,5 +1,4 @@
-//! What a run has besides its training: where it meets evaluators, and those that it starts on the
-//! cores that are left.
+//! Endpoints and evaluators of a run, and the cores that training leaves to them.
 
 use std::num::NonZero;
 use std::thread::available_parallelism;
@@ -19,24 +18,16 @@ use crate::local_evaluators::LocalEvaluators;
 /// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with
 /// one next action per state), and threads that wait for a tile keep their cores busy.
 const MOST_THREADS: usize = 16;
-/// For a run that needs no known port, so that several can run at a time.
 const ANY_PORT: u16 = 0;
 
-/// What the command line asks for.
 pub(super) struct Outside {
-    /// Where the learner listens or connects.
     pub endpoints: Endpoints,
-    /// The evaluators that the learner starts.
     pub evaluators: LocalEvaluators,
-    /// Whether the command line does not say where to listen.
+    /// True if the command line names no endpoint.
     is_default: bool,
 }
 
 impl Outside {
-    /// Reads the command line.
-    ///
-    /// # Errors
-    /// Endpoints or certificates that cannot be used, or no `evaluator` program to start.
     pub fn new(args: &TrainArgs, experiment: &Experiment) -> anyhow::Result<Self> {
         let endpoints = endpoints(args, experiment.eval_interval)?;
         let is_default = args.listen.is_none() && args.connect.is_none();
@@ -58,41 +49,30 @@ impl Outside {
 
     /// Starts to open the session. If another learner on this machine has the usual port, it takes
     /// a free one.
-    ///
-    /// # Errors
-    /// The learner cannot listen.
     pub async fn open(&mut self) -> anyhow::Result<Opening> {
         let mut opening = open_network(&self.endpoints).await;
         if opening.is_err() && self.is_default {
             info!("another program, perhaps a learner, has port {DEFAULT_PORT}; taking a free one");
-            self.endpoints.listen =
-                vec![default_endpoint(self.endpoints.certificates.as_ref(), ANY_PORT)];
+            let certificates = self.endpoints.certificates.as_ref();
+            self.endpoints.listen = vec![default_endpoint(certificates, ANY_PORT)];
             opening = open_network(&self.endpoints).await;
         }
-        opening.hint_of(|error| {
-            error
-                .downcast_ref()
-                .map_or("join a router with --connect, or listen with --listen", SessionError::hint)
-        })
+        let hint = "join a router with --connect, or listen with --listen";
+        opening.hint_of(|error| error.downcast_ref().map_or(hint, SessionError::hint))
     }
 }
 
-/// Threads that train: so many as the command line or RAYON_NUM_THREADS asks for, or else one per
+/// The number of training threads: that of the command line or RAYON_NUM_THREADS, or else one per
 /// core, up to a limit.
 pub(super) fn training_threads(asked: Option<NonZero<usize>>) -> usize {
     let cores = available_parallelism().map_or(1, NonZero::get);
     asked.or_else(threads_asked).map_or(cores.min(MOST_THREADS), NonZero::get)
 }
 
-/// Where the learner listens or connects.
 fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
-    // Evaluators of its own have none, nor has the learner then: the variable is for other
-    // networks.
-    let folder = if args.evaluators.is_some_and(|count| count > 0) {
-        None
-    } else {
-        certificates_folder(args.certificates.clone())
-    };
+    // A learner that starts evaluators uses no certificates: the variable is for other networks.
+    let has_evaluators = args.evaluators.is_some_and(|count| count > 0);
+    let folder = certificates_folder(args.certificates.clone()).filter(|_| !has_evaluators);
     let certificates = folder.map(|folder| Certificates::read(&folder, Role::Learner));
     let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
     let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
@@ -100,8 +80,8 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> 
         (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
         (listen, _) => Vec::from_iter(listen.clone()),
     };
-    let endpoints =
-        Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
+    let connect = Vec::from_iter(args.connect.clone());
+    let endpoints = Endpoints { listen, connect, certificates };
     endpoints.check().hint_of(SessionError::hint)?;
     if let Some(endpoint) = endpoints.open_to_all() {
         warn!(

@@ -1,4 +1,4 @@
-//! `learner page`: serves the page of all runs until it is told to stop.
+//! `learner page`: serves the page of all runs until a signal.
 
 use anyhow::anyhow;
 use quad_runtime::{

@@ -13,6 +13,8 @@ use quad_run::table::{Style, Table};
 use quad_runtime::{
     Hint, SessionError, hinted, open_router, print, stay_in_background, threads_asked, unfinished,
 };
+use tokio::sync::mpsc;
+use tokio::task::LocalSet;
 use tracing::{info, warn};
 
 use super::all_readable;
@@ -20,39 +22,46 @@ use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
 use crate::sweep::{Cost, Ended, Learners, PlannedRun, Study, Sweep};
 
-/// Runs and their states.
 type Runs = Vec<(PlannedRun, State)>;
 
-/// Runs the sweep; a run that is not complete is an error.
 pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     let study = Study::read(&args.study, &args.only, &args.set)?;
     let folder = args.runs.join(&study.name);
     let runs = chosen(&study, args, &folder)?;
-    if args.list {
-        print(&list(&runs))?;
-        return all_readable(runs.iter().filter(|(_, state)| *state == State::Unreadable).count());
+    let split = |runs: Runs, state| -> (Runs, Runs) {
+        runs.into_iter().partition(|(_, found)| *found == state)
+    };
+    let (count, listed) = (runs.len(), args.list.then(|| list(&runs)));
+    let (unreadable, runs) = split(runs, State::Unreadable);
+    if let Some(text) = listed {
+        print(&text)?;
+        return all_readable(unreadable.len());
     }
     info!("{}: {}", study.name, study.about);
-    let count = runs.len();
-    let left: Runs = runs.into_iter().filter(|(_, state)| *state != State::Complete).collect();
-    let complete = count - left.len();
-    let (unreadable, left): (Runs, Runs) =
-        left.into_iter().partition(|(_, state)| *state == State::Unreadable);
+    let (complete, left) = split(runs, State::Complete);
     let begun = left.iter().filter(|(_, state)| *state != State::NotBegun).count();
-    info!("{count} runs: {complete} complete, {} to do, of which {begun} have begun", left.len());
-    let mut ended =
-        if left.is_empty() { Ended::default() } else { work(args, &study.name, &folder, left)? };
-    ended.failed.extend(
-        unreadable.iter().map(|(run, _)| format!("{}: its folder cannot be read", run.name)),
-    );
+    let (complete, todo) = (complete.len(), left.len());
+    info!("{count} runs: {complete} complete, {todo} to do, of which {begun} have begun");
+    let mut ended = match todo {
+        0 => Ended::default(),
+        _ => work(args, &study.name, &folder, left)?,
+    };
+    for (run, _) in unreadable {
+        ended.failed.push(format!("{}: its folder cannot be read", run.name));
+    }
     conclude(&folder, count, ended)
+}
+
+/// Makes a folder.
+fn make(folder: &Path) -> anyhow::Result<()> {
+    let failed = || format!("cannot make the folder {}", folder.display());
+    fs::create_dir_all(folder).with_context(failed)
 }
 
 /// Keeps others from the study's folder, or from the whole study if this is a part of it: two
 /// sweeps of the same runs would start them twice.
 fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
-    fs::create_dir_all(folder)
-        .with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    make(folder)?;
     let path = folder.join("sweep.lock");
     let is_part = args.index.is_some() || args.shard.is_some() || !args.only.is_empty();
     let lock = if is_part { Lock::share(&path) } else { Lock::take(&path) };
@@ -66,17 +75,20 @@ fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
 
 /// The runs that the command line selects, and their states.
 fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs> {
-    if let Some(index) = args.index.filter(|index| study.runs.iter().all(|run| run.index != *index))
-    {
-        return Err(hinted(anyhow!("there is no run {index}"), "--list prints them"));
+    let mut chosen = Runs::new();
+    for (place, run) in study.runs.iter().enumerate() {
+        if args.index.is_none_or(|index| run.index == index)
+            && args.shard.is_none_or(|shard| shard.has(place))
+        {
+            chosen.push((run.clone(), run.state(&folder.join(&run.name))?));
+        }
     }
-    let is_chosen = |(place, run): &(usize, &PlannedRun)| {
-        args.index.is_none_or(|index| run.index == index)
-            && args.shard.is_none_or(|shard| shard.has(*place))
-    };
-    let with_state =
-        |(_, run): (usize, &PlannedRun)| Ok((run.clone(), run.state(&folder.join(&run.name))?));
-    study.runs.iter().enumerate().filter(is_chosen).map(with_state).collect()
+    match args.index {
+        Some(index) if chosen.is_empty() => {
+            Err(hinted(anyhow!("there is no run {index}"), "--list prints them"))
+        }
+        _ => Ok(chosen),
+    }
 }
 
 fn list(runs: &Runs) -> String {
@@ -87,38 +99,18 @@ fn list(runs: &Runs) -> String {
     table.render(Style::Text)
 }
 
-/// How the runs share the machine.
-struct Machine {
-    /// Runs at a time.
-    jobs: usize,
-    /// Threads of each learner.
-    threads: usize,
-    /// The evaluators of all runs.
-    evaluators: LocalEvaluators,
-}
-
-impl Machine {
-    /// The shares for `runs` runs. What the command line does not say follows from the cores that
-    /// this process may use.
-    fn share(args: &SweepArgs, runs: usize) -> anyhow::Result<Self> {
-        let cores = available_parallelism()?.get();
-        let threads = threads_asked().map_or(1, usize::from);
-        let (jobs, left) = shares(cores, threads, args.jobs, runs);
-        let count = if args.connect.is_some() { 0 } else { args.evaluators.unwrap_or(left) };
-        Ok(Self { jobs, threads, evaluators: LocalEvaluators::new(count, left)? })
-    }
-}
-
-/// How many learners of so many threads run at a time, and how many cores that leaves for
-/// evaluators.
+/// The number of learners at a time, and of cores that they leave to evaluators.
 fn shares(cores: usize, threads: usize, jobs: Option<u16>, runs: usize) -> (usize, usize) {
     let jobs = jobs.map_or(cores * 3 / 4 / threads, usize::from).clamp(1, runs);
     (jobs, cores.saturating_sub(jobs.saturating_mul(threads)).max(1))
 }
 
 fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
-    let Machine { jobs, threads, mut evaluators } = Machine::share(args, left.len())?;
-    // Here once, not in each learner.
+    let threads = threads_asked().map_or(1, usize::from);
+    let (jobs, cores) = shares(available_parallelism()?.get(), threads, args.jobs, left.len());
+    let count = if args.connect.is_some() { 0 } else { args.evaluators.unwrap_or(cores) };
+    let mut evaluators = LocalEvaluators::new(count, cores)?;
+    // Fetched once, not by each learner.
     let mut datasets = BTreeMap::<Option<String>, Option<PathBuf>>::new();
     for (run, _) in &left {
         datasets.entry(run.experiment.dataset.clone()).or_insert_with(|| {
@@ -136,33 +128,39 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     let _lock = lock(args, folder)?;
     // Tasks of an array job must not write into each other's logs.
     let logs = args.index.map_or(folder.to_owned(), |_| folder.join(&left[0].0.name));
-    fs::create_dir_all(&logs)
-        .with_context(|| format!("cannot make the folder {}", logs.display()))?;
+    make(&logs)?;
 
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime =
         runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
     let ended = runtime.block_on(async {
+        // Outside the `LocalSet`, in which Zenoh may not block its thread.
         let (_router, endpoint) = match args.connect.clone() {
             Some(endpoint) => (None, endpoint),
             None => {
-                open_router().await.map(|(router, endpoint)| (Some(router), endpoint)).hint_of(SessionError::hint)?
+                let (router, endpoint) = open_router().await.hint_of(SessionError::hint)?;
+                (Some(router), endpoint)
             }
         };
-        evaluators.start(std::slice::from_ref(&endpoint), &logs, study)?;
         info!(
             "{jobs} at a time; learners and evaluators meet at {endpoint}; logs are {}/RUN/learner.log",
             folder.display()
         );
-        let (folder, waiting) = (folder.to_owned(), VecDeque::from(left));
-        let learners = Learners { threads, endpoint, http: args.http };
-        anyhow::Ok(Sweep { folder, waiting, jobs, learners, evaluators, step_seconds }.run().await)
+        let (tx, lines) = mpsc::unbounded_channel();
+        let report = move |line| drop(tx.send(line));
+        let work = async {
+            evaluators.start(std::slice::from_ref(&endpoint), &logs, study, report)?;
+            let (folder, waiting) = (folder.to_owned(), VecDeque::from(left));
+            let learners = Learners { threads, endpoint, http: args.http };
+            let sweep = Sweep { folder, waiting, jobs, learners, evaluators, lines, step_seconds };
+            anyhow::Ok(sweep.run().await)
+        };
+        LocalSet::new().run_until(work).await
     });
     runtime.shutdown_background();
     ended
 }
 
-/// Prints how all runs have ended.
 fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
     let Ended { unfinished: stopped, failed } = ended;
     if !failed.is_empty() {
@@ -185,7 +183,7 @@ mod tests {
     use crate::cli::{Cli, Command};
 
     #[test]
-    fn learners_and_evaluators_share_the_cores_however_many_threads_are_asked_for() {
+    fn learners_and_evaluators_share_the_cores() {
         assert_eq!(shares(16, 1, None, 20), (12, 4));
         assert_eq!(shares(16, 2, None, 20), (6, 4));
         assert_eq!(shares(1, 1, None, 20), (1, 1));
@@ -194,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn shards_share_the_runs_that_the_command_line_keeps_to() {
+    fn shards_share_the_selected_runs() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mine.toml");
         let text = "about = 'x'\nrun = { task = 'hopper-demo', dataset = 'x.hdf5' }\n\

@@ -1,7 +1,7 @@
 //! `learner train`, from the parsed command line to the report.
 
 use std::num::NonZero;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -17,33 +17,35 @@ use quad_run::results::RunReport;
 use quad_runtime::{
     Health, Hint, ListenError, hinted, print, serve_metrics, stay_in_background, unfinished,
 };
+use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
+use tokio::time::timeout;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
 use super::outside::{Outside, training_threads};
 use crate::cli::TrainArgs;
 use crate::data::{LocalDataset, Source, load};
-use crate::live::{Display, Ending, Incarnation, Live, MainLoop, Metrics, Run, STUCK, Threads};
+use crate::live::{
+    Display, Ending, Events, Incarnation, MainLoop, Metrics, PageState, Run, STUCK, Threads,
+};
 use crate::page;
 use crate::report::learning_curve;
 use crate::train::{HeldOut, begin, device};
 
-/// How long a run that is not complete may take to write its report.
+/// Time limit for the report of a run that is not complete.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Trains; a run that does not complete is an error.
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let preset = Preset::read(args.preset()).hint_of(ConfigError::hint)?;
     let experiment = preset.resolve(&args.changes()).hint_of(ConfigError::hint)?;
-    let named = experiment
-        .dataset
-        .clone()
-        .ok_or_else(|| anyhow!("preset {} names no dataset", preset.label));
+    let label = &preset.label;
+    let named = experiment.dataset.as_ref();
+    let named = named.ok_or_else(|| anyhow!("preset {label} names no dataset"));
     let benchmark = preset.task.and_then(|task| task.benchmark);
-    let missing = match benchmark
-        .and_then(|benchmark| Some((benchmark, benchmark.converter.as_ref()?)))
-    {
+    let converted =
+        benchmark.and_then(|benchmark| Some((benchmark, benchmark.converter.as_ref()?)));
+    let missing = match converted {
         Some((benchmark, converter)) => format!(
             "its rewards come from {}'s simulator: with quad_rl and {converter} installed, `quad-convert {converter}:{} --out \
              FILE` makes a file for --dataset FILE",
@@ -52,11 +54,14 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         ),
         None => record_hint(&experiment),
     };
-    let source = Source::parse(&named.hint(missing)?)?;
+    let source = Source::parse(named.hint(missing)?)?;
     source.check_environment(&experiment.environment)?;
     let path = match &args.run_dir {
         Some(path) => path.clone(),
-        None => default_run_dir(&preset.label, &experiment)?,
+        None => {
+            let (variant, seed) = (experiment.variant()?, experiment.seed);
+            Path::new("runs").join(format!("{label}-{variant}-seed{seed}"))
+        }
     };
     let name = run_name(&path)?;
     let begun = ExistingRun::open(&path, args.fresh)?;
@@ -78,13 +83,14 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     {
         warn!("{warning}");
     }
-    let Experiment { environment: acts_in, eval_interval, .. } = &config.experiment;
-    if *eval_interval > 0 && environment::find(acts_in).is_err() {
+    let experiment = &config.experiment;
+    if experiment.eval_interval > 0 && environment::find(&experiment.environment).is_err() {
         info!(
-            "scores come from evaluators that have the environment {acts_in}, which only Python's can (docs/python.md)"
+            "scores come from evaluators that have the environment {}, which only Python's can (docs/python.md)",
+            experiment.environment
         );
     }
-    if !config.experiment.precision.is_available() {
+    if !experiment.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
     debug!("{config:?}");
@@ -94,17 +100,18 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     // Zenoh and training have threads of their own; this runtime serves the metrics and the main
     // loop.
-    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    let mut runtime = Builder::new_multi_thread();
     let runtime =
         runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
-    let ended = runtime.block_on(run_to_end(args, outside, &path, begun, name, &config, data));
-    let concluded = ended.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
+    let run = run_to_end(args, outside, &path, begun, &config, data);
+    let ended = runtime.block_on(run);
+    let concluded =
+        ended.and_then(|(run_dir, ending)| conclude(&runtime, &run_dir, &config, ending));
     // Does not wait for a thread that a broken disk blocks.
     runtime.shutdown_background();
     concluded
 }
 
-/// Starts rayon's threads for training.
 fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
     let threads = training_threads(asked);
     let pool = rayon::ThreadPoolBuilder::new().thread_name(|_| "training".to_owned());
@@ -115,64 +122,73 @@ fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
 }
 
 /// A hint for a run without a dataset.
-fn record_hint(Experiment { environment: name, .. }: &Experiment) -> String {
-    let is_recorded = environment::find(name).is_ok_and(|spec| spec.maze.is_none());
-    let other = match is_recorded {
+fn record_hint(experiment: &Experiment) -> String {
+    let name = &experiment.environment;
+    let can_record = environment::find(name).is_ok_and(|spec| spec.maze.is_none());
+    let other = match can_record {
         true => format!("`evaluator collect --env {name} --out FILE` records one"),
         false => "docs/data.md says what it may be".to_owned(),
     };
     format!("name a file as `dataset`, on the command line by --dataset FILE; {other}")
 }
 
+/// Runs the threads and the main loop until the run ends.
 async fn run_to_end(
     args: &TrainArgs,
     mut outside: Outside,
     path: &Path,
     begun: Option<ExistingRun>,
-    name: Name,
     config: &RunConfig,
     data: Split,
 ) -> anyhow::Result<(RunDir, Ending)> {
-    let steps = config.experiment.steps;
-    let (metrics, registry) = Metrics::new(&name, steps, config.experiment.definition()?.metrics)?;
+    let (run, experiment, device) = (&config.run.name, &config.experiment, config.run.device);
+    let (metrics, registry) =
+        Metrics::new(run, experiment.steps, experiment.definition()?.metrics)?;
     let health = Health::default();
-    let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
-    let telling = live.clone();
-    let page = page::routes(path.to_owned(), Some(Arc::new(move || telling.tell())))?;
-    let server = serve_metrics(args.http, registry, health.clone(), page)
-        .await
-        .hint_of(ListenError::hint)?;
+    let page_state = PageState {
+        run: run.clone(),
+        steps: experiment.steps,
+        metrics: metrics.clone(),
+        health: health.clone(),
+        coordinator: Arc::default(),
+    };
+    let coordinator = page_state.coordinator.clone();
+    let page = page::routes(path.to_owned(), Some(Arc::new(move || page_state.to_json())))?;
+    let server = serve_metrics(args.http, registry, health.clone(), page).await;
+    let server = server.hint_of(ListenError::hint)?;
     info!("page: http://{}/", server.address);
-    let Experiment { environment, .. } = &config.experiment;
     let Split { training, held_out, .. } = data;
-    let task = Task::new(environment, training.observation_dim(), training.action_dim());
-    let mut agent = begin(&config.experiment, config.run.device, training)?;
-    let held_out = held_out.and_then(|held_out| {
-        HeldOut::new(&config.experiment, config.run.device, held_out, &mut agent)
-    });
+    let (observation_dim, action_dim) = (training.observation_dim(), training.action_dim());
+    let task = Task::new(&experiment.environment, observation_dim, action_dim);
+    let mut agent = begin(experiment, device, training)?;
+    let held_out =
+        held_out.and_then(|held_out| HeldOut::new(experiment, device, held_out, &mut agent));
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
-    let (run_dir, scores, past) = open_or_create(path, begun, args.fresh, config)?;
-    let (tx, events) = mpsc::unbounded_channel();
+    let (dir, scores, past) = open_or_create(path, begun, args.fresh, config)?;
     // A later start has a larger number; the low bits distinguish two that start in the same
     // millisecond.
-    let incarnation =
-        Incarnation { run: name, number: now()? << 16 | u64::from(rand::random::<u16>()) };
+    let number = now()? << 16 | u64::from(rand::random::<u16>());
+    let incarnation = Incarnation { run: run.clone(), number };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let run = Run {
         incarnation: incarnation.clone(),
         config,
-        dir: &run_dir,
+        dir: &dir,
+        task,
+        agent,
+        held_out,
         scores,
         past,
         checkpoint_every,
     };
-    let threads = Threads::start(run, task, (agent, held_out), &metrics, &health, &tx)?;
-    threads.show_on(&live);
+    let (tx, events) = mpsc::unbounded_channel();
+    let threads = Threads::start(run, &metrics, &health, &Events(tx))?;
+    coordinator.set(threads.coordinator().clone()).ok();
     let main_loop = MainLoop {
         incarnation,
-        run_dir: run_dir.clone(),
-        display: Display::start(metrics.clone(), steps),
+        run_dir: dir.clone(),
+        display: Display::start(metrics.clone(), experiment.steps),
         metrics,
         metrics_address: server.address.to_string(),
         endpoints: outside.endpoints,
@@ -182,10 +198,10 @@ async fn run_to_end(
         health,
         evaluators: outside.evaluators,
     };
-    Ok((run_dir, main_loop.run(opening).await))
+    Ok((dir, main_loop.run(opening).await))
 }
 
-/// Opens or makes the run's folder, and reads what it contains.
+/// Opens or makes the run's folder, and reads its state.
 fn open_or_create(
     path: &Path,
     begun: Option<ExistingRun>,
@@ -207,38 +223,43 @@ fn now() -> anyhow::Result<u64> {
 }
 
 /// Writes the report after any ending; a run that did not complete is an error.
-fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
+fn conclude(
+    runtime: &Runtime,
+    run_dir: &RunDir,
+    config: &RunConfig,
+    ending: Ending,
+) -> anyhow::Result<()> {
     let folder = run_dir.path().display();
     let reported = match &ending {
         Ending::Complete => summarize(run_dir),
-        // The run may have failed because its disk hangs, and one that was told to stop has little
-        // time.
+        // The disk may hang, and after a signal there is little time.
         _ => {
-            let run_dir = run_dir.clone();
-            within(REPORT_PATIENCE, move || summarize(&run_dir))
+            let dir = run_dir.clone();
+            let report = runtime.spawn_blocking(move || summarize(&dir));
+            let report = runtime.block_on(async { timeout(REPORT_PATIENCE, report).await });
+            report.map_err(anyhow::Error::from).and_then(|report| report?)
         }
     };
     let kept = format!(
         "everything up to the newest checkpoint is kept in {folder}; the same command continues from there"
     );
+    let Experiment { steps, environment, .. } = &config.experiment;
     let error = match ending {
         Ending::Complete => return all_scored(reported?),
         Ending::Failed(error) => hinted(error, kept),
         Ending::Interrupted => {
-            let steps = config.experiment.steps;
-            unfinished(
-                anyhow!("interrupted before the end of {steps} steps and their evaluations"),
-                kept,
-            )
+            let error =
+                anyhow!("interrupted before the end of {steps} steps and their evaluations");
+            unfinished(error, kept)
         }
-        Ending::Unscored => unfinished(
-            anyhow!(
-                "training is complete, but no evaluator came that has the environment {}",
-                config.experiment.environment
-            ),
-            "start one and give the same command again, which waits for the scores; or let the learner start some, by \
-             --evaluators N",
-        ),
+        Ending::Unscored => {
+            let error = anyhow!(
+                "training is complete, but no evaluator came that has the environment {environment}"
+            );
+            let hint = "start one and give the same command again, which waits for the scores; or let the learner start \
+                        some, by --evaluators N";
+            unfinished(error, hint)
+        }
     };
     if let Err(error) = reported {
         warn!("the run has no report: {error:#}");
@@ -246,7 +267,6 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
     Err(error)
 }
 
-/// Checks that no episode was given up.
 fn all_scored(report: RunReport) -> anyhow::Result<()> {
     let missing = report.episodes_missing;
     if missing == 0 {
@@ -254,16 +274,6 @@ fn all_scored(report: RunReport) -> anyhow::Result<()> {
     }
     let hint = "the log says why; fix it, and the same command hands them out again";
     Err(anyhow!("training is complete, but {missing} episodes have no score")).hint(hint)
-}
-
-/// Runs `work` on another thread, and stops waiting for it after a limit.
-fn within<T: Send + 'static>(
-    patience: Duration,
-    work: impl FnOnce() -> anyhow::Result<T> + Send + 'static,
-) -> anyhow::Result<T> {
-    let (tx, rx) = std::sync::mpsc::channel();
-    std::thread::spawn(move || tx.send(work()));
-    rx.recv_timeout(patience).unwrap_or_else(|_| Err(anyhow!("it took longer than {patience:?}")))
 }
 
 fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
@@ -279,11 +289,6 @@ fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     Ok(report)
 }
 
-fn default_run_dir(label: &str, experiment: &Experiment) -> anyhow::Result<PathBuf> {
-    let variant = experiment.variant()?;
-    Ok(Path::new("runs").join(format!("{label}-{variant}-seed{}", experiment.seed)))
-}
-
 /// The run's name: the folder's name, which is also part of its Zenoh keys.
 fn run_name(path: &Path) -> anyhow::Result<Name> {
     let folder = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
@@ -292,7 +297,7 @@ fn run_name(path: &Path) -> anyhow::Result<Name> {
         .hint("its last part must be 1 to 64 letters, digits, dots, dashes or underscores")
 }
 
-/// Names the CPU and the instructions that training uses.
+/// The CPU and the instructions that training uses.
 fn machine(precision: Precision) -> String {
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));

@@ -1,4 +1,4 @@
-//! The folders in which benchmarks keep their files, shared with everything else that uses these.
+//! The cache folders of benchmarks, shared with their Python packages.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use quad_dataset::benchmarks::{Benchmark, Cache};
 use quad_dataset::{NamedDataset, catalog};
 use quad_runtime::Hint;
 
-use super::partial::left_of;
+use super::partial::partial_files;
 
 /// The folder of a benchmark's files.
 pub fn folder(benchmark: &Benchmark) -> anyhow::Result<PathBuf> {
@@ -26,8 +26,8 @@ pub fn folder(benchmark: &Benchmark) -> anyhow::Result<PathBuf> {
         .hint(hint)
 }
 
-/// The catalog: name, environment, size, and what of it is in its folder already. Checksums are not
-/// computed for this.
+/// The catalog: name, environment, size, and state of the file in its folder. Does not compute
+/// checksums.
 pub fn list() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
     catalog::all().iter().map(|dataset| {
         let size =
@@ -39,7 +39,7 @@ pub fn list() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
 
 fn state(dataset: &NamedDataset, path: &Path) -> String {
     let found = path.metadata().map(|metadata| metadata.len());
-    let part = left_of(path).into_iter().map(|(_, length)| length).max();
+    let part = partial_files(path).into_iter().map(|(_, length)| length).max();
     match (found, part) {
         (Ok(found), _) if dataset.bytes.is_some_and(|bytes| bytes != found) => {
             format!("another file of {found} bytes")

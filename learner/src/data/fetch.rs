@@ -1,4 +1,4 @@
-//! A file of the catalog: from the cache folder, or from the first address that has it.
+//! Files of the catalog, from the cache folder or from the first address that has them.
 
 use std::fs;
 use std::io::{self, ErrorKind};
@@ -17,22 +17,21 @@ use super::verify::verify;
 #[cfg(test)]
 mod tests;
 
-/// Attempts at one address, if none of them brings the file forward.
+/// Attempts at one address without progress.
 const ATTEMPTS: u32 = 4;
 
 /// A dataset on this machine.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LocalDataset {
-    /// The file, or the folder if it is Minari's.
+    /// The file, or the folder of a Minari dataset.
     pub path: PathBuf,
     /// SHA-256 of the file, or of the folder's `main_data.hdf5`.
     pub sha256: String,
 }
 
-/// Fetches files.
 pub struct Fetcher {
     client: Agent,
-    /// Between two attempts.
+    /// Pause between two attempts.
     pause: Duration,
     mirror: Option<String>,
 }
@@ -43,19 +42,16 @@ impl Fetcher {
         Self { client: client(Duration::from_secs(30)), pause: Duration::from_secs(2), mirror }
     }
 
-    /// The dataset's file under its own name in `folder`, verified.
+    /// Verifies the dataset's file in `folder`, or fetches it.
     pub fn fetch(&self, dataset: &NamedDataset, folder: &Path) -> anyhow::Result<LocalDataset> {
         let path = folder.join(&dataset.file);
         let local = |error| local(error, dataset, folder);
         match verify(dataset, &path) {
             Ok(Ok(sha256)) => return Ok(LocalDataset { path, sha256 }),
             Ok(Err(mismatch)) => {
-                return Err(anyhow!(
-                    "{} is not the dataset {}: {mismatch}",
-                    path.display(),
-                    dataset.name
-                ))
-                .hint("remove it or move it away, and it will be fetched anew");
+                let (path, name) = (path.display(), &dataset.name);
+                return Err(anyhow!("{path} is not the dataset {name}: {mismatch}"))
+                    .hint("remove it or move it away, and it will be fetched anew");
             }
             Err(error) if error.kind() == ErrorKind::NotFound => {}
             Err(error) => return Err(local(error)),
@@ -87,14 +83,13 @@ impl Fetcher {
     }
 
     fn addresses(&self, dataset: &NamedDataset) -> Vec<String> {
-        let mirror = self
-            .mirror
-            .iter()
-            .map(|base| format!("{}/{}", base.trim_end_matches('/'), dataset.file));
+        let file = |base: &String| format!("{}/{}", base.trim_end_matches('/'), dataset.file);
+        let mirror = self.mirror.iter().map(file);
         mirror.chain(dataset.addresses.iter().cloned()).collect()
     }
 
-    /// The whole file from one address, by as many attempts as bring it forward; its SHA-256.
+    /// Fetches the whole file from one address, as long as attempts make progress. Returns its
+    /// SHA-256.
     fn fetch_from(
         &self,
         address: &str,
@@ -102,8 +97,7 @@ impl Fetcher {
         partial: &mut Partial,
         progress: &ProgressBar,
     ) -> Result<String, Failure> {
-        // Without its size, nothing tells whether what is here already can be the beginning of the
-        // file.
+        // Without its size, an earlier part may be of another file.
         if dataset.bytes.is_none_or(|bytes| partial.length > bytes) {
             partial.clear()?;
         }
@@ -132,7 +126,7 @@ impl Fetcher {
     }
 }
 
-/// SHA-256 of what has arrived, if it is the dataset's file; otherwise it is deleted.
+/// SHA-256 of the fetched file, which is deleted if it is not the dataset's.
 fn check(dataset: &NamedDataset, partial: &mut Partial) -> Result<String, Failure> {
     verify(dataset, &partial.path)?.or_else(|mismatch| {
         partial.clear()?;
@@ -140,7 +134,7 @@ fn check(dataset: &NamedDataset, partial: &mut Partial) -> Result<String, Failur
     })
 }
 
-/// The file cannot be read or written here.
+/// An error of the local disk.
 fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
     let hint = match (&dataset.benchmark.cache.variable, error.kind()) {
         (None, _) => {
@@ -151,12 +145,6 @@ fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
         ),
         (Some(variable), _) => format!("name a folder that you may write to in {variable}"),
     };
-    hinted(
-        Error::new(error).context(format!(
-            "cannot keep the dataset {} in {}",
-            dataset.name,
-            folder.display()
-        )),
-        hint,
-    )
+    let (name, folder) = (&dataset.name, folder.display());
+    hinted(Error::new(error).context(format!("cannot keep the dataset {name} in {folder}")), hint)
 }

@@ -1,4 +1,4 @@
-//! The transitions that a run learns from, as its settings have them.
+//! The transitions of a run.
 
 use std::path::Path;
 
@@ -9,11 +9,8 @@ use quad_dataset::{
 use quad_run::config::Experiment;
 use quad_runtime::Hint;
 
-/// Reads a file or folder of transitions for an experiment.
-///
-/// # Errors
-/// It cannot be read or learned from, or it has fewer transitions than a batch: a batch never holds
-/// one twice while there are others.
+/// Reads a file or folder of transitions for an experiment. Fewer transitions than a batch are an
+/// error: a batch never holds one twice while there are others.
 pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
     let options = ReadOptions {
         environment: environment::find(&experiment.environment).ok(),

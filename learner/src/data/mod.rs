@@ -1,14 +1,11 @@
 //! Finds or fetches the data that a run learns from.
 //!
-//! Owns the fetches into D4RL's and OGBench's cache folders. It has no thread: `learner train` and
-//! `learner datasets` call it on the main thread before a run begins, and it returns when the file
-//! is on this machine. It uses `config` for a run's settings of its data and to suggest names, and
-//! imports nothing else of the learner.
+//! It has no thread: `learner train` and `learner datasets` call it on the main thread before a run
+//! begins.
 //!
 //! In reading order: `source` parses `--dataset`; `cache` are the folders; `fetch` gets a file of
-//! the catalog into one, from one address after the other; `transfer` is one attempt at one
-//! address; `partial` is a file that has arrived in part; `verify` checks the file. `load` reads
-//! the file's transitions for a run.
+//! the catalog from one address after the other; `transfer` is one attempt at one address; `partial`
+//! is a file that has arrived in part; `verify` checks the file. `load` reads its transitions.
 
 pub(crate) mod cache;
 mod fetch;

@@ -1,4 +1,4 @@
-//! What has arrived of a file so far.
+//! Files that have arrived in part.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -6,21 +6,19 @@ use std::path::{Path, PathBuf};
 
 use quad_run::files;
 
-/// A file of this run alone beside the place of the whole one, `<file>.<number>.partial`.
+/// The part of `<file>` that this process has fetched: `<file>.<number>.partial`.
 pub struct Partial {
-    /// Where it is.
     pub path: PathBuf,
-    /// Bytes so far.
     pub length: u64,
     file: File,
 }
 
 impl Partial {
-    /// Goes on with what an interrupted run has left of `target`, or begins with nothing.
+    /// Continues the part that an interrupted process has left of `target`, or makes an empty one.
     pub fn open(target: &Path) -> io::Result<Self> {
         let path = target.with_added_extension(format!("{:08x}.partial", rand::random::<u32>()));
-        for (left, _) in left_of(target) {
-            // A run that is still fetching has a lock on its file.
+        for (left, _) in partial_files(target) {
+            // A process that is still fetching has a lock on its file.
             let Ok(file) = files::append(&left) else { continue };
             if file.try_lock().is_ok() && fs::rename(&left, &path).is_ok() {
                 let length = file.metadata()?.len();
@@ -28,8 +26,7 @@ impl Partial {
             }
         }
         let file = files::append(&path)?;
-        // Where the file system has no locks, this run continues all the same, and nothing is taken
-        // over there.
+        // On a file system without locks, nothing is continued.
         file.try_lock().ok();
         Ok(Self { path, length: 0, file })
     }
@@ -40,14 +37,12 @@ impl Partial {
         Ok(())
     }
 
-    /// Forgets all bytes.
     pub fn clear(&mut self) -> io::Result<()> {
         self.length = 0;
         self.file.set_len(0)
     }
 
-    /// Gives it its final name, under which there is never less than the whole file, not even after
-    /// a power cut.
+    /// Renames the file to `target`, which is whole even after a power cut.
     pub fn finish(self, target: &Path) -> io::Result<()> {
         self.file.sync_all()?;
         fs::rename(&self.path, target)?;
@@ -63,8 +58,8 @@ impl Drop for Partial {
     }
 }
 
-/// The partial files of `target` that hold something, and how many bytes.
-pub fn left_of(target: &Path) -> Vec<(PathBuf, u64)> {
+/// The non-empty partial files of `target`, and their lengths.
+pub fn partial_files(target: &Path) -> Vec<(PathBuf, u64)> {
     let folder = target.parent().and_then(|folder| fs::read_dir(folder).ok());
     let file = target.file_name().unwrap_or_default().to_string_lossy();
     let length = |entry: io::Result<fs::DirEntry>| {

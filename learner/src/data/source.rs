@@ -1,4 +1,4 @@
-//! What `--dataset` means: a path, a name of the catalog, or `minari:` and an ID.
+//! Values of `--dataset`: a path, a name of the catalog, or `minari:` and an ID.
 
 use std::path::{Path, PathBuf};
 
@@ -12,12 +12,10 @@ use super::cache;
 use super::fetch::{Fetcher, LocalDataset};
 use super::verify::sha256;
 
-/// A lab's own mirror: the address of a folder that is tried before the catalog's.
+/// Environment variable with the address of a mirror that is tried before the catalog's addresses.
 const MIRROR: &str = "QUAD_DATASETS_URL";
-/// What names a dataset of Minari's begin with.
 const MINARI: &str = "minari:";
 
-/// Where a run's data comes from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Source {
     /// A file of the catalog, in its benchmark's cache folder or fetched into it.
@@ -29,8 +27,8 @@ pub enum Source {
 }
 
 impl Source {
-    /// Understands what was typed. A name of the catalog comes before a file of that name; `./NAME`
-    /// is the file.
+    /// Parses `--dataset`. A name of the catalog comes before a file of that name; `./NAME` is the
+    /// file.
     pub fn parse(text: &str) -> anyhow::Result<Self> {
         if let Some(id) = text.strip_prefix(MINARI) {
             return Ok(Self::Minari(id.to_owned()));
@@ -62,22 +60,20 @@ impl Source {
         }
     }
 
-    /// Refuses data that the catalog says is from another simulation than that of `environment`.
+    /// Refuses data of another simulation than that of `environment`.
     pub fn check_environment(&self, environment: &str) -> anyhow::Result<()> {
         match self.entry() {
-            Some(entry) if simulation_of(&entry.environment) != simulation_of(environment) => {
-                Err(anyhow!(
-                    "{} is a dataset of {}, but the policy is for {environment}",
-                    entry.name,
-                    entry.environment
-                ))
-                .hint("choose a task in the dataset's environment, or another --dataset")
+            Some(NamedDataset { name, environment: other, .. })
+                if simulation_of(other) != simulation_of(environment) =>
+            {
+                Err(anyhow!("{name} is a dataset of {other}, but the policy is for {environment}"))
+                    .hint("choose a task in the dataset's environment, or another --dataset")
             }
             _ => Ok(()),
         }
     }
 
-    /// Finds it on this machine, or fetches it; its checksum is computed in any case.
+    /// Finds the data on this machine, or fetches it, and computes its checksum.
     pub fn obtain(&self) -> anyhow::Result<LocalDataset> {
         match self {
             Self::Named(dataset) => {

@@ -9,19 +9,18 @@ use ureq::{Agent, Body, Error};
 
 use super::partial::Partial;
 
-/// Read at a time.
+/// Bytes that are read at a time.
 const CHUNK: usize = 1 << 16;
-/// How long a server may take to be connected to.
+/// Time limit of a connection.
 const CONNECT: Duration = Duration::from_secs(10);
 
-/// Why an attempt failed.
 #[derive(Debug)]
 pub enum Failure {
-    /// The file cannot be written here, which no address can mend.
+    /// The file cannot be written.
     Local(io::Error),
     /// A later attempt at this address may succeed.
     Passing(String),
-    /// It will not.
+    /// Further attempts at this address would fail, too.
     Lasting(String),
 }
 
@@ -31,8 +30,8 @@ impl From<io::Error> for Failure {
     }
 }
 
-/// The HTTP client, which heeds `HTTPS_PROXY` and its kin. `silence` is how long a server may take
-/// for its answer's first line, or for the next bytes of the file.
+/// The HTTP client, which uses `HTTPS_PROXY` and the like. `silence` is the time limit of a server
+/// for the first line of its answer, and for the next bytes of the file.
 pub fn client(silence: Duration) -> Agent {
     Agent::config_builder()
         .timeout_resolve(Some(CONNECT))
@@ -45,8 +44,8 @@ pub fn client(silence: Duration) -> Agent {
         .new_agent()
 }
 
-/// Appends what is missing of a file of `expected` bytes, as far as its size is known. The server
-/// is asked for the rest alone; one that sends the whole file instead starts it again.
+/// Appends the rest of a file of `expected` bytes, if that is known. A server that sends the whole
+/// file instead starts it again.
 pub fn transfer(
     client: &Agent,
     address: &str,
@@ -64,31 +63,26 @@ pub fn transfer(
         StatusCode::PARTIAL_CONTENT if first_byte(&response) == Some(partial.length) => {}
         StatusCode::PARTIAL_CONTENT | StatusCode::RANGE_NOT_SATISFIABLE => {
             partial.clear()?;
-            return Err(Failure::Passing(
-                "the server did not continue where the last connection broke".to_owned(),
-            ));
+            let reason = "the server did not continue where the last connection broke";
+            return Err(Failure::Passing(reason.to_owned()));
         }
         status => return Err(refusal(status)),
     }
     let found = response.body().content_length().map(|rest| partial.length + rest);
-    let bytes = match (expected, found) {
-        (Some(expected), Some(found)) if found != expected => {
-            return Err(Failure::Lasting(format!(
-                "the server's file has {found} bytes, but must have {expected}"
-            )));
-        }
-        (Some(bytes), _) | (None, Some(bytes)) => bytes,
-        (None, None) => {
-            return Err(Failure::Lasting(
-                "the server does not say how large the file is".to_owned(),
-            ));
-        }
+    if let (Some(expected), Some(found)) = (expected, found)
+        && found != expected
+    {
+        let mismatch = format!("the server's file has {found} bytes, but must have {expected}");
+        return Err(Failure::Lasting(mismatch));
+    }
+    let Some(bytes) = expected.or(found) else {
+        return Err(Failure::Lasting("the server does not say how large the file is".to_owned()));
     };
     progress.start(partial.length, bytes);
     append(response.body_mut(), bytes, partial, progress)
 }
 
-/// Appends what a server sends, until there are `bytes`.
+/// Appends the answer until the file has `bytes`.
 fn append(
     body: &mut Body,
     bytes: u64,
@@ -112,24 +106,24 @@ fn append(
 }
 
 fn network(error: Error) -> Failure {
-    let lasting = matches!(
-        error,
-        Error::BadUri(_) | Error::Http(_) | Error::Tls(_) | Error::TooManyRedirects
-    );
-    if lasting { Failure::Lasting(error.to_string()) } else { Failure::Passing(error.to_string()) }
+    use Error::{BadUri, Http, Tls, TooManyRedirects};
+    let reason = error.to_string();
+    match error {
+        BadUri(_) | Http(_) | Tls(_) | TooManyRedirects => Failure::Lasting(reason),
+        _ => Failure::Passing(reason),
+    }
 }
 
 fn refusal(status: StatusCode) -> Failure {
     let reason = format!("the server answered {status}");
-    let busy = [StatusCode::REQUEST_TIMEOUT, StatusCode::TOO_MANY_REQUESTS].contains(&status);
-    if busy || status.is_server_error() {
-        Failure::Passing(reason)
-    } else {
-        Failure::Lasting(reason)
+    match status {
+        StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS => Failure::Passing(reason),
+        _ if status.is_server_error() => Failure::Passing(reason),
+        _ => Failure::Lasting(reason),
     }
 }
 
-/// Where a part begins, by `Content-Range: bytes FIRST-LAST/SIZE`.
+/// First byte of a part, by `Content-Range: bytes FIRST-LAST/SIZE`.
 fn first_byte(response: &Response<Body>) -> Option<u64> {
     let range = response.headers().get("content-range")?.to_str().ok()?;
     range.strip_prefix("bytes ")?.split_once('-')?.0.parse().ok()

@@ -1,4 +1,4 @@
-//! Whether a file is the one that the catalog means.
+//! Checks files against the catalog.
 
 use std::io::{self, Read};
 use std::path::Path;
@@ -8,8 +8,8 @@ use quad_dataset::benchmarks::Format;
 use quad_run::files;
 use sha2::{Digest, Sha256};
 
-/// SHA-256 of a file in lower-case hexadecimal if the file is what `dataset` says, as far as that
-/// is known; else what is wrong.
+/// SHA-256 of a file in lower-case hexadecimal if size, format and checksum are those of the
+/// catalog; otherwise the mismatch.
 pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, String>> {
     let mut file = files::open_named(path)?;
     let found = file.metadata()?.len();
@@ -19,7 +19,7 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
     let mut start = Vec::new();
     let format = dataset.benchmark.format;
     file.by_ref().take(16).read_to_end(&mut start)?;
-    // Some servers send a page for people in place of an error.
+    // Some servers send a web page instead of an error.
     if Format::of(&start) != Some(format) {
         return Ok(Err(format!("it is not an {}", format.name())));
     }

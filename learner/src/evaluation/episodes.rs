@@ -1,4 +1,4 @@
-//! One evaluation: the snapshot that it is of, and how far each of its episodes is.
+//! One evaluation: its snapshot and the states of its episodes.
 
 use std::collections::{BTreeSet, HashMap};
 use std::mem;
@@ -6,12 +6,10 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash};
 
-/// An episode whose evaluator was lost so often is given up: the episode itself may crash
-/// evaluators.
+/// An episode is given up after this many lost evaluators: the episode itself may crash them.
 const MOST_ATTEMPTS: u32 = 20;
-/// Lost more often than this, an episode rests before it is handed out again. One machine that
-/// fails again and again would else soon have taken all attempts, and what may pass, like a disk
-/// that snapshots are read from, gets time to.
+/// Lost more often than this, an episode rests before it is handed out again: otherwise one broken
+/// machine would soon take all attempts, and a disk that snapshots are read from may recover.
 const ATTEMPTS_AT_ONCE: u32 = 3;
 const LONGEST_REST: Duration = Duration::from_secs(60);
 
@@ -19,22 +17,21 @@ const LONGEST_REST: Duration = Duration::from_secs(60);
 pub(super) struct Evaluation {
     pub weights: Hash,
     episodes: Vec<Episode>,
-    /// Where among them a seed is.
-    places: HashMap<u64, usize>,
-    /// Which of them wait, and which are given up. Complete evaluations become many, and are passed
-    /// over.
+    /// Indices of the episodes by seed.
+    indices: HashMap<u64, usize>,
+    /// Indices of the episodes in each state but `Scored`. Complete evaluations become many, and
+    /// are passed over.
     waiting: BTreeSet<usize>,
+    handed_out: BTreeSet<usize>,
     given_up: BTreeSet<usize>,
-    handed_out: usize,
 }
 
 #[derive(Debug)]
 struct Episode {
     seed: u64,
     state: EpisodeState,
-    /// How often an evaluator that had it was lost, or could not do it.
+    /// Number of evaluators that were lost with it, or could not do it.
     lost: u32,
-    /// It is not handed out before.
     rests_until: Option<Instant>,
 }
 
@@ -63,105 +60,111 @@ enum EpisodeState {
 }
 
 impl Evaluation {
-    /// Opens an evaluation of the episodes `seeds`, some of which may have a score already.
+    /// An evaluation of the episodes `seeds`, some of which may have a score already.
     pub fn new(weights: Hash, seeds: &[u64], scores: &[EpisodeScore]) -> Self {
-        let episode = |&seed| {
-            let score = scores.iter().find(|score| score.seed == seed);
-            let state = score.map_or(EpisodeState::Waiting, |score| EpisodeState::Scored(*score));
-            Episode { seed, state, lost: 0, rests_until: None }
+        let mut evaluation = Self {
+            weights,
+            episodes: Vec::new(),
+            indices: seeds.iter().enumerate().map(|(index, &seed)| (seed, index)).collect(),
+            waiting: (0..seeds.len()).collect(),
+            handed_out: BTreeSet::new(),
+            given_up: BTreeSet::new(),
         };
-        let episodes: Vec<Episode> = seeds.iter().map(episode).collect();
-        let places = seeds.iter().enumerate().map(|(place, &seed)| (seed, place)).collect();
-        let is_waiting = |&place: &usize| matches!(episodes[place].state, EpisodeState::Waiting);
-        let waiting = (0..episodes.len()).filter(is_waiting).collect();
-        Self { weights, episodes, places, waiting, given_up: BTreeSet::new(), handed_out: 0 }
+        let waiting =
+            |&seed| Episode { seed, state: EpisodeState::Waiting, lost: 0, rests_until: None };
+        evaluation.episodes = seeds.iter().map(waiting).collect();
+        evaluation.score(scores);
+        evaluation
     }
 
-    fn change(&mut self, place: usize, state: EpisodeState) {
-        match mem::replace(&mut self.episodes[place].state, state) {
-            EpisodeState::Waiting => drop(self.waiting.remove(&place)),
-            EpisodeState::HandedOut { .. } => self.handed_out -= 1,
-            EpisodeState::GivenUp => drop(self.given_up.remove(&place)),
-            EpisodeState::Scored(_) => {}
+    fn set_state(&mut self, index: usize, state: EpisodeState) {
+        let old = mem::replace(&mut self.episodes[index].state, state);
+        if let Some(indices) = self.indices_of(old) {
+            indices.remove(&index);
         }
+        if let Some(indices) = self.indices_of(state) {
+            indices.insert(index);
+        }
+    }
+
+    fn indices_of(&mut self, state: EpisodeState) -> Option<&mut BTreeSet<usize>> {
         match state {
-            EpisodeState::Waiting => drop(self.waiting.insert(place)),
-            EpisodeState::HandedOut { .. } => self.handed_out += 1,
-            EpisodeState::GivenUp => drop(self.given_up.insert(place)),
-            EpisodeState::Scored(_) => {}
+            EpisodeState::Waiting => Some(&mut self.waiting),
+            EpisodeState::HandedOut { .. } => Some(&mut self.handed_out),
+            EpisodeState::GivenUp => Some(&mut self.given_up),
+            EpisodeState::Scored(_) => None,
         }
     }
 
-    /// Episodes that have no score yet, and may still get one.
+    /// Number of episodes that have no score yet, and may still get one.
     pub fn pending(&self) -> usize {
-        self.waiting.len() + self.handed_out
+        self.waiting.len() + self.handed_out.len()
     }
 
-    /// Episodes that wait for an evaluator.
+    /// Number of episodes that wait for an evaluator.
     pub fn waiting(&self) -> usize {
         self.waiting.len()
     }
 
-    /// The seeds of those that have no score and are not handed out any more.
+    /// Seeds of the episodes that have no score and are not handed out any more.
     pub fn given_up(&self) -> impl Iterator<Item = u64> {
-        self.given_up.iter().map(|&place| self.episodes[place].seed)
+        self.given_up.iter().map(|&index| self.episodes[index].seed)
     }
 
-    /// Hands out some of the episodes that wait, without those that rest; none if there are none.
-    /// After a failure `few` at most, in case the episode is its cause.
+    /// Hands out episodes that wait and do not rest. After a failure `few` at most, in case the
+    /// episode is its cause.
     pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2], now: Instant) -> Vec<u64> {
         let ready = self.waiting.iter().copied();
-        let mut ready = ready.filter(|place| !self.episodes[*place].rests(now)).peekable();
-        let lost = ready.peek().is_some_and(|&place| self.episodes[place].lost > 0);
-        let places: Vec<usize> = ready.take(if lost { few } else { most }).collect();
-        for &place in &places {
-            self.change(place, EpisodeState::HandedOut { job });
+        let mut ready = ready.filter(|&index| !self.episodes[index].rests(now)).peekable();
+        let lost = ready.peek().is_some_and(|&index| self.episodes[index].lost > 0);
+        let indices = Vec::from_iter(ready.take(if lost { few } else { most }));
+        for &index in &indices {
+            self.set_state(index, EpisodeState::HandedOut { job });
         }
-        places.into_iter().map(|place| self.episodes[place].seed).collect()
+        indices.into_iter().map(|index| self.episodes[index].seed).collect()
     }
 
-    /// Takes those of a job's episodes back that have no score yet; `lost` is when its evaluator
-    /// was lost or failed, and nothing if it handed the job back in order. Gives the seeds of those
-    /// that were lost too often.
+    /// Takes back the episodes of a job that have no score yet. `lost` is when its evaluator was
+    /// lost or failed, and `None` if it handed the job back in order. Returns the seeds that are
+    /// given up.
     pub fn take_back(&mut self, job: u64, seeds: &[u64], lost: Option<Instant>) -> Vec<u64> {
         let mut given_up = Vec::new();
         for &seed in seeds {
-            let Some(&place) = self.places.get(&seed) else { continue };
-            let episode = &mut self.episodes[place];
+            let Some(&index) = self.indices.get(&seed) else { continue };
+            let episode = &mut self.episodes[index];
             if matches!(episode.state, EpisodeState::HandedOut { job: of } if of == job) {
                 lost.into_iter().for_each(|now| episode.lost(now));
-                let hopeless = episode.lost >= MOST_ATTEMPTS;
-                given_up.extend(hopeless.then_some(seed));
-                self.change(
-                    place,
-                    if hopeless { EpisodeState::GivenUp } else { EpisodeState::Waiting },
-                );
+                let mut state = EpisodeState::Waiting;
+                if episode.lost >= MOST_ATTEMPTS {
+                    state = EpisodeState::GivenUp;
+                    given_up.push(seed);
+                }
+                self.set_state(index, state);
             }
         }
         given_up
     }
 
-    /// Counts scores. Gives the jobs that their episodes were handed out with.
+    /// Counts scores. Returns the jobs that their episodes were handed out with.
     pub fn score(&mut self, scores: &[EpisodeScore]) -> BTreeSet<u64> {
         let mut jobs = BTreeSet::new();
         for score in scores {
-            if let Some(&place) = self.places.get(&score.seed) {
-                if let EpisodeState::HandedOut { job } = self.episodes[place].state {
-                    jobs.insert(job);
-                }
-                self.change(place, EpisodeState::Scored(*score));
+            let Some(&index) = self.indices.get(&score.seed) else { continue };
+            if let EpisodeState::HandedOut { job } = self.episodes[index].state {
+                jobs.insert(job);
             }
+            self.set_state(index, EpisodeState::Scored(*score));
         }
         jobs
     }
 
-    /// Whether an episode has a score; nothing if there is no such episode.
+    /// True if an episode has a score; `None` if there is no such episode.
     pub fn is_scored(&self, seed: u64) -> Option<bool> {
-        let place = self.places.get(&seed)?;
-        Some(matches!(self.episodes[*place].state, EpisodeState::Scored(_)))
+        let index = self.indices.get(&seed)?;
+        Some(matches!(self.episodes[*index].state, EpisodeState::Scored(_)))
     }
 
-    /// The scores, if all are there.
+    /// The scores in the order of the seeds, once all are there.
     pub fn scores(&self) -> Option<Vec<EpisodeScore>> {
         let score = |episode: &Episode| match episode.state {
             EpisodeState::Scored(score) => Some(score),

@@ -1,5 +1,4 @@
-//! The state of a run's evaluations: which episodes wait for a score, which evaluator has which,
-//! which scores came. It does no I/O.
+//! The state of a run's evaluations: episodes, jobs and scores. It does no I/O.
 //!
 //! An evaluation is a snapshot (step and hash) with a list of episode seeds. A job gives some of
 //! its episodes to one evaluator under a lease, which progress extends. When the lease ends, or the
@@ -11,11 +10,10 @@
 //! is an argument, so tests have a clock of their own.
 //!
 //! In reading order: `scoreboard`, `outcomes` (its arguments and results), `episodes` (one
-//! evaluation), `jobs` (which evaluator has which episodes until when), `validate` (which reports
-//! count), `refusal` (why a report does not).
+//! evaluation), `open_job` (a job and its lease), `validate` (checks of reports), `refusal`.
 
 mod episodes;
-mod jobs;
+mod open_job;
 mod outcomes;
 mod refusal;
 mod scoreboard;
@@ -23,7 +21,7 @@ mod scoreboard;
 mod tests;
 mod validate;
 
-pub(crate) use outcomes::{Claim, Claimed, HandedBack, Lost, OtherWeights};
+pub(crate) use outcomes::{Claim, Claimed, Lost, OtherWeights};
 pub(crate) use refusal::Refusal;
 pub(crate) use scoreboard::{Rules, Scoreboard};
 pub(crate) use validate::Validated;

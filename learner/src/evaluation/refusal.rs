@@ -1,16 +1,13 @@
-//! Why a message about a job or its scores is not accepted.
+//! Reasons not to accept a message about a job or its scores.
 
-/// Why a message is not accepted.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub(crate) enum Refusal {
     #[error("it is for another run")]
     Run,
     #[error("it is for another incarnation of the learner")]
     Incarnation,
-    #[error("no such job is open")]
+    #[error("the evaluator has no such job")]
     Job,
-    #[error("the job was handed out to another evaluator")]
-    Evaluator,
     #[error("the job is not further than before")]
     NotAdvanced,
     #[error("there is no evaluation of that step")]
@@ -30,7 +27,6 @@ impl Refusal {
             Self::Run => "unknown_run",
             Self::Incarnation => "unknown_incarnation",
             Self::Job => "unknown_job",
-            Self::Evaluator => "wrong_evaluator",
             Self::NotAdvanced => "not_advanced",
             Self::Step => "unknown_step",
             Self::Weights => "unknown_weights",

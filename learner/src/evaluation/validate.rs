@@ -1,4 +1,4 @@
-//! Which reports are accepted.
+//! Checks of score reports.
 
 use std::collections::BTreeSet;
 
@@ -21,8 +21,8 @@ pub(crate) struct Validated {
 }
 
 impl Scoreboard {
-    /// Checks a report against the evaluation that it is about, and says what in it is new. Changes
-    /// nothing: the caller writes the new scores down first, then calls [`record`](Self::record).
+    /// Checks a report against its evaluation and finds its new scores. Changes nothing: the caller
+    /// writes the new scores to the disk first, then calls [`record`](Self::record).
     pub fn validate(&self, report: &ScoreReport) -> Result<Validated, Refusal> {
         require(report.run == self.rules.run, Refusal::Run)?;
         let evaluation = self.evaluations.get(&report.step).ok_or(Refusal::Step)?;
@@ -33,18 +33,14 @@ impl Scoreboard {
             require(seen.insert(score.seed), Refusal::Seed(score.seed))?;
             let is_scored = evaluation.is_scored(score.seed).ok_or(Refusal::Seed(score.seed))?;
             require(self.is_possible(score), Refusal::Episode(score.seed))?;
-            match is_scored {
-                true => validated.duplicates += 1,
-                false => validated.new.push(*score),
-            }
+            if is_scored { validated.duplicates += 1 } else { validated.new.push(*score) }
         }
         Ok(validated)
     }
 
     fn is_possible(&self, score: &EpisodeScore) -> bool {
         let task = &self.rules.task;
-        // In an environment that is not known here, the evaluator's user decides what counts as a
-        // score.
+        // In an environment without reference scores the evaluator's user defines the score.
         let expected =
             if task.is_normalized() { task.score(score.episode_return) } else { score.score };
         let longest = task.max_episode_steps().unwrap_or(usize::MAX);

@@ -1,5 +1,4 @@
-//! Which evaluator has which job, and which episodes are scored: the scoreboard and the evaluators
-//! behind one lock.
+//! The state that threads share: the scoreboard and the connected evaluators, behind one lock.
 //!
 //! Every thread may call it. It holds the lock for microseconds, never during input or output: the
 //! caller does slow work, like writing scores, between two calls.
@@ -13,39 +12,29 @@ use quad_protocol::{
     episode_seeds,
 };
 use quad_run::folder::SavedScores;
+use serde_json::{Value, json};
 use tracing::{debug, warn};
 
-use super::evaluators::{EvaluatorAtWork, Evaluators, JobAtWork};
+use super::evaluators::Evaluators;
 use super::events::{Event, Events};
 use super::metrics::Metrics;
 use super::requests::NotAccepted;
 use crate::evaluation::{
-    Claim, Claimed, HandedBack, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated,
+    Claim, Claimed, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated,
 };
 
 /// Most characters of an evaluator's error message that the learner logs.
 const LONGEST_REASON: usize = 300;
 /// Most evaluator names for which the learner reports that two evaluators use them.
-const MOST_NAMES_TOLD: usize = 100;
-
-/// The episodes of each evaluation of a run.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct EvaluationPlan {
-    /// Seed of the run.
-    pub seed: u64,
-    /// Episodes per evaluation.
-    pub episodes: u32,
-}
+const MOST_SHARED_NAMES: usize = 100;
 
 /// A handle to the shared state. Clones share it.
 #[derive(Clone, Debug)]
 pub(crate) struct Coordinator {
     state: Arc<Mutex<State>>,
-    plan: EvaluationPlan,
-    incarnation: u64,
-    environment: String,
-    metrics: Metrics,
-    events: Events,
+    rules: Arc<Rules>,
+    pub(super) metrics: Metrics,
+    pub(super) events: Events,
 }
 
 #[derive(Debug)]
@@ -53,55 +42,46 @@ struct State {
     scoreboard: Scoreboard,
     evaluators: Evaluators,
     /// Steps for which a failed job was reported.
-    failures_told: BTreeSet<u64>,
+    failed_steps: BTreeSet<u64>,
     /// Names for which it was reported that two evaluators use them.
-    names_told: BTreeSet<Name>,
+    shared_names: BTreeSet<Name>,
 }
 
 impl Coordinator {
     /// A coordinator without evaluations; see [`Scoreboard::new`].
     pub fn new(
         rules: Rules,
-        plan: EvaluationPlan,
         earlier: BTreeMap<u64, SavedScores>,
         metrics: Metrics,
         events: Events,
     ) -> Self {
-        let (incarnation, environment) = (rules.incarnation, rules.task.environment.clone());
+        let rules = Arc::new(rules);
         let state = State {
-            scoreboard: Scoreboard::new(rules, earlier),
-            evaluators: Evaluators::new(metrics.evaluators.clone(), Instant::now()),
-            failures_told: BTreeSet::new(),
-            names_told: BTreeSet::new(),
+            scoreboard: Scoreboard::new(rules.clone(), earlier),
+            evaluators: Evaluators::new(metrics.clone(), events.clone(), Instant::now()),
+            failed_steps: BTreeSet::new(),
+            shared_names: BTreeSet::new(),
         };
-        Self { state: Arc::new(Mutex::new(state)), plan, incarnation, environment, metrics, events }
+        Self { state: Arc::new(Mutex::new(state)), rules, metrics, events }
     }
 
     /// The environment in which evaluators run the policies.
     pub fn environment(&self) -> &str {
-        &self.environment
+        &self.rules.task.environment
     }
 
-    /// Whether an evaluator is connected that may have this environment.
+    /// True if an evaluator is connected that may have this environment.
     pub fn any_may_fit(&self) -> bool {
         self.lock().evaluators.any_may_fit()
     }
 
     /// Each connected evaluator and its job, for the page.
-    pub fn evaluators(&self) -> Vec<EvaluatorAtWork> {
+    pub fn evaluators(&self) -> Vec<Value> {
         let state = self.lock();
-        let present = state.evaluators.present();
-        let at_work = present.map(|(evaluator, fits, seen)| EvaluatorAtWork {
-            name: evaluator.to_string(),
-            fits,
-            seconds_ago: seen.map(|seen| seen.elapsed().as_secs_f64()),
-            job: state.scoreboard.job_of(evaluator).map(|(step, done, episodes)| JobAtWork {
-                step,
-                done,
-                episodes,
-            }),
-        });
-        at_work.collect()
+        state.evaluators.to_json(|evaluator| {
+            let (step, done, episodes) = state.scoreboard.job_of(evaluator)?;
+            Some(json!({ "step": step, "done": done, "episodes": episodes }))
+        })
     }
 
     // A panic with the lock held ends the run.
@@ -114,7 +94,7 @@ impl Coordinator {
     /// # Errors
     /// The step is known with other weights.
     pub fn open(&self, step: u64, weights: Hash) -> Result<(), OtherWeights> {
-        let seeds = episode_seeds(self.plan.seed, step, self.plan.episodes);
+        let seeds = episode_seeds(self.rules.seed, step, self.rules.episodes);
         let mut state = self.lock();
         if let Some(scores) = state.scoreboard.add_evaluation(step, weights, &seeds)? {
             self.show(step, &scores);
@@ -128,178 +108,151 @@ impl Coordinator {
         self.lock().scoreboard.weights(step)
     }
 
-    /// Episodes that have no score, but may still get one.
+    /// Number of episodes that have no score, but may still get one.
     pub fn pending(&self) -> usize {
         self.lock().scoreboard.pending()
     }
 
-    /// Evaluations with such episodes.
+    /// Number of evaluations with such episodes.
     pub fn evaluations_pending(&self) -> usize {
         self.lock().scoreboard.evaluations_pending()
     }
 
     /// Answers a claim or a hand-back.
     pub fn job(&self, request: &JobRequest) -> JobReply {
-        let mut state = self.lock();
+        let (mut state, now) = (self.lock(), Instant::now());
+        let incarnation = self.rules.incarnation;
         match request {
             JobRequest::Claim { evaluator, attempt, environments } => {
+                let fits = environments.iter().any(|name| name == self.environment());
+                state.evaluators.asked(evaluator, fits);
                 let present = state.evaluators.count();
-                state.evaluators.asks(evaluator, environments.contains(&self.environment));
-                let claim = Claim { evaluator, attempt: *attempt, environments, present };
-                let claimed = state.scoreboard.claim(claim, Instant::now());
-                self.claimed(evaluator, claimed)
+                let claim = Claim { evaluator, attempt: *attempt, fits, present };
+                match state.scoreboard.claim(claim, now) {
+                    Claimed::Job { job, again } => {
+                        if !again {
+                            debug!(job = job.id, step = job.step, %evaluator, "handed out");
+                            self.metrics.jobs("handed_out", 1);
+                        }
+                        JobReply::Job(job)
+                    }
+                    Claimed::Wait(time) => {
+                        JobReply::Wait { incarnation, milliseconds: time.as_millis() as u64 }
+                    }
+                }
             }
             JobRequest::HandBack { evaluator, job, failed } => {
-                let when = failed.is_some().then(Instant::now);
+                let when = failed.is_some().then_some(now);
                 let handed_back = state.scoreboard.hand_back(evaluator, *job, when);
                 let accepted = handed_back.is_some();
-                if let Some(HandedBack { step, given_up }) = handed_back {
+                if let Some((step, given_up)) = handed_back {
                     match failed {
                         Some(reason) => self.failed(&mut state, step, evaluator, reason),
-                        None => self.metrics.evaluation.jobs_handed_back.inc(),
+                        None => self.metrics.jobs("handed_back", 1),
                     }
-                    self.given_up(&state, given_up);
+                    self.given_up(&state, &given_up);
                 }
-                JobReply::HandedBack { incarnation: self.incarnation, accepted }
+                JobReply::HandedBack { incarnation, accepted }
             }
         }
     }
 
-    fn claimed(&self, evaluator: &Name, claimed: Claimed) -> JobReply {
-        match claimed {
-            Claimed::Job { job, again } => {
-                if !again {
-                    debug!(job = job.id, step = job.step, %evaluator, "handed out");
-                    self.metrics.evaluation.jobs_handed_out.inc();
-                }
-                JobReply::Job(job)
-            }
-            Claimed::Wait(time) => JobReply::Wait {
-                incarnation: self.incarnation,
-                milliseconds: time.as_millis() as u64,
-            },
-        }
-    }
-
-    /// Records an evaluator's progress.
-    pub fn progress(&self, progress: Progress) -> Result<(), NotAccepted> {
+    pub(super) fn progress(&self, progress: Progress) -> Result<(), NotAccepted> {
         let (mut state, now) = (self.lock(), Instant::now());
         let shares_name = state.scoreboard.progress(&progress, now)?;
-        let (names, name) = (&mut state.names_told, &progress.evaluator);
-        if shares_name && names.len() < MOST_NAMES_TOLD && names.insert(name.clone()) {
-            self.events.send(Event::SameName(name.clone())).ok();
+        let (names, name) = (&mut state.shared_names, &progress.evaluator);
+        if shares_name && names.len() < MOST_SHARED_NAMES && names.insert(name.clone()) {
+            self.events.line(format!(
+                "two evaluators were started with --name {name}, and one of them gets no work; give each its own name"
+            ));
         }
-        state.evaluators.heard(progress, now)
+        state.evaluators.progress(progress, now)
     }
 
-    /// Records that an evaluator has connected.
-    pub fn joined(&self, evaluator: Name) -> Result<(), NotAccepted> {
+    pub(super) fn joined(&self, evaluator: Name) -> Result<(), NotAccepted> {
         self.lock().evaluators.joined(evaluator)
     }
 
     /// Records that an evaluator has left; its job becomes free for others.
     pub fn left(&self, evaluator: &Name) {
         let mut state = self.lock();
-        let lost = state.scoreboard.evaluator_gone(evaluator, Instant::now());
-        state.evaluators.left(evaluator, lost.jobs);
-        self.lost(&state, lost);
+        let lost = state.scoreboard.evaluator_left(evaluator, Instant::now());
+        state.evaluators.left(evaluator, lost.jobs > 0);
+        self.lost(&state, &lost);
     }
 
-    /// Checks reports and finds the new scores in each. Changes nothing.
-    pub fn validate<'a>(
-        &self,
-        reports: impl Iterator<Item = &'a ScoreReport>,
-    ) -> Vec<Result<Validated, Refusal>> {
-        let state = self.lock();
-        reports.map(|report| state.scoreboard.validate(report)).collect()
+    /// Checks a report and finds its new scores. Changes nothing.
+    pub fn validate(&self, report: &ScoreReport) -> Result<Validated, Refusal> {
+        self.lock().scoreboard.validate(report)
     }
 
     /// Extends the lease of a job whose scores have arrived but are not on the disk yet.
-    pub fn keep(&self, report: &ScoreReport) {
-        self.lock().scoreboard.keep(report, Instant::now());
+    pub fn extend_lease(&self, report: &ScoreReport) {
+        self.lock().scoreboard.extend_lease(report, Instant::now());
     }
 
-    /// Counts scores that are on the disk. Returns the acknowledgment of each report.
-    pub fn record<'a>(
-        &self,
-        reports: impl Iterator<Item = (&'a ScoreReport, &'a Validated)>,
-    ) -> Vec<ScoreReply> {
+    /// Counts scores of a report that are on the disk. Returns its acknowledgment.
+    pub fn record(&self, report: &ScoreReport, validated: &Validated) -> ScoreReply {
         let mut state = self.lock();
-        let replies = reports
-            .map(|(report, validated)| self.record_one(&mut state, report, validated))
-            .collect();
-        self.count(&state);
-        replies
-    }
-
-    fn record_one(
-        &self,
-        state: &mut State,
-        report: &ScoreReport,
-        validated: &Validated,
-    ) -> ScoreReply {
         let Validated { new, duplicates } = validated;
         let recorded = state.scoreboard.record(report, new);
         let evaluation = &self.metrics.evaluation;
         evaluation.scores_recorded.inc_by(new.len() as u64);
         evaluation.scores_duplicate.inc_by((*duplicates).into());
-        evaluation.jobs_completed.inc_by(recorded.jobs_completed as u64);
+        self.metrics.jobs("completed", recorded.jobs_completed);
         if let Some(scores) = recorded.evaluation_completed {
             self.show(report.step, &scores);
-            self.events.send(Event::Evaluated { step: report.step, scores }).ok();
+            self.events.send(Event::Evaluated { step: report.step, scores });
         }
-        ScoreReply::Recorded {
-            incarnation: self.incarnation,
-            new: new.len() as u32,
-            duplicates: *duplicates,
-        }
+        self.count(&state);
+        let (incarnation, new) = (self.rules.incarnation, new.len() as u32);
+        ScoreReply::Recorded { incarnation, new, duplicates: *duplicates }
     }
 
     /// The answer to a report that the learner will never accept.
     pub fn refused(&self, refusal: Refusal) -> ScoreReply {
-        ScoreReply::Refused { incarnation: self.incarnation, reason: refusal.to_string() }
+        let incarnation = self.rules.incarnation;
+        ScoreReply::Refused { incarnation, reason: refusal.to_string() }
     }
 
-    /// Takes back jobs whose lease has expired, and forgets evaluators that left long ago. Returns
-    /// lines for the log. Call it several times a second.
-    pub fn tick(&self) -> Vec<String> {
+    /// Takes back jobs whose lease has expired, and forgets evaluators that left long ago. Call it
+    /// several times a second.
+    pub fn tick(&self) {
         let (mut state, now) = (self.lock(), Instant::now());
-        let mut lines = state.evaluators.tick(now);
+        state.evaluators.tick(now);
         let expired = state.scoreboard.expire(now);
         if expired.jobs > 0 {
-            lines.push(format!("{} jobs made no progress; they go to others", expired.jobs));
+            self.events.line(format!("{} jobs made no progress; they go to others", expired.jobs));
         }
-        self.lost(&state, expired);
+        self.lost(&state, &expired);
         self.metrics.evaluation.episodes_missing.set(state.scoreboard.missing().len() as i64);
-        lines
     }
 
     /// Reports a job that an evaluator could not run, once for each step.
     fn failed(&self, state: &mut State, step: u64, evaluator: &Name, reason: &str) {
-        self.metrics.evaluation.jobs_failed.inc();
-        let reason: String =
-            reason.chars().filter(|c| !c.is_control()).take(LONGEST_REASON).collect();
+        self.metrics.jobs("failed", 1);
+        let printable = reason.chars().filter(|c| !c.is_control());
+        let reason = String::from_iter(printable.take(LONGEST_REASON));
         debug!(step, %evaluator, reason, "a job failed");
-        if state.failures_told.insert(step) {
-            self.events.send(Event::JobFailed { step, evaluator: evaluator.clone(), reason }).ok();
+        if state.failed_steps.insert(step) {
+            self.events.line(format!(
+                "evaluator {evaluator} could not do a job of step {step}, which goes to others: {reason}"
+            ));
         }
     }
 
-    fn lost(&self, state: &State, lost: Lost) {
-        self.metrics.evaluation.jobs_expired.inc_by(lost.jobs as u64);
-        self.given_up(state, lost.given_up);
+    fn lost(&self, state: &State, lost: &Lost) {
+        self.metrics.jobs("expired", lost.jobs);
+        self.given_up(state, &lost.given_up);
     }
 
-    fn given_up(&self, state: &State, episodes: Vec<(u64, u64)>) {
-        for (step, seed) in &episodes {
-            warn!(
-                step,
-                seed,
-                "an episode is given up: too many evaluators were lost with it or could not do it"
-            );
+    fn given_up(&self, state: &State, episodes: &[(u64, u64)]) {
+        const REASON: &str = "too many evaluators were lost with them or could not do them";
+        for (step, seed) in episodes {
+            warn!(step, seed, "an episode is given up");
         }
         if !episodes.is_empty() {
-            self.events.send(Event::GivenUp(episodes)).ok();
+            self.events.line(format!("{} episodes are given up: {REASON}", episodes.len()));
         }
         self.count(state);
     }
@@ -314,9 +267,8 @@ impl Coordinator {
         if let Ok(step) = i64::try_from(step)
             && step >= evaluation.step.get()
         {
-            evaluation
-                .score
-                .set(scores.iter().map(|score| score.score).sum::<f64>() / scores.len() as f64);
+            let sum: f64 = scores.iter().map(|score| score.score).sum();
+            evaluation.score.set(sum / scores.len() as f64);
             evaluation.step.set(step);
         }
     }

@@ -1,5 +1,5 @@
-//! Whether the disk accepts what a thread writes. While it does not, `/healthz` and a metric say
-//! so; display and log repeat it from time to time.
+//! Reports of a disk that refuses writes: `/healthz` and a metric say so while it does; display and
+//! log repeat it from time to time.
 
 use std::time::{Duration, Instant};
 
@@ -7,50 +7,87 @@ use prometheus::IntGauge;
 use quad_runtime::Heartbeat;
 use tracing::warn;
 
-use super::events::{Event, Events, Saved};
-use super::metrics::DiskMetrics;
+use super::events::Events;
+use super::metrics::Metrics;
 
-/// How often the log repeats that the disk is in trouble.
+/// Interval of reminders in the log.
 const REMIND: Duration = Duration::from_secs(60);
 
-/// Whether the disk accepts what one thread writes.
+/// A thread that writes to the run's folder.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Writer {
+    /// Writes snapshots, checkpoints and metrics.
+    Snapshots,
+    Scores,
+}
+
+impl Writer {
+    pub const ALL: [Self; 2] = [Self::Snapshots, Self::Scores];
+
+    pub fn thread(self) -> &'static str {
+        match self {
+            Self::Snapshots => "snapshots",
+            Self::Scores => "scores",
+        }
+    }
+
+    /// The output as a metric's label.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Snapshots => "run",
+            Self::Scores => "scores",
+        }
+    }
+
+    fn output(self) -> &'static str {
+        match self {
+            Self::Snapshots => "the run",
+            Self::Scores => "scores",
+        }
+    }
+}
+
+/// The success of one thread's writes.
 #[derive(Debug)]
 pub(crate) struct DiskStatus {
-    what: Saved,
+    output: &'static str,
     gauge: IntGauge,
     events: Events,
-    /// When the trouble began, and when it was last logged.
+    /// Start of the trouble, and time of the last reminder.
     trouble: Option<(Instant, Instant)>,
 }
 
 impl DiskStatus {
-    /// A status without trouble.
-    pub fn new(what: Saved, metrics: &DiskMetrics, events: Events) -> Self {
-        Self { what, gauge: metrics.trouble(what), events, trouble: None }
+    pub fn new(writer: Writer, metrics: &Metrics, events: Events) -> Self {
+        let gauge = metrics.disk_trouble(writer);
+        Self { output: writer.output(), gauge, events, trouble: None }
     }
 
     /// Records that the disk refused a write.
     pub fn refused(&mut self, beat: &Heartbeat, error: &str) {
-        let (now, what) = (Instant::now(), self.what);
-        beat.set_problem(Some(format!("{} cannot be saved: {error}", what.name())));
+        let problem = format!("{} cannot be saved: {error}", self.output);
+        beat.set_problem(Some(problem.clone()));
         self.gauge.set(1);
-        let (since, said) = self.trouble.get_or_insert_with(|| {
-            self.events.send(Event::DiskTrouble(what, error.to_owned())).ok();
+        let now = Instant::now();
+        let (since, logged) = self.trouble.get_or_insert_with(|| {
+            self.events.line(format!(
+                "{problem}; training continues, and it is tried again until the disk takes it"
+            ));
             (now, now)
         });
-        if now - *said >= REMIND {
-            *said = now;
-            warn!("for {} s {} cannot be saved: {error}", (now - *since).as_secs(), what.name());
+        if now - *logged >= REMIND {
+            *logged = now;
+            warn!("for {} s {problem}", (now - *since).as_secs());
         }
     }
 
     /// Records that the disk accepted a write.
-    pub fn well(&mut self, beat: &Heartbeat) {
+    pub fn accepted(&mut self, beat: &Heartbeat) {
         beat.set_problem(None);
         // The main loop sets the gauge, too, while this thread hangs.
         self.gauge.set(0);
         if self.trouble.take().is_some() {
-            self.events.send(Event::DiskWell(self.what)).ok();
+            self.events.line(format!("{} can be saved again", self.output));
         }
     }
 }

@@ -10,16 +10,15 @@ use tracing::info;
 
 use super::metrics::Metrics;
 
-/// How often the figures on a terminal change.
-const REDRAW: Duration = Duration::from_millis(250);
-/// How often a log gets a line.
+/// Interval at which to call [`Display::tick`].
+pub(super) const REDRAW: Duration = Duration::from_millis(250);
+/// Interval of log lines.
 const LINE: Duration = Duration::from_secs(5);
-/// How long training runs before the forecast of its duration.
+/// Time of training before the forecast of its duration.
 const ESTIMATE: Duration = Duration::from_secs(3);
-/// How many of the newest evaluations are shown.
+/// Number of the newest evaluations that are shown.
 const SCORES_SHOWN: usize = 3;
 
-/// Shows the progress of a run.
 pub(crate) struct Display {
     metrics: Metrics,
     steps: u64,
@@ -32,7 +31,6 @@ pub(crate) struct Display {
     /// Newest last: gradient step and mean score.
     scores: VecDeque<(u64, f64)>,
     last_line: Instant,
-    /// Whether the forecast has been printed.
     estimated: bool,
 }
 
@@ -40,7 +38,7 @@ impl Display {
     /// Starts the display of a run with `steps` gradient steps.
     pub fn start(metrics: Metrics, steps: u64) -> Self {
         let bar = ProgressBar::with_draw_target(Some(steps), ProgressDrawTarget::stderr());
-        // Without our style the bar still works, but shows less.
+        // If our style were wrong, the bar would still work.
         if let Ok(style) =
             ProgressStyle::with_template("{bar:40} {pos}/{len} gradient steps\n{msg}")
         {
@@ -53,13 +51,7 @@ impl Display {
         Self { metrics, steps, bar, begin: now, first, scores, last_line: now, estimated: false }
     }
 
-    /// How often [`tick`](Self::tick) wants to be called.
-    pub fn interval(&self) -> Duration {
-        REDRAW
-    }
-
-    /// Prints an event as a line.
-    pub fn say(&self, text: &str) {
+    pub fn line(&self, text: &str) {
         if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(clean(text)) }
     }
 
@@ -71,7 +63,6 @@ impl Display {
         }
     }
 
-    /// Updates the figures.
     pub fn tick(&mut self, now: Instant) {
         let step = self.metrics.training.gradient_steps.get();
         self.bar.set_position(step);
@@ -95,15 +86,11 @@ impl Display {
         self.estimated = true;
         let left = self.bar.eta();
         if left > Duration::from_secs(60) {
-            self.say(&format!(
-                "{:.1} steps/s: this takes about {}",
-                self.bar.per_sec(),
-                HumanDuration(left)
-            ));
+            let (rate, left) = (self.bar.per_sec(), HumanDuration(left));
+            self.line(&format!("{rate:.1} steps/s: this takes about {left}"));
         }
     }
 
-    /// Removes the bar.
     pub fn finish(&self) {
         self.bar.finish_and_clear();
     }
@@ -117,12 +104,11 @@ impl Display {
                 parts.push(format!("{} left", HumanDuration(self.bar.eta())));
             }
         }
-        let shown = training.algorithm.iter().filter(|(metric, _)| !metric.label.is_empty());
-        parts.extend(
-            shown.filter_map(|(metric, gauge)| {
-                Some(format!("{} {:.3}", metric.label, gauge.get()?))
-            }),
-        );
+        for (metric, gauge) in &training.algorithm {
+            if let Some(value) = gauge.get().filter(|_| !metric.label.is_empty()) {
+                parts.push(format!("{} {value:.3}", metric.label));
+            }
+        }
         parts.join(", ")
     }
 
@@ -132,10 +118,9 @@ impl Display {
         if pending > 0 {
             parts.push(format!("{pending} episodes to score"));
         }
+        let scores = self.scores.iter().map(|(step, mean)| format!("{mean:.1} @{step}"));
         if !self.scores.is_empty() {
-            let scores: Vec<_> =
-                self.scores.iter().map(|(step, mean)| format!("{mean:.1} @{step}")).collect();
-            parts.push(format!("scores {}", scores.join(", ")));
+            parts.push(format!("scores {}", Vec::from_iter(scores).join(", ")));
         }
         parts.join(", ")
     }

@@ -16,10 +16,10 @@ use super::events::{Event, Events};
 /// Zenoh takes five seconds to remove the token of a learner that lost its connection, and longer
 /// on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// For this long after its start, a learner ends if it sees an earlier learner of the same name. By
-/// then the tokens of learners that started together have arrived.
+/// A learner of this age no longer ends if it sees an earlier one of the same name: the tokens of
+/// learners that started together have arrived.
 const TOGETHER: Duration = Duration::from_secs(10);
-/// How often the learner looks for another one, and how long an answer may take.
+/// Interval of the searches for another learner, and time limit of each.
 const LOOK_AGAIN: Duration = Duration::from_millis(500);
 
 /// Identifies one process of a run's learner.
@@ -33,24 +33,23 @@ pub(crate) struct Incarnation {
 /// Returns when no other learner of the run is connected.
 ///
 /// # Errors
-///
 /// Another learner is still connected when the token of a dead one would be gone.
 pub(super) async fn wait_until_gone(
     session: &Session,
     incarnation: &Incarnation,
 ) -> anyhow::Result<()> {
     let deadline = Instant::now() + PATIENCE;
-    let mut said = false;
+    let mut logged = false;
     while let Some(other) = another(session, incarnation).await? {
         if Instant::now() >= deadline {
-            return Err(is_there(incarnation, other));
+            return Err(conflict(incarnation, other));
         }
-        if !said {
+        if !logged {
+            let run = &incarnation.run;
             info!(
-                "another learner of run {} was here a moment ago; waiting to see if it is gone",
-                incarnation.run
+                "another learner of run {run} was here a moment ago; waiting to see if it is gone"
             );
-            said = true;
+            logged = true;
         }
         tokio::time::sleep(LOOK_AGAIN).await;
     }
@@ -58,12 +57,9 @@ pub(super) async fn wait_until_gone(
 }
 
 async fn another(session: &Session, incarnation: &Incarnation) -> anyhow::Result<Option<u64>> {
-    let asked = session
-        .liveliness()
-        .get(keys::all_incarnations(&incarnation.run))
-        .timeout(LOOK_AGAIN)
-        .await;
-    let replies = asked.map_err(anyhow::Error::from_boxed)?;
+    let liveliness = session.liveliness();
+    let query = liveliness.get(keys::all_incarnations(&incarnation.run)).timeout(LOOK_AGAIN);
+    let replies = query.await.map_err(anyhow::Error::from_boxed)?;
     while let Ok(reply) = replies.recv_async().await {
         let found =
             reply.result().ok().and_then(|token| keys::incarnation_of(token.key_expr().as_str()));
@@ -81,19 +77,18 @@ pub(super) async fn watch(
     incarnation: &Incarnation,
     events: &Events,
 ) -> anyhow::Result<()> {
-    let (mine, events, told) = (incarnation.clone(), events.clone(), AtomicBool::new(false));
+    let (mine, events, reported) = (incarnation.clone(), events.clone(), AtomicBool::new(false));
     let callback = move |token: Sample| {
-        let there = token.kind() == SampleKind::Put;
-        let found = keys::incarnation_of(token.key_expr().as_str());
-        let earlier = found.filter(|other| there && *other < mine.number);
-        if let Some(other) = earlier
-            && !told.swap(true, Ordering::Relaxed)
+        if let Some(other) = keys::incarnation_of(token.key_expr().as_str())
+            && token.kind() == SampleKind::Put
+            && other < mine.number
+            && !reported.swap(true, Ordering::Relaxed)
         {
-            events.send(Event::Failed(is_there(&mine, other))).ok();
+            events.send(Event::Failed(conflict(&mine, other)));
         }
     };
-    let tokens = session
-        .liveliness()
+    let liveliness = session.liveliness();
+    let tokens = liveliness
         .declare_subscriber(keys::all_incarnations(&incarnation.run))
         .history(true)
         .callback(callback);
@@ -107,11 +102,9 @@ pub(super) async fn watch(
     Ok(())
 }
 
-fn is_there(incarnation: &Incarnation, other: u64) -> anyhow::Error {
+fn conflict(Incarnation { run, number }: &Incarnation, other: u64) -> anyhow::Error {
     let error = anyhow!(
-        "there is another learner of run {} (incarnation {other}, this one is {})",
-        incarnation.run,
-        incarnation.number
+        "there is another learner of run {run} (incarnation {other}, this one is {number})"
     );
     hinted(error, "choose another name for the folder with --run-dir, or stop the other learner")
 }

@@ -1,13 +1,13 @@
-//! Which evaluators are connected, when each last reported progress, and the log lines about them.
+//! The connected evaluators, their last progress messages, and the log lines about them.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::mem;
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{Name, Progress};
-use serde::Serialize;
+use serde_json::{Value, json};
 
-use super::metrics::EvaluatorMetrics;
+use super::events::Events;
+use super::metrics::Metrics;
 use super::requests::NotAccepted;
 
 /// The metrics of an evaluator that has left are dropped this long after its last progress message.
@@ -15,170 +15,171 @@ const FORGET_AFTER: Duration = Duration::from_secs(600);
 /// Most evaluators that the learner tracks: far above any real pool. The limit bounds the memory
 /// that made-up names take.
 const MOST_EVALUATORS: usize = 1024;
-/// So many evaluators per period get a log line of their own; the rest are one line with a number.
-const ONE_BY_ONE: usize = 20;
+/// Most log lines in a period about evaluators that come and go; the rest are counted.
+const MOST_LINES: usize = 20;
 const PERIOD: Duration = Duration::from_secs(10);
 
-/// A connected evaluator.
-#[derive(Debug, Serialize)]
-pub(super) struct EvaluatorAtWork {
-    pub name: String,
-    /// Whether it has asked for a job, and has the run's environment.
-    pub fits: bool,
-    /// Time since its last progress message.
-    pub seconds_ago: Option<f64>,
-    pub job: Option<JobAtWork>,
-}
-
-/// Its job.
-#[derive(Debug, Serialize)]
-pub(super) struct JobAtWork {
-    /// Gradient step of the snapshot.
-    pub step: u64,
-    /// Episodes that have ended.
-    pub done: u32,
-    /// Episodes.
-    pub episodes: usize,
-}
-
-/// The connected evaluators, and those whose last message is recent.
 #[derive(Debug)]
 pub(super) struct Evaluators {
-    metrics: EvaluatorMetrics,
-    present: BTreeSet<Name>,
-    /// Whether each connected evaluator that has asked for a job has the run's environment.
-    asked: BTreeMap<Name, bool>,
+    metrics: Metrics,
+    events: Events,
+    /// The connected evaluators, and whether each has the run's environment, once it has asked for
+    /// a job.
+    present: BTreeMap<Name, Option<bool>>,
     last_seen: BTreeMap<Name, Instant>,
-    news: News,
+    /// Start of the period, and how often an evaluator has come or gone in it.
+    period: (Instant, usize),
 }
 
 impl Evaluators {
-    pub fn new(metrics: EvaluatorMetrics, now: Instant) -> Self {
-        let news = News { since: now, told: 0, joined: 0, left: 0, lines: Vec::new() };
-        Self {
-            metrics,
-            present: BTreeSet::new(),
-            asked: BTreeMap::new(),
-            last_seen: BTreeMap::new(),
-            news,
-        }
+    pub fn new(metrics: Metrics, events: Events, now: Instant) -> Self {
+        let (present, last_seen) = (BTreeMap::new(), BTreeMap::new());
+        Self { metrics, events, present, last_seen, period: (now, 0) }
     }
 
-    /// The number of connected evaluators.
     pub fn count(&self) -> usize {
         self.present.len()
     }
 
-    /// Whether a connected evaluator may have the run's environment. One that has not asked for a
-    /// job yet may: it may be at a long job of another run.
+    /// True if a connected evaluator may have the run's environment. An evaluator that has not asked
+    /// for a job yet may: it may be at a long job of another run.
     pub fn any_may_fit(&self) -> bool {
-        self.present.iter().any(|evaluator| self.asked.get(evaluator) != Some(&false))
+        self.present.values().any(|fits| *fits != Some(false))
     }
 
-    /// The connected evaluators: whether each is known to have the run's environment, and when its
-    /// last message came.
-    pub fn present(&self) -> impl Iterator<Item = (&Name, bool, Option<Instant>)> {
-        let fits = |evaluator: &Name| self.asked.get(evaluator) == Some(&true);
-        let seen = |evaluator: &Name| self.last_seen.get(evaluator).copied();
-        self.present.iter().map(move |evaluator| (evaluator, fits(evaluator), seen(evaluator)))
+    /// The connected evaluators, for the page.
+    pub fn to_json(&self, job_of: impl Fn(&Name) -> Option<Value>) -> Vec<Value> {
+        let evaluator = |(name, fits): (&Name, &Option<bool>)| {
+            json!({
+                "name": name.as_str(),
+                "fits": *fits == Some(true),
+                "seconds_ago": self.last_seen.get(name).map(|seen| seen.elapsed().as_secs_f64()),
+                "job": job_of(name),
+            })
+        };
+        self.present.iter().map(evaluator).collect()
     }
 
     /// Records that an evaluator asked for a job, and whether it has the run's environment.
-    pub fn asks(&mut self, evaluator: &Name, fits: bool) {
-        if self.present.contains(evaluator) && self.asked.get(evaluator) != Some(&fits) {
-            self.asked.insert(evaluator.clone(), fits);
+    pub fn asked(&mut self, evaluator: &Name, fits: bool) {
+        if let Some(known) = self.present.get_mut(evaluator) {
+            *known = Some(fits);
         }
     }
 
-    /// Records that an evaluator is connected.
     pub fn joined(&mut self, evaluator: Name) -> Result<(), NotAccepted> {
-        if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {
+        if self.present.contains_key(&evaluator) {
+            return Ok(());
+        }
+        if self.present.len() >= MOST_EVALUATORS {
             return Err(NotAccepted::Crowd);
         }
-        let line = format!("evaluator {evaluator} is here");
-        if self.present.insert(evaluator) && !self.news.tell(line) {
-            self.news.joined += 1;
-        }
-        self.metrics.present.set(self.present.len() as i64);
+        self.line(format!("evaluator {evaluator} is here"));
+        self.present.insert(evaluator, None);
+        self.metrics.evaluators.present.set(self.present.len() as i64);
         Ok(())
     }
 
-    /// Records that an evaluator has left; the learner took back `jobs` of its jobs.
-    pub fn left(&mut self, evaluator: &Name, jobs: usize) {
-        if !self.present.remove(evaluator) {
+    /// Records that an evaluator has left; `had_job` if the learner took a job back.
+    pub fn left(&mut self, evaluator: &Name, had_job: bool) {
+        if self.present.remove(evaluator).is_none() {
             return;
         }
-        self.asked.remove(evaluator);
-        self.metrics.present.set(self.present.len() as i64);
-        let line = match jobs {
-            0 => format!("evaluator {evaluator} has left or lost its connection"),
-            _ => format!(
-                "evaluator {evaluator} has left or lost its connection; its unfinished job goes to others"
-            ),
-        };
-        if !self.news.tell(line) {
-            self.news.left += 1;
+        self.metrics.evaluators.present.set(self.present.len() as i64);
+        let job = if had_job { "; its unfinished job goes to others" } else { "" };
+        self.line(format!("evaluator {evaluator} has left or lost its connection{job}"));
+    }
+
+    fn line(&mut self, text: String) {
+        self.period.1 += 1;
+        if self.period.1 <= MOST_LINES {
+            self.events.line(text);
         }
     }
 
-    /// Records an evaluator's progress message.
-    pub fn heard(&mut self, progress: Progress, now: Instant) -> Result<(), NotAccepted> {
-        if self.last_seen.len() >= MOST_EVALUATORS
-            && !self.last_seen.contains_key(&progress.evaluator)
-        {
+    pub fn progress(&mut self, progress: Progress, now: Instant) -> Result<(), NotAccepted> {
+        let is_known = self.last_seen.contains_key(&progress.evaluator);
+        if self.last_seen.len() >= MOST_EVALUATORS && !is_known {
             return Err(NotAccepted::Crowd);
         }
-        self.metrics.observe(&progress);
+        self.metrics.evaluators.observe(&progress);
         self.last_seen.insert(progress.evaluator, now);
         Ok(())
     }
 
-    /// Forgets evaluators that left long ago. Returns the log lines since the last call.
-    pub fn tick(&mut self, now: Instant) -> Vec<String> {
-        let (present, metrics) = (&self.present, &self.metrics);
+    /// Forgets evaluators that left long ago, and reports how many lines the period had too many.
+    pub fn tick(&mut self, now: Instant) {
         self.last_seen.retain(|evaluator, seen| {
-            let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;
+            let is_recent = now.duration_since(*seen) < FORGET_AFTER;
+            let keep = is_recent || self.present.contains_key(evaluator);
             if !keep {
-                metrics.forget(evaluator);
+                self.metrics.evaluators.forget(evaluator);
             }
             keep
         });
-        self.news.take(now)
-    }
-}
-
-/// Log lines about evaluators that come and go: one for each of a few, a number for many.
-#[derive(Debug)]
-struct News {
-    since: Instant,
-    told: usize,
-    joined: usize,
-    left: usize,
-    lines: Vec<String>,
-}
-
-impl News {
-    /// Whether this one gets a line of its own.
-    fn tell(&mut self, line: String) -> bool {
-        self.told += 1;
-        let may = self.told <= ONE_BY_ONE;
-        if may {
-            self.lines.push(line);
-        }
-        may
-    }
-
-    fn take(&mut self, now: Instant) -> Vec<String> {
-        if now.duration_since(self.since) >= PERIOD {
-            if self.joined + self.left > 0 {
-                self.lines
-                    .push(format!("{} more evaluators came and {} left", self.joined, self.left));
+        let (since, lines) = self.period;
+        if now.duration_since(since) >= PERIOD {
+            if lines > MOST_LINES {
+                let more = lines - MOST_LINES;
+                self.events.line(format!("evaluators came or left {more} more times"));
             }
-            (self.since, self.told, self.joined, self.left) = (now, 0, 0, 0);
+            self.period = (now, 0);
         }
-        mem::take(&mut self.lines)
     }
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use tokio::sync::mpsc::unbounded_channel;
+
+    use super::super::events::Event;
+    use super::*;
+
+    fn name(number: usize) -> Name {
+        Name::new(format!("e-{number}")).unwrap()
+    }
+
+    #[test]
+    fn floods_of_evaluators_are_bounded_in_number_and_in_lines() {
+        let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), 1, &[]).unwrap();
+        let ((tx, mut rx), now) = (unbounded_channel(), Instant::now());
+        let mut lines = || Vec::from_iter(std::iter::from_fn(|| rx.try_recv().ok()));
+        let mut evaluators = Evaluators::new(metrics, Events(tx), now);
+        for number in 0..2 * MOST_EVALUATORS {
+            assert_eq!(evaluators.joined(name(number)).is_ok(), number < MOST_EVALUATORS);
+        }
+        for number in 0..2 * MOST_EVALUATORS {
+            evaluators.left(&name(number), false);
+        }
+        evaluators.tick(now);
+        assert_eq!(lines().len(), MOST_LINES, "the period is not over");
+        evaluators.tick(now + PERIOD);
+        let more = 2 * MOST_EVALUATORS - MOST_LINES;
+        let expected = format!("evaluators came or left {more} more times");
+        assert!(matches!(&lines()[..], [Event::Line(line)] if *line == expected));
+        evaluators.joined(name(7)).unwrap();
+        assert_eq!(lines().len(), 1, "a new period");
+    }
+
+    /// A trained run waits for an evaluator at a long job of another run, and not for one that can
+    /// do nothing here.
+    #[test]
+    fn an_evaluator_may_fit_until_it_asks_for_other_work() {
+        let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), 1, &[]).unwrap();
+        let events = Events(unbounded_channel().0);
+        let mut evaluators = Evaluators::new(metrics, events, Instant::now());
+        evaluators.asked(&name(1), true);
+        assert!(!evaluators.any_may_fit(), "it is not connected");
+        evaluators.joined(name(1)).unwrap();
+        assert!(evaluators.any_may_fit(), "it has not asked");
+        evaluators.asked(&name(1), false);
+        assert!(!evaluators.any_may_fit());
+        evaluators.joined(name(2)).unwrap();
+        evaluators.asked(&name(2), true);
+        assert!(evaluators.any_may_fit());
+        let fits = evaluators.to_json(|_| None).into_iter().map(|shown| shown["fits"] == true);
+        assert_eq!(Vec::from_iter(fits), [false, true]);
+        evaluators.left(&name(2), false);
+        assert!(!evaluators.any_may_fit());
+    }
+}

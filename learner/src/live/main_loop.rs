@@ -4,23 +4,24 @@ use std::time::{Duration, Instant};
 
 use quad_run::folder::RunDir;
 use quad_run::results::Spread;
-use quad_runtime::{Endpoints, Health, Heartbeat};
+use quad_runtime::{Endpoints, Health, Heartbeat, LEAVE_WITHIN, shutdown_signal};
 use tokio::sync::mpsc::UnboundedReceiver;
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, LocalSet};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{error, warn};
 
-use super::display::{Display, evaluators};
+use super::disk::Writer;
+use super::display::{Display, REDRAW, evaluators};
 use super::duplicate::Incarnation;
-use super::events::{Event, Saved};
+use super::events::Event;
 use super::metrics::Metrics;
 use super::network::{Online, Opening, Wire, go_online};
-use super::patience::{Patience, Verdict, how_to_evaluate};
+use super::patience::{Patience, Verdict, advice};
 use super::threads::{STUCK, Threads};
 use crate::local_evaluators::LocalEvaluators;
 use crate::train::Outcome;
 
-/// When so many evaluations wait for scores, the evaluators are slower than the training.
+/// Number of evaluations without scores from which on the evaluators are called slow.
 const BEHIND: usize = 3;
 /// Time limit for closing the session, if the network hangs.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
@@ -28,7 +29,6 @@ const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// trouble, too.
 const LAST_WRITES: Duration = Duration::from_secs(15);
 
-/// How a run ended.
 #[derive(Debug)]
 pub(crate) enum Ending {
     /// Training is complete, and every episode has a score or was given up.
@@ -37,18 +37,16 @@ pub(crate) enum Ending {
     Interrupted,
     /// Training is complete, but no evaluator came that may have the run's environment.
     Unscored,
-    /// The run could not continue.
     Failed(anyhow::Error),
 }
 
-/// What the loop needs.
 pub(crate) struct MainLoop {
     pub incarnation: Incarnation,
     pub run_dir: RunDir,
     pub metrics: Metrics,
     /// The address of `/metrics`.
     pub metrics_address: String,
-    /// Where the learner listens or connects, as the command line asks.
+    /// The endpoints of the command line.
     pub endpoints: Endpoints,
     pub events: UnboundedReceiver<Event>,
     pub threads: Threads,
@@ -56,29 +54,28 @@ pub(crate) struct MainLoop {
     pub health: Health,
     /// Reports that this loop is alive. It is not if a full pipe blocks its output.
     pub beat: Heartbeat,
-    /// The evaluators that it starts.
     pub evaluators: LocalEvaluators,
 }
 
 /// The state of the run, as far as the loop knows.
 #[derive(Default)]
-struct Reached {
+struct State {
     trained: bool,
     interrupted: bool,
     wire: Option<Wire>,
-    /// Where evaluators can reach the run; empty until it is online.
+    /// Endpoints for evaluators; empty until the run is online.
     reachable_at: Vec<String>,
-    /// Outputs whose disk hangs, as reported.
-    hangs: Vec<Saved>,
-    /// Whether it was said that the evaluators are slow.
-    is_behind: bool,
+    /// Threads whose disk hangs, as reported.
+    hanging: Vec<Writer>,
+    reported_behind: bool,
     patience: Patience,
 }
 
 impl MainLoop {
-    /// Runs until the end, then ends the threads and the session.
+    /// Runs until the end, then ends the threads and the session. Call it on the main thread: the
+    /// evaluators end with it.
     pub async fn run(mut self, opening: Opening) -> Ending {
-        let online = tokio::spawn(go_online(
+        let mut online = tokio::spawn(go_online(
             opening,
             self.endpoints.clone(),
             self.incarnation.clone(),
@@ -86,20 +83,24 @@ impl MainLoop {
             self.run_dir.clone(),
             self.metrics_address.clone(),
         ));
-        let mut reached = Reached::default();
-        let mut ending = self.watch(online, &mut reached).await;
+        // Its context is limited to what the evaluators need: in it Zenoh may not block the thread,
+        // as it does when a session is dropped.
+        let local = LocalSet::new();
+        let mut state = State::default();
+        let mut ending = local.run_until(self.watch(&mut online, &mut state)).await;
         self.display.finish();
-        // All that the ending takes happens at the same time: after a signal there is little of it.
-        tokio::join!(end(self.threads, &ending), self.evaluators.end());
+        // Everything ends at the same time: after a signal there is little of it.
+        let evaluators = local.run_until(self.evaluators.end());
+        tokio::join!(end(self.threads, &ending), evaluators);
         while let Ok(event) = self.events.try_recv() {
             match (event, &ending) {
                 // The reason of the failure is known already.
                 (Event::Failed(_), Ending::Failed(_)) => {}
                 (Event::Failed(error), _) => ending = Ending::Failed(error),
-                (event, _) => tell(event, &mut self.display),
+                (event, _) => report(event, &mut self.display),
             }
         }
-        if let Some(wire) = reached.wire {
+        if let Some(wire) = state.wire {
             // An evaluator that misses this message notices the lost connection.
             timeout(CLOSE_PATIENCE, tokio::spawn(wire.close())).await.ok();
         }
@@ -108,98 +109,88 @@ impl MainLoop {
 
     async fn watch(
         &mut self,
-        mut online: JoinHandle<anyhow::Result<Online>>,
-        reached: &mut Reached,
+        online: &mut JoinHandle<anyhow::Result<Online>>,
+        state: &mut State,
     ) -> Ending {
-        let mut shutdown =
-            std::pin::pin!(quad_runtime::shutdown_signal(quad_runtime::LEAVE_WITHIN));
-        let mut ticker = interval(self.display.interval());
+        let mut shutdown = std::pin::pin!(shutdown_signal(LEAVE_WITHIN));
+        let mut ticker = interval(REDRAW);
         ticker.set_missed_tick_behavior(MissedTickBehavior::Skip);
         let mut is_online = false;
         loop {
             tokio::select! {
-                result = &mut online, if !is_online => {
+                result = &mut *online, if !is_online => {
                     is_online = true;
-                    match result.map_err(anyhow::Error::from).flatten() {
-                        Ok(online) => {
-                            if let Err(error) = self.online(online, reached) {
-                                return Ending::Failed(error);
-                            }
-                        }
-                        Err(error) => return Ending::Failed(error),
+                    let online = result.map_err(anyhow::Error::from).flatten();
+                    if let Err(error) = online.and_then(|online| self.online(online, state)) {
+                        return Ending::Failed(error);
                     }
                 }
                 Some(event) = self.events.recv() => match event {
                     Event::Failed(error) => return Ending::Failed(error),
                     Event::TrainingEnded(Outcome::Stopped { .. }) => return Ending::Interrupted,
                     // The stop came during the last step; the run does not wait for scores.
-                    Event::TrainingEnded(Outcome::Completed) if reached.interrupted => return Ending::Interrupted,
+                    Event::TrainingEnded(_) if state.interrupted => return Ending::Interrupted,
                     Event::TrainingEnded(Outcome::Completed) => {
-                        reached.trained = true;
-                        self.display.say(&self.trained());
+                        state.trained = true;
+                        self.display.line(&self.trained());
                     }
                     event => {
                         let published = matches!(event, Event::Published { .. });
-                        tell(event, &mut self.display);
-                        if published && !reached.is_behind {
-                            reached.is_behind = self.say_if_behind();
+                        report(event, &mut self.display);
+                        if published && !state.reported_behind {
+                            state.reported_behind = self.report_if_behind();
                         }
                     }
                 },
                 _ = ticker.tick() => {
-                    if let Verdict::GiveUp = self.tick(reached) {
+                    if let Verdict::GiveUp = self.tick(state) {
                         return Ending::Unscored;
                     }
-                    if reached.trained && self.threads.services.coordinator.pending() == 0 {
+                    if state.trained && self.threads.coordinator().pending() == 0 {
                         return Ending::Complete;
                     }
                 }
-                () = &mut shutdown, if !reached.interrupted => {
-                    reached.interrupted = true;
-                    if reached.trained {
+                () = &mut shutdown, if !state.interrupted => {
+                    state.interrupted = true;
+                    if state.trained {
                         return Ending::Interrupted;
                     }
-                    self.display.say("stopping after this gradient step");
+                    self.display.line("stopping after this gradient step");
                     self.threads.stop_training();
                 }
             }
         }
     }
 
-    fn online(&mut self, online: Online, reached: &mut Reached) -> anyhow::Result<()> {
-        let (zenoh, metrics) = (online.reachable_at.join(", "), &self.metrics_address);
-        self.display.say(&format!(
-            "run {} is at {zenoh}, its metrics at http://{metrics}/metrics",
-            self.incarnation.run
-        ));
-        reached.reachable_at = online.reachable_at;
-        reached.wire = Some(online.wire);
-        self.evaluators.start(
-            &reached.reachable_at,
-            self.run_dir.path(),
-            self.incarnation.run.as_str(),
-        )
+    fn online(&mut self, online: Online, state: &mut State) -> anyhow::Result<()> {
+        let (run, zenoh) = (&self.incarnation.run, online.reachable_at.join(", "));
+        let metrics = &self.metrics_address;
+        self.display
+            .line(&format!("run {run} is at {zenoh}, its metrics at http://{metrics}/metrics"));
+        state.reachable_at = online.reachable_at;
+        state.wire = Some(online.wire);
+        let events = self.threads.coordinator().events.clone();
+        let report = move |line| events.line(line);
+        self.evaluators.start(&state.reachable_at, self.run_dir.path(), run.as_str(), report)
     }
 
     fn trained(&self) -> String {
-        match self.threads.services.coordinator.pending() {
+        let present = evaluators(self.metrics.evaluators.present.get());
+        match self.threads.coordinator().pending() {
             0 => "training is done".to_owned(),
-            pending => {
-                let present = evaluators(self.metrics.evaluators.present.get());
-                format!(
-                    "training is done; waiting for the scores of {pending} episodes ({present} here)"
-                )
-            }
+            pending => format!(
+                "training is done; waiting for the scores of {pending} episodes ({present} here)"
+            ),
         }
     }
 
-    /// Says that the evaluators are slower than the training, if that is so. A run without any says
-    /// so elsewhere.
-    fn say_if_behind(&self) -> bool {
-        let waiting = self.threads.services.coordinator.evaluations_pending();
+    /// Reports once that the evaluators are slower than the training. A run without any reports
+    /// that elsewhere.
+    fn report_if_behind(&self) -> bool {
+        let waiting = self.threads.coordinator().evaluations_pending();
         let is_behind = waiting >= BEHIND && self.metrics.evaluators.present.get() > 0;
         if is_behind {
-            self.display.say(&format!(
+            self.display.line(&format!(
                 "the evaluators are slower than the training, which does not wait for them: {waiting} evaluations have no \
                  score yet; more evaluators or a longer --eval-interval end the run sooner"
             ));
@@ -207,95 +198,67 @@ impl MainLoop {
         is_behind
     }
 
-    fn tick(&mut self, reached: &mut Reached) -> Verdict {
+    fn tick(&mut self, state: &mut State) -> Verdict {
         self.beat.alive();
-        for line in self.threads.services.coordinator.tick() {
-            self.display.say(&line);
-        }
-        self.watch_disk(&mut reached.hangs);
+        self.threads.coordinator().tick();
+        self.watch_disk(&mut state.hanging);
         self.display.tick(Instant::now());
-        for line in self.evaluators.news() {
-            self.display.say(&line);
-        }
-        if !reached.trained {
+        if !state.trained {
             return Verdict::Wait;
         }
-        let verdict =
-            reached.patience.look(self.threads.services.coordinator.any_may_fit(), Instant::now());
+        let any_may_fit = self.threads.coordinator().any_may_fit();
+        let verdict = state.patience.check(any_may_fit, Instant::now());
         if let Verdict::Advise = verdict {
-            self.display.say(&self.advice(&reached.reachable_at));
+            let advice = match state.reachable_at.first() {
+                None => format!(
+                    "no router has answered at {} yet; the scores wait for it",
+                    self.endpoints.connect.join(", ")
+                ),
+                Some(endpoint) => {
+                    let environment = self.threads.coordinator().environment();
+                    advice(environment, endpoint, self.evaluators.log())
+                }
+            };
+            self.display.line(&advice);
         }
         verdict
     }
 
     /// A thread that writes and has not reported for long waits for the disk.
-    fn watch_disk(&self, told: &mut Vec<Saved>) {
-        let hangs: Vec<_> =
-            Saved::ALL.into_iter().filter(|what| self.health.is_silent(what.thread())).collect();
-        for what in hangs.iter().filter(|what| !told.contains(what)) {
-            self.metrics.disk.trouble(*what).set(1);
-            let waits = match what {
-                Saved::Run => "snapshots and checkpoints wait for it; training continues",
-                Saved::Scores => "scores wait for it; evaluators keep theirs",
+    fn watch_disk(&self, reported: &mut Vec<Writer>) {
+        let mut hanging = Vec::from(Writer::ALL);
+        hanging.retain(|writer| self.health.is_silent(writer.thread()));
+        for writer in hanging.iter().filter(|writer| !reported.contains(writer)) {
+            self.metrics.disk_trouble(*writer).set(1);
+            let waits = match writer {
+                Writer::Snapshots => "snapshots and checkpoints wait for it; training continues",
+                Writer::Scores => "scores wait for it; evaluators keep theirs",
             };
             let silent = STUCK.as_secs();
-            self.display.say(&format!(
+            self.display.line(&format!(
                 "nothing was saved for {silent} s, as the disk hangs or the machine is too busy: {waits}"
             ));
         }
-        *told = hangs;
-    }
-
-    fn advice(&self, reachable_at: &[String]) -> String {
-        match reachable_at {
-            [] => {
-                format!(
-                    "no router has answered at {} yet; the scores wait for it",
-                    self.endpoints.connect.join(", ")
-                )
-            }
-            [endpoint, ..] => how_to_evaluate(
-                self.threads.services.coordinator.environment(),
-                endpoint,
-                self.evaluators.log(),
-            ),
-        }
+        *reported = hanging;
     }
 }
 
-/// Reports an event.
-fn tell(event: Event, display: &mut Display) {
-    let text = match event {
-        Event::Published { step } => format!("step {step}: snapshot handed to evaluation"),
-        Event::GivenUp(episodes) => {
-            let episodes = episodes.len();
-            format!(
-                "{episodes} episodes are given up: too many evaluators were lost with them or could not do them"
-            )
+fn report(event: Event, display: &mut Display) {
+    match event {
+        Event::Line(line) => display.line(&line),
+        Event::Published { step } => {
+            display.line(&format!("step {step}: snapshot handed to evaluation"));
         }
-        Event::JobFailed { step, evaluator, reason } => {
-            format!(
-                "evaluator {evaluator} could not do a job of step {step}, which goes to others: {reason}"
-            )
-        }
-        Event::SameName(name) => format!(
-            "two evaluators were started with --name {name}, and one of them gets no work; give each a name of its own"
-        ),
         Event::Evaluated { step, scores } => {
-            let values: Vec<_> = scores.iter().map(|score| score.score).collect();
-            let Some(Spread { mean, std, .. }) = Spread::of(&values) else { return };
+            let scores = Vec::from_iter(scores.iter().map(|score| score.score));
+            let Some(Spread { mean, std, .. }) = Spread::of(&scores) else { return };
             display.scored(step, mean);
-            let std = std.map(|std| format!(" ± {std:.2}")).unwrap_or_default();
-            format!("step {step}: score {mean:.2}{std} over {} episodes", values.len())
+            let (std, count) =
+                (std.map(|std| format!(" ± {std:.2}")).unwrap_or_default(), scores.len());
+            display.line(&format!("step {step}: score {mean:.2}{std} over {count} episodes"));
         }
-        Event::DiskTrouble(what, error) => format!(
-            "{} cannot be saved: {error}; training continues, and it is tried again until the disk takes it",
-            what.name()
-        ),
-        Event::DiskWell(what) => format!("{} can be saved again", what.name()),
-        Event::TrainingEnded(_) | Event::Failed(_) => return,
-    };
-    display.say(&text);
+        Event::TrainingEnded(_) | Event::Failed(_) => {}
+    }
 }
 
 /// Ends the threads. Those of a failed run get limited time; meanwhile the user reads why it

@@ -13,8 +13,7 @@
 //! - `snapshots` is the thread that writes the output of training, and publishes snapshots through
 //!   `weights`.
 //! - `services` assigns each kind of message to a pool of threads or to the thread `scores`, which
-//!   writes scores. `requests`: queries that wait for their answer, and why a message was not
-//!   accepted.
+//!   writes scores. `requests` are queries that wait for their answer.
 //! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`.
 //! - `metrics` are for Prometheus; `disk` reports a disk that refuses writes; `display` is the
 //!   terminal, `page_state` the state for the page.
@@ -40,8 +39,9 @@ mod weights;
 
 pub(crate) use display::Display;
 pub(crate) use duplicate::Incarnation;
+pub(crate) use events::Events;
 pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;
 pub(crate) use network::{Opening, open_network};
-pub(crate) use page_state::Live;
+pub(crate) use page_state::PageState;
 pub(crate) use threads::{Run, STUCK, Threads};

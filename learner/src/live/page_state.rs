@@ -11,28 +11,17 @@ use super::metrics::Metrics;
 
 /// A handle to the state. Clones share it.
 #[derive(Clone)]
-pub(crate) struct Live {
-    run: Name,
-    steps: u64,
-    metrics: Metrics,
-    health: Health,
+pub(crate) struct PageState {
+    pub run: Name,
+    pub steps: u64,
+    pub metrics: Metrics,
+    pub health: Health,
     /// Set once the threads run.
-    coordinator: Arc<OnceLock<Coordinator>>,
+    pub coordinator: Arc<OnceLock<Coordinator>>,
 }
 
-impl Live {
-    /// The state of a run of `steps` gradient steps that is about to begin.
-    pub fn new(run: Name, steps: u64, metrics: Metrics, health: Health) -> Self {
-        Self { run, steps, metrics, health, coordinator: Arc::default() }
-    }
-
-    /// Records that the run has begun.
-    pub(super) fn begun(&self, coordinator: Coordinator) {
-        self.coordinator.set(coordinator).ok();
-    }
-
-    /// The state as JSON.
-    pub fn tell(&self) -> Value {
+impl PageState {
+    pub fn to_json(&self) -> Value {
         json!({
             "run": self.run.as_str(),
             "step": self.metrics.training.gradient_steps.get(),

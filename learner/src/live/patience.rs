@@ -5,31 +5,29 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
 
-/// After this time the learner says what to do.
+/// After this time the learner advises the user to start an evaluator.
 const ADVISE: Duration = Duration::from_secs(10);
 /// After this time the run ends without its scores; the same command waits again.
 const GIVE_UP: Duration = Duration::from_secs(600);
 
-/// How long no evaluator has been connected that could score the run.
+/// The time without an evaluator that could score the run.
 #[derive(Default)]
 pub(super) struct Patience {
     since: Option<Instant>,
     advised: bool,
 }
 
-/// What the main loop should do.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Verdict {
     Wait,
-    /// Say what to do: once in each period without such an evaluator.
+    /// Comes once in each period without such an evaluator.
     Advise,
     GiveUp,
 }
 
 impl Patience {
-    /// Checks whether an evaluator is connected.
-    pub fn look(&mut self, there: bool, now: Instant) -> Verdict {
-        if there {
+    pub fn check(&mut self, any_evaluator: bool, now: Instant) -> Verdict {
+        if any_evaluator {
             *self = Self::default();
             return Verdict::Wait;
         }
@@ -45,22 +43,20 @@ impl Patience {
     }
 }
 
-/// A hint for a run without an evaluator that has its environment. `own` is the log of one that the
-/// learner has started.
-pub(super) fn how_to_evaluate(name: &str, endpoint: &str, own: Option<&Path>) -> String {
-    match (environment::find(name), own) {
-        (Ok(_), Some(log)) => {
-            let log = log.display();
-            format!(
-                "this learner's evaluators have not connected yet; if they do not, their log may say why: {log}"
-            )
-        }
+/// Advice for a run without an evaluator that has its environment. `log` is that of an evaluator
+/// which the learner has started.
+pub(super) fn advice(environment: &str, endpoint: &str, log: Option<&Path>) -> String {
+    match (environment::find(environment), log) {
+        (Ok(_), Some(log)) => format!(
+            "this learner's evaluators have not connected yet; if they do not, their log may say why: {}",
+            log.display()
+        ),
         (Ok(_), None) => {
             format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}")
         }
         (Err(_), _) => format!(
-            "no evaluator is here that has the environment {name}; from Python: \
-             quad_rl.evaluate(\"{name}\", YOUR_ENVIRONMENT, connect=\"{endpoint}\") (docs/python.md)"
+            "no evaluator is here that has the environment {environment}; from Python: \
+             quad_rl.evaluate(\"{environment}\", YOUR_ENVIRONMENT, connect=\"{endpoint}\") (docs/python.md)"
         ),
     }
 }
@@ -69,37 +65,27 @@ pub(super) fn how_to_evaluate(name: &str, endpoint: &str, own: Option<&Path>) ->
 mod tests {
     use super::*;
 
-    /// On a busy machine they take longer to start than the learner takes to train.
+    /// On a busy machine evaluators take longer to start than the learner takes to train.
     #[test]
-    fn who_has_started_evaluators_is_not_told_to_start_one() {
-        let endpoint = "tcp/127.0.0.1:7447";
-        let own = Some(Path::new("runs/mine/evaluator-1.log"));
-        let [none, some] = [None, own].map(|own| how_to_evaluate("hopper", endpoint, own));
-        assert!(
-            none.contains("start one with: evaluator serve --connect tcp/127.0.0.1:7447"),
-            "{none}"
-        );
-        assert!(
-            !some.contains("start one") && some.contains("runs/mine/evaluator-1.log"),
-            "{some}"
-        );
-        assert!(
-            how_to_evaluate("my-robot", endpoint, own).contains("quad_rl.evaluate(\"my-robot\"")
-        );
+    fn the_advice_depends_on_the_environment_and_the_learners_own_evaluators() {
+        let log = Some(Path::new("runs/mine/evaluator-1.log"));
+        for (environment, log, expected) in [
+            ("hopper", None, "start one with: evaluator serve --connect tcp/127.0.0.1:7447"),
+            ("hopper", log, "may say why: runs/mine/evaluator-1.log"),
+            ("my-robot", log, "quad_rl.evaluate(\"my-robot\""),
+        ] {
+            let advice = advice(environment, "tcp/127.0.0.1:7447", log);
+            assert!(advice.contains(expected), "{advice}");
+        }
     }
 
     #[test]
     fn an_evaluator_that_comes_starts_the_time_anew() {
+        use Verdict::{Advise, GiveUp, Wait};
         let (mut patience, begin) = (Patience::default(), Instant::now());
-        let mut look = |there, seconds| patience.look(there, begin + Duration::from_secs(seconds));
-        assert_eq!([0, 9, 10, 11, 599].map(|s| look(false, s)), {
-            use Verdict::{Advise, Wait};
-            [Wait, Wait, Advise, Wait, Wait]
-        });
-        assert_eq!(look(true, 599), Verdict::Wait);
-        assert_eq!([600, 610, 1199, 1200].map(|s| look(false, s)), {
-            use Verdict::{Advise, GiveUp, Wait};
-            [Wait, Advise, Wait, GiveUp]
-        });
+        let mut check = |any, seconds| patience.check(any, begin + Duration::from_secs(seconds));
+        assert_eq!([0, 9, 10, 11, 599].map(|s| check(false, s)), [Wait, Wait, Advise, Wait, Wait]);
+        assert_eq!(check(true, 599), Wait);
+        assert_eq!([600, 610, 1199, 1200].map(|s| check(false, s)), [Wait, Advise, Wait, GiveUp]);
     }
 }

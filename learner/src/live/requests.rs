@@ -1,4 +1,4 @@
-//! A Zenoh query that waits for its answer, and why its message was not accepted.
+//! Zenoh queries that wait for their answers, and the reasons not to accept a message.
 
 use std::mem;
 
@@ -29,7 +29,6 @@ impl Request {
         Self { query, payload }
     }
 
-    /// The query's key.
     pub fn key(&self) -> &str {
         self.query.key_expr().as_str()
     }
@@ -39,7 +38,6 @@ impl Request {
         read(&mem::take(&mut self.payload))
     }
 
-    /// Sends an answer.
     pub fn reply<M: Message>(self, message: &M) {
         match encode(message) {
             Ok(bytes) => self.send(bytes.into()),
@@ -78,7 +76,7 @@ pub(super) fn read<M: Message>(payload: &ZBytes) -> Result<M, NotAccepted> {
     }
 }
 
-/// Why the learner did not accept a message.
+/// A reason not to accept a message.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum NotAccepted {
     #[error("the message is empty")]

@@ -12,7 +12,6 @@ use quad_runtime::Heartbeat;
 
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
-use super::metrics::Metrics;
 use super::requests::{NotAccepted, Request};
 use crate::evaluation::Validated;
 
@@ -22,13 +21,11 @@ const MOST_TOGETHER: usize = 256;
 /// An evaluator's report with its query; `None` marks the last one to wait for.
 pub(super) type Delivery = Option<(Request, ScoreReport)>;
 
-/// State of the thread.
 pub(super) struct Scores {
     /// `scores.jsonl`.
     pub log: Log,
     pub deliveries: Receiver<Delivery>,
     pub coordinator: Coordinator,
-    pub metrics: Metrics,
     pub disk: DiskStatus,
 }
 
@@ -43,88 +40,63 @@ impl Scores {
                 Err(RecvTimeoutError::Timeout) => continue,
                 Err(RecvTimeoutError::Disconnected) => return Ok(()),
             };
-            let mut reports = Vec::new();
-            for delivery in
-                std::iter::once(first).chain(self.deliveries.try_iter()).take(MOST_TOGETHER)
-            {
-                match delivery {
-                    Some(report) => reports.push(report),
-                    None => ended = true,
-                }
-            }
-            while !reports.is_empty() {
-                reports = self.take_in(reports, beat);
-            }
+            let mut batch = vec![first];
+            batch.extend(self.deliveries.try_iter().take(MOST_TOGETHER - 1));
+            ended = batch.iter().any(Option::is_none);
+            self.record(batch.into_iter().flatten(), beat);
         }
         Ok(())
     }
 
-    /// Handles reports together. If two of them contain the same episode, returns the second for
-    /// the next round, when the first is counted.
-    fn take_in(
-        &mut self,
-        reports: Vec<(Request, ScoreReport)>,
-        beat: &Heartbeat,
-    ) -> Vec<(Request, ScoreReport)> {
-        let mut seen = BTreeSet::new();
-        let (now, later): (Vec<_>, Vec<_>) = reports.into_iter().partition(|(_, report)| {
-            let keys = || report.episodes.iter().map(|score| (report.step, score.seed));
-            let first = !keys().any(|key| seen.contains(&key));
-            seen.extend(keys().filter(|_| first));
-            first
-        });
-        let mut accepted = Vec::new();
-        let validated = self.coordinator.validate(now.iter().map(|(_, report)| report));
-        for ((request, report), validated) in now.into_iter().zip(validated) {
-            match validated {
-                Ok(validated) => accepted.push((request, report, validated)),
-                Err(refusal) => {
-                    self.metrics.reject(refusal.label());
-                    request.reply(&self.coordinator.refused(refusal));
-                }
-            }
-        }
-        // Scores that are already on the disk need not wait for it.
-        let (new, known): (Vec<_>, Vec<_>) =
-            accepted.into_iter().partition(|(_, _, validated)| !validated.new.is_empty());
-        self.acknowledge(known);
-        self.write(new, beat);
-        later
-    }
-
     /// Writes the new scores of reports, and answers each report.
-    fn write(&mut self, reports: Vec<(Request, ScoreReport, Validated)>, beat: &Heartbeat) {
-        let of = |(_, report, validated): &(_, ScoreReport, Validated)| {
-            validated.new.iter().map(|score| ScoreLine::new(report, score)).collect::<Vec<_>>()
-        };
-        let lines: Vec<_> = reports.iter().flat_map(of).collect();
+    fn record(&mut self, reports: impl Iterator<Item = (Request, ScoreReport)>, beat: &Heartbeat) {
+        // Step and seed of the scores to write: a second score of an episode is a duplicate.
+        let mut seen = BTreeSet::new();
+        let (mut batch, mut lines) = (Vec::new(), Vec::new());
+        for (request, report) in reports {
+            let mut validated = match self.coordinator.validate(&report) {
+                Ok(validated) => validated,
+                Err(refusal) => {
+                    self.coordinator.metrics.reject(refusal.label());
+                    request.reply(&self.coordinator.refused(refusal));
+                    continue;
+                }
+            };
+            if validated.new.is_empty() {
+                // All of its scores are on the disk.
+                self.acknowledge(request, &report, &validated);
+                continue;
+            }
+            let count = validated.new.len();
+            validated.new.retain(|score| seen.insert((report.step, score.seed)));
+            validated.duplicates += (count - validated.new.len()) as u32;
+            lines.extend(validated.new.iter().map(|score| ScoreLine::new(&report, score)));
+            batch.push((request, report, validated));
+        }
         if lines.is_empty() {
             return;
         }
-        if let Err(error) = self.log.append(&lines) {
-            let error = format!("{:#}", anyhow::Error::from(error));
-            self.disk.refused(beat, &error);
-            return self.refuse(reports, &error);
+        match self.log.append(&lines) {
+            Ok(()) => {
+                self.disk.accepted(beat);
+                for (request, report, validated) in batch {
+                    self.acknowledge(request, &report, &validated);
+                }
+            }
+            // The scores are still new when the evaluators deliver them again.
+            Err(error) => {
+                let error = format!("{:#}", anyhow::Error::from(error));
+                self.disk.refused(beat, &error);
+                for (request, report, _) in batch {
+                    self.coordinator.extend_lease(&report);
+                    let why = NotAccepted::NotSaved(error.clone());
+                    request.reject(&why, &self.coordinator.metrics);
+                }
+            }
         }
-        self.disk.well(beat);
-        self.acknowledge(reports);
     }
 
-    /// Counts the scores of reports, which are on the disk, and answers each report.
-    fn acknowledge(&self, reports: Vec<(Request, ScoreReport, Validated)>) {
-        let replies = self
-            .coordinator
-            .record(reports.iter().map(|(_, report, validated)| (report, validated)));
-        for ((request, ..), reply) in reports.into_iter().zip(replies) {
-            request.reply(&reply);
-        }
-    }
-
-    /// Counts no score, so the scores are still new when the evaluators deliver them again.
-    fn refuse(&self, reports: Vec<(Request, ScoreReport, Validated)>, error: &str) {
-        for (request, report, _) in reports {
-            self.coordinator.keep(&report);
-            request.reject(&NotAccepted::NotSaved(error.to_owned()), &self.metrics);
-        }
+    fn acknowledge(&self, request: Request, report: &ScoreReport, validated: &Validated) {
+        request.reply(&self.coordinator.record(report, validated));
     }
 }

@@ -2,117 +2,108 @@
 //! each snapshot, then publishes the snapshot.
 
 use std::collections::BTreeMap;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use quad_protocol::Hash;
-use quad_run::folder::{Checkpoint, Log, RunDir, RunDirError};
+use quad_run::folder::{Checkpoint, Log, RunDirError};
 use quad_runtime::{Heartbeat, hinted};
 use tracing::debug;
 
+use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
-use super::events::{Event, Events};
-use super::metrics::Metrics;
+use super::events::Event;
+use super::metrics::unix_time;
 use super::weights::Weights;
 use crate::evaluation::OtherWeights;
-use crate::train::{Outbox, TrainedPolicy, Work};
+use crate::train::{Output, OutputQueue, TrainedPolicy};
 
 /// Pause after the disk has refused a write.
 pub(super) const RETRY: Duration = Duration::from_secs(2);
 
-/// State of the thread.
+const OTHER_WEIGHTS: &str = "another kind of processor, another number of threads or another version computes other bits: \
+                             continue where the run was before, or begin anew with --fresh";
+
 pub(super) struct Snapshots {
-    pub outbox: Outbox,
-    pub run_dir: RunDir,
+    pub queue: OutputQueue,
     /// `metrics.jsonl`.
     pub rows: Log,
     pub weights: Weights,
-    pub metrics: Metrics,
-    pub events: Events,
     /// Snapshots of earlier processes, by step: training may reach their steps again.
     pub known: BTreeMap<u64, Hash>,
     pub disk: DiskStatus,
 }
 
 impl Snapshots {
-    /// The thread's work, until the outbox is closed and empty. It repeats a write that the disk
+    /// The thread's work, until the queue is closed and empty. It repeats a write that the disk
     /// refuses until the disk accepts it.
     pub fn run(mut self, beat: &Heartbeat) -> anyhow::Result<()> {
-        while let Some(work) = self.outbox.next(beat) {
-            match self.carry_out(&work) {
-                Ok(()) => {
-                    self.disk.well(beat);
-                    self.outbox.done(&work);
+        while let Some(output) = self.queue.next(beat) {
+            while let Err(error) = self.save(&output) {
+                match error.downcast_ref() {
+                    Some(RunDirError::Io { .. }) => {
+                        self.disk.refused(beat, &format!("{error:#}"));
+                        std::thread::sleep(RETRY);
+                        beat.alive();
+                    }
+                    Some(other) => {
+                        let hint = other.hint();
+                        return Err(hinted(error, hint));
+                    }
+                    None if error.is::<OtherWeights>() => return Err(hinted(error, OTHER_WEIGHTS)),
+                    None => return Err(error),
                 }
-                Err(error) if matches!(error.downcast_ref(), Some(RunDirError::Io { .. })) => {
-                    self.disk.refused(beat, &format!("{error:#}"));
-                    self.outbox.put_back(work);
-                    std::thread::sleep(RETRY);
-                }
-                Err(error) => return Err(with_hint(error)),
+            }
+            self.disk.accepted(beat);
+        }
+        Ok(())
+    }
+
+    fn coordinator(&self) -> &Coordinator {
+        &self.weights.coordinator
+    }
+
+    fn save(&mut self, output: &Output) -> anyhow::Result<()> {
+        match output {
+            Output::Snapshot(policy) => self.snapshot(policy)?,
+            Output::Checkpoint(checkpoint) => self.checkpoint(checkpoint)?,
+            Output::Rows(rows) => self.rows.append(rows)?,
+            Output::Ended(outcome) => {
+                self.coordinator().events.send(Event::TrainingEnded(*outcome));
             }
         }
         Ok(())
     }
 
-    fn carry_out(&mut self, work: &Work) -> anyhow::Result<()> {
-        match work {
-            Work::Snapshot(policy) => self.snapshot(policy),
-            Work::Checkpoint(checkpoint) => self.checkpoint(checkpoint),
-            Work::Rows(rows) => Ok(self.rows.append(rows)?),
-            Work::Ended(outcome) => {
-                self.events.send(Event::TrainingEnded(*outcome)).ok();
-                Ok(())
-            }
-        }
-    }
-
     /// Writes a snapshot, then opens its evaluation and publishes it.
     fn snapshot(&mut self, trained: &TrainedPolicy) -> anyhow::Result<()> {
-        let TrainedPolicy { step, file, evaluate } = trained;
+        let &TrainedPolicy { step, ref file, evaluate } = trained;
         let hash = Hash::of(file);
-        self.metrics.evaluation.snapshot_bytes.set(file.len() as i64);
-        match self.known.get(step) {
-            None => self.run_dir.write_snapshot(*step, file)?,
+        let metrics = &self.weights.coordinator.metrics.evaluation;
+        metrics.snapshot_bytes.set(file.len() as i64);
+        match self.known.get(&step) {
+            None => self.weights.run_dir.write_snapshot(step, file)?,
             Some(known) if *known == hash => {}
             // The step has scores already: the snapshot is neither overwritten nor published.
             Some(known) => {
-                return Err(
-                    OtherWeights { step: *step, found: hash, scored: known.to_string() }.into()
-                );
+                return Err(OtherWeights { step, found: hash, scored: known.to_string() }.into());
             }
         }
-        if *evaluate {
-            self.weights.publish(*step, hash, file.clone())?;
-            self.metrics.evaluation.snapshots_published.inc();
-            self.events.send(Event::Published { step: *step }).ok();
+        if evaluate {
+            self.weights.publish(step, hash, file.clone())?;
+            metrics.snapshots_published.inc();
+            self.coordinator().events.send(Event::Published { step });
         }
         Ok(())
     }
 
     fn checkpoint(&self, checkpoint: &Checkpoint) -> anyhow::Result<()> {
-        self.run_dir.write_checkpoint(checkpoint)?;
+        self.weights.run_dir.write_checkpoint(checkpoint)?;
         let Checkpoint { step, state } = checkpoint;
         debug!(step, bytes = state.len(), "checkpoint");
-        let disk = &self.metrics.disk;
+        let disk = &self.coordinator().metrics.disk;
         disk.checkpoint_step.set(i64::try_from(*step).unwrap_or(i64::MAX));
         disk.checkpoint_bytes.set(state.len() as i64);
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        disk.checkpoint_timestamp.set(now.as_secs_f64());
+        disk.checkpoint_timestamp.set(unix_time());
         Ok(())
-    }
-}
-
-/// Adds a hint.
-fn with_hint(error: anyhow::Error) -> anyhow::Error {
-    if let Some(hint) = error.downcast_ref().map(RunDirError::hint) {
-        return hinted(error, hint);
-    }
-    match error.is::<OtherWeights>() {
-        true => hinted(
-            error,
-            "another kind of processor, another number of threads or another version computes other bits: continue where the \
-             run was before, or begin anew with --fresh",
-        ),
-        false => error,
     }
 }

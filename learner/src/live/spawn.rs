@@ -2,15 +2,13 @@
 //! or for up to two seconds, after which Zenoh closes the connection; so only threads on which no
 //! others wait send answers. The queue for these threads is bounded.
 
-use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use anyhow::anyhow;
 use quad_runtime::{Heartbeat, stay_in_background};
-use tracing::debug;
 
 use super::events::{Event, Events};
 
@@ -31,28 +29,18 @@ pub(super) fn spawn_alive(
 
 /// Starts a thread. If it fails or panics, the main loop ends the run: without that thread the
 /// process would look alive and do nothing.
-pub(super) fn spawn(
+fn spawn(
     name: &'static str,
     events: &Events,
     work: impl FnOnce() -> anyhow::Result<()> + Send + 'static,
 ) -> std::io::Result<JoinHandle<()>> {
     let events = events.clone();
     thread::Builder::new().name(name.to_owned()).spawn(move || {
-        debug!(thread = name, "started");
-        let ended = catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|payload| {
-            let message = message(payload.as_ref());
-            Err(anyhow!("the thread `{name}` panicked, which is a bug of this program: {message}"))
-        });
-        if let Err(error) = ended {
-            events.send(Event::Failed(error)).ok();
+        let panicked = |_| Err(anyhow!("the thread `{name}` panicked, which is a bug"));
+        if let Err(error) = catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(panicked) {
+            events.send(Event::Failed(error));
         }
-        debug!(thread = name, "ended");
     })
-}
-
-fn message(payload: &(dyn Any + Send)) -> String {
-    let text = payload.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    text.or_else(|| payload.downcast_ref::<String>().cloned()).unwrap_or_default()
 }
 
 type Task = Box<dyn FnOnce() + Send>;
@@ -71,13 +59,15 @@ impl Pool {
         most_waiting: usize,
         events: &Events,
     ) -> std::io::Result<Self> {
-        let (tasks, waiting) = sync_channel(most_waiting);
-        let waiting = Arc::new(Mutex::new(waiting));
+        let (tasks, rx) = sync_channel::<Task>(most_waiting);
+        let rx = Arc::new(Mutex::new(rx));
         for _ in 0..threads {
-            let waiting = waiting.clone();
+            let rx = rx.clone();
             spawn(name, events, move || {
                 stay_in_background();
-                while let Some(task) = next(&waiting) {
+                // One thread waits on the queue, the others on its lock.
+                let next = || rx.lock().unwrap_or_else(PoisonError::into_inner).recv();
+                while let Ok(task) = next() {
                     task();
                 }
                 Ok(())
@@ -92,11 +82,34 @@ impl Pool {
     }
 }
 
-/// Waits for the next task; `None` when no more can come. One thread waits on the queue, the others
-/// on its lock.
-fn next(waiting: &Mutex<Receiver<Task>>) -> Option<Task> {
-    waiting.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()
-}
-
 #[cfg(test)]
-mod tests;
+mod tests {
+    use std::time::Duration;
+
+    use quad_runtime::Health;
+    use tokio::sync::mpsc::unbounded_channel;
+
+    use super::*;
+
+    #[test]
+    fn a_thread_that_fails_or_panics_tells_the_main_loop_why() {
+        let (tx, mut rx) = unbounded_channel();
+        let (events, health) = (Events(tx), Health::default());
+        for (work, expected) in [
+            (
+                (|_| panic!("on purpose")) as fn(&Heartbeat) -> _,
+                "the thread `scores` panicked, which is a bug",
+            ),
+            (|_| Err(anyhow!("no such file")), "no such file"),
+        ] {
+            let beat = health.register("scores", Duration::from_secs(60));
+            spawn_alive("scores", &events, beat, work).unwrap().join().unwrap();
+            assert!(
+                matches!(rx.try_recv(), Ok(Event::Failed(error)) if error.to_string() == expected)
+            );
+        }
+        assert_eq!(health.problems().len(), 2);
+        spawn("scores", &events, || Ok(())).unwrap().join().unwrap();
+        assert!(rx.try_recv().is_err());
+    }
+}

@@ -1,30 +1,28 @@
 //! The threads of a run, started together and ended in order.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use quad_algorithms::Agent;
-use quad_dataset::Task;
-use quad_run::config::{Experiment, RunConfig};
-use quad_run::folder::{Log, ResumePoint, RunDir, SavedScores};
+use quad_dataset::{BatchSampler, Task};
+use quad_run::config::RunConfig;
+use quad_run::folder::{Log, ResumePoint, RunDir};
 use quad_runtime::Health;
 
-use super::coordinator::{Coordinator, EvaluationPlan};
-use super::disk::DiskStatus;
+use super::coordinator::Coordinator;
+use super::disk::{DiskStatus, Writer};
 use super::duplicate::Incarnation;
-use super::events::{Events, Saved};
+use super::events::Events;
 use super::metrics::Metrics;
-use super::page_state::Live;
 use super::scores::Scores;
 use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
 use super::weights::Weights;
 use crate::evaluation::Rules;
-use crate::train::{HeldOut, Outbox, Training};
+use crate::train::{HeldOut, OutputQueue, Training, origin, resume};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when
 /// hundreds wait.
@@ -41,20 +39,21 @@ const TRAINING_STUCK: Duration = Duration::from_secs(300);
 pub(crate) struct Run<'a> {
     pub incarnation: Incarnation,
     pub config: &'a RunConfig,
-    /// The run's folder.
     pub dir: &'a RunDir,
+    pub task: Task,
+    pub agent: Agent,
+    pub held_out: Option<HeldOut>,
     /// The run's scores, open for appending.
     pub scores: Log,
-    /// What earlier processes of this run have reached.
+    /// State that earlier processes of this run have reached.
     pub past: ResumePoint,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
 }
 
-/// The running threads.
 pub(crate) struct Threads {
     pub(super) services: Services,
-    outbox: Outbox,
+    queue: OutputQueue,
     stop: Arc<AtomicBool>,
     training: JoinHandle<()>,
     snapshots: JoinHandle<()>,
@@ -65,80 +64,75 @@ impl Threads {
     /// Starts all threads.
     pub fn start(
         run: Run<'_>,
-        task: Task,
-        (agent, held_out): (Agent, Option<HeldOut>),
         metrics: &Metrics,
         health: &Health,
         events: &Events,
     ) -> anyhow::Result<Self> {
-        let Run { incarnation, config, dir, scores, past, checkpoint_every } = run;
+        let Run { incarnation, config, dir, past, mut agent, .. } = run;
         let ResumePoint { checkpoint, snapshots: known, scores: earlier } = past;
+        let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
+        if let Some(checkpoint) = checkpoint {
+            resume(&mut agent, &checkpoint)?;
+        }
         let experiment = &config.experiment;
-        let coordinator = coordinator(&incarnation, experiment, task, earlier, metrics, events);
+        let rules = Rules {
+            run: incarnation.run.clone(),
+            incarnation: incarnation.number,
+            task: run.task,
+            seed: experiment.seed,
+            episodes: experiment.episodes,
+            job_episodes: JOB_EPISODES,
+            lease: LEASE,
+        };
+        let coordinator = Coordinator::new(rules, earlier, metrics.clone(), events.clone());
         for (&step, &hash) in &known {
             coordinator.open(step, hash)?;
         }
-        let weights =
-            Weights::new(incarnation.run, incarnation.number, dir.clone(), coordinator.clone());
-        let (services, deliveries) =
-            Services::start(coordinator.clone(), weights.clone(), metrics.clone(), events.clone())?;
+        let weights = Weights::new(incarnation, dir.clone(), coordinator.clone());
+        let (services, deliveries) = Services::start(weights.clone())?;
 
-        let disk = |what| DiskStatus::new(what, &metrics.disk, events.clone());
-        let scores = Scores {
-            log: scores,
-            deliveries,
-            coordinator,
-            metrics: metrics.clone(),
-            disk: disk(Saved::Scores),
-        };
-        let writer = Saved::Scores.thread();
-        let scores = spawn_alive(writer, events, health.register(writer, STUCK), move |beat| {
-            scores.run(beat)
-        })?;
+        let disk = |writer| DiskStatus::new(writer, metrics, events.clone());
+        let disk_of_scores = disk(Writer::Scores);
+        let scores = Scores { log: run.scores, deliveries, coordinator, disk: disk_of_scores };
+        let writer = Writer::Scores.thread();
+        let beat = health.register(writer, STUCK);
+        let scores = spawn_alive(writer, events, beat, move |beat| scores.run(beat))?;
 
-        let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         metrics.training.gradient_steps.inc_by(step);
         let (rows, seconds_before) = dir.metrics_log(step)?;
-        let outbox = Outbox::default();
-        let snapshots = Snapshots {
-            outbox: outbox.clone(),
-            run_dir: dir.clone(),
-            rows,
-            weights,
-            metrics: metrics.clone(),
-            events: events.clone(),
-            known,
-            disk: disk(Saved::Run),
-        };
-        let writer = Saved::Run.thread();
-        let snapshots = spawn_alive(writer, events, health.register(writer, STUCK), move |beat| {
-            snapshots.run(beat)
-        })?;
+        let queue = OutputQueue::default();
+        let snapshots =
+            Snapshots { queue: queue.clone(), rows, weights, known, disk: disk(Writer::Snapshots) };
+        let writer = Writer::Snapshots.thread();
+        let beat = health.register(writer, STUCK);
+        let snapshots = spawn_alive(writer, events, beat, move |beat| snapshots.run(beat))?;
 
         let stop = Arc::new(AtomicBool::new(false));
         let training = Training {
-            experiment: experiment.clone(),
+            sampler: BatchSampler::new(
+                agent.dataset_len(),
+                experiment.batch_size as usize,
+                experiment.seed,
+                step,
+            ),
             agent,
-            held_out,
-            checkpoint,
-            checkpoint_every,
+            held_out: run.held_out,
+            schedule: experiment.schedule(),
+            origin: origin(experiment),
+            checkpoint_every: run.checkpoint_every,
             seconds_before,
             metrics: metrics.training.clone(),
-            outbox: outbox.clone(),
+            queue: queue.clone(),
             stop: stop.clone(),
         };
-        let training = spawn_alive(
-            "training",
-            events,
-            health.register("training", TRAINING_STUCK),
-            move |beat| training.run(beat),
-        )?;
-        Ok(Self { services, outbox, stop, training, snapshots, scores })
+        let beat = health.register("training", TRAINING_STUCK);
+        let training = spawn_alive("training", events, beat, move |beat| training.run(beat))?;
+        Ok(Self { services, queue, stop, training, snapshots, scores })
     }
 
-    /// Shows the shared state of jobs and scores on the page.
-    pub fn show_on(&self, live: &Live) {
-        live.begun(self.services.coordinator.clone());
+    /// The shared state of jobs and scores.
+    pub fn coordinator(&self) -> &Coordinator {
+        self.services.coordinator()
     }
 
     /// Asks training to end after its current step.
@@ -146,35 +140,14 @@ impl Threads {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    /// Ends the threads: their output is on the disk afterwards. A thread that failed has told the
-    /// main loop.
+    /// Ends the threads: their output is on the disk afterwards. A thread that failed has reported
+    /// it to the main loop.
     pub fn join(self) {
         self.stop_training();
         self.training.join().ok();
-        self.outbox.close();
+        self.queue.close();
         self.snapshots.join().ok();
         self.services.deliveries.send(None).ok();
         self.scores.join().ok();
     }
-}
-
-/// The shared state of jobs and scores, at the start of this process.
-fn coordinator(
-    incarnation: &Incarnation,
-    experiment: &Experiment,
-    task: Task,
-    earlier: BTreeMap<u64, SavedScores>,
-    metrics: &Metrics,
-    events: &Events,
-) -> Coordinator {
-    let rules = Rules {
-        run: incarnation.run.clone(),
-        incarnation: incarnation.number,
-        task,
-        environment_seed: experiment.seed,
-        job_episodes: JOB_EPISODES,
-        lease: LEASE,
-    };
-    let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
-    Coordinator::new(rules, plan, earlier, metrics.clone(), events.clone())
 }

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use anyhow::Context;
-use quad_protocol::{Hash, Name, Snapshot, encode, keys};
+use quad_protocol::{Hash, Snapshot, encode, keys};
 use quad_run::folder::RunDir;
 use tracing::debug;
 use zenoh::bytes::ZBytes;
@@ -11,15 +11,15 @@ use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 
 use super::coordinator::Coordinator;
+use super::duplicate::Incarnation;
 use super::requests::NotAccepted;
 
-/// What all snapshots of a run share, and where they are. Clones share it.
+/// A handle to the snapshots of a run. Clones share them.
 #[derive(Clone)]
 pub(super) struct Weights {
-    run: Name,
-    incarnation: u64,
-    run_dir: RunDir,
-    coordinator: Coordinator,
+    incarnation: Incarnation,
+    pub run_dir: RunDir,
+    pub coordinator: Coordinator,
     /// Set once the learner is online.
     session: Arc<OnceLock<Session>>,
     /// The newest snapshot with its step, ready to send; older ones come from the disk.
@@ -27,15 +27,9 @@ pub(super) struct Weights {
 }
 
 impl Weights {
-    pub fn new(run: Name, incarnation: u64, run_dir: RunDir, coordinator: Coordinator) -> Self {
-        Self {
-            run,
-            incarnation,
-            run_dir,
-            coordinator,
-            session: Arc::default(),
-            newest: Arc::default(),
-        }
+    pub fn new(incarnation: Incarnation, run_dir: RunDir, coordinator: Coordinator) -> Self {
+        let (session, newest) = (Arc::default(), Arc::default());
+        Self { incarnation, run_dir, coordinator, session, newest }
     }
 
     /// Sets the session, so that later snapshots are published.
@@ -56,7 +50,7 @@ impl Weights {
             // An evaluator that does not read loses the snapshot instead of delaying others. It
             // asks for it when it gets a job.
             let put = session
-                .put(keys::weights(&self.run), bytes)
+                .put(keys::weights(&self.incarnation.run), bytes)
                 .congestion_control(CongestionControl::Drop);
             if let Err(error) = put.wait() {
                 debug!(%error, step, "the snapshot could not be published");
@@ -66,7 +60,7 @@ impl Weights {
     }
 
     /// The snapshot of a step, for an evaluator that asks.
-    pub fn of(&self, step: u64) -> Result<ZBytes, NotAccepted> {
+    pub fn snapshot(&self, step: u64) -> Result<ZBytes, NotAccepted> {
         let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone();
         if let Some((_, bytes)) = newest.filter(|(newest, _)| *newest == step) {
             return Ok(bytes);
@@ -82,8 +76,8 @@ impl Weights {
     }
 
     fn message(&self, step: u64, hash: Hash, file: Vec<u8>) -> anyhow::Result<ZBytes> {
-        let snapshot =
-            Snapshot { run: self.run.clone(), incarnation: self.incarnation, step, hash, file };
+        let Incarnation { run, number } = self.incarnation.clone();
+        let snapshot = Snapshot { run, incarnation: number, step, hash, file };
         Ok(encode(&snapshot).context("the snapshot cannot be sent to evaluators")?.into())
     }
 }

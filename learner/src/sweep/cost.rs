@@ -54,21 +54,21 @@ impl Cost {
                 );
             }
         }
-        let measured = prices.values().filter(|price| price.step > 0.0).count();
+        let measured = prices.values().filter(|price| price.step_seconds > 0.0).count();
         let mean = |value: fn(&Price) -> f64| {
             prices.values().map(value).sum::<f64>() / measured.max(1) as f64
         };
         let other = Price {
-            step: mean(|price| price.step),
-            snapshot: mean(|price| price.snapshot as f64) as u64,
-            checkpoint: mean(|price| price.checkpoint as f64) as u64,
+            step_seconds: mean(|price| price.step_seconds),
+            snapshot_bytes: mean(|price| price.snapshot_bytes as f64) as u64,
+            checkpoint_bytes: mean(|price| price.checkpoint_bytes as f64) as u64,
         };
         let mut cost = Self { step_seconds: BTreeMap::new(), seconds: 0.0, bytes: 0, measured };
         for (run, state) in runs {
             let price = prices.get(&configuration(run)).copied().unwrap_or(other);
             let steps = run.experiment.steps;
-            cost.step_seconds.insert(run.index, price.step);
-            cost.seconds += price.step * (steps - state.step(steps).min(steps)) as f64;
+            cost.step_seconds.insert(run.index, price.step_seconds);
+            cost.seconds += price.step_seconds * (steps - state.step(steps).min(steps)) as f64;
             cost.bytes += price.bytes(&run.experiment);
         }
         Ok(cost)

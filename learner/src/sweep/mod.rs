@@ -8,18 +8,18 @@
 //!
 //! In reading order: `study` is the file, `axes` are its lists of values, `rules` say which
 //! combinations, `names` what runs are called; `cost` estimates; `work` runs the learners, each a
-//! `job`, and `display` shows them.
+//! `learner_process`, and `display` shows them.
 
 mod axes;
 mod cost;
 mod display;
-mod job;
+mod learner_process;
 mod names;
 mod rules;
 mod study;
 mod work;
 
 pub(crate) use cost::Cost;
-pub(crate) use job::Learners;
+pub(crate) use learner_process::Learners;
 pub(crate) use study::{PlannedRun, Study};
 pub(crate) use work::{Ended, Sweep};

@@ -3,19 +3,23 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
 use std::pin::pin;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use indicatif::HumanDuration;
 use quad_run::status::{Pace, State};
 use quad_runtime::LEAVE_WITHIN;
-use tokio::sync::watch;
-use tokio::task::{JoinSet, LocalSet};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
 use tokio::time::interval;
+use tokio_util::sync::CancellationToken;
 
 use super::display::Display;
-use super::job::{End, GLANCE, Job, Learners};
+use super::learner_process::{End, LearnerProcess, Learners};
 use super::study::PlannedRun;
 use crate::local_evaluators::LocalEvaluators;
+
+/// How often the display is updated.
+const TICK: Duration = Duration::from_millis(100);
 
 /// What is to be done.
 pub(crate) struct Sweep {
@@ -27,8 +31,9 @@ pub(crate) struct Sweep {
     pub jobs: usize,
     /// How they are started.
     pub learners: Learners,
-    /// Evaluators that were started for it.
     pub evaluators: LocalEvaluators,
+    /// Reports of the evaluators.
+    pub lines: mpsc::UnboundedReceiver<String>,
     /// Seconds of a gradient step, by the run's number; without one, all are taken to be the same.
     pub step_seconds: BTreeMap<usize, f64>,
 }
@@ -45,7 +50,7 @@ pub(crate) struct Ended {
 /// What is going on.
 struct Floor {
     /// By the run's number, with what each was last seen to have done.
-    at_work: BTreeMap<usize, (Job, Pace)>,
+    at_work: BTreeMap<usize, (LearnerProcess, Pace)>,
     complete: usize,
     failed: Vec<String>,
     display: Display,
@@ -55,16 +60,12 @@ struct Floor {
 }
 
 impl Sweep {
-    /// Runs all, or, at a signal to end, lets those at work save what they have. Learners are the
-    /// calling thread's.
+    /// Runs all learners. After a signal to end, those at work save checkpoints. Needs a `LocalSet`
+    /// on the main thread: the system ends the learners with their thread.
     pub async fn run(mut self) -> Ended {
-        LocalSet::new().run_until(self.work()).await
-    }
-
-    async fn work(&mut self) -> Ended {
         let mut shutdown = pin!(quad_runtime::shutdown_signal(2 * LEAVE_WITHIN));
-        let (stop, told) = watch::channel(false);
-        let mut ticker = interval(GLANCE);
+        let stop = CancellationToken::new();
+        let mut ticker = interval(TICK);
         let count = self.waiting.len();
         let mut floor = Floor {
             at_work: BTreeMap::new(),
@@ -79,19 +80,16 @@ impl Sweep {
             while learners.len() < self.jobs
                 && let Some((run, state)) = self.waiting.pop_front()
             {
-                let job = Job::new(run, state, &self.folder);
-                let begun = Pace { step: job.from, ..Pace::default() };
-                floor.at_work.insert(job.run.index, (job.clone(), begun));
-                learners.spawn_local(job.see_through(self.learners.clone(), told.clone()));
+                let learner = LearnerProcess::new(run, state, &self.folder);
+                let begun = Pace { step: learner.from, ..Pace::default() };
+                floor.at_work.insert(learner.run.index, (learner.clone(), begun));
+                learners.spawn_local(learner.run(self.learners.clone(), stop.clone()));
             }
             if learners.is_empty() {
                 break;
             }
             tokio::select! {
                 _ = ticker.tick() => {
-                    for line in self.evaluators.news() {
-                        floor.display.say(&line);
-                    }
                     if floor.display.is_due() {
                         match reading.is_empty() {
                             true => drop(reading.spawn_blocking(read(&floor))),
@@ -99,17 +97,20 @@ impl Sweep {
                         }
                     }
                 }
-                Some(Ok((job, end, pace))) = learners.join_next() => self.conclude(&job, end, pace, &mut floor),
+                Some(line) = self.lines.recv() => floor.display.say(&line),
+                Some(Ok((learner, end, pace))) = learners.join_next() => {
+                    self.conclude(&learner, end, pace, &mut floor);
+                }
                 Some(Ok(progress)) = reading.join_next() => {
                     for (index, pace) in progress {
                         floor.at_work.entry(index).and_modify(|(_, known)| *known = pace);
                     }
                     floor.display.show(&self.lines(&floor));
                 }
-                () = &mut shutdown, if !*told.borrow() => {
+                () = &mut shutdown, if !stop.is_cancelled() => {
                     floor.display.say("stopping; the runs at work save their checkpoints");
                     self.waiting.clear();
-                    stop.send_replace(true);
+                    stop.cancel();
                 }
             }
         }
@@ -118,10 +119,10 @@ impl Sweep {
         Ended { unfinished: count - floor.complete - floor.failed.len(), failed: floor.failed }
     }
 
-    fn conclude(&self, job: &Job, end: End, pace: Pace, floor: &mut Floor) {
-        let name = &job.run.name;
-        floor.at_work.remove(&job.run.index);
-        floor.done += self.seconds(&job.run, job.from, pace.step);
+    fn conclude(&self, learner: &LearnerProcess, end: End, pace: Pace, floor: &mut Floor) {
+        let name = &learner.run.name;
+        floor.at_work.remove(&learner.run.index);
+        floor.done += self.seconds(&learner.run, learner.from, pace.step);
         let said = match end {
             End::Complete => {
                 floor.complete += 1;
@@ -143,7 +144,7 @@ impl Sweep {
     /// A line for each run at work, and one for all.
     fn lines(&self, floor: &Floor) -> Vec<String> {
         let (mut lines, mut done, mut left) = (Vec::new(), floor.done, 0.0);
-        for (Job { run, from, .. }, pace) in floor.at_work.values() {
+        for (LearnerProcess { run, from, .. }, pace) in floor.at_work.values() {
             let steps = run.experiment.steps;
             done += self.seconds(run, *from, pace.step);
             left += self.seconds(run, pace.step, steps);
@@ -177,6 +178,6 @@ impl Sweep {
 /// Reads how far the runs at work are.
 fn read(floor: &Floor) -> impl FnOnce() -> Vec<(usize, Pace)> + use<> {
     let dirs: Vec<_> =
-        floor.at_work.iter().map(|(index, (job, _))| (*index, job.dir.clone())).collect();
+        floor.at_work.iter().map(|(index, (learner, _))| (*index, learner.dir.clone())).collect();
     move || dirs.into_iter().map(|(index, dir)| (index, Pace::read(&dir))).collect()
 }

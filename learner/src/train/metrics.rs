@@ -1,48 +1,88 @@
-//! What Prometheus can ask about gradient steps, and how a metric of the learner is made.
+//! Prometheus metrics of gradient steps.
 
 use std::time::Duration;
 
 use prometheus::core::{Collector, Desc};
 use prometheus::proto::MetricFamily;
 use prometheus::{
-    Counter, Gauge, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge,
-    IntGaugeVec, Opts, Registry, exponential_buckets,
+    Counter, Gauge, Histogram, HistogramOpts, IntCounter, IntGauge, Registry, exponential_buckets,
 };
 use quad_algorithms::Metric;
 
-use super::held_out;
+use super::results::held_out_name;
 
-/// Shortest gradient step that the histogram tells apart, and how many doublings follow it: 1 ms to
+/// Shortest gradient step that the histogram tells apart, and number of doublings after it: 1 ms to
 /// 2 s.
 const SHORTEST_STEP: f64 = 1e-3;
 const STEP_BUCKETS: usize = 12;
 
-/// Gradient steps and what they measured. Updating one is an atomic store, so the training thread
-/// may.
+/// Declares a struct of registered metrics: `field: Type("name", "help")`, or `("name", "help",
+/// "label")` for the types with a label.
+macro_rules! metrics {
+    (@new $Type:ident, $name:literal, $help:literal) => {
+        prometheus::$Type::new(concat!("quad_learner_", $name), $help)
+    };
+    (@new $Type:ident, $name:literal, $help:literal, $label:literal) => {
+        prometheus::$Type::new(
+            prometheus::Opts::new(concat!("quad_learner_", $name), $help), &[$label])
+    };
+    ($(#[$meta:meta])* $Name:ident {
+        $($field:ident: $Type:ident($($argument:literal),+),)+
+    }) => {
+        $(#[$meta])*
+        #[derive(Clone, Debug)]
+        pub(crate) struct $Name {
+            $(pub $field: prometheus::$Type,)+
+        }
+
+        impl $Name {
+            fn new(registry: &prometheus::Registry) -> prometheus::Result<Self> {
+                Ok(Self {
+                    $($field: $crate::train::register(
+                        registry,
+                        metrics!(@new $Type, $($argument),+),
+                    )?,)+
+                })
+            }
+        }
+    };
+}
+pub(crate) use metrics;
+
+/// Registers a new metric.
+pub(crate) fn register<M: Collector + Clone + 'static>(
+    registry: &Registry,
+    metric: prometheus::Result<M>,
+) -> prometheus::Result<M> {
+    let metric = metric?;
+    registry.register(Box::new(metric.clone()))?;
+    Ok(metric)
+}
+
+/// Metrics of gradient steps. An update is an atomic store.
 #[derive(Clone, Debug)]
 pub(crate) struct TrainingMetrics {
     pub gradient_steps: IntCounter,
     pub step_duration: Histogram,
     pub saving_seconds: Counter,
     pub diverged: IntGauge,
-    /// What the algorithm measures, in its order.
-    pub algorithm: Vec<(&'static Metric, MaybeGauge)>,
-    /// What it measures on held-out episodes, in its order.
-    held_out: Vec<MaybeGauge>,
+    /// The algorithm's metrics, in its order.
+    pub algorithm: Vec<(&'static Metric, OptionalGauge)>,
+    /// The same on held-out episodes.
+    held_out: Vec<OptionalGauge>,
 }
 
-/// A gauge that is there as long as it has a value.
+/// A gauge that is exposed as long as it has a value.
 #[derive(Clone, Debug)]
-pub(crate) struct MaybeGauge(Gauge);
+pub(crate) struct OptionalGauge(Gauge);
 
-impl MaybeGauge {
-    fn new(name: &str, help: &str) -> prometheus::Result<Self> {
+impl OptionalGauge {
+    fn new(registry: &Registry, name: &str, help: &str) -> prometheus::Result<Self> {
         let gauge = Gauge::new(full(name), help)?;
         gauge.set(f64::NAN);
-        Ok(Self(gauge))
+        register(registry, Ok(Self(gauge)))
     }
 
-    /// Its value, if it has one.
     pub fn get(&self) -> Option<f64> {
         Some(self.0.get()).filter(|value| !value.is_nan())
     }
@@ -52,7 +92,7 @@ impl MaybeGauge {
     }
 }
 
-impl Collector for MaybeGauge {
+impl Collector for OptionalGauge {
     fn desc(&self) -> Vec<&Desc> {
         self.0.desc()
     }
@@ -63,95 +103,47 @@ impl Collector for MaybeGauge {
 }
 
 impl TrainingMetrics {
-    /// Makes them, for a run of so many steps whose algorithm measures that.
+    /// Makes the metrics of a run of this many steps.
     pub fn new(
-        make: &Registrar,
+        registry: &Registry,
         target_steps: u64,
-        measured: &'static [Metric],
+        metrics: &'static [Metric],
     ) -> prometheus::Result<Self> {
-        let target = make.count("gradient_steps_target", "Gradient steps that this run will do")?;
+        let target = "Gradient steps that this run will do";
+        let target = register(registry, IntGauge::new(full("gradient_steps_target"), target))?;
         target.set(i64::try_from(target_steps).unwrap_or(i64::MAX));
-        let buckets = exponential_buckets(SHORTEST_STEP, 2.0, STEP_BUCKETS)?;
         let duration =
-            HistogramOpts::new(full("step_duration_seconds"), "Wall time of one gradient step");
+            HistogramOpts::new(full("step_duration_seconds"), "Wall time of one gradient step")
+                .buckets(exponential_buckets(SHORTEST_STEP, 2.0, STEP_BUCKETS)?);
+        let steps = IntCounter::new(full("gradient_steps_total"), "Gradient steps done");
         let saving = "Time that the training thread spent on copying its state and its policy instead of training";
-        let gauge = |name: &str, help: &str| make.add(MaybeGauge::new(name, help));
-        let gauges = measured.iter().map(|metric| Ok((metric, gauge(metric.name, metric.help)?)));
-        let help = |metric: &Metric| {
-            format!("On held-out episodes, with the weights as they are: {}", metric.help)
-        };
-        let held_out = measured.iter().map(|metric| gauge(&held_out::name(metric), &help(metric)));
+        let diverged = "1 once training has met a number that is not finite, else 0";
+        let (mut algorithm, mut held_out) = (Vec::new(), Vec::new());
+        for metric in metrics {
+            algorithm.push((metric, OptionalGauge::new(registry, metric.name, metric.help)?));
+            let help =
+                format!("On held-out episodes, with the weights as they are: {}", metric.help);
+            held_out.push(OptionalGauge::new(registry, &held_out_name(metric), &help)?);
+        }
         Ok(Self {
-            held_out: held_out.collect::<prometheus::Result<_>>()?,
-            gradient_steps: make.counter("gradient_steps_total", "Gradient steps done")?,
-            step_duration: make.add(Histogram::with_opts(duration.buckets(buckets)))?,
-            saving_seconds: make.add(Counter::new(full("saving_seconds_total"), saving))?,
-            diverged: make
-                .count("diverged", "1 once training has met a number that is not finite, else 0")?,
-            algorithm: gauges.collect::<prometheus::Result<_>>()?,
+            gradient_steps: register(registry, steps)?,
+            step_duration: register(registry, Histogram::with_opts(duration))?,
+            saving_seconds: register(registry, Counter::new(full("saving_seconds_total"), saving))?,
+            diverged: register(registry, IntGauge::new(full("diverged"), diverged))?,
+            algorithm,
+            held_out,
         })
     }
 
-    /// Takes in one gradient step: what it measured, in the algorithm's order.
+    /// Records a gradient step and its values, in the algorithm's order.
     pub fn observe(&self, values: &[Option<f32>], duration: Duration) {
         self.gradient_steps.inc();
         self.step_duration.observe(duration.as_secs_f64());
-        for ((_, gauge), value) in self.algorithm.iter().zip(values) {
-            gauge.set(*value);
-        }
+        self.algorithm.iter().zip(values).for_each(|((_, gauge), value)| gauge.set(*value));
     }
 
-    /// Takes in what was measured on held-out episodes.
     pub fn observe_held_out(&self, values: &[Option<f32>]) {
         self.held_out.iter().zip(values).for_each(|(gauge, value)| gauge.set(*value));
-    }
-}
-
-/// Makes metrics of the learner and registers them.
-pub(crate) struct Registrar {
-    pub registry: Registry,
-}
-
-impl Registrar {
-    pub fn add<M: Collector + Clone + 'static>(
-        &self,
-        made: prometheus::Result<M>,
-    ) -> prometheus::Result<M> {
-        let metric = made?;
-        self.registry.register(Box::new(metric.clone()))?;
-        Ok(metric)
-    }
-
-    pub fn counter(&self, name: &str, help: &str) -> prometheus::Result<IntCounter> {
-        self.add(IntCounter::new(full(name), help))
-    }
-
-    pub fn gauge(&self, name: &str, help: &str) -> prometheus::Result<Gauge> {
-        self.add(Gauge::new(full(name), help))
-    }
-
-    pub fn count(&self, name: &str, help: &str) -> prometheus::Result<IntGauge> {
-        self.add(IntGauge::new(full(name), help))
-    }
-
-    /// A counter with a label.
-    pub fn counters(
-        &self,
-        name: &str,
-        help: &str,
-        label: &str,
-    ) -> prometheus::Result<IntCounterVec> {
-        self.add(IntCounterVec::new(Opts::new(full(name), help), &[label]))
-    }
-
-    /// A gauge of whole numbers with a label.
-    pub fn counts(&self, name: &str, help: &str, label: &str) -> prometheus::Result<IntGaugeVec> {
-        self.add(IntGaugeVec::new(Opts::new(full(name), help), &[label]))
-    }
-
-    /// A gauge with a label.
-    pub fn gauges(&self, name: &str, help: &str, label: &str) -> prometheus::Result<GaugeVec> {
-        self.add(GaugeVec::new(Opts::new(full(name), help), &[label]))
     }
 }
 

@@ -7,27 +7,21 @@ use quad_dataset::{BatchSampler, Transitions};
 use quad_run::config::{Device, Experiment};
 use quad_run::folder::Checkpoint;
 
-use super::training::{begin, origin};
+use super::agent::{begin, origin};
 
-/// How long steps are measured, in all phases together.
+/// Time of the measurement, of all phases together.
 const MEASURED: Duration = Duration::from_secs(1);
 
-/// What a run takes.
+/// The cost of a run.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct Price {
-    /// Seconds of one gradient step.
-    pub step: f64,
-    /// Bytes of a snapshot.
-    pub snapshot: u64,
-    /// Bytes of a checkpoint.
-    pub checkpoint: u64,
+    pub step_seconds: f64,
+    pub snapshot_bytes: u64,
+    pub checkpoint_bytes: u64,
 }
 
 impl Price {
-    /// Measures the first steps of each phase of a run, on the threads of the pool that calls.
-    ///
-    /// # Errors
-    /// The run could not begin with these transitions, or a step fails.
+    /// Measures the first steps of each phase of a run, on the threads of the calling pool.
     pub fn measure(
         experiment: &Experiment,
         device: Device,
@@ -41,20 +35,20 @@ impl Price {
             0,
         );
         Ok(Self {
-            step: mean_step(&mut agent, &mut sampler, experiment.steps)?,
-            snapshot: agent.policy(origin(experiment))?.len() as u64,
-            checkpoint: agent.save()?.len() as u64,
+            step_seconds: mean_step(&mut agent, &mut sampler, experiment.steps)?,
+            snapshot_bytes: agent.policy(origin(experiment))?.len() as u64,
+            checkpoint_bytes: agent.save()?.len() as u64,
         })
     }
 
     /// Bytes on disk of a whole run: its snapshots, and the checkpoints that are kept.
     pub fn bytes(&self, experiment: &Experiment) -> u64 {
         let snapshots = experiment.schedule().evaluations().max(1);
-        snapshots * self.snapshot + Checkpoint::KEPT as u64 * self.checkpoint
+        snapshots * self.snapshot_bytes + Checkpoint::KEPT as u64 * self.checkpoint_bytes
     }
 }
 
-/// Seconds of a step, in the mean over a run of so many: each phase counts by its share of them.
+/// Mean seconds of a gradient step over a run of `steps`, weighted by the lengths of its phases.
 pub(super) fn mean_step(
     agent: &mut Agent,
     sampler: &mut BatchSampler,
@@ -62,16 +56,15 @@ pub(super) fn mean_step(
 ) -> Result<f64, AlgorithmError> {
     let mut begins = agent.phases();
     begins.push(steps);
-    let phases = Vec::from_iter(
-        begins.windows(2).map(|phase| (phase[0], phase[1])).filter(|(begin, end)| begin < end),
-    );
+    let phases = begins.windows(2).map(|phase| (phase[0], phase[1]));
+    let phases = Vec::from_iter(phases.filter(|(begin, end)| begin < end));
     let mut seconds = 0.0;
     for (begin, end) in &phases {
         let mut step = || {
             agent.skip_to(*begin);
             agent.update(sampler.next_items())
         };
-        // The first step makes what later ones use again.
+        // The first step also allocates buffers.
         step()?;
         let (start, mut done) = (Instant::now(), 0);
         while done == 0 || start.elapsed() < MEASURED / phases.len() as u32 {

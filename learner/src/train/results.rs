@@ -1,35 +1,32 @@
-//! What training gives.
+//! Output of training.
 
 use quad_algorithms::Metric;
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
-use super::held_out;
+/// Gradient steps that a line of `metrics.jsonl` averages over.
+pub(super) const STEPS_PER_ROW: u64 = 100;
 
 /// The policy after a gradient step.
 #[derive(Debug)]
 pub(crate) struct TrainedPolicy {
-    /// After which step.
     pub step: u64,
-    /// Its file.
     pub file: Vec<u8>,
-    /// Whether it is to be evaluated, or only kept.
+    /// False for the last policy of a run without evaluations, which is only kept.
     pub evaluate: bool,
 }
 
 /// A line of `metrics.jsonl`: means over the gradient steps since the line before.
 #[derive(Clone, Debug)]
 pub(crate) struct Row {
-    /// Gradient steps done.
     pub step: u64,
-    /// Since training began.
+    /// Time since training began.
     pub seconds: f64,
-    /// What was measured.
     pub metrics: &'static [Metric],
-    /// The means, in the order of `metrics`; none of what none of the steps measured.
+    /// Means in the order of `metrics`; `None` if none of the steps measured it.
     pub values: Vec<Option<f32>>,
-    /// What was measured on held-out episodes after the last of the steps, in that order; empty if
-    /// nothing was.
+    /// Values on held-out episodes after the last of the steps, in the order of `metrics`; empty if
+    /// nothing was measured.
     pub held_out: Vec<Option<f32>>,
 }
 
@@ -42,13 +39,18 @@ impl Serialize for Row {
             map.serialize_entry(metric.name, &value)?;
         }
         for (metric, value) in measured(self.metrics, &self.held_out) {
-            map.serialize_entry(&held_out::name(metric), &value)?;
+            map.serialize_entry(&held_out_name(metric), &value)?;
         }
         map.end()
     }
 }
 
-/// The metrics that have a value, with it.
+/// The name of a metric on held-out episodes.
+pub(super) fn held_out_name(metric: &Metric) -> String {
+    format!("held_out_{}", metric.name)
+}
+
+/// The metrics that have a value.
 pub(super) fn measured<'a>(
     metrics: &'a [Metric],
     values: &'a [Option<f32>],
@@ -56,44 +58,42 @@ pub(super) fn measured<'a>(
     metrics.iter().zip(values).filter_map(|(metric, value)| Some((metric, (*value)?)))
 }
 
-/// Means of metrics, each over the times that it was measured. Sums in f64.
+/// Running means of metrics: sum and count of each.
 pub(super) struct Means(Vec<(f64, u32)>);
 
 impl Means {
-    /// Of so many metrics.
+    /// Means of this many metrics.
     pub fn new(count: usize) -> Self {
         Self(vec![(0.0, 0); count])
     }
 
-    /// Takes in values in the order of the metrics, as far as they were measured.
+    /// Adds values in the order of the metrics.
     pub fn add(&mut self, values: &[Option<f32>]) {
-        for ((sum, count), value) in
-            self.0.iter_mut().zip(values).filter_map(|(mean, value)| Some((mean, (*value)?)))
-        {
-            *sum += f64::from(value);
-            *count += 1;
+        for ((sum, count), value) in self.0.iter_mut().zip(values) {
+            if let Some(value) = value {
+                *sum += f64::from(*value);
+                *count += 1;
+            }
         }
     }
 
-    /// The means so far; begins anew.
+    /// Returns the means and resets them.
     pub fn take(&mut self) -> Vec<Option<f32>> {
-        let means = std::mem::replace(self, Self::new(self.0.len()));
-        means
-            .0
-            .into_iter()
-            .map(|(sum, count)| (count > 0).then(|| (sum / f64::from(count)) as f32))
-            .collect()
+        let mean = |(sum, count): &mut (f64, u32)| {
+            let mean = (*count > 0).then(|| (*sum / f64::from(*count)) as f32);
+            (*sum, *count) = (0.0, 0);
+            mean
+        };
+        self.0.iter_mut().map(mean).collect()
     }
 }
 
-/// How training ended well.
+/// The end of training without an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Outcome {
-    /// All steps are done.
     Completed,
-    /// It was stopped after this many.
+    /// Training was stopped after this gradient step.
     Stopped {
-        /// Gradient steps done.
         step: u64,
     },
 }

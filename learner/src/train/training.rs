@@ -1,138 +1,160 @@
-//! The work of the thread `training`: continues from a checkpoint, trains. The agent is made before
-//! the run's folder.
+//! The loop of gradient steps: samples a batch, updates the agent, again and again.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
-use anyhow::{Context, anyhow};
-use quad_algorithms::{Agent, AlgorithmError, Context as Learning};
-use quad_dataset::{BatchSampler, Transitions};
-use quad_protocol::{Origin, Snapshot};
-use quad_run::config::{Device, Experiment};
+use quad_algorithms::{Agent, AlgorithmError};
+use quad_dataset::BatchSampler;
+use quad_policy::{NetworkError, PolicyError};
+use quad_protocol::Origin;
+use quad_run::config::Schedule;
 use quad_run::folder::Checkpoint;
-use quad_runtime::{Heartbeat, Hint, hinted};
+use quad_runtime::{Heartbeat, hinted};
+use tracing::debug;
 
-use super::device;
 use super::held_out::HeldOut;
 use super::metrics::TrainingMetrics;
-use super::outbox::Outbox;
-use super::steps::{Outlets, Plan, TrainError, train};
+use super::output_queue::OutputQueue;
+use super::results::{Means, Outcome, Row, STEPS_PER_ROW, TrainedPolicy, measured};
+
+/// Least time of training that is spent between two checkpoints for each second that one takes:
+/// saving costs at most 1 %.
+const TRAINING_PER_SAVING: u32 = 100;
 
 const DIVERGED: &str = "the same configuration would diverge again: try smaller learning rates (`learner presets TASK` prints the \
                         names of all hyper-parameters), or look for outliers with `learner datasets inspect`; begin anew with \
                         --fresh";
 
-const TOO_LARGE: &str = "take smaller networks or fewer critics; or train without evaluations (--eval-interval 0) and score the \
-                         last snapshot by `evaluator score`";
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum TrainError {
+    /// A metric or a tensor is not finite.
+    #[error("training diverged: at gradient step {step} {what}")]
+    Diverged { step: u64, what: String },
+    #[error("gradient step {step} failed")]
+    Update { step: u64, source: AlgorithmError },
+}
 
-/// Everything that the thread takes along.
+impl TrainError {
+    fn at(step: u64) -> impl Fn(AlgorithmError) -> Self {
+        move |source| match source {
+            AlgorithmError::Policy(error @ PolicyError::Network(NetworkError::NotFinite(_))) => {
+                Self::Diverged { step, what: error.to_string() }
+            }
+            source => Self::Update { step, source },
+        }
+    }
+}
+
+/// The loop of gradient steps and its connections to the other threads.
 pub(crate) struct Training {
-    pub experiment: Experiment,
-    /// At step 0.
     pub agent: Agent,
-    /// What measures it on held-out episodes, if there are any.
+    pub sampler: BatchSampler,
     pub held_out: Option<HeldOut>,
-    /// Where an earlier incarnation of the run has left off.
-    pub checkpoint: Option<Checkpoint>,
+    pub schedule: Schedule,
+    /// Origin of the snapshots; the step is set for each.
+    pub origin: Origin,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
-    /// Seconds of training in earlier incarnations.
+    /// Seconds of training in earlier incarnations of the run.
     pub seconds_before: f64,
     pub metrics: TrainingMetrics,
-    pub outbox: Outbox,
-    /// Set to end training after its current step.
+    pub queue: OutputQueue,
+    /// Set by the main loop to end training early.
     pub stop: Arc<AtomicBool>,
 }
 
-/// The algorithm of an experiment at step 0. What it cannot learn with, or from, is refused here,
-/// before the run has a folder.
-///
-/// # Errors
-/// The algorithm cannot start with its hyper-parameters or these transitions, or evaluators cannot
-/// be sent its policy.
-pub(crate) fn begin(
-    experiment: &Experiment,
-    device: Device,
-    transitions: Transitions,
-) -> anyhow::Result<Agent> {
-    let agent = algorithm(experiment, device, transitions, experiment.batch_size as usize)?;
-    if experiment.eval_interval > 0 {
-        check_size(agent.policy(origin(experiment))?.len())?;
-    }
-    Ok(agent)
-}
-
-/// The algorithm of an experiment over these transitions, with batches of this size.
-pub(super) fn algorithm(
-    experiment: &Experiment,
-    device: Device,
-    transitions: Transitions,
-    batch_size: usize,
-) -> anyhow::Result<Agent> {
-    let context = Learning {
-        transitions: Arc::new(transitions),
-        batch_size,
-        total_steps: experiment.steps,
-        seed: experiment.seed,
-        precision: experiment.precision,
-        device: device::open(device)?,
-    };
-    Agent::new(experiment.definition()?, &experiment.agent, context).hint_of(AlgorithmError::hint)
-}
-
-/// Where the snapshots of a run are from; the step is set for each.
-pub(super) fn origin(experiment: &Experiment) -> Origin {
-    let Experiment { environment, seed, episodes, .. } = experiment;
-    Origin { environment: environment.clone(), seed: *seed, step: 0, episodes: *episodes }
-}
-
 impl Training {
-    /// The thread's work. How training ended comes last in the outbox, unless it failed.
-    pub fn run(self, beat: &Heartbeat) -> anyhow::Result<()> {
-        let Self { experiment, mut agent, mut held_out, .. } = self;
-        if let Some(Checkpoint { step, state }) = &self.checkpoint {
-            let advice = "begin anew with --fresh, or continue with the version of the learner that wrote it";
-            let loaded = agent.load(state).hint(advice);
-            loaded
-                .with_context(|| format!("cannot continue from the checkpoint of step {step}"))?;
+    /// The work of the thread `training`. The outcome comes last in the queue, unless training
+    /// fails.
+    pub fn run(mut self, beat: &Heartbeat) -> anyhow::Result<()> {
+        match self.train(beat) {
+            Ok(outcome) => self.queue.ended(outcome),
+            Err(error @ TrainError::Diverged { .. }) => {
+                self.metrics.diverged.set(1);
+                return Err(hinted(error, DIVERGED));
+            }
+            Err(error) => return Err(error.into()),
         }
-        let (batch_size, origin) = (experiment.batch_size as usize, origin(&experiment));
-        let mut sampler =
-            BatchSampler::new(agent.dataset_len(), batch_size, experiment.seed, agent.step());
-        let outlets = Outlets {
-            metrics: &self.metrics,
-            outbox: &self.outbox,
-            origin: &origin,
-            stop: &self.stop,
-            beat,
-        };
-        let plan = Plan {
-            schedule: experiment.schedule(),
-            checkpoint_every: self.checkpoint_every,
-            seconds_before: self.seconds_before,
-        };
-        let outcome = train(&mut agent, &mut sampler, held_out.as_mut(), plan, &outlets).map_err(
-            |error| {
-                let diverged = matches!(error, TrainError::Diverged { .. });
-                self.metrics.diverged.set(diverged.into());
-                if diverged { hinted(error, DIVERGED) } else { error.into() }
-            },
-        )?;
-        self.outbox.ended(outcome);
         Ok(())
     }
-}
 
-/// Checks that evaluators can be sent a policy's file of so many bytes: fails now rather than at
-/// the first evaluation.
-fn check_size(bytes: usize) -> anyhow::Result<()> {
-    let most = Snapshot::MOST_FILE;
-    if bytes <= most {
-        return Ok(());
+    /// Trains until all steps are done or `stop` is set. Either way the queue gets a checkpoint of
+    /// the last step.
+    pub(super) fn train(&mut self, beat: &Heartbeat) -> Result<Outcome, TrainError> {
+        let start = Instant::now();
+        let (steps, metrics) = (self.schedule.steps, self.agent.metrics());
+        let mut means = Means::new(metrics.len());
+        let mut next_checkpoint = start + self.checkpoint_every;
+        while self.agent.step() < steps {
+            let begin = Instant::now();
+            let step = self.agent.step() + 1;
+            let batch = self.sampler.next_items();
+            let values = self.agent.update(batch).map_err(TrainError::at(step))?;
+            let infinite = measured(metrics, &values).find(|(_, value)| !value.is_finite());
+            if let Some((metric, value)) = infinite {
+                let what = format!("{} is {value}", metric.name);
+                return Err(TrainError::Diverged { step, what });
+            }
+            let updated = Instant::now();
+            beat.alive();
+            self.metrics.observe(&values, updated - begin);
+            means.add(&values);
+
+            let is_last = step == steps;
+            let stopped = !is_last && self.stop.load(Ordering::Relaxed);
+            if step.is_multiple_of(STEPS_PER_ROW) || is_last || stopped {
+                let seconds = self.seconds_before + start.elapsed().as_secs_f64();
+                let (values, held_out) = (means.take(), self.measure_held_out(step, is_last)?);
+                self.queue.row(Row { step, seconds, metrics, values, held_out });
+            }
+            if is_last || self.schedule.is_evaluated(step) {
+                self.save_policy(step, beat)?;
+            }
+            if is_last || stopped || updated >= next_checkpoint {
+                let pause = TRAINING_PER_SAVING * self.save_state(step)?;
+                next_checkpoint = Instant::now() + self.checkpoint_every.max(pause);
+            }
+            if stopped {
+                return Ok(Outcome::Stopped { step });
+            }
+        }
+        Ok(Outcome::Completed)
     }
-    Err(hinted(
-        anyhow!("the policy's file has {bytes} bytes, and evaluators can be sent at most {most}"),
-        TOO_LARGE,
-    ))
+
+    /// Empty if the row of this step has no such metrics.
+    fn measure_held_out(
+        &mut self,
+        step: u64,
+        is_last: bool,
+    ) -> Result<Vec<Option<f32>>, TrainError> {
+        let Some(held_out) = self.held_out.as_mut().filter(|it| it.is_due(step, is_last)) else {
+            return Ok(Vec::new());
+        };
+        let values = self.agent.save().and_then(|state| held_out.measure(&state));
+        let values = values.map_err(TrainError::at(step))?;
+        self.metrics.observe_held_out(&values);
+        Ok(values)
+    }
+
+    fn save_policy(&mut self, step: u64, beat: &Heartbeat) -> Result<(), TrainError> {
+        let begin = Instant::now();
+        debug!(step, "snapshot");
+        self.origin.step = step;
+        let file = self.agent.policy(self.origin.clone()).map_err(TrainError::at(step))?;
+        self.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
+        let evaluate = self.schedule.is_evaluated(step);
+        self.queue.snapshot(TrainedPolicy { step, file, evaluate }, &self.stop, beat);
+        Ok(())
+    }
+
+    /// Returns the time that it took to copy the state, in which nothing was trained.
+    fn save_state(&mut self, step: u64) -> Result<Duration, TrainError> {
+        let begin = Instant::now();
+        let state = self.agent.save().map_err(TrainError::at(step))?;
+        let took = begin.elapsed();
+        self.metrics.saving_seconds.inc_by(took.as_secs_f64());
+        self.queue.checkpoint(Checkpoint { step, state });
+        Ok(took)
+    }
 }

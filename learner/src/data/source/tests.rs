@@ -1,11 +1,11 @@
-//! Tests of `data/source.rs`.
+//! Tests of the values of `--dataset`.
 
 use quad_run::config::{resolve, tasks};
 
 use super::*;
 
 #[test]
-fn a_word_is_a_name_a_path_or_neither() {
+fn names_paths_and_unknown_names() {
     let named = Source::parse("walker2d-medium-replay-v2").unwrap();
     assert_eq!(named.entry().unwrap().file, "walker2d_medium_replay-v2.hdf5");
     assert_eq!(Source::parse("minari:a/b-v0").unwrap(), Source::Minari("a/b-v0".to_owned()));
@@ -17,7 +17,7 @@ fn a_word_is_a_name_a_path_or_neither() {
 }
 
 #[test]
-fn the_tasks_datasets_are_known_and_of_their_environments() {
+fn the_datasets_of_all_tasks_are_known_and_fit() {
     let resolved =
         tasks::all().iter().map(|task| resolve(&task.name, &toml::Table::new()).unwrap());
     let named: Vec<_> = resolved.filter(|experiment| experiment.dataset.is_some()).collect();
@@ -47,7 +47,7 @@ fn data_of_another_simulation_is_refused() {
         ("antmaze-medium-stitch-v0", "antmaze-medium", false),
         ("antmaze-medium-play-v2", "antmaze-medium-singletask-v0", false),
         ("humanoidmaze-large-stitch-v0", "humanoidmaze-large-singletask-task3-v0", true),
-        // By the name of the file alone.
+        // The catalog knows the first file by its name.
         ("data/hopper_medium-v2.hdf5", "walker2d", false),
         ("data/mine.hdf5", "walker2d", true),
     ] {

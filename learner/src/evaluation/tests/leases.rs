@@ -1,17 +1,13 @@
-//! For how long an evaluator keeps a job.
+//! Tests of leases.
 
 use super::*;
 
 #[test]
-fn a_lease_that_runs_out_gives_the_unscored_episodes_to_the_next() {
+fn an_expired_lease_frees_the_unscored_episodes() {
     let mut bench = Bench::new();
     let lost = bench.job("a", 0);
     bench.deliver(&report(&lost, "a", vec![score(2, 0.0)])).unwrap();
-    assert_eq!(
-        [bench.expire(9), bench.expire(10), bench.expire(10)],
-        [0, 1, 0],
-        "in time, and only once"
-    );
+    assert_eq!([9, 10, 10].map(|seconds| bench.expire(seconds)), [0, 1, 0]);
     let next = bench.job("b", 10);
     assert_eq!((next.step, next.seeds), (1000, vec![1, 3, 4, 5, 6]));
     assert_ne!(next.id, lost.id);
@@ -36,22 +32,17 @@ fn progress_that_does_not_advance_extends_nothing() {
     let job = bench.job("a", 0);
     let first = progress(&job, "a", 100);
     bench.progress(&first, 5).unwrap();
-    assert_eq!(bench.progress(&first, 9), Err(Refusal::NotAdvanced), "the same once more");
-    assert_eq!(bench.progress(&progress(&job, "a", 99), 9), Err(Refusal::NotAdvanced));
-    assert_eq!(
-        bench.progress(&progress(&job, "a", 0), 9),
-        Err(Refusal::NotAdvanced),
-        "it has begun"
-    );
+    for steps in [100, 99, 0] {
+        let message = progress(&job, "a", steps);
+        assert_eq!(bench.progress(&message, 9), Err(Refusal::NotAdvanced));
+    }
     let ended = Progress { episodes_done: 1, ..progress(&job, "a", 100) };
     bench.progress(&ended, 14).unwrap();
-    assert_eq!((bench.expire(23), bench.expire(24)), (0, 1));
+    assert_eq!([23, 24].map(|seconds| bench.expire(seconds)), [0, 1]);
 }
 
-/// While it fetches the weights an evaluator has nothing to show. It has a minute for that, then it
-/// must begin.
 #[test]
-fn an_evaluator_may_prepare_for_a_while() {
+fn an_evaluator_has_a_minute_to_fetch_the_weights() {
     let mut bench = Bench::new();
     let (job, other) = (bench.job("a", 0), bench.job("b", 0));
     for seconds in (5..60).step_by(5) {
@@ -60,27 +51,28 @@ fn an_evaluator_may_prepare_for_a_while() {
     }
     bench.progress(&progress(&other, "b", 1), 59).unwrap();
     bench.progress(&progress(&job, "a", 0), 59).unwrap();
-    assert_eq!((bench.expire(59), bench.expire(60)), (0, 1), "a's, which has not begun");
-    assert_eq!((bench.expire(68), bench.expire(69)), (0, 1));
+    // The job of a, which has not begun, ends before that of b.
+    assert_eq!([59, 60, 68, 69].map(|seconds| bench.expire(seconds)), [0, 1, 0, 1]);
 }
 
-/// The disk is full: an evaluator that has delivered its scores has done all that it can, and
-/// delivers them again.
+/// While the disk is full, evaluators deliver their scores again and again.
 #[test]
-fn scores_that_cannot_be_saved_keep_their_job() {
+fn scores_that_cannot_be_saved_extend_the_lease() {
     let mut bench = Bench::new();
     let (job, other) = (bench.job("a", 0), bench.job("b", 0));
     let good = full_report(&job, "a");
     for seconds in (5..60).step_by(5) {
-        bench.keep(&good, seconds);
-        bench.keep(&ScoreReport { incarnation: 1, ..full_report(&other, "b") }, seconds);
-        bench.keep(&ScoreReport { evaluator: name("b"), ..good.clone() }, seconds);
+        bench.extend_lease(&good, seconds);
+        bench.extend_lease(&ScoreReport { incarnation: 1, ..full_report(&other, "b") }, seconds);
+        bench.extend_lease(&ScoreReport { evaluator: name("b"), ..good.clone() }, seconds);
     }
-    assert_eq!((bench.expire(9), bench.expire(10)), (0, 1), "b's, for which nothing was delivered");
-    assert_eq!((bench.expire(64), bench.expire(65)), (0, 1), "a's, which has stopped asking");
+    // Nothing was delivered for the job of b; a has stopped delivering.
+    assert_eq!([9, 10, 64, 65].map(|seconds| bench.expire(seconds)), [0, 1, 0, 1]);
     let job = bench.job("a", 70);
     let longest = 70 + Job::LONGEST.as_secs();
-    (75..longest).step_by(5).for_each(|seconds| bench.keep(&full_report(&job, "a"), seconds));
+    (75..longest)
+        .step_by(5)
+        .for_each(|seconds| bench.extend_lease(&full_report(&job, "a"), seconds));
     assert_eq!((bench.expire(longest - 1), bench.expire(longest)), (0, 1));
 }
 
@@ -89,13 +81,18 @@ fn progress_of_others_is_refused_and_extends_nothing() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
     bench.job("b", 0);
-    let cases = [
-        (progress(&job, "b", 10), Refusal::Evaluator),
-        (progress(&Job { id: 99, ..job.clone() }, "a", 10), Refusal::Job),
-        (progress(&Job { run: name("other"), ..job.clone() }, "a", 10), Refusal::Run),
-        (progress(&Job { incarnation: 1, ..job.clone() }, "a", 10), Refusal::Incarnation),
-    ];
-    for (message, refusal) in cases {
+    let good = progress(&job, "a", 10);
+    let wrong = |change: fn(&mut Progress)| {
+        let mut message = good.clone();
+        change(&mut message);
+        message
+    };
+    for (message, refusal) in [
+        (wrong(|message| message.evaluator = name("b")), Refusal::Job),
+        (wrong(|message| message.job = 99), Refusal::Job),
+        (wrong(|message| message.run = name("other")), Refusal::Run),
+        (wrong(|message| message.incarnation = 1), Refusal::Incarnation),
+    ] {
         assert_eq!(bench.progress(&message, 9), Err(refusal));
     }
     assert_eq!(bench.expire(10), 2);

@@ -1,26 +1,28 @@
-//! The scoreboard under a clock of the test's own: two evaluations, and what evaluators say.
+//! Tests of the scoreboard under a simulated clock.
 
 mod jobs;
 mod leases;
 mod reports;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
 use quad_run::folder::SavedScores;
 
-use super::outcomes::Recorded;
-use super::{Claim, Claimed, HandedBack, Lost, Refusal, Rules, Scoreboard, Validated};
+use super::{Claim, Claimed, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated};
 
 const LEASE: Duration = Duration::from_secs(10);
 const INCARNATION: u64 = 77;
 
 struct Bench {
     board: Scoreboard,
-    /// How many evaluators there are.
+    /// Number of connected evaluators.
     present: usize,
     start: Instant,
+    /// Scores of the last evaluation that a report completed.
+    completed: Option<Vec<EpisodeScore>>,
 }
 
 fn hash(step: u64) -> Hash {
@@ -39,14 +41,15 @@ impl Bench {
             run: name("run"),
             incarnation: INCARNATION,
             task: quad_dataset::environment::find("hopper").unwrap().into(),
-            environment_seed: 5,
+            seed: 5,
+            episodes: 7,
             job_episodes: [5, 20],
             lease: LEASE,
         };
-        let mut board = Scoreboard::new(rules, earlier);
+        let mut board = Scoreboard::new(Arc::new(rules), earlier);
         board.add_evaluation(2000, hash(2000), &Vec::from_iter(11..=17)).unwrap();
         board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
-        Self { board, present: 2, start: Instant::now() }
+        Self { board, present: 2, start: Instant::now(), completed: None }
     }
 
     fn at(&self, seconds: u64) -> Instant {
@@ -54,17 +57,8 @@ impl Bench {
     }
 
     fn claim(&mut self, evaluator: &str, attempt: u64, seconds: u64) -> Claimed {
-        let now = self.at(seconds);
-        let environments = ["ant".to_owned(), "hopper".to_owned()];
-        self.board.claim(
-            Claim {
-                evaluator: &name(evaluator),
-                attempt,
-                environments: &environments,
-                present: self.present,
-            },
-            now,
-        )
+        let (evaluator, present, now) = (&name(evaluator), self.present, self.at(seconds));
+        self.board.claim(Claim { evaluator, attempt, fits: true, present }, now)
     }
 
     fn job(&mut self, evaluator: &str, seconds: u64) -> Job {
@@ -80,20 +74,25 @@ impl Bench {
         self.board.progress(progress, now)
     }
 
-    /// Hands a job back; `failed` is the second at which it failed, if it did.
-    fn hand_back(&mut self, evaluator: &str, job: &Job, failed: Option<u64>) -> Option<HandedBack> {
+    /// Hands a job back, which may have failed at some second.
+    fn hand_back(
+        &mut self,
+        evaluator: &str,
+        job: &Job,
+        failed: Option<u64>,
+    ) -> Option<(u64, Vec<(u64, u64)>)> {
         let failed = failed.map(|seconds| self.at(seconds));
         self.board.hand_back(&name(evaluator), job.id, failed)
     }
 
-    fn gone(&mut self, evaluator: &str, seconds: u64) -> Lost {
+    fn leave(&mut self, evaluator: &str, seconds: u64) -> Lost {
         let now = self.at(seconds);
-        self.board.evaluator_gone(&name(evaluator), now)
+        self.board.evaluator_left(&name(evaluator), now)
     }
 
-    fn keep(&mut self, report: &ScoreReport, seconds: u64) {
+    fn extend_lease(&mut self, report: &ScoreReport, seconds: u64) {
         let now = self.at(seconds);
-        self.board.keep(report, now);
+        self.board.extend_lease(report, now);
     }
 
     fn expire(&mut self, seconds: u64) -> usize {
@@ -101,11 +100,13 @@ impl Bench {
         self.board.expire(now).jobs
     }
 
-    /// As the thread `scores` does: validate, then record.
-    fn deliver(&mut self, report: &ScoreReport) -> Result<(Validated, Recorded), Refusal> {
-        let validated = self.board.validate(report)?;
-        let recorded = self.board.record(report, &validated.new);
-        Ok((validated, recorded))
+    /// Validates and records a report. Returns the numbers of its new and duplicate scores, and of
+    /// completed jobs.
+    fn deliver(&mut self, report: &ScoreReport) -> Result<(usize, u32, usize), Refusal> {
+        let Validated { new, duplicates } = self.board.validate(report)?;
+        let recorded = self.board.record(report, &new);
+        self.completed = recorded.evaluation_completed.or(self.completed.take());
+        Ok((new.len(), duplicates, recorded.jobs_completed))
     }
 }
 
@@ -113,33 +114,22 @@ fn name(text: &str) -> Name {
     Name::new(text).unwrap()
 }
 
-/// An episode of Hopper.
 fn score(seed: u64, episode_return: f64) -> EpisodeScore {
     let hopper = quad_dataset::environment::find("hopper").unwrap();
-    EpisodeScore {
-        seed,
-        episode_return,
-        length: 100,
-        score: hopper.normalized_score(episode_return),
-    }
+    let score = hopper.normalized_score(episode_return);
+    EpisodeScore { seed, episode_return, length: 100, score }
 }
 
-/// Some of a job's scores.
 fn report(job: &Job, evaluator: &str, episodes: Vec<EpisodeScore>) -> ScoreReport {
     ScoreReport::new(job, name(evaluator), name("f32"), episodes)
 }
 
-/// All of them.
+/// All scores of a job.
 fn full_report(job: &Job, evaluator: &str) -> ScoreReport {
     report(job, evaluator, job.seeds.iter().map(|&seed| score(seed, 500.0)).collect())
 }
 
 /// Progress of a job after this many environment steps.
 fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
-    Progress {
-        steps_done,
-        environment_steps: 10,
-        episodes: 1,
-        ..Progress::new(job, name(evaluator))
-    }
+    Progress { steps_done, ..Progress::new(job, name(evaluator)) }
 }

@@ -4,7 +4,7 @@ use std::fs;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus};
+use std::process::{Command, ExitStatus};
 use std::time::Duration;
 
 use anyhow::Context;
@@ -12,16 +12,13 @@ use quad_run::config::tables;
 use quad_run::folder::RunDir;
 use quad_run::status::{Pace, State};
 use quad_runtime::{ENDED_AT_ONCE, FAILURE_FILE, LEAVE_WITHIN, UNFINISHED};
-use rustix::process::{Pid, Signal, kill_process};
-use tokio::sync::watch::Receiver;
 use tokio::task::spawn_blocking;
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
+use tokio_util::sync::CancellationToken;
 
 use super::study::PlannedRun;
-use crate::local_evaluators::{not_encrypted, run_beside};
+use crate::children::{self, Process, hide_certificates};
 
-/// How often it looks whether a learner has ended.
-pub(super) const GLANCE: Duration = Duration::from_millis(100);
 /// A learner that was told to stop ends within less; one that is frozen is killed. Then there is
 /// time for the evaluators to leave before the sweep must have ended.
 const LEARNERS_LEAVE: Duration = LEAVE_WITHIN.saturating_add(Duration::from_secs(2));
@@ -42,7 +39,7 @@ pub(crate) struct Learners {
 
 /// A run at work.
 #[derive(Clone)]
-pub(super) struct Job {
+pub(super) struct LearnerProcess {
     pub run: PlannedRun,
     /// The run's folder.
     pub dir: PathBuf,
@@ -61,50 +58,47 @@ pub(super) enum End {
     Failed(String),
 }
 
-impl Job {
+impl LearnerProcess {
     /// A run of a study in this folder.
     pub fn new(run: PlannedRun, state: State, study: &Path) -> Self {
         Self { dir: study.join(&run.name), from: state.step(run.experiment.steps), run }
     }
 
-    /// Starts the learner and waits for its end; after `stop`, in which it saves a checkpoint, for
-    /// no longer than it may take. The system ends the learner with the calling thread. Other
+    /// Starts the learner and waits for its end. After `stop` it waits no longer than the learner
+    /// may take to save a checkpoint. The system ends the learner with the calling thread. Other
     /// threads read and write the folder: a disk that hangs holds up neither other runs nor Ctrl-C.
-    pub async fn see_through(self, with: Learners, stop: Receiver<bool>) -> (Self, End, Pace) {
+    pub async fn run(self, with: Learners, stop: CancellationToken) -> (Self, End, Pace) {
         let begun = Pace { step: self.from, ..Pace::default() };
-        let (end, pace) = self
-            .work(with, stop)
-            .await
-            .unwrap_or_else(|error| (End::Failed(format!("{error:#}")), begun));
+        let (end, pace) = match self.supervise(with, stop).await {
+            Ok(Some(ended)) => ended,
+            Ok(None) => (End::Unfinished, begun),
+            Err(error) => (End::Failed(format!("{error:#}")), begun),
+        };
         (self, end, pace)
     }
 
-    async fn work(&self, with: Learners, stop: Receiver<bool>) -> anyhow::Result<(End, Pace)> {
-        let unfinished = (End::Unfinished, Pace { step: self.from, ..Pace::default() });
-        let job = self.clone();
-        let mut command = tokio::select! {
-            prepared = spawn_blocking(move || job.prepare(&with)) => prepared??,
-            () = told(&stop) => return Ok(unfinished),
-        };
-        let mut learner = command
-            .spawn()
+    /// `None` if the sweep stops before the learner starts, or before the disk has answered.
+    async fn supervise(
+        &self,
+        with: Learners,
+        stop: CancellationToken,
+    ) -> anyhow::Result<Option<(End, Pace)>> {
+        let this = self.clone();
+        let prepared = spawn_blocking(move || this.prepare(&with));
+        let Some(prepared) = stop.run_until_cancelled(prepared).await else { return Ok(None) };
+        let mut command = prepared??;
+        let mut learner = Process::start(&mut command)
             .with_context(|| format!("{}: cannot start a learner", self.run.name))?;
-        let status = tokio::select! {
-            status = ended(&mut learner) => status,
-            () = told(&stop) => {
-                kill_process(Pid::from_child(&learner), Signal::TERM).ok();
-                if timeout(LEARNERS_LEAVE, ended(&mut learner)).await.is_err() {
-                    learner.kill().ok();
-                }
-                ended(&mut learner).await
-            }
+        let status = match stop.run_until_cancelled(learner.wait()).await {
+            Some(status) => status,
+            None => learner.end(LEARNERS_LEAVE).await,
         };
-        let (job, stopped) = (self.clone(), *stop.borrow());
+        let (this, stopped) = (self.clone(), stop.is_cancelled());
         let concluded =
-            spawn_blocking(move || (job.conclude(status, stopped), Pace::read(&job.dir)));
+            spawn_blocking(move || (this.conclude(status, stopped), Pace::read(&this.dir)));
         tokio::select! {
-            concluded = concluded => Ok(concluded?),
-            () = async { told(&stop).await; sleep(LAST_WORDS).await } => Ok(unfinished),
+            concluded = concluded => Ok(Some(concluded?)),
+            () = async { stop.cancelled().await; sleep(LAST_WORDS).await } => Ok(None),
         }
     }
 
@@ -121,11 +115,11 @@ impl Job {
             command.args(["--set", &format!("{key}={value}")]);
         }
         command.env("RAYON_NUM_THREADS", with.threads.to_string());
-        not_encrypted(&mut command, &with.endpoint);
+        hide_certificates(&mut command, &with.endpoint);
         let folder = RunDir::at(dir);
         command.env(FAILURE_FILE, folder.failure_path());
         fs::create_dir_all(dir)
-            .and_then(|()| run_beside(&mut command, &log(dir)))
+            .and_then(|()| children::prepare(&mut command, &log(dir)))
             .with_context(|| format!("{}: cannot write to {}", run.name, dir.display()))?;
         folder.clear_failure()?;
         Ok(command)
@@ -161,20 +155,6 @@ impl Job {
     }
 }
 
-/// Waits until the sweep is told to end.
-async fn told(stop: &Receiver<bool>) {
-    stop.clone().wait_for(|stop| *stop).await.ok();
-}
-
-async fn ended(learner: &mut Child) -> io::Result<ExitStatus> {
-    loop {
-        if let Some(status) = learner.try_wait().transpose() {
-            return status;
-        }
-        sleep(GLANCE).await;
-    }
-}
-
 fn log(dir: &Path) -> PathBuf {
     dir.join("learner.log")
 }
@@ -194,19 +174,22 @@ mod tests {
         let text = "about = 'x'\nrun = { task = 'hopper-demo', dataset = 'x.hdf5' }\naxes = { seed = [0] }";
         fs::write(&file, text).unwrap();
         let run = Study::read(&file, &[], &[]).unwrap().runs.remove(0);
-        let job = Job::new(run, State::NotBegun, folder.path());
-        fs::create_dir_all(&job.dir).unwrap();
+        let learner = LearnerProcess::new(run, State::NotBegun, folder.path());
+        fs::create_dir_all(&learner.dir).unwrap();
         let killed = || Ok(ExitStatus::from_raw(9));
-        for (failure, reason) in
-            [(None, "the learner ended by signal: 9"), (Some("a loose cable"), "a loose cable")]
-        {
-            let dir = RunDir::at(&job.dir);
+        for (failure, reason) in [
+            (None, "the learner ended by signal: 9 (SIGKILL)"),
+            (Some("a loose cable"), "a loose cable"),
+        ] {
+            let dir = RunDir::at(&learner.dir);
             dir.clear_failure().unwrap();
-            failure.into_iter().for_each(|failure| dir.mark_failed(failure).unwrap());
-            let End::Failed(said) = job.conclude(killed(), false) else { panic!("{reason}") };
+            if let Some(failure) = failure {
+                dir.mark_failed(failure).unwrap();
+            }
+            let End::Failed(said) = learner.conclude(killed(), false) else { panic!("{reason}") };
             assert!(said.starts_with(&format!("seed0: {reason}")), "{said}");
             assert_eq!(dir.failure().as_deref(), Some(reason));
         }
-        assert!(matches!(job.conclude(killed(), true), End::Unfinished), "it was told to stop");
+        assert!(matches!(learner.conclude(killed(), true), End::Unfinished), "it was stopped");
     }
 }

@@ -1,0 +1,134 @@
+//! The queue from training to the disk.
+//!
+//! A disk that is full or hangs delays the thread that takes from here, and not training. The queue
+//! is bounded: it holds the newest checkpoint, rows of hours, and so many bytes of snapshots that
+//! training continues for hours before it waits for the disk, too.
+
+use std::collections::VecDeque;
+use std::mem;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use quad_run::folder::Checkpoint;
+use quad_runtime::Heartbeat;
+
+use super::results::{Outcome, Row, TrainedPolicy};
+
+/// Most bytes of snapshots that wait for the disk: forty of the paper's size.
+const MOST_BYTES: usize = 256 << 20;
+/// Most lines of `metrics.jsonl` that wait for it; more push out the oldest.
+const MOST_ROWS: usize = 10_000;
+/// Interval at which training checks for a stop while it waits for the disk.
+const POLL: Duration = Duration::from_millis(100);
+
+#[derive(Debug)]
+pub(crate) enum Output {
+    Snapshot(TrainedPolicy),
+    Checkpoint(Checkpoint),
+    Rows(Vec<Row>),
+    /// Comes after all other output.
+    Ended(Outcome),
+}
+
+/// A handle to the queue. Clones share it.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct OutputQueue {
+    shared: Arc<(Mutex<Waiting>, Condvar)>,
+}
+
+#[derive(Debug, Default)]
+struct Waiting {
+    snapshots: VecDeque<TrainedPolicy>,
+    checkpoint: Option<Checkpoint>,
+    rows: Vec<Row>,
+    ended: Option<Outcome>,
+    closed: bool,
+}
+
+impl OutputQueue {
+    /// Adds a policy. Waits while too many bytes wait already, unless training is to `stop`.
+    pub fn snapshot(&self, policy: TrainedPolicy, stop: &AtomicBool, beat: &Heartbeat) {
+        let mut waiting = self.lock();
+        while waiting.bytes() > MOST_BYTES && !stop.load(Ordering::Relaxed) {
+            beat.alive();
+            waiting = self.wait(waiting, POLL);
+        }
+        waiting.snapshots.push_back(policy);
+        self.shared.1.notify_all();
+    }
+
+    /// Adds a checkpoint, which replaces one that still waits.
+    pub fn checkpoint(&self, checkpoint: Checkpoint) {
+        self.lock().checkpoint = Some(checkpoint);
+        self.shared.1.notify_all();
+    }
+
+    /// Adds a line of `metrics.jsonl`.
+    pub fn row(&self, row: Row) {
+        let rows = &mut self.lock().rows;
+        rows.push(row);
+        rows.drain(..rows.len().saturating_sub(MOST_ROWS));
+        self.shared.1.notify_all();
+    }
+
+    pub fn ended(&self, outcome: Outcome) {
+        self.lock().ended = Some(outcome);
+        self.shared.1.notify_all();
+    }
+
+    /// Declares that nothing more will come.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.shared.1.notify_all();
+    }
+
+    /// Waits for the next output; `None` once the queue is closed and empty. Snapshots go before
+    /// the checkpoint: a run that is resumed from a checkpoint does not make earlier snapshots
+    /// again.
+    pub fn next(&self, beat: &Heartbeat) -> Option<Output> {
+        let mut waiting = self.lock();
+        loop {
+            beat.alive();
+            let output = waiting.next();
+            if output.is_some() || waiting.closed {
+                self.shared.1.notify_all();
+                return output;
+            }
+            waiting = self.wait(waiting, beat.interval());
+        }
+    }
+
+    fn wait<'a>(
+        &self,
+        waiting: MutexGuard<'a, Waiting>,
+        limit: Duration,
+    ) -> MutexGuard<'a, Waiting> {
+        let woken = self.shared.1.wait_timeout(waiting, limit);
+        woken.unwrap_or_else(PoisonError::into_inner).0
+    }
+
+    // A thread that panicked here left the queue as it was before its change or after it.
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        self.shared.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Waiting {
+    fn bytes(&self) -> usize {
+        self.snapshots.iter().map(|policy| policy.file.len()).sum()
+    }
+
+    fn next(&mut self) -> Option<Output> {
+        if let Some(policy) = self.snapshots.pop_front() {
+            return Some(Output::Snapshot(policy));
+        }
+        if let Some(checkpoint) = self.checkpoint.take() {
+            return Some(Output::Checkpoint(checkpoint));
+        }
+        if !self.rows.is_empty() {
+            return Some(Output::Rows(mem::take(&mut self.rows)));
+        }
+        self.ended.take().map(Output::Ended)
+    }
+}
