@@ -236,10 +236,9 @@ fn parts_of(
     bench(group, "critic step", || regress(&critics));
     let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
     let gradient = regress(&critics)?.copy()?;
-    bench(group, "critic optimizer", || critic_adam.apply(critics.weights_mut(), &gradient, step));
-    bench(group, "critic EMA", || {
-        target_critics.weights_mut().ema_update(critics.weights(), 0.005)
-    });
+    critic_adam.set_step(step)?;
+    bench(group, "critic optimizer", || critic_adam.apply(critics.weights_mut(), &gradient));
+    bench(group, "critic EMA", || target_critics.soft_update(&critics, 0.005));
     bench(group, "Q-gradients' scale", || target_critics.values(&observations, &actions));
     bench(group, "Q-gradients", || target_critics.action_gradients(&observations, &actions));
     let t = Tensor::from_iter((0..b).map(|i| (i % steps + 1) as u32), observations.device())?;
@@ -257,9 +256,10 @@ fn parts_of(
         Ok(gradient)
     });
     let gradient = clone(&actor)?.copy()?;
+    actor_adam.set_step(step)?;
     bench(group, "actor optimizer and EMA", || {
-        actor_adam.apply(actor.weights_mut(), &gradient, step)?;
-        target_actor.weights_mut().ema_update(actor.weights(), 0.005)
+        actor_adam.apply(actor.weights_mut(), &gradient)?;
+        target_actor.soft_update(&actor, 0.005)
     });
     Ok(())
 }

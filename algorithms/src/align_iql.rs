@@ -132,9 +132,9 @@ impl DiffusionUpdate for AlignIql {
     fn begin(&mut self, networks: &mut Networks, step: u64, total_steps: u64) -> Result<()> {
         let (config, decay) = (&self.config, cosine_decay(step, total_steps));
         let adam = |rate: f32| AdamStep::after(step, rate);
-        networks.actor.adam.set(adam(*config.actor_learning_rate * decay))?;
-        self.value.adam.set(adam(*config.value_learning_rate))?;
-        networks.critic.adam.set(adam(*config.critic_learning_rate))
+        networks.actor.adam.set_step(adam(*config.actor_learning_rate * decay))?;
+        self.value.adam.set_step(adam(*config.value_learning_rate))?;
+        networks.critic.adam.set_step(adam(*config.critic_learning_rate))
     }
 
     fn update(
@@ -179,7 +179,7 @@ impl DiffusionUpdate for AlignIql {
         let value = (self.rule == Rule::Nearest).then_some(&*self.value);
         let tensors = DiffusionPolicy::tensors(&actor.target, &critic.target, value)?;
         let candidates = *self.config.candidates;
-        Ok((Choice { candidates, value: Aggregate::Min, rule: self.rule }, tensors))
+        Ok((Choice { candidates, aggregate: Aggregate::Min, rule: self.rule }, tensors))
     }
 
     fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {

@@ -156,8 +156,8 @@ impl DiffusionUpdate for Config {
 
     fn begin(&mut self, networks: &mut Networks, step: u64, _: u64) -> Result<()> {
         let adam = |rate: f32| AdamStep { rate, clip: Some(*self.gradient_clip), count: step + 1 };
-        networks.critic.adam.set(adam(*self.critic_learning_rate))?;
-        networks.actor.adam.set(adam(*self.actor_learning_rate))
+        networks.critic.adam.set_step(adam(*self.critic_learning_rate))?;
+        networks.actor.adam.set_step(adam(*self.actor_learning_rate))
     }
 
     /// Algorithm 1's loop, but for the target actor.
@@ -195,6 +195,6 @@ impl DiffusionUpdate for Config {
         let Networks { actor, critic } = networks;
         let tensors = DiffusionPolicy::tensors(actor, &critic.target, None)?;
         let rule = Rule::Softmax { temperature: *self.temperature };
-        Ok((Choice { candidates: *self.candidates, value: Aggregate::Min, rule }, tensors))
+        Ok((Choice { candidates: *self.candidates, aggregate: Aggregate::Min, rule }, tensors))
     }
 }

@@ -278,8 +278,8 @@ impl Algorithm for Dtql {
     /// The one-step policy, which draws one of its candidates by the target critics' values.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let (candidates, temperature) = (*self.config.candidates, *self.config.temperature);
-        let (value, rule) = (Aggregate::Min, Rule::Softmax { temperature });
-        let choice = Choice { candidates, value, rule };
+        let (aggregate, rule) = (Aggregate::Min, Rule::Softmax { temperature });
+        let choice = Choice { candidates, aggregate, rule };
         let (actor, critics) = (&self.networks.actor.network, &self.networks.critic.target);
         let shape = ActorCriticShape::of(actor, critics);
         let tensors = ActorCriticShape::tensors(actor, critics)?;

@@ -184,8 +184,8 @@ impl Algorithm for Fql {
 
     /// The one-step policy, which chooses by the target critics.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let (candidates, value) = (*self.config.candidates, self.config.target);
-        let choice = Choice { candidates, value, rule: Rule::Best };
+        let (candidates, aggregate) = (*self.config.candidates, self.config.target);
+        let choice = Choice { candidates, aggregate, rule: Rule::Best };
         let (actor, critics) = (&self.networks.actor, &self.networks.critic.target);
         let shape = ActorCriticShape::of(actor, critics);
         let tensors = ActorCriticShape::tensors(actor, critics)?;

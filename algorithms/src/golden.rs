@@ -15,7 +15,7 @@ use candle_core::{D, DType, Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
 use quad_nn::{Precision, Scaling, Tensors, open_gpu};
 use quad_policy::{
-    Aggregate, Choice, EpisodeState, Header, PolicyConfig, Rule, Sampled, load_policy,
+    Aggregate, Choice, EpisodeState, Header, PolicyConfig, Rule, Samples, load_policy,
 };
 pub(super) use reader::{Golden, MAKE, committed, fresh, goldens, run};
 
@@ -173,10 +173,10 @@ fn check_policy(golden: &Golden, algorithm: &dyn Algorithm) {
     if let Some(choice) = policy.choice() {
         assert_eq!(choice.candidates as usize, golden.count("/agent/candidates"));
         // The folders of all but QUAD have the smaller of the critics' values.
-        let value =
-            if golden.config["algorithm"] == "quad" { choice.value } else { Aggregate::Min };
-        policy = policy.with_choice(Choice { value, ..choice }).unwrap();
-        let Sampled { actions, values } = policy.sample(&observations, &mut begin()).unwrap();
+        let aggregate =
+            if golden.config["algorithm"] == "quad" { choice.aggregate } else { Aggregate::Min };
+        policy = policy.with_choice(Choice { aggregate, ..choice }).unwrap();
+        let Samples { actions, values } = policy.sample(&observations, &mut begin()).unwrap();
         let [actions, values] = [actions, values].map(|x| Tensor::new(x, &Device::Cpu).unwrap());
         // A planner has more candidates than first actions, and QUAD's folders have none.
         if !["diffuser", "quad"].contains(&name) {

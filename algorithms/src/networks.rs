@@ -70,16 +70,17 @@ impl<N: Weighted> TrainState<N> {
         self.apply_gradients(&Gradients::of(loss)?, step)
     }
 
-    /// [`Self::minimize`] with the step that [`Adam::set`] was given.
+    /// [`Self::minimize`] with the step that [`Adam::set_step`] has set.
     pub fn minimize_as_set(&mut self, loss: &Tensor) -> Result<Tensor> {
         let gradient = Gradients::of(loss)?.with_respect_to(self.network.weights())?;
-        self.adam.apply_as_set(self.network.weights_mut(), &gradient)
+        self.adam.apply(self.network.weights_mut(), &gradient)
     }
 
     /// [`Self::minimize`] with gradients that were computed before.
     pub fn apply_gradients(&mut self, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
         let gradient = gradients.with_respect_to(self.network.weights())?;
-        self.adam.apply(self.network.weights_mut(), &gradient, step)
+        self.adam.set_step(step)?;
+        self.adam.apply(self.network.weights_mut(), &gradient)
     }
 
     /// Adds a target network, which `copy` makes.

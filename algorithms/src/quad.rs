@@ -124,8 +124,8 @@ impl DiffusionUpdate for Quad {
     fn begin(&mut self, networks: &mut Networks, step: u64, total_steps: u64) -> Result<()> {
         let (decay, clip) = (cosine_decay(step, total_steps), Some(*self.config.gradient_clip));
         let adam = |rate: f32| AdamStep { rate: rate * decay, clip, count: step + 1 };
-        networks.critic.adam.set(adam(*self.config.critic_learning_rate))?;
-        networks.actor.adam.set(adam(*self.config.actor_learning_rate))
+        networks.critic.adam.set_step(adam(*self.config.critic_learning_rate))?;
+        networks.actor.adam.set_step(adam(*self.config.actor_learning_rate))
     }
 
     /// Algorithm 1's loop, but for the target actor.

@@ -42,7 +42,7 @@ impl<I: Inputs> Replay<I> {
         let thread = current().id();
         let Some(mut kept) = self.0.take().filter(|kept| kept.thread == thread) else {
             let inputs = inputs.on(device)?;
-            let computed = CudaGraph::rehearse(device, || work(&inputs))?;
+            let computed = CudaGraph::warm_up(device, || work(&inputs))?;
             self.0 = Some(Kept { inputs, computed, recording: None, thread });
             return Ok(());
         };
@@ -58,7 +58,7 @@ impl<I: Inputs> Replay<I> {
         let record = || computed.numbers.slice_set(&work(inputs)?.numbers, 0, 0);
         let mut recorded = match recording.take() {
             Some(recorded) => recorded,
-            None => CudaGraph::of(device, record)?,
+            None => CudaGraph::capture(device, record)?,
         };
         recorded.replay()?;
         *recording = Some(recorded);

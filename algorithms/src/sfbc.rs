@@ -266,8 +266,8 @@ impl Algorithm for Sfbc {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let (temperature, actions) = (*self.config.temperature, *self.config.averaged);
         let rule = Rule::Average { temperature, actions };
-        let (candidates, value) = (*self.config.candidates, Aggregate::Mean);
-        let choice = Choice { candidates, value, rule };
+        let (candidates, aggregate) = (*self.config.candidates, Aggregate::Mean);
+        let choice = Choice { candidates, aggregate, rule };
         let shape = ScorePolicyShape {
             observation_dim: self.context.observation_dim(),
             action_dim: self.context.action_dim(),

@@ -3,11 +3,10 @@
 use crate::vectorized::vectorized;
 use serde::{Deserialize, Serialize};
 
-/// Below this, Mish and its slope are taken to be what they are here: some -2e-14, nothing beside
-/// numbers of order 1. Followed further down, gradients behind such a unit would become subnormal
-/// numbers, with which a CPU is ten times slower.
+/// Below this, Mish and its slope are constants of some −2e-14. Smaller ones would lead to subnormal
+/// gradients, with which a CPU is ten times slower.
 const MISH_ZERO: f32 = -35.0;
-/// Above this, Mish is x and its slope 1 to the last bit of f32; it keeps squares of e^x finite.
+/// Above this, Mish is x and its slope 1 to the last bit of f32; keeps squares of e^x finite.
 const MISH_LINEAR: f32 = 20.0;
 
 /// e^x for x in [-35, 20], relative error below 2e-7.
@@ -51,7 +50,7 @@ pub(crate) fn mish_and_slope(x: f32) -> (f32, f32) {
     (x * t, (4.0 * bounded * r) * (e * (e + 1.0) * r) + t)
 }
 
-/// What stands between the layers of a network.
+/// Activation function of a hidden layer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Activation {
@@ -69,8 +68,8 @@ pub enum Activation {
     Gelu,
 }
 
-/// Below this, GELU and its slope are taken to be what they are here, -8e-15; above, GELU is x to
-/// the last bit of f32.
+/// Below this, GELU and its slope are constants of −8e-15; above [`GELU_LINEAR`], GELU is x to the
+/// last bit of f32.
 const GELU_ZERO: f32 = -6.9;
 const GELU_LINEAR: f32 = 5.4;
 
@@ -192,7 +191,7 @@ pub(crate) mod tests {
         (x * t, t + x * (1.0 - t * t) / (1.0 + (-x).exp()))
     }
 
-    /// Any activation and its derivative in double precision.
+    /// An activation and its derivative in double precision.
     fn exact(f: Activation, x: f64) -> (f64, f64) {
         let sigmoid = 1.0 / (1.0 + (-x).exp());
         match f {
@@ -203,10 +202,8 @@ pub(crate) mod tests {
             Activation::Gelu => {
                 let c = (2.0 / std::f64::consts::PI).sqrt();
                 let t = (c * (x + 0.044715 * x.powi(3))).tanh();
-                (
-                    0.5 * x * (1.0 + t),
-                    0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * c * (1.0 + 0.134145 * x * x),
-                )
+                let inner = c * (1.0 + 0.134145 * x * x);
+                (0.5 * x * (1.0 + t), 0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * inner)
             }
         }
     }
@@ -214,6 +211,7 @@ pub(crate) mod tests {
     const ALL: [Activation; 5] =
         [Activation::Mish, Activation::Relu, Activation::Silu, Activation::Tanh, Activation::Gelu];
 
+    /// Value and slope by the loop with slopes, of which the value is compared with the other loop.
     fn at(f: Activation, x: f32) -> (f32, f32) {
         let (mut y, mut plain, mut slope) = ([x], [x], [0.0]);
         activate_with_slope(f, &mut y, &[0.0], &mut slope);
@@ -227,49 +225,33 @@ pub(crate) mod tests {
         for (f, i) in ALL.into_iter().flat_map(|f| (-4000..=4000).map(move |i| (f, i))) {
             let x = i as f32 * 0.025;
             let ((y, slope), (y64, slope64)) = (at(f, x), exact(f, f64::from(x)));
-            assert!(
-                (f64::from(y) - y64).abs() <= 1e-6 * y64.abs() + 2e-7,
-                "{f:?}({x}) = {y} for {y64}"
-            );
-            assert!(
-                (f64::from(slope) - slope64).abs() <= 2e-6 * slope64.abs() + 1e-6,
-                "{f:?}'({x})"
-            );
+            let errors = [(f64::from(y) - y64).abs(), (f64::from(slope) - slope64).abs()];
+            assert!(errors[0] <= 1e-6 * y64.abs() + 2e-7, "{f:?}({x}) = {y} for {y64}");
+            assert!(errors[1] <= 2e-6 * slope64.abs() + 1e-6, "{f:?}'({x})");
         }
-        let mish = at(Activation::Mish, -30.0).0;
-        assert!(
-            (f64::from(mish) / exact(Activation::Mish, -30.0).0 - 1.0).abs() < 1e-6,
-            "relatively, too: {mish}"
-        );
+        let mish = f64::from(at(Activation::Mish, -30.0).0);
+        assert!((mish / mish_f64(-30.0).0 - 1.0).abs() < 1e-6, "relative error of {mish}");
     }
 
     #[test]
-    fn activations_are_finite_everywhere() {
-        for (f, x) in ALL
-            .into_iter()
-            .flat_map(|f| [-f32::MAX, -1e30, -100.0, -0.0, 88.0, 89.0, 1e30].map(|x| (f, x)))
-        {
-            let (y, slope) = at(f, x);
-            assert!(y.is_finite() && slope.is_finite(), "{f:?} at {x}: {y} {slope}");
+    fn activations_are_finite_and_a_nan_is_kept() {
+        for f in ALL {
+            for x in [-f32::MAX, -1e30, -100.0, -0.0, 88.0, 89.0, 1e30] {
+                let (y, slope) = at(f, x);
+                assert!(y.is_finite() && slope.is_finite(), "{f:?} at {x}: {y} {slope}");
+            }
+            assert!(at(f, f32::NAN).0.is_nan(), "{f:?}");
         }
     }
 
     #[test]
     fn a_unit_that_is_off_makes_no_subnormal_numbers() {
-        for (f, x) in [Activation::Mish, Activation::Silu, Activation::Gelu]
-            .into_iter()
-            .flat_map(|f| [-30.0, -87.0, -1e30].map(|x| (f, x)))
-        {
-            let (y, slope) = at(f, x);
-            assert!(
-                (1e-10 * y).is_normal() && (1e-10 * slope).is_normal(),
-                "{f:?} at {x}: {y} {slope}"
-            );
+        for f in [Activation::Mish, Activation::Silu, Activation::Gelu] {
+            for x in [-30.0, -87.0, -1e30] {
+                let (y, slope) = at(f, x);
+                let normal = (1e-10 * y).is_normal() && (1e-10 * slope).is_normal();
+                assert!(normal, "{f:?} at {x}: {y} {slope}");
+            }
         }
-    }
-
-    #[test]
-    fn a_nan_is_not_hidden() {
-        assert!(ALL.into_iter().all(|f| at(f, f32::NAN).0.is_nan()));
     }
 }

@@ -7,9 +7,9 @@ use std::arch::x86_64::{
 
 /// Lanes of a register.
 const LANES: usize = 8;
-/// Columns of the result that are worked on together: two registers.
+/// Columns of a block of the result: two registers.
 pub(crate) const COLUMNS: usize = 2 * LANES;
-/// Rows of the result that are worked on together: their sums fill most of the 16 registers.
+/// Rows of a block of the result: its sums fill most of the 16 registers.
 const ROWS: usize = 6;
 
 /// `R` rows of one block of columns: `c = a · b`, `a` being `R × k` and `b` `k × 16`.
@@ -40,7 +40,7 @@ unsafe fn block<const R: usize>(k: usize, a: *const f32, b: *const f32, c: *mut 
     }
 }
 
-/// `c[m × n] = a[m × k] · b`, where `b` has `n / 16` blocks of `k × 16`, one behind the other.
+/// `c[m × n] = a[m × k] · b`, where `b` has `n / 16` consecutive blocks of `k × 16`.
 ///
 /// # Safety
 /// The CPU must have AVX2 and FMA, and the three matrices must span that many elements.
@@ -55,7 +55,7 @@ pub(crate) unsafe fn multiply_packed(
 ) {
     let blocks = m.div_ceil(ROWS);
     for j in (0..n).step_by(COLUMNS) {
-        // Blocks of nearly equal height: in a low one the sums would wait for one another.
+        // Blocks of nearly equal height: low ones have too few independent sums.
         for i in 0..blocks {
             let (from, to) = (i * m / blocks, (i + 1) * m / blocks);
             // SAFETY: rows from..to, at most `ROWS`, and the columns of block j are inside.

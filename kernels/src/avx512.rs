@@ -1,9 +1,8 @@
-//! A dense product for CPUs with AVX-512 that copies little.
+//! Dense products for CPUs with AVX-512.
 //!
-//! The matrices of these networks fit into a core's own cache, so the copies of both sides that a
-//! general library makes first cost more than they gain (benches/README.md): the left side is read
-//! where it lies, and of the right one a block of columns is copied or transposed at a time, to
-//! stay in the nearest cache.
+//! The matrices of these networks fit into a core's own cache, where a general library's copies of
+//! both sides cost more than they gain (benches/README.md). Only one block of columns of the right
+//! side at a time is copied or transposed, into the nearest cache.
 
 use std::arch::x86_64::{
     _MM_HINT_T0, _mm_prefetch, _mm512_castpd_ps, _mm512_castps_pd, _mm512_fmadd_ps,
@@ -17,18 +16,17 @@ use crate::level::Level;
 
 /// Lanes of a register.
 pub(crate) const LANES: usize = 16;
-/// Columns of the result that are worked on together: two registers.
+/// Columns of a block of the result: two registers.
 pub(crate) const COLUMNS: usize = 2 * LANES;
-/// Rows of the result that are worked on together: their sums fill most of the 32 registers.
+/// Rows of a block of the result: its sums fill most of the 32 registers.
 const ROWS: usize = 12;
 
-/// Whether this CPU can, and results of this many columns are whole blocks.
+/// True if this CPU has AVX-512 and results of this many columns are whole blocks.
 pub(crate) fn serves(columns: usize) -> bool {
     columns.is_multiple_of(COLUMNS) && Level::in_use() == Level::Avx512
 }
 
-/// What a register holds, where one cache line holds it: other addresses take two for each
-/// register.
+/// A register's numbers in one cache line; at other addresses an access takes two lines.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 pub(crate) struct Line<T>(pub [T; LANES]);
@@ -41,10 +39,10 @@ pub(crate) struct Strided<T> {
     pub column: usize,
 }
 
-/// Two neighbors of a sum's terms, rounded to bfloat16, in one element.
+/// Two neighboring terms of a sum, rounded to bfloat16.
 type Pair = i32;
 
-/// Whether this CPU has AVX512-BF16.
+/// True if this CPU has AVX512-BF16.
 fn has_bf16() -> bool {
     Level::in_use() == Level::Avx512 && is_x86_feature_detected!("avx512bf16")
 }
@@ -52,15 +50,15 @@ fn has_bf16() -> bool {
 thread_local! {
     /// A block of columns of the right side.
     static BLOCK: RefCell<Vec<Line<f32>>> = RefCell::default();
-    /// The left side, if it had to be copied.
+    /// A copy of the left side.
     static LEFT: RefCell<Vec<f32>> = RefCell::default();
 }
 
-/// Numbers apart at which rows crowd into few places of a core's caches.
+/// Distance at which rows share few sets of a core's caches.
 const CROWDED: usize = 512;
 
-/// The left side `m × k` of a product: as it is, or copied to `room` with a gap behind each row
-/// where its rows in memory are so far apart that they would drive each other out of the cache.
+/// The left side `m × k` of a product, copied to `room` with a gap after each row if its rows would
+/// evict each other from the cache.
 ///
 /// # Safety
 /// The matrix must span that many elements.
@@ -82,16 +80,15 @@ unsafe fn spread(m: usize, k: usize, a: Strided<f32>, room: &mut Vec<f32>) -> St
     Strided { first: room.as_ptr(), row, column }
 }
 
-/// What is read after a block, two cache lines of it for each of the block's `k` rows.
+/// Memory that is read after a block, prefetched in steps of two cache lines.
 #[derive(Clone, Copy)]
 struct Ahead<T> {
     first: *const T,
     row: usize,
 }
 
-/// Defines `panel`, `c = a·b` for all `m` rows and one block of columns, `b` being `k × 32` and `c`
-/// part of a matrix, for elements of 32 bits: `$add(sum, x, b)` adds the products of one element,
-/// in all lanes, with a register of others.
+/// Defines `panel`: `c = a·b` for `m` rows and one block of columns, `b` being `k × 32`, for elements
+/// of 32 bits. `$add(sum, x, b)` adds the products of two registers to a third.
 macro_rules! panel {
     ($features:literal, $element:ty, $broadcast:expr, $load:expr, $add:expr) => {
         #[inline]
@@ -137,7 +134,7 @@ macro_rules! panel {
             c: *mut f32,
             c_row: usize,
         ) {
-            // Blocks of nearly equal height: in a low one the sums would wait for one another.
+            // Blocks of nearly equal height: low ones have too few independent sums.
             let blocks = m.div_ceil(ROWS);
             for i in 0..blocks {
                 let (from, to) = (i * m / blocks, (i + 1) * m / blocks);
@@ -199,22 +196,15 @@ pub(crate) unsafe fn multiply(
                     );
                 }
             }
-            panel(
-                m,
-                k,
-                a,
-                block,
-                Ahead { first: b.wrapping_add(j + COLUMNS), row: n },
-                c.add(j),
-                n,
-            );
+            let ahead = Ahead { first: b.wrapping_add(j + COLUMNS), row: n };
+            panel(m, k, a, block, ahead, c.add(j), n);
         }
     }
     BLOCK.set(block_of_b);
     LEFT.set(left);
 }
 
-/// `c[m × n] = a[m × k] · b`, where `b` has `n / 32` blocks of `k × 32`, one behind the other.
+/// `c[m × n] = a[m × k] · b`, where `b` has `n / 32` consecutive blocks of `k × 32`.
 ///
 /// # Safety
 /// [`serves`] must hold for `n`, and the three matrices must span that many elements.
@@ -232,15 +222,8 @@ pub(crate) unsafe fn multiply_packed(
         // SAFETY: block j and its columns of the result are inside.
         unsafe {
             let block = b.add(j * k);
-            panel(
-                m,
-                k,
-                a,
-                block,
-                Ahead { first: block.wrapping_add(k * COLUMNS), row: COLUMNS },
-                c.add(j),
-                n,
-            );
+            let ahead = Ahead { first: block.wrapping_add(k * COLUMNS), row: COLUMNS };
+            panel(m, k, a, block, ahead, c.add(j), n);
         }
     }
 }
@@ -312,15 +295,8 @@ pub(crate) unsafe fn multiply_transposed(
                     transpose(b.add((j + half) * n + p), n, block.add(p * COLUMNS + half), COLUMNS);
                 }
             }
-            panel(
-                m,
-                n,
-                a,
-                block,
-                Ahead { first: b.wrapping_add((j + COLUMNS) * n), row: COLUMNS },
-                c.add(j),
-                k,
-            );
+            let ahead = Ahead { first: b.wrapping_add((j + COLUMNS) * n), row: COLUMNS };
+            panel(m, n, a, block, ahead, c.add(j), k);
         }
     }
     BLOCK.set(block_of_b);

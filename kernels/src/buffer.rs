@@ -1,15 +1,15 @@
-//! Memory that is used again and again.
+//! Reused memory.
 
 /// Bytes of a cache line, and of the widest register.
 const LINE: usize = 64;
 
-/// Numbers from the beginning of a cache line on: a register of them elsewhere costs two accesses.
-/// Grows, never shrinks.
+/// Numbers aligned to a cache line, since registers across two lines cost two accesses. Grows, never
+/// shrinks.
 #[derive(Default)]
 pub struct Buffer(Vec<f32>);
 
 impl Buffer {
-    /// `len` numbers; what they hold is left over from earlier use.
+    /// `len` numbers, with the content of earlier use.
     pub fn sized(&mut self, len: usize) -> &mut [f32] {
         let needed = len + LINE / size_of::<f32>();
         if self.0.len() < needed {
@@ -19,7 +19,7 @@ impl Buffer {
         &mut self.0[start..][..len]
     }
 
-    /// The first `len` of the numbers that [`Self::sized`] gave last, which must have been as many.
+    /// The first `len` numbers, at most as many as [`Self::sized`] was asked for.
     pub fn first(&self, len: usize) -> &[f32] {
         let start = self.0.as_ptr().align_offset(LINE);
         &self.0[start..][..len]

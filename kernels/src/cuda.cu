@@ -1,27 +1,30 @@
 // The loops of a gradient step on an Nvidia GPU. Matrices are row-major.
 
+// Activations in the order of the enum `Activation`; another number is the identity.
+enum { MISH, RELU, SILU, TANH, GELU };
+
 // y = f(z + bias), and where slope is not null also f'(z + bias), of members × rows × width numbers; each member has a bias.
 extern "C" __global__ void activate(const float *z, const float *bias, float *y, float *slope, unsigned count,
                                     unsigned member, unsigned width, unsigned activation) {
   for (unsigned i = blockIdx.x * blockDim.x + threadIdx.x; i < count; i += gridDim.x * blockDim.x) {
     float x = z[i] + bias[i / member * width + i % width], value = x, derivative = 1.0f;
-    if (activation == 0) {
+    if (activation == MISH) {
       // Mish by one exponential: x·n/(n + 2) with n = e^x (e^x + 2). From 20 on it is x, to the last bit.
       float e = expf(fminf(x, 20.0f)), n = e * (e + 2.0f), d = n + 2.0f;
       value = x * (n / d);
       derivative = n / d + x * (4.0f * e * (e + 1.0f) / (d * d));
-    } else if (activation == 1) {
+    } else if (activation == RELU) {
       // The product keeps a NaN.
       value = x > 0.0f ? x : 0.0f * x;
       derivative = x > 0.0f ? 1.0f : 0.0f;
-    } else if (activation == 2) {
+    } else if (activation == SILU) {
       float s = 1.0f / (1.0f + expf(-x));
       value = x * s;
       derivative = s * (1.0f + x * (1.0f - s));
-    } else if (activation == 3) {
+    } else if (activation == TANH) {
       value = tanhf(x);
       derivative = 1.0f - value * value;
-    } else if (activation == 4) {
+    } else if (activation == GELU) {
       // x·s with s = σ(2u), where u is what GELU's tanh is of.
       float square = x * x, s = 1.0f / (1.0f + expf(-1.5957692f * x * (1.0f + 0.044715f * square)));
       value = x * s;

@@ -16,45 +16,44 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Threads of a block; `cuda.cu` counts on it.
 const BLOCK: u32 = 256;
-/// Sums into which a gradient's norm is cut.
+/// Partial sums of a gradient's norm.
 const SUMS: usize = 256;
 
-/// Why a kernel does not run.
+/// A kernel that does not run.
 #[derive(Debug, thiserror::Error)]
 pub enum CudaError {
-    /// The driver refuses.
+    /// The driver fails.
     #[error("the CUDA driver failed")]
     Driver(#[from] DriverError),
-    /// The kernels cannot be translated.
+    /// The kernels cannot be compiled.
     #[error("the CUDA kernels cannot be compiled for this GPU")]
     Compile(#[from] CompileError),
 }
 
-/// What a function gives.
+/// Result of a kernel.
 pub type Result<T> = std::result::Result<T, CudaError>;
 
-/// The numbers of a reverse step: `clean = clamp((x - deviation·ε)·scale)`, then
-/// `clamp(from_clean·clean + from_noisy·x + noise·z)`, each with a bound of its own, which may be
-/// infinite.
+/// Coefficients of a reverse step: `clean = clamp((x - deviation·ε)·scale)`, then
+/// `clamp(from_clean·clean + from_noisy·x + noise·z)`. Bounds can be infinite.
 #[derive(Clone, Copy, Debug)]
 pub struct ReverseStep {
-    /// What multiplies the predicted noise.
+    /// Factor of the predicted noise ε.
     pub deviation: f32,
-    /// What multiplies the difference.
+    /// Factor of the difference.
     pub scale: f32,
     /// Bound of `clean`.
     pub clean_bound: f32,
-    /// What multiplies `clean`.
+    /// Factor of `clean`.
     pub from_clean: f32,
-    /// What multiplies x.
+    /// Factor of x.
     pub from_noisy: f32,
-    /// What multiplies the noise z; 0 if there is none.
+    /// Factor of the noise z; 0 without noise.
     pub noise: f32,
-    /// Bound of the outcome.
+    /// Bound of the result.
     pub bound: f32,
 }
 
-/// The translated kernels.
+/// The compiled kernels.
 struct Kernels {
     activate: CudaFunction,
     reverse_step: CudaFunction,
@@ -63,7 +62,7 @@ struct Kernels {
     ema: CudaFunction,
 }
 
-/// The kernels, which the first call translates. A process trains on one GPU.
+/// The kernels, compiled by the first call. A process trains on one GPU.
 fn kernels(stream: &CudaStream) -> Result<Arc<Kernels>> {
     static KERNELS: Mutex<Option<Arc<Kernels>>> = Mutex::new(None);
     let mut kernels = KERNELS.lock().unwrap_or_else(PoisonError::into_inner);
@@ -71,22 +70,18 @@ fn kernels(stream: &CudaStream) -> Result<Arc<Kernels>> {
         return Ok(kernels.clone());
     }
     let module = stream.context().load_module(compile_ptx(include_str!("cuda.cu"))?)?;
-    let translated = Kernels {
+    let compiled = Kernels {
         activate: module.load_function("activate")?,
         reverse_step: module.load_function("reverse_step")?,
         squares: module.load_function("squares")?,
         adam: module.load_function("adam")?,
         ema: module.load_function("ema")?,
     };
-    Ok(kernels.insert(Arc::new(translated)).clone())
+    Ok(kernels.insert(Arc::new(compiled)).clone())
 }
 
-/// Spares a process that computes on one stream two costs: without this, the driver gives the
-/// memory that is free back whenever the host waits for the GPU, so that each update begins without
-/// any; and each array has two events, which would order streams.
-///
-/// # Errors
-/// The driver refuses.
+/// Prepares a process that computes on one stream. The driver keeps free memory, which it would
+/// return whenever the host waits for the GPU, and arrays have no events, which would order streams.
 pub fn prepare(context: &CudaContext) -> Result<()> {
     let mut all = u64::MAX;
     let threshold = CUmemPool_attribute::CU_MEMPOOL_ATTR_RELEASE_THRESHOLD;
@@ -96,21 +91,19 @@ pub fn prepare(context: &CudaContext) -> Result<()> {
         let pool = device::get_default_mem_pool(context.cu_device())?;
         mem_pool::set_attribute(pool, threshold, (&raw mut all).cast())?;
     }
-    // SAFETY: cudarc records events only where there are streams that it has made, and there are
-    // none.
+    // SAFETY: cudarc records events for streams that it has made, of which there are none.
     unsafe { context.disable_event_tracking() };
     Ok(())
 }
 
-/// Enough blocks that each number has a thread.
+/// One thread for each number.
 fn threads(count: usize) -> LaunchConfig {
     let blocks = u32::try_from(count).unwrap_or(u32::MAX).div_ceil(BLOCK);
     LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 }
 }
 
-/// `f(z + bias)` of `members × rows × width` numbers, where each member has a bias of its own,
-/// `members × width`; without `f` just the sum. With `slope`, the derivatives f'(z + bias) follow
-/// behind all values.
+/// `f(z + bias)` for z `members × rows × width` and bias `members × width`; without `f` the sum. With
+/// `slope`, the derivatives f'(z + bias) follow all values.
 pub fn activate(
     stream: &Arc<CudaStream>,
     f: Option<Activation>,
@@ -120,14 +113,7 @@ pub fn activate(
 ) -> Result<CudaSlice<f32>> {
     let (count, width) = (z.len(), bias.len() / members);
     assert!(count.is_multiple_of(members * width) && u32::try_from(count).is_ok(), "whole rows");
-    let number: u32 = match f {
-        Some(Activation::Mish) => 0,
-        Some(Activation::Relu) => 1,
-        Some(Activation::Silu) => 2,
-        Some(Activation::Tanh) => 3,
-        Some(Activation::Gelu) => 4,
-        None => 5,
-    };
+    let number = f.map_or(u32::MAX, |f| f as u32);
     let kernels = kernels(stream)?;
     // SAFETY: the kernel writes every number.
     let mut out = unsafe { stream.alloc::<f32>(if slope { 2 * count } else { count })? };
@@ -167,9 +153,9 @@ pub fn reverse(
     Ok(out)
 }
 
-/// Adam's step, as [`crate::optimizer::adam`]; the gradient is scaled down to the norm `clip` if it
-/// is longer. Gives its norm before that. `rates` are those of [`crate::optimizer::AdamRates`], in
-/// its order: as numbers of the GPU they can differ each time that recorded work is replayed.
+/// [`crate::optimizer::adam`] with the gradient scaled down to norm `clip`. Returns its norm before
+/// that. `rates` are the fields of [`crate::optimizer::AdamRates`], on the GPU so that they can differ
+/// at each replay of a CUDA graph.
 pub fn adam(
     stream: &Arc<CudaStream>,
     parameters: &mut CudaViewMut<'_, f32>,

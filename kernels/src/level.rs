@@ -1,12 +1,12 @@
-//! Which of the CPU's vector instructions are used: the widest that it has, or fewer where a
-//! developer asks for it, to test and to measure what other CPUs run.
+//! The CPU's vector instructions in use: the widest, or fewer, to test and measure what other CPUs
+//! run.
 
 use std::sync::LazyLock;
 
-/// Sets of instructions, each with all of those before.
+/// Sets of instructions, each with all sets before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Level {
-    /// What every CPU of its architecture has.
+    /// The instructions of every CPU of the architecture.
     Plain,
     /// AVX2 and FMA: 8 numbers at a time.
     Avx2,
@@ -15,7 +15,7 @@ pub enum Level {
 }
 
 impl Level {
-    /// As it is called in `scores.jsonl` and in the environment variable.
+    /// Name in `scores.jsonl` and in the environment variable.
     pub fn name(self) -> &'static str {
         match self {
             Self::Plain if cfg!(target_arch = "x86_64") => "x86",
@@ -25,7 +25,7 @@ impl Level {
         }
     }
 
-    /// The widest that this CPU has.
+    /// The widest set of this CPU.
     pub fn available() -> Self {
         #[cfg(target_arch = "x86_64")]
         {
@@ -47,8 +47,7 @@ impl Level {
         Self::Plain
     }
 
-    /// The level of this process: the widest, but no wider than AVX2 where the environment has
-    /// `QUAD_INSTRUCTIONS=avx2`.
+    /// The level of this process: the widest, or at most AVX2 with `QUAD_INSTRUCTIONS=avx2`.
     pub fn in_use() -> Self {
         static IN_USE: LazyLock<Level> = LazyLock::new(|| {
             let only_avx2 =

@@ -3,23 +3,18 @@
 //!
 //! # Layout
 //!
-//! - [`product`]: dense products on one thread, in f32 and with operands rounded to bfloat16.
-//! - `packed`: a product's right-hand side, laid out once for many products.
-//! - `avx512`, `avx2`: the products that the libraries at hand do more slowly
-//!   (kernels/benches/README.md says by how much).
-//! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network,
-//!   fused with it.
-//! - [`norm`]: layer norm, forward and backward.
+//! - [`product`]: dense products on one thread, in f32 and in bfloat16; `packed`: their right-hand
+//!   sides, packed once; `avx512`, `avx2`: products faster than a library's
+//!   (kernels/benches/README.md).
+//! - [`activation`]: activations and their derivatives; [`narrow`]: the first and last layer of a
+//!   network; [`norm`]: layer norm, forward and backward.
 //! - [`optimizer`]: Adam and EMA over whole parameter vectors.
-//! - `cuda`: what of this a GPU does in one launch, and `recording`: many launches as one; both
-//!   with the feature `cuda`.
-//! - [`scaling`]: between a user's units and those of networks.
-//! - [`Level`] (`level`): which of the CPU's instructions are used.
-//! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.
-//! - `vectorized`: the macro that loops are written with.
+//! - `cuda`, `cuda_graph` (feature `cuda`): the same loops on a GPU, and many launches as one.
+//! - [`scaling`]: conversion between a user's units and those of networks.
+//! - [`Level`] (`level`): the CPU's instructions in use; `vectorized`: a macro that compiles loops
+//!   for each level; [`Buffer`] (`buffer`): reused memory, aligned to cache lines.
 //!
-//! Matrices are row-major `f32` slices; a name's shape is given as `rows × columns`. What a CPU can
-//! do is found out at run time.
+//! Matrices are row-major `f32` slices; their shapes are given as `rows × columns`.
 
 pub mod activation;
 #[cfg(target_arch = "x86_64")]
@@ -29,6 +24,8 @@ mod avx512;
 mod buffer;
 #[cfg(feature = "cuda")]
 pub mod cuda;
+#[cfg(feature = "cuda")]
+pub mod cuda_graph;
 mod level;
 pub mod narrow;
 pub mod norm;
@@ -36,8 +33,6 @@ pub mod optimizer;
 #[cfg(target_arch = "x86_64")]
 mod packed;
 pub mod product;
-#[cfg(feature = "cuda")]
-pub mod recording;
 pub mod scaling;
 mod vectorized;
 

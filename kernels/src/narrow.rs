@@ -5,7 +5,7 @@
 use crate::activation::{Activation, gelu_and_slope, mish, relu, silu_and_slope, tanh_and_slope};
 use crate::vectorized::vectorized;
 
-/// Lanes that the loops work on at a time: one AVX-512 register of f32.
+/// Numbers of one AVX-512 register.
 const LANES: usize = 16;
 
 /// `acc + Σ_j coefficients[j] · vectors[j·stride + at ..][..LANES]`.
@@ -48,22 +48,22 @@ fn load(x: &[f32], at: usize) -> [f32; LANES] {
     lanes
 }
 
-/// Operands of the first layer: what the rows share, and what they do not.
+/// Operands of the first layer.
 pub struct FirstLayer<'a> {
-    /// Pre-activation of the state part, one row per state: `states × width`.
+    /// State part of the pre-activation, `states × width`.
     pub base: &'a [f32],
     /// Consecutive rows that share a state.
     pub repeat: usize,
-    /// Added to every row: the bias, and for the actor the time embedding's part.
+    /// Bias, and for the actor the time embedding's part.
     pub shift: &'a [f32],
-    /// `rows × action_dim`; the action may have no numbers at all.
+    /// `rows × action_dim`; action_dim can be 0.
     pub actions: &'a [f32],
-    /// The kernel's rows that multiply the action: `action_dim × width`.
+    /// The kernel's rows for the action, `action_dim × width`.
     pub kernel: &'a [f32],
 }
 
 impl FirstLayer<'_> {
-    /// The action of a row; empty where the network has none.
+    /// The action of a row.
     #[inline(always)]
     fn action(&self, row: usize) -> &[f32] {
         let action_dim = self.kernel.len() / self.shift.len();

@@ -1,16 +1,15 @@
 //! Layer norm (Ba et al. 2016) of a tile's rows, and its backward pass.
 //!
-//! What is kept of a tile for the backward pass is one slice: the gradients of scale and shift,
-//! `width` numbers each; for each row one over its deviation; and the normalized rows, `rows ×
-//! width`.
+//! One slice is saved of a tile for the backward pass: the gradients of scale and shift, `width`
+//! numbers each; 1/√(variance + ε) of each row; and the normalized rows, `rows × width`.
 
 use crate::vectorized::vectorized;
 
-/// Partial sums that are added up side by side: one AVX-512 register of f32.
+/// Partial sums side by side: one AVX-512 register of f32.
 const LANES: usize = 16;
 
-/// Numbers that are kept of a tile.
-pub fn kept(rows: usize, width: usize) -> usize {
+/// Numbers saved of a tile.
+pub fn saved_len(rows: usize, width: usize) -> usize {
     2 * width + rows * (1 + width)
 }
 
@@ -32,11 +31,11 @@ fn mean(x: &[f32], y: &[f32], f: impl Fn(f32, f32) -> f32) -> f32 {
 }
 
 vectorized! {
-    /// `x = scale ⊙ (z − mean)/√(variance + epsilon)` with z = x + bias, over each row. Fills
-    /// `kept`.
-    pub fn normalize(x: &mut [f32], bias: Option<&[f32]>, scale: &[f32], epsilon: f32, kept: &mut [f32]) {
+    /// `x = scale ⊙ (z − mean)/√(variance + epsilon)` with z = x + bias, over each row. Writes
+    /// `saved`.
+    pub fn normalize(x: &mut [f32], bias: Option<&[f32]>, scale: &[f32], epsilon: f32, saved: &mut [f32]) {
         let width = scale.len();
-        let (inverse, normed) = kept[2 * width..].split_at_mut(x.len() / width);
+        let (inverse, normed) = saved[2 * width..].split_at_mut(x.len() / width);
         let rows = x.chunks_exact_mut(width).zip(normed.chunks_exact_mut(width));
         for ((x, normed), inverse) in rows.zip(inverse) {
             for (x, bias) in x.iter_mut().zip(bias.unwrap_or(&[])) {
@@ -63,11 +62,11 @@ vectorized! {
 }
 
 vectorized! {
-    /// Turns gradients behind a norm, `rows × width`, into those before it, and leaves the
-    /// gradients of scale and shift in what [`normalize`] has kept.
-    pub fn normalize_backward(delta: &mut [f32], scale: &[f32], kept: &mut [f32]) {
+    /// Turns gradients after a norm, `rows × width`, into those before it, and writes the
+    /// gradients of scale and shift to `saved`.
+    pub fn normalize_backward(delta: &mut [f32], scale: &[f32], saved: &mut [f32]) {
         let width = scale.len();
-        let (sums, rows) = kept.split_at_mut(2 * width);
+        let (sums, rows) = saved.split_at_mut(2 * width);
         let (inverse, normed) = rows.split_at(delta.len() / width);
         sums.fill(0.0);
         let (of_scale, of_shift) = sums.split_at_mut(width);
@@ -104,50 +103,43 @@ mod tests {
             .collect()
     }
 
+    /// Finite differences of the formulas in double precision.
     #[test]
     fn a_norm_and_its_gradients_match_their_definition() {
         for width in [1, 5, 16, 40] {
-            let numbers = |len: usize, by: f32| {
-                (0..len).map(|i| (by * (i + 1) as f32).sin()).collect::<Vec<f32>>()
+            let numbers = |len: usize, by: f32| -> Vec<f32> {
+                (0..len).map(|i| (by * (i + 1) as f32).sin()).collect()
             };
             let (x, delta, rows) = (numbers(3 * width, 2.1), numbers(3 * width, 1.3), 3);
             let (bias, scale) = (numbers(width, 0.7), numbers(width, 0.3));
-            let (mut y, mut keeps) = (x.clone(), vec![f32::NAN; kept(rows, width)]);
-            normalize(&mut y, Some(&bias), &scale, 1e-2, &mut keeps);
-            let loss = |x: &[f32], scale: &[f32]| -> f64 {
-                let y = x.chunks(width).flat_map(|row| exact(row, &bias, scale, 1e-2));
-                y.zip(&delta).map(|(y, delta)| y * f64::from(*delta)).sum()
+            let (mut y, mut saved) = (x.clone(), vec![f32::NAN; saved_len(rows, width)]);
+            normalize(&mut y, Some(&bias), &scale, 1e-2, &mut saved);
+            let all = |x: &[f32], scale: &[f32]| -> Vec<f64> {
+                x.chunks(width).flat_map(|row| exact(row, &bias, scale, 1e-2)).collect()
             };
-            for (found, row) in y.chunks(width).zip(x.chunks(width)) {
-                let expected = exact(row, &bias, &scale, 1e-2);
-                assert!(
-                    found
-                        .iter()
-                        .zip(expected)
-                        .all(|(y, exact)| (f64::from(*y) - exact).abs() < 1e-5),
-                    "{width}"
-                );
+            let near = |x: f32, y: f64, by: f64| (f64::from(x) - y).abs() < by * (1.0 + y.abs());
+            for (y, exact) in y.iter().zip(all(&x, &scale)) {
+                assert!(near(*y, exact, 1e-5), "{width}: {y} for {exact}");
             }
-            let mut found = delta.clone();
-            normalize_backward(&mut found, &scale, &mut keeps);
-            let moved = |numbers: &[f32], i: usize, by: f32| {
-                let mut numbers = numbers.to_vec();
-                numbers[i] += by;
-                numbers
+            let mut of_x = delta.clone();
+            normalize_backward(&mut of_x, &scale, &mut saved);
+            let loss = |x: &[f32], scale: &[f32]| -> f64 {
+                all(x, scale).iter().zip(&delta).map(|(y, delta)| y * f64::from(*delta)).sum()
             };
-            let slope = |of: &dyn Fn(f32) -> f64| (of(0.01) - of(-0.01)) / 0.02;
-            for (i, found) in found.iter().enumerate() {
-                let expected = slope(&|by| loss(&moved(&x, i, by), &scale));
-                assert!(
-                    (f64::from(*found) - expected).abs() < 1e-3 * (1.0 + expected.abs()),
-                    "{width}, x {i}"
-                );
+            let slope = |at: &[f32], i: usize, loss: &dyn Fn(&[f32]) -> f64| {
+                let (mut above, mut below) = (at.to_vec(), at.to_vec());
+                above[i] += 0.01;
+                below[i] -= 0.01;
+                (loss(&above) - loss(&below)) / 0.02
+            };
+            for (i, of_x) in of_x.iter().enumerate() {
+                assert!(near(*of_x, slope(&x, i, &|x| loss(x, &scale)), 1e-3), "{width}, x {i}");
             }
             for i in 0..width {
-                let expected = slope(&|by| loss(&x, &moved(&scale, i, by)));
-                assert!((f64::from(keeps[i]) - expected).abs() < 1e-3, "{width}, scale {i}");
+                let of_scale = slope(&scale, i, &|scale| loss(&x, scale));
+                assert!(near(saved[i], of_scale, 1e-3), "{width}, scale {i}");
                 let sum: f32 = delta.chunks(width).map(|row| row[i]).sum();
-                assert!((keeps[width + i] - sum).abs() < 1e-5, "{width}, shift {i}");
+                assert!((saved[width + i] - sum).abs() < 1e-5, "{width}, shift {i}");
             }
         }
     }

@@ -4,14 +4,14 @@ use rayon::prelude::*;
 
 use crate::vectorized::vectorized;
 
-/// Numbers per task: a few arrays of them fit into a core's own cache.
+/// Numbers of one task: a few arrays of them fit into a core's own cache.
 const CHUNK: usize = 1 << 14;
 
 /// Adam's decay rate of the first moment, β1.
 pub const BETA1: f64 = 0.9;
 /// Adam's decay rate of the second moment, β2.
 pub const BETA2: f64 = 0.999;
-/// What Adam adds to the root of the second moment, ε.
+/// Number ε that Adam adds to the root of the second moment.
 pub const EPSILON: f32 = 1e-8;
 
 vectorized! {
@@ -28,19 +28,19 @@ vectorized! {
     }
 }
 
-/// Coefficients of Adam's element-wise update.
+/// Coefficients of one step of Adam.
 #[derive(Clone, Copy, Debug)]
 pub struct AdamRates {
     /// Learning rate over the first moment's bias correction.
     pub rate: f32,
-    /// What multiplies the parameters themselves.
+    /// Weight decay times learning rate.
     pub decay: f32,
     /// 1/sqrt of the second moment's bias correction.
     pub correction: f32,
 }
 
 impl AdamRates {
-    /// Those of step number `count`, from 1, with a learning rate and a weight decay.
+    /// The coefficients of step number `count`, from 1.
     pub fn new(rate: f32, decay: f32, count: u64) -> Self {
         let count = count as f64;
         Self {
@@ -53,16 +53,14 @@ impl AdamRates {
 
 vectorized! {
     fn adam_chunk(scale: f32, rates: AdamRates, parameters: &mut [f32], first: &mut [f32], second: &mut [f32], gradient: &[f32]) {
-        // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in
-        // 20,000.
+        // Rounded from f64, since 1 − 0.999 in f32 has an error of 5e-5.
         const NEW: [f32; 2] = [(1.0 - BETA1) as f32, (1.0 - BETA2) as f32];
         const OLD: [f32; 2] = [BETA1 as f32, BETA2 as f32];
         for (((p, m), v), g) in parameters.iter_mut().zip(first).zip(second).zip(gradient) {
             let g = g * scale;
             *m = OLD[0] * *m + NEW[0] * g;
             *v = OLD[1] * *v + NEW[1] * g * g;
-            // In one subtraction: a decay by itself would be too small a part of the parameter to
-            // change it.
+            // One subtraction: the decay alone would be rounded away.
             *p -= rates.rate * *m / (v.sqrt() * rates.correction + EPSILON) + rates.decay * *p;
         }
     }

@@ -1,12 +1,11 @@
-//! The right-hand side of products, laid out once as all of them read it.
+//! The right-hand side of products, packed once for many of them.
 
 use crate::avx2;
 use crate::avx512::bf16::Rounded;
 use crate::avx512::{self, LANES, Line};
 use crate::level::Level;
 
-/// A matrix `k × n` that many others are multiplied with: block after block of columns, so that a
-/// product copies nothing.
+/// A matrix `k × n` in blocks of columns, so that products copy nothing.
 pub struct Packed(Blocks);
 
 enum Blocks {
@@ -15,8 +14,7 @@ enum Blocks {
 }
 
 impl Packed {
-    /// Packs a row-major matrix; `None` where this CPU gains nothing by it, or the matrix is not
-    /// made of whole blocks.
+    /// Packs a row-major matrix; `None` if this CPU gains nothing, or the matrix is not whole blocks.
     pub fn new(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
         assert_eq!(matrix.len(), k * n, "the matrix's shape");
         let columns = match Level::in_use() {
@@ -40,13 +38,12 @@ impl Packed {
         Some(Self(Blocks::F32 { lines, k, n }))
     }
 
-    /// Packs a matrix with its numbers rounded to bfloat16, as those of the left side will be; sums
-    /// are in f32.
+    /// Packs a matrix rounded to bfloat16, as the left side will be; sums are in f32.
     pub fn rounded(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
         Some(Self(Blocks::Bf16(Rounded::new(matrix, k, n)?)))
     }
 
-    /// Whether its numbers are rounded.
+    /// True for a matrix rounded to bfloat16.
     pub fn is_rounded(&self) -> bool {
         matches!(self.0, Blocks::Bf16(_))
     }
@@ -59,8 +56,7 @@ impl Packed {
                 let m = a.len() / k;
                 assert!(a.len() == m * k && c.len() == m * n, "the product's shape");
                 let (a, b, c) = (a.as_ptr(), lines.as_ptr().cast(), c.as_mut_ptr());
-                // SAFETY: they were packed for the instructions in use, which the CPU has, and the
-                // shapes are those.
+                // SAFETY: packed for the instructions in use; the shapes were checked.
                 unsafe {
                     match Level::in_use() {
                         Level::Avx512 => avx512::multiply_packed(m, *n, *k, a, b, c),

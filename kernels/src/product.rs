@@ -1,6 +1,6 @@
 //! Dense products on one thread, all matrices row-major.
 //!
-//! The callers split work into tiles that run in parallel, so a single product never does.
+//! Callers run tiles in parallel; a single product uses one thread.
 
 use gemm::{Parallelism, gemm};
 #[cfg(target_arch = "x86_64")]
@@ -18,12 +18,12 @@ pub use crate::packed::Packed;
 /// The left or right side of a product.
 #[derive(Clone, Copy)]
 pub enum Matrix<'a> {
-    /// The matrix that has these elements, row by row.
+    /// The matrix with these elements, row by row.
     RowMajor(&'a [f32]),
-    /// The transpose of the matrix that has these elements, row by row.
+    /// The transpose of the matrix with these elements, row by row.
     TransposeOf(&'a [f32]),
-    /// The transpose of some columns, from one on, of the matrix that has these elements, row by
-    /// row, and so many columns.
+    /// The transpose of columns from an index on of the matrix with these elements, row by row, and
+    /// this many columns.
     TransposeOfColumns(&'a [f32], usize, usize),
 }
 
@@ -31,8 +31,6 @@ pub enum Matrix<'a> {
 type Strided = (*const f32, isize, isize);
 
 impl Matrix<'_> {
-    /// # Panics
-    /// If it has not `rows × columns` elements.
     fn strided(self, rows: usize, columns: usize) -> Strided {
         let (elements, column, row, from, len) = match self {
             Self::RowMajor(elements) => (elements, 1, columns, 0, rows * columns),
@@ -47,11 +45,7 @@ impl Matrix<'_> {
     }
 }
 
-/// `out[m × n] = a[m × k] · b[k × n]`, as the crate `gemm` does it with the instructions in use
-/// ([`Level`]).
-///
-/// # Panics
-/// If an operand has another number of elements.
+/// `out[m × n] = a[m × k] · b[k × n]` by the crate `gemm`, with the instructions in use ([`Level`]).
 pub fn by_gemm([m, k, n]: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32]) {
     let (a, b) = (a.strided(m, k), b.strided(k, n));
     assert_eq!(out.len(), m * n, "the product's shape");
@@ -73,7 +67,7 @@ pub fn by_gemm([m, k, n]: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32]) {
     }
 }
 
-/// What `gemm` does on a CPU that has no more than AVX2. On a wider one it would not.
+/// The product as `gemm` computes it on a CPU without AVX-512.
 ///
 /// # Safety
 /// The matrices must span that many elements.
@@ -82,39 +76,17 @@ unsafe fn by_avx2(avx2: V3, [m, n, k]: [usize; 3], out: &mut [f32], a: Strided, 
     use gemm_f32::microkernel::fma::f32::{H_M, H_N, H_UKR, MR_DIV_N, NR, UKR};
     const LANES: usize = 8;
     let (no, one) = (false, Parallelism::None);
-    let out = out.as_mut_ptr();
+    let (out, row, fma) = (out.as_mut_ptr(), n as isize, |a, b, c| a * b + c);
     // SAFETY: the caller's. Its kernels write columns, so it is given the transposed matrices.
     unsafe {
         gemm_basic_generic::<_, f32, LANES, { MR_DIV_N * LANES }, NR, MR_DIV_N, H_M, H_N>(
-            avx2,
-            n,
-            m,
-            k,
-            out,
-            n as isize,
-            1,
-            no,
-            b.0,
-            b.2,
-            b.1,
-            a.0,
-            a.2,
-            a.1,
-            0.0,
-            1.0,
-            no,
-            no,
-            no,
-            |a, b, c| a * b + c,
-            &UKR,
-            &H_UKR,
-            no,
-            one,
+            avx2, n, m, k, out, row, 1, no, b.0, b.2, b.1, a.0, a.2, a.1, 0.0, 1.0, no, no, no,
+            fma, &UKR, &H_UKR, no, one,
         );
     }
 }
 
-/// Multiplies by AVX-512 where the CPU has it and the result is whole blocks wide, else by `gemm`.
+/// The product by AVX-512, if the CPU and the width allow, or by `gemm`.
 fn multiply([m, k, n]: [usize; 3], a: Matrix, b: &[f32], out: &mut [f32]) {
     #[cfg(target_arch = "x86_64")]
     if avx512::serves(n) {
@@ -127,7 +99,7 @@ fn multiply([m, k, n]: [usize; 3], a: Matrix, b: &[f32], out: &mut [f32]) {
     by_gemm([m, k, n], a, Matrix::RowMajor(b), out);
 }
 
-/// Whether this CPU multiplies rounded operands ([`Packed::rounded`]), and faster than in f32.
+/// True if this CPU multiplies rounded operands ([`Packed::rounded`]) faster than f32.
 pub fn rounding_is_faster() -> bool {
     #[cfg(target_arch = "x86_64")]
     let available = avx512::bf16::available();
@@ -136,8 +108,8 @@ pub fn rounding_is_faster() -> bool {
     available
 }
 
-/// The instructions that this CPU multiplies with, `rounded` operands or not. Other instructions
-/// add up in another order, and so to other last bits.
+/// The instructions of products, in f32 or `rounded`. Other instructions add in another order, and
+/// so give other last bits.
 pub fn instructions(rounded: bool) -> &'static str {
     #[cfg(target_arch = "x86_64")]
     let names = if rounded { avx512::bf16::instructions() } else { Level::in_use().name() };
@@ -151,7 +123,7 @@ pub fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     multiply([x.len() / k, k, n], Matrix::RowMajor(x), w, out);
 }
 
-/// There are none where no such CPU is.
+/// No kernels are packed on other architectures.
 #[cfg(not(target_arch = "x86_64"))]
 pub enum Packed {}
 
@@ -194,7 +166,7 @@ pub fn outer(x: &[f32], g: &[f32], out: &mut [f32], k: usize, n: usize) {
     outer_rows(x, g, out, (0, k), n);
 }
 
-/// Those rows of [`outer`]'s result, from row `from` on, that `out` has room for.
+/// The rows of [`outer`]'s result from `from` on, as many as fit into `out`.
 pub fn outer_rows(x: &[f32], g: &[f32], out: &mut [f32], (from, k): (usize, usize), n: usize) {
     multiply([out.len() / n, x.len() / k, n], Matrix::TransposeOfColumns(x, from, k), g, out);
 }
@@ -205,81 +177,62 @@ mod tests {
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    fn assert_close(out: &[f32], expected: impl Fn(usize) -> f64, shape: &str) {
+    fn assert_close(what: &str, out: &[f32], expected: impl Fn(usize) -> f64) {
         for (i, x) in out.iter().enumerate() {
             let exact = expected(i);
-            assert!(
-                (f64::from(*x) - exact).abs() < 1e-5 * exact.abs().max(1.0),
-                "{shape} at {i}: {x} for {exact}"
-            );
+            let error = (f64::from(*x) - exact).abs() / exact.abs().max(1.0);
+            assert!(error < 1e-5, "{what} at {i}: {x} for {exact}");
         }
     }
 
-    /// Rows that are whole blocks and that are not; columns that AVX-512 serves and that it does
-    /// not.
+    /// Whole blocks of rows and others, columns for AVX-512 and others.
     #[test]
     fn products_match_their_definition() {
-        let mut generator = ChaCha8Rng::seed_from_u64(0);
-        let mut numbers =
-            |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
-        for (m, k, n) in [
-            (1, 3, 1),
-            (5, 14, 32),
-            (7, 11, 23),
-            (12, 32, 64),
-            (29, 64, 96),
-            (41, 96, 32),
-            (16, 33, 32),
-            (9, 512, 32),
-            (7, 32, 512),
-            (256, 256, 32),
-        ] {
+        let generator = &mut ChaCha8Rng::seed_from_u64(0);
+        let mut numbers = |len: usize| -> Vec<f32> {
+            (0..len).map(|_| generator.random_range(-1.0..1.0)).collect()
+        };
+        let small = [[1, 3, 1], [5, 14, 32], [7, 11, 23], [12, 32, 64], [16, 33, 32]];
+        let large = [[29, 64, 96], [41, 96, 32], [9, 512, 32], [7, 32, 512], [256, 256, 32]];
+        for [m, k, n] in small.into_iter().chain(large) {
             let (x, w, g) = (numbers(m * k), numbers(k * n), numbers(m * n));
             let sum = |len: usize, term: &dyn Fn(usize) -> (f32, f32)| -> f64 {
                 (0..len).map(term).map(|(a, b)| f64::from(a) * f64::from(b)).sum()
             };
+            let what = format!("{m} × {k} × {n}");
             let mut out = vec![f32::NAN; m * n];
             product(&x, &w, &mut out, k, n);
             let exact = |i: usize| sum(k, &|p| (x[i / n * k + p], w[p * n + i % n]));
-            assert_close(&out, exact, &format!("{m} × {k} × {n}"));
+            assert_close(&what, &out, exact);
             if let Some(packed) = Packed::new(&w, k, n) {
                 out.fill(f32::NAN);
                 packed.product(&x, &mut out);
-                assert_close(&out, exact, &format!("{m} × {k} × {n}, packed"));
+                assert_close(&format!("{what}, packed"), &out, exact);
             }
-            let mut out = vec![f32::NAN; m * n];
-            match Packed::rounded(&w, k, n) {
-                Some(rounded) => rounded.product(&x, &mut out),
-                None => product(&x, &w, &mut out, k, n),
+            if let Some(rounded) = Packed::rounded(&w, k, n) {
+                out.fill(f32::NAN);
+                rounded.product(&x, &mut out);
             }
-            // Each term is off by at most a part in 2^8: twice half a unit in the last of 8 bits.
+            // Rounding changes each term by at most a part in 2^8.
             let terms = |i: usize| sum(k, &|p| (x[i / n * k + p].abs(), w[p * n + i % n].abs()));
             for (i, x) in out.iter().enumerate() {
-                assert!(
-                    (f64::from(*x) - exact(i)).abs() <= terms(i) / 256.0 + 1e-5,
-                    "{m} × {k} × {n} in bf16 at {i}"
-                );
+                let error = (f64::from(*x) - exact(i)).abs();
+                assert!(error <= terms(i) / 256.0 + 1e-5, "{what} in bf16 at {i}");
             }
             let mut out = vec![f32::NAN; m * k];
             product_transposed(&g, &w, &mut out, k, n);
-            assert_close(
-                &out,
-                |i| sum(n, &|p| (g[i / k * n + p], w[i % k * n + p])),
-                &format!("{m} × {n} × {k}ᵀ"),
-            );
+            let exact = |i: usize| sum(n, &|p| (g[i / k * n + p], w[i % k * n + p]));
+            assert_close(&format!("{what}, transposed"), &out, exact);
             let mut out = vec![f32::NAN; k * n];
             outer(&x, &g, &mut out, k, n);
-            assert_close(
-                &out,
-                |i| sum(m, &|p| (x[p * k + i / n], g[p * n + i % n])),
-                &format!("{k} × {m}ᵀ × {n}"),
-            );
+            let exact = |i: usize| sum(m, &|p| (x[p * k + i / n], g[p * n + i % n]));
+            assert_close(&format!("{what}, outer"), &out, exact);
             let (whole, from) = (out.clone(), k / 3);
             let (above, below) = out.split_at_mut(from * n);
             above.fill(f32::NAN);
             outer_rows(&x, &g, above, (0, k), n);
             outer_rows(&x, &g, below, (from, k), n);
-            assert_eq!(out, whole, "{k} × {m}ᵀ × {n} in two parts, bit for bit");
+            assert_eq!(out, whole, "{what}, outer in two parts");
         }
     }
 }

@@ -1,5 +1,4 @@
-//! Loops that are compiled for several instruction sets, of which the one in use is chosen at run
-//! time.
+//! Loops compiled for several instruction sets, chosen at run time.
 
 macro_rules! vectorized {
     ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $(-> $result:ty)? $body:block) => {
@@ -17,7 +16,7 @@ macro_rules! vectorized {
                 match Level::in_use() {
                     // SAFETY: the CPU has what is in use.
                     Level::Avx512 => return unsafe { avx512($($arg),*) },
-                    // SAFETY: likewise.
+                    // SAFETY: the CPU has what is in use.
                     Level::Avx2 => return unsafe { avx2($($arg),*) },
                     Level::Plain => {}
                 }

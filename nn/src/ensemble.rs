@@ -2,17 +2,16 @@
 //! policy's mean over s.
 
 use crate::error::NetworkError;
-use crate::layers::action_gradients::ActionGradients;
 use crate::layers::composed::Pass;
 use crate::layers::mlp::Mlp;
-use crate::layers::operation::OnCpu;
 use crate::layers::packed::Packing;
 use crate::layers::plain;
 use crate::precision::Precision;
 use crate::shape::EnsembleShape;
+use crate::slices::{has_fast_implementation, read, read_all};
 use crate::weighted::weighted;
 use crate::weights::{Tensors, Weights};
-use candle_core::{Result, Tensor, Var, bail};
+use candle_core::{Error, Result, Tensor, Var, bail};
 
 /// An ensemble and its weights.
 pub struct Ensemble {
@@ -25,13 +24,14 @@ pub struct Ensemble {
 weighted!(Ensemble, networks);
 
 impl Ensemble {
-    /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
+    /// An ensemble with weights of the shape's layout. `precision` applies where no gradient is
+    /// taken.
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
         let networks = Mlp::new(shape.layers(), "");
         Self { shape, networks, weights, packing: Packing::new(precision) }
     }
 
-    /// Takes the tensors of such networks out of `tensors`, for a policy that acts.
+    /// Loads an ensemble that acts, removing its tensors from `tensors`.
     pub fn take(
         shape: EnsembleShape,
         tensors: &mut Tensors,
@@ -42,31 +42,29 @@ impl Ensemble {
         Ok(Self::new(shape, weights, precision).packed()?)
     }
 
-    /// Its shape.
+    /// The shape.
     pub fn shape(&self) -> &EnsembleShape {
         &self.shape
     }
 
-    /// Copies the networks, with constant weights: a target network at its beginning.
+    /// Copies the networks with constant weights, as target networks.
     pub fn copy(&self) -> Result<Self> {
         Ok(Self::new(self.shape.clone(), self.weights.copy()?, self.packing.precision))
     }
 
-    /// Makes constants of the weights; they share the memory of these networks.
+    /// The same networks with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
-        let (shape, networks) = (self.shape.clone(), self.networks.clone());
         Self {
-            shape,
-            networks,
+            shape: self.shape.clone(),
+            networks: self.networks.clone(),
             weights: self.weights.detach(),
             packing: Packing::new(self.packing.precision),
         }
     }
 
-    /// What comes out, `[K, rows, outputs]`, a row for each action.
-    ///
-    /// `observations` is `[n, o]`; `actions` `[rows, a]`, where equally many consecutive rows share
-    /// an observation. Differentiable in weights, observations and actions.
+    /// The outputs, `[K, rows, outputs]`, for `observations` `[n, o]` and `actions` `[rows, a]`,
+    /// of which the first rows/n belong to the first observation, and so on. Differentiable in
+    /// weights, observations and actions.
     pub fn outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         self.check(observations, actions)?;
         let constant =
@@ -80,26 +78,25 @@ impl Ensemble {
         self.networks.forward_by(packed, &self.weights, inputs)
     }
 
-    /// Q_k(s, a), `[K, rows]`, of networks with one output; the arguments are those of
+    /// Q_k(s, a), `[K, rows]`, of networks with one output, for the arguments of
     /// [`Self::outputs`].
     pub fn values(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         self.outputs(observations, actions)?.squeeze(2)
     }
 
-    /// Values of networks that see only the state, `[K, n]`.
+    /// V_k(s), `[K, n]`, of networks of s alone with one output.
     pub fn state_values(&self, observations: &Tensor) -> Result<Tensor> {
         self.state_outputs(observations)?.squeeze(2)
     }
 
-    /// What comes out of networks of s alone: `[K, n, outputs]`.
+    /// The outputs of networks of s alone, `[K, n, outputs]`.
     pub fn state_outputs(&self, observations: &Tensor) -> Result<Tensor> {
         let none =
             Tensor::zeros((observations.dim(0)?, 0), observations.dtype(), observations.device())?;
         self.outputs(observations, &none)
     }
 
-    /// Mean over members and rows of (Q_k(s, a) - y)², `[]`, for `targets` y `[rows]`, which are
-    /// constants.
+    /// Mean of (Q_k(s, a) − y)² over members and rows, `[]`, for constant `targets` y `[rows]`.
     pub fn squared_error(
         &self,
         observations: &Tensor,
@@ -112,12 +109,18 @@ impl Ensemble {
     /// ∇_a Q_k(s, a) of each member, `[K, rows, a]`, as constants.
     pub fn action_gradients(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         self.check(observations, actions)?;
-        let weights = self.weights.values().detach();
         if !self.networks.is_fast(&self.weights) || self.shape.outputs != 1 {
             return self.plain_action_gradients(observations, actions);
         }
-        let operation = OnCpu(ActionGradients { networks: self.networks.clone() });
-        weights.apply_op3_no_bwd(&observations.contiguous()?, &actions.contiguous()?, &operation)
+        let (observations, actions) = (observations.contiguous()?, actions.contiguous()?);
+        let (states, (rows, a)) = (observations.dim(0)?, actions.dims2()?);
+        let gradients = read_all(
+            [self.weights.values(), &observations, &actions],
+            |[weights, observations, actions]| {
+                self.networks.action_gradients(weights, (observations, states), (actions, rows))
+            },
+        )?;
+        Tensor::from_vec(gradients, (self.shape.members, rows, a), actions.device())
     }
 
     fn check(&self, observations: &Tensor, actions: &Tensor) -> Result<()> {
@@ -131,25 +134,53 @@ impl Ensemble {
         Ok(())
     }
 
-    /// [`Self::action_gradients`] in plain candle operations. One backward pass gives the gradients
-    /// of all members at actions of their own: none has a part in another's.
+    /// [`Self::action_gradients`] in candle's operations. One backward pass serves all members:
+    /// each has its own copy of the actions.
     fn plain_action_gradients(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let repeat = actions.dim(0)? / observations.dim(0)?;
         let (action_dim, layers) = (self.shape.action_dim, &self.networks.layers);
+        let observations = plain::repeat_rows(observations, repeat)?;
         if !layers.norm {
-            let x = Tensor::cat(&[&plain::repeat_rows(observations, repeat)?, actions], 1)?;
+            let x = Tensor::cat(&[&observations, actions], 1)?;
             let pass = Pass::forward(layers, &self.weights, &x, true)?;
             let (_, gradients) = pass.backward(&pass.out.ones_like()?, false, true)?;
-            let gradients = gradients
-                .ok_or_else(|| candle_core::Error::Msg("no gradient was asked for".into()))?;
+            let gradients = gradients.ok_or_else(|| Error::Msg("no gradient of inputs".into()))?;
             return gradients.narrow(2, self.shape.observation_dim, action_dim)?.contiguous();
         }
-        let observations =
-            plain::repeat_rows(observations, repeat)?.broadcast_left(self.shape.members)?;
+        let observations = observations.broadcast_left(self.shape.members)?;
         let actions = Var::from_tensor(&actions.broadcast_left(self.shape.members)?)?;
         let inputs = Tensor::cat(&[&observations, actions.as_tensor()], 2)?;
         let values = self.networks.plain_forward(&self.weights.detach(), &inputs)?;
         let gradients = values.sum_all()?.backward()?.remove(&actions);
-        gradients.ok_or_else(|| candle_core::Error::Msg("no gradient reaches the actions".into()))
+        gradients.ok_or_else(|| Error::Msg("no gradient reaches the actions".into()))
     }
+}
+
+/// Mean and population variance over the first dimension: `[K, …]` → twice `[…]`, as constants.
+pub fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
+    let x = x.detach();
+    if !has_fast_implementation(x.device()) {
+        let mean = x.mean_keepdim(0)?;
+        let variance = x.broadcast_sub(&mean)?.sqr()?.mean(0)?;
+        return Ok((mean.squeeze(0)?, variance));
+    }
+    // Candle's own sums over a leading dimension take ten times as long.
+    let (members, shape) = (x.dim(0)?, &x.dims()[1..]);
+    let (mean, variance) = read(&x.contiguous()?, |x: &[f32]| {
+        let share = 1.0 / members as f32;
+        let mut mean = vec![0.0; x.len() / members];
+        let mut variance = mean.clone();
+        for member in x.chunks_exact(mean.len()) {
+            mean.iter_mut().zip(member).for_each(|(mean, x)| *mean += x * share);
+        }
+        for member in x.chunks_exact(mean.len()) {
+            let squares = member.iter().zip(&mean).map(|(x, mean)| (x - mean) * (x - mean));
+            variance
+                .iter_mut()
+                .zip(squares)
+                .for_each(|(variance, square)| *variance += square * share);
+        }
+        (mean, variance)
+    })?;
+    Ok((Tensor::from_vec(mean, shape, x.device())?, Tensor::from_vec(variance, shape, x.device())?))
 }

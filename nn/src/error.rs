@@ -6,17 +6,17 @@ pub enum NetworkError {
     /// A tensor is missing.
     #[error("the weights lack the tensor {0:?}")]
     Missing(String),
-    /// A tensor of the wrong element type or shape.
+    /// A tensor has the wrong type or shape.
     #[error("tensor {name:?} has type and shape {found}, expected {expected}")]
     Shape {
-        /// Its name.
+        /// Name of the tensor.
         name: String,
         /// Its type and shape.
         found: String,
         /// The network's type and shape.
         expected: String,
     },
-    /// A NaN or an infinity among the weights.
+    /// A weight is NaN or infinite.
     #[error("tensor {0:?} holds a number that is not finite")]
     NotFinite(String),
     /// Candle cannot compute or move a tensor.

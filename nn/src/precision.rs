@@ -1,10 +1,10 @@
-//! How exactly networks are evaluated that no gradient is taken of.
+//! Arithmetic of networks without gradients.
 
 use serde::de::{self, IntoDeserializer};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
-/// Arithmetic of the wide products in networks that no gradient is taken of.
+/// Arithmetic of the wide products in networks without gradients.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
@@ -17,11 +17,11 @@ pub enum Precision {
 }
 
 impl Precision {
-    /// What to tell people whose CPU does not compute with what they asked for.
+    /// Message to users whose CPU does not have the requested arithmetic.
     pub const UNAVAILABLE: &str =
         "this CPU is no faster in bf16, which takes AMX or AMD's AVX512-BF16: it computes in f32";
 
-    /// What it is called on command lines and in configurations.
+    /// Name on command lines and in configurations.
     pub fn name(self) -> &'static str {
         match self {
             Precision::F32 => "f32",
@@ -29,24 +29,20 @@ impl Precision {
         }
     }
 
-    /// What this CPU computes with where it is asked for.
+    /// The precision that this CPU computes with if this one is requested.
     pub fn in_effect(self) -> Self {
         if quad_kernels::product::rounding_is_faster() { self } else { Precision::F32 }
     }
 
-    /// How this CPU computes where it is asked for, as it is called on the wire and in
-    /// `scores.jsonl`: what is in effect, and by which instructions, e.g. `bf16-amx`. Two CPUs give
-    /// the same bits only if this is the same.
+    /// The precision in effect and its instructions, e.g. `bf16-amx`, as on the wire and in
+    /// `scores.jsonl`. Two CPUs compute the same bits only if this is the same.
     pub fn arithmetic(self) -> String {
         let precision = self.in_effect();
-        format!(
-            "{}-{}",
-            precision.name(),
-            quad_kernels::product::instructions(precision == Precision::Bf16)
-        )
+        let instructions = quad_kernels::product::instructions(precision == Precision::Bf16);
+        format!("{}-{instructions}", precision.name())
     }
 
-    /// Whether this CPU computes with it, rather than with f32 in its place.
+    /// True if this CPU computes with it, rather than with f32 in its place.
     pub fn is_available(self) -> bool {
         self.in_effect() == self
     }

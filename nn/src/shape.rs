@@ -1,11 +1,11 @@
-//! The shapes of networks: hidden layers, and what goes in and comes out.
+//! The shapes of networks: hidden layers, inputs and outputs.
 
 use crate::diffusion::schedule::Reverse;
 use crate::layers::config::MlpConfig;
 use crate::layers::flat::{Layers, TILE};
 use crate::weights::Layout;
 
-/// Size of the sinusoidal features of a denoising step.
+/// Sinusoidal features of a denoising step.
 pub(crate) const TIME_FEATURES: usize = 16;
 /// Width of the network that embeds them, and of its output.
 pub(crate) const TIME_EMBEDDING: usize = 32;
@@ -13,84 +13,93 @@ pub(crate) const TIME_EMBEDDING: usize = 32;
 /// The shape of an ensemble.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EnsembleShape {
-    /// Networks, K.
+    /// Number of networks, K.
     pub members: usize,
-    /// Numbers in an observation s.
+    /// Length of an observation s.
     pub observation_dim: usize,
-    /// Numbers in an action a; 0 for networks of s alone.
+    /// Length of an action a; 0 for networks of s alone.
     pub action_dim: usize,
-    /// The hidden layers of each.
+    /// Hidden layers of each network.
     pub layers: MlpConfig,
-    /// Numbers that come out.
+    /// Outputs of each network.
     pub outputs: usize,
 }
 
 impl EnsembleShape {
-    pub(crate) fn layers(&self) -> Layers {
-        Layers::new(
-            self.members,
-            self.observation_dim + self.action_dim,
-            &self.layers,
-            self.outputs,
-            0,
-        )
+    /// Critics Q_1..Q_K(s, a).
+    pub fn critics(
+        members: usize,
+        (observation_dim, action_dim): (usize, usize),
+        layers: &MlpConfig,
+    ) -> Self {
+        Self { members, observation_dim, action_dim, layers: layers.clone(), outputs: 1 }
     }
 
-    /// Numbers that it takes to run all networks forward on so many states, `repeat` rows for each.
-    pub fn memory(&self, states: u128, repeat: u128) -> u128 {
+    /// One network of s.
+    pub fn of_state(observation_dim: usize, layers: &MlpConfig, outputs: usize) -> Self {
+        Self { outputs, ..Self::critics(1, (observation_dim, 0), layers) }
+    }
+
+    pub(crate) fn layers(&self) -> Layers {
+        let inputs = self.observation_dim + self.action_dim;
+        Layers::new(self.members, inputs, &self.layers, self.outputs, 0)
+    }
+
+    /// Numbers held by a forward pass of all networks, with `repeat` rows for each state.
+    pub fn floats(&self, states: u128, repeat: u128) -> u128 {
         let rows = states * repeat * self.members as u128;
         let inside = match self.layers.norm {
-            false => tile_numbers(repeat, &self.layers),
-            // The plain implementation keeps whole layers: input and output of an operation.
+            false => tile_floats(repeat, &self.layers),
+            // The plain implementation holds whole layers: input and output of an operation.
             true => rows * 4 * self.layers.widest() as u128,
         };
         // An observation for each action, and both side by side.
-        let fed = states * repeat * (2 * self.observation_dim + self.action_dim) as u128;
-        rows * self.outputs as u128 + fed + inside
+        let inputs = states * repeat * (2 * self.observation_dim + self.action_dim) as u128;
+        rows * self.outputs as u128 + inputs + inside
     }
 
     /// Tensors `{0..}.kernel` `[K, in, out]` and `{0..}.bias` `[K, out]`, and with a norm `.scale`
     /// and `.shift` `[K, out]`.
     pub fn layout(&self) -> Layout {
-        Layout::new(self.layers().named("", true))
+        Layout::new(self.layers().specs("", true))
     }
 }
 
-/// Numbers that the threads keep of the tiles of rows that they are at: rows of one state are not
-/// parted, and of each row there are some hidden layers.
-pub fn tile_numbers(repeat: u128, layers: &MlpConfig) -> u128 {
+/// Numbers in all threads' tiles of rows. The `repeat` rows of a state share a tile, which holds
+/// some hidden layers.
+pub fn tile_floats(repeat: u128, layers: &MlpConfig) -> u128 {
     let each = (2 * layers.hidden.len()).max(4) * layers.widest();
     (rayon::current_num_threads() * each) as u128 * repeat.max(TILE as u128)
 }
 
-/// Bytes of so many numbers, or as many as can be said.
-pub fn bytes(numbers: u128) -> u64 {
-    u64::try_from(4 * numbers).unwrap_or(u64::MAX)
+/// Bytes of this many numbers of f32, at most `u64::MAX`.
+pub fn bytes(floats: u128) -> u64 {
+    u64::try_from(4 * floats).unwrap_or(u64::MAX)
 }
 
 /// The shape of a noise predictor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NoiseShape {
-    /// Numbers in an observation s.
+    /// Length of an observation s.
     pub observation_dim: usize,
-    /// Numbers in an action a.
+    /// Length of an action a.
     pub action_dim: usize,
-    /// Its hidden layers.
+    /// Hidden layers.
     pub layers: MlpConfig,
     /// Denoising steps T.
     pub diffusion_steps: usize,
-    /// How each of them is made when sampling.
+    /// Formula of a reverse step.
     pub reverse: Reverse,
 }
 
 impl NoiseShape {
-    /// The network that embeds a denoising step; always the same.
+    /// The network that embeds a denoising step.
     pub(crate) fn time_layers(&self) -> Layers {
-        let config =
-            MlpConfig { initial: self.layers.initial, ..MlpConfig::mish(&[TIME_EMBEDDING]) };
-        Layers::new(1, TIME_FEATURES, &config, TIME_EMBEDDING, 0)
+        let hidden = self.layers.embedding(TIME_EMBEDDING);
+        Layers::new(1, TIME_FEATURES, &hidden, TIME_EMBEDDING, 0)
     }
 
+    /// The network of [s, a^t, embedding].
     pub(crate) fn trunk_layers(&self) -> Layers {
         let input = self.observation_dim + self.action_dim + TIME_EMBEDDING;
         Layers::new(1, input, &self.layers, self.action_dim, self.time_layers().range().end)
@@ -98,8 +107,8 @@ impl NoiseShape {
 
     /// Tensors `time.{0,1}` and `trunk.{0..}`, each with `.kernel` `[in, out]` and `.bias` `[out]`.
     pub fn layout(&self) -> Layout {
-        let mut parts = self.time_layers().named("time.", false);
-        parts.extend(self.trunk_layers().named("trunk.", false));
-        Layout::new(parts)
+        let mut specs = self.time_layers().specs("time.", false);
+        specs.extend(self.trunk_layers().specs("trunk.", false));
+        Layout::new(specs)
     }
 }

@@ -1,12 +1,12 @@
 //! Candle's CPU tensors as slices.
 
+use candle_core::{
+    CpuStorage, Device, Error, InplaceOp1, Layout, Result, Storage, Tensor, WithDType, bail,
+};
 use std::cell::Cell;
 
-use candle_core::{CpuStorage, Device, Error, InplaceOp1, Layout, Result, Storage, Tensor};
-
-/// Whether operations on this device have a fast implementation: on the CPU, unless the feature
-/// `plain` says otherwise.
-pub fn has_fast_implementation(device: &Device) -> bool {
+/// True on the CPU, unless the feature `plain` asks for candle's own operations there, too.
+pub(crate) fn has_fast_implementation(device: &Device) -> bool {
     #[cfg(test)]
     if PLAINLY.get() {
         return false;
@@ -19,7 +19,7 @@ thread_local! {
     static PLAINLY: Cell<bool> = const { Cell::new(false) };
 }
 
-/// What `work` gives where nothing has a fast implementation.
+/// The result of `work` in candle's own operations.
 #[cfg(test)]
 pub(crate) fn plainly<R>(work: impl FnOnce() -> R) -> R {
     PLAINLY.set(true);
@@ -29,39 +29,41 @@ pub(crate) fn plainly<R>(work: impl FnOnce() -> R) -> R {
 }
 
 /// The numbers behind a contiguous layout.
-pub(crate) fn slice<'a, T: candle_core::WithDType>(
-    storage: &'a CpuStorage,
-    layout: &Layout,
-) -> Result<&'a [T]> {
-    let Some((from, to)) = layout.contiguous_offsets() else {
-        candle_core::bail!("a tensor is not contiguous")
-    };
+pub(crate) fn slice<'a, T: WithDType>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [T]> {
+    let Some((from, to)) = layout.contiguous_offsets() else { bail!("a tensor is not contiguous") };
     Ok(&storage.as_slice()?[from..to])
 }
 
 /// The numbers of a contiguous tensor on the CPU.
-pub(crate) fn on_cpu<'a, T: candle_core::WithDType>(
-    storage: &'a Storage,
-    layout: &Layout,
-) -> Result<&'a [T]> {
+pub(crate) fn on_cpu<'a, T: WithDType>(storage: &'a Storage, layout: &Layout) -> Result<&'a [T]> {
     match storage {
         Storage::Cpu(storage) => slice(storage, layout),
-        _ => candle_core::bail!("a tensor is not on the CPU"),
+        _ => bail!("a tensor is not on the CPU"),
     }
 }
 
-/// Hands the numbers of a contiguous tensor on the CPU to `work`.
-pub fn read<T: candle_core::WithDType, R>(
-    tensor: &Tensor,
-    work: impl FnOnce(&[T]) -> R,
-) -> Result<R> {
+/// Calls `work` with the numbers of a contiguous tensor on the CPU.
+pub fn read<T: WithDType, R>(tensor: &Tensor, work: impl FnOnce(&[T]) -> R) -> Result<R> {
     let (storage, layout) = tensor.storage_and_layout();
     Ok(work(on_cpu(&storage, layout)?))
 }
 
-/// Has `work` change the numbers of a contiguous tensor on the CPU in place.
-pub fn modify<R>(tensor: &Tensor, work: impl FnOnce(&mut [f32]) -> R) -> Result<R> {
-    /// Candle asks for an operation that could be applied many times; this one is applied once.
+/// Calls `work` with the numbers of several contiguous tensors on the CPU.
+pub(crate) fn read_all<const N: usize, R>(
+    tensors: [&Tensor; N],
+    work: impl FnOnce([&[f32]; N]) -> R,
+) -> Result<R> {
+    let held = tensors.map(Tensor::storage_and_layout);
+    let mut slices = [&[][..]; N];
+    for (slice, (storage, layout)) in slices.iter_mut().zip(&held) {
+        *slice = on_cpu(storage, layout)?;
+    }
+    Ok(work(slices))
+}
+
+/// Lets `work` change the numbers of a contiguous tensor on the CPU in place.
+pub(crate) fn modify<R>(tensor: &Tensor, work: impl FnOnce(&mut [f32]) -> R) -> Result<R> {
+    /// Candle takes operations that can be applied many times; this one is applied once.
     struct Once<F, R>(Cell<Option<F>>, Cell<Option<R>>);
     impl<R, F: FnOnce(&mut [f32]) -> R> InplaceOp1 for Once<F, R> {
         fn name(&self) -> &'static str {
@@ -72,9 +74,7 @@ pub fn modify<R>(tensor: &Tensor, work: impl FnOnce(&mut [f32]) -> R) -> Result<
             let (CpuStorage::F32(numbers), Some((from, to)), Some(work)) =
                 (storage, layout.contiguous_offsets(), self.0.take())
             else {
-                return Err(Error::Msg(
-                    "only contiguous tensors of f32 can be changed in place".into(),
-                ));
+                bail!("only contiguous tensors of f32 can be changed in place")
             };
             self.1.set(Some(work(&mut numbers[from..to])));
             Ok(())

@@ -1,22 +1,19 @@
-//! What all networks have: weights, and kernels that are laid out of them.
+//! The trait of all networks with weights.
 
 use crate::weights::Weights;
 use candle_core::Result;
 
 /// A network with its weights.
 pub trait Weighted {
-    /// Its weights.
+    /// The weights.
     fn weights(&self) -> &Weights;
 
-    /// Its weights, to be changed. Kernels that were laid out of them are dropped.
+    /// The weights, to be changed. Drops kernels that were packed from them.
     fn weights_mut(&mut self) -> &mut Weights;
 
     /// The EMA update of a target network: w = (1 − rate)·w + rate·online.
-    ///
-    /// # Errors
-    /// Candle fails.
     fn soft_update(&mut self, online: &Self, rate: f32) -> Result<()> {
-        self.weights_mut().ema_update(online.weights(), rate)
+        self.weights_mut().soft_update(online.weights(), rate)
     }
 }
 
@@ -30,24 +27,34 @@ impl Weighted for Weights {
     }
 }
 
-/// Implements it for a network type with the fields `weights` and `packing`, whose products are
-/// those of the MLP in a field.
+/// Implements [`Weighted`] for a type with the field `weights`. Where the field `packing` holds
+/// packed kernels, their MLP's path follows the type.
 macro_rules! weighted {
-    ($type:ty, $($mlp:ident).+) => {
+    ($type:ty) => {
         impl crate::weighted::Weighted for $type {
-            fn weights(&self) -> &Weights {
+            fn weights(&self) -> &crate::weights::Weights {
                 &self.weights
             }
 
-            fn weights_mut(&mut self) -> &mut Weights {
+            fn weights_mut(&mut self) -> &mut crate::weights::Weights {
+                &mut self.weights
+            }
+        }
+    };
+    ($type:ty, $($mlp:ident).+) => {
+        impl crate::weighted::Weighted for $type {
+            fn weights(&self) -> &crate::weights::Weights {
+                &self.weights
+            }
+
+            fn weights_mut(&mut self) -> &mut crate::weights::Weights {
                 self.packing = Packing::new(self.packing.precision);
                 &mut self.weights
             }
         }
 
         impl $type {
-            /// Lays its kernels out for products now: for a policy that acts, whose weights do not
-            /// change.
+            /// Packs the kernels now, for a policy whose weights do not change any more.
             pub fn packed(self) -> Result<Self> {
                 self.packing.pack(&self.$($mlp).+, &self.weights)?;
                 Ok(self)

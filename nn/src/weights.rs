@@ -1,8 +1,8 @@
 //! The weights of a network: one flat vector, with named tensors in it.
 
 use crate::error::NetworkError;
-use crate::gradients::kept::KeptGradient;
-use crate::slices::{has_fast_implementation, modify};
+use crate::gradients::buffer::GradientBuffer;
+use crate::slices::{has_fast_implementation, modify, read};
 use candle_core::{DType, Device, Result, Tensor, Var};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -12,35 +12,41 @@ use std::sync::Arc;
 /// Tensors by name.
 pub type Tensors = BTreeMap<String, Tensor>;
 
-/// What a tensor's numbers are before training.
+/// Initial values of a tensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Init {
-    /// All the same.
+    /// This number.
     Constant(f32),
-    /// Uniform within ± this.
+    /// U(−b, b) for this b.
     Uniform(f32),
-    /// This times matrices with orthonormal rows or columns, whichever are fewer.
+    /// This gain times matrices with orthonormal rows or columns, whichever are fewer.
     Orthogonal(f32),
 }
 
 /// A named tensor in a flat vector.
 #[derive(Clone, Debug)]
 pub struct TensorSpec {
-    /// Its name within the network, e.g. `trunk.0.kernel`.
+    /// Name within the network, e.g. `trunk.0.kernel`.
     pub name: String,
-    /// Its shape.
+    /// Shape.
     pub shape: Vec<usize>,
-    /// What it begins with.
-    pub start: Init,
+    /// Initial values.
+    pub init: Init,
 }
 
 impl TensorSpec {
-    fn count(&self) -> usize {
+    /// A tensor with this name, shape and initial values.
+    pub fn new(name: String, shape: &[usize], init: Init) -> Self {
+        Self { name, shape: shape.to_vec(), init }
+    }
+
+    /// Numbers in the tensor.
+    pub(crate) fn count(&self) -> usize {
         self.shape.iter().product()
     }
 
     fn fill(&self, values: &mut [f32], generator: &mut impl Rng) {
-        match (self.start, &self.shape[..]) {
+        match (self.init, &self.shape[..]) {
             (Init::Constant(value), _) => values.fill(value),
             (Init::Uniform(bound), _) => values.fill_with(|| generator.random_range(-bound..bound)),
             (Init::Orthogonal(gain), [.., rows, columns]) => {
@@ -66,8 +72,7 @@ fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &m
             vector.iter_mut().zip(other).for_each(|(x, y)| *x -= along * y);
         }
         let size = vector.iter().map(|x| x * x).sum::<f64>().sqrt();
-        // A vector that hardly stands out of the others is drawn again: its direction would be
-        // rounding.
+        // A vector nearly in the span of the others is drawn again: its rest is rounding error.
         if size > 1e-3 {
             vector.iter_mut().for_each(|x| *x /= size);
             vectors.push(vector);
@@ -79,19 +84,17 @@ fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &m
     }
 }
 
-/// The named tensors of a network, in the order in which they follow one another in its vector,
-/// without gaps.
+/// The named tensors of a network in the order of its vector, without gaps.
 #[derive(Clone, Debug)]
 pub struct Layout(Arc<[TensorSpec]>);
 
 impl Layout {
-    /// The layout of these parts.
-    pub fn new(parts: Vec<TensorSpec>) -> Self {
-        Self(parts.into())
+    /// The layout of these tensors.
+    pub fn new(specs: Vec<TensorSpec>) -> Self {
+        Self(specs.into())
     }
 
-    /// Its parts.
-    pub(crate) fn parts(&self) -> &[TensorSpec] {
+    pub(crate) fn specs(&self) -> &[TensorSpec] {
         &self.0
     }
 
@@ -100,41 +103,36 @@ impl Layout {
         self.0.iter().map(TensorSpec::count).sum()
     }
 
-    /// The tensors in a vector of this layout, as views of it, named with `prefix` before each
-    /// name.
+    /// Views of the tensors in a vector of this layout, named `{prefix}{name}`.
     pub fn split(&self, vector: &Tensor, prefix: &str) -> Result<Tensors> {
         let mut offset = 0;
-        let view = |part: &TensorSpec| {
-            let tensor = vector.narrow(0, offset, part.count())?.reshape(part.shape.as_slice())?;
-            offset += part.count();
-            Ok((format!("{prefix}{}", part.name), tensor))
+        let view = |spec: &TensorSpec| {
+            let tensor = vector.narrow(0, offset, spec.count())?.reshape(spec.shape.as_slice())?;
+            offset += spec.count();
+            Ok((format!("{prefix}{}", spec.name), tensor))
         };
         self.0.iter().map(view).collect()
     }
 
-    /// Puts a vector together of the tensors that [`Self::split`] names, and takes them out of
-    /// `tensors`.
-    ///
-    /// # Errors
-    /// One that is missing, or has another type or shape, or a number that is not finite.
+    /// The vector of the tensors that [`Self::split`] names, which it removes from `tensors`.
     pub fn join(
         &self,
         tensors: &mut Tensors,
         prefix: &str,
     ) -> std::result::Result<Tensor, NetworkError> {
         let mut flat = Vec::with_capacity(self.0.len());
-        for part in self.0.iter() {
-            let tensor = take(tensors, format!("{prefix}{}", part.name), &part.shape)?;
+        for spec in self.0.iter() {
+            let tensor = take(tensors, format!("{prefix}{}", spec.name), &spec.shape)?;
             flat.push(tensor.flatten_all()?);
         }
         Ok(Tensor::cat(&flat, 0)?)
     }
 }
 
-/// Takes a tensor of that name and shape out of `tensors`.
+/// Removes a tensor of f32 with this name and shape from `tensors`.
 ///
 /// # Errors
-/// It is missing, or has another type or shape, or a number that is not finite.
+/// A tensor that is missing, has another type or shape, or holds a number that is not finite.
 pub fn take(
     tensors: &mut Tensors,
     name: String,
@@ -153,42 +151,35 @@ pub fn take(
 /// Checks that a tensor holds neither a NaN nor an infinity.
 pub fn check_finite(name: &str, tensor: &Tensor) -> std::result::Result<(), NetworkError> {
     let numbers = tensor.flatten_all()?.to_vec1::<f32>()?;
-    if numbers.iter().all(|x| x.is_finite()) {
-        Ok(())
-    } else {
-        Err(NetworkError::NotFinite(name.to_owned()))
-    }
+    let finite = numbers.iter().all(|x| x.is_finite());
+    if finite { Ok(()) } else { Err(NetworkError::NotFinite(name.to_owned())) }
 }
 
-/// Weights of one network, as a vector on one of candle's devices.
+/// The weights of one network: a vector on one of candle's devices.
 #[derive(Debug)]
 pub struct Weights {
     layout: Layout,
     values: Tensor,
-    kept: Option<Arc<KeptGradient>>,
+    buffer: Option<Arc<GradientBuffer>>,
 }
 
 impl Weights {
-    /// Weights that gradients are taken of: a variable of candle's.
+    /// Weights with gradients: one of candle's variables.
     pub fn trainable(layout: Layout, values: &Tensor) -> Result<Self> {
         let values = Var::from_tensor(values)?.into_inner();
-        let kept = if has_fast_implementation(values.device()) {
-            Some(Arc::new(KeptGradient::new(&values)?))
-        } else {
-            None
+        let buffer = match has_fast_implementation(values.device()) {
+            true => Some(Arc::new(GradientBuffer::new(&values)?)),
+            false => None,
         };
-        Ok(Self { layout, values, kept })
+        Ok(Self { layout, values, buffer })
     }
 
-    /// Weights that no gradient is taken of.
+    /// Weights without gradients.
     pub fn constant(layout: Layout, values: Tensor) -> Self {
-        Self { layout, values, kept: None }
+        Self { layout, values, buffer: None }
     }
 
-    /// Joins named tensors, which it takes out of `tensors`, into one vector of variables.
-    ///
-    /// # Errors
-    /// As [`Layout::join`].
+    /// Constant weights of named tensors, which it removes from `tensors`.
     pub fn take(
         layout: Layout,
         tensors: &mut Tensors,
@@ -203,41 +194,38 @@ impl Weights {
         Ok(Self::constant(self.layout.clone(), self.values.detach().copy()?))
     }
 
-    /// Makes a constant of the vector; it changes with this one.
+    /// The same weights as constants, in the same memory.
     pub fn detach(&self) -> Self {
-        Self { kept: None, layout: self.layout.clone(), values: self.values.detach() }
+        Self::constant(self.layout.clone(), self.values.detach())
     }
 
-    /// What each part begins with.
+    /// Draws the initial values of a layout, `[P]`.
     pub fn initial(layout: &Layout, generator: &mut impl Rng, device: &Device) -> Result<Tensor> {
         let mut values = vec![0.0; layout.count()];
         let mut rest = &mut values[..];
-        for part in layout.0.iter() {
-            let mine = rest.split_off_mut(..part.count()).unwrap_or_default();
-            part.fill(mine, generator);
+        for spec in layout.0.iter() {
+            let tensor = rest.split_off_mut(..spec.count()).unwrap_or_default();
+            spec.fill(tensor, generator);
         }
         Tensor::from_vec(values, layout.count(), device)
     }
 
-    /// The vector.
+    /// The vector, `[P]`.
     pub fn values(&self) -> &Tensor {
         &self.values
     }
 
-    /// What lies where in the vector.
+    /// The tensors in the vector.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
 
-    /// The named tensors, as views of the vector.
+    /// Views of the named tensors, as constants.
     pub fn tensors(&self, prefix: &str) -> Result<Tensors> {
         self.layout.split(&self.values.detach(), prefix)
     }
 
-    /// Takes the values of named tensors, and takes these out of `tensors`.
-    ///
-    /// # Errors
-    /// As [`Layout::join`].
+    /// Overwrites the weights by named tensors, which it removes from `tensors`.
     pub fn load(
         &mut self,
         tensors: &mut Tensors,
@@ -252,13 +240,13 @@ impl Weights {
         work(&self.values.detach())
     }
 
-    /// Where the fast implementation leaves the gradient of these weights.
-    pub(crate) fn kept_gradient(&self) -> Option<&Arc<KeptGradient>> {
-        self.kept.as_ref()
+    /// Memory for the gradient, if the weights are trained by fast implementations.
+    pub(crate) fn gradient_buffer(&self) -> Option<&Arc<GradientBuffer>> {
+        self.buffer.as_ref()
     }
 
-    /// The EMA update of a target network: `w = (1 - rate)·w + rate·online`.
-    pub fn ema_update(&mut self, online: &Self, rate: f32) -> Result<()> {
+    /// The EMA update of a target network: w = (1 − rate)·w + rate·online.
+    pub fn soft_update(&mut self, online: &Self, rate: f32) -> Result<()> {
         let online = online.values.detach();
         #[cfg(feature = "cuda")]
         if online.device().is_cuda() {
@@ -272,7 +260,7 @@ impl Weights {
             });
         }
         if has_fast_implementation(online.device()) {
-            return crate::slices::read(&online, |online: &[f32]| {
+            return read(&online, |online: &[f32]| {
                 self.change(|mine| {
                     modify(mine, |mine| quad_kernels::optimizer::ema(mine, online, rate))
                 })
@@ -284,40 +272,33 @@ impl Weights {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use crate::testing::{assert_close, numbers};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
     #[test]
-    fn each_part_begins_with_what_it_says() {
-        let part = |name: &str, shape: &[usize], start| TensorSpec {
-            name: name.to_owned(),
-            shape: shape.to_vec(),
-            start,
-        };
+    fn tensors_have_their_initial_values() -> Result<()> {
+        let spec =
+            |name: &str, shape: &[usize], init| TensorSpec::new(name.to_owned(), shape, init);
         let layout = Layout::new(vec![
-            part("wide", &[2, 3, 5], Init::Orthogonal(2.0)),
-            part("tall", &[1, 5, 3], Init::Orthogonal(2.0)),
-            part("scale", &[4], Init::Constant(1.0)),
-            part("flat", &[100], Init::Uniform(0.25)),
+            spec("wide", &[2, 3, 5], Init::Orthogonal(2.0)),
+            spec("tall", &[1, 5, 3], Init::Orthogonal(2.0)),
+            spec("scale", &[4], Init::Constant(1.0)),
+            spec("flat", &[100], Init::Uniform(0.25)),
         ]);
-        let values =
-            Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu).unwrap();
-        let parts = layout.split(&values, "").unwrap();
-        for (name, transposed) in [("wide", false), ("tall", true)] {
-            for matrix in parts[name].to_vec3::<f32>().unwrap() {
-                let matrix = Tensor::new(matrix, &Device::Cpu).unwrap();
-                let rows = if transposed { matrix.t().unwrap() } else { matrix };
-                let rows = rows.contiguous().unwrap();
-                let products = rows.matmul(&rows.t().unwrap()).unwrap();
-                let expected = (Tensor::eye(3, DType::F32, &Device::Cpu).unwrap() * 4.0).unwrap();
-                let difference = (products - expected).unwrap().abs().unwrap().max_all().unwrap();
-                assert!(difference.to_scalar::<f32>().unwrap() < 1e-5, "{name}");
-            }
-        }
-        assert_eq!(parts["scale"].to_vec1::<f32>().unwrap(), [1.0; 4]);
-        let flat = parts["flat"].to_vec1::<f32>().unwrap();
+        let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu)?;
+        let tensors = layout.split(&values, "")?;
+        let products = tensors["wide"].matmul(&tensors["wide"].t()?)?; // [2, 3, 3]
+        let identity = (Tensor::eye(3, DType::F32, &Device::Cpu)? * 4.0)?;
+        assert_close("wide", &products, &identity.broadcast_left(2)?);
+        let products = tensors["tall"].t()?.matmul(&tensors["tall"])?;
+        assert_close("tall", &products, &identity.unsqueeze(0)?);
+        assert_eq!(numbers(&tensors["scale"]), [1.0; 4]);
+        let flat = numbers(&tensors["flat"]);
         assert!(flat.iter().all(|x| x.abs() < 0.25) && flat.iter().any(|x| x.abs() > 0.2));
+        Ok(())
     }
 }

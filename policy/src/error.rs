@@ -1,69 +1,69 @@
-//! What can be wrong with a policy.
+//! Errors of policies.
 
 use quad_nn::NetworkError;
 
 /// The version that writes policies.
 pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// Weights that are not what they should be, or that lead to no action.
+/// A file that is no policy, or a policy that cannot act.
 #[derive(Debug, thiserror::Error)]
 pub enum PolicyError {
-    /// The bytes are no safetensors file.
+    /// The bytes are not a safetensors file.
     #[error("the weights are not a readable safetensors file")]
     Unreadable(#[from] safetensors::SafeTensorError),
-    /// The file does not say what it holds.
+    /// The file has no header.
     #[error("the file does not say what it holds (metadata `{0}`)")]
     NoHeader(&'static str),
-    /// What it says is not understood.
+    /// The header cannot be parsed.
     #[error("what the weights say about themselves is not understood: {0}")]
     Header(#[from] serde_json::Error),
-    /// What it says is not understood, and another version wrote it.
+    /// The header cannot be parsed, and another version wrote it.
     #[error(
         "the weights were written by version {version}, and this version, {VERSION}, does not understand them: {source}"
     )]
     Version {
-        /// The version that wrote them, and reads them.
+        /// The version that wrote it.
         version: String,
-        /// What is not understood.
+        /// The error of the parser.
         source: serde_json::Error,
     },
-    /// A shape with a number out of range.
+    /// A number of the header is out of range.
     #[error("the weights' {field} is {value}, which is out of range")]
     Range {
-        /// Name in the header.
+        /// Name of the number.
         field: &'static str,
-        /// What it says.
+        /// The number.
         value: usize,
     },
-    /// A map to the user's units that does not fit the policy.
+    /// A scaling that does not fit the policy.
     #[error(
         "the scaling of {what} in the file is not {columns} finite offsets and as many finite scales, none below 0"
     )]
     Scaling {
-        /// Observations or actions.
+        /// "observations" or "actions".
         what: &'static str,
-        /// Their numbers.
+        /// Their length.
         columns: usize,
     },
-    /// A temperature that nothing can be drawn with.
+    /// A temperature that is not positive and finite.
     #[error("the softmax's temperature is {0}, but must be above 0")]
     Temperature(f32),
-    /// It is to choose among candidates, but draws none.
+    /// A choice among candidates, which the policy does not draw.
     #[error("this policy draws no candidates, so there is nothing to choose among")]
     NoCandidates,
-    /// It is to say what actions are worth, but has no critics.
-    #[error("this policy has no critics, which would say what a single action is worth")]
+    /// A question to critics, which the policy does not have.
+    #[error("this policy has no critics, which would value a single action")]
     NoCritics,
-    /// It is to choose by a value function, but has none.
+    /// A choice by a value function, which the policy does not have.
     #[error("the rule `nearest` takes a value function, which this policy does not have")]
     NoValue,
-    /// The weights do not fit, or a network fails.
+    /// The weights do not fit a network.
     #[error(transparent)]
     Network(#[from] NetworkError),
-    /// A tensor that no network has.
+    /// A tensor that belongs to no network.
     #[error("the weights hold a tensor {0:?} that this policy does not have")]
     Unexpected(String),
-    /// A NaN on the way to an action.
+    /// A NaN in an action or a value.
     #[error("{0} is not a number (NaN)")]
     NotANumber(&'static str),
     /// Candle cannot compute or move a tensor.
@@ -71,7 +71,7 @@ pub enum PolicyError {
     Candle(#[from] candle_core::Error),
 }
 
-/// Checks that a number of a shape is from 1 to `most`.
+/// Checks that a number of the header is from 1 to `most`.
 pub(crate) fn check_range(
     field: &'static str,
     value: usize,
@@ -80,7 +80,7 @@ pub(crate) fn check_range(
     if (1..=most).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
 }
 
-/// Checks that none of these is a NaN.
+/// Checks that no number is NaN.
 pub(crate) fn check_numbers(what: &'static str, numbers: &[f32]) -> Result<(), PolicyError> {
     if numbers.iter().any(|x| x.is_nan()) { Err(PolicyError::NotANumber(what)) } else { Ok(()) }
 }

@@ -1,9 +1,9 @@
-//! Kinds of policy, and how one is read from a file that says which it is.
+//! The file of a policy: tensors and a header.
 
 use crate::error::{PolicyError, VERSION};
-use crate::kinds::actor_critic::ActorCriticShape;
+use crate::kinds::actor_critic::{ACTOR, ActorCriticShape, CRITIC};
 use crate::kinds::diffuser::{self, DiffuserPolicy};
-use crate::kinds::diffusion::{ACTOR, CRITIC, DiffusionPolicy, DiffusionShape, VALUE};
+use crate::kinds::diffusion::{DiffusionPolicy, DiffusionShape, VALUE};
 use crate::kinds::gaussian::{GaussianPolicy, GaussianShape};
 use crate::kinds::one_step::OneStepActor;
 use crate::kinds::planner::DiffuserShape;
@@ -26,61 +26,61 @@ use std::collections::{BTreeMap, HashMap};
 
 /// Key of the header in a safetensors file's metadata.
 const HEADER: &str = "quad";
-/// Longest header of a safetensors file that is read, bytes. The paper's networks have 3 KB; a
-/// million empty tensors would take a gigabyte of memory before anything else is known of them.
+/// Longest header of a safetensors file, bytes. The paper's networks have 3 KB; a million empty
+/// tensors would take a gigabyte of memory before they can be refused.
 const MAX_HEADER: u64 = 1 << 20;
 
-/// What a policy is: its kind, the shapes of its networks, and how it chooses.
+/// The kind of a policy, the shapes of its networks, and its choice among candidates.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum PolicyConfig {
-    /// One of several samples of a diffusion model.
+    /// A choice among samples of a diffusion model.
     Diffusion {
-        /// Shape of its networks.
+        /// Shapes of the networks.
         shape: DiffusionShape,
-        /// Which sample it is.
+        /// Choice among the samples.
         choice: Choice,
     },
-    /// One of several samples of a tanh-squashed Gaussian.
+    /// A choice among samples of a tanh-squashed Gaussian.
     Squashed {
-        /// Shape of its networks.
+        /// Shapes of the networks.
         shape: ActorCriticShape,
-        /// Which sample it is.
+        /// Choice among the samples.
         choice: Choice,
     },
-    /// What a network says of state and noise, for one of several noises.
+    /// A choice among actions of a network of state and noise.
     #[serde(rename = "one-step")]
     OneStep {
-        /// Shape of its networks.
+        /// Shapes of the networks.
         shape: ActorCriticShape,
-        /// Which sample it is.
+        /// Choice among the samples.
         choice: Choice,
     },
     /// The mean of a Gaussian.
     Gaussian {
-        /// Shape of its network.
+        /// Shape of the network.
         shape: GaussianShape,
     },
-    /// Some of several samples of a score network.
+    /// A choice among samples of a score network.
     Score {
-        /// Shape of its networks.
+        /// Shapes of the networks.
         shape: ScorePolicyShape,
-        /// Which samples they are.
+        /// Choice among the samples.
         choice: Choice,
     },
-    /// The first actions of one of several plans.
+    /// The first actions of a choice among plans.
     #[serde(rename = "planner")]
     Diffuser {
-        /// What it is beside its weights.
+        /// Shapes of the networks, and the guidance.
         shape: DiffuserShape,
-        /// Which plan it is.
+        /// Choice among the plans.
         choice: Choice,
     },
 }
 
 impl PolicyConfig {
-    /// The tensors of such a policy whose networks have the numbers that `values` gives for their
-    /// layouts, as [`Weights::initial`] does. Tests and benchmarks act with it.
+    /// Tensors of the policy's networks with the weights that `values` returns for their layouts, for
+    /// tests and benchmarks.
     pub fn tensors(
         &self,
         mut values: impl FnMut(&Layout) -> candle_core::Result<Tensor>,
@@ -121,73 +121,67 @@ impl PolicyConfig {
     }
 }
 
-/// What a policy's file says beside its tensors: JSON under one key of its metadata, written once,
-/// with the tensors. `O` says where the policy comes from, which is not looked into here.
+/// The header of a policy's file: JSON in the metadata. `O` is the origin of the policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Header<O> {
-    /// What it is.
+    /// Kind, shapes and choice.
     pub policy: PolicyConfig,
-    /// The maps between the units that its networks have learned in and those that it is asked in,
-    /// unless they are the same.
+    /// Conversion between the networks' units and the user's, unless they are the same.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scaling: Option<Scaling>,
-    /// What the data that it has learned from calls the numbers of an observation; empty where they
-    /// have no names.
+    /// Names of the numbers of an observation in the dataset; empty without names.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub observation_names: Vec<String>,
     /// Names of the numbers of an action.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub action_names: Vec<String>,
-    /// Where it comes from.
+    /// Origin of the policy.
     pub origin: O,
-    /// What `learner export` says of the data and of how good it is; nothing in a snapshot.
+    /// Facts about dataset and score from `learner export`; null in a snapshot.
     #[serde(default, skip_serializing_if = "Value::is_null")]
     pub about: Value,
-    /// The version that wrote it; empty before 0.1.0 was released.
+    /// Version that wrote the file; empty before 0.1.0.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub version: String,
 }
 
-/// What is read of a header that is not understood.
+/// The version in a header that cannot be parsed.
 #[derive(Deserialize)]
 struct Written {
     version: String,
 }
 
 impl<O> Header<O> {
-    /// The header of networks that have learned in the user's own units, from numbers without
-    /// names.
+    /// A header without scaling and names.
     pub fn new(policy: PolicyConfig, origin: O) -> Self {
-        let (observation_names, action_names, version) =
-            (Vec::new(), Vec::new(), VERSION.to_owned());
         Self {
             policy,
             scaling: None,
-            observation_names,
-            action_names,
+            observation_names: Vec::new(),
+            action_names: Vec::new(),
             origin,
             about: Value::Null,
-            version,
+            version: VERSION.to_owned(),
         }
     }
 }
 
 impl<O: Serialize> Header<O> {
-    /// The safetensors file of a policy with this header.
+    /// The safetensors file of a policy.
     ///
     /// # Errors
-    /// A number that is not finite.
+    /// A weight is not finite.
     pub fn to_safetensors(&self, tensors: &Tensors) -> Result<Vec<u8>, PolicyError> {
         write_tensors(tensors, HEADER, self)
     }
 }
 
 impl<O: DeserializeOwned> Header<O> {
-    /// What a policy's file says of itself.
+    /// Reads the header of a policy's file.
     ///
     /// # Errors
-    /// As [`read_header`]; where another version wrote what is not understood, that is said.
+    /// As [`read_header`], or [`PolicyError::Version`].
     pub fn read(file: &[u8]) -> Result<Self, PolicyError> {
         read_header(file, HEADER).map_err(|error| match (error, read_header(file, HEADER)) {
             (PolicyError::Header(source), Ok(Written { version })) if version != VERSION => {
@@ -198,11 +192,10 @@ impl<O: DeserializeOwned> Header<O> {
     }
 }
 
-/// Reads a policy from its file: exactly the tensors that its header asks for, all finite. Where
-/// the file has a scaling, the policy takes and gives the user's units.
+/// Loads a policy, which takes and returns the user's units if the file has a scaling.
 ///
 /// # Errors
-/// A file that is not what it should be, or a kind of policy that is not known here.
+/// The header is wrong, or the tensors are not exactly those of its networks, all finite.
 pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>, PolicyError> {
     let Header { policy, scaling, origin: IgnoredAny, .. } = Header::read(file)?;
     let mut tensors = read_tensors(file)?;
@@ -211,12 +204,12 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
             Box::new(DiffusionPolicy::load(shape, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Squashed { shape, choice } => {
-            let of_actor = SquashedActor::shape(&shape);
-            Box::new(shape.load(of_actor, SquashedActor::new, choice, &mut tensors, precision)?)
+            let actor = SquashedActor::shape(&shape);
+            Box::new(shape.load(actor, SquashedActor::new, choice, &mut tensors, precision)?)
         }
         PolicyConfig::OneStep { shape, choice } => {
-            let of_actor = OneStepActor::shape(&shape);
-            Box::new(shape.load(of_actor, OneStepActor::new, choice, &mut tensors, precision)?)
+            let actor = OneStepActor::shape(&shape);
+            Box::new(shape.load(actor, OneStepActor::new, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
         PolicyConfig::Score { shape, choice } => {
@@ -233,11 +226,11 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
     }
 }
 
-/// The safetensors file of some tensors, with `header` as JSON under that key of its metadata:
-/// always the same bytes for the same header and numbers.
+/// A safetensors file of tensors, with `header` as JSON under `key` in its metadata. Equal arguments
+/// give equal bytes.
 ///
 /// # Errors
-/// A number that is not finite.
+/// A number is not finite.
 pub fn write_tensors(
     tensors: &Tensors,
     key: &str,
@@ -252,10 +245,10 @@ pub fn write_tensors(
     Ok(safetensors::serialize(here, Some(metadata))?)
 }
 
-/// What [`write_tensors`] has written beside the tensors.
+/// Reads the header that [`write_tensors`] has written.
 ///
 /// # Errors
-/// No safetensors file, or one without such a header.
+/// Bytes that are not a safetensors file, or lack the header.
 pub fn read_header<T: DeserializeOwned>(file: &[u8], key: &'static str) -> Result<T, PolicyError> {
     check_header(file)?;
     let (_, metadata) = SafeTensors::read_metadata(file)?;
@@ -263,18 +256,14 @@ pub fn read_header<T: DeserializeOwned>(file: &[u8], key: &'static str) -> Resul
     Ok(serde_json::from_str(header.ok_or(PolicyError::NoHeader(key))?)?)
 }
 
-/// All tensors of a safetensors file, on the CPU.
-///
-/// # Errors
-/// A file that cannot be read.
+/// Reads all tensors of a safetensors file, on the CPU.
 pub fn read_tensors(bytes: &[u8]) -> Result<Tensors, PolicyError> {
     check_header(bytes)?;
     let file = SafeTensors::deserialize(bytes)?;
     file.tensors().into_iter().map(|(name, view)| Ok((name, view.load(&Device::Cpu)?))).collect()
 }
 
-/// Checks the header's length, which the file's first eight bytes say; a file without them is
-/// refused later.
+/// Checks the length of the header, the file's first eight bytes. A shorter file is refused later.
 fn check_header(file: &[u8]) -> Result<(), PolicyError> {
     match file.first_chunk() {
         Some(length) if u64::from_le_bytes(*length) > MAX_HEADER => {

@@ -1,14 +1,14 @@
-//! Policies: kinds, sampling, the choice among candidates, and the file that holds one.
+//! Policies: observations in, actions out, and the file that holds one.
 //!
 //! # Layout
 //!
-//! - [`Policy`] (`policy`): observations in, actions out; [`EpisodeState`] is its state in an
-//!   episode. A policy with a [`Scaling`] takes and gives its user's units (`scaled`).
-//! - `file`: [`load_policy`] reads a policy from a file whose [`Header`] says what it is.
-//! - `kinds/`: [`DiffusionPolicy`], [`ScorePolicy`], [`GaussianPolicy`], and those of an
-//!   [`ActorCriticShape`], with a [`SquashedActor`] or a [`OneStepActor`]; Diffuser's [`DiffuserPolicy`]
-//!   acts by plans.
-//! - `sampling/`: N_a candidates per state, of which a [`Choice`] takes one, or the mean of some.
+//! - [`Policy`] (`policy`) acts; [`EpisodeState`] is its state in an episode. `scaled` converts from
+//!   and to the user's units, given a [`Scaling`].
+//! - `file`: [`load_policy`] reads a policy from a file with a [`Header`].
+//! - `kinds/`: [`GaussianPolicy`]; [`DiffusionPolicy`], [`ScorePolicy`], and those of an
+//!   [`ActorCriticShape`] with a [`SquashedActor`] or a [`OneStepActor`], which draw candidates;
+//!   [`DiffuserPolicy`], which draws plans with a [`Planner`].
+//! - `sampling/`: candidates, and the [`Choice`] among them.
 
 #![deny(unsafe_code)]
 
@@ -21,6 +21,9 @@ mod kinds;
 mod policy;
 mod sampling;
 mod scaled;
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod testing;
 
 pub use error::PolicyError;
 pub use file::{Header, PolicyConfig, load_policy, read_header, read_tensors, write_tensors};
@@ -32,7 +35,7 @@ pub use kinds::one_step::OneStepActor;
 pub use kinds::planner::{DiffuserShape, Planner, ValueGuidance, with_first_state};
 pub use kinds::score::{ScorePolicy, ScorePolicyShape};
 pub use kinds::squashed::SquashedActor;
-pub use policy::{Policy, Sampled};
+pub use policy::{Policy, Samples};
 pub use quad_nn::{Activation, Affine, MlpConfig, NetworkError, Precision, Scaling};
 pub use sampling::choice::{Aggregate, Choice, Rule};
 pub use sampling::episode::EpisodeState;

@@ -1,4 +1,4 @@
-//! What any policy can do, whatever its kind.
+//! The trait of all policies.
 
 use crate::error::PolicyError;
 use crate::sampling::choice::Choice;
@@ -6,53 +6,50 @@ use crate::sampling::episode::EpisodeState;
 use quad_nn::Precision;
 
 /// A trained policy, ready to act.
+///
+/// Methods for n states take `observations`, `n × observation_dim`, and the `states` of the policy
+/// in their episodes.
 pub trait Policy: Send + Sync {
-    /// Numbers in an observation.
+    /// Length of an observation.
     fn observation_dim(&self) -> usize;
 
-    /// Numbers in an action.
+    /// Length of an action.
     fn action_dim(&self) -> usize;
 
-    /// The precision that its actions are computed in, which need not be the one that was asked
-    /// for.
+    /// The precision in effect, which can differ from the requested one.
     fn precision(&self) -> Precision;
 
-    /// How it chooses among the actions that it draws; none if it draws none.
+    /// The choice among candidates; `None` if the policy draws none.
     fn choice(&self) -> Option<Choice> {
         None
     }
 
-    /// Makes a policy that chooses in another way, by the same networks in the same memory. This
-    /// one stays as it is.
+    /// The same networks, in the same memory, with another choice.
     ///
     /// # Errors
-    /// It draws no actions, it lacks a network that this takes, or a number is out of range.
+    /// The policy draws no candidates, it lacks a value function, or a number is out of range.
     fn with_choice(&self, _choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
         Err(PolicyError::NoCandidates)
     }
 
-    /// Memory beside the weights that one call of [`Self::act`] takes for so many states at most,
-    /// bytes. It can be asked before it is too much.
+    /// Upper bound of the memory that [`Self::act`] takes for this many states, bytes.
     fn memory(&self, states: usize) -> u64;
 
-    /// What it carries through the episode of that seed, at its beginning.
+    /// The state at the beginning of an episode with this seed.
     fn begin(&self, seed: u64) -> EpisodeState {
         EpisodeState::new(seed)
     }
 
-    /// The shape of the standard normal numbers that [`Self::act`] draws in a state of an episode
-    /// that begins; empty if it draws none. [`Choice::uniforms`] says how many uniform ones follow.
+    /// Shape of the standard normal numbers that [`Self::act`] draws in the first state of an
+    /// episode; empty if it draws none. [`Choice::uniforms`] uniform numbers follow.
     fn noise(&self) -> Vec<usize> {
         Vec::new()
     }
 
-    /// Acts in each of n states.
-    ///
-    /// `observations` is `n × observation_dim`, `actions` (written) `n × action_dim`; `states` has
-    /// what the policy carries through each state's episode.
+    /// Acts in n states, writing `actions`, `n × action_dim`.
     ///
     /// # Errors
-    /// An action or its value is not a number, or candle fails.
+    /// An action or its value is NaN.
     fn act(
         &self,
         observations: &[f32],
@@ -60,40 +57,34 @@ pub trait Policy: Send + Sync {
         actions: &mut [f32],
     ) -> Result<(), PolicyError>;
 
-    /// Draws the actions that [`Self::act`] would choose among in each of n states, and says what
-    /// the critics give each.
-    ///
-    /// `observations` is `n × observation_dim`, n at least 1; `states` has what the policy carries
-    /// through each state's episode. From equal states, [`Self::act`] takes one of these actions,
-    /// or the mean of some.
+    /// Draws the candidates of n ≥ 1 states and their values. From equal states, [`Self::act`] takes
+    /// one of these candidates, or the mean of some.
     ///
     /// # Errors
-    /// It has no critics, an action or its value is not a number, or candle fails.
+    /// The policy has no critics, or an action or its value is NaN.
     fn sample(
         &self,
         _observations: &[f32],
         _states: &mut [EpisodeState],
-    ) -> Result<Sampled, PolicyError> {
+    ) -> Result<Samples, PolicyError> {
         Err(PolicyError::NoCritics)
     }
 
-    /// What the critics say of n actions, each in a state of its own: n numbers, by the choice's
+    /// The critics' values of n ≥ 1 actions, `n × action_dim`, each in its own state, by the choice's
     /// [`Aggregate`](crate::Aggregate), in units of the return that they were trained for.
     ///
-    /// `observations` is `n × observation_dim`, `actions` `n × action_dim`, n at least 1.
-    ///
     /// # Errors
-    /// It has no critics, a value is not a number, the lengths do not fit, or candle fails.
+    /// The policy has no critics, the lengths do not fit, or a value is NaN.
     fn value(&self, _observations: &[f32], _actions: &[f32]) -> Result<Vec<f32>, PolicyError> {
         Err(PolicyError::NoCritics)
     }
 }
 
-/// What a policy has drawn in n states.
+/// Candidates of n states.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Sampled {
-    /// The actions, `n × candidates × action_dim`, in the order in which they were drawn.
+pub struct Samples {
+    /// Actions, `n × candidates × action_dim`, in the order of their drawing.
     pub actions: Vec<f32>,
-    /// The value of each action, `n × candidates`, by the choice's [`Aggregate`](crate::Aggregate).
+    /// Values, `n × candidates`, by the choice's [`Aggregate`](crate::Aggregate).
     pub values: Vec<f32>,
 }

@@ -35,14 +35,14 @@ pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn 
     }
     if let Some(value) = changes.value {
         let error = |_| PyValueError::new_err(format!("value is {value:?}, not mean or min"));
-        choice.value = value.parse().map_err(error)?;
+        choice.aggregate = value.parse().map_err(error)?;
     }
     policy.with_choice(choice).map(Arc::from).map_err(|error| of_policy(&error))
 }
 
 /// A choice as Python's arguments.
 pub fn as_dictionary(py: Python<'_>, choice: Choice) -> PyResult<Bound<'_, PyDict>> {
-    let value = match choice.value {
+    let value = match choice.aggregate {
         Aggregate::Mean => "mean",
         Aggregate::Min => "min",
     };

@@ -1,44 +1,43 @@
 //! The denoiser of EDM (Karras et al. 2022, "Elucidating the Design Space of Diffusion-Based
-//! Generative Models") over actions: a network that is told how much noise there is, by a number
-//! that may be any.
+//! Generative Models") over actions, conditioned on the noise level σ, a real number.
 
 use crate::diffusion::noise_predictor::sinusoids;
 use crate::layers::config::MlpConfig;
 use crate::layers::flat::Layers;
 use crate::layers::mlp::Mlp;
 use crate::shape::TIME_FEATURES;
-use crate::weighted::Weighted;
+use crate::weighted::weighted;
 use crate::weights::{Layout, Weights};
 use candle_core::{Device, Result, Tensor};
 use rand::Rng;
 
-/// Deviation of clean actions that the scales below are made for, σ_data.
+/// Standard deviation of clean actions, σ_data.
 const SIGMA_DATA: f64 = 0.5;
 /// Bounds of σ.
 const SIGMA: (f64, f64) = (0.002, 80.0);
-/// Scale of the logistic distribution of ln σ, whose middle is ln σ_data.
+/// Scale of the logistic distribution of ln σ, whose mean is ln σ_data.
 const SPREAD: f64 = 0.5;
 /// Width of the network that embeds σ.
 const EMBEDDING_WIDTH: usize = 32;
-/// Numbers in an embedding of σ.
+/// Length of an embedding of σ.
 const EMBEDDING: usize = 16;
 
-/// Deviations σ of the noise in some actions.
+/// Noise levels σ of a batch of actions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NoiseLevels(Vec<f32>);
 
 impl NoiseLevels {
-    /// These.
+    /// These noise levels.
     pub fn new(sigma: Vec<f32>) -> Self {
         Self(sigma)
     }
 
-    /// Draws so many: log-logistic numbers, cut off at both ends.
+    /// Draws `count` noise levels from a truncated log-logistic distribution.
     pub fn draw(count: usize, generator: &mut impl Rng) -> Self {
         let below = |sigma: f64| 1.0 / (1.0 + (-(sigma / SIGMA_DATA).ln() / SPREAD).exp());
         let (least, most) = (below(SIGMA.0), below(SIGMA.1));
-        let of_share = |p: f64| SIGMA_DATA * (p / (1.0 - p)).powf(SPREAD);
-        Self((0..count).map(|_| of_share(generator.random_range(least..most)) as f32).collect())
+        let quantile = |p: f64| SIGMA_DATA * (p / (1.0 - p)).powf(SPREAD);
+        Self((0..count).map(|_| quantile(generator.random_range(least..most)) as f32).collect())
     }
 
     /// σ as a column, `[B, 1]`.
@@ -46,21 +45,22 @@ impl NoiseLevels {
         self.column(device, |sigma| sigma)
     }
 
-    /// c_out of Karras et al.'s Table 1, `[B, 1]`: what comes out of the network is as many times
-    /// as large.
+    /// Scale c_out of the network's output (Karras et al., Table 1), `[B, 1]`.
     pub fn output_scale(&self, device: &Device) -> Result<Tensor> {
         self.column(device, |sigma| sigma * SIGMA_DATA / sigma.hypot(SIGMA_DATA))
     }
 
+    /// c_in, `[B, 1]`.
     fn input_scale(&self, device: &Device) -> Result<Tensor> {
         self.column(device, |sigma| 1.0 / sigma.hypot(SIGMA_DATA))
     }
 
+    /// c_skip, `[B, 1]`.
     fn skip_scale(&self, device: &Device) -> Result<Tensor> {
         self.column(device, |sigma| (SIGMA_DATA / sigma.hypot(SIGMA_DATA)).powi(2))
     }
 
-    /// What the network is told of σ: sinusoids of ln(σ)/4, `[B, 16]`.
+    /// Sinusoids of c_noise = ln(σ)/4, `[B, 16]`.
     fn features(&self, device: &Device) -> Result<Tensor> {
         let features: Vec<f32> =
             self.0.iter().flat_map(|sigma| sinusoids(f64::from(*sigma).ln() / 4.0)).collect();
@@ -76,19 +76,17 @@ impl NoiseLevels {
 /// The shape of a denoiser.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DenoiserShape {
-    /// Numbers in an observation s.
+    /// Length of an observation s.
     pub observation_dim: usize,
-    /// Numbers in an action a.
+    /// Length of an action a.
     pub action_dim: usize,
-    /// Its hidden layers. A linear map before them, as wide as the first, has no activation.
+    /// Hidden layers, after a linear map to the width of the first.
     pub layers: MlpConfig,
 }
 
 impl DenoiserShape {
     fn time_layers(&self) -> Layers {
-        let config =
-            MlpConfig { initial: self.layers.initial, ..MlpConfig::mish(&[EMBEDDING_WIDTH]) };
-        Layers::new(1, TIME_FEATURES, &config, EMBEDDING, 0)
+        Layers::new(1, TIME_FEATURES, &self.layers.embedding(EMBEDDING_WIDTH), EMBEDDING, 0)
     }
 
     fn input_layers(&self) -> Layers {
@@ -108,10 +106,10 @@ impl DenoiserShape {
     /// Tensors `time.{0,1}`, `input.0` and `trunk.{0..}`, each with `.kernel` `[in, out]` and
     /// `.bias` `[out]`.
     pub fn layout(&self) -> Layout {
-        let mut parts = self.time_layers().named("time.", false);
-        parts.extend(self.input_layers().named("input.", false));
-        parts.extend(self.trunk_layers().named("trunk.", false));
-        Layout::new(parts)
+        let mut specs = self.time_layers().specs("time.", false);
+        specs.extend(self.input_layers().specs("input.", false));
+        specs.extend(self.trunk_layers().specs("trunk.", false));
+        Layout::new(specs)
     }
 }
 
@@ -121,31 +119,29 @@ pub struct Denoiser {
     time: Mlp,
     /// A linear map of [s, noisy action, embedding].
     input: Mlp,
-    /// Over what comes out of it.
     trunk: Mlp,
     weights: Weights,
 }
 
+weighted!(Denoiser);
+
 impl Denoiser {
-    /// `weights` are of the shape's layout.
+    /// A denoiser with weights of the shape's layout.
     pub fn new(shape: &DenoiserShape, weights: Weights) -> Self {
         let time = Mlp::new(shape.time_layers(), "time.");
         let input = Mlp::new(shape.input_layers(), "input.");
         Self { time, input, trunk: Mlp::new(shape.trunk_layers(), "trunk."), weights }
     }
 
-    /// Makes constants of the weights; they share the memory of this network.
+    /// The same network with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
-        let [time, input, trunk] = [&self.time, &self.input, &self.trunk].map(Clone::clone);
+        let [time, input, trunk] = [&self.time, &self.input, &self.trunk].map(Mlp::clone);
         Self { time, input, trunk, weights: self.weights.detach() }
     }
 
-    /// D(a + σ·n; s, σ), the clean actions that it sees in noisy ones, within ±1 (Karras et al.'s
-    /// Eq. 7): `observations [B, o]`, `noisy [B, a]` → `[B, a]`. Differentiable in weights,
-    /// observations and actions.
-    ///
-    /// # Errors
-    /// Shapes that do not fit, or candle fails.
+    /// D(a + σ·n; s, σ), the predicted clean actions within ±1 (Karras et al., Eq. 7):
+    /// `observations [B, o]`, `noisy [B, a]` → `[B, a]`. Differentiable in weights, observations and
+    /// actions.
     pub fn denoise(
         &self,
         observations: &Tensor,
@@ -156,7 +152,7 @@ impl Denoiser {
         let embedding =
             self.time.forward(&self.weights, &[&levels.features(device)?])?.squeeze(0)?;
         let scaled = noisy.broadcast_mul(&levels.input_scale(device)?)?;
-        // One linear map: the fast networks have hidden layers.
+        // The fast implementation has at least one hidden layer.
         let x = self
             .input
             .plain_forward(&self.weights, &Tensor::cat(&[observations, &scaled, &embedding], 1)?)?;
@@ -166,110 +162,73 @@ impl Denoiser {
     }
 }
 
-impl Weighted for Denoiser {
-    fn weights(&self) -> &Weights {
-        &self.weights
-    }
-
-    fn weights_mut(&mut self) -> &mut Weights {
-        &mut self.weights
-    }
-}
-
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use crate::gradients::gradient::Gradients;
-    use crate::layers::config::Initial;
+    use crate::layers::config::InitScheme;
+    use crate::testing::{assert_close, check_gradient, loss, random, weights};
     use candle_core::Var;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
-    fn numbers(x: &Tensor) -> Vec<f32> {
-        x.flatten_all().unwrap().to_vec1().unwrap()
-    }
-
     #[test]
-    fn noise_levels_are_log_logistic_and_within_their_bounds() {
+    fn noise_levels_are_log_logistic_within_their_bounds() {
         const DRAWS: usize = 40_000;
         let NoiseLevels(mut sigma) = NoiseLevels::draw(DRAWS, &mut ChaCha8Rng::seed_from_u64(1));
         assert!(sigma.iter().all(|x| (0.002..=80.0).contains(x)));
         sigma.sort_by(f32::total_cmp);
-        // p/(1 − p) = (σ/0.5)²: quartiles at 0.5/√3 and 0.5·√3, and one in ten below 0.5/3.
-        for (share, expected) in
+        // p/(1 − p) = (σ/0.5)²
+        for (p, expected) in
             [(0.1, 0.5 / 3.0), (0.25, 0.5 / 3f32.sqrt()), (0.5, 0.5), (0.75, 0.5 * 3f32.sqrt())]
         {
-            let found = sigma[(share * DRAWS as f64) as usize];
-            assert!((found / expected - 1.0).abs() < 0.03, "{found} at {share}, not {expected}");
+            let found = sigma[(p * DRAWS as f64) as usize];
+            assert!((found / expected - 1.0).abs() < 0.03, "{found} at {p}, not {expected}");
         }
     }
 
-    /// Clean actions of deviation 0.5 with noise have deviation 1 as the network sees them, and so
-    /// has what it is to predict.
+    /// For clean actions of standard deviation 0.5.
     #[test]
-    fn the_scales_keep_inputs_and_targets_at_variance_one() {
+    fn the_scales_keep_inputs_and_targets_at_variance_one() -> Result<()> {
         for sigma in [0.002f64, 0.3, 0.5, 4.0, 80.0] {
             let levels = NoiseLevels::new(vec![sigma as f32]);
-            let of = |x: Result<Tensor>| f64::from(numbers(&x.unwrap())[0]);
-            let device = &Device::Cpu;
-            let (skip, out) = (of(levels.skip_scale(device)), of(levels.output_scale(device)));
-            let input = of(levels.input_scale(device)).powi(2) * (sigma.powi(2) + 0.25);
-            let target = ((1.0 - skip).powi(2) * 0.25 + (skip * sigma).powi(2)) / out.powi(2);
-            assert!(
-                (input - 1.0).abs() < 1e-5 && (target - 1.0).abs() < 1e-3,
-                "{sigma}: {input} {target}"
+            let number =
+                |x: Tensor| Result::Ok(f64::from(x.flatten_all()?.get(0)?.to_scalar::<f32>()?));
+            let (skip, out) = (
+                number(levels.skip_scale(&Device::Cpu)?)?,
+                number(levels.output_scale(&Device::Cpu)?)?,
             );
+            let input = number(levels.input_scale(&Device::Cpu)?)?.powi(2) * (sigma.powi(2) + 0.25);
+            let target = ((1.0 - skip).powi(2) * 0.25 + (skip * sigma).powi(2)) / out.powi(2);
+            assert!((input - 1.0).abs() < 1e-5, "{sigma}: {input}");
+            assert!((target - 1.0).abs() < 1e-3, "{sigma}: {target}");
         }
+        Ok(())
     }
 
-    /// Gradients by finite differences, through a denoiser as it is and through one whose weights
-    /// are constant.
     #[test]
-    fn gradients_reach_weights_and_actions() {
+    fn gradients_of_weights_and_actions_match_finite_differences() -> Result<()> {
         let generator = &mut ChaCha8Rng::seed_from_u64(2);
-        let layers = MlpConfig { initial: Initial::Torch, ..MlpConfig::mish(&[12, 9]) };
+        let layers = MlpConfig { initial: InitScheme::Torch, ..MlpConfig::mish(&[12, 9]) };
         let shape = DenoiserShape { observation_dim: 3, action_dim: 2, layers };
-        let start = Weights::initial(&shape.layout(), generator, &Device::Cpu).unwrap();
-        let denoiser = Denoiser::new(&shape, Weights::trainable(shape.layout(), &start).unwrap());
-        let tensor = |count: usize, generator: &mut ChaCha8Rng| {
-            let x: Vec<f32> = (0..count).map(|_| generator.random_range(-0.5..0.5)).collect();
-            Tensor::from_vec(x, (20, ()), &Device::Cpu).unwrap()
-        };
-        let (s, a) = (tensor(60, generator), Var::from_tensor(&tensor(40, generator)).unwrap());
-        let levels = NoiseLevels::draw(20, generator);
-        let loss = |denoiser: &Denoiser, a: &Tensor| {
-            denoiser.denoise(&s, a, &levels).unwrap().sqr().unwrap().sum_all().unwrap()
-        };
-        let number = |x: Tensor| f64::from(x.to_scalar::<f32>().unwrap());
-        let gradients = Gradients::of(&loss(&denoiser, &a)).unwrap();
-        let (w, of_weights) = (
-            denoiser.weights.values().detach(),
-            gradients.with_respect_to(&denoiser.weights).unwrap(),
-        );
-        let of_actions = gradients.store.get(&a).unwrap().clone();
-        let with = |w: Tensor| Denoiser::new(&shape, Weights::constant(shape.layout(), w));
-        for (what, at, gradient) in
-            [("weights", &w, &of_weights), ("actions", &a.detach(), &of_actions)]
-        {
-            let size = number(gradient.sqr().unwrap().sum_all().unwrap()).sqrt();
-            let moved = |by: f64| (at + (gradient * (by / size)).unwrap()).unwrap();
-            let value = |by: f64| match what {
-                "weights" => number(loss(&with(moved(by)), &a.detach())),
-                _ => number(loss(&denoiser, &moved(by))),
-            };
-            let found = (value(1e-2) - value(-1e-2)) / 2e-2;
-            assert!((found / size - 1.0).abs() < 0.02, "{what}: {found} for {size}");
-        }
-        let constant = denoiser.detach();
-        let gradients = Gradients::of(&loss(&constant, &a)).unwrap();
-        let same = |(x, y): (&f32, &f32)| (x - y).abs() < 1e-5;
-        assert!(
-            numbers(gradients.store.get(&a).unwrap()).iter().zip(&numbers(&of_actions)).all(same)
-        );
-        assert!(
-            gradients.with_respect_to(&denoiser.weights).is_err(),
-            "no gradient reaches constants"
-        );
+        let denoiser = Denoiser::new(&shape, weights(shape.layout(), generator));
+        let (s, levels) = (random((20, 3), 1), NoiseLevels::draw(20, generator));
+        let a = Var::from_tensor(&(random((20, 2), 2) * 0.5)?)?;
+        let gradients = Gradients::of(&loss(&denoiser.denoise(&s, &a, &levels)?)?)?;
+        let w = denoiser.weights.values().detach();
+        let of_w = gradients.with_respect_to(&denoiser.weights)?;
+        check_gradient(("weights", 1e-2, 0.02), (&w, &of_w), |w| {
+            let weights = Weights::constant(shape.layout(), w.clone());
+            Denoiser::new(&shape, weights).denoise(&s, &a.detach(), &levels)
+        })?;
+        let of_a = gradients.store.get(&a).unwrap();
+        check_gradient(("actions", 1e-2, 0.02), (&a.detach(), of_a), |a| {
+            denoiser.denoise(&s, a, &levels)
+        })?;
+        let gradients = Gradients::of(&loss(&denoiser.detach().denoise(&s, &a, &levels)?)?)?;
+        assert_close("through constant weights", gradients.store.get(&a).unwrap(), of_a);
+        assert!(gradients.with_respect_to(&denoiser.weights).is_err());
+        Ok(())
     }
 }

@@ -1,6 +1,6 @@
-//! Diffusion over actions: noise schedule, noise predictor, EDM denoiser, reverse chain.
+//! Diffusion over actions: noise schedule, noise predictor with its sampler, EDM denoiser.
 
 pub(crate) mod edm;
 pub(crate) mod noise_predictor;
-pub(crate) mod sampler;
+mod sampler;
 pub(crate) mod schedule;

@@ -1,13 +1,13 @@
-//! The noise predictor ε_θ(a^t, s, t) and the sampler that denoises with it.
+//! The noise predictor ε_θ(a^t, s, t) and its sampler.
 
-use crate::diffusion::sampler::{Parts, Sample};
+use crate::diffusion::sampler::Architecture;
 use crate::diffusion::schedule::Schedule;
 use crate::layers::mlp::Mlp;
-use crate::layers::operation::OnCpu;
 use crate::layers::packed::Packing;
 use crate::layers::plain;
 use crate::precision::Precision;
 use crate::shape::{NoiseShape, TIME_FEATURES};
+use crate::slices::read_all;
 use crate::weighted::weighted;
 use crate::weights::Weights;
 use candle_core::{DType, Result, Tensor, bail};
@@ -15,7 +15,7 @@ use std::sync::{Arc, OnceLock};
 
 /// A noise predictor and its weights.
 pub struct NoisePredictor {
-    parts: Arc<Parts>,
+    architecture: Arc<Architecture>,
     weights: Weights,
     packing: Packing,
 }
@@ -30,85 +30,88 @@ pub(crate) fn sinusoids(x: f64) -> impl Iterator<Item = f32> {
         .map(|x| x as f32)
 }
 
-/// The sinusoids of t = 1..T.
-fn time_features(steps: usize) -> Vec<f32> {
-    (1..=steps).flat_map(|t| sinusoids(t as f64)).collect()
-}
-
-weighted!(NoisePredictor, parts.trunk);
+weighted!(NoisePredictor, architecture.trunk);
 
 impl NoisePredictor {
-    /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
+    /// A noise predictor with weights of the shape's layout. `precision` applies where no gradient
+    /// is taken.
     pub fn new(shape: NoiseShape, weights: Weights, precision: Precision) -> Self {
-        let parts = Parts {
+        let architecture = Architecture {
             time: Mlp::new(shape.time_layers(), "time."),
             trunk: Mlp::new(shape.trunk_layers(), "trunk."),
             schedule: Schedule::variance_preserving(shape.diffusion_steps, shape.reverse),
-            features: time_features(shape.diffusion_steps),
+            features: (1..=shape.diffusion_steps).flat_map(|t| sinusoids(t as f64)).collect(),
             features_tensor: OnceLock::new(),
             shape,
         };
-        Self { parts: Arc::new(parts), weights, packing: Packing::new(precision) }
+        Self { architecture: Arc::new(architecture), weights, packing: Packing::new(precision) }
     }
 
-    /// Its shape.
+    /// The shape.
     pub fn shape(&self) -> &NoiseShape {
-        &self.parts.shape
+        &self.architecture.shape
     }
 
-    /// The noise schedule that it was made for.
+    /// The noise schedule.
     pub fn schedule(&self) -> &Schedule {
-        &self.parts.schedule
+        &self.architecture.schedule
     }
 
-    /// The sinusoids of all t, `[T, 16]`, where the weights are.
+    /// The sinusoids of all t, `[T, 16]`, on the weights' device.
     fn features(&self) -> Result<Tensor> {
-        let Parts { features, shape, features_tensor, .. } = &*self.parts;
+        let Architecture { features, features_tensor, .. } = &*self.architecture;
         if let Some(tensor) = features_tensor.get() {
             return Ok(tensor.clone());
         }
         let device = self.weights.values().device();
-        let tensor = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), device)?;
+        let tensor = Tensor::from_slice(features, ((), TIME_FEATURES), device)?;
         Ok(features_tensor.get_or_init(|| tensor).clone())
     }
 
     /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`.
     /// Differentiable in weights, observations and actions.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
-        let Parts { time, trunk, .. } = &*self.parts;
+        let Architecture { time, trunk, .. } = &*self.architecture;
         let embedding = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
         let embedding =
             embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
         trunk.forward(&self.weights, &[observations, actions, &embedding])?.squeeze(0)
     }
 
-    /// Makes constants of the weights; they share the memory of this network.
+    /// The same network with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
-        let (parts, weights) = (self.parts.clone(), self.weights.detach());
-        Self { parts, weights, packing: Packing::new(self.packing.precision) }
+        let (architecture, weights) = (self.architecture.clone(), self.weights.detach());
+        Self { architecture, weights, packing: Packing::new(self.packing.precision) }
     }
 
-    /// Draws actions by the whole reverse process (DDPM).
+    /// Draws actions `[rows, a]` by the reverse process (DDPM), without gradients.
     ///
-    /// `observations` is `[n, o]`; `noise` is `[T, rows, a]`, standard normal, where equally many
-    /// consecutive rows share an observation: first a^T, then the noise of the reverse steps from t
-    /// = T down to 2. Gives `[rows, a]`, through which no gradient flows.
+    /// `observations` is `[n, o]`; `noise` is `[T, rows, a]`, standard normal: first a^T, then the
+    /// noise of the reverse steps from t = T down to 2. The first rows/n rows belong to the first
+    /// observation, and so on.
     pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
-        if !self.parts.trunk.is_fast(&self.weights) {
+        let trunk = &self.architecture.trunk;
+        if !trunk.is_fast(&self.weights) {
             return self.detach().composed_sample(observations, noise);
         }
         self.check_noise(observations, noise)?;
-        let packed = self.packing.kernels(&self.parts.trunk, &self.weights)?;
-        let operation = OnCpu(Sample { parts: self.parts.clone(), packed });
-        let weights = self.weights.values().detach();
-        weights.apply_op3_no_bwd(&observations.contiguous()?, &noise.contiguous()?, &operation)
+        let packed = self.packing.kernels(trunk, &self.weights)?;
+        let (observations, noise) = (observations.contiguous()?, noise.contiguous()?);
+        let (states, (_, rows, a)) = (observations.dim(0)?, noise.dims3()?);
+        let actions = read_all(
+            [self.weights.values(), &observations, &noise],
+            |[weights, observations, noise]| {
+                let inputs = (observations, states);
+                self.architecture.sample(weights, packed.as_deref(), inputs, noise)
+            },
+        )?;
+        Tensor::from_vec(actions, (rows, a), noise.device())
     }
 
-    /// [`Self::sample`] with the embeddings of all t computed once, and one operation for a reverse
-    /// step on a GPU.
+    /// [`Self::sample`] in composed operations, with the embeddings of all t computed once.
     fn composed_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
-        let Parts { time, trunk, .. } = &*self.parts;
+        let Architecture { time, trunk, .. } = &*self.architecture;
         let (steps, rows, _) = noise.dims3()?;
         let embeddings = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
@@ -123,7 +126,7 @@ impl NoisePredictor {
         Ok(actions)
     }
 
-    /// [`Self::sample`], but differentiable in the weights, through every reverse step; slower.
+    /// [`Self::sample`], differentiable in the weights through every reverse step; slower.
     pub fn sample_with_gradient(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
         let (steps, rows, _) = noise.dims3()?;
@@ -139,7 +142,8 @@ impl NoisePredictor {
     }
 
     fn check_noise(&self, observations: &Tensor, noise: &Tensor) -> Result<()> {
-        let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } = self.parts.shape;
+        let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } =
+            self.architecture.shape;
         let ((states, o), (steps, rows, a)) = (observations.dims2()?, noise.dims3()?);
         let fits = states > 0
             && rows > 0
@@ -148,7 +152,7 @@ impl NoisePredictor {
         if !fits || steps != diffusion_steps {
             bail!(
                 "a noise predictor of {:?} got {states} × {o} and noise {steps} × {rows} × {a}",
-                self.parts.shape
+                self.architecture.shape
             );
         }
         Ok(())

@@ -1,40 +1,39 @@
-//! The variance-preserving noise schedule and one step of the reverse process.
+//! Noise schedules and one step of the reverse process.
 
 use candle_core::{Device, Result, Tensor};
 #[cfg(feature = "cuda")]
 use quad_kernels::cuda::{ReverseStep, reverse};
 use serde::{Deserialize, Serialize};
 
-/// How a reverse step is made of a predicted noise.
+/// Formula of a reverse step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Reverse {
-    /// x_0 is clipped to ±1, the noise's variance is 1 - α_t (DAC).
+    /// x_0 is clipped to ±1, the variance is 1 − α_t (DAC).
     #[default]
     ClipClean,
-    /// x_0 is clipped to ±1, the variance is the posterior's, (1 - α_t)(1 - ᾱ_{t-1})/(1 - ᾱ_t)
+    /// x_0 is clipped to ±1, the variance is the posterior's, (1 − α_t)(1 − ᾱ_{t−1})/(1 − ᾱ_t)
     /// (Diffusion-QL).
     Posterior,
-    /// x_0 is not clipped, but the outcome is, noise and all; the variance is 1 - α_t (IDQL,
-    /// AlignIQL).
+    /// x_{t−1} is clipped instead, after adding noise; the variance is 1 − α_t (IDQL, AlignIQL).
     ClipSample,
 }
 
-/// Constants of the diffusion over t = 1..T (Eq. 3–5; DAC's "vp" schedule).
+/// Constants of the diffusion over t = 1..T (Eq. 3–5).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Schedule {
     steps: Vec<Step>,
     reverse: Reverse,
 }
 
-/// Coefficients of one t.
+/// Coefficients at one t.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Step {
-    /// sqrt(ᾱ_t).
+    /// √ᾱ_t.
     signal: f32,
-    /// sqrt(1 - ᾱ_t).
+    /// √(1 − ᾱ_t).
     deviation: f32,
-    /// Factor of the clipped x_0 in the posterior's mean.
+    /// Factor of x_0 in the posterior's mean.
     from_clean: f32,
     /// Factor of x_t in the posterior's mean.
     from_noisy: f32,
@@ -43,7 +42,7 @@ struct Step {
 }
 
 impl Schedule {
-    /// β_t = 1 - exp(-0.1/T - 0.5·(10 - 0.1)·(2t - 1)/T²) for t = 1..T.
+    /// DAC's "vp": β_t = 1 − exp(−0.1/T − 0.5·(10 − 0.1)·(2t − 1)/T²).
     pub fn variance_preserving(steps: usize, reverse: Reverse) -> Self {
         let total = steps as f64;
         let alpha = |t: usize| {
@@ -55,10 +54,10 @@ impl Schedule {
     /// ᾱ_t = f(t/T)/f(0) with f(x) = cos²(π/2·(x + 0.008)/1.008), each β_t at most 0.999 (Nichol
     /// and Dhariwal 2021); the variance of a reverse step is the posterior's.
     pub fn cosine(steps: usize) -> Self {
-        let falls = |t: usize| {
+        let f = |t: usize| {
             ((t as f64 / steps as f64 + 0.008) / 1.008 * std::f64::consts::FRAC_PI_2).cos().powi(2)
         };
-        Self::of(steps, Reverse::Posterior, |t| (falls(t) / falls(t - 1)).max(0.001))
+        Self::of(steps, Reverse::Posterior, |t| (f(t) / f(t - 1)).max(0.001))
     }
 
     /// The schedule with these α_t for t = 1..T.
@@ -67,7 +66,7 @@ impl Schedule {
         let step = |t: usize| {
             let alpha = alpha(t);
             let alpha_bar = before * alpha;
-            let shrink = match reverse {
+            let posterior = match reverse {
                 Reverse::Posterior => (1.0 - before) / (1.0 - alpha_bar),
                 Reverse::ClipClean | Reverse::ClipSample => 1.0,
             };
@@ -76,7 +75,7 @@ impl Schedule {
                 deviation: (1.0 - alpha_bar).sqrt() as f32,
                 from_clean: (before.sqrt() * (1.0 - alpha) / (1.0 - alpha_bar)) as f32,
                 from_noisy: (alpha.sqrt() * (1.0 - before) / (1.0 - alpha_bar)) as f32,
-                noise: if t == 1 { 0.0 } else { ((1.0 - alpha) * shrink).sqrt() as f32 },
+                noise: if t == 1 { 0.0 } else { ((1.0 - alpha) * posterior).sqrt() as f32 },
             };
             before = alpha_bar;
             step
@@ -89,8 +88,8 @@ impl Schedule {
         self.steps[t - 1].noise.powi(2)
     }
 
-    /// x_t → x_{t-1} where the clean x_0 is predicted rather than the noise: the posterior's mean,
-    /// plus noise `z` for t > 1. All of one shape.
+    /// x_t → x_{t−1}, given the predicted x_0: the posterior's mean, plus noise `z` for t > 1. All of
+    /// one shape.
     pub fn reverse_to_clean(
         &self,
         t: usize,
@@ -106,8 +105,8 @@ impl Schedule {
         }
     }
 
-    /// sqrt(ᾱ_t) and sqrt(1 - ᾱ_t) for each t in 1..=T, `[B, width]` each, a row for each t with
-    /// its number in all columns; the second is also the guidance weight w(t).
+    /// √ᾱ_t and √(1 − ᾱ_t) for each t in 1..=T, repeated in all columns, `[B, width]` each; the second
+    /// is also the guidance weight w(t).
     pub fn noising(&self, t: &[u32], width: usize, device: &Device) -> Result<(Tensor, Tensor)> {
         let rows = |of: fn(&Step) -> f32| {
             let numbers =
@@ -117,18 +116,16 @@ impl Schedule {
         Ok((rows(|step| step.signal)?, rows(|step| step.deviation)?))
     }
 
-    /// x_0 as a predicted noise ε has it, (x_t - sqrt(1 - ᾱ_t)·ε)/sqrt(ᾱ_t), clipped to [-1, 1]
-    /// unless samples are; all `[rows, a]`.
+    /// x_0 = (x_t − √(1 − ᾱ_t)·ε)/√ᾱ_t for a predicted noise ε, clipped to ±1 unless samples are; all
+    /// `[rows, a]`.
     pub fn clean(&self, t: usize, x: &Tensor, epsilon: &Tensor) -> Result<Tensor> {
         let Step { signal, deviation, .. } = self.steps[t - 1];
         let clean = ((x - (epsilon * f64::from(deviation))?)? * f64::from(1.0 / signal))?;
         if self.reverse == Reverse::ClipSample { Ok(clean) } else { clean.clamp(-1f32, 1f32) }
     }
 
-    /// x_t → x_{t-1}: the posterior's mean plus noise for t > 1. All `[rows, a]`, and
-    /// differentiable.
-    ///
-    /// `epsilon` is the predicted noise, `z` standard normal.
+    /// x_t → x_{t−1}: the posterior's mean, plus noise for t > 1. `epsilon` is the predicted noise,
+    /// `z` standard normal; all `[rows, a]`, and differentiable.
     pub fn reverse(
         &self,
         t: usize,
@@ -140,7 +137,7 @@ impl Schedule {
         if self.reverse == Reverse::ClipSample { next.clamp(-1f32, 1f32) } else { Ok(next) }
     }
 
-    /// [`Self::reverse`] of constants: on a GPU one operation.
+    /// [`Self::reverse`] without gradients: one operation on a GPU.
     pub(crate) fn constant_reverse(
         &self,
         t: usize,
@@ -192,12 +189,11 @@ impl Schedule {
         tensor(next, x.shape(), &x)
     }
 
-    /// Bounds of the predicted x_0 and of the outcome.
+    /// Bounds of the predicted x_0 and of x_{t−1}.
     fn bounds(&self) -> (f32, f32) {
-        if self.reverse == Reverse::ClipSample {
-            (f32::INFINITY, 1.0)
-        } else {
-            (1.0, f32::INFINITY)
+        match self.reverse {
+            Reverse::ClipSample => (f32::INFINITY, 1.0),
+            Reverse::ClipClean | Reverse::Posterior => (1.0, f32::INFINITY),
         }
     }
 

@@ -1,56 +1,47 @@
-//! Work of a GPU that is recorded in one update and replayed in later ones.
+//! Work of a GPU that is captured in one update and replayed in later ones.
 
 use candle_core::{Device, Result, Tensor, bail};
 
-/// Recorded work.
-pub struct CudaGraph(#[cfg(feature = "cuda")] quad_kernels::recording::Recording);
+/// Captured work.
+pub struct CudaGraph(#[cfg(feature = "cuda")] quad_kernels::cuda_graph::CudaGraph);
 
 impl CudaGraph {
-    /// Does `work` as a rehearsal: what it sends to the GPU, sizes and constants, stays there for
-    /// its recording.
-    pub fn rehearse<R>(device: &Device, work: impl FnOnce() -> R) -> R {
+    /// Does `work` before its capture. Sizes and constants that it sends to the GPU stay there.
+    pub fn warm_up<R>(device: &Device, work: impl FnOnce() -> R) -> R {
         #[cfg(feature = "cuda")]
-        let _kept = if let Device::Cuda(gpu) = device {
-            Some(gpu.enable_cuda_graph_htod_cache())
-        } else {
-            None
+        let _cache = match device {
+            Device::Cuda(gpu) => Some(gpu.enable_cuda_graph_htod_cache()),
+            _ => None,
         };
         let _ = device;
         work()
     }
 
-    /// Records `work`, which was rehearsed on this thread, without doing it. It changes tensors
-    /// that there are, and lets go of none of these and of all that it makes.
-    ///
-    /// # Errors
-    /// `work` fails, or cannot be recorded.
-    pub fn of(device: &Device, work: impl FnOnce() -> Result<()>) -> Result<Self> {
+    /// Captures `work`, which was warmed up on this thread, without doing it. It may change existing
+    /// tensors but free none of them, and must free all that it makes.
+    pub fn capture(device: &Device, work: impl FnOnce() -> Result<()>) -> Result<Self> {
         #[cfg(feature = "cuda")]
         if let Device::Cuda(gpu) = device {
-            let record = || quad_kernels::recording::Recording::of(&gpu.cuda_stream(), work);
-            let (done, recording) = Self::rehearse(device, record);
+            let stream = gpu.cuda_stream();
+            let capture = || quad_kernels::cuda_graph::CudaGraph::capture(&stream, work);
+            let (done, graph) = Self::warm_up(device, capture);
             done?;
-            return recording.map(Self).map_err(candle_core::Error::wrap);
+            return graph.map(Self).map_err(candle_core::Error::wrap);
         }
-        Self::rehearse(device, work)?;
-        bail!("work is recorded on a GPU only")
+        Self::warm_up(device, work)?;
+        bail!("work is captured on a GPU only")
     }
 
-    /// Queues the recorded work.
-    ///
-    /// # Errors
-    /// The driver refuses.
+    /// Queues the captured work.
     pub fn replay(&mut self) -> Result<()> {
         #[cfg(feature = "cuda")]
-        self.0.replay().map_err(candle_core::Error::wrap)?;
+        self.0.launch().map_err(candle_core::Error::wrap)?;
         Ok(())
     }
 }
 
-/// Writes the numbers of a tensor on the CPU over those of one on a GPU.
-///
-/// # Errors
-/// Another number of numbers or another type, or the driver refuses.
+/// Overwrites the numbers of a tensor on a GPU by those of one on the CPU, of the same type and
+/// number.
 pub fn overwrite(tensor: &Tensor, with: &Tensor) -> Result<()> {
     #[cfg(feature = "cuda")]
     return match with.dtype() {

@@ -1,11 +1,11 @@
-//! The GPU, as candle is to use it.
+//! Opening the GPU.
 
 use candle_core::{Device, Result};
 
 /// Opens this machine's first GPU.
 ///
 /// # Errors
-/// There is none that the driver knows, or this program was built without the feature `cuda`.
+/// The driver finds no GPU, or this program was built without the feature `cuda`.
 pub fn open_gpu() -> Result<Device> {
     let device = Device::new_cuda(0)?;
     #[cfg(feature = "cuda")]

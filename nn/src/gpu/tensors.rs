@@ -1,4 +1,4 @@
-//! Candle's tensors on a GPU as the kernels of `quad_kernels::cuda` take them.
+//! Candle's tensors on a GPU as arguments of `quad_kernels::cuda`.
 
 use candle_core::cuda_backend::CudaDType;
 use candle_core::cuda_backend::cudarc::driver::{
@@ -13,10 +13,7 @@ use std::cell::Cell;
 use std::marker::PhantomData;
 use std::sync::Arc;
 
-/// Makes candle's calls of the driver fewer.
-///
-/// # Errors
-/// The driver refuses.
+/// Saves calls of the driver ([`quad_kernels::cuda::prepare`]).
 pub(crate) fn prepare(device: &Device) -> Result<()> {
     let Device::Cuda(device) = device else { bail!("the device is not a GPU") };
     quad_kernels::cuda::prepare(device.cuda_stream().context()).map_err(Error::wrap)
@@ -34,7 +31,7 @@ pub(crate) fn view<'a>(storage: &'a CudaStorage, layout: &Layout) -> Result<Cuda
     Ok(storage.as_cuda_slice::<f32>()?.slice(range(layout)?))
 }
 
-/// New numbers that `work` has queued on the stream of `storage`.
+/// Queues `work`, which makes new numbers, on the stream of `storage`.
 pub(crate) fn with_stream(
     storage: &CudaStorage,
     work: impl FnOnce(&Arc<CudaStream>) -> std::result::Result<CudaSlice<f32>, CudaError>,
@@ -44,7 +41,7 @@ pub(crate) fn with_stream(
     Ok(CudaStorage::wrap_cuda_slice(numbers, device))
 }
 
-/// Hands the numbers of a contiguous tensor to `work`.
+/// Calls `work` with the numbers of a contiguous tensor.
 pub(crate) fn read<R>(
     tensor: &Tensor,
     work: impl FnOnce(&CudaView<'_, f32>) -> Result<R>,
@@ -56,12 +53,12 @@ pub(crate) fn read<R>(
     }
 }
 
-/// Has `work` change the numbers of a contiguous tensor in place, on its stream.
+/// Lets `work` change the numbers of a contiguous tensor in place, on its stream.
 pub(crate) fn modify<T: CudaDType, R>(
     tensor: &Tensor,
     work: impl FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, T>) -> Result<R>,
 ) -> Result<R> {
-    /// Candle asks for an operation that could be applied many times; this one is applied once.
+    /// Candle takes operations that can be applied many times; this one is applied once.
     struct Once<T, F, R>(Cell<Option<F>>, Cell<Option<R>>, PhantomData<T>);
     impl<T: CudaDType, R, F: FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, T>) -> Result<R>>
         InplaceOp1 for Once<T, F, R>
@@ -88,7 +85,7 @@ pub(crate) fn modify<T: CudaDType, R>(
     once.1.take().ok_or_else(|| Error::Msg("a tensor is not on the GPU".into()))
 }
 
-/// Writes the numbers of a tensor on the CPU over those of a contiguous one on the GPU.
+/// Overwrites a contiguous tensor on the GPU by one on the CPU.
 pub(crate) fn overwrite<T: CudaDType + DeviceRepr + WithDType>(
     tensor: &Tensor,
     with: &Tensor,
@@ -102,7 +99,7 @@ pub(crate) fn overwrite<T: CudaDType + DeviceRepr + WithDType>(
     crate::slices::read(with, copy)?
 }
 
-/// Numbers of the GPU as a tensor.
+/// A tensor of numbers on the GPU.
 pub(crate) fn tensor(
     numbers: CudaSlice<f32>,
     shape: impl Into<Shape>,

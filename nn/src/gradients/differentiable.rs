@@ -1,43 +1,40 @@
-//! The named tensors of a network, through each of which a gradient flows to the network's vector
-//! of weights.
+//! A network's named tensors, through each of which a gradient flows to its vector of weights.
 
-use crate::gradients::kept::KeptGradient;
+use crate::gradients::buffer::GradientBuffer;
 use crate::slices::{read, slice};
-use crate::weights::{Tensors, Weights};
+use crate::weights::{TensorSpec, Tensors, Weights};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
 use std::ops::Range;
 use std::sync::Arc;
 
 impl Weights {
-    /// The named tensors. Where a gradient is taken of the weights, each leaves its own where the
-    /// others' are kept: candle's views of a vector would each make a gradient as long as the
-    /// vector.
+    /// The named tensors, differentiable in the weights. The gradient of each goes to the
+    /// [`GradientBuffer`]: through candle's views each would be as long as the whole vector.
     pub(crate) fn differentiable(&self) -> Result<Tensors> {
-        let Some(kept) = self.kept_gradient() else {
+        let Some(buffer) = self.gradient_buffer() else {
             return self.layout().split(self.values(), "");
         };
         let mut start = 0;
-        let tensor = |part: &crate::weights::TensorSpec| {
-            let range = start..start + part.shape.iter().product::<usize>();
+        let tensor = |spec: &TensorSpec| {
+            let range = start..start + spec.count();
             start = range.end;
-            let view = View { range, shape: part.shape.as_slice().into(), kept: kept.clone() };
-            Ok((part.name.clone(), self.values().apply_op1(view)?))
+            let view = View { range, shape: spec.shape.as_slice().into(), buffer: buffer.clone() };
+            Ok((spec.name.clone(), self.values().apply_op1(view)?))
         };
-        self.layout().parts().iter().map(tensor).collect()
+        self.layout().specs().iter().map(tensor).collect()
     }
 }
 
-/// The operation: a range of a vector, as a tensor of this shape.
+/// The operation that cuts a tensor of this shape out of a vector.
 struct View {
     range: Range<usize>,
     shape: Shape,
-    /// Where the gradient of the whole vector is left.
-    kept: Arc<KeptGradient>,
+    buffer: Arc<GradientBuffer>,
 }
 
 impl CustomOp1 for View {
     fn name(&self) -> &'static str {
-        "part-of-the-weights"
+        "view-of-weights"
     }
 
     fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
@@ -46,9 +43,8 @@ impl CustomOp1 for View {
     }
 
     fn bwd(&self, _: &Tensor, _: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
-        let gradient = gradient.contiguous()?;
-        read(&gradient, |mine: &[f32]| {
-            self.kept.write(self.range.clone(), |out| out.copy_from_slice(mine))
+        read(&gradient.contiguous()?, |gradient: &[f32]| {
+            self.buffer.write(self.range.clone(), |out| out.copy_from_slice(gradient))
         })??;
         Ok(None)
     }

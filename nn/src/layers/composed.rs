@@ -1,6 +1,6 @@
-//! Layers act(x·W + b) whose backward pass is written out: products by candle, and one operation
-//! for bias, activation and its slope. So a GPU launches two kernels a layer forward and four
-//! backward, where candle's own differentiation takes some forty.
+//! Layers act(x·W + b) whose backward pass is written out: candle's products, and one operation for
+//! bias, activation and slope. A GPU launches two kernels a layer forward and four backward, with
+//! candle's own differentiation some forty.
 
 use crate::layers::flat::Layers;
 use crate::slices::slice;
@@ -11,24 +11,23 @@ use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Storage, 
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use std::sync::Arc;
 
-/// A forward pass, with what its backward pass needs.
+/// A forward pass and the tensors that its backward pass reads.
 pub(crate) struct Pass {
     layers: Arc<Layers>,
-    /// Numbers in the whole vector of weights.
+    /// Length of the vector of weights.
     count: usize,
     /// Kernels `[K, in, out]`.
     kernels: Vec<Tensor>,
     /// Inputs of each layer, `[K, rows, in]`.
     inputs: Vec<Tensor>,
-    /// Slopes of the hidden layers' activations, `[K, rows, width]`; none if no gradient is taken.
+    /// Slopes of the hidden layers' activations, `[K, rows, width]`; empty without gradients.
     slopes: Vec<Tensor>,
     /// `[K, rows, out]`.
     pub out: Tensor,
 }
 
 impl Pass {
-    /// Computes the outputs for inputs `[rows, in]`, which all members share; `differentiable`
-    /// keeps what a backward pass needs.
+    /// Computes the outputs of all members for the same inputs `[rows, in]`.
     pub fn forward(
         layers: &Arc<Layers>,
         weights: &Weights,
@@ -37,7 +36,7 @@ impl Pass {
     ) -> Result<Self> {
         let values = weights.values().detach();
         let (rows, inputs) = x.dims2()?;
-        // All members read the same numbers: no copy is made.
+        // A view: all members read the same numbers.
         let x =
             x.detach().contiguous()?.unsqueeze(0)?.broadcast_as((layers.members, rows, inputs))?;
         let mut pass = Self {
@@ -69,8 +68,8 @@ impl Pass {
         Ok(pass)
     }
 
-    /// The gradients of a loss, given that of the output, `[K, rows, out]`: of the whole vector of
-    /// weights, if asked for, and of each member's inputs, `[K, rows, in]`, if asked for.
+    /// The gradients, given the output's, `[K, rows, out]`: of the vector of weights, if `weights`,
+    /// and of each member's inputs, `[K, rows, in]`, if `inputs`.
     pub fn backward(
         &self,
         gradient: &Tensor,
@@ -84,7 +83,7 @@ impl Pass {
             .broadcast_as((members, 1, rows))?;
         for layer in (0..self.layers.count()).rev() {
             if weights {
-                // From the last part to the first: a layer's biases follow its kernels.
+                // In reverse: a layer's biases follow its kernels.
                 parts.push(ones.matmul(&delta)?.flatten_all()?);
                 parts.push(self.inputs[layer].t()?.matmul(&delta)?.flatten_all()?);
             }
@@ -98,7 +97,7 @@ impl Pass {
         Ok((weights, inputs.then_some(delta)))
     }
 
-    /// The gradient of the whole vector of these parts, in reverse; it is 0 outside these layers.
+    /// The gradient of the whole vector from these layers' parts in reverse; 0 elsewhere.
     fn whole(&self, mut parts: Vec<Tensor>, device: &candle_core::Device) -> Result<Tensor> {
         let range = self.layers.range();
         let zeros = |count: usize| Tensor::zeros(count, DType::F32, device);
@@ -113,13 +112,12 @@ impl Pass {
     }
 }
 
-/// The operation of (weights, inputs) by which candle's differentiation meets a pass: its outcome
-/// is that of the pass.
+/// The operation of (weights, inputs) through which candle differentiates a pass.
 pub(crate) struct Composed(pub Pass);
 
 impl Composed {
-    /// The numbers of the outcome, which is small.
-    fn outcome<S>(&self, copy: impl FnOnce(&Storage, &Layout) -> Result<S>) -> Result<(S, Shape)> {
+    /// A copy of the pass's output.
+    fn output<S>(&self, copy: impl FnOnce(&Storage, &Layout) -> Result<S>) -> Result<(S, Shape)> {
         let (storage, layout) = self.0.out.storage_and_layout();
         Ok((copy(&storage, layout)?, layout.shape().clone()))
     }
@@ -137,7 +135,7 @@ impl CustomOp2 for Composed {
         _: &CpuStorage,
         _: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        self.outcome(|storage, layout| {
+        self.output(|storage, layout| {
             Ok(CpuStorage::F32(crate::slices::on_cpu(storage, layout)?.to_vec()))
         })
     }
@@ -150,7 +148,7 @@ impl CustomOp2 for Composed {
         _: &candle_core::CudaStorage,
         _: &Layout,
     ) -> Result<(candle_core::CudaStorage, Shape)> {
-        self.outcome(|storage, layout| match storage {
+        self.output(|storage, layout| match storage {
             Storage::Cuda(storage) => storage.try_clone(layout),
             _ => candle_core::bail!("a tensor is not on the GPU"),
         })
@@ -169,8 +167,8 @@ impl CustomOp2 for Composed {
     }
 }
 
-/// The operation of (z `[K, rows, width]`, biases `[K, width]`): f(z + bias), or z + bias without
-/// f, `[1, K, rows, width]`; with `slope` also the derivatives f'(z + bias), `[2, K, rows, width]`.
+/// The operation of (z `[K, rows, width]`, biases `[K, width]`): f(z + bias), `[1, K, rows, width]`;
+/// with `slope` also f'(z + bias), `[2, K, rows, width]`. Without f, z + bias.
 struct Activate {
     f: Option<Activation>,
     slope: bool,

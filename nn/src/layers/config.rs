@@ -1,4 +1,4 @@
-//! Hidden layers as a line of configuration.
+//! Hidden layers in a configuration.
 
 use crate::error::MAX_DIM;
 use crate::weights::Init;
@@ -6,36 +6,36 @@ use quad_kernels::activation::Activation;
 use serde::de::{Deserializer, Error};
 use serde::{Deserialize, Serialize};
 
-/// Most hidden layers that are believed.
+/// Largest number of hidden layers.
 const MOST_LAYERS: usize = 64;
 
-/// A network's hidden layers, as a configuration or a policy's file has them.
+/// A network's hidden layers, as in a configuration or a policy's file.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MlpConfig {
-    /// Their widths: from 1 to 64 of them, each from 1 to 65535.
+    /// Widths: 1 to 64 of them, each from 1 to 65535.
     #[serde(deserialize_with = "widths")]
     pub hidden: Vec<usize>,
-    /// What follows each of them.
+    /// Activation of each layer.
     pub activation: Activation,
-    /// Whether a layer norm (Ba et al. 2016) stands before each activation.
+    /// Layer norm (Ba et al. 2016), before each activation.
     #[serde(default)]
     pub norm: bool,
-    /// Whether it stands after each activation instead.
+    /// Moves the norm behind each activation.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub norm_after: bool,
-    /// What the norm adds to the variance.
-    #[serde(default, skip_serializing_if = "Epsilon::is_default")]
-    pub norm_epsilon: Epsilon,
-    /// What the weights begin with.
+    /// Number that the norm adds to the variance.
+    #[serde(default, skip_serializing_if = "NormEpsilon::is_default")]
+    pub norm_epsilon: NormEpsilon,
+    /// Initial weights.
     #[serde(default)]
-    pub initial: Initial,
+    pub initial: InitScheme,
 }
 
-/// What a layer norm adds to the variance, ε.
+/// Number ε that a layer norm adds to the variance.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Epsilon {
+pub enum NormEpsilon {
     /// 1e-6, as in Flax.
     #[default]
     Flax,
@@ -43,8 +43,8 @@ pub enum Epsilon {
     Torch,
 }
 
-impl Epsilon {
-    /// The number.
+impl NormEpsilon {
+    /// ε as a number.
     pub(crate) fn value(self) -> f64 {
         match self {
             Self::Flax => 1e-6,
@@ -57,10 +57,10 @@ impl Epsilon {
     }
 }
 
-/// What a network's weights begin with.
+/// Distribution of a network's initial weights.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Initial {
+pub enum InitScheme {
     /// Kernels U(±√(6/(in + out))) (Glorot and Bengio 2010), biases 0.
     #[default]
     Xavier,
@@ -73,40 +73,40 @@ pub enum Initial {
     /// ReBRAC's actor: kernels U(±1/√in), biases 0.1; the last layer's kernel and bias U(±0.001).
     #[serde(rename = "rebrac-actor")]
     RebracActor,
-    /// ReBRAC's critics, whose last layer is U(±0.003).
+    /// ReBRAC's critics: as the actor, but the last layer's kernel and bias U(±0.003).
     #[serde(rename = "rebrac-critic")]
     RebracCritic,
 }
 
-impl Initial {
-    /// Initial values of the kernel and bias of a linear layer, the last or another.
-    pub(crate) fn of_layer(self, inputs: usize, outputs: usize, last: bool) -> (Init, Init) {
+impl InitScheme {
+    /// Initial values of a layer's kernel and bias.
+    pub(crate) fn layer(self, inputs: usize, outputs: usize, last: bool) -> (Init, Init) {
+        use Init::{Constant, Orthogonal, Uniform};
+        let bound = 1.0 / (inputs as f32).sqrt();
         match self {
-            Self::RebracActor if last => (Init::Uniform(1e-3), Init::Uniform(1e-3)),
-            Self::RebracCritic if last => (Init::Uniform(3e-3), Init::Uniform(3e-3)),
-            Self::RebracActor | Self::RebracCritic => {
-                (Init::Uniform(1.0 / (inputs as f32).sqrt()), Init::Constant(0.1))
-            }
-            Self::Xavier => {
-                (Init::Uniform((6.0 / (inputs + outputs) as f32).sqrt()), Init::Constant(0.0))
-            }
-            Self::Orthogonal => (Init::Orthogonal(std::f32::consts::SQRT_2), Init::Constant(0.0)),
-            Self::Orthonormal => (Init::Orthogonal(1.0), Init::Constant(0.0)),
-            Self::Torch => {
-                let bound = 1.0 / (inputs as f32).sqrt();
-                (Init::Uniform(bound), Init::Uniform(bound))
-            }
+            Self::RebracActor if last => (Uniform(1e-3), Uniform(1e-3)),
+            Self::RebracCritic if last => (Uniform(3e-3), Uniform(3e-3)),
+            Self::RebracActor | Self::RebracCritic => (Uniform(bound), Constant(0.1)),
+            Self::Xavier => (Uniform((6.0 / (inputs + outputs) as f32).sqrt()), Constant(0.0)),
+            Self::Orthogonal => (Orthogonal(std::f32::consts::SQRT_2), Constant(0.0)),
+            Self::Orthonormal => (Orthogonal(1.0), Constant(0.0)),
+            Self::Torch => (Uniform(bound), Uniform(bound)),
         }
     }
 }
 
 impl MlpConfig {
-    /// Hidden layers of these widths, with Mish and nothing else.
+    /// Hidden layers of these widths with Mish.
     pub fn mish(hidden: &[usize]) -> Self {
         Self { hidden: hidden.to_vec(), ..Self::default() }
     }
 
-    /// Numbers of the widest hidden layer.
+    /// One hidden layer with Mish, for an embedding beside these layers.
+    pub(crate) fn embedding(&self, width: usize) -> Self {
+        Self { initial: self.initial, ..Self::mish(&[width]) }
+    }
+
+    /// Width of the widest hidden layer.
     pub(crate) fn widest(&self) -> usize {
         self.hidden.iter().copied().max().unwrap_or(1)
     }
@@ -130,9 +130,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_configuration_names_what_a_norm_adds_only_where_it_is_not_the_usual() {
+    fn a_configuration_names_epsilon_only_where_it_is_not_the_default() {
         let config =
-            MlpConfig { norm: true, norm_epsilon: Epsilon::Torch, ..MlpConfig::mish(&[4]) };
+            MlpConfig { norm: true, norm_epsilon: NormEpsilon::Torch, ..MlpConfig::mish(&[4]) };
         let json = serde_json::to_string(&config).unwrap();
         assert!(json.contains(r#""norm_epsilon":"torch""#), "{json}");
         assert_eq!(serde_json::from_str::<MlpConfig>(&json).unwrap(), config);
@@ -140,30 +140,14 @@ mod tests {
     }
 
     #[test]
-    fn rebrac_s_last_layer_begins_smaller_than_the_others() {
-        let shape = |initial| {
-            let layers = MlpConfig { initial, ..MlpConfig::mish(&[4]) };
-            crate::shape::EnsembleShape {
-                members: 1,
-                observation_dim: 16,
-                action_dim: 0,
-                layers,
-                outputs: 2,
-            }
-        };
-        for (initial, last) in [(Initial::RebracActor, 1e-3), (Initial::RebracCritic, 3e-3)] {
-            let starts: Vec<Init> =
-                shape(initial).layout().parts().iter().map(|part| part.start).collect();
-            let (first, last) =
-                ([Init::Uniform(0.25), Init::Constant(0.1)], [Init::Uniform(last); 2]);
-            assert_eq!(starts, [first, last].concat());
+    fn initial_weights_depend_on_the_layer() {
+        use InitScheme::{Orthogonal, Orthonormal, RebracActor, RebracCritic};
+        let first = (Init::Uniform(0.25), Init::Constant(0.1));
+        for (scheme, last) in [(RebracActor, 1e-3), (RebracCritic, 3e-3)] {
+            let last = (Init::Uniform(last), Init::Uniform(last));
+            assert_eq!([scheme.layer(16, 4, false), scheme.layer(4, 2, true)], [first, last]);
         }
-    }
-
-    #[test]
-    fn orthogonal_weights_have_the_gain_that_their_name_says() {
-        let gains = [Initial::Orthogonal, Initial::Orthonormal]
-            .map(|initial| initial.of_layer(3, 5, false).0);
+        let gains = [Orthogonal, Orthonormal].map(|scheme| scheme.layer(3, 5, false).0);
         assert_eq!(gains, [Init::Orthogonal(std::f32::consts::SQRT_2), Init::Orthogonal(1.0)]);
     }
 }

@@ -1,48 +1,45 @@
-//! Where the layers of some networks of one shape lie in one flat vector.
+//! Offsets of the layers of K networks in one flat vector.
 //!
-//! A vector for all weights keeps an optimizer's step at one operation, and each named tensor is
-//! one contiguous run of it: layer after layer the kernels of all members, then their biases, then
-//! scales and shifts of the norm, if there is one.
+//! With one vector for all weights an optimizer's step is one operation. Each named tensor is
+//! contiguous: layer after layer the kernels of all members, then their biases, then scales and
+//! shifts of a norm.
 
-use crate::layers::config::{Epsilon, Initial, MlpConfig};
+use crate::layers::config::{InitScheme, MlpConfig, NormEpsilon};
 use crate::weights::{Init, TensorSpec};
 use candle_core::{Result, Tensor};
 use quad_kernels::activation::Activation;
 use std::ops::Range;
 
-/// Rows that one task works on: weights and activations of a tile stay in a core's own cache.
+/// Rows of one task: weights and activations of a tile stay in a core's own cache.
 pub(crate) const TILE: usize = 128;
 
 /// Linear layers for K members: for each K kernels `[in, out]`, then K biases `[out]`.
 #[derive(Clone, Debug)]
 pub(crate) struct Layers {
-    /// Networks side by side.
+    /// Number of networks, K.
     pub members: usize,
     widths: Vec<usize>,
-    /// Whether a norm stands between the hidden layers' linear maps and their activations.
     pub norm: bool,
-    /// Whether it stands behind the activations instead.
     pub norm_after: bool,
-    /// What it adds to the variance.
-    pub norm_epsilon: Epsilon,
+    pub norm_epsilon: NormEpsilon,
     pub activation: Activation,
-    initial: Initial,
-    /// Where each layer's parameters begin in the vector; behind the last layer, its end.
+    initial: InitScheme,
+    /// Start of each layer, and the end of the last.
     offsets: Vec<usize>,
 }
 
-/// Parameters of one layer of one member, to be written.
+/// Gradients of one layer of one member, to be written.
 pub(crate) struct LayerMut<'a> {
     pub layer: usize,
     pub member: usize,
     pub kernel: &'a mut [f32],
     pub bias: &'a mut [f32],
-    /// Scale and shift of the norm, if the layer has one.
+    /// Scale and shift of a norm.
     pub norm: Option<[&'a mut [f32]; 2]>,
 }
 
 impl Layers {
-    /// The first kernel lies at `start`.
+    /// Layers whose first kernel is at `start`.
     pub fn new(
         members: usize,
         inputs: usize,
@@ -72,17 +69,14 @@ impl Layers {
         self.norm && layer + 1 < self.count()
     }
 
-    /// What a norm adds to the variance.
     pub fn epsilon(&self) -> f32 {
         self.norm_epsilon.value() as f32
     }
 
-    /// Numbers that go in.
     pub fn inputs(&self) -> usize {
         self.widths[0]
     }
 
-    /// Numbers that come out.
     pub fn outputs(&self) -> usize {
         self.widths[self.count()]
     }
@@ -92,7 +86,7 @@ impl Layers {
         &self.widths[1..self.count()]
     }
 
-    /// Where in the vector they lie.
+    /// Range of the layers in the vector.
     pub fn range(&self) -> Range<usize> {
         self.offsets[0]..self.offsets[self.count()]
     }
@@ -123,7 +117,7 @@ impl Layers {
         &weights[self.offsets[layer] + (self.members * inputs + member) * outputs..][..outputs]
     }
 
-    /// Scale and shift of a layer's norm, if it has one.
+    /// Scale and shift of a layer's norm.
     pub fn norm<'a>(
         &self,
         weights: &'a [f32],
@@ -138,8 +132,7 @@ impl Layers {
         self.is_normed(layer).then(|| [of(1), of(2)])
     }
 
-    /// All parameters in the part of a vector that is these layers'. They share nothing, so that
-    /// each may be written by another thread.
+    /// Splits the layers' range of a vector, so that each layer can be written by another thread.
     pub fn split_mut<'a>(&self, mut rest: &'a mut [f32]) -> Vec<LayerMut<'a>> {
         let mut all = Vec::with_capacity(self.count() * self.members);
         for layer in 0..self.count() {
@@ -161,18 +154,17 @@ impl Layers {
         all
     }
 
-    /// Names, shapes and initial values of the tensors `{prefix}{layer}.kernel` and `.bias`, and
-    /// with a norm `.scale` and `.shift`; `leading` says whether the number of members is their
-    /// first dimension.
-    pub fn named(&self, prefix: &str, leading: bool) -> Vec<TensorSpec> {
-        let mut parts = Vec::new();
+    /// The tensors `{prefix}{layer}.kernel` and `.bias`, and with a norm `.scale` and `.shift`; with
+    /// `leading` their first dimension is K.
+    pub fn specs(&self, prefix: &str, leading: bool) -> Vec<TensorSpec> {
+        let mut specs = Vec::new();
         for layer in 0..self.count() {
             let (inputs, outputs) = self.shape(layer);
-            let (kernel, bias) = self.initial.of_layer(inputs, outputs, layer + 1 == self.count());
-            let mut push = |kind: &str, shape: &[usize], start| {
-                let members = leading.then_some(&self.members);
-                let shape = members.into_iter().chain(shape).copied().collect();
-                parts.push(TensorSpec { name: format!("{prefix}{layer}.{kind}"), shape, start });
+            let (kernel, bias) = self.initial.layer(inputs, outputs, layer + 1 == self.count());
+            let mut push = |kind: &str, shape: &[usize], init| {
+                let members = leading.then_some(self.members);
+                let shape: Vec<usize> = members.into_iter().chain(shape.iter().copied()).collect();
+                specs.push(TensorSpec::new(format!("{prefix}{layer}.{kind}"), &shape, init));
             };
             push("kernel", &[inputs, outputs], kernel);
             push("bias", &[outputs], bias);
@@ -181,6 +173,6 @@ impl Layers {
                 push("shift", &[outputs], Init::Constant(0.0));
             }
         }
-        parts
+        specs
     }
 }

@@ -1,52 +1,52 @@
 //! K networks of one shape side by side: layers act(x·W + b), differentiable in x, W and b.
 //!
-//! On the CPU a custom operation of candle's runs all layers, cut into (member, tile of rows) and
-//! in parallel; the cut does not depend on the number of threads, so neither do the results.
-//! Elsewhere `composed` does, and with a norm plain operations do.
+//! On the CPU one custom operation of candle's runs all layers, for tiles of one member's rows in
+//! parallel. The tiles do not depend on the number of threads, so neither do the results. Elsewhere
+//! `composed` runs them, or with a norm `plain`.
 
-use crate::gradients::kept::KeptGradient;
+use crate::gradients::buffer::GradientBuffer;
 use crate::layers::composed::{Composed, Pass};
 use crate::layers::flat::{Layers, TILE};
 use crate::layers::network::{Input, Network, rows_of};
 use crate::layers::plain;
-use crate::layers::saved::{Lent, Pool, SavedActivations};
+use crate::layers::saved::SavedActivations;
 use crate::layers::workspace::with_workspace;
-use crate::slices::{has_fast_implementation, on_cpu, slice};
+use crate::pool::{Pool, Pooled};
+use crate::slices::{has_fast_implementation, read_all, slice};
 use crate::weights::Weights;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use quad_kernels::product::Packed;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// For each network the kernels between its hidden layers, packed; none where products are as fast
-/// without.
+/// Packed kernels between the hidden layers of each network; empty where packing gains nothing.
 pub(crate) type Kernels = Vec<Vec<Packed>>;
 
-/// Kernels of one member, if any were packed.
+/// Packed kernels of one member.
 pub(crate) fn of_member(packed: Option<&Kernels>, member: usize) -> Option<&[Packed]> {
     packed.and_then(|packed| packed.get(member)).map(Vec::as_slice)
 }
 
-/// Networks over some part of a vector of weights.
+/// Networks in a range of a vector of weights.
 #[derive(Clone)]
 pub(crate) struct Mlp {
     pub layers: Arc<Layers>,
-    /// Before the names of their tensors.
+    /// Prefix of the tensors' names.
     prefix: &'static str,
-    saved: Pool<SavedActivations>,
+    saved: Arc<Pool<SavedActivations>>,
 }
 
 impl Mlp {
     pub fn new(layers: Layers, prefix: &'static str) -> Self {
-        Self { layers: Arc::new(layers), prefix, saved: Pool::default() }
+        Self { layers: Arc::new(layers), prefix, saved: Arc::default() }
     }
 
-    /// `inputs [rows, …]`, side by side → `[K, rows, out]`.
+    /// The outputs `[K, rows, out]` for `inputs [rows, …]`, which are concatenated.
     pub fn forward(&self, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
         self.forward_by(None, weights, inputs)
     }
 
-    /// Applies the network; where no gradient is taken, by these packed kernels of the members.
+    /// [`Self::forward`] with packed kernels, which are used where no gradient is taken.
     pub fn forward_by(
         &self,
         packed: Option<Arc<Kernels>>,
@@ -64,26 +64,23 @@ impl Mlp {
             );
         }
         if !self.is_fast(weights) {
-            return if layers.norm {
-                self.plain_forward(weights, &x)
-            } else {
-                self.composed_forward(weights, &x)
+            return match layers.norm {
+                true => self.plain_forward(weights, &x),
+                false => self.composed_forward(weights, &x),
             };
         }
-        let kept = if values.track_op() { weights.kept_gradient().cloned() } else { None };
+        let buffer = if values.track_op() { weights.gradient_buffer().cloned() } else { None };
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
         let constant = inputs
             .iter()
             .take_while(|input| !input.track_op())
             .map(|input| input.dim(1))
             .sum::<Result<_>>()?;
-        values.apply_op2(
-            &x.contiguous()?,
-            Operation { mlp: self.clone(), kept, saved, packed, constant },
-        )
+        let operation = Operation { mlp: self.clone(), buffer, saved, packed, constant };
+        values.apply_op2(&x.contiguous()?, operation)
     }
 
-    /// Whether the fast implementation serves them.
+    /// True if the fast implementation runs these weights.
     pub fn is_fast(&self, weights: &Weights) -> bool {
         has_fast_implementation(weights.values().device())
     }
@@ -94,8 +91,7 @@ impl Mlp {
         if differentiable { weights.values().apply_op2(x, Composed(pass)) } else { Ok(pass.out) }
     }
 
-    /// [`Self::forward`] in plain candle operations; here each member may have inputs of its own,
-    /// `[K, rows, in]`.
+    /// [`Self::forward`] in candle's operations, also for inputs of each member, `[K, rows, in]`.
     pub fn plain_forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
         let tensors = weights.layout().split(weights.values(), "")?;
         let x = if x.rank() == 2 { x.unsqueeze(0)? } else { x.clone() };
@@ -106,7 +102,7 @@ impl Mlp {
         Network { weights, layers: &self.layers, member, packed: None }
     }
 
-    /// Forward of plain rows, nothing kept: `K × rows × out`.
+    /// A forward pass without gradients: `x`, `rows × in` → `out`, `K × rows × out`.
     pub fn run(&self, weights: &[f32], packed: Option<&Kernels>, x: &[f32], out: &mut [f32]) {
         let (inputs, outputs) = (self.layers.inputs(), self.layers.outputs());
         let rows = out.len() / (self.layers.members * outputs);
@@ -119,28 +115,59 @@ impl Mlp {
                     work.with_base(x.len() / inputs * network.width(), 0, |base, _, work| {
                         network.first_part(x, inputs, base);
                         let shift = network.bias(0);
-                        network.forward(
-                            Input { base, repeat: 1, shift, actions: &[], kernel: &[] },
-                            work,
-                            out,
-                        );
+                        let input = Input { base, repeat: 1, shift, actions: &[], kernel: &[] };
+                        network.forward(input, work, out);
                     });
                 });
             });
         });
+    }
+
+    /// ∇_a Q of networks of [s, a] with one output, `K × rows × a`, for equally many rows of
+    /// actions per state. Each tile of rows goes forward and back while its activations are in a
+    /// core's cache.
+    pub fn action_gradients(
+        &self,
+        weights: &[f32],
+        (observations, states): (&[f32], usize),
+        (actions, rows): (&[f32], usize),
+    ) -> Vec<f32> {
+        let (o, a, repeat) = (observations.len() / states, actions.len() / rows, rows / states);
+        let mut out = vec![0.0; self.layers.members * rows * a];
+        out.par_chunks_mut(rows * a).enumerate().for_each(|(member, out)| {
+            let network = self.network(weights, member);
+            out.par_chunks_mut(TILE * a).enumerate().for_each(|(i, out)| {
+                let count = out.len() / a;
+                let mut x = Vec::with_capacity(count * (o + a)); // [s, a]
+                for row in i * TILE..i * TILE + count {
+                    x.extend_from_slice(&observations[row / repeat * o..][..o]);
+                    x.extend_from_slice(&actions[row * a..][..a]);
+                }
+                with_workspace(|work| {
+                    work.with_activations(count, &self.layers, |saved, work| {
+                        let mut values = vec![0.0; count];
+                        network.forward_saving(&x, saved, work, &mut values);
+                        values.fill(1.0);
+                        network.backward(&values, saved, work);
+                        network.input_gradient(saved.slope[0], (o, a), out);
+                    });
+                });
+            });
+        });
+        out
     }
 }
 
 /// The custom operation of (weights, inputs).
 struct Operation {
     mlp: Mlp,
-    /// Where the weights' gradient is left, if there is to be one.
-    kept: Option<Arc<KeptGradient>>,
-    /// What the forward pass keeps for the backward pass, if there is to be one.
-    saved: Option<Lent<SavedActivations>>,
-    /// What the products between hidden layers use, if nothing is kept.
+    /// Memory for the weights' gradient, if it is taken.
+    buffer: Option<Arc<GradientBuffer>>,
+    /// Activations for the backward pass, if there is one.
+    saved: Option<Pooled<SavedActivations>>,
+    /// Kernels for a forward pass without gradients.
     packed: Option<Arc<Kernels>>,
-    /// How many of the inputs, the first ones, get no gradient.
+    /// Number of leading inputs without gradient.
     constant: usize,
 }
 
@@ -149,13 +176,11 @@ impl Operation {
         &self,
         weights: &[f32],
         x: &[f32],
-        lent: &Lent<SavedActivations>,
+        saved: &mut SavedActivations,
         out: &mut [f32],
     ) {
         let layers = &self.mlp.layers;
-        let rows = out.len() / (layers.members * layers.outputs());
-        let mut saved = lent.lock();
-        saved.resize(layers, rows);
+        saved.resize(layers, out.len() / (layers.members * layers.outputs()));
         saved.tiles(out).into_par_iter().for_each(|mut tile| {
             let x = rows_of(x, tile.index * TILE, TILE, layers.inputs());
             let network = self.mlp.network(weights, tile.member);
@@ -163,8 +188,7 @@ impl Operation {
         });
     }
 
-    /// Leaves the weights' gradient where it is kept, and gives that of the inputs, if there is to
-    /// be one.
+    /// Writes the weights' gradient to the buffer and returns that of the inputs, if it is taken.
     fn backward(
         &self,
         weights: &[f32],
@@ -175,13 +199,13 @@ impl Operation {
         let layers = &self.mlp.layers;
         let (members, inputs) = (layers.members, layers.inputs());
         let rows = gradient.len() / (members * layers.outputs());
-        // The copy is cut up; the other is read as a whole.
+        // A copy, since tiles are mutable.
         saved.tiles(&mut gradient.to_vec()).into_par_iter().for_each(|mut tile| {
             let network = self.mlp.network(weights, tile.member);
             with_workspace(|work| network.backward(tile.out, &mut tile.activations, work));
         });
-        if let Some(kept) = &self.kept {
-            kept.write(layers.range(), |out| {
+        if let Some(buffer) = &self.buffer {
+            buffer.write(layers.range(), |out| {
                 saved.weight_gradients(layers.split_mut(out), x, gradient)
             })?;
         }
@@ -221,7 +245,7 @@ impl CustomOp2 for Operation {
         let rows = x_layout.dims()[0];
         let mut out = vec![0.0; members * rows * outputs];
         match &self.saved {
-            Some(saved) => self.forward_saving(weights, x, saved, &mut out),
+            Some(saved) => self.forward_saving(weights, x, &mut saved.lock(), &mut out),
             None => self.mlp.run(weights, self.packed.as_deref(), x, &mut out),
         }
         Ok((CpuStorage::F32(out), (members, rows, outputs).into()))
@@ -236,13 +260,10 @@ impl CustomOp2 for Operation {
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let Some(saved) = &self.saved else { return Ok((None, None)) };
         let (x, gradient) = (x.contiguous()?, gradient.contiguous()?);
-        let of_input = {
-            let held = [weights, &x, &gradient].map(Tensor::storage_and_layout);
-            let [w, input, g] = held.each_ref().map(|(storage, layout)| on_cpu(storage, layout));
-            self.backward(w?, input?, g?, &mut saved.lock())?
-        };
-        let of_input =
-            of_input.map(|numbers| Tensor::from_vec(numbers, x.shape(), x.device())).transpose()?;
-        Ok((None, of_input))
+        let of_input = read_all([weights, &x, &gradient], |[weights, x, gradient]| {
+            self.backward(weights, x, gradient, &mut saved.lock())
+        })??;
+        let tensor = |numbers| Tensor::from_vec(numbers, x.shape(), x.device());
+        Ok((None, of_input.map(tensor).transpose()?))
     }
 }

@@ -1,13 +1,20 @@
-//! Fully connected networks: K of them as one operation, on a CPU, on a GPU and plainly.
+//! Fully connected networks act(x·W + b), K of one shape side by side.
 
-pub(crate) mod action_gradients;
+/// Few operations for a GPU, with a backward pass written out.
 pub(crate) mod composed;
+/// Hidden layers in a configuration.
 pub(crate) mod config;
+/// Offsets of the layers in the vector of weights.
 pub(crate) mod flat;
+/// The networks: dispatch between implementations, and candle's custom operation for the CPU.
 pub(crate) mod mlp;
+/// One network on one tile of rows.
 pub(crate) mod network;
-pub(crate) mod operation;
+/// Kernels packed for products.
 pub(crate) mod packed;
+/// Candle's own operations.
 pub(crate) mod plain;
+/// Activations saved for the backward pass.
 pub(crate) mod saved;
+/// Buffers of a thread.
 pub(crate) mod workspace;

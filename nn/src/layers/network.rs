@@ -1,9 +1,7 @@
-//! One network on one tile of rows: hidden layers with a norm, if they have one, and an activation
-//! each, and a linear output; forward and backward.
+//! One network on one tile of rows, forward and backward.
 //!
-//! Forward passes that nothing is kept of take the first layer apart: the state's part is computed
-//! once per state, whatever number of actions is tried in it, and the action's few columns are
-//! fused with the activation.
+//! Forward passes without gradients split the first layer: the state's part is computed once per
+//! state for all its actions, and the action's few columns are fused with the activation.
 
 use crate::layers::flat::{Layers, TILE};
 use crate::layers::workspace::{Activations, Workspace};
@@ -11,36 +9,36 @@ use crate::precision::Precision;
 use quad_kernels::Buffer;
 use quad_kernels::activation::{activate, activate_with_slope, multiply};
 use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
-use quad_kernels::norm::{kept, normalize, normalize_backward, shift_rows};
+use quad_kernels::norm::{normalize, normalize_backward, saved_len, shift_rows};
 use quad_kernels::product::{Packed, product, product_transposed};
 
-/// Rows of a tile that are worked on together in a task whose products are rounded: these are so
-/// fast that activations must be in the nearest cache.
+/// Rows of a block in bfloat16, whose products are so fast that activations must be in the nearest
+/// cache.
 const BLOCK: usize = 32;
-/// Most inputs whose gradients are sums of products, one by one.
+/// Largest number of inputs whose gradients are dot products, one by one.
 const NARROW: usize = 16;
 
-/// One member of the networks in a vector of weights.
+/// One member of an ensemble.
 #[derive(Clone, Copy)]
 pub(crate) struct Network<'a> {
     pub weights: &'a [f32],
     pub layers: &'a Layers,
     pub member: usize,
-    /// The kernels between hidden layers as their products read them, if they were packed.
+    /// Packed kernels between hidden layers.
     pub packed: Option<&'a [Packed]>,
 }
 
-/// What a tile of rows is fed: `repeat` consecutive rows share a row of `base`.
+/// Inputs of a tile: `repeat` consecutive rows share a row of `base`.
 #[derive(Clone, Copy)]
 pub(crate) struct Input<'a> {
-    /// State part of the first pre-activation, from [`Network::first_part`].
+    /// State part of the first pre-activation ([`Network::first_part`]).
     pub base: &'a [f32],
     pub repeat: usize,
-    /// Added to each row of the first pre-activation (bias and all else that the tile shares).
+    /// Bias, and a time embedding's part, of each row.
     pub shift: &'a [f32],
-    /// `rows × a`, behind the state among the inputs; a may be 0.
+    /// `rows × a`; a can be 0.
     pub actions: &'a [f32],
-    /// The first kernel's rows that multiply them: `a × width`.
+    /// The first kernel's rows for the actions, `a × width`.
     pub kernel: &'a [f32],
 }
 
@@ -53,12 +51,10 @@ impl<'a> Network<'a> {
         self.layers.bias(self.weights, layer, self.member)
     }
 
-    /// Scale and shift of a layer's norm, if it has one.
     fn norm(&self, layer: usize) -> Option<[&'a [f32]; 2]> {
         self.layers.norm(self.weights, layer, self.member)
     }
 
-    /// The last layer's number.
     fn last(&self) -> usize {
         self.layers.count() - 1
     }
@@ -68,18 +64,18 @@ impl<'a> Network<'a> {
         self.layers.shape(0).1
     }
 
-    /// Rows of the first kernel, those that multiply some of the inputs.
+    /// The first kernel's rows for inputs `from..from + count`.
     pub fn first_kernel(&self, from: usize, count: usize) -> &'a [f32] {
         let width = self.width();
         &self.kernel(0)[from * width..(from + count) * width]
     }
 
-    /// `out[states × width] = x · kernel`, for the first `inputs` of the inputs, without the bias.
+    /// `out[states × width] = x · kernel` for the first `inputs` inputs, without the bias.
     pub fn first_part(&self, x: &[f32], inputs: usize, out: &mut [f32]) {
         product(x, self.first_kernel(0, inputs), out, inputs, self.width());
     }
 
-    /// The output layer's kernel as `outputs × width`.
+    /// The transposed kernel of the output layer, `outputs × width`.
     fn output_rows<'b>(&self, transposed: &'b mut Buffer) -> &'b [f32]
     where
         'a: 'b,
@@ -97,7 +93,7 @@ impl<'a> Network<'a> {
         rows
     }
 
-    /// The kernels between hidden layers, packed; `None` where products are as fast without.
+    /// Packs the kernels between hidden layers; `None` where packing gains nothing.
     pub fn pack(&self, precision: Precision) -> Option<Vec<Packed>> {
         let pack = |layer| {
             let (kernel, (inputs, outputs)) = (self.kernel(layer), self.layers.shape(layer));
@@ -131,14 +127,14 @@ impl<'a> Network<'a> {
             match self.norm(0) {
                 Some([scale, shift]) if !self.layers.norm_after => {
                     first_layer(None, &first, out_of_first);
-                    let room = work.not_kept.sized(kept(count, width));
-                    normalize(out_of_first, None, scale, self.layers.epsilon(), room);
+                    let saved = work.norm_scratch.sized(saved_len(count, width));
+                    normalize(out_of_first, None, scale, self.layers.epsilon(), saved);
                     activate(self.layers.activation, out_of_first, shift);
                 }
                 _ => {
                     first_layer(Some(self.layers.activation), &first, out_of_first);
                     self.normalize_after(0, out_of_first, || {
-                        work.not_kept.sized(kept(count, width))
+                        work.norm_scratch.sized(saved_len(count, width))
                     });
                 }
             }
@@ -150,9 +146,10 @@ impl<'a> Network<'a> {
                     Some(kernels) => kernels[layer - 1].product(x, y),
                     None => product(x, self.kernel(layer), y, inputs, width),
                 }
-                let bias = self.normalize(layer, y, || work.not_kept.sized(kept(count, width)));
+                let bias =
+                    self.normalize(layer, y, || work.norm_scratch.sized(saved_len(count, width)));
                 activate(self.layers.activation, y, bias);
-                self.normalize_after(layer, y, || work.not_kept.sized(kept(count, width)));
+                self.normalize_after(layer, y, || work.norm_scratch.sized(saved_len(count, width)));
             }
             let width = self.layers.shape(last).0;
             let x = if last % 2 == 1 { &mut *x } else { &mut *y };
@@ -160,75 +157,70 @@ impl<'a> Network<'a> {
         }
     }
 
-    /// `forward` of whole rows `rows × inputs` that leaves activations and slopes behind for
-    /// `backward`.
+    /// [`Self::forward`] of rows `rows × inputs` that saves activations and slopes for
+    /// [`Self::backward`].
     pub fn forward_saving(
         &self,
         input: &[f32],
-        left: &mut Activations<'_>,
+        saved: &mut Activations<'_>,
         work: &mut Workspace,
         out: &mut [f32],
     ) {
         let last = self.last();
         for layer in 0..last {
             let (inputs, width) = self.layers.shape(layer);
-            let (before, here) = left.x.split_at_mut(layer);
+            let (before, here) = saved.x.split_at_mut(layer);
             let x = before.last().map_or(input, |x| &**x);
             product(x, self.kernel(layer), here[0], inputs, width);
-            let bias = self.normalize(layer, here[0], || left.norm[layer]);
-            activate_with_slope(self.layers.activation, here[0], bias, left.slope[layer]);
-            self.normalize_after(layer, here[0], || left.norm[layer]);
+            let bias = self.normalize(layer, here[0], || saved.norm[layer]);
+            activate_with_slope(self.layers.activation, here[0], bias, saved.slope[layer]);
+            self.normalize_after(layer, here[0], || saved.norm[layer]);
         }
-        dots(
-            left.x[last - 1],
-            self.output_rows(&mut work.output),
-            self.bias(last),
-            out,
-            self.layers.shape(last).0,
-        );
+        let (output, width) = (self.output_rows(&mut work.output), self.layers.shape(last).0);
+        dots(saved.x[last - 1], output, self.bias(last), out, width);
     }
 
-    /// Adds the bias of a layer that has a norm before its activation, and normalizes. Gives what
-    /// is to be added before the activation.
+    /// Adds the bias and normalizes, if the layer has a norm before its activation. Returns the
+    /// vector that is then added: the norm's shift, or the bias.
     fn normalize<'b>(
         &self,
         layer: usize,
         x: &mut [f32],
-        keep: impl FnOnce() -> &'b mut [f32],
+        saved: impl FnOnce() -> &'b mut [f32],
     ) -> &'a [f32] {
         let bias = self.bias(layer);
         match self.norm(layer) {
             Some([scale, shift]) if !self.layers.norm_after => {
-                normalize(x, Some(bias), scale, self.layers.epsilon(), keep());
+                normalize(x, Some(bias), scale, self.layers.epsilon(), saved());
                 shift
             }
             _ => bias,
         }
     }
 
-    /// Normalizes what follows the activation of a layer that has a norm there.
+    /// Normalizes after the activation, if the layer has its norm there.
     fn normalize_after<'b>(
         &self,
         layer: usize,
         x: &mut [f32],
-        keep: impl FnOnce() -> &'b mut [f32],
+        saved: impl FnOnce() -> &'b mut [f32],
     ) {
         if let Some([scale, shift]) = self.norm(layer).filter(|_| self.layers.norm_after) {
-            normalize(x, None, scale, self.layers.epsilon(), keep());
+            normalize(x, None, scale, self.layers.epsilon(), saved());
             shift_rows(x, shift);
         }
     }
 
-    /// Turns the slopes of a tile into the gradients δ before each activation and norm, given that
-    /// of the output.
+    /// Turns the saved slopes into the gradients δ before each activation and norm, given the
+    /// output's gradient.
     pub fn backward(
         &self,
         output_gradient: &[f32],
-        left: &mut Activations<'_>,
+        saved: &mut Activations<'_>,
         work: &mut Workspace,
     ) {
         let last = self.last();
-        let Activations { slope, norm, .. } = left;
+        let Activations { slope, norm, .. } = saved;
         let after = self.layers.norm_after;
         let mut through_norm = |layer: usize, here: bool, delta: &mut [f32]| {
             if let Some([scale, _]) = self.norm(layer).filter(|_| here) {
@@ -259,25 +251,18 @@ impl<'a> Network<'a> {
         }
     }
 
-    /// After `backward`: the gradient of the inputs `from .. from + count`, `rows × count`.
+    /// After [`Self::backward`]: the gradient of inputs `from..from + count`, `rows × count`.
     pub fn input_gradient(&self, first: &[f32], (from, count): (usize, usize), out: &mut [f32]) {
+        let (kernel, width) = (self.first_kernel(from, count), self.width());
         match count {
             // A library's product is slow at few columns.
-            0..=NARROW => dots(
-                first,
-                self.first_kernel(from, count),
-                &[0.0; NARROW][..count],
-                out,
-                self.width(),
-            ),
-            _ => {
-                product_transposed(first, self.first_kernel(from, count), out, count, self.width())
-            }
+            0..=NARROW => dots(first, kernel, &[0.0; NARROW][..count], out, width),
+            _ => product_transposed(first, kernel, out, count, width),
         }
     }
 }
 
-/// Rows `from .. from + count` (or fewer, at the end) of a matrix with `width` columns.
+/// Rows `from..from + count`, fewer at the end, of a matrix with `width` columns.
 pub(crate) fn rows_of(matrix: &[f32], from: usize, count: usize, width: usize) -> &[f32] {
     let end = ((from + count) * width).min(matrix.len());
     &matrix[from * width..end]

@@ -1,16 +1,16 @@
-//! The networks in plain candle operations, which candle differentiates: on a GPU those with a
-//! norm, and what the others are tested against.
+//! Networks in candle's own operations, which candle differentiates: those with a norm on a GPU,
+//! and the reference of all tests.
 
 use crate::layers::flat::Layers;
 use crate::weights::Tensors;
 use candle_core::{D, Result, Tensor};
 use quad_kernels::activation::Activation;
 
-/// x·tanh(softplus(x)) as x·n/(n + 2) with n = e^x (e^x + 2). From 20 on it is x, to the last bit
-/// of f32; the bound keeps value and derivative finite everywhere (the derivative of candle's own
-/// Mish is NaN from 89 on).
+/// x·tanh(softplus(x)) as x·n/(n + 2) with n = e^x (e^x + 2). From 20 on it is x to the last bit of
+/// f32; the bound keeps value and derivative finite (the derivative of candle's Mish is NaN from 89
+/// on).
 pub(crate) fn mish(x: &Tensor) -> Result<Tensor> {
-    // As a tensor, not a number: that would be sent to the device each time.
+    // A tensor, since candle would send a number to the device each time.
     let e = x.minimum(&Tensor::full(20f32, x.shape(), x.device())?)?.exp()?;
     let n = (&e * (&e + 2.0)?)?;
     x * (&n / (&n + 2.0)?)?
@@ -19,7 +19,7 @@ pub(crate) fn mish(x: &Tensor) -> Result<Tensor> {
 pub(crate) fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     match f {
         Activation::Mish => mish(x),
-        // A maximum would drop a NaN; zero times x lets none get lost.
+        // A maximum alone would drop a NaN.
         Activation::Relu => x.relu()? + (x * 0.0)?,
         Activation::Silu => x.silu(),
         Activation::Tanh => x.tanh(),
@@ -27,8 +27,8 @@ pub(crate) fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     }
 }
 
-/// Each row over its numbers: (x - mean)/√(variance + ε)·scale + shift, for `x [K, rows, width]`
-/// and `[K, 1, width]`. (candle-nn's own has no gradient, and says nothing.)
+/// (x − mean)/√(variance + ε)·scale + shift of each row, for `x [K, rows, width]`, scale and shift
+/// `[K, 1, width]`. (candle-nn's layer norm has no gradient.)
 pub(crate) fn layer_norm(
     x: &Tensor,
     scale: &Tensor,
@@ -42,8 +42,7 @@ pub(crate) fn layer_norm(
 
 /// Layers `{prefix}0 …`: `x [1 or K, rows, in]` → `[K, rows, out]`.
 pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, x: &Tensor) -> Result<Tensor> {
-    // `[K, in, out]` or `[K, 1, out]`, whether the tensors are named as members' or as one
-    // network's.
+    // `[K, in, out]` or `[K, 1, out]`
     let get = |layer: usize, kind: &str| {
         let path = format!("{prefix}{layer}.{kind}");
         let tensor =
@@ -75,7 +74,7 @@ pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, x: &Tensor) 
     Ok(x)
 }
 
-/// Each row `times` times, one after the other: `[n, w]` → `[n·times, w]`.
+/// Repeats each row: `[n, w]` → `[n·times, w]`.
 pub(crate) fn repeat_rows(x: &Tensor, times: usize) -> Result<Tensor> {
     let (rows, width) = x.dims2()?;
     if times == 1 {
@@ -85,24 +84,26 @@ pub(crate) fn repeat_rows(x: &Tensor, times: usize) -> Result<Tensor> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use crate::testing::assert_close;
     use candle_core::Device;
 
-    /// Rows of variance 1e-6, in which it shows what is added to it.
+    /// The variance of these rows is 1e-6, so that ε shows.
     #[test]
-    fn a_norm_divides_by_the_root_of_the_variance_and_what_it_adds() {
-        let x = Tensor::new(&[[[5.001f32, 4.999]]], &Device::Cpu).unwrap();
-        let one = |x: f32| Tensor::full(x, (1, 1, 2), &Device::Cpu).unwrap();
-        for (epsilon, expected) in [(1e-6, 0.5f64.sqrt()), (1e-5, (1.0 / 11.0f64).sqrt())] {
-            let y = layer_norm(&x, &one(2.0), &one(0.5), epsilon).unwrap();
-            let y: Vec<f32> = y.flatten_all().unwrap().to_vec1().unwrap();
-            let expected = [0.5 + 2.0 * expected, 0.5 - 2.0 * expected];
-            assert!(
-                y.iter().zip(expected).all(|(y, x)| (f64::from(*y) - x).abs() < 1e-3),
-                "{y:?} {expected:?}"
+    fn layer_norm_matches_its_definition() -> Result<()> {
+        let x = Tensor::new(&[[[5.001f32, 4.999]]], &Device::Cpu)?;
+        let one = |x: f32| Tensor::full(x, (1, 1, 2), &Device::Cpu);
+        for (epsilon, expected) in [(1e-6, 0.5f32.sqrt()), (1e-5, (1.0 / 11f32).sqrt())] {
+            let y = layer_norm(&x, &one(2.0)?, &one(0.5)?, epsilon)?;
+            let expected = [[[0.5 + 2.0 * expected, 0.5 - 2.0 * expected]]];
+            let difference = (y - Tensor::new(&expected, &Device::Cpu)?)?.abs()?;
+            assert_close(
+                "norm",
+                &(difference * 1e-2)?,
+                &Tensor::zeros((1, 1, 2), x.dtype(), x.device())?,
             );
         }
+        Ok(())
     }
 }

@@ -1,31 +1,30 @@
-//! What a forward pass leaves behind for its backward pass, and the weights' gradient made of it.
+//! Activations saved by a forward pass, and the weights' gradient computed from them.
 
 use crate::layers::flat::{LayerMut, Layers, TILE};
 use crate::layers::workspace::Activations;
 use quad_kernels::Buffer;
 use quad_kernels::activation::column_sums;
-use quad_kernels::norm::kept;
+use quad_kernels::norm::saved_len;
 use quad_kernels::product::outer_rows;
 use rayon::prelude::*;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Activations of all hidden layers of all members, and their slopes, each `members × rows ×
-/// width`; on the backward pass the gradients before the activations take the slopes' place.
+/// Activations and slopes of the hidden layers, each `K × rows × width`; the backward pass replaces
+/// the slopes by the gradients before the activations.
 #[derive(Default)]
 pub(crate) struct SavedActivations {
     x: Vec<Buffer>,
     slope: Vec<Buffer>,
-    /// What norms keep, tile after tile as if each were full; none without a norm.
+    /// Saved by norms, for full tiles one after the other; empty without a norm.
     norm: Vec<Buffer>,
     widths: Vec<usize>,
     members: usize,
     rows: usize,
 }
 
-/// A tile of some rows of one member.
+/// Some rows of one member.
 pub(crate) struct Tile<'a> {
     pub member: usize,
-    /// Place among the member's tiles.
+    /// Index among the member's tiles.
     pub index: usize,
     pub activations: Activations<'a>,
     /// `rows × outputs`.
@@ -33,7 +32,7 @@ pub(crate) struct Tile<'a> {
 }
 
 impl SavedActivations {
-    /// Makes room.
+    /// Prepares for a forward pass of this many rows.
     pub fn resize(&mut self, layers: &Layers, rows: usize) {
         (self.widths, self.members, self.rows) = (layers.hidden().to_vec(), layers.members, rows);
         self.x.resize_with(self.widths.len(), Buffer::default);
@@ -41,7 +40,7 @@ impl SavedActivations {
         self.norm.resize_with(if layers.norm { self.widths.len() } else { 0 }, Buffer::default);
     }
 
-    /// Cuts everything into tiles, beside `out`, which is `members × rows × outputs`.
+    /// Splits the activations and `out`, `K × rows × outputs`, into tiles.
     pub fn tiles<'a>(&'a mut self, out: &'a mut [f32]) -> Vec<Tile<'a>> {
         let (members, rows) = (self.members, self.rows);
         let cut = |all: &'a mut [f32]| {
@@ -64,13 +63,13 @@ impl SavedActivations {
             }
         }
         for (layer, (norm, width)) in self.norm.iter_mut().zip(&self.widths).enumerate() {
-            let full = kept(TILE, *width);
+            let full = saved_len(TILE, *width);
             for (tile, norm) in tiles
                 .iter_mut()
                 .zip(norm.sized(members * each_member * full).chunks_exact_mut(full))
             {
                 let rows = tile.activations.x[layer].len() / width;
-                tile.activations.norm.push(&mut norm[..kept(rows, *width)]);
+                tile.activations.norm.push(&mut norm[..saved_len(rows, *width)]);
             }
         }
         tiles
@@ -81,13 +80,13 @@ impl SavedActivations {
         &buffer.first(self.members * len)[member * len..][..len]
     }
 
-    /// The gradient before a member's first activation, `rows × width`, after the backward pass.
+    /// After the backward pass: the gradient before a member's first activation, `rows × width`.
     pub fn first_delta(&self, member: usize) -> &[f32] {
         self.of_member(&self.slope[0], 0, member)
     }
 
-    /// After the backward pass: the gradients of these layers. `input` is `rows × inputs`,
-    /// `output_gradient` `members × rows × outputs`.
+    /// After the backward pass: writes the gradients of all layers. `input` is `rows × inputs`,
+    /// `output_gradient` `K × rows × outputs`.
     pub fn weight_gradients(
         &self,
         layers: Vec<LayerMut<'_>>,
@@ -105,68 +104,26 @@ impl SavedActivations {
                 None => &output_gradient[member * self.rows * columns..][..self.rows * columns],
             };
             let inputs = kernel.len() / columns;
-            // One network alone would leave threads idle.
+            // A single network is split, for all threads to work.
             let rows = if self.members == 1 { inputs.min(TILE) } else { inputs };
             kernel.par_chunks_mut(rows * columns).enumerate().for_each(|(i, kernel)| {
                 outer_rows(x, gradient, kernel, (i * rows, inputs), columns);
             });
             column_sums(gradient, bias);
             for (i, out) in norm.into_iter().flatten().enumerate() {
-                self.add_up_norms(layer, member, i, out);
+                self.sum_over_tiles(layer, member, i, out);
             }
         });
     }
 
-    /// The gradient of a norm's scales (0) or shifts (1), of which each tile has a part.
-    fn add_up_norms(&self, layer: usize, member: usize, which: usize, out: &mut [f32]) {
-        let (tiles, full, width) = (self.rows.div_ceil(TILE), kept(TILE, out.len()), out.len());
-        let kept = self.norm[layer].first(self.members * tiles * full);
+    /// The gradient of a norm's scales (0) or shifts (1): the sum of the tiles' parts.
+    fn sum_over_tiles(&self, layer: usize, member: usize, which: usize, out: &mut [f32]) {
+        let (tiles, full, width) =
+            (self.rows.div_ceil(TILE), saved_len(TILE, out.len()), out.len());
+        let saved = self.norm[layer].first(self.members * tiles * full);
         out.fill(0.0);
-        for tile in kept[member * tiles * full..][..tiles * full].chunks_exact(full) {
+        for tile in saved[member * tiles * full..][..tiles * full].chunks_exact(full) {
             out.iter_mut().zip(&tile[which * width..]).for_each(|(sum, x)| *sum += x);
         }
-    }
-}
-
-/// Memory that is used again: fresh memory of such sizes would cost as much as the arithmetic.
-pub(crate) struct Pool<T>(Arc<Mutex<Vec<T>>>);
-
-impl<T> Default for Pool<T> {
-    fn default() -> Self {
-        Self(Arc::default())
-    }
-}
-
-impl<T> Clone for Pool<T> {
-    fn clone(&self) -> Self {
-        Self(self.0.clone())
-    }
-}
-
-impl<T: Default> Pool<T> {
-    /// One that is lent until it is dropped.
-    pub fn lend(&self) -> Lent<T> {
-        let lent = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
-        Lent { lent: Mutex::new(lent), home: self.clone() }
-    }
-}
-
-/// What a pool has lent.
-pub(crate) struct Lent<T: Default> {
-    lent: Mutex<T>,
-    home: Pool<T>,
-}
-
-impl<T: Default> Lent<T> {
-    /// Access to it, of one at a time.
-    pub fn lock(&self) -> MutexGuard<'_, T> {
-        self.lent.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl<T: Default> Drop for Lent<T> {
-    fn drop(&mut self) {
-        let lent = std::mem::take(self.lent.get_mut().unwrap_or_else(PoisonError::into_inner));
-        self.home.0.lock().unwrap_or_else(PoisonError::into_inner).push(lent);
     }
 }

@@ -1,20 +1,20 @@
-//! Buffers that a thread keeps from one tile of rows to the next.
+//! Buffers of a thread, reused from tile to tile.
 
 use crate::layers::flat::Layers;
 use quad_kernels::Buffer;
-use quad_kernels::norm::kept;
+use quad_kernels::norm::saved_len;
 use std::cell::RefCell;
 
-/// Activations of a tile's hidden layers, and their slopes; on the backward pass the gradients
-/// before the activations.
+/// Activations and slopes of a tile's hidden layers; the backward pass replaces the slopes by the
+/// gradients before the activations.
 pub(crate) struct Activations<'a> {
     pub x: Vec<&'a mut [f32]>,
     pub slope: Vec<&'a mut [f32]>,
-    /// What norms keep ([`quad_kernels::norm`]); empty without a norm.
+    /// Saved by norms ([`quad_kernels::norm`]); empty without a norm.
     pub norm: Vec<&'a mut [f32]>,
 }
 
-/// Buffers of one thread, grown to the largest tile it met.
+/// Buffers of one thread, as large as its largest tile.
 #[derive(Default)]
 pub(crate) struct Workspace {
     pub pair: [Buffer; 2],
@@ -22,27 +22,27 @@ pub(crate) struct Workspace {
     pub output: Buffer,
     /// State part of the first layer.
     base: Buffer,
-    /// Network output or its gradient.
+    /// Network output.
     out: Buffer,
     x: Vec<Buffer>,
     slope: Vec<Buffer>,
     norm: Vec<Buffer>,
-    /// What a norm keeps when no gradient is taken.
-    pub not_kept: Buffer,
+    /// Saved by a norm when no gradient is taken.
+    pub norm_scratch: Buffer,
 }
 
 thread_local! {
     static WORKSPACE: RefCell<Workspace> = RefCell::default();
 }
 
-/// Lends the thread's workspace. Not re-entrant: a task that holds it must not start others.
+/// Runs `work` with the thread's workspace. Not re-entrant: `work` must not start other tasks.
 pub(crate) fn with_workspace<R>(work: impl FnOnce(&mut Workspace) -> R) -> R {
     WORKSPACE.with_borrow_mut(work)
 }
 
 impl Workspace {
-    /// Lends the buffer of the state part, `len` numbers, and that of the output, `out` numbers,
-    /// beside the others.
+    /// Runs `work` with the buffers of the state part, `len` numbers, and of the output, `out`
+    /// numbers.
     pub fn with_base<R>(
         &mut self,
         len: usize,
@@ -56,32 +56,33 @@ impl Workspace {
         result
     }
 
-    /// Lends room for the activations of `rows` rows, for a tile whose gradients are taken at once.
+    /// Runs `work` with room for the activations of `rows` rows.
     pub fn with_activations<R>(
         &mut self,
         rows: usize,
         layers: &Layers,
         work: impl FnOnce(&mut Activations<'_>, &mut Self) -> R,
     ) -> R {
+        /// One buffer for each width, `len(width)` numbers long.
+        fn sized<'a>(
+            buffers: &'a mut Vec<Buffer>,
+            widths: &[usize],
+            len: impl Fn(usize) -> usize,
+        ) -> Vec<&'a mut [f32]> {
+            buffers.resize_with(widths.len().max(buffers.len()), Buffer::default);
+            buffers
+                .iter_mut()
+                .zip(widths)
+                .map(|(buffer, width)| buffer.sized(len(*width)))
+                .collect()
+        }
         let mut all = [&mut self.x, &mut self.slope, &mut self.norm].map(std::mem::take);
-        let widths = layers.hidden();
-        all.iter_mut().for_each(|buffers| {
-            buffers.resize_with(widths.len().max(buffers.len()), Buffer::default)
-        });
         let [x, slope, norm] = &mut all;
+        let widths = layers.hidden();
         let normed = if layers.norm { widths } else { &[] };
-        let x =
-            x.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
-        let slope = slope
-            .iter_mut()
-            .zip(widths)
-            .map(|(buffer, width)| buffer.sized(rows * width))
-            .collect();
-        let norm = norm
-            .iter_mut()
-            .zip(normed)
-            .map(|(buffer, width)| buffer.sized(kept(rows, *width)))
-            .collect();
+        let (x, slope) =
+            (sized(x, widths, |width| rows * width), sized(slope, widths, |width| rows * width));
+        let norm = sized(norm, normed, |width| saved_len(rows, width));
         let result = work(&mut Activations { x, slope, norm }, self);
         [self.x, self.slope, self.norm] = all;
         result

@@ -1,6 +1,6 @@
-//! SfBC's score network and the DPM-Solver that samples it.
+//! SfBC's score network and the DPM-Solver that samples from it.
 
-pub(crate) mod dense;
-pub(crate) mod dense_graph;
+mod dense;
+mod dense_graph;
 pub(crate) mod dpm_solver;
 pub(crate) mod network;

@@ -1,59 +1,58 @@
-//! Networks over windows of consecutive steps: their configuration, and the named tensors of their
-//! layers.
+//! Configuration of Diffuser's networks, and the named tensors of their layers.
 
 use crate::error::MAX_DIM;
 use crate::weights::{Init, Layout, TensorSpec};
 use serde::{Deserialize, Serialize};
 
-/// Taps of a block's convolutions.
+/// Kernel size of a block's convolutions.
 const TAPS: usize = 5;
-/// Most levels that are believed.
+/// Largest number of levels.
 const MOST_LEVELS: usize = 8;
-/// Longest window that is believed.
+/// Longest trajectory.
 const MOST_STEPS: usize = 1000;
 
-/// The networks over windows of a planner (Janner et al. 2022), as a configuration or a policy's
-/// file has them.
+/// Diffuser's networks over trajectories (Janner et al. 2022), as in a configuration or a policy's
+/// file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrajectoryConfig {
-    /// Steps in a window, H.
+    /// Steps of a trajectory, H.
     pub horizon: usize,
-    /// Numbers of the embedding of a denoising step, and what `multipliers` multiply.
+    /// Channels of the first level, before its multiplier, and length of the embedding of a denoising
+    /// step.
     pub channels: usize,
-    /// Channels of each level, in multiples of `channels`. A level has half as many steps as the
-    /// one before.
+    /// Channels of each level, in multiples of `channels`. Each level halves the steps.
     pub multipliers: Vec<usize>,
-    /// Groups of channels whose numbers are normed together.
+    /// Groups of the group norms.
     pub groups: usize,
-    /// The attention behind each level of the model, if there is one; the value network has none.
+    /// Attention after each level of the model; the value network has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attention: Option<Attention>,
 }
 
-/// Linear attention between the steps of a window.
+/// Linear attention between the steps of a trajectory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Attention {
-    /// Heads.
+    /// Number of heads.
     pub heads: usize,
-    /// Numbers in a query of a head.
+    /// Length of a query.
     pub width: usize,
 }
 
-/// A number of a window's networks that is out of range.
+/// A number of the configuration that is out of range.
 #[derive(Debug, PartialEq, Eq)]
 pub struct TrajectoryError {
-    /// Its name.
+    /// Name of the number.
     pub field: &'static str,
     /// The number.
     pub value: usize,
-    /// What it must be.
+    /// Allowed range.
     pub range: &'static str,
 }
 
 impl TrajectoryConfig {
-    /// Checks that there are such networks.
+    /// Checks all numbers.
     ///
     /// # Errors
     /// The first number that is out of range.
@@ -67,38 +66,23 @@ impl TrajectoryConfig {
         is("groups", groups, (1..=MAX_DIM).contains(&groups), "from 1 to 65535")?;
         let even = (4..=MAX_DIM).contains(&channels) && channels.is_multiple_of(2);
         is("channels", channels, even, "an even number from 4 to 65535")?;
-        let (halves, most) = (1 << (levels - 1), (1..=MOST_STEPS).contains(&horizon));
-        is(
-            "horizon",
-            horizon,
-            most && horizon.is_multiple_of(halves),
-            "from 1 to 1000 and halved once for each further level",
-        )?;
+        let halves = horizon.is_multiple_of(1 << (levels - 1));
+        let holds = (1..=MOST_STEPS).contains(&horizon) && halves;
+        let range = "from 1 to 1000 and halved once for each further level";
+        is("horizon", horizon, holds, range)?;
         for multiplier in &self.multipliers {
             let wide = channels.saturating_mul(*multiplier);
             let holds = (1..=MAX_DIM).contains(&wide) && wide.is_multiple_of(groups);
-            is(
-                "multipliers",
-                *multiplier,
-                holds,
-                "such that channels times it is at most 65535 and divided by groups",
-            )?;
+            let range = "such that channels times it is at most 65535 and divided by groups";
+            is("multipliers", *multiplier, holds, range)?;
         }
         let last = self.widths().last().copied().unwrap_or_default();
-        is(
-            "multipliers",
-            last,
-            last.is_multiple_of(4 * groups),
-            "such that a quarter of the last level's channels is divided by groups",
-        )?;
-        let Attention { heads, width } = self.attention.unwrap_or(Attention { heads: 1, width: 1 });
+        let range = "such that a quarter of the last level's channels is divided by groups";
+        is("multipliers", last, last.is_multiple_of(4 * groups), range)?;
+        let Some(Attention { heads, width }) = self.attention else { return Ok(()) };
         is("heads", heads, (1..=MAX_DIM).contains(&heads), "from 1 to 65535")?;
-        is(
-            "width",
-            width,
-            (1..=MAX_DIM / heads).contains(&width),
-            "at least 1, and with the heads at most 65535",
-        )
+        let holds = (1..=MAX_DIM / heads).contains(&width);
+        is("width", width, holds, "at least 1, and with the heads at most 65535")
     }
 
     /// Channels of each level.
@@ -112,42 +96,37 @@ impl TrajectoryConfig {
     }
 }
 
-/// The named tensors of a network over windows, one layer after the other. What they begin with is
-/// PyTorch's.
-pub(crate) struct Parts {
-    parts: Vec<TensorSpec>,
-    /// Numbers of the embedding of a denoising step.
+/// The layout of a network, layer after layer, with PyTorch's initial weights.
+pub(crate) struct LayoutBuilder {
+    specs: Vec<TensorSpec>,
+    /// Length of the embedding of a denoising step.
     embedding: usize,
     attention: Option<Attention>,
 }
 
-impl Parts {
+impl LayoutBuilder {
     /// Begins with the embedding of a denoising step: `time.{0,1}`.
     pub fn new(config: &TrajectoryConfig) -> Self {
         let embedding = config.channels;
-        let mut parts = Self { parts: Vec::new(), embedding, attention: config.attention };
-        parts.linear("time.0", embedding, 4 * embedding);
-        parts.linear("time.1", 4 * embedding, embedding);
-        parts
+        let mut builder = Self { specs: Vec::new(), embedding, attention: config.attention };
+        builder.linear("time.0", embedding, 4 * embedding);
+        builder.linear("time.1", 4 * embedding, embedding);
+        builder
     }
 
-    pub fn layout(self) -> Layout {
-        Layout::new(self.parts)
+    pub fn build(self) -> Layout {
+        Layout::new(self.specs)
     }
 
-    fn add(&mut self, name: &str, kind: &str, shape: &[usize], start: Init) {
-        self.parts.push(TensorSpec {
-            name: format!("{name}.{kind}"),
-            shape: shape.to_vec(),
-            start,
-        });
+    fn add(&mut self, name: &str, kind: &str, shape: &[usize], init: Init) {
+        self.specs.push(TensorSpec::new(format!("{name}.{kind}"), shape, init));
     }
 
-    /// A kernel and a bias, of so many products in each sum.
-    fn kernel(&mut self, name: &str, shape: &[usize], outputs: usize, products: usize) {
-        let start = Init::Uniform(1.0 / (products as f32).sqrt());
-        self.add(name, "kernel", shape, start);
-        self.add(name, "bias", &[outputs], start);
+    /// A kernel and a bias; each output is a sum of `fan_in` products.
+    fn kernel(&mut self, name: &str, shape: &[usize], outputs: usize, fan_in: usize) {
+        let init = Init::Uniform(1.0 / (fan_in as f32).sqrt());
+        self.add(name, "kernel", shape, init);
+        self.add(name, "bias", &[outputs], init);
     }
 
     fn norm(&mut self, name: &str, channels: usize) {
@@ -166,8 +145,8 @@ impl Parts {
         self.norm(name, outputs);
     }
 
-    /// A residual block: two convolutions `.0` and `.1`, the step's part `.time`, and `.skip` where
-    /// widths differ.
+    /// A residual block: convolutions `.0` and `.1`, a linear map `.time` of the embedding, and
+    /// `.skip` where widths differ.
     pub fn block(&mut self, name: &str, inputs: usize, outputs: usize) {
         self.normed(&format!("{name}.0"), inputs, outputs);
         self.linear(&format!("{name}.time"), self.embedding, outputs);
@@ -187,13 +166,13 @@ impl Parts {
         self.kernel(name, &[channels, 4, channels], channels, 4 * channels);
     }
 
-    /// Attention, if the configuration has it: a layer norm, `.queries.kernel [C, 3 · heads ·
-    /// width]` without a bias for queries, keys and values, and `.out`.
+    /// Attention, if configured: a layer norm, `.queries.kernel [C, 3·heads·width]` for queries, keys
+    /// and values, and `.out`.
     pub fn attention(&mut self, name: &str, channels: usize) {
         let Some(Attention { heads, width }) = self.attention else { return };
         self.norm(name, channels);
-        let start = Init::Uniform(1.0 / (channels as f32).sqrt());
-        self.add(name, "queries.kernel", &[channels, 3 * heads * width], start);
+        let init = Init::Uniform(1.0 / (channels as f32).sqrt());
+        self.add(name, "queries.kernel", &[channels, 3 * heads * width], init);
         self.linear(&format!("{name}.out"), heads * width, channels);
     }
 }
@@ -203,8 +182,9 @@ impl Parts {
 mod tests {
     use super::*;
 
-    fn refused(change: impl Fn(&mut TrajectoryConfig)) -> &'static str {
-        let mut config = TrajectoryConfig {
+    #[test]
+    fn numbers_out_of_range_are_refused() {
+        let config = TrajectoryConfig {
             horizon: 16,
             channels: 16,
             multipliers: vec![1, 2, 4],
@@ -212,27 +192,22 @@ mod tests {
             attention: None,
         };
         config.check().unwrap();
-        change(&mut config);
-        config.check().unwrap_err().field
-    }
-
-    #[test]
-    fn what_cannot_be_is_refused() {
-        assert_eq!(refused(|config| config.multipliers.clear()), "multipliers");
-        assert_eq!(refused(|config| config.multipliers = vec![1, 1]), "multipliers");
-        assert_eq!(refused(|config| config.multipliers[1] = usize::MAX), "multipliers");
-        assert_eq!(refused(|config| config.multipliers[1] = 0), "multipliers");
-        assert_eq!(refused(|config| config.groups = 0), "groups");
-        assert_eq!(refused(|config| config.channels = 7), "channels");
-        assert_eq!(refused(|config| config.horizon = 18), "horizon");
-        assert_eq!(refused(|config| config.horizon = 0), "horizon");
-        assert_eq!(
-            refused(|config| config.attention = Some(Attention { heads: 0, width: 1 })),
-            "heads"
-        );
-        assert_eq!(
-            refused(|config| config.attention = Some(Attention { heads: 2, width: usize::MAX })),
-            "width"
-        );
+        let refused = |field: &str, change: fn(&mut TrajectoryConfig)| {
+            let mut config = config.clone();
+            change(&mut config);
+            assert_eq!(config.check().unwrap_err().field, field);
+        };
+        refused("multipliers", |config| config.multipliers.clear());
+        refused("multipliers", |config| config.multipliers = vec![1, 1]);
+        refused("multipliers", |config| config.multipliers[1] = usize::MAX);
+        refused("multipliers", |config| config.multipliers[1] = 0);
+        refused("groups", |config| config.groups = 0);
+        refused("channels", |config| config.channels = 7);
+        refused("horizon", |config| config.horizon = 18);
+        refused("horizon", |config| config.horizon = 0);
+        refused("heads", |config| config.attention = Some(Attention { heads: 0, width: 1 }));
+        refused("width", |config| {
+            config.attention = Some(Attention { heads: 2, width: usize::MAX })
+        });
     }
 }

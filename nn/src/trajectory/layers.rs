@@ -1,5 +1,5 @@
-//! The layers of networks over windows `[B, L, C]`, by the names of their tensors (which `window`
-//! lists).
+//! The layers of Diffuser's networks over trajectories `[B, L, C]`, by the names of their tensors
+//! ([`LayoutBuilder`](crate::trajectory::config::LayoutBuilder)).
 
 use crate::layers::plain::{layer_norm, mish};
 use crate::trajectory::config::{Attention, TrajectoryConfig};
@@ -8,18 +8,19 @@ use crate::trajectory::group_norm::normed_mish;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Error, Result, Tensor};
 
-/// Added to the variance of attention's layer norm.
+/// Number added to the variance of attention's layer norm.
 const EPSILON: f64 = 1e-5;
 
-/// The layers of one network, and what all of them take.
+/// The layers of one network.
 pub(crate) struct Layers<'a> {
     tensors: Tensors,
     config: &'a TrajectoryConfig,
 }
 
-/// Embeddings of a denoising step for each window, `[B, 1, embedding]`: as it is, and through Mish.
+/// Embeddings of the denoising steps, `[B, 1, embedding]`.
 pub(crate) struct Time {
     pub embedding: Tensor,
+    /// Mish of the embedding.
     activated: Tensor,
 }
 
@@ -33,8 +34,8 @@ impl<'a> Layers<'a> {
         self.tensors.get(&path).ok_or_else(|| Error::CannotFindTensor { path }.bt())
     }
 
-    /// The embedding of t, in 1..=T, of each window: sines, then cosines, of (t − 1)·f_k, f_k from
-    /// 1 down to 10⁻⁴, through two layers.
+    /// The embedding of each t in 1..=T: sines, then cosines, of (t − 1)·f_k with f_k from 1 down to
+    /// 10⁻⁴, through two layers.
     pub fn time(&self, t: &[u32], device: &Device) -> Result<Time> {
         let half = self.config.channels / 2;
         let angle = |t: u32, k: usize| {
@@ -76,68 +77,33 @@ impl<'a> Layers<'a> {
         }
     }
 
-    /// Every second step of a convolution.
+    /// A convolution with stride 2.
     pub fn halve(&self, name: &str, x: &Tensor) -> Result<Tensor> {
         convolve(x, self.get(name, "kernel")?, self.get(name, "bias")?, 2)
     }
 
-    /// Twice the steps.
+    /// A transposed convolution with stride 2.
     pub fn double(&self, name: &str, x: &Tensor) -> Result<Tensor> {
         double(x, self.get(name, "kernel")?, self.get(name, "bias")?)
     }
 
-    /// x plus linear attention (Shen et al. 2021) of its layer norm, if the configuration has it:
-    /// keys are softened over the steps, and what they gather of the values is read by the queries.
+    /// x plus linear attention (Shen et al. 2021) of its layer norm, if configured: queries·softmax
+    /// over steps of keysᵀ·values.
     pub fn attend(&self, name: &str, x: &Tensor) -> Result<Tensor> {
         let Some(Attention { heads, width }) = self.config.attention else { return Ok(x.clone()) };
-        let (windows, length, _) = x.dims3()?;
+        let (batch, length, _) = x.dims3()?;
         let normed = layer_norm(x, self.get(name, "scale")?, self.get(name, "shift")?, EPSILON)?;
         let kernel = self.get(name, "queries.kernel")?;
         let none = Tensor::zeros(kernel.dim(1)?, x.dtype(), x.device())?;
         let all = convolve(&normed, &kernel.unsqueeze(0)?, &none, 1)?
-            .reshape((windows, length, 3, heads, width))?;
+            .reshape((batch, length, 3, heads, width))?;
         let part = |part: usize| all.narrow(2, part, 1)?.squeeze(2)?.transpose(1, 2)?.contiguous();
         let (queries, keys, values) = (part(0)?, part(1)?, part(2)?); // [B, heads, L, width]
         let powers = keys.broadcast_sub(&keys.max_keepdim(2)?.detach())?.exp()?;
         let keys = powers.broadcast_div(&powers.sum_keepdim(2)?)?;
         let gathered = keys.transpose(2, 3)?.contiguous()?.matmul(&values)?; // [B, heads, width, width]
-        let read = (queries.matmul(&gathered)? * (width as f64).powf(-0.5))?;
-        let read = read.transpose(1, 2)?.reshape((windows, length, heads * width))?;
-        x + self.linear(&format!("{name}.out"), &read)?
-    }
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-mod tests {
-    use super::*;
-    use crate::gradients::finite_differences::{check_gradients, random};
-
-    /// Two heads read what keys gather; the gradient is that of differences, of weights and of what
-    /// goes in.
-    #[test]
-    fn attention_has_the_gradient_of_finite_differences() {
-        let attention = Some(Attention { heads: 2, width: 3 });
-        let config = TrajectoryConfig {
-            horizon: 4,
-            channels: 4,
-            multipliers: vec![1],
-            groups: 1,
-            attention,
-        };
-        let names = ["a.scale", "a.shift", "a.queries.kernel", "a.out.kernel", "a.out.bias"];
-        let arguments = [
-            random((2, 4, 4), 0),
-            random(4, 1),
-            random(4, 2),
-            random((4, 18), 3),
-            random((6, 4), 4),
-            random(4, 5),
-        ];
-        check_gradients(&arguments, |x| {
-            let tensors =
-                names.iter().zip(&x[1..]).map(|(name, x)| (name.to_string(), x.clone())).collect();
-            Layers { tensors, config: &config }.attend("a", &x[0])
-        });
+        let out = (queries.matmul(&gathered)? * (width as f64).powf(-0.5))?;
+        let out = out.transpose(1, 2)?.reshape((batch, length, heads * width))?;
+        x + self.linear(&format!("{name}.out"), &out)?
     }
 }

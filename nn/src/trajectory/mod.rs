@@ -1,7 +1,7 @@
-//! Diffuser's networks over windows of consecutive steps.
+//! Diffuser's networks over trajectories.
 
 pub(crate) mod config;
-pub(crate) mod convolution;
-pub(crate) mod group_norm;
-pub(crate) mod layers;
+mod convolution;
+mod group_norm;
+mod layers;
 pub(crate) mod networks;

@@ -1,5 +1,4 @@
-//! Policies of a network that draws and of critics: the shapes of these, their tensors, and what
-//! loads them.
+//! Policies of an actor network that draws candidates, and critics.
 
 use crate::error::{PolicyError, check_range};
 use crate::sampling::candidates::{Actor, CandidatePolicy, Networks};
@@ -7,37 +6,31 @@ use crate::sampling::choice::Choice;
 use quad_nn::{Ensemble, EnsembleShape, MAX_DIM, MlpConfig, Precision, Tensors, Weighted};
 use serde::{Deserialize, Serialize};
 
-/// Before the names of the networks' tensors.
-const ACTOR: &str = "actor.";
-const CRITIC: &str = "critic.";
+/// Prefixes of the tensors' names.
+pub(crate) const ACTOR: &str = "actor.";
+pub(crate) const CRITIC: &str = "critic.";
 
-/// The shapes of such a policy's networks.
+/// The shapes of the networks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ActorCriticShape {
-    /// Numbers in an observation s.
+    /// Length of an observation s.
     pub observation_dim: usize,
-    /// Numbers in an action a.
+    /// Length of an action a.
     pub action_dim: usize,
-    /// The hidden layers of the network that draws.
+    /// The actor's hidden layers.
     pub actor: MlpConfig,
     /// The critics' hidden layers.
     pub critic: MlpConfig,
-    /// Ensemble size K.
+    /// Number of critics, K.
     pub critics: usize,
 }
 
 impl ActorCriticShape {
     /// Shape of the critics.
     pub fn critics(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, critics, .. } = *self;
-        EnsembleShape {
-            members: critics,
-            observation_dim,
-            action_dim,
-            layers: self.critic.clone(),
-            outputs: 1,
-        }
+        let dims = (self.observation_dim, self.action_dim);
+        EnsembleShape::critics(self.critics, dims, &self.critic)
     }
 
     /// The shape of a policy of these networks.
@@ -52,21 +45,17 @@ impl ActorCriticShape {
         }
     }
 
-    /// The tensors of a policy of these networks, as they are named in a file.
-    ///
-    /// # Errors
-    /// Candle fails.
+    /// The tensors of a policy's file.
     pub fn tensors(actor: &Ensemble, critics: &Ensemble) -> candle_core::Result<Tensors> {
         let mut tensors = actor.weights().tensors(ACTOR)?;
         tensors.extend(critics.weights().tensors(CRITIC)?);
         Ok(tensors)
     }
 
-    /// Takes the networks of a policy out of a file's tensors: one of the shape `of_actor`, of
-    /// which `actor` makes what draws, and critics.
+    /// Loads a policy, removing its tensors from `tensors`.
     pub(crate) fn load<A: Actor + 'static>(
         &self,
-        of_actor: EnsembleShape,
+        actor_shape: EnsembleShape,
         actor: fn(Ensemble) -> A,
         choice: Choice,
         tensors: &mut Tensors,
@@ -75,7 +64,7 @@ impl ActorCriticShape {
         check_range("observation_dim", self.observation_dim, MAX_DIM)?;
         check_range("action_dim", self.action_dim, MAX_DIM)?;
         check_range("critics", self.critics, MAX_DIM)?;
-        let actor = Box::new(actor(Ensemble::take(of_actor, tensors, ACTOR, precision)?));
+        let actor = Box::new(actor(Ensemble::take(actor_shape, tensors, ACTOR, precision)?));
         let critics = Ensemble::take(self.critics(), tensors, CRITIC, precision)?;
         CandidatePolicy::new(Networks { actor, critics, value: None }, choice, precision)
     }

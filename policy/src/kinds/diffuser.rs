@@ -3,26 +3,26 @@
 
 use crate::error::{PolicyError, check_numbers};
 use crate::kinds::planner::{CHUNK, DiffuserShape, Planner};
-use crate::policy::{Policy, Sampled};
+use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Choice, Rule};
 use crate::sampling::episode::EpisodeState;
 use quad_nn::{Precision, Tensors, TrajectoryModel, TrajectoryValue, Weighted, Weights, bytes};
 use std::sync::Arc;
 
-/// Before the names of the networks' tensors.
+/// Prefixes of the tensors' names.
 pub(crate) const MODEL: &str = "model.";
 pub(crate) const VALUE: &str = "value.";
 
-/// A planner, in its networks' units.
+/// Diffuser's policy.
 pub struct DiffuserPolicy {
     shape: DiffuserShape,
     choice: Choice,
-    /// Shared with those that choose in another way.
+    /// Shared with copies that have another choice.
     planner: Arc<Planner>,
 }
 
 impl DiffuserPolicy {
-    /// The tensors of a planner of these networks, as they are named in a file.
+    /// The tensors of a policy's file.
     pub fn tensors(
         model: &TrajectoryModel,
         value: &TrajectoryValue,
@@ -49,7 +49,7 @@ impl DiffuserPolicy {
         Self { shape, choice, planner }.choosing(choice)
     }
 
-    /// Makes a policy of the same networks that chooses by `choice`.
+    /// The same networks with another choice.
     fn choosing(&self, choice: Choice) -> Result<Self, PolicyError> {
         choice.check()?;
         match choice.rule {
@@ -58,8 +58,8 @@ impl DiffuserPolicy {
         }
     }
 
-    /// Plans in states with these observations. Gives the first actions of all plans, `states ×
-    /// plans × replan_every · action_dim`, and their values, `states × plans`.
+    /// Plans in some states. Returns the first actions of all plans, `states × plans × replan_every ×
+    /// action_dim`, and their values, `states × plans`.
     fn plan(
         &self,
         observations: &[f32],
@@ -79,13 +79,13 @@ impl DiffuserPolicy {
         Ok(planned)
     }
 
-    /// Numbers of the actions that are taken of a plan.
+    /// Numbers in the executed actions of a plan.
     fn taken(&self) -> usize {
         self.shape.replan_every * self.shape.action_dim
     }
 }
 
-/// The states that have no plan, with their observations side by side.
+/// The states without a plan, and their observations.
 fn without_plan<'a>(
     observations: &[f32],
     states: &'a mut [EpisodeState],
@@ -96,8 +96,7 @@ fn without_plan<'a>(
     (observations.concat(), states)
 }
 
-/// The value of the plan that a state has, and the action that comes next in it, which is then
-/// done.
+/// Removes the next action of a state's plan. Returns the plan's value and the action.
 fn next_of_plan(state: &mut EpisodeState, action_dim: usize) -> (f32, Vec<f32>) {
     let value = state.memory[0];
     let action = state.memory.drain(1..=action_dim).collect();
@@ -130,11 +129,11 @@ impl Policy for DiffuserPolicy {
 
     fn memory(&self, states: usize) -> u64 {
         let rows = states as u128 * u128::from(self.choice.candidates);
-        let window = (self.shape.network.horizon * self.shape.width()) as u128;
-        let drawn =
-            rows * (window * self.shape.diffusion_steps as u128 + 2 * self.taken() as u128 + 2);
+        let trajectory = (self.shape.network.horizon * self.shape.width()) as u128;
+        let noise = trajectory * self.shape.diffusion_steps as u128;
+        let drawn = rows * (noise + 2 * self.taken() as u128 + 2);
         let observations = 2 * (states * self.shape.observation_dim) as u128;
-        bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape.numbers())
+        bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape.floats())
     }
 
     fn noise(&self) -> Vec<usize> {
@@ -142,7 +141,7 @@ impl Policy for DiffuserPolicy {
         vec![self.shape.diffusion_steps, plans, self.shape.network.horizon, self.shape.width()]
     }
 
-    /// In a state that has a plan left, its next action; else that of a new plan.
+    /// Takes the next action of each state's plan, planning where it has none.
     fn act(
         &self,
         observations: &[f32],
@@ -156,12 +155,12 @@ impl Policy for DiffuserPolicy {
             let of_each = planned.chunks_exact(plans * taken).zip(values.chunks_exact(plans));
             for (state, (planned, values)) in planning.into_iter().zip(of_each) {
                 let chosen = self.choice.pick(values, state)?;
-                // The value, then the actions: of one plan, or the mean of some.
-                let number = |of: &dyn Fn(usize) -> f32| {
+                // The value, then the actions; the mean, where several plans are chosen.
+                let mean = |of: &dyn Fn(usize) -> f32| {
                     chosen.iter().map(|plan| of(*plan)).sum::<f32>() / chosen.len() as f32
                 };
-                state.memory.push(number(&|plan| values[plan]));
-                state.memory.extend((0..taken).map(|i| number(&|plan| planned[plan * taken + i])));
+                state.memory.push(mean(&|plan| values[plan]));
+                state.memory.extend((0..taken).map(|i| mean(&|plan| planned[plan * taken + i])));
             }
         }
         for (action, state) in actions.chunks_exact_mut(self.shape.action_dim).zip(states) {
@@ -170,13 +169,13 @@ impl Policy for DiffuserPolicy {
         Ok(())
     }
 
-    /// In a state that has a plan left, as often as there are plans its next action and the plan's
-    /// value; else the first action and the value of each new plan.
+    /// The first action and the value of each new plan. A state with a plan repeats its next action
+    /// and its value instead.
     fn sample(
         &self,
         observations: &[f32],
         states: &mut [EpisodeState],
-    ) -> Result<Sampled, PolicyError> {
+    ) -> Result<Samples, PolicyError> {
         let (plans, action_dim) = (self.choice.candidates as usize, self.shape.action_dim);
         let (lacking, mut planning) = without_plan(observations, states);
         let (planned, drawn) = match planning.is_empty() {
@@ -184,9 +183,8 @@ impl Policy for DiffuserPolicy {
             false => self.plan(&lacking, &mut planning)?,
         };
         let mut new = planned.chunks_exact(plans * self.taken()).zip(drawn.chunks_exact(plans));
-        let mut sampled = Sampled { actions: Vec::new(), values: Vec::new() };
+        let mut sampled = Samples { actions: Vec::new(), values: Vec::new() };
         for state in states {
-            // Both of states without a plan, in their order, and of the others.
             match if state.memory.is_empty() { new.next() } else { None } {
                 Some((planned, values)) => {
                     let firsts =

@@ -1,94 +1,84 @@
-//! The diffusion policy: it draws candidates from the target actor, of which it takes one by what
-//! the target critics say of them, the best if nothing else is asked for (Eq. 25).
+//! The diffusion policy: candidates of the target actor, chosen by the target critics (Eq. 25).
 
 use crate::error::{PolicyError, check_range};
+use crate::kinds::actor_critic::{ACTOR, CRITIC};
 use crate::sampling::candidates::{Actor, CandidatePolicy, Networks};
 use crate::sampling::choice::Choice;
 use candle_core::Tensor;
 use quad_nn::{
     Ensemble, EnsembleShape, MAX_DIM, MlpConfig, NoisePredictor, NoiseShape, Precision, Reverse,
-    Tensors, Weighted, Weights, tile_numbers,
+    Tensors, Weighted, Weights, tile_floats,
 };
 use serde::{Deserialize, Serialize};
 
-/// Most denoising steps that are believed; the tensors' shapes do not bound them.
+/// Largest number of denoising steps, which the tensors' shapes do not bound.
 const MOST_STEPS: usize = 1000;
-/// Before the names of the networks' tensors.
-pub(crate) const ACTOR: &str = "actor.";
-pub(crate) const CRITIC: &str = "critic.";
+/// Prefix of the value function's tensors.
 pub(crate) const VALUE: &str = "value.";
 
-/// The shapes of a diffusion policy's networks.
+/// The shapes of the networks.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DiffusionShape {
-    /// Numbers in an observation s.
+    /// Length of an observation s.
     pub observation_dim: usize,
-    /// Numbers in an action a.
+    /// Length of an action a.
     pub action_dim: usize,
     /// The noise predictor's hidden layers.
     pub actor: MlpConfig,
     /// The critics' hidden layers.
     pub critic: MlpConfig,
-    /// The value function's, if there is one.
+    /// The value function's hidden layers, for the rule `nearest`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub value: Option<MlpConfig>,
-    /// Ensemble size K.
+    /// Number of critics, K.
     pub critics: usize,
     /// Denoising steps T.
     pub diffusion_steps: usize,
-    /// How each of them is made when sampling.
+    /// Formula of a reverse step.
     #[serde(default)]
     pub reverse: Reverse,
 }
 
 impl DiffusionShape {
-    /// QUAD's: noise predictor and critics with the same hidden layers.
+    /// QUAD's networks: actor and critics with the same hidden layers.
     pub fn quad(
         dims: (usize, usize),
         layers: &MlpConfig,
         critics: usize,
         diffusion_steps: usize,
     ) -> Self {
+        let (observation_dim, action_dim) = dims;
+        let (actor, critic, value) = (layers.clone(), layers.clone(), None);
+        let reverse = Reverse::default();
         Self {
-            observation_dim: dims.0,
-            action_dim: dims.1,
-            actor: layers.clone(),
-            critic: layers.clone(),
+            observation_dim,
+            action_dim,
+            actor,
+            critic,
+            value,
             critics,
             diffusion_steps,
-            ..Self::default()
+            reverse,
         }
     }
 
     /// Shape of the noise predictor.
     pub fn actor(&self) -> NoiseShape {
         let Self { observation_dim, action_dim, diffusion_steps, reverse, .. } = *self;
-        NoiseShape {
-            observation_dim,
-            action_dim,
-            layers: self.actor.clone(),
-            diffusion_steps,
-            reverse,
-        }
+        let layers = self.actor.clone();
+        NoiseShape { observation_dim, action_dim, layers, diffusion_steps, reverse }
     }
 
     /// Shape of the critics.
     pub fn critics(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, critics, .. } = *self;
-        EnsembleShape {
-            members: critics,
-            observation_dim,
-            action_dim,
-            layers: self.critic.clone(),
-            outputs: 1,
-        }
+        let dims = (self.observation_dim, self.action_dim);
+        EnsembleShape::critics(self.critics, dims, &self.critic)
     }
 
-    /// Shape of the value function, if there is one.
+    /// Shape of the value function.
     pub fn value(&self) -> Option<EnsembleShape> {
-        let layers = self.value.clone()?;
-        Some(EnsembleShape { members: 1, action_dim: 0, layers, ..self.critics() })
+        Some(EnsembleShape::of_state(self.observation_dim, self.value.as_ref()?, 1))
     }
 
     fn check(&self) -> Result<(), PolicyError> {
@@ -99,13 +89,11 @@ impl DiffusionShape {
     }
 }
 
-/// The diffusion policy, of target actor, target critics and, if the choice takes it, a value
-/// function.
+/// The diffusion policy.
 pub struct DiffusionPolicy;
 
 impl DiffusionPolicy {
-    /// The tensors of a policy of these networks, as they are named in a file. There is a value
-    /// function exactly if the shape says so.
+    /// The tensors of a policy's file.
     pub fn tensors(
         actor: &NoisePredictor,
         critics: &Ensemble,
@@ -129,8 +117,8 @@ impl DiffusionPolicy {
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
         let actor = NoisePredictor::new(shape.actor(), weights, precision).packed()?;
         let critics = Ensemble::take(shape.critics(), tensors, CRITIC, precision)?;
-        let value =
-            shape.value().map(|of| Ensemble::take(of, tensors, VALUE, precision)).transpose()?;
+        let value = |shape| Ensemble::take(shape, tensors, VALUE, precision);
+        let value = shape.value().map(value).transpose()?;
         CandidatePolicy::new(Networks { actor: Box::new(actor), critics, value }, choice, precision)
     }
 }
@@ -140,7 +128,7 @@ impl Actor for NoisePredictor {
         (self.shape().observation_dim, self.shape().action_dim)
     }
 
-    fn noises(&self) -> usize {
+    fn noise_vectors(&self) -> usize {
         self.shape().diffusion_steps
     }
 
@@ -148,7 +136,11 @@ impl Actor for NoisePredictor {
         self.sample(observations, noise)
     }
 
-    fn memory(&self, _: u128, candidates: u128) -> u128 {
-        tile_numbers(candidates, &self.shape().layers)
+    fn floats(&self, _: u128, candidates: u128) -> u128 {
+        tile_floats(candidates, &self.shape().layers)
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests;

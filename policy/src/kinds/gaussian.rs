@@ -1,5 +1,4 @@
-//! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is
-//! sampled.
+//! The Gaussian policy, which acts by its mean: tanh of a network of the state.
 
 use crate::error::{PolicyError, check_numbers, check_range};
 use crate::policy::Policy;
@@ -10,44 +9,41 @@ use quad_nn::{
 };
 use serde::{Deserialize, Serialize};
 
-/// Before the names of the network's tensors.
+/// Prefix of the tensors' names.
 const ACTOR: &str = "actor.";
 
 /// The shape of a Gaussian policy's network.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GaussianShape {
-    /// Numbers in an observation s.
+    /// Length of an observation s.
     pub observation_dim: usize,
-    /// Numbers in an action a.
+    /// Length of an action a.
     pub action_dim: usize,
-    /// Its hidden layers.
+    /// The actor's hidden layers.
     pub actor: MlpConfig,
 }
 
 impl GaussianShape {
-    /// Shape of the network whose tanh is the mean.
+    /// Shape of the actor, whose tanh is the mean.
     pub fn actor(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, .. } = *self;
-        let layers = self.actor.clone();
-        EnsembleShape { members: 1, observation_dim, action_dim: 0, layers, outputs: action_dim }
+        EnsembleShape::of_state(self.observation_dim, &self.actor, self.action_dim)
     }
 }
 
-/// A policy that does what its network says.
+/// A policy that acts by the mean.
 pub struct GaussianPolicy {
     shape: GaussianShape,
     actor: Ensemble,
 }
 
-/// The mean of the policy with this network: `observations [n, o]` → `[n, a]`, each number in (-1,
-/// 1).
+/// The mean actions, `[n, a]` in (−1, 1), for `observations [n, o]`.
 pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> {
     actor.state_outputs(observations)?.squeeze(0)?.tanh()
 }
 
 impl GaussianPolicy {
-    /// The tensors of a policy with this network, as they are named in a file.
+    /// The tensors of a policy's file.
     pub fn tensors(actor: &Ensemble) -> Result<Tensors> {
         actor.weights().tensors(ACTOR)
     }
@@ -79,10 +75,8 @@ impl Policy for GaussianPolicy {
     fn memory(&self, states: usize) -> u64 {
         let GaussianShape { observation_dim, action_dim, .. } = self.shape;
         let states = states as u128;
-        bytes(
-            self.shape.actor().memory(states, 1)
-                + states * (observation_dim + 2 * action_dim) as u128,
-        )
+        let numbers = states * (observation_dim + 2 * action_dim) as u128;
+        bytes(self.shape.actor().floats(states, 1) + numbers)
     }
 
     fn act(
@@ -91,11 +85,8 @@ impl Policy for GaussianPolicy {
         states: &mut [EpisodeState],
         actions: &mut [f32],
     ) -> std::result::Result<(), PolicyError> {
-        let observations = Tensor::from_slice(
-            observations,
-            (states.len(), self.shape.observation_dim),
-            &Device::Cpu,
-        )?;
+        let shape = (states.len(), self.shape.observation_dim);
+        let observations = Tensor::from_slice(observations, shape, &Device::Cpu)?;
         let means = gaussian_mean(&self.actor, &observations)?;
         read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
         check_numbers("an action", actions)

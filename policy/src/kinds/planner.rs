@@ -12,44 +12,43 @@ use serde::{Deserialize, Serialize};
 /// Bound of the denoising steps, and of the steps of guidance in each.
 const MOST_STEPS: usize = 1000;
 
-/// Windows that are worked on together; what a gradient takes is kept of so many at most.
+/// Trajectories denoised together, which bounds the memory of a gradient.
 pub(crate) const CHUNK: usize = 32;
 
-/// What a planner is beside its weights.
+/// The shapes of the networks, and the planning.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DiffuserShape {
-    /// Numbers in an observation s.
+    /// Length of an observation s.
     pub observation_dim: usize,
-    /// Numbers in an action a.
+    /// Length of an action a.
     pub action_dim: usize,
-    /// Both networks.
+    /// Shape of both networks.
     pub network: TrajectoryConfig,
     /// Denoising steps T.
     pub diffusion_steps: usize,
-    /// How plans are pulled toward large returns.
+    /// Guidance toward large values.
     pub guidance: ValueGuidance,
-    /// Steps of an episode that are taken by one plan, from 1 to the horizon.
+    /// Actions executed of one plan, from 1 to the horizon.
     pub replan_every: usize,
-    /// The units in which the networks see observations and actions, beside those of the file's own
-    /// scaling.
+    /// Normalization of observations and actions, beside the file's scaling.
     pub units: Scaling,
 }
 
-/// How plans are pulled toward large returns.
+/// Guidance of plans by the gradient of their value.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ValueGuidance {
-    /// Steps along the value's gradient in each denoising step.
+    /// Gradient steps in each denoising step.
     pub steps: usize,
-    /// What the gradient is multiplied by, beside the variance of the denoising step.
+    /// Factor of the gradient, beside the variance of the denoising step.
     pub scale: f32,
-    /// The last denoising steps, so many, have none.
+    /// Number of last denoising steps without guidance.
     pub stop: usize,
 }
 
 impl DiffuserShape {
-    /// Numbers of a step in a window: [action, state].
+    /// Length of a step of a trajectory, [action, state].
     pub fn width(&self) -> usize {
         self.action_dim + self.observation_dim
     }
@@ -65,9 +64,9 @@ impl DiffuserShape {
         check_range("replan_every", self.replan_every, self.network.horizon)
     }
 
-    /// Numbers that are kept of a window while a gradient is taken: those of the networks' layers,
-    /// some of them unfolded, with their gradients.
-    pub(crate) fn numbers(&self) -> u128 {
+    /// Numbers held of a trajectory while a gradient is taken: all layers, some of them unfolded, and
+    /// their gradients.
+    pub(crate) fn floats(&self) -> u128 {
         let TrajectoryConfig { horizon, attention, .. } = &self.network;
         let levels = self.network.lengths().into_iter().zip(self.network.widths());
         let of_blocks =
@@ -85,33 +84,25 @@ pub struct Planner {
     value: TrajectoryValue,
 }
 
-/// Windows `[B, H, a + o]` whose first state is this one, `[B, o]`.
-///
-/// # Errors
-/// Candle fails.
-pub fn with_first_state(windows: &Tensor, states: &Tensor) -> Result<Tensor> {
-    let (horizon, action_dim) = (windows.dim(1)?, windows.dim(2)? - states.dim(1)?);
-    let first = Tensor::cat(
-        &[&windows.narrow(1, 0, 1)?.narrow(2, 0, action_dim)?, &states.unsqueeze(1)?],
-        2,
-    )?;
-    Tensor::cat(&[&first, &windows.narrow(1, 1, horizon - 1)?], 1)
+/// Trajectories `x [B, H, a + o]` with the first state replaced by `states [B, o]`.
+pub fn with_first_state(x: &Tensor, states: &Tensor) -> Result<Tensor> {
+    let (horizon, action_dim) = (x.dim(1)?, x.dim(2)? - states.dim(1)?);
+    let action = x.narrow(1, 0, 1)?.narrow(2, 0, action_dim)?;
+    let first = Tensor::cat(&[&action, &states.unsqueeze(1)?], 2)?;
+    Tensor::cat(&[&first, &x.narrow(1, 1, horizon - 1)?], 1)
 }
 
 impl Planner {
-    /// The networks are those of the shape.
+    /// A planner with networks of the shape.
     pub fn new(shape: DiffuserShape, model: TrajectoryModel, value: TrajectoryValue) -> Self {
         Self { schedule: Schedule::cosine(shape.diffusion_steps), shape, model, value }
     }
 
-    /// Plans in n states, whose observations are `n × observation_dim`; `noise` is `T × n × plans ×
-    /// H × (a + o)`, standard normal: first the windows as they begin, then the noise of the
-    /// reverse steps from t = T down to 2. Gives the first actions of each plan, `n × plans ×
-    /// replan_every × a`, and the value of each as its last guidance finds it; all in the networks'
-    /// units.
+    /// Plans in n states with `observations`, `n × observation_dim`, in the networks' units.
     ///
-    /// # Errors
-    /// Candle fails.
+    /// `noise`, `T × n × plans × H × (a + o)`, is standard normal: first the noisy trajectories, then
+    /// the noise of the reverse steps from t = T down to 2. Returns the first actions of each plan,
+    /// `n × plans × replan_every × a`, and its value at the last denoising step, `n × plans`.
     pub fn plan(
         &self,
         observations: &[f32],
@@ -133,16 +124,16 @@ impl Planner {
                 let numbers = &noise[step * all + from * size..][..count * size];
                 Tensor::from_slice(numbers, (count, horizon, self.shape.width()), &Device::Cpu)
             };
-            let (plans, worth) = self.denoise(&first, noise)?;
+            let (plans, of_plans) = self.denoise(&first, noise)?;
             let taken = plans.narrow(1, 0, replan_every)?.narrow(2, 0, a)?.contiguous()?;
             read(&taken, |taken: &[f32]| actions.extend_from_slice(taken))?;
-            values.extend(worth);
+            values.extend(of_plans);
         }
         Ok((actions, values))
     }
 
-    /// The whole reverse process of windows with these first states, `[B, o]`. Gives the windows,
-    /// `[B, H, a + o]`, and their values.
+    /// The reverse process of trajectories with these first states, `[B, o]`. Returns the
+    /// trajectories, `[B, H, a + o]`, and their values.
     fn denoise(
         &self,
         first: &Tensor,
@@ -154,7 +145,7 @@ impl Planner {
         for t in (1..=self.shape.diffusion_steps).rev() {
             let all = vec![t as u32; first.dim(0)?];
             if t == 1 {
-                // There is no variance, and so no guidance: all of its steps would find this.
+                // The variance, and so the guidance, is 0.
                 values = self.value.values(&x, &all)?.to_vec1()?;
             } else if t > stop {
                 for _ in 0..steps {
@@ -164,20 +155,20 @@ impl Planner {
                 }
             }
             let z = if t > 1 { Some(noise(self.shape.diffusion_steps - t + 1)?) } else { None };
+            let clean = self.model.clean(&x, &all)?;
             x = with_first_state(
-                &self.schedule.reverse_to_clean(t, &x, &self.model.clean(&x, &all)?, z.as_ref())?,
+                &self.schedule.reverse_to_clean(t, &x, &clean, z.as_ref())?,
                 first,
             )?;
         }
         Ok((x, values))
     }
 
-    /// The gradient of each window's value with respect to the window, as constants.
+    /// The gradient of each trajectory's value, as constants.
     fn gradient(&self, x: &Tensor, t: &[u32]) -> Result<Tensor> {
         let x = Var::from_tensor(x)?;
         let gradient = self.value.values(&x, t)?.sum_all()?.backward()?.remove(&x);
-        gradient
-            .map(|gradient| gradient.detach())
-            .ok_or_else(|| Error::Msg("no gradient reaches the windows".into()))
+        let missing = || Error::Msg("no gradient reaches the trajectories".into());
+        gradient.map(|gradient| gradient.detach()).ok_or_else(missing)
     }
 }

@@ -1,7 +1,7 @@
-//! The policy of SfBC: it draws candidates by solving the reverse process of a cloned score
-//! network, and takes some by what a critic says of them.
+//! SfBC's policy: candidates of a score network, chosen by a critic.
 
 use crate::error::{PolicyError, check_range};
+use crate::kinds::actor_critic::{ACTOR, CRITIC};
 use crate::sampling::candidates::{Actor, CandidatePolicy, Networks};
 use crate::sampling::choice::Choice;
 use candle_core::Tensor;
@@ -11,26 +11,24 @@ use quad_nn::{
 };
 use serde::{Deserialize, Serialize};
 
-/// Most evaluations that are believed; the tensors' shapes do not bound them.
+/// Largest number of evaluations, which the tensors' shapes do not bound.
 const MOST_EVALUATIONS: usize = 1000;
-/// Before the names of the networks' tensors, and the name of the score network's frequencies.
-const ACTOR: &str = "actor.";
-const CRITIC: &str = "critic.";
+/// Name of the score network's frequencies.
 pub(crate) const FREQUENCIES: &str = "frequencies";
 
-/// The shapes of such a policy's networks.
+/// The shapes of the networks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScorePolicyShape {
-    /// Numbers in an observation s.
+    /// Length of an observation s.
     pub observation_dim: usize,
-    /// Numbers in an action a.
+    /// Length of an action a.
     pub action_dim: usize,
-    /// The score network's narrowing blocks.
+    /// Widths of the score network's downward blocks.
     pub actor: MlpConfig,
     /// The critic's hidden layers.
     pub critic: MlpConfig,
-    /// Evaluations of the score network for an action.
+    /// Evaluations of the score network by the solver.
     pub evaluations: usize,
 }
 
@@ -43,14 +41,7 @@ impl ScorePolicyShape {
 
     /// Shape of the critic, an ensemble of one.
     pub fn critic(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, .. } = *self;
-        EnsembleShape {
-            members: 1,
-            observation_dim,
-            action_dim,
-            layers: self.critic.clone(),
-            outputs: 1,
-        }
+        EnsembleShape::critics(1, (self.observation_dim, self.action_dim), &self.critic)
     }
 
     fn check(&self) -> Result<(), PolicyError> {
@@ -60,14 +51,11 @@ impl ScorePolicyShape {
     }
 }
 
-/// The policy of a score network and a critic.
+/// The policy of SfBC.
 pub struct ScorePolicy;
 
 impl ScorePolicy {
-    /// The tensors of a policy of these networks, as they are named in a file.
-    ///
-    /// # Errors
-    /// Candle fails.
+    /// The tensors of a policy's file.
     pub fn tensors(actor: &ScoreNetwork, critic: &Ensemble) -> candle_core::Result<Tensors> {
         let mut tensors = actor.weights().tensors(ACTOR)?;
         tensors.extend(critic.weights().tensors(CRITIC)?);
@@ -84,31 +72,25 @@ impl ScorePolicy {
         shape.check()?;
         let frequencies = take(tensors, FREQUENCIES.to_owned(), &[ScoreShape::FREQUENCIES])?;
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
-        let actor = Drawing {
-            network: ScoreNetwork::new(shape.actor(), weights, frequencies),
-            solver: DpmSolver::new(shape.evaluations),
-        };
+        let network = ScoreNetwork::new(shape.actor(), weights, frequencies);
+        let actor = Box::new(ScoreActor { network, solver: DpmSolver::new(shape.evaluations) });
         let critics = Ensemble::take(shape.critic(), tensors, CRITIC, precision)?;
-        CandidatePolicy::new(
-            Networks { actor: Box::new(actor), critics, value: None },
-            choice,
-            Precision::F32,
-        )
+        CandidatePolicy::new(Networks { actor, critics, value: None }, choice, Precision::F32)
     }
 }
 
-/// A score network with what it is sampled by.
-struct Drawing {
+/// A score network and its solver.
+struct ScoreActor {
     network: ScoreNetwork,
     solver: DpmSolver,
 }
 
-impl Actor for Drawing {
+impl Actor for ScoreActor {
     fn dims(&self) -> (usize, usize) {
         (self.network.shape().observation_dim, self.network.shape().action_dim)
     }
 
-    fn noises(&self) -> usize {
+    fn noise_vectors(&self) -> usize {
         1
     }
 
@@ -116,11 +98,10 @@ impl Actor for Drawing {
         self.network.sample(&self.solver, observations, &noise.get(0)?)
     }
 
-    fn memory(&self, states: u128, candidates: u128) -> u128 {
-        // The solver holds some actions more.
-        let shape = self.network.shape();
-        shape.memory(states, states * candidates)
-            + states * candidates * (6 * shape.action_dim) as u128
+    fn floats(&self, states: u128, candidates: u128) -> u128 {
+        let (shape, rows) = (self.network.shape(), states * candidates);
+        // The solver holds six times the actions.
+        shape.floats(states, rows) + rows * (6 * shape.action_dim) as u128
     }
 }
 
@@ -128,68 +109,41 @@ impl Actor for Drawing {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
-    use crate::file::{Header, PolicyConfig, load_policy};
-    use crate::policy::Sampled;
+    use crate::file::{PolicyConfig, load_policy};
+    use crate::policy::Samples;
     use crate::sampling::choice::Rule;
-    use candle_core::Device;
-    use quad_kernels::activation::Activation;
-    use rand::SeedableRng;
-    use rand_chacha::ChaCha8Rng;
+    use crate::testing::{act, initial, sample};
+    use quad_nn::Activation;
 
-    fn shape() -> ScorePolicyShape {
+    fn file(evaluations: usize, choice: Choice) -> Vec<u8> {
         let actor = MlpConfig { activation: Activation::Silu, ..MlpConfig::mish(&[16, 8]) };
-        ScorePolicyShape {
-            observation_dim: 3,
-            action_dim: 2,
-            critic: actor.clone(),
-            actor,
-            evaluations: 5,
-        }
+        let (critic, dims) = (actor.clone(), (3, 2));
+        let (observation_dim, action_dim) = dims;
+        let shape = ScorePolicyShape { observation_dim, action_dim, actor, critic, evaluations };
+        initial(PolicyConfig::Score { shape, choice })
     }
 
-    fn file(shape: &ScorePolicyShape, choice: Choice) -> Vec<u8> {
-        let generator = &mut ChaCha8Rng::seed_from_u64(1);
-        let actor = Weights::initial(&shape.actor().layout(), generator, &Device::Cpu).unwrap();
-        let actor = Weights::constant(shape.actor().layout(), actor);
-        let actor =
-            ScoreNetwork::new(shape.actor(), actor, ScoreShape::frequencies(generator).unwrap());
-        let critic = Weights::initial(&shape.critic().layout(), generator, &Device::Cpu).unwrap();
-        let critic = Weights::constant(shape.critic().layout(), critic);
-        let critic = Ensemble::new(shape.critic(), critic, Precision::F32);
-        let policy = PolicyConfig::Score { shape: shape.clone(), choice };
-        let tensors = ScorePolicy::tensors(&actor, &critic).unwrap();
-        Header::new(policy, ()).to_safetensors(&tensors).unwrap()
-    }
-
-    /// The action is the mean of the best four candidates where the temperature leaves no doubt
-    /// which these are.
+    /// The temperature is so low that the best four are certain.
     #[test]
-    fn it_does_the_mean_of_the_best_of_what_it_samples() {
+    fn the_action_is_the_mean_of_the_best_candidates() {
         let rule = Rule::Average { temperature: 1e-7, actions: 4 };
-        let policy =
-            load_policy(&file(&shape(), Choice { rule, ..Choice::best_of(6) }), Precision::Bf16)
-                .unwrap();
+        let file = file(5, Choice { rule, ..Choice::best_of(6) });
+        let policy = load_policy(&file, Precision::Bf16).unwrap();
         assert_eq!(policy.precision(), Precision::F32);
-        let observations = [0.5, -0.2, 0.1, 1.0, 0.0, -1.0];
-        let begin = || [7, 8].map(|seed| policy.begin(seed));
-        let Sampled { actions, values } = policy.sample(&observations, &mut begin()).unwrap();
-        let mut taken = [0.0; 4];
-        policy.act(&observations, &mut begin(), &mut taken).unwrap();
+        let (observations, seeds) = ([0.5, -0.2, 0.1, 1.0, 0.0, -1.0], [7, 8]);
+        let Samples { actions, values } = sample(&*policy, &observations, &seeds).unwrap();
+        let taken = act(&*policy, &observations, &seeds).unwrap();
         for (i, taken) in taken.chunks_exact(2).enumerate() {
             let (actions, values) = (&actions[i * 12..][..12], &values[i * 6..][..6]);
             let mut order: Vec<usize> = (0..6).collect();
             order.sort_by(|x, y| values[*y].total_cmp(&values[*x]));
             for (j, taken) in taken.iter().enumerate() {
                 let mean = order[..4].iter().map(|place| actions[place * 2 + j]).sum::<f32>() / 4.0;
-                assert!(
-                    (taken - mean).abs() < 1e-5 * mean.abs().max(1.0),
-                    "state {i}: {taken} for {mean}"
-                );
+                let error = (taken - mean).abs() / mean.abs().max(1.0);
+                assert!(error < 1e-5, "state {i}: {taken} for {mean}");
             }
-            assert_eq!(
-                policy.value(&observations[i * 3..][..3].repeat(6), actions).unwrap(),
-                values
-            );
+            let observations = observations[i * 3..][..3].repeat(6);
+            assert_eq!(policy.value(&observations, actions).unwrap(), values);
         }
         let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(2) };
         assert!(matches!(policy.with_choice(nearest), Err(PolicyError::NoValue)));
@@ -198,8 +152,8 @@ mod tests {
     #[test]
     fn a_shape_out_of_range_is_refused() {
         for evaluations in [0, 1001, usize::MAX] {
-            let file = file(&ScorePolicyShape { evaluations, ..shape() }, Choice::best_of(1));
-            assert!(matches!(load_policy(&file, Precision::F32), Err(PolicyError::Range { .. })));
+            let policy = load_policy(&file(evaluations, Choice::best_of(1)), Precision::F32);
+            assert!(matches!(policy, Err(PolicyError::Range { .. })), "{evaluations}");
         }
     }
 }

@@ -1,40 +1,30 @@
-//! The squashed Gaussian policy: its candidates are tanh(u), where u is normal and a network of the
-//! state gives its mean and log σ. Of these it takes one by what critics say of them.
+//! The squashed Gaussian actor: candidates are tanh(u) with normal u, whose mean and log σ are a
+//! network of the state.
 
 use crate::kinds::actor_critic::ActorCriticShape;
 use crate::sampling::candidates::Actor;
 use candle_core::Tensor;
 use quad_nn::{Ensemble, EnsembleShape};
 
-/// A network that draws such candidates.
+/// The actor of a squashed Gaussian policy.
 pub struct SquashedActor(Ensemble);
 
 impl SquashedActor {
     /// Bounds of log σ.
     pub const LOG_STD: (f32, f32) = (-5.0, 2.0);
 
-    /// Draws with a network of [`Self::shape`].
+    /// An actor with a network of [`Self::shape`].
     pub fn new(network: Ensemble) -> Self {
         Self(network)
     }
 
-    /// Shape of the network of which the mean comes first, then log σ.
-    pub fn shape(of: &ActorCriticShape) -> EnsembleShape {
-        let ActorCriticShape { observation_dim, action_dim, .. } = *of;
-        EnsembleShape {
-            members: 1,
-            observation_dim,
-            action_dim: 0,
-            layers: of.actor.clone(),
-            outputs: 2 * action_dim,
-        }
+    /// Shape of the network, which returns the mean, then log σ.
+    pub fn shape(policy: &ActorCriticShape) -> EnsembleShape {
+        EnsembleShape::of_state(policy.observation_dim, &policy.actor, 2 * policy.action_dim)
     }
 
-    /// Actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal `noise`,
-    /// `[rows, a]`; equally many consecutive rows share a state. No gradient flows through them.
-    ///
-    /// # Errors
-    /// Shapes that do not fit, or candle fails.
+    /// Actions `[rows, a]` from standard normal `noise`, `[rows, a]`, for `observations`, `[n, o]`,
+    /// without gradients. The first rows/n rows belong to the first observation, and so on.
     pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> candle_core::Result<Tensor> {
         let (rows, a) = noise.dims2()?;
         let out = self.0.state_outputs(observations)?.detach().transpose(0, 1)?; // [n, 1, 2a]
@@ -50,7 +40,7 @@ impl Actor for SquashedActor {
         (self.0.shape().observation_dim, self.0.shape().outputs / 2)
     }
 
-    fn noises(&self) -> usize {
+    fn noise_vectors(&self) -> usize {
         1
     }
 
@@ -58,10 +48,10 @@ impl Actor for SquashedActor {
         self.sample(observations, &noise.squeeze(0)?)
     }
 
-    fn memory(&self, states: u128, candidates: u128) -> u128 {
+    fn floats(&self, states: u128, candidates: u128) -> u128 {
         let shape = self.0.shape();
-        // Mean and log σ on their way, and the normal numbers'.
-        shape.memory(states, 1) + states * shape.outputs as u128 * (4 + candidates)
+        // Mean and log σ of states, and those of candidates.
+        shape.floats(states, 1) + states * shape.outputs as u128 * (4 + candidates)
     }
 }
 
@@ -70,68 +60,51 @@ impl Actor for SquashedActor {
 mod tests {
     use super::*;
     use crate::error::PolicyError;
-    use crate::file::{Header, PolicyConfig, load_policy};
-    use crate::policy::{Policy, Sampled};
+    use crate::file::PolicyConfig;
+    use crate::policy::{Policy, Samples};
     use crate::sampling::choice::{Aggregate, Choice, Rule};
-    use candle_core::Device;
-    use quad_nn::{MlpConfig, Precision};
+    use crate::testing::{act, file_of, load, sample};
+    use quad_nn::{Activation, MlpConfig};
 
     const CHOICE: Choice = Choice {
         candidates: 3000,
-        value: Aggregate::Min,
+        aggregate: Aggregate::Min,
         rule: Rule::Softmax { temperature: f32::MIN_POSITIVE },
     };
 
-    /// A policy whose mean is (0.5·s, −1) and whose log σ is (−1, what the state says times ten);
-    /// both critics' value is a_0.
+    /// A policy with the mean (s/2, −1) and log σ (−1, 10·s), whose critics' values are a_0.
     fn policy() -> Box<dyn Policy> {
-        let layers = MlpConfig { activation: crate::Activation::Relu, ..MlpConfig::mish(&[2]) };
-        let shape = ActorCriticShape {
-            observation_dim: 1,
-            action_dim: 2,
-            actor: layers.clone(),
-            critic: layers,
-            critics: 2,
-        };
-        let tensor = |numbers: &[f32], dims: &[usize]| {
-            Tensor::from_slice(numbers, dims, &Device::Cpu).unwrap()
-        };
-        // relu(x) and relu(−x), put together again.
-        let actor = [
-            ("0.kernel", tensor(&[1.0, -1.0], &[1, 1, 2])),
-            ("0.bias", tensor(&[0.0; 2], &[1, 2])),
-            ("1.kernel", tensor(&[0.5, 0.0, 0.0, 10.0, -0.5, 0.0, 0.0, -10.0], &[1, 2, 4])),
-            ("1.bias", tensor(&[0.0, -1.0, -1.0, 0.0], &[1, 4])),
+        let layers = MlpConfig { activation: Activation::Relu, ..MlpConfig::mish(&[2]) };
+        let (actor, critic) = (layers.clone(), layers);
+        let shape =
+            ActorCriticShape { observation_dim: 1, action_dim: 2, actor, critic, critics: 2 };
+        // relu(x) − relu(−x) = x; kernels of both critics, then biases, layer after layer.
+        let actor = [1.0, -1.0, 0.0, 0.0, 0.5, 0.0, 0.0, 10.0, -0.5, 0.0, 0.0, -10.0];
+        let critics = [
+            &[0.0, 0.0, 1.0, -1.0, 0.0, 0.0].repeat(2)[..],
+            &[0.0; 4],
+            &[1.0, -1.0, 1.0, -1.0],
+            &[0.0; 2],
         ];
-        let critic = [
-            ("0.kernel", tensor(&[0.0, 0.0, 1.0, -1.0, 0.0, 0.0].repeat(2), &[2, 3, 2])),
-            ("0.bias", tensor(&[0.0; 4], &[2, 2])),
-            ("1.kernel", tensor(&[1.0, -1.0].repeat(2), &[2, 2, 1])),
-            ("1.bias", tensor(&[0.0; 2], &[2, 1])),
-        ];
-        let named = |prefix: &str, tensors: [(&str, Tensor); 4]| {
-            tensors.map(|(name, tensor)| (format!("{prefix}.{name}"), tensor))
-        };
-        let tensors = named("actor", actor).into_iter().chain(named("critic", critic)).collect();
+        let mut weights =
+            [[&actor[..], &[0.0, -1.0, -1.0, 0.0]].concat(), critics.concat()].into_iter();
         let policy = PolicyConfig::Squashed { shape, choice: CHOICE };
-        let file = Header::new(policy, ()).to_safetensors(&tensors).unwrap();
-        load_policy(&file, Precision::F32).unwrap()
-    }
-
-    /// Mean and deviation of atanh of every second action, from this one on.
-    fn moments(actions: &[f32]) -> (f64, f64) {
-        let u: Vec<f64> = actions.iter().step_by(2).map(|a| f64::from(*a).atanh()).collect();
-        let mean = u.iter().sum::<f64>() / u.len() as f64;
-        (mean, (u.iter().map(|u| (u - mean).powi(2)).sum::<f64>() / u.len() as f64).sqrt())
+        load(&file_of(policy, None, |_| weights.next().unwrap())).unwrap()
     }
 
     #[test]
-    fn candidates_are_the_tanh_of_normal_numbers_whose_mean_and_deviation_the_state_gives() {
+    fn candidates_are_tanh_of_normal_numbers() {
+        // Mean and standard deviation of atanh of every second action.
+        let moments = |actions: &[f32]| {
+            let u: Vec<f64> = actions.iter().step_by(2).map(|a| f64::from(*a).atanh()).collect();
+            let mean = u.iter().sum::<f64>() / u.len() as f64;
+            let variance = u.iter().map(|u| (u - mean).powi(2)).sum::<f64>() / u.len() as f64;
+            (mean, variance.sqrt())
+        };
         let policy = policy();
-        let begin = || [1, 2].map(|seed| policy.begin(seed));
         // In the first state log σ_1 is −4, in the second it would be 8.
-        let observations = [-0.4, 0.8];
-        let Sampled { actions, values } = policy.sample(&observations, &mut begin()).unwrap();
+        let (observations, seeds) = ([-0.4, 0.8], [1, 2]);
+        let Samples { actions, values } = sample(&*policy, &observations, &seeds).unwrap();
         assert_eq!((actions.len(), values.len()), (2 * 3000 * 2, 2 * 3000));
         let (first, second) = actions.split_at(6000);
         for (found, expected) in [
@@ -140,18 +113,14 @@ mod tests {
             (moments(second), (0.4, (-1f64).exp())),
         ] {
             let near = |x: f64, y: f64| (x - y).abs() < 0.06 * expected.1;
-            assert!(
-                near(found.0, expected.0) && near(found.1, expected.1),
-                "{found:?} for {expected:?}"
-            );
+            let near = near(found.0, expected.0) && near(found.1, expected.1);
+            assert!(near, "{found:?} for {expected:?}");
         }
-        // σ is e² at most: so 5.9 % lie within ±0.5. With e⁸ none would.
+        // σ is clamped to e², so that 5.9 % are within ±0.5.
         let inside = second[1..].iter().step_by(2).filter(|a| a.abs() < 0.5).count();
         assert!((120..240).contains(&inside), "{inside}");
-
-        // The critics say a_0, and the softmax is cold.
-        let mut taken = [0.0; 4];
-        policy.act(&observations, &mut begin(), &mut taken).unwrap();
+        // The cold softmax takes the largest a_0.
+        let taken = act(&*policy, &observations, &seeds).unwrap();
         for (taken, drawn) in taken.chunks_exact(2).zip([first, second]) {
             let largest = drawn.iter().step_by(2).copied().fold(f32::NEG_INFINITY, f32::max);
             assert_eq!(taken[0], largest);
@@ -160,17 +129,14 @@ mod tests {
     }
 
     #[test]
-    fn it_chooses_as_it_is_asked_to() {
+    fn another_choice_applies() {
         let policy = policy();
         assert_eq!(policy.choice(), Some(CHOICE));
         let of_one = policy.with_choice(Choice::best_of(1)).unwrap();
-        let mut action = [0.0; 2];
-        of_one.act(&[0.0], &mut [of_one.begin(5)], &mut action).unwrap();
-        let drawn = of_one.sample(&[0.0], &mut [of_one.begin(5)]).unwrap();
-        assert_eq!(drawn.actions, action);
+        let drawn = sample(&*of_one, &[0.0], &[5]).unwrap();
+        assert_eq!(act(&*of_one, &[0.0], &[5]).unwrap(), drawn.actions);
         let nearest = Choice { rule: Rule::Nearest, ..CHOICE };
         assert!(matches!(policy.with_choice(nearest), Err(PolicyError::NoValue)));
-        let mut nothing = [0.0; 2];
-        assert!(policy.act(&[f32::NAN], &mut [policy.begin(5)], &mut nothing).is_err());
+        assert!(act(&*policy, &[f32::NAN], &[5]).is_err());
     }
 }

@@ -1,43 +1,41 @@
-//! Policies that draw candidates with noise and choose among them by what critics say, whatever it
-//! is that draws.
+//! Policies of an actor that draws candidates, and critics that choose among them.
 
 use crate::error::{PolicyError, check_numbers};
-use crate::policy::{Policy, Sampled};
+use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Choice, Rule};
 use crate::sampling::episode::EpisodeState;
 use candle_core::{Device, Tensor};
 use quad_nn::{Ensemble, Precision, bytes, read};
 use std::sync::Arc;
 
-/// What draws actions.
+/// Networks that draw candidates.
 pub(crate) trait Actor: Send + Sync {
-    /// Numbers in an observation and in an action.
+    /// Lengths of an observation and of an action.
     fn dims(&self) -> (usize, usize);
 
-    /// How many vectors of noise, each as long as an action, one action takes.
-    fn noises(&self) -> usize;
+    /// Number of noise vectors, each as long as an action, for one action.
+    fn noise_vectors(&self) -> usize;
 
-    /// Draws actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal
-    /// `noise`, `[noises, rows, a]`; equally many consecutive rows share a state.
+    /// Draws actions `[rows, a]` for `observations`, `[n, o]`, from standard normal `noise`,
+    /// `[noise vectors, rows, a]`. The first rows/n rows belong to the first observation, and so on.
     fn draw(&self, observations: &Tensor, noise: &Tensor) -> candle_core::Result<Tensor>;
 
-    /// Numbers that drawing so many actions in each of some states takes beside the noise and the
-    /// actions.
-    fn memory(&self, states: u128, candidates: u128) -> u128;
+    /// Numbers held while drawing this many candidates in each state, beside noise and candidates.
+    fn floats(&self, states: u128, candidates: u128) -> u128;
 }
 
-/// The networks of such a policy.
+/// The networks of a policy.
 pub(crate) struct Networks {
     pub actor: Box<dyn Actor>,
     pub critics: Ensemble,
-    /// What the rule `nearest` takes.
+    /// Value function of the rule `nearest`.
     pub value: Option<Ensemble>,
 }
 
-/// A policy of such networks.
+/// A policy that chooses among candidates.
 pub(crate) struct CandidatePolicy {
     choice: Choice,
-    /// Shared with those that choose in another way.
+    /// Shared with copies that have another choice.
     networks: Arc<Networks>,
     precision: Precision,
 }
@@ -51,7 +49,7 @@ impl CandidatePolicy {
         Self { choice, networks: Arc::new(networks), precision }.choosing(choice)
     }
 
-    /// Makes a policy of the same networks that chooses by `choice`.
+    /// The same networks with another choice.
     fn choosing(&self, choice: Choice) -> Result<Self, PolicyError> {
         choice.check()?;
         if choice.rule == Rule::Nearest && self.networks.value.is_none() {
@@ -60,10 +58,10 @@ impl CandidatePolicy {
         Ok(Self { choice, networks: self.networks.clone(), precision: self.precision })
     }
 
-    /// The noise of all candidates, `noises × states × candidates × action_dim`.
-    fn drawn(&self, states: &mut [EpisodeState]) -> Vec<f32> {
+    /// Draws the noise of all candidates, `noise vectors × states × candidates × action_dim`.
+    fn draw_noise(&self, states: &mut [EpisodeState]) -> Vec<f32> {
         let (n, row) = (states.len(), self.choice.candidates as usize * self.action_dim());
-        let noises = self.networks.actor.noises();
+        let noises = self.networks.actor.noise_vectors();
         let mut noise = vec![0.0; noises * n * row];
         for (i, state) in states.iter_mut().enumerate() {
             for number in 0..noises {
@@ -73,8 +71,7 @@ impl CandidatePolicy {
         noise
     }
 
-    /// The observations, `[states, observation_dim]`, and the candidates that this noise leads to,
-    /// `[states · candidates, action_dim]`.
+    /// The observations, `[states, o]`, and their candidates, `[states·candidates, a]`, from noise.
     fn candidates(
         &self,
         observations: &[f32],
@@ -85,55 +82,49 @@ impl CandidatePolicy {
         let rows = states * self.choice.candidates as usize;
         let observations =
             Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
-        let noise = Tensor::from_vec(
-            noise,
-            (self.networks.actor.noises(), rows, action_dim),
-            &Device::Cpu,
-        )?;
+        let noise = Tensor::from_vec(noise, ((), rows, action_dim), &Device::Cpu)?;
         let drawn = self.networks.actor.draw(&observations, &noise)?;
         Ok((observations, drawn))
     }
 
-    /// What the critics say of each of some actions, by the choice's
+    /// The critics' values of actions, by the choice's
     /// [`Aggregate`](crate::sampling::choice::Aggregate).
     fn values(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>, PolicyError> {
         let rows = actions.dim(0)?;
         let values = self.networks.critics.values(observations, actions)?;
-        Ok(read(&values, |values: &[f32]| self.choice.value.reduce(values, rows))?)
+        Ok(read(&values, |values: &[f32]| self.choice.aggregate.reduce(values, rows))?)
     }
 
-    /// Draws candidates with noise `noises × states × candidates × action_dim`. Gives these,
-    /// `states × candidates × action_dim`, and what the choice's rule compares of each, `states ×
-    /// candidates`: zeros where there is nothing to choose.
+    /// Draws candidates, `states × candidates × action_dim`, and their scores, `states × candidates`,
+    /// which are 0 for a single candidate.
     pub fn draw(
         &self,
         observations: &[f32],
         noise: Vec<f32>,
     ) -> Result<(Vec<f32>, Vec<f32>), PolicyError> {
         let (observations, drawn) = self.candidates(observations, noise)?;
-        let worth = match self.choice.candidates {
+        let scores = match self.choice.candidates {
             1 => vec![0.0; drawn.dim(0)?],
-            _ => self.worth(&observations, &drawn)?,
+            _ => self.scores(&observations, &drawn)?,
         };
-        Ok((read(&drawn, <[f32]>::to_vec)?, worth))
+        Ok((read(&drawn, <[f32]>::to_vec)?, scores))
     }
 
-    /// What the choice's rule compares of each of some actions.
-    fn worth(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>, PolicyError> {
-        let mut worth = self.values(observations, actions)?;
+    /// The numbers that the choice's rule compares: values Q, or −(Q − V)² for the rule `nearest`.
+    fn scores(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>, PolicyError> {
+        let mut scores = self.values(observations, actions)?;
         if let (Rule::Nearest, Some(value)) = (self.choice.rule, &self.networks.value) {
             let of_states = read(&value.state_values(observations)?, <[f32]>::to_vec)?;
-            for (of_one, v) in
-                worth.chunks_exact_mut(self.choice.candidates as usize).zip(of_states)
-            {
-                of_one.iter_mut().for_each(|q| *q = -(*q - v).powi(2));
+            let candidates = scores.chunks_exact_mut(self.choice.candidates as usize);
+            for (scores, v) in candidates.zip(of_states) {
+                scores.iter_mut().for_each(|q| *q = -(*q - v).powi(2));
             }
         }
-        Ok(worth)
+        Ok(scores)
     }
 }
 
-/// Writes the mean of the chosen ones among candidates.
+/// Writes the mean of the chosen candidates.
 fn mean_of(chosen: &[usize], drawn: &[f32], action: &mut [f32]) {
     let a = action.len();
     for (j, x) in action.iter_mut().enumerate() {
@@ -164,17 +155,21 @@ impl Policy for CandidatePolicy {
 
     fn memory(&self, states: usize) -> u64 {
         let Networks { actor, critics, value } = &*self.networks;
-        let ((observation_dim, action_dim), noises) = (actor.dims(), actor.noises());
+        let ((observation_dim, action_dim), noises) = (actor.dims(), actor.noise_vectors());
         let (states, candidates) = (states as u128, u128::from(self.choice.candidates));
         // The noise of all steps, the candidates and their copies, and their values.
         let drawn = states * candidates * (action_dim * (noises + 3) + 1) as u128;
-        let sampling = drawn + states * observation_dim as u128 + actor.memory(states, candidates);
-        let of_states = value.as_ref().map_or(0, |value| value.shape().memory(states, 1));
-        bytes(sampling + critics.shape().memory(states, candidates) + of_states)
+        let sampling = drawn + states * observation_dim as u128 + actor.floats(states, candidates);
+        let of_states = value.as_ref().map_or(0, |value| value.shape().floats(states, 1));
+        bytes(sampling + critics.shape().floats(states, candidates) + of_states)
     }
 
     fn noise(&self) -> Vec<usize> {
-        vec![self.networks.actor.noises(), self.choice.candidates as usize, self.action_dim()]
+        vec![
+            self.networks.actor.noise_vectors(),
+            self.choice.candidates as usize,
+            self.action_dim(),
+        ]
     }
 
     fn act(
@@ -184,13 +179,13 @@ impl Policy for CandidatePolicy {
         actions: &mut [f32],
     ) -> Result<(), PolicyError> {
         let (action_dim, candidates) = (self.action_dim(), self.choice.candidates as usize);
-        let (drawn, worth) = self.draw(observations, self.drawn(states))?;
-        let of_each = drawn
-            .chunks_exact(candidates * action_dim)
-            .zip(worth.chunks_exact(candidates))
-            .zip(states);
-        for (action, ((drawn, worth), state)) in actions.chunks_exact_mut(action_dim).zip(of_each) {
-            mean_of(&self.choice.pick(worth, state)?, drawn, action);
+        let (drawn, scores) = self.draw(observations, self.draw_noise(states))?;
+        let drawn = drawn.chunks_exact(candidates * action_dim);
+        let of_states = drawn.zip(scores.chunks_exact(candidates)).zip(states);
+        for (action, ((drawn, scores), state)) in
+            actions.chunks_exact_mut(action_dim).zip(of_states)
+        {
+            mean_of(&self.choice.pick(scores, state)?, drawn, action);
         }
         check_numbers("a sampled action", actions)
     }
@@ -199,13 +194,13 @@ impl Policy for CandidatePolicy {
         &self,
         observations: &[f32],
         states: &mut [EpisodeState],
-    ) -> Result<Sampled, PolicyError> {
-        let (observations, drawn) = self.candidates(observations, self.drawn(states))?;
+    ) -> Result<Samples, PolicyError> {
+        let (observations, drawn) = self.candidates(observations, self.draw_noise(states))?;
         let values = self.values(&observations, &drawn)?;
         let actions = read(&drawn, <[f32]>::to_vec)?;
         check_numbers("a sampled action", &actions)?;
         check_numbers("the value of a candidate", &values)?;
-        Ok(Sampled { actions, values })
+        Ok(Samples { actions, values })
     }
 
     fn value(&self, observations: &[f32], actions: &[f32]) -> Result<Vec<f32>, PolicyError> {

@@ -1,4 +1,4 @@
-//! How a policy that samples chooses among the actions that it has drawn in a state.
+//! The choice among the candidates of a state.
 
 use crate::error::{PolicyError, check_range};
 use crate::sampling::episode::EpisodeState;
@@ -7,70 +7,68 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// How many actions are drawn in each state, and which of them is taken, or the mean of which. It
-/// travels in a policy's file; an operator may have the policy scored with another.
+/// The number of candidates, and the choice among them. A policy's file has one; users can ask for
+/// another.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Choice {
-    /// Actions that are drawn, N_a of Eq. 25, within 1..=[`Self::MOST_CANDIDATES`]. Of one nothing
-    /// is chosen, and the critics are not asked.
+    /// Candidates N_a of Eq. 25, within 1..=[`Self::MOST_CANDIDATES`]. A single one is taken without
+    /// evaluating the critics.
     pub candidates: u32,
-    /// How the values that the critics give an action become one.
-    pub value: Aggregate,
-    /// Which action is taken.
+    /// Aggregate of the critics' values. Older files call it `value`.
+    #[serde(alias = "value")]
+    pub aggregate: Aggregate,
+    /// Rule of the choice.
     pub rule: Rule,
 }
 
-/// How the values that an ensemble of critics gives an action become one.
+/// Aggregate of the values of an ensemble of critics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Aggregate {
-    /// Their mean.
+    /// Mean.
     Mean,
-    /// The smallest.
+    /// Minimum.
     Min,
 }
 
-/// Which of several actions is taken.
+/// Rule of the choice among candidates.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum Rule {
-    /// The one of the largest value, the first of equals.
+    /// The candidate of the largest value, the first of equals.
     Best,
-    /// One that is drawn, with a probability proportional to exp(value / temperature).
+    /// A candidate drawn with a probability proportional to exp(value / temperature).
     Softmax {
         /// Temperature in units of the value, above 0.
         temperature: f32,
     },
-    /// The one whose value Q is nearest to the state's own, V: the largest -(Q - V)² (AlignIQL).
+    /// The candidate whose value Q is nearest to V(s): the largest −(Q − V)² (AlignIQL).
     Nearest,
-    /// The mean of several that are drawn, each once, with probabilities as of [`Self::Softmax`]
-    /// (SfBC). Values count up to forty temperatures above the smallest of as many largest, so that
-    /// no draw is a certainty too early.
+    /// The mean of several candidates drawn as in [`Self::Softmax`], without replacement (SfBC).
+    /// Values are clipped to forty temperatures above the smallest of as many largest ones, which
+    /// keeps the first draws random.
     Average {
         /// Temperature in units of the value, above 0.
         temperature: f32,
-        /// How many are drawn, at least 1; all of fewer candidates.
+        /// Number of candidates drawn, at least 1; all, if there are fewer.
         actions: u32,
     },
 }
 
-/// Temperatures by which values may exceed the smallest of the largest.
+/// Clipping of values in [`Rule::Average`], in temperatures.
 const MOST_ABOVE: f32 = 40.0;
 
 impl Choice {
-    /// Most actions drawn in a state: far above any use, low enough for evaluators' memory.
+    /// Largest number of candidates, which bounds an evaluator's memory.
     pub const MOST_CANDIDATES: u32 = 10_000;
 
-    /// The best of so many candidates by the mean of the critics (Eq. 25).
+    /// The best of this many candidates by the mean of the critics (Eq. 25).
     pub fn best_of(candidates: u32) -> Self {
-        Self { candidates, value: Aggregate::Mean, rule: Rule::Best }
+        Self { candidates, aggregate: Aggregate::Mean, rule: Rule::Best }
     }
 
-    /// Checks that a policy can act by this choice.
-    ///
-    /// # Errors
-    /// A number of candidates or a temperature out of range.
+    /// Checks the numbers of candidates and the temperature.
     pub fn check(&self) -> Result<(), PolicyError> {
         check_range("candidates", self.candidates as usize, Self::MOST_CANDIDATES as usize)?;
         if let Rule::Average { actions, .. } = self.rule {
@@ -86,7 +84,7 @@ impl Choice {
         }
     }
 
-    /// How many uniform numbers [`Rule`] takes to choose in a state.
+    /// Number of uniform numbers that the choice in a state draws.
     pub fn uniforms(&self) -> usize {
         match self.rule {
             Rule::Softmax { .. } if self.candidates > 1 => 1,
@@ -97,31 +95,30 @@ impl Choice {
         }
     }
 
-    /// Which of a state's candidates are taken: one, or several of which the mean is the action.
-    /// `worth` has what the rule compares of each: its value, or -(Q - V)².
+    /// Indices of the chosen candidates, of which the mean is the action. `scores` are values, or
+    /// −(Q − V)² for [`Rule::Nearest`].
     pub(crate) fn pick(
         &self,
-        worth: &[f32],
+        scores: &[f32],
         state: &mut EpisodeState,
     ) -> Result<Vec<usize>, PolicyError> {
-        if worth.iter().any(|worth| worth.is_nan()) {
+        if scores.iter().any(|score| score.is_nan()) {
             return Err(PolicyError::NotANumber("the value of a candidate"));
         }
         Ok(match self.rule {
-            Rule::Softmax { temperature } if worth.len() > 1 => {
-                vec![draw(worth, temperature, state.uniform())]
+            Rule::Softmax { temperature } if scores.len() > 1 => {
+                vec![draw(scores, temperature, state.uniform())]
             }
-            Rule::Average { temperature, actions } if worth.len() > 1 => {
-                draw_several(worth, temperature, actions as usize, state)
+            Rule::Average { temperature, actions } if scores.len() > 1 => {
+                draw_several(scores, temperature, actions as usize, state)
             }
-            _ => vec![best(worth)],
+            _ => vec![best(scores)],
         })
     }
 }
 
 impl Aggregate {
-    /// The value of each of `rows` actions, of `values`, `critics × rows`. A NaN of one critic is
-    /// kept.
+    /// The aggregate of each of `rows` actions, for `values` `critics × rows`. Keeps NaN.
     pub(crate) fn reduce(self, values: &[f32], rows: usize) -> Vec<f32> {
         let critics = (values.len() / rows) as f32;
         let of_action = |row| {
@@ -137,43 +134,42 @@ impl Aggregate {
     }
 }
 
-/// The place of the largest, the first of equals.
-fn best(worth: &[f32]) -> usize {
-    (1..worth.len()).fold(0, |best, i| if worth[i] > worth[best] { i } else { best })
+/// Index of the largest score, the first of equals.
+fn best(scores: &[f32]) -> usize {
+    (1..scores.len()).fold(0, |best, i| if scores[i] > scores[best] { i } else { best })
 }
 
-/// A place, with a probability proportional to exp(worth / temperature); `uniform` is in [0, 1).
-/// Relative to the largest worth nothing overflows, and infinite worth counts as equal.
-fn draw(worth: &[f32], temperature: f32, uniform: f64) -> usize {
-    let largest = worth[best(worth)];
-    let weight = |worth: &f32| match *worth == largest {
+/// An index drawn with a probability proportional to exp(score / temperature); `uniform` is in
+/// [0, 1). Relative to the largest score nothing overflows, and infinite scores are equal.
+fn draw(scores: &[f32], temperature: f32, uniform: f64) -> usize {
+    let largest = scores[best(scores)];
+    let weight = |score: &f32| match *score == largest {
         true => 1.0,
-        false => (f64::from(worth - largest) / f64::from(temperature)).exp(),
+        false => (f64::from(score - largest) / f64::from(temperature)).exp(),
     };
-    let weights: Vec<f64> = worth.iter().map(weight).collect();
+    let weights: Vec<f64> = scores.iter().map(weight).collect();
     let mut left = uniform * weights.iter().sum::<f64>();
     let place = weights.iter().position(|weight| {
         left -= weight;
         left < 0.0
     });
-    // Rounding may leave no weight for the last: then it is the best.
-    place.unwrap_or(best(worth))
+    // Rounding can leave no weight for the last.
+    place.unwrap_or(best(scores))
 }
 
-/// So many places, or all of fewer, each once, with a probability among those left as [`draw`] has
-/// it.
+/// `count` indices, or all of fewer, drawn by [`draw`] without replacement.
 fn draw_several(
-    worth: &[f32],
+    scores: &[f32],
     temperature: f32,
     count: usize,
     state: &mut EpisodeState,
 ) -> Vec<usize> {
-    let count = count.min(worth.len());
-    let mut sorted = worth.to_vec();
+    let count = count.min(scores.len());
+    let mut sorted = scores.to_vec();
     sorted.sort_unstable_by(|x, y| y.total_cmp(x));
     let most = sorted[count - 1] + MOST_ABOVE * temperature;
-    let mut left: Vec<f32> = worth.iter().map(|worth| worth.min(most)).collect();
-    let mut places: Vec<usize> = (0..worth.len()).collect();
+    let mut left: Vec<f32> = scores.iter().map(|score| score.min(most)).collect();
+    let mut places: Vec<usize> = (0..scores.len()).collect();
     let mut one = || {
         let drawn = draw(&left, temperature, state.uniform());
         left.remove(drawn);
@@ -193,7 +189,7 @@ impl FromStr for Aggregate {
 impl FromStr for Rule {
     type Err = &'static str;
 
-    /// As [`Display`](fmt::Display) writes it.
+    /// Parses the form of [`Display`](fmt::Display).
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let expected = "one of best, softmax:TEMPERATURE, average:TEMPERATURE:ACTIONS and nearest";
         let temperature = |text: &str| text.parse().map_err(|_| expected);
@@ -210,7 +206,7 @@ impl FromStr for Rule {
     }
 }
 
-/// As an operator writes it: `best`, `softmax:0.1`, `average:0.01:4`, `nearest`.
+/// `best`, `softmax:0.1`, `average:0.01:4` or `nearest`.
 impl fmt::Display for Rule {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -222,10 +218,10 @@ impl fmt::Display for Rule {
     }
 }
 
-/// As people read it: `10 candidates`, and where it is not the best by the mean, what it is.
+/// `10 candidates`, then rule and aggregate where they are not the best by the mean.
 impl fmt::Display for Choice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { candidates, value, rule } = self;
+        let Self { candidates, aggregate, rule } = self;
         if *candidates == 1 {
             return f.write_str("1 candidate");
         }
@@ -233,7 +229,7 @@ impl fmt::Display for Choice {
         if *rule != Rule::Best {
             write!(f, ", {rule}")?;
         }
-        if *value == Aggregate::Min { f.write_str(", min") } else { Ok(()) }
+        if *aggregate == Aggregate::Min { f.write_str(", min") } else { Ok(()) }
     }
 }
 

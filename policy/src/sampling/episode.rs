@@ -1,26 +1,25 @@
-//! What a policy carries through an episode.
+//! The state of a policy in an episode.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-/// The stream, among those of an episode's seed, that a policy draws from.
+/// The policy's stream of an episode's seed.
 const POLICY_STREAM: u64 = 2;
 
-/// What a policy carries through one episode. Each episode has its own, so that its outcome does
-/// not depend on which other episodes share a batch with it.
+/// The state of a policy in one episode, which makes the outcome independent of other episodes in
+/// the batch.
 pub struct EpisodeState {
     noise: ChaCha8Rng,
     /// Numbers that come before the generator's.
     given: Vec<f32>,
-    /// Numbers that the policy keeps from one step to the next, such as a plan or a history; none
-    /// when an episode begins.
+    /// Memory from step to step, such as a plan; empty when an episode begins.
     pub memory: Vec<f32>,
 }
 
 impl EpisodeState {
-    /// Begins an episode. Its noise is a stream of the episode's seed that the environment does not
-    /// use.
+    /// The state at the beginning of an episode. The environment does not use the stream of its
+    /// noise.
     pub fn new(seed: u64) -> Self {
         let mut noise = ChaCha8Rng::seed_from_u64(seed);
         noise.set_stream(POLICY_STREAM);
@@ -33,7 +32,7 @@ impl EpisodeState {
         Self { given: noise, ..Self::new(0) }
     }
 
-    /// Standard normal numbers.
+    /// Fills `out` with standard normal numbers.
     pub fn fill_normal(&mut self, out: &mut [f32]) {
         let given = self.given.len().min(out.len());
         let (first, rest) = out.split_at_mut(given);
@@ -41,7 +40,7 @@ impl EpisodeState {
         rest.fill_with(|| StandardNormal.sample(&mut self.noise));
     }
 
-    /// A number in [0, 1).
+    /// Draws from U[0, 1).
     pub fn uniform(&mut self) -> f64 {
         self.noise.random()
     }
@@ -51,10 +50,9 @@ impl EpisodeState {
 mod tests {
     use super::*;
 
-    /// The environments of the evaluator draw the initial state from stream 1 of an episode's seed,
-    /// the goal from stream 4.
+    /// The evaluator draws the initial state from stream 1 and the goal from stream 4.
     #[test]
-    fn a_policy_s_noise_is_apart_from_the_initial_state_and_the_goal() {
+    fn the_noise_differs_from_streams_of_the_environment() {
         let mut noise = [0.0; 4];
         EpisodeState::new(7).fill_normal(&mut noise);
         for stream in [0, 1, 4] {

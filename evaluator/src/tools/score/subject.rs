@@ -111,8 +111,8 @@ impl Subject {
 fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
     let own = own.unwrap_or(Choice::best_of(1));
     let rule = args.rule.unwrap_or(own.rule);
-    let value = args.value.unwrap_or(own.value);
-    let with = |candidates| Choice { candidates, rule, value };
+    let aggregate = args.value.unwrap_or(own.aggregate);
+    let with = |candidates| Choice { candidates, rule, aggregate };
     match args.candidates.as_slice() {
         [] if args.rule.is_none() && args.value.is_none() => Vec::new(),
         [] => vec![with(own.candidates)],
@@ -129,7 +129,7 @@ mod tests {
     #[test]
     fn options_replace_the_policy_s_own_choice() {
         let (mut own, mut args) = (Choice::best_of(7), ScoreArgs::default());
-        own.value = Aggregate::Min;
+        own.aggregate = Aggregate::Min;
         assert!(choices(&args, Some(own)).is_empty());
         let with = |candidates| Choice { candidates, ..own };
         args.candidates = vec![1, 10];

@@ -1,26 +1,23 @@
-//! Tests of acting by plans; their numbers are compared with a script's in the crate of the
-//! algorithms.
+//! Tests of acting by plans. Golden tests of the algorithm compare the numbers.
 
 use super::*;
-use crate::file::{Header, PolicyConfig, load_policy};
+use crate::file::{Header, PolicyConfig};
 use crate::kinds::planner::ValueGuidance;
-use candle_core::Device;
-use quad_kernels::scaling::{Affine, Scaling};
-use quad_nn::TrajectoryConfig;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
+use crate::testing::{argmax, initial, load, sample};
+use quad_nn::{Affine, Scaling, TrajectoryConfig};
 
 const DIMS: (usize, usize) = (4, 2);
 
 fn shape(replan_every: usize) -> DiffuserShape {
     let affine = |n| Some(Affine { offset: vec![0.5; n], scale: vec![2.0; n] });
+    let multipliers = vec![1, 4];
     DiffuserShape {
         observation_dim: DIMS.0,
         action_dim: DIMS.1,
         network: TrajectoryConfig {
             horizon: 4,
             channels: 4,
-            multipliers: vec![1, 4],
+            multipliers,
             groups: 2,
             attention: None,
         },
@@ -31,19 +28,11 @@ fn shape(replan_every: usize) -> DiffuserShape {
     }
 }
 
-fn file(shape: DiffuserShape, plans: u32) -> Vec<u8> {
-    let generator = &mut ChaCha8Rng::seed_from_u64(5);
-    let policy = PolicyConfig::Diffuser { shape, choice: Choice::best_of(plans) };
-    let tensors =
-        policy.tensors(|layout| Weights::initial(layout, generator, &Device::Cpu)).unwrap();
-    Header::new(policy, ()).to_safetensors(&tensors).unwrap()
+fn policy(shape: DiffuserShape, plans: u32) -> Box<dyn Policy> {
+    load(&initial(PolicyConfig::Diffuser { shape, choice: Choice::best_of(plans) })).unwrap()
 }
 
-fn policy(replan_every: usize, plans: u32) -> Box<dyn Policy> {
-    load_policy(&file(shape(replan_every), plans), Precision::F32).unwrap()
-}
-
-/// What it does in so many steps of an episode with this observation.
+/// The actions at some steps of episodes, whose observations depend on their seeds.
 fn acts(policy: &dyn Policy, seeds: &[u64], steps: usize) -> Vec<Vec<f32>> {
     let mut states: Vec<_> = seeds.iter().map(|seed| policy.begin(*seed)).collect();
     let observations: Vec<f32> =
@@ -57,18 +46,17 @@ fn acts(policy: &dyn Policy, seeds: &[u64], steps: usize) -> Vec<Vec<f32>> {
 }
 
 #[test]
-fn a_plan_is_followed_and_then_made_again() {
-    let [each, third] = [acts(&*policy(1, 3), &[7], 4), acts(&*policy(3, 3), &[7], 4)];
-    assert_eq!(each[0], third[0], "the plan is the same");
+fn a_plan_is_executed_before_the_next_is_made() {
+    let [each, third] = [1, 3].map(|every| acts(&*policy(shape(every), 3), &[7], 4));
+    assert_eq!(each[0], third[0], "the first plan is the same");
     assert!(each[1] != third[1] && third[1] != third[2]);
-    // The second plan of each draws the same noise in the same state.
-    assert_eq!(each[1], third[3]);
+    assert_eq!(each[1], third[3], "the second plan is the same");
 }
 
+/// Two chunks of plans, which split a state's.
 #[test]
-fn an_episode_does_not_depend_on_those_beside_it() {
-    // More windows than a chunk, cut within a state's.
-    let policy = policy(2, 25);
+fn an_episode_does_not_depend_on_others() {
+    let policy = policy(shape(2), 25);
     let together = acts(&*policy, &[1, 2, 3], 5);
     for (i, seed) in [1, 2, 3].into_iter().enumerate() {
         for (together, alone) in together.iter().zip(acts(&*policy, &[seed], 5)) {
@@ -78,59 +66,39 @@ fn an_episode_does_not_depend_on_those_beside_it() {
 }
 
 #[test]
-fn what_is_sampled_is_what_is_chosen_among() {
-    let policy = policy(2, 6);
-    let begin = || [4, 5].map(|seed| policy.begin(seed));
-    let (mut acting, mut sampling) = (begin(), begin());
+fn the_sampled_plan_of_largest_value_is_taken() {
+    let policy = policy(shape(2), 6);
     let observations = [0.3; 2 * DIMS.0];
-    // One of the two is in the middle of its plan.
-    for states in [&mut acting, &mut sampling] {
+    // One of two states has a plan.
+    let begin = || {
+        let mut states = [4, 5].map(|seed| policy.begin(seed));
         policy.act(&observations[..DIMS.0], &mut states[..1], &mut [0.0; DIMS.1]).unwrap();
-    }
-    let sampled = policy.sample(&observations, &mut sampling).unwrap();
-    let mut actions = [0.0; 2 * DIMS.1];
-    policy.act(&observations, &mut acting, &mut actions).unwrap();
-    let (of_first, of_second) = sampled.actions.split_at(6 * DIMS.1);
-    assert!(of_first.chunks(DIMS.1).all(|action| action == &actions[..DIMS.1]));
-    assert!(sampled.values[..6].iter().all(|value| *value == sampled.values[0]));
-    let values = &sampled.values[6..];
-    let best = (1..6).fold(0, |best, i| if values[i] > values[best] { i } else { best });
-    assert_eq!(of_second[best * DIMS.1..][..DIMS.1], actions[DIMS.1..]);
-    assert!(
-        values.iter().any(|value| *value != values[0])
-            && policy.value(&[0.0; 4], &[0.0; 2]).is_err()
-    );
-}
-
-#[test]
-fn guidance_raises_values() {
-    let mean = |scale: f32| {
-        let mut shape = shape(1);
-        shape.guidance.scale = scale;
-        let policy = load_policy(&file(shape, 20), Precision::F32).unwrap();
-        policy.sample(&[0.3; DIMS.0], &mut [policy.begin(0)]).unwrap().values.iter().sum::<f32>()
-            / 20.0
+        states
     };
-    assert!(
-        mean(5.0) > mean(0.0) && mean(0.0) > mean(-5.0),
-        "{} {} {}",
-        mean(5.0),
-        mean(0.0),
-        mean(-5.0)
-    );
+    let samples = policy.sample(&observations, &mut begin()).unwrap();
+    let mut actions = [0.0; 2 * DIMS.1];
+    policy.act(&observations, &mut begin(), &mut actions).unwrap();
+    let (first, second) = samples.actions.split_at(6 * DIMS.1);
+    assert!(first.chunks(DIMS.1).all(|action| action == &actions[..DIMS.1]));
+    assert!(samples.values[..6].iter().all(|value| *value == samples.values[0]));
+    let values = &samples.values[6..];
+    assert_eq!(second[argmax(values) * DIMS.1..][..DIMS.1], actions[DIMS.1..]);
+    assert!(values.iter().any(|value| *value != values[0]), "values differ");
+    assert!(policy.value(&[0.0; 4], &[0.0; 2]).is_err());
 }
 
 #[test]
-fn the_last_denoising_steps_so_many_are_not_guided() {
+fn guidance_raises_values_but_not_in_the_last_steps() {
     let values = |scale: f32, stop: usize| {
         let guidance = ValueGuidance { steps: 2, scale, stop };
-        let policy =
-            load_policy(&file(DiffuserShape { guidance, ..shape(1) }, 4), Precision::F32).unwrap();
-        policy.sample(&[0.3; DIMS.0], &mut [policy.begin(0)]).unwrap().values
+        let policy = policy(DiffuserShape { guidance, ..shape(1) }, 20);
+        sample(&*policy, &[0.3; DIMS.0], &[0]).unwrap().values
     };
-    let unguided = values(0.0, 0);
-    assert_eq!(values(5.0, 3), unguided, "of three steps");
-    assert_ne!(values(5.0, 2), unguided);
+    let [low, unguided, high] =
+        [-5.0, 0.0, 5.0].map(|scale| values(scale, 1).iter().sum::<f32>() / 20.0);
+    assert!(low < unguided && unguided < high, "{low} {unguided} {high}");
+    assert_eq!(values(5.0, 3), values(0.0, 0), "three of three steps");
+    assert_ne!(values(5.0, 2), values(0.0, 0));
 }
 
 #[test]
@@ -140,16 +108,18 @@ fn a_shape_out_of_range_is_refused() {
         change(&mut shape);
         let policy = PolicyConfig::Diffuser { shape, choice: Choice::best_of(1) };
         let file = Header::new(policy, ()).to_safetensors(&Tensors::new()).unwrap();
-        matches!(load_policy(&file, Precision::F32), Err(PolicyError::Range { .. }))
+        matches!(load(&file), Err(PolicyError::Range { .. }))
     };
     assert!(refused(|shape| shape.replan_every = 5) && refused(|shape| shape.replan_every = 0));
-    assert!(
-        refused(|shape| shape.network.horizon = 3)
-            && refused(|shape| shape.diffusion_steps = usize::MAX)
-    );
+    assert!(refused(|shape| shape.network.horizon = 3));
+    assert!(refused(|shape| shape.diffusion_steps = usize::MAX));
     assert!(refused(|shape| shape.observation_dim = 0) && !refused(|_| ()));
-    let header = Header::<()>::read(&file(shape(1), 1)).unwrap();
-    assert_eq!(serde_json::to_value(header.policy).unwrap()["kind"], "planner");
     let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(2) };
-    assert!(matches!(policy(1, 2).with_choice(nearest), Err(PolicyError::NoValue)));
+    assert!(matches!(policy(shape(1), 2).with_choice(nearest), Err(PolicyError::NoValue)));
+}
+
+#[test]
+fn files_call_the_kind_planner() {
+    let policy = PolicyConfig::Diffuser { shape: shape(1), choice: Choice::best_of(1) };
+    assert_eq!(serde_json::to_value(policy).unwrap()["kind"], "planner");
 }

@@ -1,4 +1,4 @@
-//! Memory in which the fast implementation leaves the gradient of weights.
+//! Memory into which fast implementations write the gradient of weights.
 
 use crate::slices::modify;
 use candle_core::{Result, Tensor, bail};
@@ -7,15 +7,15 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-/// Backward passes that have begun in this process: each has a number of its own.
+/// Backward passes begun in this process; each gets the next number.
 static PASSES: AtomicU64 = AtomicU64::new(0);
 
 thread_local! {
-    /// The number of the backward pass that this thread is in; 0 outside.
+    /// Number of this thread's backward pass; 0 outside.
     static PASS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Runs `work` as a backward pass. Gives what it gives, and the pass's number.
+/// Runs `work` as a backward pass. Returns its result and the pass's number.
 pub(crate) fn backward_pass<R>(work: impl FnOnce() -> R) -> (R, u64) {
     let pass = PASSES.fetch_add(1, Ordering::Relaxed) + 1;
     let before = PASS.replace(pass);
@@ -24,23 +24,22 @@ pub(crate) fn backward_pass<R>(work: impl FnOnce() -> R) -> (R, u64) {
     (result, pass)
 }
 
-/// A gradient in memory that is kept from step to step. Handing megabytes to candle's `GradStore`
-/// instead costs some milliseconds in each backward pass: they are allocated three times over, and
-/// given back to the system.
+/// The gradient of one network's weights, in the same memory at each step. Candle's `GradStore`
+/// would allocate these megabytes three times in each backward pass, which takes milliseconds.
 #[derive(Debug)]
-pub(crate) struct KeptGradient {
+pub(crate) struct GradientBuffer {
     values: Tensor,
-    /// The backward pass that has written last, and the ranges that it wrote.
+    /// Number of the last backward pass, and the ranges that it wrote.
     written: Mutex<(u64, Vec<Range<usize>>)>,
 }
 
-impl KeptGradient {
+impl GradientBuffer {
     pub fn new(weights: &Tensor) -> Result<Self> {
         Ok(Self { values: weights.zeros_like()?.detach(), written: Mutex::default() })
     }
 
-    /// Has `work` write the gradient of a range of the weights, all of it. What the same pass wrote
-    /// there before is added; what an earlier pass left is gone.
+    /// Lets `work` write the whole gradient of a range of the weights. It is added to the same
+    /// pass's gradient of this range, and replaces that of an earlier pass.
     pub fn write(&self, range: Range<usize>, work: impl FnOnce(&mut [f32])) -> Result<()> {
         let pass = PASS.get();
         if pass == 0 {
@@ -61,7 +60,7 @@ impl KeptGradient {
         })
     }
 
-    /// What that pass has written, 0 elsewhere; none if it wrote nothing.
+    /// The gradient of this pass, 0 outside the written ranges; `None` if the pass wrote nothing.
     pub fn read(&self, pass: u64) -> Option<Tensor> {
         let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
         if written.0 != pass {

@@ -1,0 +1,103 @@
+//! Helpers of tests.
+
+use crate::gradients::gradient::Gradients;
+use crate::weights::{Layout, Weights};
+use candle_core::{DType, Device, Result, Shape, Tensor, Var};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Numbers from U(−1, 1), a function of the seed.
+pub(crate) fn random(shape: impl Into<Shape>, seed: u64) -> Tensor {
+    tensor(&mut ChaCha8Rng::seed_from_u64(seed), shape)
+}
+
+/// Numbers from U(−1, 1).
+pub(crate) fn tensor(generator: &mut ChaCha8Rng, shape: impl Into<Shape>) -> Tensor {
+    let shape = shape.into();
+    let numbers: Vec<f32> =
+        (0..shape.elem_count()).map(|_| generator.random_range(-1.0..1.0)).collect();
+    Tensor::from_vec(numbers, shape, &Device::Cpu).unwrap()
+}
+
+/// Trainable weights: initial ones plus a little, so that biases are not 0.
+pub(crate) fn weights(layout: Layout, generator: &mut ChaCha8Rng) -> Weights {
+    let noise = (tensor(generator, layout.count()) * 0.1).unwrap();
+    let values = (Weights::initial(&layout, generator, &Device::Cpu).unwrap() + noise).unwrap();
+    Weights::trainable(layout, &values).unwrap()
+}
+
+pub(crate) fn numbers(x: &Tensor) -> Vec<f32> {
+    x.flatten_all().unwrap().to_vec1().unwrap()
+}
+
+/// Asserts that two tensors are equal up to rounding.
+pub(crate) fn assert_close(what: &str, found: &Tensor, expected: &Tensor) {
+    assert_within(2e-5, what, found, expected);
+}
+
+/// Asserts that errors are within a tolerance, relative to the root mean square.
+pub(crate) fn assert_within(tolerance: f32, what: &str, found: &Tensor, expected: &Tensor) {
+    assert_eq!(found.dims(), expected.dims(), "{what}");
+    let (found, expected) = (numbers(found), numbers(expected));
+    let size = (expected.iter().map(|x| x * x).sum::<f32>() / expected.len() as f32).sqrt();
+    for (i, (x, y)) in found.iter().zip(&expected).enumerate() {
+        let error = (x - y).abs() / (size.max(1e-3) + 5.0 * y.abs());
+        assert!(error <= tolerance, "{what} at {i}: {x} for {y}");
+    }
+}
+
+/// A loss that depends on every output in its own way, in the outputs' type.
+pub(crate) fn loss(outputs: &Tensor) -> Result<Tensor> {
+    let factors = Tensor::arange(0f32, outputs.elem_count() as f32, &Device::Cpu)?.sin()?;
+    (outputs.flatten_all()? * factors.to_dtype(outputs.dtype())?)?.sqr()?.sum_all()
+}
+
+/// The gradient of [`loss`] with respect to weights.
+pub(crate) fn gradient(outputs: &Tensor, weights: &Weights) -> Result<Tensor> {
+    Gradients::of(&loss(outputs)?)?.with_respect_to(weights)?.copy()
+}
+
+/// Compares the gradient of [`loss`] at an argument of `outputs` with finite differences, along the
+/// gradient and along a random direction. `tolerance` is relative to the gradient's norm.
+pub(crate) fn check_gradient(
+    (what, step, tolerance): (&str, f64, f64),
+    (at, gradient): (&Tensor, &Tensor),
+    outputs: impl Fn(&Tensor) -> Result<Tensor>,
+) -> Result<()> {
+    let norm = |x: &Tensor| Result::Ok(f64::from(x.sqr()?.sum_all()?.to_scalar::<f32>()?).sqrt());
+    let size = norm(gradient)?;
+    assert!(size > 1e-3, "{what}: no gradient");
+    for direction in [gradient.detach(), random(at.shape(), 1)] {
+        let moved = (&direction * (step / norm(&direction)?))?;
+        let value = |at: Tensor| loss(&outputs(&at)?.to_dtype(DType::F64)?)?.to_scalar::<f64>();
+        let found = (value((at + &moved)?)? - value((at - &moved)?)?) / 2.0;
+        let expected = f64::from((gradient * &moved)?.sum_all()?.to_scalar::<f32>()?);
+        let error = (found - expected).abs() / (size * step);
+        assert!(error < tolerance, "{what}: {found} for {expected}");
+    }
+    Ok(())
+}
+
+/// [`check_gradient`] for each argument of an operation.
+pub(crate) fn check_gradients(
+    what: &str,
+    arguments: &[Tensor],
+    outputs: impl Fn(&[Tensor]) -> Result<Tensor>,
+) -> Result<()> {
+    let variables = arguments.iter().map(Var::from_tensor).collect::<Result<Vec<_>>>()?;
+    let tensors: Vec<Tensor> = variables.iter().map(|x| x.as_tensor().clone()).collect();
+    let gradients = loss(&outputs(&tensors)?)?.backward()?;
+    for (i, variable) in variables.iter().enumerate() {
+        let gradient = gradients.get(variable).unwrap();
+        check_gradient(
+            (&format!("{what}, argument {i}"), 1e-2, 0.01),
+            (&arguments[i], gradient),
+            |x| {
+                let mut arguments = arguments.to_vec();
+                arguments[i] = x.clone();
+                outputs(&arguments)
+            },
+        )?;
+    }
+    Ok(())
+}

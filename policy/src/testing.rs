@@ -1,0 +1,83 @@
+//! Helpers of tests.
+
+use crate::error::PolicyError;
+use crate::file::{Header, PolicyConfig, load_policy};
+use crate::kinds::diffusion::DiffusionShape;
+use crate::policy::{Policy, Samples};
+use crate::sampling::choice::Choice;
+use candle_core::{Device, Tensor};
+use quad_nn::{Layout, MlpConfig, Precision, Scaling, Weights};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+/// The file of a policy whose networks have the weights that `values` returns for their layouts.
+pub(crate) fn file_of(
+    policy: PolicyConfig,
+    scaling: Option<Scaling>,
+    mut values: impl FnMut(&Layout) -> Vec<f32>,
+) -> Vec<u8> {
+    let tensors = policy.tensors(|layout| Tensor::new(values(layout), &Device::Cpu)).unwrap();
+    Header { scaling, ..Header::new(policy, ()) }.to_safetensors(&tensors).unwrap()
+}
+
+/// The file of a policy with initial weights.
+pub(crate) fn initial(policy: PolicyConfig) -> Vec<u8> {
+    let generator = &mut ChaCha8Rng::seed_from_u64(5);
+    file_of(policy, None, |layout| {
+        Weights::initial(layout, generator, &Device::Cpu).unwrap().to_vec1().unwrap()
+    })
+}
+
+/// The shape of a small diffusion policy.
+pub(crate) fn small() -> DiffusionShape {
+    DiffusionShape::quad((4, 2), &MlpConfig::mish(&[8; 3]), 2, 2)
+}
+
+/// The file of a [`small`] policy. The critics' weights are ±`critic`; `v` is the value of every
+/// state, if the policy has a value function.
+pub(crate) fn diffusion_file(
+    choice: Choice,
+    critic: f32,
+    v: Option<f32>,
+    scaling: Option<Scaling>,
+) -> Vec<u8> {
+    let shape = DiffusionShape { value: v.map(|_| small().critic), ..small() };
+    // Magnitude and last weight of actor, critics and value function.
+    let mut sizes = [(0.1, 0.1), (critic, critic), (0.0, v.unwrap_or(0.0))].into_iter();
+    file_of(PolicyConfig::Diffusion { shape, choice }, scaling, |layout| {
+        let (size, last) = sizes.next().unwrap();
+        let signed = |i: usize| if i / 3 % 2 == 0 { size } else { -size };
+        let count = layout.count();
+        (1..=count).map(|i| if i == count { last } else { signed(i) }).collect()
+    })
+}
+
+pub(crate) fn load(file: &[u8]) -> Result<Box<dyn Policy>, PolicyError> {
+    load_policy(file, Precision::F32)
+}
+
+/// The actions at the first step of episodes with these seeds.
+pub(crate) fn act(
+    policy: &dyn Policy,
+    observations: &[f32],
+    seeds: &[u64],
+) -> Result<Vec<f32>, PolicyError> {
+    let mut states: Vec<_> = seeds.iter().map(|seed| policy.begin(*seed)).collect();
+    let mut actions = vec![0.0; seeds.len() * policy.action_dim()];
+    policy.act(observations, &mut states, &mut actions).map(|()| actions)
+}
+
+/// The candidates at the first step of episodes with these seeds.
+pub(crate) fn sample(
+    policy: &dyn Policy,
+    observations: &[f32],
+    seeds: &[u64],
+) -> Result<Samples, PolicyError> {
+    let mut states: Vec<_> = seeds.iter().map(|seed| policy.begin(*seed)).collect();
+    policy.sample(observations, &mut states)
+}
+
+/// Index of the largest value.
+pub(crate) fn argmax(values: &[f32]) -> usize {
+    (0..values.len()).max_by(|i, j| values[*i].total_cmp(&values[*j])).unwrap()
+}
