@@ -207,11 +207,7 @@ impl<'a> Initializer<'a> {
 
     /// Learned numbers `[n]` with these initial values.
     pub fn numbers(&self, name: &str, values: &[f32]) -> Result<TrainState<Weights>> {
-        let spec = TensorSpec {
-            name: name.to_owned(),
-            shape: vec![values.len()],
-            start: Init::Constant(0.0),
-        };
+        let spec = TensorSpec::new(name.to_owned(), &[values.len()], Init::Constant(0.0));
         let values = Tensor::from_slice(values, values.len(), &self.context.device)?;
         TrainState::new(Weights::trainable(Layout::new(vec![spec]), &values)?)
     }

@@ -98,7 +98,7 @@ fn gradients_match_finite_differences() -> Result<()> {
         let of_w = gradient(&predictor.sample_with_gradient(&s, &z)?, predictor.weights())?;
         let w = predictor.weights().values().detach();
         // Clipping has corners, hence the tolerance.
-        check_gradient((&what("sampler"), 1e-4, 0.1), (&w, &of_w), |w| {
+        check_gradient((&what("sampler"), 2e-5, 0.1), (&w, &of_w), |w| {
             let weights = Weights::constant(shape.layout(), w.clone());
             NoisePredictor::new(shape.clone(), weights, Precision::F32).sample_with_gradient(&s, &z)
         })?;

@@ -46,7 +46,7 @@ pub(crate) fn diffusion_file(
     let mut sizes = [(0.1, 0.1), (critic, critic), (0.0, v.unwrap_or(0.0))].into_iter();
     file_of(PolicyConfig::Diffusion { shape, choice }, scaling, |layout| {
         let (size, last) = sizes.next().unwrap();
-        let signed = |i: usize| if i / 3 % 2 == 0 { size } else { -size };
+        let signed = |i: usize| [size, -size][i / 3 % 2];
         let count = layout.count();
         (1..=count).map(|i| if i == count { last } else { signed(i) }).collect()
     })

@@ -61,7 +61,7 @@ def in_jax(path):
     def values(tensors, observations, actions):
         x = jnp.concatenate([observations, actions], -1)
         q = mlp(tensors, "critic.", shape["critic"]["activation"], x, len(shape["critic"]["hidden"]))[..., 0]
-        return q.mean(0) if choice["value"] == "mean" else q.min(0)
+        return q.mean(0) if choice["aggregate"] == "mean" else q.min(0)
 
     def act(tensors, key, observations):
         n = len(observations)

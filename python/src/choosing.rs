@@ -14,12 +14,12 @@ use crate::error::of_policy;
 pub struct Changes {
     pub candidates: Option<i64>,
     pub rule: Option<String>,
-    pub value: Option<String>,
+    pub aggregate: Option<String>,
 }
 
 /// The policy with a changed choice.
 pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn Policy>> {
-    if let Changes { candidates: None, rule: None, value: None } = changes {
+    if let Changes { candidates: None, rule: None, aggregate: None } = changes {
         return Ok(policy.clone());
     }
     let mut choice = policy.choice().unwrap_or(Choice::best_of(1));
@@ -33,22 +33,22 @@ pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn 
         let error = |expected| PyValueError::new_err(format!("rule is {rule:?}, not {expected}"));
         choice.rule = rule.parse().map_err(error)?;
     }
-    if let Some(value) = changes.value {
-        let error = |_| PyValueError::new_err(format!("value is {value:?}, not mean or min"));
-        choice.aggregate = value.parse().map_err(error)?;
+    if let Some(name) = changes.aggregate {
+        let error = |_| PyValueError::new_err(format!("aggregate is {name:?}, not mean or min"));
+        choice.aggregate = name.parse().map_err(error)?;
     }
     policy.with_choice(choice).map(Arc::from).map_err(|error| of_policy(&error))
 }
 
 /// A choice as Python's arguments.
 pub fn as_dictionary(py: Python<'_>, choice: Choice) -> PyResult<Bound<'_, PyDict>> {
-    let value = match choice.aggregate {
+    let aggregate = match choice.aggregate {
         Aggregate::Mean => "mean",
         Aggregate::Min => "min",
     };
     let dictionary = PyDict::new(py);
     dictionary.set_item("candidates", choice.candidates)?;
     dictionary.set_item("rule", choice.rule.to_string())?;
-    dictionary.set_item("value", value)?;
+    dictionary.set_item("aggregate", aggregate)?;
     Ok(dictionary)
 }

@@ -74,7 +74,7 @@ impl PyPolicy {
     ///     keys are ignored.
     /// candidates: the number of actions drawn in each state. rule: the choice among them, "best",
     ///     "softmax:TEMPERATURE", "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest".
-    ///     value: the "mean" or "min" of the critics. None: the file's `choice`.
+    ///     aggregate: the "mean" or "min" of the critics. None: the file's `choice`.
     /// seed: an int: row i draws from seed + i, as an evaluator does in the first step of the episode
     ///     of that seed. A sequence of n ints: a seed for each row. None: fresh random numbers.
     ///
@@ -82,50 +82,51 @@ impl PyPolicy {
     ///
     /// Raises ValueError for another shape, NaN or infinite numbers, or a choice that this policy
     /// cannot make; RuntimeError if its networks give no number.
-    #[pyo3(signature = (observations, *, candidates = None, rule = None, value = None, seed = None))]
+    #[pyo3(signature = (observations, *, candidates = None, rule = None, aggregate = None, seed = None))]
     fn act<'py>(
         &self,
         py: Python<'py>,
         observations: ArrayLike<'py>,
         candidates: Option<i64>,
         rule: Option<String>,
-        value: Option<String>,
+        aggregate: Option<String>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Array<'py>> {
         let rows = self.rows(&observations)?;
-        let policy = choosing(&self.policy, Changes { candidates, rule, value })?;
+        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate })?;
         let mut states = begin(&*policy, &seeds(seed, rows.count)?);
         act(py, &*policy, &rows, &mut states)
     }
 
     /// `act`, by the name that d3rlpy has for it.
-    #[pyo3(signature = (observations, *, candidates = None, rule = None, value = None, seed = None))]
+    #[pyo3(signature = (observations, *, candidates = None, rule = None, aggregate = None, seed = None))]
     fn predict<'py>(
         &self,
         py: Python<'py>,
         observations: ArrayLike<'py>,
         candidates: Option<i64>,
         rule: Option<String>,
-        value: Option<String>,
+        aggregate: Option<String>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Array<'py>> {
-        self.act(py, observations, candidates, rule, value, seed)
+        self.act(py, observations, candidates, rule, aggregate, seed)
     }
 
     /// Draws candidates of `act`: (actions [n, candidates, action_size], values [n, candidates]),
     /// float32; for one state, without the first axis. With the same seed, `act` chooses among these.
     /// Raises as `act`, and ValueError if the policy has no critics.
-    #[pyo3(signature = (observations, *, candidates = None, value = None, seed = None))]
+    #[pyo3(signature = (observations, *, candidates = None, aggregate = None, seed = None))]
     fn sample<'py>(
         &self,
         py: Python<'py>,
         observations: ArrayLike<'py>,
         candidates: Option<i64>,
-        value: Option<String>,
+        aggregate: Option<String>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<(Array<'py>, Array<'py>)> {
         let rows = self.rows(&observations)?;
-        let policy = choosing(&self.policy, Changes { candidates, value, ..Changes::default() })?;
+        let policy =
+            choosing(&self.policy, Changes { candidates, aggregate, ..Changes::default() })?;
         let mut states = begin(&*policy, &seeds(seed, rows.count)?);
         let (actions, values) = compute(py, || {
             let (mut actions, mut values) = (Vec::new(), Vec::new());
@@ -145,15 +146,15 @@ impl PyPolicy {
     /// observation_size], actions [n, action_size] -> [n], float32. For one state and action, an array
     /// without axes.
     ///
-    /// value: the "mean" or "min" of the critics. Raises as `act`, and ValueError if the policy has no
+    /// aggregate: the "mean" or "min" of the critics. Raises as `act`, and ValueError if the policy has no
     /// critics.
-    #[pyo3(signature = (observations, actions, *, value = None))]
+    #[pyo3(signature = (observations, actions, *, aggregate = None))]
     fn value<'py>(
         &self,
         py: Python<'py>,
         observations: ArrayLike<'py>,
         actions: ArrayLike<'py>,
-        value: Option<String>,
+        aggregate: Option<String>,
     ) -> PyResult<Array<'py>> {
         let rows = self.rows(&observations)?;
         let taken = Rows::of("actions", &actions, self.policy.action_dim(), &self.names.actions)?;
@@ -162,7 +163,7 @@ impl PyPolicy {
             let error = format!("{n} observations, but {m} actions: one action for each");
             return Err(PyValueError::new_err(error));
         }
-        let policy = choosing(&self.policy, Changes { value, ..Changes::default() })?;
+        let policy = choosing(&self.policy, Changes { aggregate, ..Changes::default() })?;
         let values = match rows.count {
             0 => Vec::new(),
             _ => compute(py, || policy.value(&rows.values, &taken.values))?,
@@ -174,17 +175,17 @@ impl PyPolicy {
     /// `export_onnx`: a dictionary of "noise", standard normal numbers [n, ...], and "uniform", numbers
     /// within [0, 1), [n, draws], float32, without those that the policy does not draw. Raises as
     /// `act`.
-    #[pyo3(signature = (n, *, candidates = None, rule = None, value = None, seed = None))]
+    #[pyo3(signature = (n, *, candidates = None, rule = None, aggregate = None, seed = None))]
     fn noise<'py>(
         &self,
         py: Python<'py>,
         n: usize,
         candidates: Option<i64>,
         rule: Option<String>,
-        value: Option<String>,
+        aggregate: Option<String>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Bound<'py, PyDict>> {
-        let policy = choosing(&self.policy, Changes { candidates, rule, value })?;
+        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate })?;
         noise(py, &*policy, &mut begin(&*policy, &seeds(seed, n)?))
     }
 
@@ -193,15 +194,15 @@ impl PyPolicy {
     ///
     ///     episodes = policy.begin([0, 1, 2])
     ///     actions = episodes.act(observations)  # [3, observation_size] -> [3, action_size]
-    #[pyo3(signature = (seeds, *, candidates = None, rule = None, value = None))]
+    #[pyo3(signature = (seeds, *, candidates = None, rule = None, aggregate = None))]
     fn begin(
         &self,
         seeds: &Bound<'_, PyAny>,
         candidates: Option<i64>,
         rule: Option<String>,
-        value: Option<String>,
+        aggregate: Option<String>,
     ) -> PyResult<Episodes> {
-        let policy = choosing(&self.policy, Changes { candidates, rule, value })?;
+        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate })?;
         let seeds = match seeds.extract::<u64>() {
             Ok(seed) => vec![seed],
             Err(_) => seeds.extract().map_err(|_| not_seeds("a sequence of them"))?,
@@ -274,7 +275,7 @@ impl PyPolicy {
         self.policy.precision().name()
     }
 
-    /// The choice among candidates: a dictionary of `act`'s arguments candidates, rule and value; None
+    /// The choice among candidates: a dictionary of `act`'s arguments candidates, rule and aggregate; None
     /// if the policy draws nothing.
     #[getter]
     fn choice<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {

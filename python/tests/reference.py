@@ -110,7 +110,7 @@ class Reference:
     def values(self, observations, actions, reduce=None):
         """Scales observations to the network's units."""
         q = self.mlp("critic.", self.shape["critic"], np.concatenate([observations, actions], -1))[..., 0]
-        return q.mean(0) if (reduce or self.choice["value"]) == "mean" else q.min(0)
+        return q.mean(0) if (reduce or self.choice["aggregate"]) == "mean" else q.min(0)
 
     def to_network(self, name, x):
         scale = self.maps[name]["scale"]
@@ -160,7 +160,7 @@ class Reference:
             return self.to_user(np.tanh(self.mlp("actor.", self.shape["actor"], s[None])).reshape(-1)), None, None
         choice = {**self.choice, **changes}
         drawn = self.draw(s, random, choice["candidates"])
-        values = self.values(np.tile(s, (len(drawn), 1)), drawn, choice["value"])
+        values = self.values(np.tile(s, (len(drawn), 1)), drawn, choice["aggregate"])
         scores, rule = values, choice["rule"]
         if rule == "nearest":
             scores = -((values - self.mlp("value.", self.shape["value"], s[None]).reshape(-1)) ** 2)

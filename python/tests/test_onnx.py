@@ -51,7 +51,7 @@ def compare(policy, path, **choice):
         assert {given.name for given in session.get_inputs()} == set(inputs)
         found = dict(zip((out.name for out in session.get_outputs()), session.run(None, inputs)))
         if policy.choice:
-            asked = {name: choice[name] for name in ("candidates", "value") if name in choice}
+            asked = {name: choice[name] for name in ("candidates", "aggregate") if name in choice}
             close(found["values"], policy.sample(states, seed=seed, **asked)[1], by)
         episodes = policy.begin(range(seed, seed + len(states)), **choice)
         close(found["actions"], episodes.act(states), by)
@@ -72,8 +72,8 @@ def test_networks_units_and_processes_of_all_kinds(snapshots, name, tmp_path):
 @pytest.mark.parametrize("rule", RULES)
 def test_every_choice(snapshots, rule, tmp_path):
     policy = Policy.load(snapshots["align-iql"])
-    for candidates, value in [(1, "mean"), (6, "min"), (30, "mean")]:
-        compare(policy, tmp_path / "policy.onnx", candidates=candidates, rule=rule, value=value)
+    for candidates, aggregate in [(1, "mean"), (6, "min"), (30, "mean")]:
+        compare(policy, tmp_path / "policy.onnx", candidates=candidates, rule=rule, aggregate=aggregate)
 
 
 BELOW_ONE = np.nextafter(np.float32(1), np.float32(0))
@@ -175,7 +175,7 @@ def test_the_example_of_the_documentation_runs(snapshots, tmp_path, monkeypatch)
 
 def test_refuses_invalid_choices(snapshots, tmp_path):
     for message, choice in {"takes a value function": {"rule": "nearest"}, "candidates is 0": {"candidates": 0},
-                            'value is "max"': {"value": "max"}}.items():
+                            'aggregate is "max"': {"aggregate": "max"}}.items():
         with pytest.raises(ValueError, match=message):
             export_onnx(snapshots["quad"], tmp_path / "policy.onnx", **choice)
     assert not (tmp_path / "policy.onnx").exists()

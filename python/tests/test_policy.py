@@ -47,16 +47,16 @@ def test_acts_like_the_numpy_implementation(snapshots, name):
     close(policy.value(states, drawn[:, 3]), values[:, 3])
     critics = [reference.values(reference.to_network("observations", states), reference.to_network("actions", drawn[:, 3]), how)
                for how in ("min", "mean")]
-    close([policy.value(states, drawn[:, 3], value=how) for how in ("min", "mean")], critics)
+    close([policy.value(states, drawn[:, 3], aggregate=how) for how in ("min", "mean")], critics)
 
 
 def test_a_call_may_change_the_choice(snapshots):
     policy, reference = Policy.load(snapshots["align-iql"]), Reference(snapshots["align-iql"])
     state = observations(1)[0]
     for rule, of_file in [("best", "best"), ("nearest", "nearest"), ("softmax:0.05", {"softmax": {"temperature": 0.05}})]:
-        for value in ("min", "mean"):
-            expected, _, _ = reference.act(state, Random(7, POLICY_STREAM), candidates=9, rule=of_file, value=value)
-            close(policy.act(state, candidates=9, rule=rule, value=value, seed=7), expected)
+        for aggregate in ("min", "mean"):
+            expected, _, _ = reference.act(state, Random(7, POLICY_STREAM), candidates=9, rule=of_file, aggregate=aggregate)
+            close(policy.act(state, candidates=9, rule=rule, aggregate=aggregate, seed=7), expected)
     assert np.array_equal(policy.act(state, seed=7), policy.act(state, **policy.choice, seed=7))
     assert policy.choice["rule"] == "nearest"
     drawn, values = policy.sample(state, candidates=4, seed=7)
@@ -167,7 +167,7 @@ def test_refuses_invalid_arguments(snapshots, tmp_path):
         'rule is "worst", not one of best': lambda: policy.act(states, rule="worst"),
         "temperature is -1": lambda: policy.act(states, rule="softmax:-1"),
         "`nearest` takes a value function": lambda: policy.act(states, rule="nearest"),
-        'value is "max", not mean or min': lambda: policy.act(states, value="max"),
+        'aggregate is "max", not mean or min': lambda: policy.act(states, aggregate="max"),
         "no critics": lambda: Policy.load(snapshots["iql"]).value(states, np.zeros((3, ACTION))),
         "no candidates": lambda: Policy.load(snapshots["iql"]).act(states, candidates=2),
         "2 rows of observations for 3 episodes": lambda: episodes.act(states[:2]),

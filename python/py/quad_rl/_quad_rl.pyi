@@ -17,7 +17,7 @@ class Policy:
         *,
         candidates: int | None = None,
         rule: str | None = None,
-        value: str | None = None,
+        aggregate: str | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> NDArray[np.float32]: ...
     def predict(
@@ -26,7 +26,7 @@ class Policy:
         *,
         candidates: int | None = None,
         rule: str | None = None,
-        value: str | None = None,
+        aggregate: str | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> NDArray[np.float32]: ...
     def sample(
@@ -34,11 +34,11 @@ class Policy:
         observations: ArrayLike | Mapping[str, ArrayLike],
         *,
         candidates: int | None = None,
-        value: str | None = None,
+        aggregate: str | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
     def value(
-        self, observations: ArrayLike | Mapping[str, ArrayLike], actions: ArrayLike | Mapping[str, ArrayLike], *, value: str | None = None
+        self, observations: ArrayLike | Mapping[str, ArrayLike], actions: ArrayLike | Mapping[str, ArrayLike], *, aggregate: str | None = None
     ) -> NDArray[np.float32]: ...
     def noise(
         self,
@@ -46,7 +46,7 @@ class Policy:
         *,
         candidates: int | None = None,
         rule: str | None = None,
-        value: str | None = None,
+        aggregate: str | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> dict[str, NDArray[np.float32]]: ...
     def begin(
@@ -55,7 +55,7 @@ class Policy:
         *,
         candidates: int | None = None,
         rule: str | None = None,
-        value: str | None = None,
+        aggregate: str | None = None,
     ) -> Episodes: ...
     def to_bytes(self) -> bytes: ...
     @property

@@ -85,7 +85,7 @@ fn candidates_rules_and_values_are_chosen_at_scoring() {
     let mut learner = scratch.learner_with("unscored", SETTING, &["--eval-interval", "0"]);
     learner.process.assert_succeeds(PATIENCE);
     let snapshot = learner.snapshot(SETTING.steps);
-    let flags = "--candidates 1,3 --rule softmax:0.5 --value min";
+    let flags = "--candidates 1,3 --rule softmax:0.5 --aggregate min";
     let [softmax, best] =
         [flags, ""].map(|flags| score(&[&snapshot], &format!("--episodes 2 {flags}")));
     let rule = json!({ "softmax": { "temperature": 0.5 } });

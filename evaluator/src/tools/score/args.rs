@@ -20,7 +20,7 @@ Examples:
   evaluator score runs/mine/snapshots/step_000020000.safetensors --episodes 100 --candidates 1,10
 
   # Draw one of fifty actions, with the softmax of the critics' smallest value.
-  evaluator score runs/mine/snapshots/step_000020000.safetensors --candidates 50 --rule softmax:1 --value min
+  evaluator score runs/mine/snapshots/step_000020000.safetensors --candidates 50 --rule softmax:1 --aggregate min
 
 RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
@@ -49,7 +49,7 @@ pub struct ScoreArgs {
     pub rule: Option<Rule>,
     /// Combination of the critics' values of an action: mean or min [default: the snapshot's]
     #[arg(long, value_name = "NAME")]
-    pub value: Option<Aggregate>,
+    pub aggregate: Option<Aggregate>,
     /// Seed from which, with the snapshot's step, the episodes' seeds follow [default: the run's]
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,

@@ -14,7 +14,7 @@ use crate::sim::{Environments, Rollout, Simulations};
 
 const SNAPSHOT: &str = "pass a file like RUN/snapshots/step_000020000.safetensors, written by `learner train` of this version";
 const OTHER_ENVIRONMENT: &str = "in your own environment, run it from Python (docs/python.md)";
-const OTHER_CHOICE: &str = "score it without --candidates, --rule and --value";
+const OTHER_CHOICE: &str = "score it without --candidates, --rule and --aggregate";
 
 /// A saved policy, ready to act, with its episodes.
 pub struct Subject {
@@ -111,10 +111,10 @@ impl Subject {
 fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
     let own = own.unwrap_or(Choice::best_of(1));
     let rule = args.rule.unwrap_or(own.rule);
-    let aggregate = args.value.unwrap_or(own.aggregate);
+    let aggregate = args.aggregate.unwrap_or(own.aggregate);
     let with = |candidates| Choice { candidates, rule, aggregate };
     match args.candidates.as_slice() {
-        [] if args.rule.is_none() && args.value.is_none() => Vec::new(),
+        [] if args.rule.is_none() && args.aggregate.is_none() => Vec::new(),
         [] => vec![with(own.candidates)],
         several => several.iter().copied().map(with).collect(),
     }

@@ -16,11 +16,11 @@ def export_onnx(
     *,
     candidates: int | None = None,
     rule: str | None = None,
-    value: str | None = None,
+    aggregate: str | None = None,
 ) -> None:
     """Writes a policy, or that of a snapshot's file, as an ONNX model of opset 17, in float32.
 
-    It acts as `Policy.act` does with the same `candidates`, `rule` and `value`, which are fixed in the model. The number of
+    It acts as `Policy.act` does with the same `candidates`, `rule` and `aggregate`, which are fixed in the model. The number of
     states, n, is free.
 
     Inputs: `observations` [n, observation_size] and the arrays of `policy.noise(n, ...)`: `noise`, standard normal numbers, and
@@ -38,7 +38,7 @@ def export_onnx(
 
     if not isinstance(policy, Policy):
         policy = Policy.load(policy)
-    written = model(policy, candidates=candidates, rule=rule, value=value).SerializeToString()
+    written = model(policy, candidates=candidates, rule=rule, aggregate=aggregate).SerializeToString()
     whole = Path(path)
     partial = whole.with_name(f"{whole.name}.{token_hex(4)}.partial")  # An existing file stays until the new one is complete.
     try:

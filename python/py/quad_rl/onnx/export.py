@@ -37,7 +37,7 @@ def critics(file: File, choice: dict[str, Any], observations: Value, drawn: Valu
     """The critics' values of drawn [n, candidates, a], and the rule's scores; both [n, candidates]."""
     graph, candidates = drawn.graph, choice["candidates"]
     of_members = of_actions(file, "critic.", file.shape["critic"], observations, drawn, candidates)
-    values = graph("ReduceMin" if choice["value"] == "min" else "ReduceMean", of_members, axes=[0], keepdims=0)
+    values = graph("ReduceMin" if choice["aggregate"] == "min" else "ReduceMean", of_members, axes=[0], keepdims=0)
     if choice["rule"] != "nearest":
         return values, values
     difference = values - of_states(file, "value.", file.shape["value"], observations).reshape(-1, 1)
