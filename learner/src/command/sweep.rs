@@ -20,7 +20,7 @@ use tracing::{info, warn};
 use super::all_readable;
 use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
-use crate::sweep::{Cost, Ended, Learners, PlannedRun, Study, Sweep};
+use crate::sweep::{Cost, LearnerOptions, Outcome, PlannedRun, Study, Sweep};
 
 type Runs = Vec<(PlannedRun, State)>;
 
@@ -43,7 +43,7 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     let (complete, todo) = (complete.len(), left.len());
     info!("{count} runs: {complete} complete, {todo} to do, of which {begun} have begun");
     let mut ended = match todo {
-        0 => Ended::default(),
+        0 => Outcome::default(),
         _ => work(args, &study.name, &folder, left)?,
     };
     for (run, _) in unreadable {
@@ -105,7 +105,7 @@ fn shares(cores: usize, threads: usize, jobs: Option<u16>, runs: usize) -> (usiz
     (jobs, cores.saturating_sub(jobs.saturating_mul(threads)).max(1))
 }
 
-fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
+fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Outcome> {
     let threads = threads_asked().map_or(1, usize::from);
     let (jobs, cores) = shares(available_parallelism()?.get(), threads, args.jobs, left.len());
     let count = if args.connect.is_some() { 0 } else { args.evaluators.unwrap_or(cores) };
@@ -151,8 +151,8 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
         let work = async {
             evaluators.start(std::slice::from_ref(&endpoint), &logs, study, report)?;
             let (folder, waiting) = (folder.to_owned(), VecDeque::from(left));
-            let learners = Learners { threads, endpoint, http: args.http };
-            let sweep = Sweep { folder, waiting, jobs, learners, evaluators, lines, step_seconds };
+            let options = LearnerOptions { threads, endpoint, http: args.http };
+            let sweep = Sweep { folder, waiting, jobs, options, evaluators, lines, step_seconds };
             anyhow::Ok(sweep.run().await)
         };
         LocalSet::new().run_until(work).await
@@ -161,8 +161,8 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     ended
 }
 
-fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
-    let Ended { unfinished: stopped, failed } = ended;
+fn conclude(folder: &Path, count: usize, ended: Outcome) -> anyhow::Result<()> {
+    let Outcome { unfinished: stopped, failed } = ended;
     if !failed.is_empty() {
         let error =
             anyhow!("{} of {count} runs have failed:\n  {}", failed.len(), failed.join("\n  "));

@@ -1,4 +1,4 @@
-//! One run of a study: its learner, from the run's folder to what the learner's end means.
+//! The learner of one run of a study.
 
 use std::fs;
 use std::io;
@@ -19,57 +19,48 @@ use tokio_util::sync::CancellationToken;
 use super::study::PlannedRun;
 use crate::children::{self, Process, hide_certificates};
 
-/// A learner that was told to stop ends within less; one that is frozen is killed. Then there is
-/// time for the evaluators to leave before the sweep must have ended.
-const LEARNERS_LEAVE: Duration = LEAVE_WITHIN.saturating_add(Duration::from_secs(2));
-/// How long a sweep that was told to end waits for what a disk has to say of a learner that has
-/// ended.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+/// Time limit for a learner to stop, before it is killed. The evaluators have time to leave before
+/// the sweep must have ended.
+const STOP_LIMIT: Duration = LEAVE_WITHIN.saturating_add(Duration::from_secs(2));
+/// Time limit for the last read of a run's folder while the sweep stops.
+const LAST_READ: Duration = Duration::from_secs(1);
 
-/// What all learners of a sweep have in common.
 #[derive(Clone)]
-pub(crate) struct Learners {
-    /// Threads of each.
+pub(crate) struct LearnerOptions {
     pub threads: usize,
-    /// Where they meet evaluators.
+    /// The router.
     pub endpoint: String,
-    /// Address of the page of a single one.
+    /// Address of the page, for a single learner.
     pub http: Option<SocketAddr>,
 }
 
-/// A run at work.
 #[derive(Clone)]
 pub(super) struct LearnerProcess {
     pub run: PlannedRun,
-    /// The run's folder.
     pub dir: PathBuf,
-    /// Steps that were done before.
+    /// Steps that earlier learners have done.
     pub from: u64,
 }
 
-/// How a learner has ended.
 pub(super) enum End {
-    /// The run is complete.
     Complete,
-    /// It was told to stop, or no evaluator came, or another learner is at work in the run's
-    /// folder.
+    /// It was stopped, or no evaluator came, or another learner has the run's folder.
     Unfinished,
-    /// With an error; what it was, and where its log is.
+    /// The error, and the path of the log.
     Failed(String),
 }
 
 impl LearnerProcess {
-    /// A run of a study in this folder.
     pub fn new(run: PlannedRun, state: State, study: &Path) -> Self {
         Self { dir: study.join(&run.name), from: state.step(run.experiment.steps), run }
     }
 
-    /// Starts the learner and waits for its end. After `stop` it waits no longer than the learner
-    /// may take to save a checkpoint. The system ends the learner with the calling thread. Other
-    /// threads read and write the folder: a disk that hangs holds up neither other runs nor Ctrl-C.
-    pub async fn run(self, with: Learners, stop: CancellationToken) -> (Self, End, Pace) {
+    /// Runs the learner to its end, or stops it. The system ends the learner with the calling
+    /// thread. Other threads read and write the folder: a hanging disk blocks neither other runs
+    /// nor Ctrl-C.
+    pub async fn run(self, options: LearnerOptions, stop: CancellationToken) -> (Self, End, Pace) {
         let begun = Pace { step: self.from, ..Pace::default() };
-        let (end, pace) = match self.supervise(with, stop).await {
+        let (end, pace) = match self.supervise(options, stop).await {
             Ok(Some(ended)) => ended,
             Ok(None) => (End::Unfinished, begun),
             Err(error) => (End::Failed(format!("{error:#}")), begun),
@@ -80,42 +71,43 @@ impl LearnerProcess {
     /// `None` if the sweep stops before the learner starts, or before the disk has answered.
     async fn supervise(
         &self,
-        with: Learners,
+        options: LearnerOptions,
         stop: CancellationToken,
     ) -> anyhow::Result<Option<(End, Pace)>> {
         let this = self.clone();
-        let prepared = spawn_blocking(move || this.prepare(&with));
+        let prepared = spawn_blocking(move || this.prepare(&options));
         let Some(prepared) = stop.run_until_cancelled(prepared).await else { return Ok(None) };
         let mut command = prepared??;
         let mut learner = Process::start(&mut command)
             .with_context(|| format!("{}: cannot start a learner", self.run.name))?;
         let status = match stop.run_until_cancelled(learner.wait()).await {
             Some(status) => status,
-            None => learner.end(LEARNERS_LEAVE).await,
+            None => learner.end(STOP_LIMIT).await,
         };
         let (this, stopped) = (self.clone(), stop.is_cancelled());
         let concluded =
             spawn_blocking(move || (this.conclude(status, stopped), Pace::read(&this.dir)));
         tokio::select! {
             concluded = concluded => Ok(Some(concluded?)),
-            () = async { stop.cancelled().await; sleep(LAST_WORDS).await } => Ok(None),
+            () = async { stop.cancelled().await; sleep(LAST_READ).await } => Ok(None),
         }
     }
 
     /// Makes the run's folder and the learner's command.
-    fn prepare(&self, with: &Learners) -> anyhow::Result<Command> {
+    fn prepare(&self, options: &LearnerOptions) -> anyhow::Result<Command> {
         let Self { run, dir, .. } = self;
+        let LearnerOptions { threads, endpoint, http } = options;
         let mut command = Command::new(std::env::current_exe()?);
-        command
-            .args(["train", "--preset", &run.preset, "--connect", &with.endpoint, "--run-dir"])
-            .arg(dir);
-        command
-            .args(with.http.iter().flat_map(|address| ["--http".to_owned(), address.to_string()]));
+        command.args(["train", "--preset", &run.preset, "--connect", endpoint, "--run-dir"]);
+        command.arg(dir);
+        if let Some(address) = http {
+            command.args(["--http", &address.to_string()]);
+        }
         for (key, value) in tables::keys(&run.changes) {
             command.args(["--set", &format!("{key}={value}")]);
         }
-        command.env("RAYON_NUM_THREADS", with.threads.to_string());
-        hide_certificates(&mut command, &with.endpoint);
+        command.env("RAYON_NUM_THREADS", threads.to_string());
+        hide_certificates(&mut command, endpoint);
         let folder = RunDir::at(dir);
         command.env(FAILURE_FILE, folder.failure_path());
         fs::create_dir_all(dir)
@@ -127,16 +119,11 @@ impl LearnerProcess {
 
     /// Translates the learner's end. Marks a failed run in its folder.
     fn conclude(&self, status: io::Result<ExitStatus>, stopped: bool) -> End {
-        let code = status
-            .as_ref()
-            .ok()
-            .and_then(ExitStatus::code)
-            .and_then(|code| u8::try_from(code).ok());
-        match code {
+        let code = status.as_ref().ok().and_then(ExitStatus::code);
+        match code.and_then(|code| u8::try_from(code).ok()) {
             Some(0) => return End::Complete,
             Some(UNFINISHED) => return End::Unfinished,
-            // It was ended before it could do as it was told; the same command continues all the
-            // same.
+            // It ended before it could stop by itself; the same command continues.
             None | Some(ENDED_AT_ONCE) if stopped => return End::Unfinished,
             _ => {}
         }

@@ -1,13 +1,10 @@
-//! Many runs: reads a study file, estimates its cost, and starts its learners.
+//! Sweeps: many runs, each a process `learner train`, and the format of study files.
 //!
-//! Owns the format of study files and the folder of a study, `runs/STUDY`, in which each run has
-//! its own folder. The command `learner sweep` calls it on the main thread. Each run is a process
-//! `learner train`, which meets the shared evaluators at a router in this process. It uses
-//! `local_evaluators`, [`quad_run`] for the state of a run, and [`train`](crate::train) to measure
-//! how long steps take.
+//! All learners meet shared evaluators at a router in this process. The folder of a study,
+//! `runs/STUDY`, has a folder for each run.
 //!
-//! In reading order: `study` is the file, `axes` are its lists of values, `rules` say which
-//! combinations, `names` what runs are called; `cost` estimates; `work` runs the learners, each a
+//! In reading order: `study` reads a file, `axes` are its lists of values, `rules` select
+//! combinations, `names` are those of runs; `cost` estimates; `scheduler` runs the learners, each a
 //! `learner_process`, and `display` shows them.
 
 mod axes;
@@ -16,10 +13,10 @@ mod display;
 mod learner_process;
 mod names;
 mod rules;
+mod scheduler;
 mod study;
-mod work;
 
 pub(crate) use cost::Cost;
-pub(crate) use learner_process::Learners;
+pub(crate) use learner_process::LearnerOptions;
+pub(crate) use scheduler::{Outcome, Sweep};
 pub(crate) use study::{PlannedRun, Study};
-pub(crate) use work::{Ended, Sweep};

@@ -1,0 +1,173 @@
+//! Runs a limited number of learners at a time, until every run has ended.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::PathBuf;
+use std::pin::pin;
+use std::time::Instant;
+
+use indicatif::HumanDuration;
+use quad_run::status::{Pace, State};
+use quad_runtime::LEAVE_WITHIN;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time;
+use tokio_util::sync::CancellationToken;
+
+use super::display::Display;
+use super::learner_process::{End, LearnerOptions, LearnerProcess};
+use super::study::PlannedRun;
+use crate::local_evaluators::LocalEvaluators;
+
+pub(crate) struct Sweep {
+    /// Folder of the study.
+    pub folder: PathBuf,
+    pub waiting: VecDeque<(PlannedRun, State)>,
+    /// Runs at a time.
+    pub jobs: usize,
+    pub options: LearnerOptions,
+    pub evaluators: LocalEvaluators,
+    /// Reports of the evaluators.
+    pub lines: mpsc::UnboundedReceiver<String>,
+    /// Estimated seconds of a gradient step, by the run's index; 1 if there is no estimate.
+    pub step_seconds: BTreeMap<usize, f64>,
+}
+
+#[derive(Default)]
+pub(crate) struct Outcome {
+    /// Number of runs that the same command continues.
+    pub unfinished: usize,
+    /// The reason of each failed run.
+    pub failed: Vec<String>,
+}
+
+struct Progress {
+    /// Learners and their last known progress, by the run's index.
+    running: BTreeMap<usize, (LearnerProcess, Pace)>,
+    complete: usize,
+    failed: Vec<String>,
+    begin: Instant,
+    /// Estimated seconds of the work that learners have done that have ended.
+    done: f64,
+}
+
+impl Sweep {
+    /// Runs all learners. After a signal to end, running ones save checkpoints. Needs a `LocalSet`
+    /// on the main thread: the system ends the learners with their thread.
+    pub async fn run(mut self) -> Outcome {
+        let mut shutdown = pin!(quad_runtime::shutdown_signal(2 * LEAVE_WITHIN));
+        let stop = CancellationToken::new();
+        let (count, display) = (self.waiting.len(), Display::new());
+        let mut ticker = time::interval(display.interval());
+        ticker.tick().await; // The first tick is immediate.
+        let mut progress = Progress {
+            running: BTreeMap::new(),
+            complete: 0,
+            failed: Vec::new(),
+            begin: Instant::now(),
+            done: 0.0,
+        };
+        let (mut learners, mut reading) = (JoinSet::new(), JoinSet::new());
+        loop {
+            while learners.len() < self.jobs
+                && let Some((run, state)) = self.waiting.pop_front()
+            {
+                let learner = LearnerProcess::new(run, state, &self.folder);
+                let pace = Pace { step: learner.from, ..Pace::default() };
+                progress.running.insert(learner.run.index, (learner.clone(), pace));
+                learners.spawn_local(learner.run(self.options.clone(), stop.clone()));
+            }
+            if learners.is_empty() {
+                break;
+            }
+            tokio::select! {
+                _ = ticker.tick() => match reading.is_empty() {
+                    true => drop(reading.spawn_blocking(read(&progress))),
+                    false => display.show(&self.lines(&progress)),
+                },
+                Some(line) = self.lines.recv() => display.print(&line),
+                Some(Ok((learner, end, pace))) = learners.join_next() => {
+                    display.print(&self.conclude(&learner, end, pace, &mut progress));
+                }
+                Some(Ok(paces)) = reading.join_next() => {
+                    for (index, pace) in paces {
+                        progress.running.entry(index).and_modify(|(_, known)| *known = pace);
+                    }
+                    display.show(&self.lines(&progress));
+                }
+                () = &mut shutdown, if !stop.is_cancelled() => {
+                    display.print("stopping; the runs at work save their checkpoints");
+                    self.waiting.clear();
+                    stop.cancel();
+                }
+            }
+        }
+        display.finish();
+        self.evaluators.end().await;
+        let unfinished = count - progress.complete - progress.failed.len();
+        Outcome { unfinished, failed: progress.failed }
+    }
+
+    /// Records the end of a learner, and describes it.
+    fn conclude(
+        &self,
+        learner: &LearnerProcess,
+        end: End,
+        pace: Pace,
+        progress: &mut Progress,
+    ) -> String {
+        let LearnerProcess { run, from, .. } = learner;
+        progress.running.remove(&run.index);
+        progress.done += self.seconds(run, *from, pace.step);
+        match end {
+            End::Complete => {
+                progress.complete += 1;
+                let score = pace.score.map(|(_, score)| format!(", last score {score:.1}"));
+                format!("{} is complete{}", run.name, score.unwrap_or_default())
+            }
+            End::Unfinished => format!("{} has stopped; the same command continues", run.name),
+            End::Failed(reason) => {
+                progress.failed.push(reason.clone());
+                format!("failed: {reason}")
+            }
+        }
+    }
+
+    /// A line for each running learner, and a total.
+    fn lines(&self, progress: &Progress) -> Vec<String> {
+        let Progress { running, complete, failed, .. } = progress;
+        let (mut lines, mut done, mut left) = (Vec::new(), progress.done, 0.0);
+        for (LearnerProcess { run, from, .. }, pace) in running.values() {
+            let steps = run.experiment.steps;
+            done += self.seconds(run, *from, pace.step);
+            left += self.seconds(run, pace.step, steps);
+            lines.push(format!("{}: step {}/{steps}, {pace}", run.name, pace.step));
+        }
+        for (run, state) in &self.waiting {
+            let steps = run.experiment.steps;
+            left += self.seconds(run, state.step(steps), steps);
+        }
+        let (running, waiting) = (running.len(), self.waiting.len());
+        let mut total = format!("{complete} runs complete, {running} at work, {waiting} waiting");
+        if !failed.is_empty() {
+            total += &format!(", {} failed", failed.len());
+        }
+        if done > 0.0 {
+            let left = HumanDuration(progress.begin.elapsed().mul_f64(left / done));
+            total += &format!(", {left} left");
+        }
+        lines.push(total);
+        lines
+    }
+
+    /// Estimated seconds from one step of a run to another.
+    fn seconds(&self, run: &PlannedRun, from: u64, to: u64) -> f64 {
+        to.saturating_sub(from) as f64 * self.step_seconds.get(&run.index).copied().unwrap_or(1.0)
+    }
+}
+
+/// Reads the progress of the running learners.
+fn read(progress: &Progress) -> impl FnOnce() -> Vec<(usize, Pace)> + use<> {
+    let dirs = progress.running.iter().map(|(index, (learner, _))| (*index, learner.dir.clone()));
+    let dirs = Vec::from_iter(dirs);
+    move || dirs.into_iter().map(|(index, dir)| (index, Pace::read(&dir))).collect()
+}
