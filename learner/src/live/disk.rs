@@ -8,7 +8,6 @@ use quad_runtime::Heartbeat;
 use tracing::warn;
 
 use super::events::Events;
-use super::metrics::Metrics;
 
 /// Interval of reminders in the log.
 const REMIND: Duration = Duration::from_secs(60);
@@ -58,8 +57,7 @@ pub(crate) struct DiskStatus {
 }
 
 impl DiskStatus {
-    pub fn new(writer: Writer, metrics: &Metrics, events: Events) -> Self {
-        let gauge = metrics.disk_trouble(writer);
+    pub fn new(writer: Writer, gauge: IntGauge, events: Events) -> Self {
         Self { output: writer.output(), gauge, events, trouble: None }
     }
 

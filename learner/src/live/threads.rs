@@ -91,7 +91,7 @@ impl Threads {
         let weights = Weights::new(incarnation, dir.clone(), coordinator.clone());
         let (services, deliveries) = Services::start(weights.clone())?;
 
-        let disk = |writer| DiskStatus::new(writer, metrics, events.clone());
+        let disk = |writer| DiskStatus::new(writer, metrics.disk_trouble(writer), events.clone());
         let disk_of_scores = disk(Writer::Scores);
         let scores = Scores { log: run.scores, deliveries, coordinator, disk: disk_of_scores };
         let writer = Writer::Scores.thread();
