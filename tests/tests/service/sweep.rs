@@ -232,9 +232,9 @@ fn a_stopped_sweep_exits_with_75_whatever_hangs() {
     sweep.assert_ends(75, PATIENCE);
     assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
 
-    // A disk that hangs when the sweep reads how one of two runs has ended.
+    // A disk that hangs when the sweep marks one of two runs as failed.
     let mut through = Command::new("env");
-    through.args(&launcher("read", &study.dir(RUNS[1]).join("learner.log"))[1..]);
+    through.args(&launcher("fsync", &study.dir(RUNS[1]).join("failed"))[1..]);
     through.arg(binary("learner")).args(study.command(&["--jobs", "2"]).get_args());
     let mut sweep = Process::start("sweep", study.scratch.path(), through);
     study.wait_for(RUNS[1]);
