@@ -35,7 +35,8 @@ def flatten(tree):
             value = np.atleast_1d(np.asarray(value))
             if name.startswith("lambda_fifth_") and np.isnan(value[0]):
                 continue
-            flat[name] = value.astype(np.int64 if np.issubdtype(value.dtype, np.integer) else np.float32)
+            # In C order, since save_file writes memory as it lies.
+            flat[name] = np.ascontiguousarray(value, np.int64 if np.issubdtype(value.dtype, np.integer) else np.float32)
     return flat
 
 
