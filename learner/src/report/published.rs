@@ -139,11 +139,11 @@ impl Footnotes {
             let (methods, instead) = (methods(on.into_iter()).join(", "), instead.join(","));
             text += &format!("- {letter} ({methods}): {selected}{reason}{instead}\n");
         }
-        if select == Select::Best {
-            let is_selected = |(_, score): &&Score| score.remarks.iter().any(|it| it.selected);
-            let selected = methods(scores.iter().filter(is_selected)).join(", ");
+        let is_selected = |(_, score): &&Score| score.remarks.iter().any(|it| it.selected);
+        let selected = methods(scores.iter().filter(is_selected)).join(", ");
+        if select == Select::Best && !selected.is_empty() {
             text += &format!(
-                "- Of these figures, such selection stands behind those of {selected}, as far as is known.\n"
+                "- As far as is known, the figures of {selected} are selected like this.\n"
             );
         }
         text
