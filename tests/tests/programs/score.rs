@@ -65,7 +65,7 @@ fn a_snapshot_gets_the_scores_that_its_run_has() {
             assert_eq!(scored["step"], step);
             assert_eq!(
                 scored["choice"],
-                json!({ "candidates": SETTING.candidates, "value": "mean", "rule": "best" })
+                json!({ "candidates": SETTING.candidates, "aggregate": "mean", "rule": "best" })
             );
             let mut of_run: Vec<_> = of_run
                 .iter()
@@ -90,7 +90,7 @@ fn candidates_rules_and_values_are_chosen_at_scoring() {
         [flags, ""].map(|flags| score(&[&snapshot], &format!("--episodes 2 {flags}")));
     let rule = json!({ "softmax": { "temperature": 0.5 } });
     for (scored, candidates) in softmax.iter().zip([1, 3]) {
-        let choice = json!({ "candidates": candidates, "value": "min", "rule": rule });
+        let choice = json!({ "candidates": candidates, "aggregate": "min", "rule": rule });
         assert_eq!(scored["choice"], choice);
     }
     let all = [&softmax[0], &softmax[1], &best[0]].map(episodes);
