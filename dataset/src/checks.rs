@@ -1,19 +1,16 @@
-//! Problems for which training refuses a dataset.
+//! Checks that refuse a dataset before training.
 
 use crate::error::Problem;
 use crate::recording::{Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
 
-/// Actions may be this far outside [-1, 1]: what rounding explains is clipped, anything more is
-/// another scale.
+/// Distance outside [-1, 1] that rounding explains; such actions are clipped.
 const ACTION_TOLERANCE: f32 = 1e-3;
 
-/// The largest share of rows inside an episode that may lead elsewhere. D4RL's replay buffers have
-/// at most one in a thousand, where collection was cut off without a timeout; rows in another order
-/// than that of recording have nearly all.
+/// Share of discontinuous rows allowed. D4RL's replay buffers reach 0.001; shuffled rows nearly 1.
 const MOST_STRAYS: f64 = 0.01;
 
-/// All problems of a recording as data of an environment, the gravest first.
+/// Problems of a recording as data of an environment, most severe first.
 pub(crate) fn problems(
     recording: &Recording,
     environment: Option<&EnvironmentSpec>,
@@ -55,9 +52,8 @@ pub(crate) fn problems(
     problems
 }
 
-/// Rows inside an episode whose stored next observation is not the following row's, and whether
-/// they are refused: in a D4RL file, which is learned from as if each row led to the following one,
-/// where they are too many.
+/// Rows whose stored next observation is not the following row's, and true if they are refused.
+/// D4RL files are refused above [`MOST_STRAYS`], because training uses the following row.
 pub(crate) fn strays(recording: &Recording) -> Option<(Problem, bool)> {
     let unused = recording.unused_next_observations.as_ref();
     let stored = recording.next_observations.as_ref().or(unused)?;
@@ -79,8 +75,7 @@ fn not_finite(
     Some(Problem::NotFinite { array, row, value, rows })
 }
 
-/// Actions that no policy here can take, unless they are scaled: refused by who trains on them as
-/// they are.
+/// Actions outside [-1, 1]; refused unless actions are normalized.
 pub(crate) fn actions_outside(recording: &Recording) -> Option<Problem> {
     let is_outside = |row: usize, value: f32| {
         let is_step = recording.kinds[row] != RowKind::LastState;
@@ -91,7 +86,7 @@ pub(crate) fn actions_outside(recording: &Recording) -> Option<Problem> {
     Some(Problem::ActionOutside { array, row, value, rows })
 }
 
-/// The first row with a number that is wrong, that number, and how many rows have one.
+/// Row and value of the first wrong number, and the count of such rows.
 fn first(
     values: &[f32],
     width: usize,

@@ -1,16 +1,16 @@
-//! What can be wrong with a dataset. Messages name the file and, if possible, array and row.
+//! Errors of reading and writing datasets. Messages name the file and, if possible, array and row.
 
 use std::error::Error;
 use std::io;
 use std::path::PathBuf;
 
-/// A source that cannot be read or learned from, or a file that cannot be written.
+/// Failure to read, accept or write a dataset.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {problem}", .path.display())]
 pub struct DatasetError {
-    /// The file or folder.
+    /// File or folder.
     pub path: PathBuf,
-    /// What is wrong with it.
+    /// Problem found in it.
     #[source]
     pub problem: Problem,
 }
@@ -20,13 +20,13 @@ impl DatasetError {
         Self { path: path.into(), problem }
     }
 
-    /// Advice on how to mend it.
+    /// Advice on how to fix it.
     pub fn hint(&self) -> String {
         self.problem.hint()
     }
 }
 
-/// A problem with a dataset. Arrays are named by their path in the file; rows count from 0.
+/// Problem with a dataset. Arrays are named by their path in the file; rows count from 0.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // The messages say what each is.
 pub enum Problem {
@@ -123,22 +123,21 @@ pub enum Problem {
     BadRow { row: usize, array: &'static str, problem: String },
 }
 
-/// How to load a file of a foreign format.
+/// Remedy for a foreign format.
 #[derive(Clone, Copy, Debug)]
 pub enum Load {
-    /// A command of `quad-convert`, without its `--out`.
+    /// Command of `quad-convert`, without its `--out`.
     Convert(&'static str),
-    /// Advice on how to load it in Python.
+    /// Advice on loading it in Python.
     Python(&'static str),
 }
 
-/// Number of rows with the same problem, where there are several.
 pub(crate) fn such_rows(rows: usize) -> String {
     if rows > 1 { format!(" ({rows} such rows)") } else { String::new() }
 }
 
 impl Problem {
-    /// Advice on how to mend it.
+    /// Advice on how to fix it.
     pub fn hint(&self) -> String {
         if let Self::OtherEnvironment { claimed, expected, is_simulated } = self {
             return match is_simulated {
@@ -162,7 +161,6 @@ impl Problem {
         self.advice().to_owned()
     }
 
-    /// [`Self::hint`] of the problems that always have the same.
     fn advice(&self) -> &'static str {
         match self {
             Self::OtherEnvironment { .. } | Self::Foreign { .. } => "",
@@ -243,7 +241,6 @@ impl Problem {
     }
 }
 
-/// Copies every array, uncompressed, into one file.
 const REWRITE: &str = "pip install h5py hdf5plugin; then write it again, with your names for OLD and NEW: python -c \"import h5py, \
     hdf5plugin; a, b = h5py.File('OLD'), h5py.File('NEW', 'w'); b.attrs.update(a.attrs); a.visititems(lambda name, x: \
     b.update({name: x[()]}) if isinstance(x, h5py.Dataset) else None)\"";

@@ -1,14 +1,10 @@
-//! Reads D4RL, Minari, OGBench and custom HDF5, yields transitions and mini-batches, and writes
-//! D4RL's and custom HDF5.
+//! Reads D4RL, Minari, OGBench and custom HDF5 datasets, samples mini-batches of transitions, and
+//! writes D4RL's and the custom layout.
 //!
 //! # Layout
-//! In reading order: `tables` is what is known by name: environments, benchmarks and datasets.
-//! `formats` has a file for each format, which reads it into a `recording`, and the writers.
-//! `checks` refuse a recording, `warnings` find that little can be learned from it, and what passes
-//! becomes `transitions`, which `normalize` scales. `inspect` describes a source to people. `error`
-//! is what can be wrong with any of them.
-//!
-//! This crate knows nothing of networks, simulators or the wire.
+//! `tables` has the known environments, benchmarks and datasets. `formats` reads each format into a
+//! `recording`, and writes files. `checks` refuses bad recordings, `warnings` reports suspicious
+//! ones, `normalize` scales them, `transitions` serves them. `inspect` prints a summary.
 
 #![deny(unsafe_code)]
 

@@ -1,20 +1,18 @@
-//! Normalization of observations, actions and rewards by statistics of the data.
-
 use quad_kernels::scaling::{Affine, Scaling};
 use serde::{Deserialize, Serialize};
 
 use crate::recording::{Recording, RowKind};
 use crate::tables::reward::RewardScaling;
 
-/// Data to be normalized before training. In files it is a list of names, in any order.
+/// Columns to normalize before training. Files list them by name, in any order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "Vec<Column>", into = "Vec<Column>")]
 pub struct Normalize {
-    /// Each number of an action, so that its least and largest value become -1 and 1.
+    /// Each action dimension, so that its minimum and maximum map to -1 and 1.
     pub actions: bool,
-    /// Each number of an observation, to mean 0 and standard deviation 1.
+    /// Each observation dimension, to mean 0 and standard deviation 1.
     pub observations: bool,
-    /// Rewards after the reward rule, to a mean square of 1.
+    /// Rewards after the reward rule, to mean square 1.
     pub rewards: bool,
 }
 
@@ -47,8 +45,8 @@ impl From<Normalize> for Vec<Column> {
 }
 
 impl Normalize {
-    /// Offsets and scales for a recording whose numbers are finite. Observations count where a
-    /// transition begins, actions wherever one was taken, rewards where there is a transition.
+    /// Offsets and scales for a recording of finite numbers. Statistics of observations and rewards
+    /// are over transitions, those of actions also over dropped steps.
     pub(crate) fn scaling(self, recording: &Recording, rule: RewardScaling) -> Scaling {
         let Recording { observation_dim, action_dim, observations, actions, kinds, .. } = recording;
         let is_transition = |row: usize| kinds[row] == RowKind::Transition;
@@ -58,13 +56,12 @@ impl Normalize {
                 .observations
                 .then(|| affine(observations, *observation_dim, is_transition, standard)),
             actions: self.actions.then(|| affine(actions, *action_dim, is_step, unit_range)),
-            // Rewards that are all 0 have no size.
+            // All-zero rewards stay unscaled.
             rewards: self.rewards.then(|| rule.size(recording) as f32).filter(|size| *size > 0.0),
         }
     }
 }
 
-/// The map by which each column has mean 0 and standard deviation 1 over the rows that count.
 pub(crate) fn standard_units(
     values: &[f32],
     width: usize,
@@ -73,7 +70,6 @@ pub(crate) fn standard_units(
     affine(values, width, counts, standard)
 }
 
-/// Scales a recording.
 pub(crate) fn apply(scaling: &Scaling, recording: &mut Recording) {
     if let Some(affine) = &scaling.observations {
         affine.to_network(&mut recording.observations);
@@ -84,7 +80,7 @@ pub(crate) fn apply(scaling: &Scaling, recording: &mut Recording) {
     }
 }
 
-/// The map of each column, whose offset and scale `of` finds from the rows that count.
+/// Map of each column by the offset and scale that `of` computes from the rows that count.
 fn affine(
     values: &[f32],
     width: usize,
@@ -96,14 +92,13 @@ fn affine(
         let values: Vec<f64> =
             values.filter(|(row, _)| counts(*row)).map(|(_, value)| f64::from(*value)).collect();
         let (offset, scale) = of(&values);
-        // The scale is 0 where all are the same, or differ by less than a float32 can say.
+        // The scale is 0 if the column is constant in float32.
         (offset as f32, scale as f32)
     };
     let (offset, scale) = (0..width).map(column).unzip();
     Affine { offset, scale }
 }
 
-/// Mean and standard deviation of a column.
 fn standard(values: &[f64]) -> (f64, f64) {
     let (min, max) = range(values);
     if min == max {
@@ -115,7 +110,6 @@ fn standard(values: &[f64]) -> (f64, f64) {
     (mean, variance.sqrt())
 }
 
-/// Middle and half width of a column's range.
 fn unit_range(values: &[f64]) -> (f64, f64) {
     let (min, max) = range(values);
     ((min + max) / 2.0, (max - min) / 2.0)

@@ -1,70 +1,55 @@
-//! Rows of a dataset of any format, as they were recorded.
-
 use crate::rounding::Rounding;
 use crate::statistics::{Episode, returns};
 
-/// Two rows whose observations differ by more than this do not follow one another.
+/// Largest difference between two copies of the same observation.
 const SAME_OBSERVATION: f64 = 1e-6;
 
-/// Use of a row in training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum RowKind {
-    /// A step to learn from.
     Transition,
-    /// A step that the format's rules drop: it counts toward its episode and nothing else.
+    /// Step without a transition by the format's rules, counted in its episode's return.
     Dropped,
-    /// No step, but the last state of an episode, to which the row before leads.
+    /// Final state of an episode, without an action.
     LastState,
 }
 
-/// Names of the numbers of a row; empty lists where a source has none.
+/// Names of the dimensions of observations and actions; empty if the source has none.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Names {
-    /// Names of the numbers of an observation, o.
+    /// One name per observation dimension.
     pub observations: Vec<String>,
-    /// Names of the numbers of an action, a.
+    /// One name per action dimension.
     pub actions: Vec<String>,
 }
 
-/// Rows of a dataset, N of them. What follows the last end of an episode is an episode, too, cut
-/// off by the file's end.
+/// N rows of a dataset. The end of the file truncates the last episode.
 #[derive(Default)]
 pub(crate) struct Recording {
-    /// Numbers in an observation, o.
     pub observation_dim: usize,
-    /// Numbers in an action, a.
     pub action_dim: usize,
     /// N × o.
     pub observations: Vec<f32>,
     /// N × a.
     pub actions: Vec<f32>,
-    /// N.
     pub rewards: Vec<f32>,
-    /// N × o, where the format stores them apart. Else the following row's observation is the next
-    /// one.
+    /// N × o, if the format stores them; else the following row's observation is used.
     pub next_observations: Option<Vec<f32>>,
-    /// N × o, where a D4RL file stores them although the following row's observation is the next
-    /// one.
+    /// N × o, stored in a D4RL file and used only for checks.
     pub unused_next_observations: Option<Vec<f32>>,
-    /// What was done to observations and not to the next ones that are stored, or the other way
-    /// round.
+    /// Precision to which only one of the two arrays of observations was rounded.
     pub rounding: Rounding,
-    /// N.
     pub kinds: Vec<RowKind>,
-    /// Whether a row is terminal, so that its mask is 0 and the critics do not bootstrap; N.
+    /// True where the mask is 0, so that the critics do not bootstrap.
     pub terminals: Vec<bool>,
-    /// The array, or those of its parts, that says so.
+    /// Path of the array of terminals, for messages.
     pub terminal_array: &'static str,
-    /// Whether the episode was cut off after a row; N.
+    /// True where the episode was truncated after the row.
     pub timeouts: Vec<bool>,
-    /// Whether a row is the last step of its episode; N.
     pub ends: Vec<bool>,
-    /// Whether the task is to reach a goal, after which the recording continues.
+    /// True if the task is to reach a goal, after which the recording continues.
     pub goal: bool,
-    /// What the numbers of its rows are called.
     pub names: Names,
-    /// Where the file has several arrays of each kind: the first row of each, and the path of the
-    /// group it is in.
+    /// First row and group path of each part, if the file has one group per episode.
     pub parts: Vec<(usize, String)>,
 }
 
@@ -81,14 +66,12 @@ impl Recording {
         &self.actions[row * self.action_dim..(row + 1) * self.action_dim]
     }
 
-    /// Numbers of the rows to learn from, in order.
     pub(crate) fn transitions(&self) -> impl Iterator<Item = u32> {
         let kinds = self.kinds.iter().zip(0..);
         kinds.filter(|(kind, _)| **kind == RowKind::Transition).map(|(_, row)| row)
     }
 
-    /// Whether each row's episode has reached its goal before: a recording of a task with one
-    /// continues there.
+    /// True where the episode has reached its goal in an earlier row.
     pub(crate) fn past_goal(&self) -> Vec<bool> {
         let mut is_past = false;
         let of_row = |row: usize| {
@@ -99,7 +82,7 @@ impl Recording {
         (0..self.rows()).map(of_row).collect()
     }
 
-    /// All episodes, every recorded step included.
+    /// Length and return of each episode, dropped steps included.
     pub(crate) fn episodes(&self) -> Vec<Episode> {
         let mut episodes = Vec::new();
         let mut open = Episode::default();
@@ -113,8 +96,8 @@ impl Recording {
         episodes
     }
 
-    /// Returns of the trajectories that the locomotion rule speaks of: runs of rows to learn from,
-    /// each up to a terminal, the end of an episode, or a row that does not lead to the next one.
+    /// Returns of trajectories as the locomotion rule defines them: runs of transitions up to a
+    /// terminal, the end of an episode, or a discontinuity.
     pub(crate) fn trajectory_returns(&self) -> Vec<f64> {
         let following = self.transitions().skip(1).map(Some).chain([None]);
         let rows = self.transitions().zip(following).map(|(row, following)| {
@@ -127,13 +110,12 @@ impl Recording {
         returns(rows)
     }
 
-    /// Rows to which the following row is said to belong.
     pub(crate) fn inside(&self) -> impl Iterator<Item = usize> {
         let last = self.rows().saturating_sub(1);
         (0..last).filter(|&row| self.kinds[row] != RowKind::LastState && !self.ends[row])
     }
 
-    /// Whether the row after `row` is the next step of its episode, taken where this one led to.
+    /// True if the following row is the next step of the episode and starts in `row`'s next state.
     pub(crate) fn goes_on(&self, row: usize) -> bool {
         let ends = self.ends[row] || self.terminals[row] || self.kinds[row] == RowKind::LastState;
         let is_step = self.kinds.get(row + 1).is_some_and(|kind| *kind != RowKind::LastState);
@@ -142,20 +124,19 @@ impl Recording {
             && !self.next_observations.as_ref().is_some_and(|next| self.jumps(next, row))
     }
 
-    /// Whether `following`, the next row to learn from after `row`, continues where that one led
-    /// to.
+    /// True if `following`, the next transition after `row`, starts in its next state.
     fn continues(&self, row: usize, following: usize) -> bool {
         following == row + 1
             || !differ(self.observation(following), self.observation(row + 1), Rounding::default())
     }
 
-    /// Whether a row's stored next observation is not where the following row starts.
+    /// True if a row's stored next observation differs from the following row's observation.
     pub(crate) fn jumps(&self, next_observations: &[f32], row: usize) -> bool {
         let next = &next_observations[row * self.observation_dim..(row + 1) * self.observation_dim];
         row + 1 < self.rows() && differ(next, self.observation(row + 1), self.rounding)
     }
 
-    /// The name of the array that holds row `row` of a column, and the row's number there.
+    /// Path of the array that holds `row` of a column, and the index there.
     pub(crate) fn place(&self, column: &str, row: usize) -> (String, usize) {
         match self.parts.iter().rev().find(|(first, _)| *first <= row) {
             None => (column.to_owned(), row),
@@ -164,7 +145,6 @@ impl Recording {
     }
 }
 
-/// Whether two observations are more than rounding apart.
 fn differ(a: &[f32], b: &[f32], rounding: Rounding) -> bool {
     let apart = a.iter().zip(b).filter(|(a, b)| !rounding.explains(**a, **b));
     apart.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt() > SAME_OBSERVATION
@@ -174,7 +154,7 @@ fn differ(a: &[f32], b: &[f32], rounding: Rounding) -> bool {
 pub(crate) mod tests {
     use super::*;
 
-    /// Rows whose observation, action (in hundredths) and reward are their number.
+    /// Observation, action × 100 and reward of each row are its index.
     pub(crate) fn recording(kinds: &[RowKind]) -> Recording {
         let n = kinds.len();
         Recording {

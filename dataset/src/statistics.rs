@@ -1,6 +1,4 @@
-//! Figures of episodes.
-
-/// The smallest, mean and largest of some numbers; NaN where there are none.
+/// Minimum, mean and maximum; NaN without numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Extent {
     pub(crate) min: f64,
@@ -19,19 +17,15 @@ impl Extent {
     }
 }
 
-/// An episode while it is added up.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Episode {
-    /// Steps.
     pub(crate) length: usize,
-    /// Its undiscounted return.
     pub(crate) sum: f64,
     reached: bool,
 }
 
 impl Episode {
-    /// Adds a step. With a `goal`, the first positive reward says that it is reached, and later
-    /// ones do not count.
+    /// Adds a step. With a `goal`, rewards after the first positive one do not count.
     pub(crate) fn push(&mut self, reward: f64, goal: bool) {
         self.length += 1;
         if !self.reached {
@@ -41,8 +35,7 @@ impl Episode {
     }
 }
 
-/// Sums of rewards up to each end, given (reward, whether the run ends here) in order. What follows
-/// the last end is a run too.
+/// Undiscounted returns of pairs (reward, end of episode), including an unfinished last episode.
 pub(crate) fn returns(rewards: impl Iterator<Item = (f32, bool)>) -> Vec<f64> {
     let mut finished = Vec::new();
     let mut open = None;

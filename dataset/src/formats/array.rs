@@ -1,14 +1,10 @@
-//! An array of any format, in memory.
-
 use crate::error::Problem;
 
-/// N rows of numbers. A row of one number may be stored without an axis of its own.
+/// N rows of numbers, read from shape N × width, or N if the width is 1. `values` is N × width.
 pub(crate) struct Array<T> {
     name: String,
     shape: Vec<usize>,
-    /// Numbers in a row, at least 1.
     pub(crate) width: usize,
-    /// N × width.
     pub(crate) values: Vec<T>,
 }
 
@@ -26,12 +22,10 @@ impl<T> Array<T> {
         self.shape[0]
     }
 
-    /// The numbers of row `row`.
     pub(crate) fn row(&self, row: usize) -> &[T] {
         &self.values[row * self.width..(row + 1) * self.width]
     }
 
-    /// The array itself, if it has that many rows.
     pub(crate) fn of_rows(self, rows: usize) -> Result<Self, Problem> {
         match self.rows() == rows {
             true => Ok(self),
@@ -43,7 +37,6 @@ impl<T> Array<T> {
         }
     }
 
-    /// The numbers, if there are `rows × width`.
     pub(crate) fn sized(self, rows: usize, width: usize) -> Result<Vec<T>, Problem> {
         match (self.rows(), self.width) == (rows, width) {
             true => Ok(self.values),
@@ -57,7 +50,7 @@ impl<T> Array<T> {
 }
 
 impl Array<f32> {
-    /// One flag a row, if each number is 0 or 1.
+    /// One flag per row; all values must be 0 or 1.
     pub(crate) fn into_flags(self, rows: usize) -> Result<Vec<bool>, Problem> {
         let name = self.name.clone();
         let values = self.sized(rows, 1)?;

@@ -1,5 +1,4 @@
-//! Transitions that a program has in memory, and the file that it writes of them: the custom
-//! layout.
+//! Transitions in memory, and the writer of the custom layout.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -13,12 +12,12 @@ use crate::formats::own::{self, ACTION_NAMES, OBSERVATION_NAMES};
 use crate::recording::{Names, Recording, RowKind};
 use crate::rounding::Rounding;
 
-/// Transitions in memory, N of them, in the order of their episodes.
+/// N transitions in memory, ordered by episode.
 #[derive(Clone, Debug, Default)]
 pub struct Arrays {
-    /// Numbers in an observation, o.
+    /// Dimension of an observation, o.
     pub observation_dim: usize,
-    /// Numbers in an action, a.
+    /// Dimension of an action, a.
     pub action_dim: usize,
     /// s, N × o.
     pub observations: Vec<f32>,
@@ -28,14 +27,13 @@ pub struct Arrays {
     pub rewards: Vec<f32>,
     /// s', N × o.
     pub next_observations: Vec<f32>,
-    /// Whether the episode ended here for good; N.
+    /// True where the episode terminated, N.
     pub terminals: Vec<bool>,
-    /// Whether it was cut off here; N.
+    /// True where the episode was truncated, N.
     pub timeouts: Vec<bool>,
 }
 
 impl Arrays {
-    /// Turns the arrays into rows of a recording, not judged yet.
     pub(crate) fn into_recording(self) -> Result<Recording, Problem> {
         let (rows, o, a) = (self.rewards.len(), self.observation_dim, self.action_dim);
         for (array, width, found) in [
@@ -76,14 +74,9 @@ impl Arrays {
     }
 }
 
-/// Writes the custom layout (docs/data.md) in float32, compressed. The file appears under its name
-/// when it is whole; one that was there is replaced. The folder is made if need be. `names` are
-/// kept beside the arrays.
-///
-/// # Errors
-/// The disk, or what would be refused when the file is read: arrays that do not fit one another,
-/// numbers that are not finite, no transition, rows without any end of an episode. Actions may have
-/// any range: whether they are to be scaled is decided by who trains on them.
+/// Writes the custom layout (docs/data.md) in compressed float32, with `names` as attributes.
+/// Arrays that the reader would refuse are an error, except that actions may have any range. An
+/// existing file is replaced once the new one is complete.
 pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result<(), DatasetError> {
     let path = path.as_ref();
     let error = |problem| DatasetError::new(path, problem);

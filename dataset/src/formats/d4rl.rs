@@ -1,4 +1,4 @@
-//! D4RL's HDF5 files, of all its versions, and AntMaze's.
+//! D4RL's HDF5 files, including AntMaze.
 
 use crate::error::Problem;
 use crate::formats::hdf5_file::Hdf5File;
@@ -6,14 +6,12 @@ use crate::recording::{Recording, RowKind};
 use crate::rounding::Rounding;
 use crate::tables::environment::EnvironmentSpec;
 
-/// Reads `observations`, `actions`, `rewards`, `terminals` and, if there, `timeouts` by the rules
-/// of D4RL's `qlearning_dataset`: the next observation is the following row's, whatever the file
-/// stores; timeouts and the last row make no transition. A terminal row's next observation belongs
-/// to another episode, but its mask is 0.
+/// Reads a file as D4RL's `qlearning_dataset` does: the next observation is the following row's,
+/// and timeouts and the last row make no transition. A terminal row's next observation belongs to
+/// another episode, but its mask is 0.
 ///
-/// Without timeouts, a row at which an episode reaches the environment's time limit counts as one.
-/// Where the file stores `next_observations`, they are kept aside, to see whether the rows follow
-/// one another at all.
+/// Missing `timeouts` follow from the environment's time limit. Stored `next_observations` serve
+/// only to check the order of the rows.
 pub(super) fn read(
     file: &Hdf5File,
     environment: Option<&EnvironmentSpec>,
@@ -27,7 +25,7 @@ pub(super) fn read(
         (false, Some(environment)) => derive_timeouts(&terminals, environment.max_episode_steps),
         (false, None) => vec![false; rows],
     };
-    // A recording continues after the goal: only its timeouts end an episode.
+    // The recording continues after the goal: only timeouts end an episode.
     let goal =
         environment.is_some_and(|environment| environment.maze.is_some()) || file.has("infos/goal");
     let until_timeout = goal && timeouts.contains(&true);
@@ -64,9 +62,8 @@ pub(super) fn read(
     })
 }
 
-/// The rows at which an episode reaches `limit` steps, as D4RL counts them: the row after a timeout
-/// is number 0, but the row after a terminal is number 1, so that such an episode is cut off a step
-/// early.
+/// Rows at which an episode reaches `limit` steps, counted as in D4RL: from 0 after a timeout but
+/// from 1 after a terminal, so that the latter episode is truncated a step early.
 fn derive_timeouts(terminals: &[bool], limit: usize) -> Vec<bool> {
     let mut number = 0;
     let timeout = |&terminal: &bool| {

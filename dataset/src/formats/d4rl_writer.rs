@@ -1,4 +1,4 @@
-//! Writes D4RL's layout, in float32.
+//! Writer of D4RL's layout, in float32.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -11,42 +11,40 @@ use crate::formats::new_file::{CHUNK_ROWS, Column, NewFile};
 use crate::formats::recorded::Row;
 use crate::tables::environment::EnvironmentSpec;
 
-/// Where the rows came from; ends up under `metadata/`.
+/// Origin of the rows, stored under `metadata/`.
 #[derive(Clone, Debug)]
 pub struct Metadata<'a> {
-    /// What acted.
+    /// Name of the algorithm that acted.
     pub algorithm: &'a str,
-    /// Its last iteration.
+    /// Last iteration of the algorithm.
     pub iteration: i64,
-    /// The seed that makes the same file again.
+    /// Seed that reproduces the file.
     pub seed: u64,
 }
 
-/// A file that is being written. It appears under its name when [`finish`](Self::finish) says so,
-/// and not before: until then it is `<path>.partial`, which the next writer of that path replaces.
+/// File being written, at `<path>.partial` until [`finish`](Self::finish) renames it. An unfinished
+/// file of the same path is replaced.
 pub struct D4rlWriter {
     environment: &'static EnvironmentSpec,
     file: NewFile,
     rows: usize,
-    /// Those of [`FLOATS`].
     floats: Vec<Buffered<f32>>,
-    /// Those of [`FLAGS`].
     flags: Vec<Buffered<bool>>,
 }
 
-/// The columns of numbers, in the order of a row's.
+/// Numeric columns, in the order in which `push` writes them.
 const FLOATS: [&str; 6] =
     ["observations", "actions", "next_observations", "rewards", "infos/qpos", "infos/qvel"];
 const FLAGS: [&str; 2] = ["terminals", "timeouts"];
 
-/// A column, and rows that are not written yet: a chunk of them at most.
+/// Column with up to one chunk of rows not yet written.
 struct Buffered<T> {
     column: Column,
     buffer: Vec<T>,
 }
 
 impl D4rlWriter {
-    /// Starts a file of `environment`'s sizes, and the folder it lies in.
+    /// Starts a file of `environment`'s dimensions, creating missing folders.
     pub fn create(
         path: impl AsRef<Path>,
         environment: &'static EnvironmentSpec,
@@ -66,7 +64,7 @@ impl D4rlWriter {
         Ok(Self { environment, file, rows: 0, floats, flags })
     }
 
-    /// Appends a row. Rows of other sizes and numbers that are not finite in float32 are refused.
+    /// Appends a row. Other dimensions and numbers not finite in float32 are refused.
     pub fn push(&mut self, row: &Row) -> Result<(), DatasetError> {
         let reward = [row.reward];
         let values =
@@ -93,12 +91,12 @@ impl D4rlWriter {
         if self.rows.is_multiple_of(CHUNK_ROWS) { self.flush() } else { Ok(()) }
     }
 
-    /// Rows so far.
+    /// Number of rows so far.
     pub fn rows(&self) -> usize {
         self.rows
     }
 
-    /// Writes what is left and gives the file its name.
+    /// Writes the remaining rows and renames the file.
     pub fn finish(mut self, metadata: &Metadata) -> Result<(), DatasetError> {
         self.flush()?;
         self.write_metadata(metadata).map_err(|source| self.file.failed(source))?;

@@ -1,5 +1,4 @@
-//! Formats that are not read here, named for what they are, and what reads them: `quad-convert`, or
-//! a call in Python.
+//! Names of foreign formats, and the tools that read them.
 
 use std::fs;
 use std::path::Path;
@@ -9,7 +8,7 @@ use serde_json::Value;
 use crate::error::Load::{self, Convert, Python};
 use crate::error::Problem;
 
-/// How many bytes of a file tell what it is.
+/// Number of leading bytes that identify a format.
 pub(crate) const START: u64 = 256;
 
 const TABLE: Load = Convert(
@@ -18,7 +17,7 @@ const TABLE: Load = Convert(
 const PICKLE: Load =
     Python("load it by pickle.load, if you trust who wrote it: a pickle can run any program");
 
-/// How files begin, what such a file is, and how to load it.
+/// First bytes of a file, name of its format, and remedy.
 const STARTS: [(&[u8], &str, Load); 8] = [
     (b"PAR1", "a Parquet file", TABLE),
     (b"ARROW1", "an Arrow file", Python("load it by pandas.read_feather")),
@@ -40,12 +39,11 @@ fn foreign(what: impl Into<String>, load: Load) -> Problem {
     Problem::Foreign { what: what.into(), load }
 }
 
-/// What a file is that is neither HDF5 nor a zip archive, by its first [`START`] bytes.
+/// The problem with a file that is neither HDF5 nor zip, by its first [`START`] bytes.
 pub(crate) fn of_start(start: &[u8]) -> Problem {
     if let Some((_, what, load)) = STARTS.iter().find(|(bytes, _, _)| start.starts_with(bytes)) {
         return foreign(*what, *load);
     }
-    // A character that the last of these bytes cuts in two is left out.
     let text = start.utf8_chunks().next().filter(|chunk| start.len() - chunk.valid().len() < 4);
     let text = text.map_or("", |chunk| chunk.valid());
     let first_line = text.lines().next().unwrap_or_default();
@@ -61,7 +59,6 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
     }
 }
 
-/// What a folder is that is no Minari dataset in HDF5.
 pub(crate) fn of_folder(folder: &Path) -> Problem {
     let text = |file: &str, key: &str| {
         let json: Value = serde_json::from_slice(&fs::read(folder.join(file)).ok()?).ok()?;
@@ -83,8 +80,7 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
     }
 }
 
-/// What an HDF5 file is that has another layout, by what its group `data` holds, and what `within`
-/// says that a group there holds.
+/// The problem with an HDF5 file of another layout, by the members of its groups.
 pub(crate) fn of_group(
     members: &[String],
     within: impl Fn(&str) -> Vec<String>,
@@ -99,7 +95,6 @@ pub(crate) fn of_group(
     })
 }
 
-/// What a zip archive of these files is, if none of them is a NumPy array.
 pub(crate) fn of_archive(files: &[impl AsRef<str>]) -> Option<Problem> {
     let has = |ending: &str| files.iter().any(|name| name.as_ref().ends_with(ending));
     match (has(".npy"), has("data.pkl")) {

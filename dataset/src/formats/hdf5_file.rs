@@ -1,7 +1,5 @@
-//! Arrays of an HDF5 file, each checked for presence, type, shape and size before it is used.
-//!
-//! Damage to HDF5's own structures is libhdf5's to find, and its 1.10 does not survive all of it: a
-//! dataset is to come from a place that is trusted.
+//! HDF5 reader that checks each array for presence, type, shape and size. Damaged HDF5 structures
+//! are left to libhdf5, whose version 1.10 crashes on some: open files from trusted sources only.
 
 use std::fmt::Display;
 use std::fs::File;
@@ -17,28 +15,23 @@ use crate::formats::array::Array;
 use crate::formats::foreign;
 use crate::tables::benchmarks::Format;
 
-/// deflate shrinks by a factor of 1032 at most, so more than that in an array is a lie about its
-/// size.
+/// Deflate compresses at most 1032-fold; a larger ratio means a false array size.
 const MAX_COMPRESSION: u64 = 1040;
 
-/// The largest number that is read, and the largest integer type that HDF5's own tools use for an
-/// enum.
+/// Size of the largest numbers, and of the largest integer that HDF5's tools use for an enum.
 const MAX_ELEMENT_BYTES: usize = 8;
 
-/// The longest text of fixed length that is read whole.
 const MAX_TEXT: usize = 256;
 
 const NUMBERS: &str = "numbers";
 const FLAGS: &str = "booleans (h5py's enum, or numbers that are 0 or 1)";
 
-/// Version of the HDF5 library that this program found, and whether it reads compressed arrays, as
-/// D4RL's are.
+/// Version of the linked HDF5 library, and true if it reads compressed arrays such as D4RL's.
 pub fn hdf5_library() -> (String, bool) {
     let (major, minor, release) = hdf5::library_version();
     (format!("{major}.{minor}.{release}"), hdf5::filters::deflate_available())
 }
 
-/// An open HDF5 file.
 pub(crate) struct Hdf5File {
     path: PathBuf,
     file: hdf5::File,
@@ -46,7 +39,6 @@ pub(crate) struct Hdf5File {
 }
 
 impl Hdf5File {
-    /// Opens a file.
     pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
         let io_error = |source| DatasetError::new(path, Problem::Io(source));
         let mut start = Vec::new();
@@ -62,7 +54,6 @@ impl Hdf5File {
         &self.path
     }
 
-    /// Whether there is an array or a group of that name.
     pub(crate) fn has(&self, name: &str) -> bool {
         match name.rsplit_once('/') {
             Some((group, _)) if !self.has(group) => false,
@@ -70,25 +61,22 @@ impl Hdf5File {
         }
     }
 
-    /// Names of what a group holds, in alphabetical order; none if it is no group.
+    /// Names of a group's members in alphabetical order; `None` if it is not a group.
     pub(crate) fn members(&self, group: &str) -> Option<Vec<String>> {
         let mut names = self.file.group(group).ok()?.member_names().ok()?;
         names.sort_unstable();
         Some(names)
     }
 
-    /// A text that stands in the file as an array of its own.
     pub(crate) fn text(&self, array: &str) -> Option<String> {
         text_in(&*self.dataset(array).ok()?)
     }
 
-    /// A text that the file's root has as an attribute; empty where the attribute is something
-    /// else.
     pub(crate) fn attribute(&self, name: &str) -> Option<String> {
         Some(text_in(&*self.file.attr(name).ok()?).unwrap_or_default())
     }
 
-    /// A list of `count` texts that the file's root has as an attribute; empty where it has none.
+    /// Root attribute of `count` texts; empty if absent.
     pub(crate) fn names(&self, attribute: &str, count: usize) -> Result<Vec<String>, Problem> {
         let Ok(holder) = self.file.attr(attribute) else { return Ok(Vec::new()) };
         match texts_in(&holder).unwrap_or_default() {
@@ -101,13 +89,12 @@ impl Hdf5File {
         }
     }
 
-    /// Rows of an array, and numbers in each.
     pub(crate) fn size(&self, array: &str) -> Result<(usize, usize), Problem> {
         let empty = Array::<f32>::new(array, &self.dataset(array)?.shape(), Vec::new())?;
         Ok((empty.rows(), empty.width))
     }
 
-    /// An array of numbers, converted to `T`, that may be NaN.
+    /// Array of numbers, converted to `T`; NaN is allowed.
     pub(crate) fn numbers<T: H5Type>(&self, array: &str) -> Result<Array<T>, Problem> {
         let dataset = self.dataset(array)?;
         self.descriptor(&dataset, array, NUMBERS)?;
@@ -116,7 +103,7 @@ impl Hdf5File {
         Array::new(array, &shape, values)
     }
 
-    /// An array of actions: numbers whose type says that they are continuous.
+    /// Array of actions, which must be of a floating-point type.
     pub(crate) fn actions(&self, array: &str) -> Result<Array<f32>, Problem> {
         match self.descriptor(&self.dataset(array)?, array, NUMBERS)? {
             TypeDescriptor::Float(_) => self.numbers(array),
@@ -124,7 +111,6 @@ impl Hdf5File {
         }
     }
 
-    /// An array of `rows × width` numbers.
     pub(crate) fn table<T: H5Type>(
         &self,
         array: &str,
@@ -134,15 +120,14 @@ impl Hdf5File {
         self.numbers(array)?.sized(rows, width)
     }
 
-    /// An array of one flag a row.
     pub(crate) fn flags(&self, array: &str, rows: usize) -> Result<Vec<bool>, Problem> {
         let dataset = self.dataset(array)?;
         let descriptor = self.descriptor(&dataset, array, FLAGS)?;
         let shape = self.check_size(&dataset, array)?;
         let values = match descriptor {
             TypeDescriptor::Float(_) => dataset.read_raw::<f32>(),
-            // Not read as `bool`: a damaged file may hold any byte. HDF5 saturates, so nothing else
-            // becomes 0 or 1.
+            // A damaged file may hold any byte, which is undefined behavior in a `bool`. HDF5's
+            // conversion saturates, so no other value becomes 0 or 1.
             _ => dataset.read_raw::<i8>().map(|values| values.into_iter().map(f32::from).collect()),
         };
         let values = values.map_err(|source| unreadable(array, source))?;
@@ -172,7 +157,7 @@ impl Hdf5File {
         }
     }
 
-    /// Whether an array's name leads to an array elsewhere, in this file or in another one.
+    /// True for a soft or external link.
     fn is_link(&self, array: &str) -> bool {
         let (group, name) = array.rsplit_once('/').unwrap_or(("/", array));
         let links = self
@@ -193,7 +178,7 @@ impl Hdf5File {
     ) -> Result<TypeDescriptor, Problem> {
         let wrong = |found: String| Problem::Type { array: array.to_owned(), found, expected };
         let datatype = dataset.dtype().map_err(|source| unreadable(array, source))?;
-        // `to_descriptor` reads an enum's member into 8 bytes, whatever size the file gives it.
+        // `to_descriptor` reads an enum's member into 8 bytes, whatever its size in the file.
         if datatype.size() > MAX_ELEMENT_BYTES {
             return Err(wrong(format!("elements of {} bytes", datatype.size())));
         }
@@ -225,7 +210,6 @@ fn unreadable(array: &str, source: hdf5::Error) -> Problem {
     Problem::Unreadable { array: array.to_owned(), source: source.into() }
 }
 
-/// Why HDF5 refuses a file of `bytes` bytes that begins like this.
 fn refusal(file: &File, start: &[u8], bytes: u64, source: hdf5::Error) -> Problem {
     if Format::of(start) != Some(Format::Hdf5) {
         return foreign::of_start(start);
@@ -235,13 +219,13 @@ fn refusal(file: &File, start: &[u8], bytes: u64, source: hdf5::Error) -> Proble
     }
     match end_of_file(start) {
         Some(expected) if expected > bytes => Problem::Truncated { bytes, expected },
-        // Bit 0 of the consistency flags, which version 3 of the superblock has in byte 11.
+        // Bit 0 of the consistency flags, byte 11 in version 3 of the superblock.
         Some(_) if start[8] == 3 && start[11] & 1 == 1 => Problem::NotClosed(source),
         _ => Problem::DamagedHdf5(source),
     }
 }
 
-/// What people call a filter, by its number in HDF5's registry.
+/// Name of a filter by its number in HDF5's registry.
 fn filter_name(id: i32) -> String {
     let name = match id {
         1 => "gzip",
@@ -257,14 +241,12 @@ fn filter_name(id: i32) -> String {
     name.to_owned()
 }
 
-/// The one text that an attribute or an array holds.
 fn text_in(holder: &Container) -> Option<String> {
     let mut texts = texts_in(holder)?;
     if texts.len() == 1 { texts.pop() } else { None }
 }
 
-/// The texts that an attribute or an array holds, as HDF5's programs write them: of variable or
-/// fixed length, ASCII or UTF-8.
+/// Texts in an attribute or an array, of variable or fixed length, ASCII or UTF-8.
 fn texts_in(holder: &Container) -> Option<Vec<String>> {
     fn as_type<T: H5Type + Display>(holder: &Container) -> Option<Vec<String>> {
         Some(holder.read_raw::<T>().ok()?.iter().map(T::to_string).collect())
@@ -275,10 +257,7 @@ fn texts_in(holder: &Container) -> Option<Vec<String>> {
         .or_else(|| as_type::<FixedAscii<MAX_TEXT>>(holder))
 }
 
-/// The length that the file's superblock says the file has, of any of its versions with 8-byte
-/// addresses.
-///
-/// HDF5 File Format Specification 3.0, II.A.
+/// File size by a superblock with 8-byte addresses (HDF5 File Format Specification 3.0, II.A).
 fn end_of_file(start: &[u8]) -> Option<u64> {
     let address = match (start.get(8)?, start.get(9)?, start.get(13)?) {
         (0, _, 8) => 40,

@@ -1,4 +1,4 @@
-//! Minari's datasets: a folder with `main_data.hdf5`, one group an episode, and `metadata.json`.
+//! Minari datasets: a folder with `main_data.hdf5`, one group per episode, and `metadata.json`.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -12,14 +12,12 @@ use crate::formats::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
 use crate::tables::environment;
 
-/// The file with the data; `metadata.json` lies beside it.
 pub(super) const DATA_FILE: &str = "main_data.hdf5";
 
-/// Groups of episodes are called this and their number.
 const EPISODE: &str = "episode_";
 
-/// Where Minari keeps the dataset of this id, like `mujoco/hopper/medium-v0`: in
-/// `$MINARI_DATASETS_PATH`, or else in `~/.minari/datasets`.
+/// Folder of a Minari dataset such as `mujoco/hopper/medium-v0`, in `$MINARI_DATASETS_PATH` or
+/// `~/.minari/datasets`.
 pub fn minari_folder(id: &str) -> PathBuf {
     let root = match std::env::var_os("MINARI_DATASETS_PATH") {
         Some(root) if !root.is_empty() => PathBuf::from(root),
@@ -28,17 +26,15 @@ pub fn minari_folder(id: &str) -> PathBuf {
     root.join(id).join("data")
 }
 
-/// The data file in a dataset's folder, or in its folder `data`.
 pub(super) fn data_file(folder: &Path) -> Option<PathBuf> {
     [folder.join(DATA_FILE), folder.join("data").join(DATA_FILE)]
         .into_iter()
         .find(|path| path.exists())
 }
 
-/// What `metadata.json` says that matters here.
 #[derive(Default, Deserialize)]
 pub(crate) struct Metadata {
-    /// JSON in JSON.
+    /// JSON encoded as a string.
     env_spec: Option<String>,
     total_episodes: Option<usize>,
 }
@@ -49,7 +45,6 @@ struct EnvironmentId {
 }
 
 impl Metadata {
-    /// Reads the file beside the data; nothing is known where there is none.
     pub(super) fn read(data_file: &Path) -> Result<Self, DatasetError> {
         let path = data_file.with_file_name("metadata.json");
         match fs::read(&path) {
@@ -60,17 +55,15 @@ impl Metadata {
         }
     }
 
-    /// The environment it was recorded in: our name for it if its simulation is ours, else
-    /// Gymnasium's id.
+    /// Name in the table of environments if its simulation is known, else Gymnasium's id.
     pub(super) fn environment(&self) -> Option<String> {
         let EnvironmentId { id } = serde_json::from_str(self.env_spec.as_ref()?).ok()?;
         Some(environment::find_gymnasium(&id).map_or(id, |environment| environment.name.clone()))
     }
 }
 
-/// Reads all episodes. Every step is a transition, to the observation that its episode has for the
-/// following one; a mask is 0 where `terminations` is 1. An observation that is a Dict or a Tuple
-/// becomes a row by [`parts`].
+/// Reads all episodes. The mask is 0 where `terminations` is 1. Dict and Tuple observations are
+/// concatenated in the order of [`parts`].
 pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Problem> {
     let mut recording = Recording { terminal_array: "terminations", ..Recording::default() };
     let episodes = episodes(file);
@@ -88,7 +81,7 @@ fn episodes(file: &Hdf5File) -> usize {
     numbers.iter().filter_map(|name| name.strip_prefix(EPISODE)?.parse::<usize>().ok()).count()
 }
 
-/// Appends an episode of T steps as T + 1 rows, the last of which is its last state.
+/// Appends an episode of T steps as T + 1 rows, the last of which is its final state.
 fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(), Problem> {
     let array = |name: &str| format!("{episode}/{name}");
     let actions = file.actions(&array("actions"))?;
@@ -107,7 +100,6 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
     recording.timeouts.extend(file.flags(&array("truncations"), steps)?);
     recording.ends.extend((1..=steps).map(|step| step == steps));
     recording.kinds.extend(std::iter::repeat_n(RowKind::Transition, steps));
-    // The last state.
     recording.actions.resize(rows * a, 0.0);
     recording.rewards.push(0.0);
     recording.terminals.push(false);
@@ -117,7 +109,6 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
     Ok(())
 }
 
-/// An array, or the arrays of a Dict or a Tuple side by side.
 fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, Problem> {
     let Some(members) = file.members(name) else { return file.numbers(name) };
     let columns = parts(members)
@@ -130,8 +121,7 @@ fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, 
     Array::new(name, &[rows, width], values)
 }
 
-/// The arrays of a row in their order: those of a Dict by name, those of a Tuple by number, which
-/// Minari calls `_index_0`, `_index_1` and so on.
+/// Order of concatenation: a Dict's arrays by name, a Tuple's by number (`_index_0`, …).
 fn parts(mut names: Vec<String>) -> Vec<String> {
     let number = |name: &String| {
         name.strip_prefix("_index_").and_then(|number| number.parse::<usize>().ok())

@@ -1,5 +1,3 @@
-//! The formats that are read, each to one [`Recording`].
-
 mod array;
 pub(crate) mod arrays;
 mod d4rl;
@@ -27,8 +25,7 @@ use crate::tables::maze::MazeTask;
 
 pub use minari::minari_folder;
 
-/// The file with a source's data: for a folder of Minari's the one that is in it, else the path
-/// itself.
+/// The file with the data: `main_data.hdf5` of a Minari folder, else the path itself.
 pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {
     let path = path.as_ref();
     match path.is_dir() {
@@ -39,7 +36,6 @@ pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {
     }
 }
 
-/// An open dataset of some format, which its content tells.
 pub(crate) enum Source {
     D4rl(Hdf5File),
     Own(Hdf5File),
@@ -48,7 +44,6 @@ pub(crate) enum Source {
 }
 
 impl Source {
-    /// Opens a file, or a folder of Minari.
     pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new(path, problem);
         let file = data_file(path)?;
@@ -91,7 +86,6 @@ impl Source {
         }
     }
 
-    /// What people call the format.
     pub(crate) fn format(&self) -> &'static str {
         match self {
             Self::D4rl(_) => "D4RL",
@@ -101,7 +95,6 @@ impl Source {
         }
     }
 
-    /// The environment that it says it was recorded in.
     pub(crate) fn environment(&self) -> Option<String> {
         match self {
             Self::D4rl(file) => file.text("metadata/environment"),
@@ -110,9 +103,8 @@ impl Source {
         }
     }
 
-    /// Refuses another environment's recording. Environments that share their physics suit each
-    /// other. OGBench's files do not name theirs, but none is from a maze whose rewards do not
-    /// follow from the observations.
+    /// Refuses a recording of an environment with other physics. OGBench files do not name theirs,
+    /// but are never of a maze whose rewards are stored.
     pub(crate) fn check_environment(&self, asked: &EnvironmentSpec) -> Result<(), Problem> {
         let expected = asked.name.clone();
         let is_other_maze = asked.maze.is_some() && benchmarks::relabeling(&asked.name).is_none();
@@ -131,14 +123,12 @@ impl Source {
         }
     }
 
-    /// Whether a D4RL file leaves it open where episodes are cut off.
     pub(crate) fn lacks_timeouts(&self) -> bool {
         matches!(self, Self::D4rl(file) if !file.has("timeouts"))
     }
 
-    /// Reads all of it. The environment says what a D4RL file may leave open: a time limit, and
-    /// whether there is a goal. Of a task in a maze of OGBench's come rewards and masks, whatever
-    /// the file says.
+    /// Reads all rows. `environment` gives the time limit and goal of a D4RL file; `task` replaces
+    /// rewards and masks.
     pub(crate) fn read(
         &mut self,
         environment: Option<&EnvironmentSpec>,
@@ -161,9 +151,8 @@ impl Source {
     }
 }
 
-/// The environment that a source says it was recorded in: one of our names, or, for a Minari
-/// dataset of an environment that is not in our table, Gymnasium's id. Recordings of `evaluator
-/// collect` and Minari's datasets say it.
+/// Environment named in the source's metadata, as written by `evaluator collect` and Minari: a name
+/// in the table of environments, or else Gymnasium's id.
 pub fn recorded_environment(path: impl AsRef<Path>) -> Result<Option<String>, DatasetError> {
     Ok(Source::open(path.as_ref())?.environment())
 }

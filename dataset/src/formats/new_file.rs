@@ -1,5 +1,4 @@
-//! An HDF5 file that is being written, and its arrays, which grow by rows: gzip 4, chunked,
-//! booleans as h5py writes them.
+//! HDF5 file being written, with appendable arrays: gzip 4, chunked, booleans encoded as in h5py.
 
 use std::fs;
 use std::io;
@@ -12,26 +11,21 @@ use ndarray::ArrayViewD;
 
 use crate::error::{DatasetError, Problem};
 
-/// Rows in a chunk, unless they are wide.
 pub(crate) const CHUNK_ROWS: usize = 4096;
 
-/// Numbers in a chunk at most.
 const CHUNK_NUMBERS: usize = 1 << 20;
 
-/// D4RL's.
+/// Same as D4RL.
 const GZIP_LEVEL: u8 = 4;
 
-/// It appears under its name when [`finish`](Self::finish) says so, and not before: until then it
-/// is `<path>.partial`, which the next one of that path replaces.
+/// File written to `<path>.partial` until [`finish`](Self::finish) renames it.
 pub(crate) struct NewFile {
     path: PathBuf,
     partial: PathBuf,
-    /// Where its arrays and groups are made.
     pub(crate) hdf5: hdf5::File,
 }
 
 impl NewFile {
-    /// Starts a file, and the folder it lies in.
     pub(crate) fn create(path: &Path) -> Result<Self, DatasetError> {
         let mut partial = path.to_owned().into_os_string();
         partial.push(".partial");
@@ -43,16 +37,14 @@ impl NewFile {
         if path.is_dir() {
             return Err(DatasetError::new(path, Problem::Io(io::ErrorKind::IsADirectory.into())));
         }
-        // What a killed process has left, or a link, through which the library would write into
-        // another file.
+        // Leftover of a killed process, or a link through which HDF5 would write into another file.
         let made = fs::remove_file(&partial).or_else(|error| match error.kind() {
             io::ErrorKind::NotFound => Ok(()),
             _ => Err(error),
         });
         let made = made.and_then(|()| fs::File::create_new(&partial));
         made.map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
-        // The oldest format is read by every version of the library, and its groups do not say when
-        // they were made.
+        // The earliest format is read by all HDF5 versions, and its groups have no timestamps.
         let hdf5 = hdf5::File::with_options()
             .with_fapl(|access| access.libver_earliest())
             .create(&partial);
@@ -64,12 +56,11 @@ impl NewFile {
         &self.path
     }
 
-    /// What is told of a failed write.
     pub(crate) fn failed(&self, source: hdf5::Error) -> DatasetError {
         DatasetError::new(&self.partial, Problem::Write(source))
     }
 
-    /// Closes the file, whose columns must be dropped by then, and gives it its name.
+    /// Closes and renames the file; its columns must be dropped before.
     pub(crate) fn finish(self) -> Result<(), DatasetError> {
         let Self { path, partial, hdf5 } = self;
         drop(hdf5);
@@ -80,20 +71,17 @@ impl NewFile {
     }
 }
 
-/// Properties of an array that does not say when it was made: equal rows make equal files, by whose
-/// hash a run knows its data.
+/// Creation properties without timestamps, so that equal rows give files with equal hashes.
 #[allow(unsafe_code)]
 fn timeless() -> hdf5::Result<DatasetCreate> {
     let properties = DatasetCreate::try_new()?;
-    // SAFETY: the number is that of these properties, and no other thread is in the library
-    // meanwhile.
+    // SAFETY: the id is that of `properties`, and `sync` keeps other threads out of HDF5.
     match hdf5::sync::sync(|| unsafe { H5Pset_obj_track_times(properties.id(), 0) }) {
         0.. => Ok(properties),
         _ => Err("the HDF5 library keeps the time of arrays".into()),
     }
 }
 
-/// An array that grows by rows: N, or N × width.
 pub(crate) struct Column {
     pub(crate) name: &'static str,
     pub(crate) width: Option<usize>,
@@ -102,7 +90,6 @@ pub(crate) struct Column {
 }
 
 impl Column {
-    /// An array without rows, of numbers of type `T`.
     pub(crate) fn create<T: H5Type>(
         file: &NewFile,
         name: &'static str,
@@ -120,7 +107,6 @@ impl Column {
         Ok(Self { name, width, dataset, rows: 0 })
     }
 
-    /// Appends whole rows.
     pub(crate) fn append<T: H5Type>(&mut self, values: &[T]) -> hdf5::Result<()> {
         let shape = |rows: usize| -> Vec<usize> { [rows].into_iter().chain(self.width).collect() };
         let new = values.len() / self.width.unwrap_or(1);

@@ -1,5 +1,3 @@
-//! Arrays of an npz archive: a zip file of NumPy's `.npy` files, stored or deflated.
-
 use std::fs::File;
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
@@ -13,7 +11,6 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::array::Array;
 use crate::formats::foreign;
 
-/// An open npz archive.
 pub(crate) struct NpzFile {
     path: PathBuf,
     archive: ZipArchive<BufReader<File>>,
@@ -41,17 +38,16 @@ impl NpzFile {
         &self.path
     }
 
-    /// An array of numbers, converted to float32, that may be NaN.
+    /// Array of numbers, converted to float32; NaN is allowed.
     pub(crate) fn numbers(&mut self, array: &str) -> Result<Array<f32>, Problem> {
         self.read(array, false)
     }
 
-    /// An array of actions: numbers whose type says that they are continuous.
+    /// Array of actions, which must be of a floating-point type.
     pub(crate) fn actions(&mut self, array: &str) -> Result<Array<f32>, Problem> {
         self.read(array, true)
     }
 
-    /// An array of `rows × width` numbers.
     pub(crate) fn table(
         &mut self,
         array: &str,
@@ -61,7 +57,6 @@ impl NpzFile {
         self.numbers(array)?.sized(rows, width)
     }
 
-    /// An array of one flag a row, which may be stored as numbers.
     pub(crate) fn flags(&mut self, array: &str, rows: usize) -> Result<Vec<bool>, Problem> {
         self.numbers(array)?.into_flags(rows)
     }
@@ -87,7 +82,7 @@ impl NpzFile {
         }
         let order = file.order();
         let values = floats(file, &name)?;
-        // Only at its end does the archive compare the entry with its checksum.
+        // The checksum is compared at the end of the entry.
         io::copy(&mut reader, &mut io::sink()).map_err(unreadable)?;
         Array::new(
             array,
@@ -142,7 +137,7 @@ fn wrong_type(array: &str, found: String) -> Problem {
     Problem::Type { array: array.to_owned(), found, expected: "numbers or booleans" }
 }
 
-/// Row by row what is stored column by column.
+/// Row-major copy of a column-major array.
 fn by_rows(shape: &[usize], values: &[f32]) -> Vec<f32> {
     let rows = shape.first().copied().unwrap_or(0);
     (0..rows).flat_map(|row| values.iter().skip(row).step_by(rows.max(1)).copied()).collect()

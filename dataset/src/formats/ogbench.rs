@@ -1,19 +1,13 @@
-//! OGBench's npz files.
-
 use crate::error::Problem;
 use crate::formats::npz_file::NpzFile;
 use crate::recording::{Recording, RowKind};
 use crate::rounding::Rounding;
 use crate::tables::maze::MazeTask;
 
-/// Reads `observations`, `actions`, `terminals`, `rewards` unless they follow from a `task`, and,
-/// if there, `masks`.
-///
-/// `terminals` mark the end of a trajectory, not of what can be gained: that is where `masks` are
-/// 0, and nowhere in a file without masks. As OGBench stores its data, the last state of a
-/// trajectory is a row of its own, so that a row at a terminal starts no transition. As its loader
-/// returns the data, either each row is a transition with its own `next_observations`, or `valids`
-/// say which rows start one.
+/// Reads a file of OGBench. `terminals` mark the end of a trajectory; the mask is 0 only where
+/// `masks` is. In stored files, a trajectory's last row is its final state and starts no
+/// transition. In arrays returned by OGBench's loader, each row has `next_observations`, or
+/// `valids` marks rows that start a transition.
 pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
@@ -30,7 +24,7 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
     let last_states: Vec<bool> = match (&next_observations, file.has("valids")) {
         (Some(_), _) => vec![false; rows],
         (None, true) => file.flags("valids", rows)?.into_iter().map(|valid| !valid).collect(),
-        // A trajectory that the end of the file cuts off ends with a last state, too.
+        // A trajectory truncated by the end of the file also ends in a final state.
         (None, false) => (0..rows).map(|row| terminals[row] || row + 1 == rows).collect(),
     };
     let is_last = |row: usize| match &next_observations {

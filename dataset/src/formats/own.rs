@@ -1,21 +1,18 @@
-//! The custom layout: HDF5, one row a transition.
+//! Custom layout: HDF5 with one row per transition.
 
 use crate::error::Problem;
 use crate::formats::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
 use crate::rounding::Rounding;
 
-/// The value of the root attribute `layout` that tells this layout from D4RL's.
+/// Value of the root attribute `layout` that distinguishes this layout from D4RL's.
 pub(crate) const LAYOUT: &str = "transitions";
 
-/// The root attributes that say what the numbers of a row are called.
 pub(crate) const OBSERVATION_NAMES: &str = "observation_names";
 pub(crate) const ACTION_NAMES: &str = "action_names";
 
-/// Reads `observations`, `actions`, `rewards`, `next_observations`, `terminals` and, if there,
-/// `timeouts`. Every row is a transition, with the next observation that the file stores. Terminals
-/// and timeouts end an episode; without timeouts, so does a row whose next observation is not the
-/// following row's observation.
+/// Reads the custom layout. Terminals and timeouts end an episode; without `timeouts`, so does a
+/// next observation that differs from the following row's observation.
 pub(super) fn read(file: &Hdf5File) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);

@@ -1,25 +1,23 @@
-//! A file as it was recorded, row by row, simulator states included.
-
 use std::path::Path;
 
 use crate::error::{DatasetError, Problem};
 use crate::formats::hdf5_file::Hdf5File;
 use crate::tables::environment::{self, EnvironmentSpec};
 
-/// One recorded step, in the simulator's precision.
+/// Recorded step in float64.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Row<'a> {
     /// s, before the step.
     pub observation: &'a [f64],
-    /// a, as it was applied.
+    /// a, as applied.
     pub action: &'a [f64],
-    /// s', after the step and before any reset; empty where the file does not tell.
+    /// s', after the step and before any reset; empty if unknown.
     pub next_observation: &'a [f64],
-    /// r.
+    /// Reward r.
     pub reward: f64,
-    /// Whether s' ended the episode by the environment's own rule.
+    /// True if the episode terminated in s'.
     pub terminal: bool,
-    /// Whether the time limit cut the episode off after this step.
+    /// True if the time limit truncated the episode after this step.
     pub timeout: bool,
     /// MuJoCo's positions before the step.
     pub qpos: &'a [f64],
@@ -27,13 +25,12 @@ pub struct Row<'a> {
     pub qvel: &'a [f64],
 }
 
-/// All rows of a file that has `infos/qpos` and `infos/qvel` besides the arrays to learn from and,
-/// where there is a goal, `infos/goal`.
+/// Rows of a D4RL file with simulator states, and goals in mazes.
 pub struct RecordedRows {
     environment: &'static EnvironmentSpec,
     observations: Vec<f64>,
     actions: Vec<f64>,
-    /// D4RL's AntMaze files have none.
+    /// Absent in D4RL's AntMaze files.
     next_observations: Option<Vec<f64>>,
     rewards: Vec<f64>,
     terminals: Vec<bool>,
@@ -43,7 +40,7 @@ pub struct RecordedRows {
     goals: Option<Vec<f64>>,
 }
 
-/// The environments of the table whose sizes a file has.
+/// Known environments whose dimensions match those of the file.
 pub fn environments_of_its_sizes(
     path: impl AsRef<Path>,
 ) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
@@ -56,7 +53,6 @@ pub fn environments_of_its_sizes(
         .collect())
 }
 
-/// Numbers in a goal: x and y.
 const GOAL_DIM: usize = 2;
 
 impl RecordedRows {
@@ -94,12 +90,12 @@ impl RecordedRows {
         self.rewards.len()
     }
 
-    /// Whether the file has no row.
+    /// True without rows.
     pub fn is_empty(&self) -> bool {
         self.rewards.is_empty()
     }
 
-    /// Row `i`, which must be below [`len`](Self::len).
+    /// Row `i < len()`.
     pub fn row(&self, i: usize) -> Row<'_> {
         let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } =
             *self.environment;
@@ -116,13 +112,12 @@ impl RecordedRows {
         }
     }
 
-    /// Where the goal was at row `i`, if there is one: x and y.
+    /// Goal at row `i` if the file has goals: x and y.
     pub fn goal(&self, i: usize) -> Option<&[f64]> {
         self.goals.as_ref().map(|goals| &goals[i * GOAL_DIM..][..GOAL_DIM])
     }
 
-    /// The stored one, or else the following row's observation where no episode ended between the
-    /// two.
+    /// Stored next observation, or the following row's if no episode ends in between.
     fn next_observation(&self, i: usize) -> &[f64] {
         let width = self.environment.observation_dim;
         match &self.next_observations {
@@ -132,13 +127,12 @@ impl RecordedRows {
         }
     }
 
-    /// All rows in order.
+    /// Iterates over all rows.
     pub fn iter(&self) -> impl Iterator<Item = Row<'_>> {
         (0..self.len()).map(|i| self.row(i))
     }
 }
 
-/// An array of numbers, none of which may be NaN or infinite.
 fn finite(file: &Hdf5File, array: &str, rows: usize, width: usize) -> Result<Vec<f64>, Problem> {
     let values: Vec<f64> = file.table(array, rows, width)?;
     if let Some(i) = values.iter().position(|value| !value.is_finite()) {

@@ -1,5 +1,3 @@
-//! Problems of a dataset that training accepts.
-
 use crate::error::such_rows;
 use crate::formats::Source;
 use crate::normalize::Normalize;
@@ -8,10 +6,9 @@ use crate::tables::environment::EnvironmentSpec;
 use crate::tables::reward::RewardRule;
 use crate::{checks, warnings};
 
-/// Farthest that a robot in a maze moves in a step of 0.1 s, meters.
+/// Largest displacement of a maze robot in a step of 0.1 s, meters.
 const LONGEST_STEP: f32 = 1.0;
 
-/// One sentence for each kind of thing.
 pub(super) fn findings(
     source: &Source,
     recording: &Recording,
@@ -44,8 +41,7 @@ pub(super) fn findings(
     findings
 }
 
-/// Rows inside an episode from which the place, an observation's first two numbers, is too far from
-/// the next one.
+/// Rows whose position (first two dimensions) is too far from the next row's.
 fn leaps(recording: &Recording) -> Option<String> {
     if !recording.goal {
         return None;

@@ -1,24 +1,19 @@
-//! How often numbers are how large, as a picture in plain characters.
-
 use std::fmt;
 
 use serde::Serialize;
 
-/// Bars at most.
 const BINS: usize = 12;
 
-/// Characters of the longest bar.
 const WIDTH: usize = 40;
 
-/// Counts of numbers in bins of equal width. A number on an inner edge is in the bin above it.
+/// Counts in bins of equal width. A number on an inner edge belongs to the upper bin.
 #[derive(Debug, PartialEq, Serialize)]
 pub struct Histogram {
     /// Lower edge of the first bin.
     pub from: f64,
     /// Upper edge of the last bin.
     pub to: f64,
-    /// Numbers in each bin; a single bin where all of them are equal, none where there are no
-    /// numbers.
+    /// Count in each bin: one bin if all numbers are equal, no bin without numbers.
     pub counts: Vec<usize>,
 }
 
@@ -46,7 +41,7 @@ impl fmt::Display for Histogram {
         let most = self.counts.iter().copied().max().unwrap_or(1);
         for (bin, &count) in self.counts.iter().enumerate() {
             let edge = |bin: usize| self.from + (self.to - self.from) * bin as f64 / bins as f64;
-            // Whatever is there shows.
+            // Nonzero counts get at least one character.
             let bar = "#".repeat((count * WIDTH).div_ceil(most));
             writeln!(
                 f,

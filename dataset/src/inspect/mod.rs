@@ -1,8 +1,3 @@
-//! A description of a dataset for people.
-//!
-//! `findings` is what looks wrong though training puts up with it, `histogram` counts, and `page`
-//! is how it all looks.
-
 mod findings;
 mod histogram;
 mod page;
@@ -22,92 +17,90 @@ use crate::tables::reward::RewardScaling;
 
 pub use histogram::Histogram;
 
-/// Figures of a dataset, and what is wrong with it. Numbers that are not finite are left out of
-/// every figure; a figure of nothing is NaN, which JSON has as null.
+/// Statistics and problems of a dataset. Numbers that are not finite are excluded; a statistic of
+/// no numbers is NaN, null in JSON.
 #[derive(Debug, Serialize)]
 pub struct Inspection {
-    /// The file or folder.
+    /// File or folder.
     pub path: PathBuf,
-    /// The format it was read as: `D4RL`, `Minari`, `OGBench` or `transitions`, the custom layout.
+    /// `D4RL`, `Minari`, `OGBench` or `transitions`, the custom layout.
     pub format: &'static str,
-    /// The environment that it was inspected as: the one that was asked for, or else the one that
-    /// it says it is from.
+    /// Environment given by the caller, else the one named in the file.
     pub environment: Option<String>,
-    /// Transitions to learn from.
+    /// Number of transitions.
     pub transitions: usize,
-    /// Recorded episodes; one that the end of the file cuts off counts as well.
+    /// Number of episodes, including one truncated by the end of the file.
     pub episodes: usize,
-    /// Numbers in an observation.
+    /// Dimension of an observation.
     pub observation_dim: usize,
-    /// Numbers in an action.
+    /// Dimension of an action.
     pub action_dim: usize,
-    /// Fewest steps in an episode.
+    /// Length of the shortest episode.
     pub min_length: f64,
-    /// Mean number of steps in an episode.
+    /// Mean episode length.
     pub mean_length: f64,
-    /// Most steps in an episode.
+    /// Length of the longest episode.
     pub max_length: f64,
-    /// Smallest undiscounted return of an episode, as in [`Statistics`](crate::Statistics).
+    /// Smallest undiscounted return, as in [`Statistics`](crate::Statistics).
     pub min_return: f64,
     /// Mean return.
     pub mean_return: f64,
     /// Largest return.
     pub max_return: f64,
-    /// Smallest, mean and largest score by D4RL's reference returns, where the environment is
-    /// known.
+    /// Normalized scores by D4RL's reference returns, if the environment is known.
     #[serde(flatten)]
     pub scores: Option<Scores>,
-    /// What the source calls the numbers of an observation; empty where they have no names.
+    /// Names of the observation dimensions; empty if the source has none.
     pub observation_names: Vec<String>,
-    /// Names of the numbers of an action.
+    /// Names of the action dimensions; empty if the source has none.
     pub action_names: Vec<String>,
-    /// Numbers of an observation that never change, from 0.
+    /// Indices of constant observation dimensions.
     pub constant_observations: Vec<usize>,
-    /// Those of an action.
+    /// Indices of constant action dimensions.
     pub constant_actions: Vec<usize>,
-    /// Root mean square of the rewards; methods are made for about 1.
+    /// Root mean square of the rewards; hyperparameters are tuned for about 1.
     pub reward_size: f64,
     /// Smallest and largest reward.
     pub reward_range: Range,
-    /// Smallest and largest number in an action.
+    /// Smallest and largest value in an action.
     pub action_range: Range,
-    /// Smallest and largest value of each of an action's numbers.
+    /// Range of each action dimension.
     pub action_ranges: Vec<Range>,
-    /// Smallest and largest number in an observation.
+    /// Smallest and largest value in an observation.
     pub observation_range: Range,
-    /// Smallest and largest value of each of an observation's numbers.
+    /// Range of each observation dimension.
     pub observation_ranges: Vec<Range>,
-    /// Share of the steps that are terminal.
+    /// Fraction of terminal steps.
     pub terminals: f64,
-    /// Share of the steps at which an episode was cut off.
+    /// Fraction of timeouts.
     pub timeouts: f64,
-    /// How many episodes have which return.
+    /// Histogram of returns.
     pub returns: Histogram,
-    /// How many episodes have which length.
+    /// Histogram of episode lengths.
     pub lengths: Histogram,
-    /// What is wrong, one sentence each: first what training refuses, then what it puts up with.
+    /// Problems, one sentence each: first those that training refuses.
     pub problems: Vec<String>,
-    /// Whether `learner train` refuses it, also with `--normalize actions`.
+    /// True if `learner train` refuses the dataset even with `--normalize actions`.
     pub refused: bool,
 }
 
 /// Normalized scores of the episodes.
 #[derive(Debug, Serialize)]
 pub struct Scores {
-    /// Smallest.
+    /// Minimum.
     pub min_score: f64,
     /// Mean.
     pub mean_score: f64,
-    /// Largest.
+    /// Maximum.
     pub max_score: f64,
 }
 
-/// The smallest and the largest of some numbers.
+/// Smallest and largest of some numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Range {
-    /// Smallest.
+    /// Minimum.
     pub min: f64,
-    /// Largest.
+    /// Maximum.
     pub max: f64,
 }
 
@@ -118,7 +111,6 @@ impl Range {
         Self { min, max }
     }
 
-    /// Finds the range of each of a row's `width` numbers, over the rows that are asked for.
     fn of_columns(values: &[f32], width: usize, rows: impl Fn(usize) -> bool) -> Vec<Self> {
         let column = |column: usize| {
             let values = values.iter().skip(column).step_by(width).enumerate();
@@ -127,7 +119,6 @@ impl Range {
         (0..width).map(column).collect()
     }
 
-    /// The columns that have but one value.
     fn constant(ranges: &[Self]) -> Vec<usize> {
         (0..ranges.len()).filter(|&i| ranges[i].min == ranges[i].max).collect()
     }
@@ -139,11 +130,8 @@ impl Range {
     }
 }
 
-/// Describes a dataset of any format. Whatever is wrong with its numbers becomes a problem on the
-/// list; an error is what leaves nothing to describe, such as a file that HDF5 does not open.
-///
-/// Where no environment is asked for, it is the one that the source says it was recorded in, if we
-/// know that one.
+/// Summarizes a dataset of any format. Bad numbers are listed as problems; only an unreadable
+/// source is an error. The environment defaults to the one named in the file, if known.
 pub fn inspect(
     path: impl AsRef<Path>,
     environment: Option<&'static EnvironmentSpec>,

@@ -1,5 +1,3 @@
-//! An inspection for people to read.
-
 use std::fmt;
 
 use super::{Inspection, Range};

@@ -1,5 +1,4 @@
-//! Benchmarks of others: the table `benchmarks.toml`, and the environments, tasks and datasets that
-//! follow from its rows.
+//! Tables of D4RL and OGBench, from `benchmarks.toml`.
 
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
@@ -10,17 +9,17 @@ use super::maze::{CELL, GoalDraw, Judged, MazeTask};
 use super::reward::RewardRule;
 use super::simulator::{Robot, Simulator};
 
-/// A benchmark.
+/// Row of `benchmarks.toml`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Benchmark {
-    /// Name for people.
+    /// Display name.
     pub name: String,
-    /// Format of its files.
+    /// Format of the files.
     pub format: Format,
-    /// Folder in which its users keep its files.
+    /// Default download folder.
     pub cache: Cache,
-    /// Source of `quad-convert` for tasks without a dataset.
+    /// Source argument of `quad-convert` for tasks without a dataset.
     pub converter: Option<String>,
     host: Option<Host>,
     names: Templates,
@@ -32,18 +31,18 @@ pub struct Benchmark {
     family: Vec<Family>,
 }
 
-/// Format of a benchmark's files.
+/// File format of a benchmark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
-    /// D4RL's HDF5.
+    /// HDF5, as in D4RL.
     Hdf5,
-    /// OGBench's npz.
+    /// NumPy's npz, as in OGBench.
     Npz,
 }
 
 impl Format {
-    /// The format of a file that starts with these bytes.
+    /// Format of a file with these first bytes.
     pub fn of(start: &[u8]) -> Option<Self> {
         match start {
             [0x89, b'H', b'D', b'F', b'\r', b'\n', 0x1a, b'\n', ..] => Some(Self::Hdf5),
@@ -52,7 +51,7 @@ impl Format {
         }
     }
 
-    /// Name of such a file.
+    /// Display name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Hdf5 => "HDF5 file",
@@ -68,17 +67,16 @@ impl Format {
     }
 }
 
-/// Folder in which a benchmark's users keep its files.
+/// Default download folder of a benchmark's own library.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Cache {
-    /// Path in the user's home folder.
+    /// Path in the home folder.
     pub folder: String,
-    /// Environment variable that names another folder.
+    /// Environment variable that overrides the folder.
     pub variable: Option<String>,
 }
 
-/// Where datasets can be fetched.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Host {
@@ -86,7 +84,7 @@ pub(crate) struct Host {
     pub folders: Vec<String>,
 }
 
-/// Names with {place}, {data} and {task} in them.
+/// Templates with placeholders {place}, {data} and {task}.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Templates {
@@ -105,7 +103,6 @@ struct Rules {
     relabel: bool,
 }
 
-/// Row and column in a maze.
 type Cell = [u8; 2];
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -161,29 +158,25 @@ pub fn all() -> &'static [Benchmark] {
     &TABLE.benchmark
 }
 
-/// The benchmark of that name.
+/// Benchmark of the given name.
 pub fn find(name: &str) -> Option<&'static Benchmark> {
     all().iter().find(|benchmark| benchmark.name == name)
 }
 
-/// An environment of a benchmark, simulated here or not.
 pub(super) struct BenchmarkEnvironment {
     pub name: String,
     pub benchmark: &'static Benchmark,
-    /// Name of the physics, which several share.
     pub simulation: String,
     pub task: Option<MazeTask>,
     pub simulator: Option<Simulator>,
     pub max_episode_steps: usize,
     place: &'static Place,
-    /// Suffix of a numbered task's name.
     suffix: String,
 }
 
 static ENVIRONMENTS: LazyLock<Vec<BenchmarkEnvironment>> =
     LazyLock::new(|| all().iter().flat_map(Benchmark::environments).collect());
 
-/// All environments of benchmarks, those of a place one after the other.
 pub(super) fn environments() -> &'static [BenchmarkEnvironment] {
     &ENVIRONMENTS
 }
@@ -192,7 +185,7 @@ pub(super) fn environment(name: &str) -> Option<&'static BenchmarkEnvironment> {
     environments().iter().find(|environment| environment.name == name)
 }
 
-/// The task in a maze that gives an environment's datasets, which have none, their rewards.
+/// Task that labels an environment's datasets with rewards, if they have none.
 pub fn relabeling(environment: &str) -> Option<MazeTask> {
     self::environment(environment)
         .filter(|environment| environment.benchmark.rules.relabel)
@@ -252,12 +245,11 @@ impl Benchmark {
 }
 
 impl BenchmarkEnvironment {
-    /// The rule for its rewards: of a task in a maze the benchmark's, else none.
+    /// Reward rule of the benchmark for tasks in mazes, else none.
     pub fn reward(&self) -> RewardRule {
         self.task.map_or(RewardRule::AsIs, |_| self.benchmark.rules.reward)
     }
 
-    /// Kinds of datasets of its place, and the names of these; none without a template.
     fn datasets(&self) -> impl Iterator<Item = (&'static str, String)> {
         let template = self.benchmark.names.dataset.as_deref();
         let kinds = template
@@ -271,23 +263,23 @@ fn fill(template: &str, place: &str, data: &str, task: &str) -> String {
     template.replace("{place}", place).replace("{data}", data).replace("{task}", task)
 }
 
-/// Names that make a task.
+/// Task with its environment and dataset.
 pub struct BenchmarkTask {
-    /// Name of the task.
+    /// Task name.
     pub name: String,
-    /// The benchmark that has it.
+    /// Benchmark of the task.
     pub benchmark: &'static Benchmark,
-    /// Name of the environment.
+    /// Environment name.
     pub environment: String,
-    /// Name of the dataset.
+    /// Dataset name.
     pub dataset: String,
-    /// The task in a maze that gives the dataset, which has none, its rewards.
+    /// Task that labels the dataset with rewards, if it has none.
     pub maze: Option<MazeTask>,
-    /// Whether it is the default task of its dataset.
+    /// True for the default task of the dataset.
     pub is_default: bool,
 }
 
-/// All tasks that are named by a rule, those of a dataset one after the other.
+/// All tasks named by a rule, grouped by dataset.
 pub fn tasks() -> impl Iterator<Item = BenchmarkTask> {
     environments().chunk_by(|one, other| std::ptr::eq(one.place, other.place)).flat_map(|place| {
         place[0].datasets().flat_map(move |(data, dataset)| {

@@ -1,5 +1,4 @@
-//! The datasets that can be fetched by name: the table `datasets.toml`, and those that
-//! [`benchmarks`] names by rules.
+//! Downloadable datasets: `datasets.toml`, and those named by rules of [`benchmarks`].
 
 use std::sync::LazyLock;
 
@@ -7,24 +6,24 @@ use serde::Deserialize;
 
 use super::benchmarks::{self, Benchmark, Host};
 
-/// A file that can be fetched.
+/// Downloadable dataset.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedDataset {
     /// Name in its benchmark, e.g. `hopper-medium-v2`.
     pub name: String,
-    /// Its benchmark.
+    /// Benchmark of the dataset.
     pub benchmark: &'static Benchmark,
-    /// Environment that it was recorded in.
+    /// Environment of the recording.
     pub environment: String,
-    /// Name of the file in its benchmark.
+    /// File name in its benchmark.
     pub file: String,
-    /// Size in bytes, if it is known.
+    /// Size in bytes, if known.
     pub bytes: Option<u64>,
-    /// SHA-256 in lower-case hexadecimal, if it is known.
+    /// SHA-256 in lowercase hexadecimal, if known.
     pub sha256: Option<String>,
     /// License of the data.
     pub license: String,
-    /// Addresses of the file, best first.
+    /// URLs in order of preference.
     pub addresses: Vec<String>,
 }
 
@@ -92,12 +91,12 @@ pub fn all() -> &'static [NamedDataset] {
     &DATASETS
 }
 
-/// The dataset of that name.
+/// Dataset of the given name.
 pub fn find(name: &str) -> Option<&'static NamedDataset> {
     all().iter().find(|dataset| dataset.name == name)
 }
 
-/// The dataset whose file has that name, in whatever folder.
+/// Dataset with the given file name; folders are ignored.
 pub fn find_file(file: &str) -> Option<&'static NamedDataset> {
     all().iter().find(|dataset| dataset.file == file)
 }

@@ -1,5 +1,4 @@
-//! The environments that evaluators simulate: the table `environments.toml`, and the mazes of
-//! [`benchmarks`].
+//! Simulated environments: `environments.toml`, and the mazes of [`benchmarks`].
 
 use std::sync::LazyLock;
 
@@ -10,37 +9,37 @@ use super::maze::MazeTask;
 use super::reward::RewardRule;
 use super::simulator::{Recipe, Simulator};
 
-/// An environment that is simulated.
+/// Simulated environment.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnvironmentSpec {
-    /// Name on command lines, in files and on the wire.
+    /// Name on command lines, in files and in messages.
     pub name: String,
     #[serde(skip)]
     simulation: Option<String>,
-    /// Ids in Gymnasium of environments with the same simulation.
+    /// Gymnasium ids with the same simulation.
     #[serde(default)]
     pub gymnasium: Vec<String>,
-    /// Numbers in an observation.
+    /// Dimension of an observation.
     pub observation_dim: usize,
-    /// Numbers in an action, each within ±1.
+    /// Dimension of an action; each component is within ±1.
     pub action_dim: usize,
-    /// Numbers in MuJoCo's `qpos`.
+    /// Length of MuJoCo's `qpos`.
     pub qpos_dim: usize,
-    /// Numbers in MuJoCo's `qvel`.
+    /// Length of MuJoCo's `qvel`.
     pub qvel_dim: usize,
-    /// Steps after which an episode is cut off (a timeout, not a termination).
+    /// Time limit in steps (a timeout, not a termination).
     pub max_episode_steps: usize,
-    /// Undiscounted returns that score 0 (D4RL's random policy) and 100 (D4RL's expert).
+    /// Undiscounted returns of D4RL's random policy (score 0) and expert (score 100).
     reference_returns: (f64, f64),
-    /// Rule for a dataset's rewards, unless a task or an algorithm has another.
+    /// Reward rule, unless a task or an algorithm overrides it.
     pub reward: RewardRule,
-    /// Task in a maze.
+    /// Task, if the environment is a maze.
     #[serde(skip)]
     pub maze: Option<MazeTask>,
     /// Robot and its surroundings.
     pub simulator: Simulator,
-    /// Recipe for recording a dataset in it, if there is one.
+    /// Recipe for recording a dataset, if any.
     pub collect: Option<Recipe>,
 }
 
@@ -63,20 +62,20 @@ pub fn all() -> &'static [EnvironmentSpec] {
     &ENVIRONMENTS
 }
 
-/// The name of no environment.
+/// Error for an unknown environment.
 #[derive(Debug, PartialEq, thiserror::Error)]
 #[error("unknown environment `{name}`; known: {}", names().join(", "))]
 pub struct UnknownEnvironment {
-    /// The unknown name.
+    /// Unknown name.
     pub name: String,
 }
 
-/// The names of all environments.
+/// Names of all environments.
 pub fn names() -> Vec<&'static str> {
     all().iter().map(|environment| environment.name.as_str()).collect()
 }
 
-/// The environment of that name.
+/// Environment of the given name.
 pub fn find(name: &str) -> Result<&'static EnvironmentSpec, UnknownEnvironment> {
     all()
         .iter()
@@ -84,12 +83,12 @@ pub fn find(name: &str) -> Result<&'static EnvironmentSpec, UnknownEnvironment> 
         .ok_or_else(|| UnknownEnvironment { name: name.to_owned() })
 }
 
-/// The environment whose simulation Gymnasium has under that id, such as `Hopper-v5`.
+/// Environment that matches a Gymnasium id such as `Hopper-v5`.
 pub(crate) fn find_gymnasium(id: &str) -> Option<&'static EnvironmentSpec> {
     all().iter().find(|environment| environment.gymnasium.iter().any(|known| known == id))
 }
 
-/// Name of the physics of an environment, simulated here or not.
+/// Name of an environment's physics, simulated here or not.
 pub fn simulation_of(name: &str) -> String {
     match (find(name), benchmarks::environment(name)) {
         (Ok(spec), _) => spec.simulation().to_owned(),
@@ -98,7 +97,7 @@ pub fn simulation_of(name: &str) -> String {
     }
 }
 
-/// Rule for the rewards of an environment's datasets, simulated here or not.
+/// Reward rule for an environment's datasets, simulated here or not.
 pub fn reward_rule(name: &str) -> RewardRule {
     match (find(name), benchmarks::environment(name)) {
         (Ok(spec), _) => spec.reward,
@@ -108,7 +107,6 @@ pub fn reward_rule(name: &str) -> RewardRule {
 }
 
 impl EnvironmentSpec {
-    /// A maze with a robot that is simulated.
     fn of_maze(environment: &BenchmarkEnvironment) -> Option<Self> {
         let simulator = environment.simulator.clone()?;
         let Simulator::Maze(robot, _) = simulator else { return None };
@@ -129,7 +127,7 @@ impl EnvironmentSpec {
         })
     }
 
-    /// Name of the physics, which several environments may share.
+    /// Name of the physics, shared by several environments.
     pub fn simulation(&self) -> &str {
         self.simulation.as_deref().unwrap_or(&self.name)
     }

@@ -1,36 +1,35 @@
-//! How recorded rewards become training rewards.
+//! Transformations of recorded into training rewards.
 
 use serde::{Deserialize, Serialize};
 
 use crate::recording::Recording;
 
-/// What happens to the rewards of a file. Statistics and scores are always of the rewards as they
-/// were recorded.
+/// Transformation of rewards before training. Statistics and scores use the recorded rewards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RewardRule {
-    /// `r · 1000 / (max - min trajectory return)`: IQL's and DAC's rule for locomotion. On returns
-    /// of 0 and 1, as in AntMaze, it is `r · 1000`.
+    /// `r · 1000 / (max - min trajectory return)`: IQL and DAC on locomotion. Returns of 0 and 1,
+    /// as in AntMaze, give `r · 1000`.
     #[serde(rename = "locomotion")]
     Locomotion,
-    /// `r`: the rewards as they were recorded.
+    /// `r`, unchanged.
     #[default]
     #[serde(rename = "as-is")]
     AsIs,
-    /// `r - 1`: IQL's rule for AntMaze. Each step before the goal costs 1.
+    /// `r - 1`: IQL on AntMaze, a cost of 1 per step before the goal.
     #[serde(rename = "subtract-1")]
     Subtract1,
-    /// `4(r - 0.5)`: Diffusion-QL's rule for AntMaze. Rewards of 0 and 1 become -2 and 2.
+    /// `4(r - 0.5)`: Diffusion-QL on AntMaze.
     #[serde(rename = "center-times-4")]
     CenterTimes4,
-    /// `10(r - 0.5)`: CQL's rule for AntMaze. Rewards of 0 and 1 become -5 and 5.
+    /// `10(r - 0.5)`: CQL on AntMaze.
     #[serde(rename = "center-times-10")]
     CenterTimes10,
-    /// `100r`: ReBRAC's rule for AntMaze.
+    /// `100r`: ReBRAC on AntMaze.
     #[serde(rename = "times-100")]
     Times100,
 }
 
-/// Training rewards as a function of recorded ones: `(r - subtract) · times`.
+/// Affine map `(r - subtract) · times`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct RewardScaling {
     subtract: f64,
@@ -44,7 +43,7 @@ impl Default for RewardScaling {
 }
 
 impl RewardScaling {
-    /// The root mean square of what is learned from.
+    /// Root mean square of the training rewards.
     pub(crate) fn size(self, recording: &Recording) -> f64 {
         let squares = recording
             .transitions()
@@ -61,8 +60,7 @@ impl RewardScaling {
 }
 
 impl RewardRule {
-    /// What it does, given the returns of the trajectories; none where their spread is zero but
-    /// needed.
+    /// The rule's map, given the trajectory returns; `None` if a division by their range is by 0.
     pub(crate) fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
         let (subtract, times) = match self {
             Self::Locomotion => {
@@ -89,7 +87,7 @@ mod tests {
 
     #[test]
     fn each_name_says_what_its_rule_does_to_rewards_of_0_and_1() {
-        // The returns are from -1 to 3.
+        // The returns range from -1 to 3.
         for (name, of_0, of_1) in [
             ("locomotion", 0.0, 250.0),
             ("as-is", 0.0, 1.0),

@@ -1,33 +1,33 @@
-//! The numbers by which evaluators simulate an environment and record data in it.
+//! Simulation and recording parameters of environments.
 
 use serde::Deserialize;
 
-/// How an environment is simulated.
+/// Kind of simulation.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Simulator {
-    /// A robot that runs in a vertical plane.
+    /// Robot that runs in a vertical plane.
     Planar(Planar),
-    /// A robot in a maze of these rows of cells along +y, in them cells along +x: 1 wall, 0 free.
+    /// Robot in a maze with rows of cells along +y and columns along +x: 1 wall, 0 free.
     #[serde(skip)]
     Maze(&'static Robot, &'static [String]),
 }
 
-/// A robot that moves through mazes.
+/// Robot that moves through mazes.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Robot {
-    /// Name of its model.
+    /// Name of its MuJoCo model.
     pub name: String,
     pub(super) observation_dim: usize,
     pub(super) action_dim: usize,
     pub(super) qpos_dim: usize,
     pub(super) qvel_dim: usize,
-    /// Steps of the model that a control is held for.
+    /// Simulation steps per action.
     pub frame_skip: usize,
     /// Noise on the initial state.
     pub noise: Noise,
-    /// Effect of its actions.
+    /// Effect of an action.
     pub drive: Drive,
 }
 
@@ -35,29 +35,29 @@ pub struct Robot {
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Drive {
-    /// Torques, as fractions of each motor's strongest.
+    /// Torques, as fractions of each motor's maximum.
     Motors,
-    /// Displacements before a step, as fractions of this many meters; velocities become 0.
+    /// Displacement before a step, as a fraction of this many meters; velocities are set to 0.
     Displacement(f64),
 }
 
-/// A robot in a vertical plane that is rewarded for running along x. Positions begin with its x, z
-/// (meters) and pitch (radians); a policy observes all but x, then the velocities.
+/// Robot in a vertical plane, rewarded for running along x. `qpos` starts with x, z (meters) and
+/// pitch (radians); an observation is `qpos` without x, then `qvel`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Planar {
-    /// Steps of the model that a control is held for.
+    /// Simulation steps per action.
     pub frame_skip: usize,
     /// Noise on the initial state.
     pub noise: Noise,
-    /// Reward of every step.
+    /// Reward per step.
     pub alive_bonus: f64,
-    /// Cost of a squared action.
+    /// Cost weight of the squared action.
     pub control_cost: f64,
-    /// Limit of each observed velocity.
+    /// Clipping of observed velocities.
     #[serde(default = "unlimited")]
     pub observed_velocity: f64,
-    /// Limits within which an episode continues; without any it always does.
+    /// Region outside of which an episode terminates, if any.
     #[serde(default)]
     pub healthy: Option<Healthy>,
 }
@@ -66,7 +66,7 @@ fn unlimited() -> f64 {
     f64::INFINITY
 }
 
-/// Noise that is added to each position and velocity of the initial state.
+/// Noise on each position and velocity of the initial state.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Noise {
@@ -76,7 +76,7 @@ pub enum Noise {
     NormalVelocities(f64),
 }
 
-/// Limits, themselves excluded, within which an episode continues.
+/// Open intervals outside of which an episode terminates.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Healthy {
@@ -84,14 +84,13 @@ pub struct Healthy {
     pub z: (f64, f64),
     /// Pitch of the torso, radians.
     pub pitch: (f64, f64),
-    /// Limit of every position but x and z, and of every velocity.
+    /// Limit of all positions except x and z, and of all velocities.
     #[serde(default)]
     pub others: Option<f64>,
 }
 
 impl Healthy {
-    /// Whether an episode continues in a state. False for NaN, because no comparison with NaN
-    /// holds.
+    /// True if an episode continues in a state; false with NaN.
     pub fn contains(&self, qpos: &[f64], qvel: &[f64]) -> bool {
         let within = |(min, max): (f64, f64), value: f64| value > min && value < max;
         let mut others = qpos[2..].iter().chain(qvel);
@@ -101,19 +100,15 @@ impl Healthy {
     }
 }
 
-/// Recipe by which a dataset of mediocre behavior is recorded.
+/// Recipe for recording a dataset of mixed quality.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
-    /// Independent searches. Each finds its own gait, so that the recorded actions in a state
-    /// differ by more than noise.
+    /// Independent policy searches. Their different gaits make the recorded actions multimodal.
     pub searches: u64,
-    /// Steps that the searches may take for each recorded transition.
+    /// Search steps per recorded transition.
     pub steps_per_transition: u64,
-    /// Bands of normalized score: the lower bound of each, and its share of the transitions.
-    ///
-    /// Without shares, a search's history is mostly long, good episodes, from which offline
-    /// learning can gain little. The shares make a mixture with any seed: good actions exist, among
-    /// worse ones in the same states.
+    /// Bins of normalized score: lower bound and share of the transitions. Without shares, most
+    /// rows would be long, good episodes, which leave little for offline learning to improve.
     pub mixture: Vec<(f64, f64)>,
 }

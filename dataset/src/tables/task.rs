@@ -1,40 +1,38 @@
-//! What a run is about: an environment by its name, known here or not.
+//! Task of a run: an environment that may be unknown.
 
 use crate::tables::environment::{self, EnvironmentSpec};
 
-/// Where a run's data is from and where its policies act. An environment that is not in the table
-/// has the sizes of its dataset, no known time limit, and no reference returns.
+/// Environment of a run. One that is not in the table has the dimensions of its dataset, no time
+/// limit and no reference returns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Task {
-    /// Name of the environment.
+    /// Environment name.
     pub environment: String,
-    /// Numbers in an observation.
+    /// Dimension of an observation.
     pub observation_dim: usize,
-    /// Numbers in an action, each within ±1.
+    /// Dimension of an action; each component is within ±1.
     pub action_dim: usize,
     spec: Option<&'static EnvironmentSpec>,
 }
 
 impl Task {
-    /// The environment of that name, with the sizes that its dataset has.
+    /// Environment of the given name with its dataset's dimensions.
     pub fn new(environment: &str, observation_dim: usize, action_dim: usize) -> Self {
         let spec = environment::find(environment).ok();
         Self { environment: environment.to_owned(), observation_dim, action_dim, spec }
     }
 
-    /// Most steps in an episode, if it is known.
+    /// Time limit in steps, if known.
     pub fn max_episode_steps(&self) -> Option<usize> {
         self.spec.map(|spec| spec.max_episode_steps)
     }
 
-    /// Whether scores are D4RL's normalized ones. Without reference returns they are the returns
-    /// themselves.
+    /// True if scores are D4RL's normalized ones; without reference returns they are plain returns.
     pub fn is_normalized(&self) -> bool {
         self.spec.is_some()
     }
 
-    /// The score of an undiscounted return: normalized where there are reference returns, else the
-    /// return itself.
+    /// D4RL's normalized score of an undiscounted return, or the return without reference returns.
     pub fn score(&self, episode_return: f64) -> f64 {
         self.spec.map_or(episode_return, |spec| spec.normalized_score(episode_return))
     }

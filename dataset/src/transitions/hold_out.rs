@@ -1,4 +1,4 @@
-//! Episodes that are kept out of training.
+//! Validation episodes.
 
 use std::ops::Range;
 
@@ -8,25 +8,24 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::recording::{Recording, RowKind};
 
-/// Keeps these draws apart from other uses of the run's seed.
+/// Distinguishes this random stream from others of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"hold out");
 
-/// Which episodes are kept out.
+/// Choice of validation episodes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum HoldOut<'a> {
-    /// A fraction of them, between 0, which keeps none out, and 1.
+    /// Random fraction of the episodes.
     Fraction {
-        /// The fraction.
+        /// Fraction between 0 (none) and 1.
         fraction: f64,
         /// Seed of the choice.
         seed: u64,
     },
-    /// Those of these numbers, from 0 in the order of the file.
+    /// Indices of episodes, from 0 in file order.
     Episodes(&'a [usize]),
 }
 
 impl HoldOut<'_> {
-    /// Keeps none out.
     pub(crate) const NONE: Self = Self::Episodes(&[]);
 
     pub(crate) fn is_none(self) -> bool {
@@ -34,8 +33,7 @@ impl HoldOut<'_> {
     }
 }
 
-/// Numbers of the episodes that are kept out, from 0 in the order of the recording, in ascending
-/// order. Where the fraction is not 0 there is at least one, and one is left to learn from.
+/// Indices in ascending order. A fraction above 0 leaves at least one episode on each side.
 pub(crate) fn chosen(hold_out: HoldOut<'_>, episodes: usize) -> Vec<usize> {
     let (fraction, seed) = match hold_out {
         HoldOut::Fraction { fraction, seed } => (fraction, seed),
@@ -51,7 +49,6 @@ pub(crate) fn chosen(hold_out: HoldOut<'_>, episodes: usize) -> Vec<usize> {
 }
 
 impl Recording {
-    /// The rows of each episode; what stores an episode's last state belongs to it.
     fn rows_of_episodes(&self) -> Vec<Range<usize>> {
         let (mut episodes, mut start) = (Vec::new(), 0);
         for row in 0..self.rows() {
@@ -65,7 +62,7 @@ impl Recording {
         episodes
     }
 
-    /// The episodes to learn from, those that are kept out, and the numbers of these.
+    /// Training episodes, held-out episodes, and the indices of the latter.
     pub(crate) fn hold_out(&self, hold_out: HoldOut<'_>) -> (Recording, Recording, Vec<usize>) {
         let episodes = self.rows_of_episodes();
         let out = chosen(hold_out, episodes.len());
@@ -81,7 +78,6 @@ impl Recording {
         (training, held_out, out)
     }
 
-    /// No rows, of the same sizes.
     fn like(&self) -> Recording {
         let Recording { observation_dim, action_dim, goal, rounding, terminal_array, .. } = *self;
         let (names, next_observations) =
@@ -113,8 +109,7 @@ impl Recording {
         self.ends.extend_from_slice(&from.ends[rows]);
     }
 
-    /// A last row that leads to the first row of an episode which is not here any more gets one to
-    /// lead to.
+    /// Appends a final state if the last row's next observation was in an episode that is removed.
     fn close(&mut self) {
         if self.kinds.last() != Some(&RowKind::Transition) || self.next_observations.is_some() {
             return;
@@ -148,8 +143,7 @@ mod tests {
             let (training, held_out, out) = whole.hold_out(hold_out(seed));
             assert_eq!(out.len(), 1);
             let rows = whole.rows_of_episodes()[out[0]].clone();
-            // The rewards of these rows are their numbers; one more row may follow, which is no
-            // step.
+            // Rewards equal row indices; one more row, a final state, may follow.
             assert_eq!(
                 &held_out.rewards[..rows.len()],
                 Vec::from_iter(rows.clone().map(|row| row as f32))

@@ -1,4 +1,4 @@
-//! From a source's rows to transitions (s, a, r, s', mask).
+//! Transitions (s, a, r, s', mask) of a dataset.
 
 pub mod hold_out;
 pub mod sampler;
@@ -21,10 +21,10 @@ use crate::{checks, warnings};
 use hold_out::HoldOut;
 use statistics::Statistics;
 
-/// Actions are kept this far within ±1, where policies that squash can still reach them.
+/// Bound at which actions are clipped, within the range of tanh policies.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
 
-/// A mini-batch of B transitions, each array row by row.
+/// Mini-batch of B transitions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Batch {
     /// s, B × o.
@@ -55,48 +55,42 @@ impl Batch {
     }
 }
 
-/// Options of reading a source.
+/// Options of [`Transitions::read`].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ReadOptions {
-    /// The environment it was recorded in, if it is known: sizes, time limit and reference returns
-    /// come from there. Else the source's own sizes count, and without timeouts nothing is cut off.
+    /// Environment that provides dimensions, time limit and reference returns. Without it the
+    /// dimensions are the source's, and a file without timeouts has none.
     pub environment: Option<&'static EnvironmentSpec>,
-    /// Task in a maze from which rewards and masks follow; else they are the source's.
+    /// Maze task that replaces the source's rewards and masks.
     pub task: Option<MazeTask>,
-    /// Rule for its rewards.
+    /// Reward rule.
     pub reward: RewardRule,
-    /// Columns to normalize; actions that are not normalized must lie within [-1, 1].
+    /// Columns to normalize. Actions that are not normalized must be within [-1, 1].
     pub normalize: Normalize,
 }
 
-/// Transitions to learn from, in the order of the recording. They do not change, so threads can
-/// share them.
+/// Immutable transitions for training, in recorded order.
 ///
-/// The source's rows stay as they are; a transition is the number i of a row, and its next
-/// observation is row i + 1's, unless the format stores next observations of their own.
+/// The source's rows stay in place: transition i starts in row i and leads to row i + 1, unless the
+/// format stores next observations.
 ///
-/// A transition is followed by the next one if its episode continues there. An episode ends at a
-/// terminal, also at a goal after which the recording continues; at a timeout; and where the next
-/// row does not start where the transition led to. A row that makes no transition (D4RL's timeouts)
-/// is no part of an episode, but its action serves as the previous row's next action.
+/// An episode ends at a terminal, including a goal after which the recording continues, at a
+/// timeout, and at a discontinuity. Rows without a transition (D4RL's timeouts) belong to no
+/// episode, but provide the previous row's next action.
 pub struct Transitions {
     observation_dim: usize,
     action_dim: usize,
-    /// N × o, scaled.
+    /// N × o, scaled; so are `next_observations`.
     observations: Vec<f32>,
     /// N × a, scaled and clipped.
     actions: Vec<f32>,
-    /// N, scaled.
     rewards: Vec<f32>,
-    /// N × o, scaled, if there are any.
     next_observations: Option<Vec<f32>>,
-    /// N.
     terminals: Vec<bool>,
-    /// Rows to learn from, in order.
+    /// Rows that start a transition.
     rows: Vec<u32>,
-    /// Whether the next row is the next step of the episode; N.
     goes_on: Vec<bool>,
-    /// Whether the goal was reached earlier in the recorded episode; N.
+    /// True after the goal was reached in the recorded episode.
     past_goal: Vec<bool>,
     statistics: Statistics,
     warnings: Vec<String>,
@@ -104,28 +98,25 @@ pub struct Transitions {
     names: Names,
 }
 
-/// Transitions to learn from, and episodes that are kept out of training.
+/// Training and validation transitions.
 pub struct Split {
-    /// To learn from: statistics, scaling and warnings are of these alone.
+    /// Training transitions; statistics, scaling and warnings are of these alone.
     pub training: Transitions,
-    /// Episodes that are kept out, in the same units; none if the share is 0 or there is but one
-    /// episode.
+    /// Validation transitions, scaled like the training ones; `None` if no episode is held out.
     pub held_out: Option<Transitions>,
-    /// Their numbers, from 0 in the order of the file.
+    /// Indices of the held-out episodes, from 0 in file order.
     pub episodes: Vec<usize>,
 }
 
 impl Transitions {
-    /// Reads a D4RL file, a Minari dataset, an OGBench file or one of the custom layout;
-    /// docs/data.md has the rules of each. Data that would spoil training is refused: numbers that
-    /// are not finite, actions outside [-1, 1] that are not to be scaled, other sizes than the
-    /// environment's or another environment, a file that is one endless episode or makes no
-    /// transition.
+    /// Reads a dataset of any format by the rules in docs/data.md. Refuses numbers that are not
+    /// finite, unnormalized actions outside [-1, 1], other dimensions or another environment than
+    /// expected, and files with no transition or no end of an episode.
     pub fn read(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Self, DatasetError> {
         Ok(Self::read_split(path, options, HoldOut::NONE)?.training)
     }
 
-    /// As [`Self::read`], but keeps some episodes out.
+    /// Reads a dataset and splits off validation episodes.
     pub fn read_split(
         path: impl AsRef<Path>,
         options: &ReadOptions,
@@ -141,10 +132,7 @@ impl Transitions {
         Self::split(recording, options, hold_out).map_err(error)
     }
 
-    /// Transitions of arrays in memory, with their rewards as they are.
-    ///
-    /// # Errors
-    /// What would spoil training, as in a file.
+    /// Checks and wraps arrays in memory, with unchanged rewards.
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
@@ -226,29 +214,27 @@ impl Transitions {
         self.rows.len()
     }
 
-    /// Numbers in an observation.
+    /// Dimension of an observation.
     pub fn observation_dim(&self) -> usize {
         self.observation_dim
     }
 
-    /// Numbers in an action.
+    /// Dimension of an action.
     pub fn action_dim(&self) -> usize {
         self.action_dim
     }
 
-    /// Offsets and scales between the recording's numbers and those here; rewards are scaled after
-    /// the reward rule.
+    /// Offsets and scales of the normalization; rewards are scaled after the reward rule.
     pub fn scaling(&self) -> &Scaling {
         &self.scaling
     }
 
-    /// Names of the numbers of observations and actions.
+    /// Names of the dimensions of observations and actions.
     pub fn names(&self) -> &Names {
         &self.names
     }
 
-    /// Units in which the observations and actions that are learned from have mean 0 and standard
-    /// deviation 1, number by number; one that never changes has scale 0.
+    /// Map of each dimension to mean 0 and standard deviation 1, or scale 0 if it is constant.
     pub fn standard_units(&self) -> Scaling {
         let counts = |row: usize| self.rows.binary_search(&(row as u32)).is_ok();
         Scaling {
@@ -262,34 +248,32 @@ impl Transitions {
         }
     }
 
-    /// What the file holds, from the rewards as they were recorded.
+    /// Statistics with the recorded rewards.
     pub fn statistics(&self) -> &Statistics {
         &self.statistics
     }
 
-    /// Signs that little can be learned from them, one sentence each.
+    /// Suspicious properties of the data, one sentence each.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// The number of the transition that follows this one (below [`len`](Self::len)) in its
-    /// episode.
+    /// Index of the next transition in the episode of `index < len()`.
     pub fn next(&self, index: u32) -> Option<u32> {
         let row = self.rows[index as usize];
         let is_next = self.rows.get(index as usize + 1) == Some(&(row + 1));
         (is_next && self.goes_on[row as usize]).then_some(index + 1)
     }
 
-    /// The action a' that was taken at s', of length a. Unlike [`next`](Self::next) it is also
-    /// there where the next row is a step that makes no transition, so among transitions with mask
-    /// 1 it is missing only where it was not recorded.
+    /// Next action a', taken in s'. Unlike [`next`](Self::next), it includes steps without a
+    /// transition.
     pub fn next_action(&self, index: u32) -> Option<&[f32]> {
         let row = self.rows[index as usize] as usize;
         let next = (row + 1) * self.action_dim..(row + 2) * self.action_dim;
         self.goes_on[row].then(|| &self.actions[next])
     }
 
-    /// The numbers of the transitions of each episode, in order; each transition is in one of them.
+    /// Index range of each episode; together they cover all transitions.
     pub fn episodes(&self) -> Vec<Range<u32>> {
         let mut episodes = Vec::new();
         let mut start = 0;
@@ -302,17 +286,14 @@ impl Transitions {
         episodes
     }
 
-    /// Those of [`Self::episodes`] that begin with an episode of the recording: after a goal, where
-    /// that continues, each step is an episode of its own.
+    /// [`Self::episodes`] that start a recorded episode; the recording may continue after a goal.
     pub fn recorded_episodes(&self) -> Vec<Range<u32>> {
         let is_past =
             |episode: &Range<u32>| self.past_goal[self.rows[episode.start as usize] as usize];
         self.episodes().into_iter().filter(|episode| !is_past(episode)).collect()
     }
 
-    /// The first transition of each window of `length` transitions that follow one another: the
-    /// window of i is i, i + 1, …, which [`gather`](Self::gather) copies like any others. Episodes
-    /// that are shorter have none. `length` is at least 1.
+    /// First index of each run of `length ≥ 1` consecutive transitions within an episode.
     pub fn window_starts(&self, length: u32) -> Vec<u32> {
         let starts = |episode: Range<u32>| {
             episode.start..(episode.end + 1).saturating_sub(length).max(episode.start)
@@ -320,8 +301,7 @@ impl Transitions {
         self.episodes().into_iter().flat_map(starts).collect()
     }
 
-    /// Copies the transitions of these numbers (each below [`len`](Self::len)), in this order, over
-    /// what `batch` holds.
+    /// Copies the transitions at `indices` (below [`len`](Self::len)) into `batch`.
     pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
         let (o, a) = (self.observation_dim, self.action_dim);
         batch.clear();

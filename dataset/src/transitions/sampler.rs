@@ -1,17 +1,16 @@
-//! Mini-batches: a shuffled scan without replacement, reshuffled at the end of each pass.
+//! Sampling of mini-batches without replacement.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Keeps these draws apart from other uses of the run's seed.
+/// Distinguishes this random stream from others of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"batches ");
 
-/// Draws batches such that every transition comes once a pass, in an order that is a function of
-/// the seed and the pass alone. A batch that reaches the end of a pass continues with the next one.
+/// Shuffled epochs, in an order that depends on seed and epoch only. Batches may span two epochs.
 pub struct BatchSampler {
     seed: u64,
     pass: u64,
-    /// A permutation; the part before `position` is drawn already.
+    /// Permutation, of which the first `position` indices are drawn.
     order: Vec<u32>,
     position: usize,
     indices: Vec<u32>,
@@ -19,7 +18,7 @@ pub struct BatchSampler {
 }
 
 impl BatchSampler {
-    /// A sampler of `batch_size` out of `len` transitions that has drawn `batches` already.
+    /// Sampler of `batch_size` out of `len` transitions after `batches` batches.
     ///
     /// # Panics
     /// If `len` is 0.
@@ -41,7 +40,7 @@ impl BatchSampler {
         sampler
     }
 
-    /// The numbers of the next `batch_size` items.
+    /// Indices of the next batch.
     pub fn next_items(&mut self) -> &[u32] {
         for i in 0..self.indices.len() {
             self.indices[i] = self.draw();
@@ -56,7 +55,7 @@ impl BatchSampler {
         self.position = 0;
     }
 
-    /// One step of a Fisher–Yates shuffle, so that no step pays for a whole pass.
+    /// One step of a Fisher–Yates shuffle, which spreads its cost over the epoch.
     fn draw(&mut self) -> u32 {
         if self.position == self.order.len() {
             self.pass += 1;

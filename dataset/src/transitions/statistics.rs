@@ -1,24 +1,22 @@
-//! Figures that describe a dataset.
+//! Summary statistics of a dataset.
 
 use crate::statistics::{Episode, Extent};
 use crate::tables::environment::EnvironmentSpec;
 
-/// How much a dataset holds and how good its behavior is, from the recorded rewards.
+/// Size of a dataset and quality of its behavior policy, by the recorded rewards.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Statistics {
-    /// Transitions to learn from.
+    /// Number of transitions.
     pub transitions: usize,
-    /// Recorded episodes; one that the end of the file cuts off counts as well.
+    /// Number of episodes, including one truncated by the end of the file.
     pub episodes: usize,
-    /// Mean undiscounted return of the episodes, every recorded step included. Where the task is to
-    /// reach a goal, the steps after it do not count, as an evaluation would end there.
+    /// Mean undiscounted return, including dropped steps but not those after a goal.
     pub return_mean: f64,
     /// Smallest return.
     pub return_min: f64,
     /// Largest return.
     pub return_max: f64,
-    /// Mean normalized score of the episodes ([`EnvironmentSpec::normalized_score`]), where there
-    /// are reference returns.
+    /// Mean [`EnvironmentSpec::normalized_score`], if reference returns are known.
     pub score_mean: Option<f64>,
 }
 
@@ -35,7 +33,7 @@ impl Statistics {
             return_mean: returns.mean,
             return_min: returns.min,
             return_max: returns.max,
-            // The score is linear in the return, so this is the mean of the scores too.
+            // The score is linear in the return.
             score_mean: environment.map(|environment| environment.normalized_score(returns.mean)),
         }
     }

@@ -1,5 +1,3 @@
-//! Tests of what follows what.
-
 use super::*;
 use crate::recording::RowKind::{Dropped, LastState, Transition};
 use crate::recording::tests::recording;
@@ -98,7 +96,7 @@ fn windows_lie_within_episodes() {
 fn standard_units_are_of_the_rows_that_are_learned_from() {
     let units = transitions(d4rl()).standard_units();
     let affine = units.observations.unwrap();
-    // 0, 1, 3, 4 and 5: the mean of the squares is 10.2, that of the numbers 2.6.
+    // Mean square of 0, 1, 3, 4 and 5: 10.2; mean: 2.6.
     assert!(
         (affine.offset[0] - 2.6).abs() < 1e-6 && (affine.scale[0] - 3.44_f32.sqrt()).abs() < 1e-6,
         "{affine:?}"

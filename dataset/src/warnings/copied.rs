@@ -1,22 +1,19 @@
-//! Actions that are numbers of the same row's observation, in whatever unit: a robot that follows
-//! them stands still.
+//! Actions that copy a dimension of the same row's observation, in some unit.
 
 use std::f64::consts::PI;
 
 use super::named;
 use crate::recording::Recording;
 
-/// An action's unit over the observation's: the same, percent, degrees of radians, and back.
+/// Ratio of the units of action and observation: equal, percent, radians to degrees, and inverses.
 const UNITS: [f64; 5] = [1.0, 100.0, 0.01, 180.0 / PI, PI / 180.0];
-/// Fewer steps prove nothing.
 const FEWEST: usize = 20;
-/// How far a copy may be off, of a usual step: by rounding.
+/// Tolerance of a copy, as a fraction of a typical step.
 const OFF: f64 = 0.05;
-/// The share of the steps at which it must be one.
+/// Minimum fraction of copies among the steps.
 const SHARE: f64 = 0.9;
 
-/// One sentence on the actions that are. Only steps count at which that number moves: elsewhere, a
-/// command that was followed equals the state. The state of the next row is a command like others.
+/// Ignores steps that do not move the dimension: at rest, a position command equals the state.
 pub(super) fn actions(recording: &Recording) -> Option<String> {
     let rows = recording.some_that_go_on();
     let (mut actions, mut observations, mut least) = (Vec::new(), Vec::new(), 1.0_f64);
@@ -41,8 +38,7 @@ pub(super) fn actions(recording: &Recording) -> Option<String> {
     })
 }
 
-/// The rows from which a number of the observation moves by more than half of its usual step, and
-/// that step.
+/// Rows in which dimension `i` moves by more than half of its typical step, and that step.
 fn moving(recording: &Recording, rows: &[usize], i: usize) -> (Vec<usize>, f64) {
     let step = |row: usize| {
         f64::from(recording.observation(row + 1)[i]) - f64::from(recording.observation(row)[i])
@@ -51,8 +47,7 @@ fn moving(recording: &Recording, rows: &[usize], i: usize) -> (Vec<usize>, f64) 
     (rows.iter().copied().filter(|row| step(*row).abs() > usual / 2.0).collect(), usual)
 }
 
-/// The share of the moving rows in which the action is the observation, in one of the units, if it
-/// is large.
+/// Fraction of the moving rows in which the action equals the observation in one unit, if large.
 fn share_of_copies(
     recording: &Recording,
     moving: &(Vec<usize>, f64),

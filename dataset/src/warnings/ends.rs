@@ -1,18 +1,15 @@
-//! Flags that do not mark the end of a task: masks, discounts, successes that stay set.
+//! Flags with another meaning than the end of a task: masks, discounts, lasting successes.
 
 use super::percent;
 use crate::recording::Recording;
 
-/// Fewer flags prove nothing.
 const FEWEST: usize = 10;
-/// The largest share of rows that reach the end of a task, in episodes of two steps.
+/// Largest plausible fraction of terminals: episodes of two steps.
 const MOST_TERMINALS: f64 = 0.5;
-/// The largest share of rows that may come after the goal of their episode.
+/// Largest plausible fraction of rows after the goal.
 pub(super) const MOST_AFTER_GOAL: f64 = 0.8;
-/// Steps after which states are as far apart as any two are 1 long, those of a robot that goes on
-/// much less.
+/// Mean squared step, relative to that between random rows, above which states are reset.
 const RESET: f64 = 0.5;
-/// One sentence, if flags do not seem to be what they should be.
 pub(super) fn meaning(recording: &Recording) -> Option<String> {
     let steps = (0..recording.rows()).filter(|&row| recording.is_step(row)).count();
     let array = recording.terminal_array;
@@ -29,7 +26,7 @@ pub(super) fn meaning(recording: &Recording) -> Option<String> {
     stays_set(recording, steps)
 }
 
-/// Flags that are set while states go on.
+/// Terminals that are set although states continue.
 fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
     let array = recording.terminal_array;
     let inner = |row: &usize| {
@@ -60,8 +57,8 @@ fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
     ))
 }
 
-/// The mean squared step from these rows to the next, over that between any two rows: the median of
-/// the numbers that change.
+/// Mean squared step from these rows to the next, relative to that between random rows: median over
+/// the dimensions that change.
 fn step_length(recording: &Recording, rows: &[usize]) -> f64 {
     let width = recording.observation_dim;
     let square = |x: f64| if x.is_finite() { x * x } else { 0.0 };

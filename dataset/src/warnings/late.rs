@@ -1,28 +1,22 @@
-//! Observations that are one row late, each the state that its row's action led to.
+//! Observations recorded one row late, after their row's action.
 //!
-//! Given a row's observation, its action should explain something of the step to the next one. In
-//! data of which every observation is a row late, it is the next row's action that does. A policy
-//! that answers to the state explains a little by its next action, too: in MuJoCo's robots up to
-//! 0.45 of what it explains by the right one.
+//! A step should be explained by its row's action. In late data it is explained by the next row's.
+//! A feedback policy's next action also explains part of a step: on MuJoCo robots up to 0.45 of the
+//! variance that the right action does.
 
 use crate::recording::Recording;
 
-/// Rows that are enough to tell, and fewer than which prove nothing.
 const ROWS: usize = 4000;
 const FEWEST: usize = 200;
-/// The least share of a number's steps that late actions explain, and how much more that is than
-/// what the others do.
+/// Minimum fraction of steps explained by late actions, and minimum ratio to the correct ones.
 const EXPLAINED: f64 = 0.5;
 const TIMES: f64 = 2.5;
-/// The least share of actions that observations do not determine.
+/// Minimum fraction of the actions' variance that observations do not explain.
 const FREE: f64 = 0.1;
-/// Steps that are smaller, of a number's size, are rounding.
 const ROUNDING: f64 = 1e-5;
 
-/// Columns of equal length.
 type Columns = Vec<Vec<f64>>;
 
-/// One sentence, if they are.
 pub(super) fn observations(recording: &Recording) -> Option<String> {
     let rows = recording.some_that_go_on();
     let rows: Vec<usize> = rows.iter().copied().step_by(rows.len().div_ceil(ROWS).max(1)).collect();
@@ -73,7 +67,6 @@ fn square(column: &[f64]) -> f64 {
     column.iter().map(|x| x * x).sum()
 }
 
-/// Orthonormal columns that span these.
 fn basis(columns: impl Iterator<Item = Vec<f64>>) -> Columns {
     let mut basis = Columns::new();
     for column in columns {
@@ -88,7 +81,7 @@ fn basis(columns: impl Iterator<Item = Vec<f64>>) -> Columns {
     basis
 }
 
-/// What of a column these do not span; taken away twice, as the first time leaves rounding.
+/// Residual of a column after projection onto the basis; a second projection removes rounding.
 fn without(mut column: Vec<f64>, basis: &Columns) -> Vec<f64> {
     for direction in basis.iter().chain(basis) {
         let along: f64 = column.iter().zip(direction).map(|(x, y)| x * y).sum();

@@ -1,9 +1,5 @@
-//! Warnings about data from which little can be learned, for every format.
-//!
-//! `ends` are flags with another meaning, `resets` flags in the wrong row; `copied` are actions
-//! that equal the state, `rest` observations that do not move, `late` observations that are a row
-//! late; `rewards` and `sizes` are about magnitudes. A warning names the array, the fraction or
-//! number of rows, a likely cause, and a remedy.
+//! Warnings about data that training accepts but that is probably wrong. A warning names the array,
+//! the fraction or number of rows, a likely cause, and a remedy.
 
 mod copied;
 mod ends;
@@ -17,10 +13,9 @@ use crate::normalize::Normalize;
 use crate::recording::{Recording, RowKind};
 use crate::tables::reward::RewardRule;
 
-/// Rows that tell enough of a recording: so many of them, evenly spread.
+/// Number of evenly spaced rows that are sampled.
 const ENOUGH: usize = 20_000;
 
-/// One sentence for each warning.
 pub(crate) fn warnings(
     recording: &Recording,
     normalize: Normalize,
@@ -31,7 +26,6 @@ pub(crate) fn warnings(
     warnings
 }
 
-/// Warnings about where episodes end.
 pub(crate) fn of_ends(recording: &Recording) -> Vec<String> {
     match ends::meaning(recording) {
         Some(warning) => vec![warning],
@@ -39,7 +33,6 @@ pub(crate) fn of_ends(recording: &Recording) -> Vec<String> {
     }
 }
 
-/// Warnings about the numbers of rows.
 pub(crate) fn of_numbers(
     recording: &Recording,
     normalize: Normalize,
@@ -52,7 +45,7 @@ pub(crate) fn of_numbers(
     let mut warnings = Vec::from_iter(rewards::alike(recording));
     if warnings.is_empty() {
         warnings.extend(rewards::after_goal(recording));
-        // A task's rule or the normalization decides the size already.
+        // A task's rule or normalization sets the size.
         let is_own = rule == RewardRule::AsIs && !normalize.rewards;
         warnings.extend(if is_own { rewards::size(recording) } else { None });
     }
@@ -61,7 +54,6 @@ pub(crate) fn of_numbers(
     warnings
 }
 
-/// Columns by their numbers and, where they have some, their names.
 pub(crate) fn named(columns: &[usize], names: &[String]) -> String {
     let one = |column: &usize| match names.get(*column) {
         Some(name) => format!("{column} ({name})"),
@@ -71,7 +63,6 @@ pub(crate) fn named(columns: &[usize], names: &[String]) -> String {
     format!("{word} {}", Vec::from_iter(columns.iter().map(one)).join(", "))
 }
 
-/// A number with two digits or so.
 fn short(x: f64) -> String {
     if x == 0.0 || x.abs() >= 0.1 { format!("{x:.1}") } else { format!("{x:.1e}") }
 }
@@ -89,7 +80,7 @@ impl Recording {
         self.kinds.get(row).is_some_and(|kind| *kind != RowKind::LastState)
     }
 
-    /// Rows that the next row continues, at most [`ENOUGH`].
+    /// Rows with a following step, at most [`ENOUGH`].
     fn some_that_go_on(&self) -> Vec<usize> {
         let apart = self.rows().div_ceil(ENOUGH).max(1);
         (0..self.rows()).step_by(apart).filter(|&row| self.goes_on(row)).collect()

@@ -1,29 +1,23 @@
-//! Whether the rows that are said to end episodes are those after which states jump, found without
-//! knowing the robot.
+//! Flags one row before or after the reset they should mark.
 //!
-//! A reset is among the longest steps of a recording, each number of an observation measured by its
-//! own usual steps. Beside a flag three steps count: that of its row, and those of the rows before
-//! and after. Where flags are right, the longest of the three is the flag's own; where flags are a
-//! row out of step, hardly ever. Where resets are no longer than other steps, nothing is said.
+//! Resets are among the longest steps, with each dimension scaled by its root mean square step.
+//! Near a correct flag, the longest of three neighboring steps is the flag's.
 
 use crate::recording::{Recording, RowKind};
 
-/// Longest steps that may be resets, for each end of an episode.
+/// Candidates for resets per end of an episode.
 const CANDIDATES: usize = 4;
-/// Steps of which at most one can be a reset.
+/// Minimum number of steps per reset.
 const STEPS_BETWEEN_RESETS: usize = 20;
-/// Fewer resets beside the flags prove nothing, nor does a smaller share of the flags, as a crash
-/// may be a long step, too.
+/// Minimum number of resets near flags, and their inverse minimum fraction.
 const FEWEST: usize = 5;
 const SMALLEST_SHARE: usize = 4;
-/// One in this many resets beside the flags may be at a flag.
+/// Inverse of the largest fraction of resets exactly at a flag.
 const EXCEPTION: usize = 10;
 
-/// One sentence for each kind of flag that is a row out of step with the resets.
 pub(crate) fn out_of_step(recording: &Recording) -> Vec<String> {
     let is_last = |row: usize| recording.kinds[row] == RowKind::LastState;
-    // Where episodes are groups of their own, nothing can be out of step. A last state ends its
-    // episode, not the row before.
+    // Groups per episode cannot be shifted; a final state ends its episode, not the row before.
     let inner = 1..recording.rows().saturating_sub(2);
     let inner = inner.filter(|row| recording.parts.is_empty() && !is_last(row + 1));
     let ends: Vec<usize> = inner.filter(|&row| recording.ends[row] || is_last(row)).collect();
@@ -41,8 +35,7 @@ pub(crate) fn out_of_step(recording: &Recording) -> Vec<String> {
     judged.into_iter().flatten().collect()
 }
 
-/// Counts at which row beside a flag the reset is: a step longer than `limit`, and the longest of
-/// the three.
+/// Counts the offsets of resets, which are longer than `limit`, from flags.
 fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<String> {
     let mut resets = [0; 3];
     for &row in flags {
@@ -66,8 +59,7 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
     })
 }
 
-/// How long the step from each row to the next one is, squared: a sum over the numbers of an
-/// observation, each measured by the root mean square of its steps.
+/// Squared length of each step, with each dimension scaled by its root mean square step.
 fn lengths(recording: &Recording) -> Vec<f64> {
     let square = |row: usize, i: usize| {
         let apart =

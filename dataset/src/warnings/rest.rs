@@ -3,13 +3,10 @@
 use super::percent;
 use crate::recording::Recording;
 
-/// Fewer steps prove nothing.
 const FEWEST: usize = 20;
-/// The largest share of them at which an observation may rest: chunks of two steps have a half.
+/// Largest plausible fraction of steps at rest: action chunks of two steps give 0.5.
 const MOST_AT_REST: f64 = 0.4;
 
-/// One sentence, if observations rest: those of the following rows, or those that are stored as the
-/// next ones.
 pub(super) fn observations(recording: &Recording) -> Option<String> {
     let acts = |row: &usize| {
         let is_inner = recording.is_step(*row) && recording.is_step(row + 1);

@@ -1,5 +1,4 @@
-//! Rewards that tell nothing apart, that mostly come after the goal, or of a size that methods are
-//! not made for.
+//! Constant rewards, rewards after the goal, and rewards of unusual size.
 
 use super::ends::MOST_AFTER_GOAL;
 use super::{percent, short};
@@ -7,36 +6,33 @@ use crate::recording::Recording;
 use crate::statistics::Extent;
 use crate::tables::reward::RewardScaling;
 
-/// Differences that are smaller, of the rewards' size, are lost in float32 by critics, whose values
-/// are some hundred times as large.
+/// Relative difference that float32 critics lose: Q-values are some hundred times the rewards.
 const ALIKE: f32 = 2e-5;
-/// The largest root mean square that nothing is said of, and the smallest largest reward. The
-/// published rules for locomotion and mazes give a root mean square of about 1.
+/// Largest accepted root mean square, and smallest accepted maximum. Published rules for locomotion
+/// and mazes give a root mean square of about 1.
 const LARGEST: f64 = 30.0;
 const SMALLEST: f32 = 0.01;
-/// The share of rows after the first at the goal that must be there, too.
+/// Fraction of the rows after reaching the goal that must be at the goal.
 const STAYS: f64 = 0.9;
 
-/// What an episode has had of two rewards so far.
 #[derive(Clone, Copy, PartialEq)]
 enum Goal {
-    /// Nothing.
+    /// No reward yet.
     New,
-    /// The lower reward alone.
+    /// Lower value only.
     Ahead,
-    /// The lower one, then the higher one.
+    /// Lower, then higher value.
     Reached,
-    /// The higher one at its beginning, so that this is no goal.
+    /// Higher value first, so that it marks no goal.
     None,
 }
 
-/// The reward of each step, and whether its episode ends there.
+/// Reward of each step, and true at the end of an episode.
 fn steps(recording: &Recording) -> impl Iterator<Item = (f32, bool)> {
     let rows = (0..recording.rows()).filter(|&row| recording.is_step(row));
     rows.map(|row| (recording.rewards[row], recording.ends[row]))
 }
 
-/// Rewards that are all alike.
 pub(super) fn alike(recording: &Recording) -> Option<String> {
     let (first, _) = steps(recording).next()?;
     let (least, most) =
@@ -51,13 +47,12 @@ pub(super) fn alike(recording: &Recording) -> Option<String> {
     })
 }
 
-/// Rewards of two values, the higher of which an episode keeps from some step on: nearly all steps
-/// come after that one.
+/// Sparse goal rewards in recordings that mostly continue after the goal.
 pub(super) fn after_goal(recording: &Recording) -> Option<String> {
     let (first, _) = steps(recording).next()?;
     let (other, _) = steps(recording).find(|(reward, _)| *reward != first)?;
     let high = first.max(other);
-    // Of a task with a goal, flags tell.
+    // Goal tasks are checked by their flags.
     if recording.goal || steps(recording).any(|(reward, _)| reward != first && reward != other) {
         return None;
     }
@@ -85,7 +80,6 @@ pub(super) fn after_goal(recording: &Recording) -> Option<String> {
     })
 }
 
-/// Rewards that are too large or too small.
 pub(super) fn size(recording: &Recording) -> Option<String> {
     let size = RewardScaling::default().size(recording);
     let largest = recording

@@ -1,19 +1,17 @@
-//! Numbers that are too far from ±1, or change too little, to be learned from as they are.
+//! Observations and actions whose scale is too large or too small.
 
 use super::{named, short};
 use crate::normalize::Normalize;
 use crate::recording::{Recording, RowKind};
 
-/// The largest root mean square of a number of the observations that nothing is said of. Where one
-/// of a cart's four was this large, IQL's critic loss after 3,000 steps was twice that with all
-/// near 1; at three times this, fourteen times. D4RL's mazes measure 36 m.
+/// Largest accepted root mean square of a dimension. At this size of one of a simulated cart's
+/// four, IQL's critic loss after 3,000 steps was twice that with all near 1; at three times,
+/// fourteen times. D4RL's mazes reach 36 m.
 const LARGEST: f64 = 100.0;
-/// The smallest standard deviation of a number that changes. D4RL's smallest is 0.05.
+/// Smallest accepted standard deviation of a dimension that changes. D4RL's smallest is 0.05.
 const SMALLEST: f64 = 1e-3;
-/// Changes that are smaller, of a number's size, are rounding.
 const ROUNDING: f64 = 1e-6;
 
-/// Sentences on the columns of observations and actions that are not to be scaled.
 pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String> {
     let Recording { observation_dim, action_dim, observations, actions, kinds, names, .. } =
         recording;
@@ -38,7 +36,6 @@ pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String
     warnings
 }
 
-/// Columns that change, but hardly.
 fn small(array: &str, columns: &[[f64; 2]], names: &[String]) -> Option<String> {
     let changes = |[size, deviation]: [f64; 2]| deviation < SMALLEST && deviation > ROUNDING * size;
     let (small, largest) = most(columns, |column| changes(column).then_some(column[1]));
@@ -52,14 +49,13 @@ fn small(array: &str, columns: &[[f64; 2]], names: &[String]) -> Option<String> 
     })
 }
 
-/// The numbers of the columns that have such a figure, and the largest one.
 fn most(columns: &[[f64; 2]], of: impl Fn([f64; 2]) -> Option<f64>) -> (Vec<usize>, f64) {
     let found = columns.iter().enumerate().filter_map(|(i, column)| Some((i, of(*column)?)));
     let (numbers, figures): (Vec<usize>, Vec<f64>) = found.unzip();
     (numbers, figures.into_iter().fold(0.0, f64::max))
 }
 
-/// Root mean square and standard deviation of each column's finite numbers in the rows that count.
+/// Root mean square and standard deviation of each column's finite numbers.
 fn moments(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<[f64; 2]> {
     let mut sums = vec![[0.0; 3]; width];
     for (_, row) in values.chunks_exact(width.max(1)).enumerate().filter(|(row, _)| counts(*row)) {

@@ -1,6 +1,3 @@
-//! Files that are not what they should be: always a typed error that names file, array and row,
-//! never a panic.
-
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -18,7 +15,6 @@ use crate::{hopper, put, try_read};
 
 const ROWS: usize = 20;
 
-/// A good file, to be spoiled in one place.
 struct Subject {
     folder: TempDir,
 }
@@ -49,7 +45,7 @@ impl Subject {
         try_read(&self.path(), Some(hopper()))
     }
 
-    /// The error's text after the file's path, which every error starts with.
+    /// Text of the error after the file's path.
     fn error(&self) -> String {
         let error = self.read().err().expect("the file is broken");
         let text = error.to_string();
@@ -230,7 +226,7 @@ fn an_endless_episode() {
         "1001 rows without any terminal or timeout, as if they were one endless episode"
     );
     assert!(try_read(&long(50).path(), None).is_err());
-    // Without the array, Hopper's time limit cuts it.
+    // Without `timeouts`, Hopper's time limit truncates.
     hdf5::File::open_rw(subject.path()).unwrap().unlink("timeouts").unwrap();
     assert!(subject.read().is_ok());
 }

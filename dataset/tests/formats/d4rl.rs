@@ -1,5 +1,3 @@
-//! The rules that turn rows of D4RL's layout into transitions, against NumPy.
-
 use std::path::Path;
 
 use quad_dataset::{EnvironmentSpec, RewardRule, environment, recorded_environment};
@@ -7,7 +5,7 @@ use tempfile::tempdir;
 
 use crate::{all, compare, generated, hopper, peers, put, read, shared, try_read};
 
-/// Compares a file with what `peers.py reference` finds in it.
+/// Compares a file with the output of `peers.py reference`.
 fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>) {
     let folder = tempdir().unwrap();
     let out = folder.path().join("reference.hdf5");
@@ -19,9 +17,6 @@ fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>
     }
 }
 
-/// Terminals, timeouts and both; double precision, as in replay files; rewards and flags of shape N
-/// × 1; flags as integers; v0, which has timeouts from the time limit; v1, which stores next
-/// observations that are not used.
 #[test]
 fn every_version_follows_the_rules() {
     for variant in ["plain", "float64", "columns", "integers", "v0", "v1"] {
@@ -37,7 +32,7 @@ fn every_version_follows_the_rules() {
 fn rows_that_do_not_follow_one_another_are_refused() {
     let Some((_folder, path)) = generated("shuffled") else { return };
     let error = try_read(&path, Some(hopper())).err().unwrap();
-    // Of 600 rows two end an episode, and after the last one there is nothing to compare it with.
+    // The last row and two ends of episodes are not compared.
     let expected = "array `next_observations`, row 0: not the observation of the row that follows, though the episode \
                     continues there (597 such rows)";
     assert!(error.to_string().ends_with(expected), "{error}");
@@ -96,6 +91,6 @@ fn a_recording_with_a_goal_goes_on_after_it_in_whatever_environment() {
     put(&file, "infos/goal", &[8, 2], &[0.0f32; 16]);
     drop(file);
     let transitions = try_read(&path, None).unwrap();
-    // In each episode the goal is reached, and what comes after it is in no return.
+    // Returns exclude rewards after the goal.
     assert_eq!((transitions.statistics().episodes, transitions.statistics().return_max), (2, 1.0));
 }

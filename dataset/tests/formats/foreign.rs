@@ -1,6 +1,3 @@
-//! Files and folders that are not damaged, but something else: formats that are not read, and HDF5
-//! that is not readable here or not now.
-
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -65,7 +62,6 @@ fn folders_of_other_formats_are_named() {
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         fs::write(path, content).unwrap();
         assert_eq!(foreign(folder.path()), what);
-        // Before anything is read of it, as well.
         assert!(matches!(data_file(folder.path()).unwrap_err().problem, Problem::Foreign { .. }));
     }
     let empty = tempdir().unwrap();
@@ -120,13 +116,12 @@ fn a_robomimic_file_is_named() {
     );
 }
 
-/// A file in D4RL's layout whose arrays `write` writes.
 fn file(write: impl Fn(&hdf5::File, &str, Array2<f32>)) -> (TempDir, PathBuf) {
     let folder = tempdir().unwrap();
     let path = folder.path().join("log.hdf5");
     let file = hdf5::File::create(&path).unwrap();
     for (name, width) in [("observations", 3), ("actions", 2), ("rewards", 1), ("terminals", 1)] {
-        // Quarters, so that half precision is exact.
+        // Multiples of 1/4 are exact in half precision.
         let value = |(i, j): (usize, usize)| {
             if name == "terminals" { u8::from(i == 7).into() } else { ((i + j) % 4) as f32 / 4.0 }
         };
@@ -170,7 +165,7 @@ fn an_unknown_filter_is_named_with_what_rewrites_the_file() {
             .create(name)
             .unwrap();
     });
-    // The number stands eight bytes before the filter's name.
+    // The filter's number is eight bytes before its name.
     let mut bytes = fs::read(&path).unwrap();
     let places: Vec<usize> =
         (8..bytes.len() - 4).filter(|&i| bytes[i..].starts_with(b"lzf\0")).collect();
@@ -201,7 +196,6 @@ fn arrays_that_lie_elsewhere() {
     let link = |file: &hdf5::File, name: &str, _: Array2<f32>| {
         file.link_external("other.hdf5", name, name).unwrap()
     };
-    // To a file that is there.
     let stolen = |file: &hdf5::File, name: &str, values: Array2<f32>| {
         let other = Path::new(&file.filename()).with_file_name("other.hdf5");
         plain(&hdf5::File::append(&other).unwrap(), name, values.clone());
@@ -233,15 +227,13 @@ fn a_file_whose_writer_never_closed_it() {
         .unwrap();
     plain(&file, "observations", Array2::zeros((ROWS, 3)));
     file.flush().unwrap();
-    // As the disk has it while the writer is at work.
+    // State on disk while the writer is open.
     let copy = folder.path().join("copy.hdf5");
     fs::copy(&path, &copy).unwrap();
     assert!(matches!(error(&copy).problem, Problem::NotClosed(_)), "{}", error(&copy));
     drop(file);
 }
 
-/// Eight rows as OGBench stores them, the last of which is a trajectory's last state, in short
-/// numbers.
 fn write_archive(path: &Path, masks: [u32; 8]) {
     fn put<T: npyz::AutoSerialize>(archive: &mut ZipWriter<fs::File>, name: &str, values: Vec<T>) {
         let mut bytes = Vec::new();

@@ -1,5 +1,3 @@
-//! What `inspect` says of good files and of bad ones.
-
 use std::path::Path;
 
 use ndarray::{Array1, Array2};
@@ -8,7 +6,6 @@ use tempfile::tempdir;
 
 use crate::{generated, hopper, peers, read, shared};
 
-/// Three episodes of a robot, of 4, 4 and 2 rows, whose numbers can be followed by eye.
 fn write_robot(path: &Path, spoil: impl Fn(&mut Array2<f32>, &mut Array2<f32>, &mut Array1<f32>)) {
     let mut observations = Array2::from_shape_fn((10, 3), |(i, j)| (i + j) as f32);
     let mut actions =
@@ -148,7 +145,7 @@ fn a_maze_that_is_left_by_a_leap() {
     if !peers(&["generate-antmaze", path.to_str().unwrap()]) {
         return;
     }
-    // Its places are noise, so that the ant leaps all the time.
+    // Positions are noise, so the ant leaps at each step.
     let inspection = inspect(&path, Some(umaze)).unwrap();
     assert_eq!(inspection.scores.unwrap().mean_score, 80.0);
     let [problem] = &inspection.problems[..] else { panic!("{:?}", inspection.problems) };

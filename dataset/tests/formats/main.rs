@@ -1,5 +1,4 @@
-//! The crate against files: its own, h5py's, Minari's, OGBench's, recorded ones where they are at
-//! hand, and broken ones.
+//! Readers and writers on files of h5py, Minari and OGBench, on recorded and on damaged ones.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 use std::path::{Path, PathBuf};
@@ -29,7 +28,7 @@ fn hopper() -> &'static EnvironmentSpec {
     environment::find("hopper").unwrap()
 }
 
-/// A folder of recordings that may be beside the repository.
+/// Folder of recordings next to the repository, if present.
 fn shared(path: &str) -> Option<PathBuf> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared").join(path);
     let exists = path.exists();
@@ -39,7 +38,6 @@ fn shared(path: &str) -> Option<PathBuf> {
     exists.then_some(path)
 }
 
-/// A task of OGBench's is the environment's.
 fn options(environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> ReadOptions {
     let task = environment.and_then(|environment| relabeling(&environment.name));
     ReadOptions { environment, task, reward, normalize: Normalize::default() }
@@ -53,7 +51,6 @@ fn read(
     Transitions::read(path, &options(environment, reward)).unwrap()
 }
 
-/// Reads a source, with its rewards as they are.
 fn try_read(
     path: &Path,
     environment: Option<&'static EnvironmentSpec>,
@@ -61,7 +58,6 @@ fn try_read(
     Transitions::read(path, &options(environment, RewardRule::AsIs))
 }
 
-/// Writes an array.
 fn put<T: H5Type>(file: &hdf5::Group, array: &str, shape: &[usize], data: &[T]) {
     let view = ArrayViewD::from_shape(shape, data).unwrap();
     file.new_dataset_builder().with_data(view).create(array).unwrap();
@@ -74,7 +70,6 @@ fn all(transitions: &Transitions) -> Batch {
     batch
 }
 
-/// Compares every transition of a source, and its statistics, with a reference file of `peers.py`.
 fn compare(path: &Path, environment: Option<&'static EnvironmentSpec>, reference: &Path) {
     let reference = hdf5::File::open(reference).unwrap();
     let array = |name: &str| reference.dataset(name).unwrap().read_raw::<f32>().unwrap();
@@ -117,20 +112,18 @@ fn assert_close(name: &str, ours: &[f32], theirs: &[f32]) {
     }
 }
 
-/// A file that `peers.py generate` makes; `None` where there is no Python.
 fn generated(variant: &str) -> Option<(TempDir, PathBuf)> {
     let folder = tempdir().unwrap();
     let path = folder.path().join("generated.hdf5");
     peers(&["generate", variant, path.to_str().unwrap()]).then_some((folder, path))
 }
 
-/// Runs `peers.py`; false where there is no Python to run it, unless QUAD_REQUIRE_PEERS=1 asks for
-/// one.
+/// Runs `peers.py`. Without Python it returns false, or panics if QUAD_REQUIRE_PEERS=1.
 fn peers(arguments: &[&str]) -> bool {
     peers_in(Path::new("."), arguments)
 }
 
-/// As [`peers`], in another folder, which is also Minari's root.
+/// Runs `peers.py` in another folder, which is also Minari's root.
 fn peers_in(folder: &Path, arguments: &[&str]) -> bool {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = match std::env::var_os("QUAD_PYTHON") {

@@ -1,5 +1,3 @@
-//! Datasets that Minari wrote, against Minari's own reader.
-
 use std::path::{Path, PathBuf};
 
 use quad_dataset::{DatasetError, EnvironmentSpec, Transitions, environment, recorded_environment};
@@ -7,7 +5,6 @@ use tempfile::{TempDir, tempdir};
 
 use crate::{all, compare, hopper, peers_in, put, shared, try_read};
 
-/// A folder that Minari takes for its own, with one dataset in it.
 struct Root(TempDir);
 
 impl Root {
@@ -120,7 +117,6 @@ fn damaged_metadata_and_missing_episodes() {
     assert!(text.ends_with(": 3 episodes, but metadata.json says 4"), "{text}");
 }
 
-/// One episode of two steps whose observations are a Tuple of eleven numbers.
 fn write_tuple(path: &Path) {
     let file = hdf5::File::create(path).unwrap();
     let observations =

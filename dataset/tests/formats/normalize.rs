@@ -1,5 +1,3 @@
-//! Data in units of its owner's, scaled by what it holds.
-
 use std::path::PathBuf;
 
 use quad_dataset::{
@@ -9,8 +7,6 @@ use tempfile::{TempDir, tempdir};
 
 use crate::{all, assert_close, put};
 
-/// Four rows. A large number with a small spread, a small one, and one that is always the same;
-/// actions of one number from -30 to 50, and one that is always the same.
 fn arrays() -> Arrays {
     let o = |a: f32, b: f32, c: f32| [1e6 + a, b, c];
     Arrays {
@@ -48,7 +44,7 @@ fn normalized(actions: bool, observations: bool) -> Transitions {
         .unwrap()
 }
 
-/// The expected numbers are NumPy's: (x - x.mean(0)) / x.std(0), in float64.
+/// NumPy's (x - x.mean(0)) / x.std(0) in float64.
 #[test]
 fn observations_have_mean_0_and_deviation_1() {
     let transitions = normalized(true, true);
@@ -85,7 +81,6 @@ fn rows_that_are_not_learned_from_do_not_count() {
     drop(file);
     let normalize = Normalize { observations: true, ..Normalize::default() };
     let options = ReadOptions { normalize, ..ReadOptions::default() };
-    // Neither the timeout nor the last row makes a transition.
     let affine =
         Transitions::read(&path, &options).unwrap().scaling().observations.clone().unwrap();
     assert_eq!((affine.offset, affine.scale), (vec![1.0], vec![1.0]));
@@ -95,7 +90,7 @@ fn rows_that_are_not_learned_from_do_not_count() {
 fn actions_reach_from_least_to_largest() {
     let transitions = normalized(true, false);
     let batch = all(&transitions);
-    // As unscaled ones they are kept a little within ±1.
+    // Clipped like actions that are not normalized.
     assert_close("actions", &batch.actions, &[-0.999_99, 0.0, 0.0, 0.0, -0.25, 0.0, 0.999_99, 0.0]);
     let scaling = transitions.scaling();
     let affine = scaling.actions.clone().unwrap();
@@ -106,7 +101,6 @@ fn actions_reach_from_least_to_largest() {
         "as they are"
     );
     assert_eq!(batch.rewards, arrays().rewards);
-    // What follows what is told by the numbers of the file.
     assert_eq!(transitions.episodes().len(), 1, "as without scaling");
     assert_eq!(normalized(true, true).episodes(), transitions.episodes());
 }
@@ -134,7 +128,6 @@ fn rewards_have_a_mean_square_of_1() {
         &[1.0, 2.0, 3.0, 4.0].map(|reward| reward / size),
     );
     assert_eq!(transitions.statistics().return_mean, 10.0, "as they were recorded");
-    // After the rule of the task.
     let rule = ReadOptions { reward: RewardRule::CenterTimes4, ..options(normalize) };
     let ruled = Transitions::read(&path, &rule).unwrap();
     assert_close(
@@ -148,7 +141,6 @@ fn rewards_have_a_mean_square_of_1() {
         None,
         "0 has no size"
     );
-    // What is held out is in the same unit.
     let whole = Arrays { timeouts: vec![false, true, false, true], ..arrays() };
     write_own(&path, whole, Names::default()).unwrap();
     let split =

@@ -1,5 +1,3 @@
-//! Files of OGBench's layout, against OGBench's own reader.
-
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -72,7 +70,7 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
             (10..150).contains(&batch.masks.iter().filter(|mask| **mask == 0.0).count()),
             "{name}"
         );
-        // One trajectory in six is around one of five goals; its return is 1.
+        // One trajectory in six is around one of five goals, with return 1.
         assert!((0.1..0.7).contains(&transitions.statistics().return_mean), "{name}");
     }
 }

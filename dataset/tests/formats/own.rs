@@ -1,5 +1,3 @@
-//! People's own data, as docs/data.md tells them to write it.
-
 use std::path::Path;
 
 use quad_dataset::{
@@ -9,7 +7,6 @@ use tempfile::tempdir;
 
 use crate::{all, options, peers, peers_in, read, try_read};
 
-/// The Python of docs/data.md that writes a file.
 fn lines_of_the_page() -> String {
     let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/data.md");
     let page = std::fs::read_to_string(page).unwrap();
@@ -50,7 +47,6 @@ fn the_ten_lines_of_the_page_write_what_is_read() {
     assert_eq!(figures, (3, 6.0, 39.0, None));
 }
 
-/// Writes a small file with `peers.py write-own` and reads it; `None` where there is no Python.
 fn read_own(arguments: &[&str]) -> Option<Result<Transitions, DatasetError>> {
     let folder = tempdir().unwrap();
     let path = folder.path().join("own.hdf5");
@@ -69,7 +65,7 @@ fn without_timeouts_a_row_that_starts_elsewhere_begins_an_episode() {
 fn the_layout_is_read_however_the_text_is_stored() {
     for layout in ["text", "bytes", "padded", "utf-8", "variable-ascii", "one-element"] {
         let Some(transitions) = read_own(&[layout]) else { return };
-        // By D4RL's rules there would be 8 and not 9: the last row makes no transition.
+        // D4RL's rules would give 8: the last row makes no transition.
         assert_eq!(transitions.map(|transitions| transitions.len()).ok(), Some(9), "{layout}");
     }
 }
@@ -97,8 +93,6 @@ fn discrete_actions() {
     }
 }
 
-/// Two episodes of three steps, in units of their own: actions up to 30, and the first observation,
-/// which is large.
 fn arrays() -> Arrays {
     let numbers = |count: usize, from: f32| (0..count).map(|i| from + 0.5 * i as f32).collect();
     Arrays {

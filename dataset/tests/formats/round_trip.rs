@@ -1,5 +1,3 @@
-//! What the writer writes is what the readers read.
-
 use std::fs;
 
 use quad_dataset::{D4rlWriter, Metadata, Problem, RecordedRows, Row};
@@ -7,12 +5,11 @@ use tempfile::tempdir;
 
 use crate::{hopper, peers};
 
-/// More than two chunks, and not a whole number of them.
 const ROWS: usize = 10_000;
 
 const METADATA: Metadata = Metadata { algorithm: "formula", iteration: 12, seed: 34 };
 
-/// Numbers that float32 holds exactly; `peers.py check-written` has the same formulas.
+/// Numbers exact in float32; `peers.py check-written` has the same formulas.
 struct OwnedRow([Vec<f64>; 5]);
 
 impl OwnedRow {

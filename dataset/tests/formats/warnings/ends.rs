@@ -1,5 +1,3 @@
-//! Flags that are not what they should be.
-
 use super::{Cart, O, mass};
 
 #[test]
@@ -13,7 +11,7 @@ fn a_mask_or_a_discount_in_place_of_the_flag() {
             warning.contains("a mask or a discount (1 − done) in place of the flag? write 1 − it"),
             "{warning}"
         );
-        // Of episodes that are all cut off, the mask is 1 everywhere.
+        // A mask of truncated episodes is 1 everywhere.
         cart.terminals.fill(true);
         assert!(cart.warning(own).starts_with("array `terminals`: says in 100 % of the rows"));
     }
@@ -54,7 +52,7 @@ fn rows_after_the_goal() {
         "{warning}"
     );
     assert_eq!(cart.warning(false), warning);
-    // A fall costs something, and most rows are before it.
+    // A fall has a cost, and most rows are before it.
     cart.rewards
         .iter_mut()
         .zip(&cart.terminals)
@@ -76,7 +74,7 @@ fn flags_that_are_a_row_out_of_step_with_the_resets() {
             assert!(cart.warning(own).starts_with(&format!("array `{name}`: one row early")));
         }
     }
-    // Where resets do not show, nothing is known of flags.
+    // Without visible resets, flags cannot be judged.
     let mut kept = Cart::new(true);
     kept.timeouts.rotate_right(1);
     assert_eq!(kept.warnings(false), [""; 0]);

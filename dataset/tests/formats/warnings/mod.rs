@@ -1,7 +1,3 @@
-//! Data that can be trained on, though nothing good would come of it: a cart whose state moves a
-//! little at each step and jumps at a reset, or a mass that is pushed to the origin, with one fault
-//! in each file.
-
 mod ends;
 mod numbers;
 mod rows;
@@ -16,10 +12,8 @@ use tempfile::tempdir;
 
 use crate::{put, try_read};
 
-/// Numbers in an observation.
 const O: usize = 4;
 
-/// What a cart did in some episodes, row by row.
 #[derive(Default)]
 struct Cart {
     observations: Vec<f32>,
@@ -30,10 +24,9 @@ struct Cart {
     timeouts: Vec<bool>,
 }
 
-/// What a step does: the action, the next state, the reward, and whether the task is over.
+/// Action, next state, reward, and true if the task is over.
 type Step = ([f32; 2], [f32; O], f32, bool);
 
-/// 30 episodes of at most so many steps, made by a seed.
 fn made(
     steps: usize,
     reset: impl Fn(&mut ChaCha8Rng) -> [f32; O],
@@ -59,8 +52,6 @@ fn made(
     cart
 }
 
-/// A place and velocities in a plane, pushed to the origin with some noise, each step so long; at
-/// rest there, the task is over.
 fn mass(steps: usize, seconds: f32) -> Cart {
     let reset = |random: &mut ChaCha8Rng| {
         [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0), 0.0, 0.0]
@@ -81,8 +72,7 @@ fn mass(steps: usize, seconds: f32) -> Cart {
 }
 
 impl Cart {
-    /// 30 episodes; every third one terminates, the others are cut off. Where states are `kept`, a
-    /// new episode begins where the last one ended.
+    /// 30 episodes, every third of which terminates; `kept` omits the resets.
     fn new(kept: bool) -> Self {
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let mut draw = |scale: f32| scale * random.random_range(-1.0..1.0);
@@ -108,7 +98,6 @@ impl Cart {
         cart
     }
 
-    /// Writes it in D4RL's layout, or in the custom one.
     fn write(&self, path: &Path, own: bool) {
         let (file, rows) = (hdf5::File::create(path).unwrap(), self.rewards.len());
         if own {
@@ -127,14 +116,12 @@ impl Cart {
         put(&file, "timeouts", &[rows], &self.timeouts);
     }
 
-    /// Changes each observation, the next ones included.
     fn observe(&mut self, change: impl Fn(&mut [f32])) {
         for values in [&mut self.observations, &mut self.next_observations] {
             values.chunks_exact_mut(O).for_each(&change);
         }
     }
 
-    /// Problems that `inspect` finds in one of the layouts.
     fn problems(&self, own: bool) -> Vec<String> {
         let folder = tempdir().unwrap();
         let path = folder.path().join("cart.hdf5");
@@ -142,14 +129,12 @@ impl Cart {
         inspect(&path, None).unwrap().problems
     }
 
-    /// Its only warning.
     fn warning(&self, own: bool) -> String {
         let warnings = self.warnings(own);
         assert_eq!(warnings.len(), 1, "{warnings:?}");
         warnings[0].clone()
     }
 
-    /// Warnings in one of the layouts, which `inspect` and `Transitions` have alike.
     fn warnings(&self, own: bool) -> Vec<String> {
         let folder = tempdir().unwrap();
         let path = folder.path().join("cart.hdf5");

@@ -1,5 +1,3 @@
-//! Numbers that are too large, too small, or all alike.
-
 use quad_dataset::{Normalize, ReadOptions, Transitions, inspect};
 use tempfile::tempdir;
 
@@ -85,13 +83,12 @@ fn rewards_of_a_size_that_methods_are_not_made_for() {
     assert_eq!(scaled(&cart, Normalize { rewards: true, ..Normalize::default() }), [""; 0]);
     scale(&mut cart, 1e-6);
     assert!(cart.warning(false).contains("1 for good and bad actions alike"));
-    // Few rewards of an ordinary size are none that are small.
+    // Rare rewards of ordinary size are not small.
     cart.rewards.fill(0.0);
     cart.rewards[100] = 1.0;
     assert_eq!(cart.warnings(false), [""; 0]);
 }
 
-/// What is said of it to who trains on it with this scale.
 fn scaled(cart: &Cart, normalize: Normalize) -> Vec<String> {
     let folder = tempdir().unwrap();
     let path = folder.path().join("cart.hdf5");

@@ -1,8 +1,5 @@
-//! Observations and actions that are not those of their row.
-
 use super::{Cart, O, mass};
 
-/// Gives each row what another one has, within its episode: `from` is told its number there.
 fn moved(cart: &Cart, from: impl Fn(usize, usize) -> usize) -> Cart {
     let rows = cart.rewards.len();
     let (mut observations, mut start) = (Vec::new(), 0);
@@ -35,7 +32,7 @@ fn observations_that_rest_while_actions_change() {
         let pairs = moved(&mass(60, 0.1), |row, number| row - number % 2);
         assert!(pairs.warning(own).starts_with("array `observations`: does not change in"));
     }
-    // A robot that stands still is told to.
+    // A robot at rest is commanded to rest.
     let mut still = moved(&mass(60, 0.1), |row, number| row - number % 10);
     still.actions.chunks_exact_mut(2).for_each(|action| action.copy_from_slice(&[0.25, 0.5]));
     assert!(!still.warnings(true).iter().any(|warning| warning.contains("does not change")));
@@ -65,7 +62,7 @@ fn actions_that_are_the_state() {
         let expected = "array `actions`: columns 0, 1 copied from columns 1, 0 of the same row's observation (in 100.0 %";
         assert!(warnings.iter().any(|warning| warning.starts_with(expected)), "{warnings:?}");
     }
-    // The state of the next row is a command like others.
+    // The next state is a valid command.
     let mut cart = mass(60, 0.1);
     for (action, next) in
         cart.actions.chunks_exact_mut(2).zip(cart.next_observations.chunks_exact(O))
@@ -73,7 +70,7 @@ fn actions_that_are_the_state() {
         action.copy_from_slice(&next[..2]);
     }
     assert!(!cart.problems(true).iter().any(|warning| warning.contains("copied")));
-    // A gripper's state equals its command but where it moves.
+    // A gripper's state equals its command except while moving.
     let mut cart = mass(60, 0.1);
     let open = |row: usize| f32::from(u8::from(row % 40 < 20));
     for row in 0..cart.rewards.len() {

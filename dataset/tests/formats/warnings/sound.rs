@@ -1,5 +1,3 @@
-//! Sound data of each kind, of which nothing is said.
-
 use quad_dataset::{environment, inspect};
 use rand::Rng;
 
