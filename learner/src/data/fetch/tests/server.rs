@@ -87,7 +87,7 @@ fn reply(
     stream.write_all(&body)?;
     if is_silent {
         // Ends when the client leaves.
-        stream.read(&mut [0])?;
+        let _ = stream.read(&mut [0])?;
     }
     Ok(())
 }
