@@ -177,7 +177,7 @@ def test_names_go_into_the_file_and_the_policy(snapshots, tmp_path):
         policy.act(np.zeros((180, 3)))
 
 
-def test_quad_convert_reads_what_python_reads(tmp_path, capsys):
+def test_quad_convert_reads_what_python_reads(tmp_path, capsys, monkeypatch):
     def convert(*words):
         status = _convert.main([*map(str, words), "--out", str(tmp_path / "out.hdf5")])
         said = capsys.readouterr()
@@ -212,15 +212,19 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys):
     status, page = convert(*log, "--reward", "step-cost", "--success", "all", "--continuous", "--apart", "repeated")
     assert status == 0 and "3 of 3 names are those of several episodes: 6 in all" in page
     assert "--normalize actions" in page and "6 of 6 episodes are successes" in page, "what the inspection doubts is shown, too"
-    (tmp_path / "none-huge-v0.npz").touch()
+
+    def no_network(names, folder):
+        raise OSError("no network")
+
+    monkeypatch.setattr("ogbench.download_datasets", no_network)
     for message, words in {
         "needs --actions and --reward": [tmp_path / "log.csv", "--observations", "x", "--episode", "run"],
         "--task does not apply to this source": [*log, "--reward", "gain", "--task", "pick"],
         "nothing says what is rewarded": [folder, "--observations", "observation.state"],
         "there is no nothing.csv": ["nothing.csv"],
         "has no rewards": ["ogbench:cube-double-play-v0"],
-        "hint: put it and antmaze-huge-navigate-v0-val.npz there": ["ogbench:antmaze-huge-navigate-singletask-v0", "--folder", tmp_path],
-        "cannot be read: NameNotFound: ": ["ogbench:none-huge-singletask-v0", "--folder", tmp_path],
+        "hint: put it and antmaze-giant-navigate-v0-val.npz there": ["ogbench:antmaze-giant-navigate-singletask-v0", "--folder", tmp_path],
+        "OGBench has no task none-huge-singletask-v0": ["ogbench:none-huge-singletask-v0", "--folder", tmp_path],
     }.items():
         status, said = convert(*words)
         assert status == 1 and said.startswith("quad-convert: ") and message in said, said
