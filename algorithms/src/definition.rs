@@ -23,7 +23,7 @@ pub struct Definition {
     pub presets: &'static str,
     /// The metrics of its updates; some are measured in one phase only.
     pub metrics: &'static [Metric],
-    /// What reports say of its runs beside scores.
+    /// Texts of reports about its runs, beside scores.
     pub report: Reporting,
     /// Reads an `[agent]` table into the type of its hyper-parameters.
     pub read: fn(&Table) -> Result<Start, AgentError>,
@@ -155,7 +155,7 @@ macro_rules! metrics {
 }
 pub(crate) use metrics;
 
-/// What reports say of an algorithm's runs beside scores.
+/// Texts of reports about an algorithm's runs, beside scores.
 #[derive(Clone, Copy)]
 pub struct Reporting {
     /// The hyper-parameter that tells its variants apart, if it has any.

@@ -52,7 +52,7 @@ fn group<'a>(
 /// A product to be timed, with the right-hand side of a number: left side, right side, result.
 type Product<'a> = &'a dyn Fn(usize, &[f32], &[f32], &mut [f32]);
 
-/// How a slice is taken.
+/// Memory order of an operand.
 type Side = for<'a> fn(&'a [f32]) -> Matrix<'a>;
 const AS_IT_IS: Side = |elements| Matrix::RowMajor(elements);
 const TRANSPOSED: Side = |elements| Matrix::TransposeOf(elements);

@@ -38,7 +38,7 @@ pub mod system;
 
 use std::time::{Duration, Instant};
 
-/// How long anything is waited for: far beyond what it takes, unless others keep the machine busy.
+/// Longest wait for anything: far more than needed, unless the machine is busy.
 pub const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Polls until `condition` gives something; panics after `patience`.

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-/// How often a connection without traffic looks whether it still is one.
+/// Interval at which an idle connection is checked.
 const GLANCE: Duration = Duration::from_millis(20);
 
 /// Fault of a connection.

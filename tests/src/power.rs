@@ -1,4 +1,4 @@
-//! What a disk holds after a power cut, at worst: nothing but what was synchronized.
+//! A disk after a power cut, at worst: it holds only what was synchronized.
 //!
 //! A file has the contents of its last fsync, a folder the entries of its own last fsync, and an
 //! entry that was never synchronized itself is empty. examples/power_cut.rs, preloaded into a

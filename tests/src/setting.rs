@@ -1,4 +1,4 @@
-//! What a training run of a test is asked to do: small networks, few steps.
+//! Settings of a test's training run: small networks, few steps.
 
 /// Sizes of a run; the rest is fixed and small.
 #[derive(Clone, Copy)]

@@ -11,7 +11,7 @@ const TILE: usize = 16;
 /// columns.
 const ROWS: usize = 2 * TILE;
 
-/// Whether this CPU can and the kernel lets this process: registers of 8 KiB must be asked for.
+/// True if the CPU has AMX and the kernel grants this process its 8 KiB of registers.
 pub(super) fn available() -> bool {
     static AVAILABLE: LazyLock<bool> = LazyLock::new(|| {
         const TILES_AND_BF16: u32 = 1 << 24 | 1 << 22;
@@ -34,7 +34,7 @@ fn may_use_tiles() -> bool {
     false
 }
 
-/// What `ldtilecfg` reads: of each tile register the bytes in a row, and the rows.
+/// Operand of `ldtilecfg`: bytes per row and rows of each tile register.
 #[repr(C, align(64))]
 struct Configuration {
     palette: u8,

@@ -19,7 +19,7 @@ pub struct ExportArgs {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     pub run: PathBuf,
-    /// Which snapshot: that of a gradient step, `best`, the one with the best evaluation, or `last`
+    /// The snapshot: that of a gradient step, `best`, the one with the best evaluation, or `last`
     #[arg(long, value_name = "N|best|last", default_value = "last", value_parser = parse_at)]
     pub step: At,
     /// The file to write

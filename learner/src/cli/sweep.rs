@@ -79,7 +79,7 @@ pub struct SweepArgs {
 pub struct Shard(usize, usize);
 
 impl Shard {
-    /// Whether this part has the run at this index among all.
+    /// True if the run with this index belongs to this part.
     pub fn has(self, index: usize) -> bool {
         index % self.1 == self.0
     }

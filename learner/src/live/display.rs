@@ -1,4 +1,4 @@
-//! What the user sees while the learner works: a bar with figures on a terminal, plain log lines
+//! Progress for the user while the learner works: a bar with figures on a terminal, plain log lines
 //! otherwise.
 
 use std::collections::VecDeque;

@@ -1,4 +1,4 @@
-//! How long a trained run waits for evaluators.
+//! The wait of a trained run for evaluators.
 
 use std::path::Path;
 use std::time::{Duration, Instant};

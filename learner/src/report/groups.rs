@@ -115,7 +115,7 @@ impl Group<'_> {
         value.map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"))
     }
 
-    /// Whether the run differs from these only in its seed.
+    /// True if the run differs from these only in its seed.
     fn fits(&self, run: &RunReport, settings: &Settings) -> bool {
         let progress_fits = self.runs[0].reached() == run.reached() || run.reached() == Some(0);
         self.task() == run.task && self.settings == *settings && progress_fits

@@ -1,4 +1,4 @@
-//! What `learner export` says of how good a policy is.
+//! Scores and judgments in files of `learner export`.
 
 use std::fs;
 use std::path::Path;
@@ -64,7 +64,7 @@ fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
     judgment.save(run).unwrap();
 }
 
-/// What the file says of its score and judgment, and what is said to the user.
+/// Score and judgment in the file, and the text for the user.
 fn export(run: &RunDir, step: &str) -> (Value, Value, String) {
     let out = run.path().join("policy.safetensors");
     let (run, file) = (run.path().display(), out.display());

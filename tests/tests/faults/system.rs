@@ -65,7 +65,7 @@ pub struct System {
     started: usize,
     /// Disk of the run's folder, where it can be a disk of its own.
     disk: Option<SmallDisk>,
-    /// How often each fault has happened.
+    /// Count of each fault.
     pub faults: BTreeMap<Fault, usize>,
     scratch: Scratch,
 }
@@ -106,7 +106,7 @@ impl System {
         self.scratch.evaluator_with(&name, &["--connect", &link.endpoint])
     }
 
-    /// Whether the learner has reached its end. If it has ended in any other way, that is a bug.
+    /// True if the learner has completed its run. Any other end is a bug.
     pub fn is_over(&mut self) -> bool {
         let over = !self.learner.process.is_running();
         if over {

@@ -1,4 +1,4 @@
-//! Which programs may come in: those with a certificate, at the router as it is shipped and at a
+//! Programs that may connect: those with a certificate, at the router as it is shipped and at a
 //! learner that listens itself.
 
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ use quad_tests::system::Scratch;
 use tokio::time::timeout;
 use zenoh::sample::SampleKind;
 
-/// What the router's certificate is for.
+/// Host of the router's certificate.
 pub const HOST: &str = "127.0.0.1";
 /// For so many seconds a certificate is valid that a program is to come in with, and to be sent
 /// away with.

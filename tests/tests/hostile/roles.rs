@@ -1,4 +1,4 @@
-//! What each role may do: at the router as it is shipped, and at a learner that listens itself.
+//! Rights of each role: at the router as it is shipped, and at a learner that listens itself.
 
 use std::time::{Duration, Instant};
 
@@ -73,7 +73,7 @@ async fn answer(session: &Session, key: &str) -> Queryable<()> {
     session.declare_queryable(key).callback(callback).await.unwrap()
 }
 
-/// How many answers there are.
+/// Number of answers.
 async fn answers(session: &Session, key: &str) -> usize {
     let replies = session.get(key).timeout(LULL).await.unwrap();
     let mut count = 0;

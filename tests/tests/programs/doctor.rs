@@ -122,7 +122,7 @@ fn folders_without_file_locks_are_warned_of() {
     assert_eq!(left.collect::<Vec<_>>(), ["tiny.hdf5"], "the doctor leaves no file");
 }
 
-/// What may be wrong with certificates is in certificates.trycmd.
+/// Wrong certificates are in certificates.trycmd.
 #[test]
 fn certificates_are_checked() {
     let Some(certificates) = Certificates::make() else { return };

@@ -1,4 +1,4 @@
-//! What we write and serve, as the programs of others read it: Python's safetensors, Prometheus.
+//! Our files and metrics as other programs read them: Python's safetensors, Prometheus.
 
 use std::io::Write;
 use std::process::{Command, Stdio};

@@ -40,7 +40,7 @@ fn episodes(scored: &Value) -> Vec<(u64, u64, u64, u64)> {
         .collect()
 }
 
-/// Whether or not the policy learned from scaled data: the simulator's units go in and come out.
+/// A policy takes and gives the simulator's units, also if it learned from scaled data.
 #[test]
 fn a_snapshot_gets_the_scores_that_its_run_has() {
     let scratch = Scratch::new();

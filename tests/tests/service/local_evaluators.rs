@@ -19,7 +19,7 @@ fn children(of: u32) -> Vec<u32> {
     list.split_whitespace().map(|id| id.parse().unwrap()).collect()
 }
 
-/// Whether none of them runs; one that was killed and not yet waited for does not.
+/// True if none of them runs. A killed process that was not waited for does not run.
 fn are_gone(processes: &[u32]) -> Option<()> {
     let runs = |id: &u32| {
         let stat = fs::read_to_string(format!("/proc/{id}/stat")).unwrap_or_default();

@@ -58,7 +58,7 @@ impl Study {
         eventually(&format!("{run} trains"), PATIENCE, text);
     }
 
-    /// What `--list` says of each run.
+    /// The state of each run in `--list`.
     fn states(&self) -> Vec<String> {
         let output = self.command(&["--list"]).output().unwrap();
         let text = String::from_utf8(output.stdout).unwrap();
