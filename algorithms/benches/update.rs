@@ -64,6 +64,7 @@ fn context(experiment: &Experiment, precision: Precision, device: &Device) -> Co
         transitions: Arc::new(transitions(2 * experiment.batch_size)),
         batch_size: experiment.batch_size,
         total_steps: experiment.total_steps,
+        online_steps: 0,
         seed: 0,
         precision,
         device: device.clone(),

@@ -18,8 +18,10 @@ pub struct Context {
     pub transitions: Arc<Transitions>,
     /// Examples per update, B.
     pub batch_size: usize,
-    /// Updates of the whole run; learning rates that decay reach 0 there.
+    /// Updates on the dataset alone; learning rates that decay reach 0 there.
     pub total_steps: u64,
+    /// Updates with experience that follow.
+    pub online_steps: u64,
     /// Seed of initial weights and noise.
     pub seed: u64,
     /// Precision of forward passes without a gradient.

@@ -44,6 +44,7 @@ fn context(seed: u64, device: &Device) -> Context {
         transitions: Arc::new(Transitions::of(arrays()).unwrap()),
         batch_size: BATCH,
         total_steps: STEPS,
+        online_steps: 0,
         seed,
         precision: Precision::F32,
         device: device.clone(),

@@ -32,7 +32,7 @@ pub enum JobRequest {
 }
 
 /// The learner's answer to a [`JobRequest`], with the learner's incarnation.
-#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
 #[allow(missing_docs)] // The names say it.
 pub enum JobReply {
     Job(Job),
@@ -59,8 +59,21 @@ impl JobReply {
     }
 }
 
+/// Actions in practice episodes.
+#[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
+pub enum Exploration {
+    /// Uniform in [-1, 1] in each dimension.
+    Uniform,
+    /// The policy's, drawn from its distribution where it has one, plus normal noise with this
+    /// standard deviation, clipped to [-1, 1].
+    Policy {
+        /// Standard deviation of the noise.
+        noise: f32,
+    },
+}
+
 /// Episodes to run with one snapshot.
-#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
 #[allow(missing_docs)] // The names say it.
 pub struct Job {
     /// Number within the learner's incarnation.
@@ -78,6 +91,9 @@ pub struct Job {
     pub environment_seed: u64,
     /// A seed per episode.
     pub seeds: Vec<u64>,
+    /// Exploration of practice episodes, whose rows are delivered as
+    /// [`Episode`](crate::Episode)s; `None` for evaluation episodes, of which scores are.
+    pub practice: Option<Exploration>,
     /// Interval of progress messages; after three intervals without progress, the job may go to
     /// another evaluator.
     pub progress_milliseconds: u64,

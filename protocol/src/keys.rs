@@ -6,6 +6,7 @@
 //! | `quad/<run>/weights/<step>` | learner answers | nothing → [`Snapshot`](crate::Snapshot) |
 //! | `quad/<run>/jobs` | learner answers | [`JobRequest`](crate::JobRequest) → [`JobReply`](crate::JobReply) |
 //! | `quad/<run>/scores` | learner answers | [`ScoreReport`](crate::ScoreReport) → [`ScoreReply`](crate::ScoreReply) |
+//! | `quad/<run>/experience` | learner answers | [`Piece`](crate::Piece) → [`PieceReply`](crate::PieceReply) |
 //! | `quad/<run>/progress/<evaluator>` | evaluator publishes | [`Progress`](crate::Progress) |
 //! | `quad/<run>/live/learner/<incarnation>` | learner's liveliness token | |
 //! | `quad/<run>/live/evaluator/<evaluator>` | evaluator's liveliness token | |
@@ -42,6 +43,11 @@ pub fn jobs(run: &Name) -> String {
 /// Deliveries of scores.
 pub fn scores(run: &Name) -> String {
     format!("quad/{run}/scores")
+}
+
+/// Deliveries of practice episodes.
+pub fn experience(run: &Name) -> String {
+    format!("quad/{run}/experience")
 }
 
 /// Progress of an evaluator.

@@ -3,7 +3,7 @@
 //! # Layout
 //!
 //! In reading order: `name` and `hash`; [`keys`]; `snapshot` and `origin`, weights and the header of
-//! their file; `seeds` and `job`, an evaluator gets episodes to run; `progress`; `score`; `codec`,
+//! their file; `seeds` and `job`, an evaluator gets episodes to run; `progress`; `score`; `experience`; `codec`,
 //! messages to bytes and back.
 //!
 //! Nothing here knows what the weights mean or how episodes are simulated.
@@ -11,6 +11,7 @@
 #![deny(unsafe_code)]
 
 mod codec;
+mod experience;
 mod hash;
 mod job;
 pub mod keys;
@@ -22,11 +23,12 @@ mod seeds;
 mod snapshot;
 
 pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, encode};
+pub use experience::{Episode, Piece, PieceReply};
 pub use hash::Hash;
-pub use job::{Job, JobReply, JobRequest};
+pub use job::{Exploration, Job, JobReply, JobRequest};
 pub use name::{InvalidName, Name};
 pub use origin::Origin;
 pub use progress::Progress;
 pub use score::{EpisodeScore, ScoreReply, ScoreReport};
-pub use seeds::episode_seeds;
+pub use seeds::{episode_seeds, practice_seed};
 pub use snapshot::Snapshot;

@@ -1,4 +1,4 @@
-//! Seeds of evaluation episodes.
+//! Seeds of evaluation and practice episodes.
 
 use std::collections::HashSet;
 use std::iter;
@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 
 /// Separates these draws from other uses of a run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"episodes");
+const PRACTICE: u64 = u64::from_be_bytes(*b"practice");
 
 /// The episode seeds of the evaluation at `step`: distinct, and different at each step, so that no
 /// evaluation is tuned to one set of starting states. Runs with the same seed that differ in
@@ -18,6 +19,14 @@ pub fn episode_seeds(run_seed: u64, step: u64, episodes: u32) -> Vec<u64> {
     let mut seen = HashSet::new();
     let new = |seed: &u64| seen.insert(*seed);
     iter::repeat_with(|| generator.next_u64() >> 11).filter(new).take(episodes as usize).collect()
+}
+
+/// The seed of a run's practice episode, counted from 0. No other use of a run's seed has it, but
+/// by a chance of 2⁻⁵³.
+pub fn practice_seed(run_seed: u64, episode: u64) -> u64 {
+    let mut generator = ChaCha8Rng::seed_from_u64(run_seed ^ PRACTICE);
+    generator.set_stream(episode);
+    generator.next_u64() >> 11
 }
 
 #[cfg(test)]
@@ -31,6 +40,10 @@ mod tests {
         for (run, step) in [(3, 1000), (3, 2000), (4, 1000)] {
             let mut seeds = episode_seeds(run, step, 50).into_iter();
             assert!(seeds.all(|seed| seed < 1 << 53 && seen.insert(seed)));
+        }
+        for (run, episode) in [3, 4].into_iter().flat_map(|run| (0..50).map(move |j| (run, j))) {
+            let seed = practice_seed(run, episode);
+            assert!(seed < 1 << 53 && seen.insert(seed) && seed == practice_seed(run, episode));
         }
     }
 }

@@ -120,9 +120,12 @@ pub struct TrainArgs {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Instead of the algorithm's value for the task")]
 struct OverrideArgs {
-    /// Gradient steps
-    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
+    /// Gradient steps on the dataset; 0 with --online-steps
+    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
     steps: Option<i64>,
+    /// Environment steps of practice, from which the learner goes on learning [default: 0]
+    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
+    online_steps: Option<i64>,
     /// Gradient steps between two evaluations; 0 trains without any evaluation
     #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
     eval_interval: Option<i64>,
@@ -162,6 +165,13 @@ impl TrainArgs {
         set("hold_out", self.hold_out.map(Value::from));
         let flags = &self.overrides;
         set("steps", flags.steps.map(Value::from));
+        if let Some(steps) = flags.online_steps {
+            let online = Table::from_iter([("steps".to_owned(), steps.into())]);
+            tables::merge(&mut changes, Table::from_iter([("online".to_owned(), online.into())]));
+        }
+        let mut set = |key: &str, value: Option<Value>| {
+            changes.extend(value.map(|value| (key.to_owned(), value)));
+        };
         set("eval_interval", flags.eval_interval.map(Value::from));
         set("episodes", flags.episodes.map(Value::from));
         set("seed", flags.seed.map(Value::from));

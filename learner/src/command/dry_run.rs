@@ -12,7 +12,7 @@ use quad_runtime::print;
 use crate::train::Price;
 
 pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
-    let (experiment, steps) = (&config.experiment, config.experiment.steps);
+    let (experiment, steps) = (&config.experiment, config.experiment.total_steps());
     let price = Price::measure(experiment, config.run.device, transitions)?;
     let (milliseconds, hours) =
         (price.step_seconds * 1e3, price.step_seconds * steps as f64 / 3600.0);

@@ -94,7 +94,7 @@ fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs
 fn list(runs: &Runs) -> String {
     let mut table = Table::new(&[("index", Right), ("run", Left), ("state", Left)]);
     for (PlannedRun { index, name, experiment, .. }, state) in runs {
-        table.push([index.to_string(), name.clone(), state.text(experiment.steps)]);
+        table.push([index.to_string(), name.clone(), state.text(experiment.total_steps())]);
     }
     table.render(Style::Text)
 }

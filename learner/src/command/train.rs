@@ -143,11 +143,11 @@ async fn run_to_end(
 ) -> anyhow::Result<(RunDir, Ending)> {
     let (run, experiment, device) = (&config.run.name, &config.experiment, config.run.device);
     let (metrics, registry) =
-        Metrics::new(run, experiment.steps, experiment.definition()?.metrics)?;
+        Metrics::new(run, experiment.total_steps(), experiment.definition()?.metrics)?;
     let health = Health::default();
     let page_state = PageState {
         run: run.clone(),
-        steps: experiment.steps,
+        steps: experiment.total_steps(),
         metrics: metrics.clone(),
         health: health.clone(),
         coordinator: Arc::default(),
@@ -188,7 +188,7 @@ async fn run_to_end(
     let main_loop = MainLoop {
         incarnation,
         run_dir: dir.clone(),
-        display: Display::start(metrics.clone(), experiment.steps),
+        display: Display::start(metrics.clone(), experiment.total_steps()),
         metrics,
         metrics_address: server.address.to_string(),
         endpoints: outside.endpoints,

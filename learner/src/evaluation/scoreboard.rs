@@ -149,6 +149,7 @@ impl Scoreboard {
             environment: self.rules.task.environment.clone(),
             environment_seed: self.rules.seed,
             seeds,
+            practice: None,
             // Often enough to keep the lease.
             progress_milliseconds: progress.min(patience / 3).as_millis() as u64,
         };

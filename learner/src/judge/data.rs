@@ -110,6 +110,7 @@ impl Data {
             transitions: self.training.clone(),
             batch_size: BATCH_SIZE.min(self.training.len()),
             total_steps: 0,
+            online_steps: 0,
             seed,
             precision: Precision::F32,
             device: Device::Cpu,

@@ -65,7 +65,7 @@ impl Cost {
         let mut cost = Self { step_seconds: BTreeMap::new(), seconds: 0.0, bytes: 0, measured };
         for (run, state) in runs {
             let price = prices.get(&configuration(run)).copied().unwrap_or(mean);
-            let steps = run.experiment.steps;
+            let steps = run.experiment.total_steps();
             cost.step_seconds.insert(run.index, price.step_seconds);
             cost.seconds += price.step_seconds * (steps - state.step(steps).min(steps)) as f64;
             cost.bytes += price.bytes(&run.experiment);

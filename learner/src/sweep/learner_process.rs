@@ -52,7 +52,7 @@ pub(super) enum End {
 
 impl LearnerProcess {
     pub fn new(run: PlannedRun, state: State, study: &Path) -> Self {
-        Self { dir: study.join(&run.name), from: state.step(run.experiment.steps), run }
+        Self { dir: study.join(&run.name), from: state.step(run.experiment.total_steps()), run }
     }
 
     /// Runs the learner to its end, or stops it. The system ends the learner with the calling

@@ -137,13 +137,13 @@ impl Sweep {
         let Progress { running, complete, failed, .. } = progress;
         let (mut lines, mut done, mut left) = (Vec::new(), progress.done, 0.0);
         for (LearnerProcess { run, from, .. }, pace) in running.values() {
-            let steps = run.experiment.steps;
+            let steps = run.experiment.total_steps();
             done += self.seconds(run, *from, pace.step);
             left += self.seconds(run, pace.step, steps);
             lines.push(format!("{}: step {}/{steps}, {pace}", run.name, pace.step));
         }
         for (run, state) in &self.waiting {
-            let steps = run.experiment.steps;
+            let steps = run.experiment.total_steps();
             left += self.seconds(run, state.step(steps), steps);
         }
         let (running, waiting) = (running.len(), self.waiting.len());

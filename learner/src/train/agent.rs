@@ -51,6 +51,7 @@ pub(super) fn new_agent(
         transitions: Arc::new(transitions),
         batch_size,
         total_steps: experiment.steps,
+        online_steps: experiment.total_steps() - experiment.steps,
         seed: experiment.seed,
         precision: experiment.precision,
         device: device::open(device)?,

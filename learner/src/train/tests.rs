@@ -79,6 +79,7 @@ fn context(total_steps: u64) -> Context {
         transitions: Arc::new(transitions()),
         batch_size: 4,
         total_steps,
+        online_steps: 0,
         seed: 0,
         precision: Precision::F32,
         device: Device::Cpu,

@@ -37,6 +37,9 @@ pub fn decode_as_each(bytes: &[u8]) {
     read::<ScoreReport>(bytes);
     read::<ScoreReply>(bytes);
     read::<Progress>(bytes);
+    read::<Episode>(bytes);
+    read::<Piece>(bytes);
+    read::<PieceReply>(bytes);
 }
 
 fn name() -> Name {
@@ -62,6 +65,7 @@ pub fn each(test: &mut impl Check) {
         environment: text(),
         environment_seed: 4,
         seeds: vec![1, 2, 3],
+        practice: Some(Exploration::Policy { noise: 0.1 }),
         progress_milliseconds: 300,
     };
     let progress = Progress {
@@ -77,10 +81,37 @@ pub fn each(test: &mut impl Check) {
     test.check(&JobRequest::Claim { evaluator: name(), attempt: 9, environments });
     test.check(&JobRequest::HandBack { evaluator: name(), job: 1, failed: Some(text()) });
     test.check(&ScoreReport::new(&job, name(), name(), episodes));
-    test.check(&JobReply::Job(job));
+    test.check(&JobReply::Job(job.clone()));
     test.check(&JobReply::Wait { incarnation: 2, milliseconds: 10 });
     test.check(&JobReply::HandedBack { incarnation: 2, accepted: true });
     test.check(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 });
     test.check(&ScoreReply::Refused { incarnation: 1, reason: text() });
     test.check(&progress);
+    let uniform = Job { practice: Some(Exploration::Uniform), ..job };
+    test.check(&JobReply::Job(uniform));
+    test.check(&Episode {
+        step: 3,
+        weights: snapshot.hash,
+        score: EpisodeScore { length: 1, ..score(1, 4.0) },
+        terminated: true,
+        observations: vec![0.0, 1.0],
+        actions: vec![0.5],
+        rewards: vec![2.0],
+        interventions: vec![0],
+    });
+    test.check(&Piece {
+        evaluator: name(),
+        run: name(),
+        incarnation: 2,
+        job: 1,
+        precision: name(),
+        seed: 1,
+        hash: snapshot.hash,
+        length: 100,
+        offset: 10,
+        bytes: vec![1, 2, 3],
+    });
+    test.check(&PieceReply::Continue { incarnation: 1, offset: 2 });
+    test.check(&PieceReply::Recorded { incarnation: 1, duplicate: true });
+    test.check(&PieceReply::Refused { incarnation: 1, reason: text() });
 }

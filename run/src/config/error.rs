@@ -26,6 +26,8 @@ pub enum ConfigError {
     NoEnvironment(String),
     #[error("{field} is {value}, but must be {range}")]
     OutOfRange { field: &'static str, value: String, range: String },
+    #[error("{0} cannot go on with practice: its update needs the dataset's own episodes")]
+    NoPractice(&'static str),
     #[error("{steps} steps with an evaluation every {interval} are {evaluations} evaluations")]
     Evaluations { steps: u64, interval: u64, evaluations: u64, most: u64 },
     #[error("algorithm {algorithm}")]
@@ -41,6 +43,9 @@ impl ConfigError {
             Self::Preset { source, .. } => source.hint(),
             Self::NoEnvironment(_) => {
                 "begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks".to_owned()
+            }
+            Self::NoPractice(_) => {
+                "leave out --online-steps, or choose an algorithm with a table [online] in `learner presets TASK`".to_owned()
             }
             Self::Evaluations { most, .. } => {
                 format!("choose a larger eval_interval, for at most {most}")

@@ -8,6 +8,7 @@ use toml::Value;
 
 use super::error::ConfigError;
 use super::hyperparameters;
+use super::online::Online;
 use super::schedule::Schedule;
 
 /// Upper bounds, far above any use; each evaluation keeps a snapshot.
@@ -36,7 +37,7 @@ pub struct Experiment {
     /// which episodes these are.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub hold_out: f64,
-    /// Gradient steps.
+    /// Gradient steps on the dataset alone.
     pub steps: u64,
     /// Gradient steps between two evaluations; 0 turns evaluations off.
     pub eval_interval: u64,
@@ -51,6 +52,9 @@ pub struct Experiment {
     pub precision: Precision,
     /// Name of the learning algorithm.
     pub algorithm: String,
+    /// Practice that follows these steps; `None` without any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub online: Option<Online>,
     /// Hyper-parameters of the algorithm.
     pub agent: Hyperparameters,
 }
@@ -92,26 +96,37 @@ impl Experiment {
         Ok(method)
     }
 
+    /// Gradient steps of the whole run.
+    pub fn total_steps(&self) -> u64 {
+        self.steps.saturating_add(self.online.as_ref().map_or(0, Online::updates))
+    }
+
     /// The gradient steps and evaluations.
     pub fn schedule(&self) -> Schedule {
-        Schedule { steps: self.steps, eval_interval: self.eval_interval }
+        Schedule { steps: self.total_steps(), eval_interval: self.eval_interval }
     }
 
     /// The values that distinguish runs, in one line.
     pub fn summary(&self) -> Result<String, ConfigError> {
-        let Self { steps, eval_interval, episodes, seed, batch_size, .. } = self;
+        let Self { steps, eval_interval, episodes, seed, batch_size, online, .. } = self;
         let method = self.method()?;
         let evaluations = match eval_interval {
             0 => "no evaluations".to_owned(),
             _ => format!("{episodes} episodes every {eval_interval}"),
         };
-        Ok(format!("{method}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}"))
+        let online = online.as_ref().map_or(String::new(), |online| {
+            let Online { steps, updates_per_step, .. } = online;
+            format!(", then {steps} environment steps with {updates_per_step} each")
+        });
+        Ok(format!(
+            "{method}; seed {seed}, {steps} steps of batch {batch_size}{online}; {evaluations}"
+        ))
     }
 
     /// Checks the numbers that are no hyper-parameters.
     pub(crate) fn check_ranges(&self) -> Result<(), ConfigError> {
         for (field, value, least, most) in [
-            ("steps", self.steps, 1, MOST),
+            ("steps", self.steps, u64::from(self.online.is_none()), MOST),
             ("eval_interval", self.eval_interval, 0, MOST),
             ("seed", self.seed, 0, MOST),
             ("episodes", self.episodes.into(), 1, MOST_EPISODES),
@@ -122,6 +137,7 @@ impl Experiment {
                 return Err(ConfigError::OutOfRange { field, value, range });
             }
         }
+        self.online.as_ref().map_or(Ok(()), Online::check_ranges)?;
         if !(0.0..1.0).contains(&self.hold_out) {
             let (value, range) = (self.hold_out.to_string(), "at least 0 and below 1".to_owned());
             return Err(ConfigError::OutOfRange { field: "hold_out", value, range });
@@ -130,8 +146,9 @@ impl Experiment {
     }
 
     pub(super) fn check(&mut self) -> Result<(), ConfigError> {
+        self.online.take_if(|online| online.steps == 0);
         self.check_ranges()?;
-        let (steps, interval) = (self.steps, self.eval_interval);
+        let (steps, interval) = (self.total_steps(), self.eval_interval);
         let evaluations = self.schedule().evaluations();
         if evaluations > MOST_EVALUATIONS {
             let most = MOST_EVALUATIONS;

@@ -2,13 +2,14 @@
 //!
 //! In reading order: `tasks`; `hyperparameters`, an algorithm's values for them; `presets`, a task
 //! or a file; `experiment`, all of that resolved; `run_config`, the contents of `config.toml`;
-//! `schedule`, the evaluated steps; `settings`, which compares runs key by key.
+//! `online`, practice; `schedule`, the evaluated steps; `settings`, which compares runs key by key.
 
 mod device;
 mod error;
 mod experiment;
 pub mod hyperparameters;
 mod nearest;
+mod online;
 pub mod presets;
 mod run_config;
 mod schedule;
@@ -20,6 +21,7 @@ pub use device::Device;
 pub use error::ConfigError;
 pub use experiment::Experiment;
 pub use nearest::did_you_mean;
+pub use online::Online;
 pub use presets::{Preset, resolve};
 pub use run_config::{DatasetInfo, RunConfig, RunInfo};
 pub use schedule::Schedule;

@@ -15,6 +15,9 @@ use super::hyperparameters;
 use super::tables::merge;
 use super::tasks::{self, Task};
 
+/// A key below `[online]` that algorithms which can learn from practice have.
+const REQUIRED: &str = "updates_per_step";
+
 /// A task, or a file that may change one.
 pub struct Preset {
     /// The task's name, or the file's without folder and extension; part of the names of runs.
@@ -62,6 +65,9 @@ impl Preset {
             merge(&mut table, keys.clone());
         }
         table.insert("algorithm".to_owned(), definition.name.into());
+        if table.get("online").is_some_and(|online| online.get(REQUIRED).is_none()) {
+            return Err(ConfigError::NoPractice(definition.name));
+        }
         let Some(environment) = table.get("environment") else {
             return Err(ConfigError::NoEnvironment(preset.clone()));
         };

@@ -62,7 +62,8 @@ impl RunReport {
             Spread::of(&scores).map(|spread| spread.mean)
         };
         let last = |count: usize| mean(&complete[complete.len().checked_sub(count)?..]);
-        let final_steps = experiment.steps.checked_sub(FINAL_STEPS).filter(|start| *start > 0);
+        let final_steps =
+            experiment.total_steps().checked_sub(FINAL_STEPS).filter(|start| *start > 0);
         let in_final_steps =
             |start| mean(&complete[complete.partition_point(|e| e.step <= start)..]);
         let normalized = environment::find(&experiment.environment).is_ok();
@@ -75,7 +76,7 @@ impl RunReport {
             variant: experiment.variant()?.to_owned(),
             agent: experiment.method()?,
             seed: experiment.seed,
-            steps: experiment.steps,
+            steps: experiment.total_steps(),
             normalized,
             own_score: !normalized && lines.iter().any(|line| line.score != line.episode_return),
             scored_in: joined(&precisions),

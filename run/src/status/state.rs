@@ -32,8 +32,8 @@ impl State {
     /// State of the run of a report.
     pub fn of(report: &RunReport) -> Result<Self, RunDirError> {
         let (dir, experiment) = (RunDir::at(&report.dir), &report.config.experiment);
-        let trained =
-            experiment.eval_interval > 0 || dir.snapshots()?.last() == Some(&experiment.steps);
+        let trained = experiment.eval_interval > 0
+            || dir.snapshots()?.last() == Some(&experiment.total_steps());
         let step = || rows(dir.path()).last().map_or(0, |row| row.step);
         Ok(match (report.is_complete() && trained, dir.failure()) {
             (true, _) => Self::Complete,

@@ -1,0 +1,182 @@
+//! Experience: an evaluator delivers the rows of practice episodes, the learner acknowledges them.
+//!
+//! An [`Episode`] is one frame, which travels in pieces, because a learner takes small messages
+//! only. The hash of the frame names the episode, so pieces of two evaluators that have played the
+//! same episode fit together, and bits that differ are noticed.
+
+use bincode::{Decode, Encode};
+
+use crate::codec::{CodecError, LARGE, Message};
+use crate::hash::Hash;
+use crate::name::Name;
+use crate::score::EpisodeScore;
+
+/// A practice episode of n steps.
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+pub struct Episode {
+    /// Gradient step of the snapshot that acted.
+    pub step: u64,
+    /// Hash of the snapshot's file.
+    pub weights: Hash,
+    /// Seed, length n, return and score.
+    pub score: EpisodeScore,
+    /// True if the last step terminated the task; else it was cut off, and its next state has a
+    /// value.
+    pub terminated: bool,
+    /// `(n + 1) × o`, from the first observation to the one after the last step, in the
+    /// environment's units.
+    pub observations: Vec<f32>,
+    /// `n × a`, as they were taken.
+    pub actions: Vec<f32>,
+    /// `n`, as the environment gave them.
+    pub rewards: Vec<f32>,
+    /// Steps whose action a person took in place of the policy, in ascending order.
+    pub interventions: Vec<u32>,
+}
+
+impl Episode {
+    /// Most steps of an episode.
+    pub const LONGEST: usize = 100_000;
+
+    /// Sizes of an observation and of an action.
+    pub fn dims(&self) -> (usize, usize) {
+        let n = self.rewards.len().max(1);
+        (self.observations.len() / (n + 1), self.actions.len() / n)
+    }
+}
+
+impl Message for Episode {
+    const KIND: u8 = 7;
+    const LIMIT: usize = LARGE;
+
+    fn verify(&self) -> Result<(), CodecError> {
+        let Self { score, observations, actions, rewards, interventions, .. } = self;
+        let n = rewards.len();
+        let malformed = |what: &str| Err(CodecError::Malformed(what.to_owned()));
+        if n == 0 || n > Self::LONGEST || n != score.length as usize {
+            return malformed("an episode's length is not the number of its rewards");
+        }
+        if !observations.len().is_multiple_of(n + 1) || !actions.len().is_multiple_of(n) {
+            return malformed("an episode's arrays have different lengths");
+        }
+        let sorted = interventions.is_sorted_by(|a, b| a < b);
+        if !sorted || interventions.last().is_some_and(|&last| last as usize >= n) {
+            return malformed("an episode's interventions are not among its steps");
+        }
+        let mut numbers = observations.iter().chain(actions).chain(rewards);
+        if !numbers.all(|number| number.is_finite()) {
+            return malformed("a number of an episode is not finite");
+        }
+        Ok(())
+    }
+}
+
+/// A piece of an episode's frame.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[allow(missing_docs)] // The names say it.
+pub struct Piece {
+    pub evaluator: Name,
+    pub run: Name,
+    /// The learner's incarnation when it handed the job out.
+    pub incarnation: u64,
+    /// [`Job::id`](crate::Job::id).
+    pub job: u64,
+    /// Arithmetic of the policy, as in a [`ScoreReport`](crate::ScoreReport).
+    pub precision: Name,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Hash of the frame.
+    pub hash: Hash,
+    /// Bytes of the frame.
+    pub length: u32,
+    /// Bytes of the frame before this piece.
+    pub offset: u32,
+    pub bytes: Vec<u8>,
+}
+
+impl Piece {
+    /// Most bytes of the frame in one piece.
+    pub const MOST: usize = 28 << 10;
+}
+
+impl Message for Piece {
+    const KIND: u8 = 8;
+
+    fn verify(&self) -> Result<(), CodecError> {
+        let end = self.offset as usize + self.bytes.len();
+        let fits = (1..=Self::MOST).contains(&self.bytes.len()) && end <= self.length as usize;
+        let problem =
+            || CodecError::Malformed("a piece is empty, too large or beyond the end".to_owned());
+        fits.then_some(()).ok_or_else(problem)
+    }
+}
+
+/// The learner's answer to a [`Piece`], with the learner's incarnation.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[allow(missing_docs)] // The names say it.
+pub enum PieceReply {
+    /// The learner has this many bytes of the frame, and waits for the rest.
+    Continue { incarnation: u64, offset: u32 },
+    /// The episode is on the learner's disk. A duplicate was delivered before and counts once.
+    Recorded { incarnation: u64, duplicate: bool },
+    /// The episode is permanently refused.
+    Refused { incarnation: u64, reason: String },
+}
+
+impl PieceReply {
+    /// The incarnation of the learner that answers.
+    pub fn incarnation(&self) -> u64 {
+        match self {
+            Self::Continue { incarnation, .. }
+            | Self::Recorded { incarnation, .. }
+            | Self::Refused { incarnation, .. } => *incarnation,
+        }
+    }
+}
+
+impl Message for PieceReply {
+    const KIND: u8 = 9;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::codec::{decode, encode};
+
+    fn episode() -> Episode {
+        Episode {
+            step: 3,
+            weights: Hash::of(b"weights"),
+            score: EpisodeScore { seed: 7, episode_return: 3.0, length: 2, score: 3.0 },
+            terminated: true,
+            observations: vec![0.0, 0.1, 1.0, 1.1, 2.0, 2.1],
+            actions: vec![0.5, -0.5],
+            rewards: vec![1.0, 2.0],
+            interventions: vec![1],
+        }
+    }
+
+    #[test]
+    fn episodes_that_contradict_themselves_are_refused() {
+        assert_eq!(decode::<Episode>(&encode(&episode()).unwrap()).unwrap(), episode());
+        assert_eq!(episode().dims(), (2, 1));
+        let broken: [fn(&mut Episode); 7] = [
+            |it| it.rewards.clear(),
+            |it| it.score.length = 3,
+            |it| drop(it.observations.pop()),
+            |it| it.actions.push(0.0),
+            |it| it.interventions = vec![2],
+            |it| it.interventions = vec![1, 1],
+            |it| it.rewards[0] = f32::NAN,
+        ];
+        for spoil in broken {
+            let mut episode = episode();
+            spoil(&mut episode);
+            let frame = encode(&episode).unwrap();
+            assert!(
+                matches!(decode::<Episode>(&frame), Err(CodecError::Malformed(_))),
+                "{episode:?}"
+            );
+        }
+    }
+}

@@ -1,0 +1,77 @@
+//! Practice: the episodes that evaluators play for the learner to learn from.
+
+use serde::{Deserialize, Serialize};
+
+use super::error::ConfigError;
+
+/// Learning from practice, after the gradient steps on the dataset alone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Online {
+    /// Environment steps of practice; 0 turns practice off.
+    #[serde(default)]
+    pub steps: u64,
+    /// Gradient steps for each environment step, the update-to-data ratio.
+    pub updates_per_step: u32,
+    /// Environment steps before the first gradient step online.
+    pub warmup: u64,
+    /// True if actions during warm-up are uniform in [-1, 1] in place of the policy's.
+    pub uniform_warmup: bool,
+    /// Share of experience in each batch. Without it, batches are uniform over dataset and
+    /// experience together.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub share: Option<f64>,
+    /// Standard deviation of the normal noise on the policy's actions, which are within [-1, 1].
+    pub noise: f32,
+    /// Episodes that are in play or wait while the learner learns from those before them.
+    pub lag: u32,
+    /// Gradient steps between two snapshots that practice is played with.
+    pub snapshot_interval: u64,
+}
+
+impl Online {
+    /// Gradient steps online.
+    pub fn updates(&self) -> u64 {
+        self.updates_after(self.steps)
+    }
+
+    /// Gradient steps that go with the first `rows` environment steps.
+    pub fn updates_after(&self, rows: u64) -> u64 {
+        rows.min(self.steps).saturating_sub(self.warmup) * u64::from(self.updates_per_step)
+    }
+
+    /// Environment steps that the first `updates` gradient steps go with.
+    pub fn rows_at(&self, updates: u64) -> u64 {
+        self.warmup + updates.div_ceil(u64::from(self.updates_per_step))
+    }
+
+    pub(super) fn check_ranges(&self) -> Result<(), ConfigError> {
+        const MOST: u64 = 1_000_000_000;
+        for (field, value, least, most) in [
+            ("online.steps", self.steps, 0, MOST),
+            ("online.updates_per_step", self.updates_per_step.into(), 1, 1000),
+            (
+                "online.warmup",
+                self.warmup,
+                0,
+                self.steps.saturating_sub(1).max(MOST * u64::from(self.steps == 0)),
+            ),
+            ("online.lag", self.lag.into(), 1, 1000),
+            ("online.snapshot_interval", self.snapshot_interval, 1, MOST),
+        ] {
+            if !(least..=most).contains(&value) {
+                let (value, range) = (value.to_string(), format!("from {least} to {most}"));
+                return Err(ConfigError::OutOfRange { field, value, range });
+            }
+        }
+        for (field, value) in
+            [("online.share", self.share.unwrap_or(1.0)), ("online.noise", self.noise.into())]
+        {
+            if !(0.0..=1.0).contains(&value) {
+                let (value, range) = (value.to_string(), "from 0 to 1".to_owned());
+                return Err(ConfigError::OutOfRange { field, value, range });
+            }
+        }
+        Ok(())
+    }
+}
