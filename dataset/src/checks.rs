@@ -10,6 +10,17 @@ const ACTION_TOLERANCE: f32 = 1e-3;
 /// Share of discontinuous rows allowed. D4RL's replay buffers reach 0.001; shuffled rows nearly 1.
 const MOST_STRAYS: f64 = 0.01;
 
+/// Refuses a recording with a problem. Actions must be within [-1, 1] unless they are `normalized`.
+pub(crate) fn accept(
+    recording: &Recording,
+    environment: Option<&EnvironmentSpec>,
+    normalized: bool,
+) -> Result<(), Problem> {
+    let outside = if normalized { None } else { actions_outside(recording) };
+    let mut problems = problems(recording, environment).into_iter().chain(outside);
+    problems.next().map_or(Ok(()), Err)
+}
+
 /// Problems of a recording as data of an environment, most severe first.
 pub(crate) fn problems(
     recording: &Recording,

@@ -3,8 +3,9 @@
 //!
 //! # Layout
 //! `tables` has the known environments, benchmarks and datasets. `formats` reads each format into a
-//! `recording`, and writes files. `checks` refuses bad recordings, `warnings` reports suspicious
-//! ones, `normalize` scales them, `transitions` serves them. `inspect` prints a summary.
+//! `recording`, and writes files; `practice` is an episode that joins a dataset. `checks` refuses
+//! bad recordings, `warnings` reports suspicious ones, `normalize` scales them, `transitions` serves
+//! them. `inspect` prints a summary.
 
 #![deny(unsafe_code)]
 
@@ -13,6 +14,7 @@ mod error;
 mod formats;
 mod inspect;
 mod normalize;
+mod practice;
 mod recording;
 mod rounding;
 mod statistics;
@@ -22,12 +24,13 @@ mod warnings;
 
 pub use error::{DatasetError, Load, Problem};
 pub use formats::arrays::{Arrays, write_own};
-pub use formats::d4rl_writer::{D4rlWriter, Metadata};
+pub use formats::d4rl_writer::{D4rlWriter, Metadata, write_practice};
 pub use formats::hdf5_file::hdf5_library;
 pub use formats::recorded::{RecordedRows, Row, environments_of_its_sizes};
 pub use formats::{data_file, minari_folder, recorded_environment};
 pub use inspect::{Inspection, inspect};
 pub use normalize::Normalize;
+pub use practice::PracticeRows;
 pub use recording::Names;
 pub use tables::catalog::NamedDataset;
 pub use tables::environment::{EnvironmentSpec, UnknownEnvironment};
@@ -37,6 +40,6 @@ pub use tables::simulator::{Drive, Healthy, Noise, Planar, Recipe, Robot, Simula
 pub use tables::task::Task;
 pub use tables::{benchmarks, catalog, environment};
 pub use transitions::hold_out::HoldOut;
-pub use transitions::sampler::BatchSampler;
+pub use transitions::sampler::{BatchSampler, OnlineSampler};
 pub use transitions::statistics::Statistics;
 pub use transitions::{Batch, ReadOptions, Split, Transitions};

@@ -11,7 +11,7 @@ use crate::tables::environment::EnvironmentSpec;
 /// another episode, but its mask is 0.
 ///
 /// Missing `timeouts` follow from the environment's time limit. Stored `next_observations` serve
-/// only to check the order of the rows.
+/// only to check the order of the rows, and to know goals at which the episode ended.
 pub(super) fn read(
     file: &Hdf5File,
     environment: Option<&EnvironmentSpec>,
@@ -42,7 +42,7 @@ pub(super) fn read(
         false => None,
     };
     let stored: Option<&Vec<f32>> = unused_next_observations.as_ref();
-    Ok(Recording {
+    let mut recording = Recording {
         rounding: stored
             .map(|stored| Rounding::between(&observations.values, stored))
             .unwrap_or_default(),
@@ -51,7 +51,6 @@ pub(super) fn read(
         observations: observations.values,
         actions: actions.values,
         rewards: file.table("rewards", rows, 1)?,
-        unused_next_observations,
         kinds: timeouts.iter().enumerate().map(kind).collect(),
         ends: ends.collect(),
         terminals,
@@ -59,7 +58,14 @@ pub(super) fn read(
         timeouts,
         goal,
         ..Recording::default()
-    })
+    };
+    if let Some(stored) = unused_next_observations {
+        for row in 0..rows {
+            recording.ends[row] |= recording.terminals[row] && recording.jumps(&stored, row);
+        }
+        recording.unused_next_observations = Some(stored);
+    }
+    Ok(recording)
 }
 
 /// Rows at which an episode reaches `limit` steps, counted as in D4RL: from 0 after a timeout but

@@ -9,6 +9,7 @@ use hdf5::types::VarLenUnicode;
 use crate::error::{DatasetError, Problem};
 use crate::formats::new_file::{CHUNK_ROWS, Column, NewFile};
 use crate::formats::recorded::Row;
+use crate::practice::PracticeRows;
 use crate::tables::environment::EnvironmentSpec;
 
 /// Origin of the rows, stored under `metadata/`.
@@ -99,25 +100,11 @@ impl D4rlWriter {
     /// Writes the remaining rows and renames the file.
     pub fn finish(mut self, metadata: &Metadata) -> Result<(), DatasetError> {
         self.flush()?;
-        self.write_metadata(metadata).map_err(|source| self.file.failed(source))?;
+        write_metadata(&self.file, &self.environment.name, metadata)
+            .map_err(|source| self.file.failed(source))?;
         let Self { file, floats, flags, .. } = self;
         drop((floats, flags));
         file.finish()
-    }
-
-    fn write_metadata(&self, metadata: &Metadata) -> hdf5::Result<()> {
-        let text = |value: &str| VarLenUnicode::from_str(value).map_err(|error| error.to_string());
-        let group = self.file.hdf5.create_group("metadata")?;
-        group
-            .new_dataset::<VarLenUnicode>()
-            .create("algorithm")?
-            .write_scalar(&text(metadata.algorithm)?)?;
-        group
-            .new_dataset::<VarLenUnicode>()
-            .create("environment")?
-            .write_scalar(&text(&self.environment.name)?)?;
-        group.new_dataset::<i64>().create("iteration")?.write_scalar(&metadata.iteration)?;
-        group.new_dataset::<u64>().create("seed")?.write_scalar(&metadata.seed)
     }
 
     fn flush(&mut self) -> Result<(), DatasetError> {
@@ -137,4 +124,60 @@ impl<T: H5Type> Buffered<T> {
         self.buffer.clear();
         Ok(())
     }
+}
+
+fn write_metadata(file: &NewFile, environment: &str, metadata: &Metadata) -> hdf5::Result<()> {
+    let text = |value: &str| VarLenUnicode::from_str(value).map_err(|error| error.to_string());
+    let group = file.hdf5.create_group("metadata")?;
+    for (name, value) in [("algorithm", metadata.algorithm), ("environment", environment)] {
+        group.new_dataset::<VarLenUnicode>().create(name)?.write_scalar(&text(value)?)?;
+    }
+    group.new_dataset::<i64>().create("iteration")?.write_scalar(&metadata.iteration)?;
+    group.new_dataset::<u64>().create("seed")?.write_scalar(&metadata.seed)
+}
+
+/// Writes episodes of practice in an environment of these sizes of observation and action, without
+/// the simulator's state. Each comes with the steps, in ascending order, at which a person acted;
+/// if there are any, `infos/intervention` marks them. An existing file is replaced once the new one
+/// is complete.
+pub fn write_practice(
+    path: impl AsRef<Path>,
+    environment: &str,
+    (o, a): (usize, usize),
+    metadata: &Metadata,
+    episodes: &[(PracticeRows<'_>, &[u32])],
+) -> Result<(), DatasetError> {
+    let path = path.as_ref();
+    let [mut observations, mut actions, mut next_observations, mut rewards] =
+        [const { Vec::new() }; 4];
+    let [mut terminals, mut timeouts, mut interventions] = [const { Vec::new() }; 3];
+    for (rows, acted) in episodes {
+        let n = rows.steps(o, a).map_err(|problem| DatasetError::new(path, problem))?;
+        observations.extend_from_slice(&rows.observations[..n * o]);
+        actions.extend_from_slice(rows.actions);
+        next_observations.extend_from_slice(&rows.observations[o..]);
+        rewards.extend_from_slice(rows.rewards);
+        terminals.extend((1..=n).map(|step| step == n && rows.terminated));
+        timeouts.extend((1..=n).map(|step| step == n && !rows.terminated));
+        interventions.extend((0..n as u32).map(|step| acted.binary_search(&step).is_ok()));
+    }
+    let file = NewFile::create(path)?;
+    let write = || {
+        let floats = [observations, actions, next_observations, rewards];
+        for ((name, width), values) in
+            FLOATS.iter().zip([Some(o), Some(a), Some(o), None]).zip(&floats)
+        {
+            Column::create::<f32>(&file, name, width)?.append(values)?;
+        }
+        for (name, flags) in FLAGS.iter().zip([&terminals, &timeouts]) {
+            Column::create::<bool>(&file, name, None)?.append(flags)?;
+        }
+        if interventions.contains(&true) {
+            file.hdf5.create_group("infos")?;
+            Column::create::<bool>(&file, "infos/intervention", None)?.append(&interventions)?;
+        }
+        write_metadata(&file, environment, metadata)
+    };
+    write().map_err(|source| file.failed(source))?;
+    file.finish()
 }

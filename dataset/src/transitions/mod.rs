@@ -1,11 +1,13 @@
 //! Transitions (s, a, r, s', mask) of a dataset.
 
 pub mod hold_out;
+mod rows;
 pub mod sampler;
 pub mod statistics;
 
 use std::ops::Range;
 use std::path::Path;
+use std::sync::{PoisonError, RwLock, RwLockReadGuard};
 
 use quad_kernels::scaling::Scaling;
 
@@ -13,47 +15,17 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::formats::arrays::Arrays;
 use crate::normalize::{self, Normalize};
+use crate::practice::PracticeRows;
 use crate::recording::{Names, Recording};
 use crate::tables::environment::EnvironmentSpec;
 use crate::tables::maze::MazeTask;
 use crate::tables::reward::{RewardRule, RewardScaling};
 use crate::{checks, warnings};
 use hold_out::HoldOut;
+use rows::Rows;
 use statistics::Statistics;
 
-/// Bound at which actions are clipped, within the range of tanh policies.
-const ACTION_LIMIT: f32 = 1.0 - 1e-5;
-
-/// Mini-batch of B transitions.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Batch {
-    /// s, B × o.
-    pub observations: Vec<f32>,
-    /// a, B × a.
-    pub actions: Vec<f32>,
-    /// r, B.
-    pub rewards: Vec<f32>,
-    /// s', B × o.
-    pub next_observations: Vec<f32>,
-    /// 0 where the episode terminated, else 1; B.
-    pub masks: Vec<f32>,
-    /// Number of transitions, B.
-    pub size: usize,
-}
-
-impl Batch {
-    fn clear(&mut self) {
-        for array in [
-            &mut self.observations,
-            &mut self.actions,
-            &mut self.rewards,
-            &mut self.next_observations,
-            &mut self.masks,
-        ] {
-            array.clear();
-        }
-    }
-}
+pub use rows::Batch;
 
 /// Options of [`Transitions::read`].
 #[derive(Clone, Copy, Debug, Default)]
@@ -69,7 +41,7 @@ pub struct ReadOptions {
     pub normalize: Normalize,
 }
 
-/// Immutable transitions for training, in recorded order.
+/// Transitions for training: those of a dataset, in recorded order, and experience that grows.
 ///
 /// The source's rows stay in place: transition i starts in row i and leads to row i + 1, unless the
 /// format stores next observations.
@@ -77,23 +49,17 @@ pub struct ReadOptions {
 /// An episode ends at a terminal, including a goal after which the recording continues, at a
 /// timeout, and at a discontinuity. Rows without a transition (D4RL's timeouts) belong to no
 /// episode, but provide the previous row's next action.
+///
+/// Indices below [`len`](Self::len) are the dataset's, those from there on experience, in the order
+/// in which it was added. Statistics, scaling and episodes stay those of the dataset.
 pub struct Transitions {
-    observation_dim: usize,
-    action_dim: usize,
-    /// N × o, scaled; so are `next_observations`.
-    observations: Vec<f32>,
-    /// N × a, scaled and clipped.
-    actions: Vec<f32>,
-    rewards: Vec<f32>,
-    next_observations: Option<Vec<f32>>,
-    terminals: Vec<bool>,
-    /// Rows that start a transition.
-    rows: Vec<u32>,
-    goes_on: Vec<bool>,
+    dataset: Rows,
+    experience: RwLock<Rows>,
     /// True after the goal was reached in the recorded episode.
     past_goal: Vec<bool>,
     statistics: Statistics,
     warnings: Vec<String>,
+    reward: RewardScaling,
     scaling: Scaling,
     names: Names,
 }
@@ -146,11 +112,7 @@ impl Transitions {
         hold_out: HoldOut<'_>,
     ) -> Result<Split, Problem> {
         let ReadOptions { environment, reward, normalize, .. } = *options;
-        let problems = checks::problems(&recording, environment);
-        let outside = if normalize.actions { None } else { checks::actions_outside(&recording) };
-        if let Some(problem) = problems.into_iter().chain(outside).next() {
-            return Err(problem);
-        }
+        checks::accept(&recording, environment, normalize.actions)?;
         let (recording, held_out, episodes) = match hold_out.is_none() {
             true => (recording, None, Vec::new()),
             false => {
@@ -165,63 +127,44 @@ impl Transitions {
             held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
         let warnings = warnings::warnings(&recording, normalize, reward);
         let training = Self { warnings, ..Self::new(recording, environment, rewards, scaling) };
-        Ok(Split {
-            training,
-            held_out: held_out.filter(|held_out| !held_out.rows.is_empty()),
-            episodes,
-        })
+        Ok(Split { training, held_out: held_out.filter(|held_out| held_out.len() > 0), episodes })
     }
 
     fn new(
         mut recording: Recording,
         environment: Option<&EnvironmentSpec>,
-        of_rewards: RewardScaling,
+        reward: RewardScaling,
         scaling: Scaling,
     ) -> Self {
-        let rows: Vec<u32> = recording.transitions().collect();
-        let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
-        let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
-        let past_goal = recording.past_goal();
-        normalize::apply(&scaling, &mut recording);
-        let Recording {
-            observation_dim, action_dim, observations, mut actions, mut rewards, ..
-        } = recording;
-        actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
-        rewards.iter_mut().for_each(|reward| {
-            *reward = of_rewards.apply(*reward) / scaling.rewards.unwrap_or(1.0)
-        });
+        let (episodes, past_goal) = (recording.episodes(), recording.past_goal());
+        let names = std::mem::take(&mut recording.names);
+        let dataset = Rows::new(recording, reward, &scaling);
         Self {
-            observation_dim,
-            action_dim,
-            observations,
-            actions,
-            rewards,
-            next_observations: recording.next_observations,
-            terminals: recording.terminals,
-            rows,
-            goes_on,
+            experience: RwLock::new(dataset.none()),
             past_goal,
-            statistics,
+            statistics: Statistics::new(environment, dataset.len(), &episodes),
             warnings: Vec::new(),
+            dataset,
+            reward,
             scaling,
-            names: recording.names,
+            names,
         }
     }
 
-    /// Number of transitions, at least 1.
+    /// Number of the dataset's transitions, at least 1.
     #[allow(clippy::len_without_is_empty)] // Never empty.
     pub fn len(&self) -> usize {
-        self.rows.len()
+        self.dataset.len()
     }
 
     /// Dimension of an observation.
     pub fn observation_dim(&self) -> usize {
-        self.observation_dim
+        self.dataset.observation_dim
     }
 
     /// Dimension of an action.
     pub fn action_dim(&self) -> usize {
-        self.action_dim
+        self.dataset.action_dim
     }
 
     /// Offsets and scales of the normalization; rewards are scaled after the reward rule.
@@ -234,16 +177,15 @@ impl Transitions {
         &self.names
     }
 
-    /// Map of each dimension to mean 0 and standard deviation 1, or scale 0 if it is constant.
+    /// Map of each dimension of the dataset to mean 0 and standard deviation 1, or scale 0 if it is
+    /// constant.
     pub fn standard_units(&self) -> Scaling {
-        let counts = |row: usize| self.rows.binary_search(&(row as u32)).is_ok();
+        let Rows { observation_dim, action_dim, observations, actions, .. } = &self.dataset;
+        let counts = |row: usize| self.dataset.starts.binary_search(&(row as u32)).is_ok();
+        let units = |values, width| Some(normalize::standard_units(values, width, counts));
         Scaling {
-            observations: Some(normalize::standard_units(
-                &self.observations,
-                self.observation_dim,
-                counts,
-            )),
-            actions: Some(normalize::standard_units(&self.actions, self.action_dim, counts)),
+            observations: units(observations, *observation_dim),
+            actions: units(actions, *action_dim),
             rewards: None,
         }
     }
@@ -258,38 +200,63 @@ impl Transitions {
         &self.warnings
     }
 
-    /// Index of the next transition in the episode of `index < len()`.
+    /// Adds an episode of practice. Its rewards and numbers are transformed as the dataset's were;
+    /// what a dataset would be refused for is an error.
+    pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<(), Problem> {
+        let recording = episode.recording(self.observation_dim(), self.action_dim())?;
+        checks::accept(&recording, None, self.scaling.actions.is_some())?;
+        let rows = Rows::new(recording, self.reward, &self.scaling);
+        self.experience.write().unwrap_or_else(PoisonError::into_inner).extend(rows);
+        Ok(())
+    }
+
+    /// Number of transitions of experience.
+    pub fn experience_len(&self) -> usize {
+        self.experience().len()
+    }
+
+    /// Index range of each episode that was added.
+    pub fn experience_episodes(&self) -> Vec<Range<u32>> {
+        let len = self.len() as u32;
+        let of_all = |episode: Range<u32>| len + episode.start..len + episode.end;
+        self.experience().episodes().into_iter().map(of_all).collect()
+    }
+
+    fn experience(&self) -> RwLockReadGuard<'_, Rows> {
+        self.experience.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Index of the next transition in the episode of `index`.
     pub fn next(&self, index: u32) -> Option<u32> {
-        let row = self.rows[index as usize];
-        let is_next = self.rows.get(index as usize + 1) == Some(&(row + 1));
-        (is_next && self.goes_on[row as usize]).then_some(index + 1)
+        match self.in_experience(index) {
+            None => self.dataset.next(index),
+            Some(place) => self.experience().next(place).map(|_| index + 1),
+        }
     }
 
     /// Next action a', taken in s'. Unlike [`next`](Self::next), it includes steps without a
     /// transition.
-    pub fn next_action(&self, index: u32) -> Option<&[f32]> {
-        let row = self.rows[index as usize] as usize;
-        let next = (row + 1) * self.action_dim..(row + 2) * self.action_dim;
-        self.goes_on[row].then(|| &self.actions[next])
+    pub fn next_action(&self, index: u32) -> Option<Vec<f32>> {
+        let action = |rows: &Rows, place| rows.next_action(place).map(<[f32]>::to_vec);
+        match self.in_experience(index) {
+            None => action(&self.dataset, index),
+            Some(place) => action(&self.experience(), place),
+        }
     }
 
-    /// Index range of each episode; together they cover all transitions.
+    fn in_experience(&self, index: u32) -> Option<u32> {
+        index.checked_sub(self.len() as u32)
+    }
+
+    /// Index range of each of the dataset's episodes; together they cover all its transitions.
     pub fn episodes(&self) -> Vec<Range<u32>> {
-        let mut episodes = Vec::new();
-        let mut start = 0;
-        for index in 0..self.rows.len() as u32 {
-            if self.next(index).is_none() {
-                episodes.push(start..index + 1);
-                start = index + 1;
-            }
-        }
-        episodes
+        self.dataset.episodes()
     }
 
     /// [`Self::episodes`] that start a recorded episode; the recording may continue after a goal.
     pub fn recorded_episodes(&self) -> Vec<Range<u32>> {
-        let is_past =
-            |episode: &Range<u32>| self.past_goal[self.rows[episode.start as usize] as usize];
+        let first = |episode: &Range<u32>| self.dataset.starts[episode.start as usize];
+        let is_past = |episode: &Range<u32>| self.past_goal[first(episode) as usize];
         self.episodes().into_iter().filter(|episode| !is_past(episode)).collect()
     }
 
@@ -301,24 +268,18 @@ impl Transitions {
         self.episodes().into_iter().flat_map(starts).collect()
     }
 
-    /// Copies the transitions at `indices` (below [`len`](Self::len)) into `batch`.
+    /// Copies the transitions at `indices` into `batch`.
     pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
-        let (o, a) = (self.observation_dim, self.action_dim);
+        let experience = self.experience();
         batch.clear();
         batch.size = indices.len();
-        batch.observations.reserve(batch.size * o);
-        batch.next_observations.reserve(batch.size * o);
+        batch.observations.reserve(batch.size * self.observation_dim());
+        batch.next_observations.reserve(batch.size * self.observation_dim());
         for &index in indices {
-            let row = self.rows[index as usize] as usize;
-            batch.observations.extend_from_slice(&self.observations[row * o..(row + 1) * o]);
-            batch.actions.extend_from_slice(&self.actions[row * a..(row + 1) * a]);
-            batch.rewards.push(self.rewards[row]);
-            let next = match &self.next_observations {
-                Some(next_observations) => &next_observations[row * o..(row + 1) * o],
-                None => &self.observations[(row + 1) * o..(row + 2) * o],
-            };
-            batch.next_observations.extend_from_slice(next);
-            batch.masks.push(if self.terminals[row] { 0.0 } else { 1.0 });
+            match self.in_experience(index) {
+                None => self.dataset.copy_to(batch, index),
+                Some(place) => experience.copy_to(batch, place),
+            }
         }
     }
 }

@@ -1,10 +1,11 @@
-//! Sampling of mini-batches without replacement.
+//! Sampling of mini-batches: of a dataset without replacement, of a dataset and experience with it.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Distinguishes this random stream from others of the run's seed.
+/// Distinguish these random streams from others of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"batches ");
+const ONLINE: u64 = u64::from_be_bytes(*b"online  ");
 
 /// Shuffled epochs, in an order that depends on seed and epoch only. Batches may span two epochs.
 pub struct BatchSampler {
@@ -68,6 +69,43 @@ impl BatchSampler {
     }
 }
 
+/// Batches of a dataset and experience, uniform with replacement.
+pub struct OnlineSampler {
+    seed: u64,
+    share: Option<f64>,
+    indices: Vec<u32>,
+}
+
+impl OnlineSampler {
+    /// Sampler of `batch_size` transitions: with a `share`, round(share · batch size) of them are
+    /// experience, after those of the dataset; without, all are of both together.
+    pub fn new(batch_size: usize, share: Option<f64>, seed: u64) -> Self {
+        Self { seed, share, indices: vec![0; batch_size] }
+    }
+
+    /// Indices of the batch of gradient step `step`, out of `len` transitions of the dataset and
+    /// `experience` that follow them. Nothing but these and the arguments of [`new`](Self::new)
+    /// decides.
+    ///
+    /// # Panics
+    /// If `experience` is 0, but has a share.
+    pub fn items(&mut self, step: u64, len: usize, experience: usize) -> &[u32] {
+        let mut generator = ChaCha8Rng::seed_from_u64(self.seed ^ ONLINE);
+        generator.set_stream(step);
+        let [len, all] = [len as u32, (len + experience) as u32];
+        let size = self.indices.len();
+        let shared = self.share.map(|share| size - (share * size as f64).round() as usize);
+        for (i, index) in self.indices.iter_mut().enumerate() {
+            *index = generator.random_range(match shared {
+                None => 0..all,
+                Some(first) if i < first => 0..len,
+                Some(_) => len..all,
+            });
+        }
+        &self.indices
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -108,5 +146,40 @@ mod tests {
         (0..10_000).for_each(|seed| counts[passes(10, seed, 1)[0] as usize] += 1);
         // Binomial(10000, 0.1): standard deviation 30.
         assert!(counts.iter().all(|count| (850..1150).contains(count)), "{counts:?}");
+    }
+
+    #[test]
+    fn batches_online_depend_on_their_arguments_alone() {
+        let batch = |seed, step, experience| {
+            OnlineSampler::new(64, None, seed).items(step, 1000, experience).to_vec()
+        };
+        let mut sampler = OnlineSampler::new(64, None, 3);
+        let forward = [1, 2, 3].map(|step| sampler.items(step, 1000, 50).to_vec());
+        let backward = [3, 2, 1].map(|step| sampler.items(step, 1000, 50).to_vec());
+        assert!(forward.iter().eq(backward.iter().rev()));
+        assert_eq!(forward[1], batch(3, 2, 50));
+        let others = [batch(4, 2, 50), batch(3, 2, 51), forward[0].clone()];
+        assert!(others.iter().all(|other| *other != forward[1]));
+    }
+
+    #[test]
+    fn batches_online_are_uniform_within_each_part() {
+        for (share, expected) in [(Some(0.5), [12_800, 12_800]), (None, [19_200, 6_400])] {
+            let mut counts = [0; 40];
+            let mut sampler = OnlineSampler::new(256, share, 7);
+            for step in 0..100 {
+                for index in sampler.items(step, 30, 10) {
+                    counts[*index as usize] += 1;
+                }
+            }
+            for (part, expected) in [&counts[..30], &counts[30..]].into_iter().zip(expected) {
+                let (total, each) = (part.iter().sum::<i32>(), expected / part.len() as i32);
+                assert!(share.is_none() || total == expected, "{share:?}: {total}");
+                // Binomial: a standard deviation of at most 36.
+                assert!(part.iter().all(|n| (n - each).abs() < 150), "{share:?}: {counts:?}");
+            }
+        }
+        let batch = OnlineSampler::new(5, Some(0.3), 1).items(0, 30, 10).to_vec();
+        assert_eq!(batch.iter().filter(|index| **index >= 30).count(), 2, "0.3 · 5 is rounded");
     }
 }

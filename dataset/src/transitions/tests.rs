@@ -1,3 +1,5 @@
+use quad_kernels::scaling::Affine;
+
 use super::*;
 use crate::recording::RowKind::{Dropped, LastState, Transition};
 use crate::recording::tests::recording;
@@ -46,7 +48,7 @@ fn the_last_state_of_an_episode_is_no_step() {
     recording.ends[3] = true;
     let transitions = transitions(recording);
     assert_eq!(transitions.episodes(), [0..2, 2..3]);
-    assert_eq!((transitions.next_action(0), transitions.next_action(1)), (Some(&[0.01][..]), None));
+    assert_eq!((transitions.next_action(0), transitions.next_action(1)), (Some(vec![0.01]), None));
 }
 
 #[test]
@@ -106,4 +108,60 @@ fn standard_units_are_of_the_rows_that_are_learned_from() {
         (affine.offset[0] - 0.026).abs() < 1e-6
             && (affine.scale[0] - 0.01 * 3.44_f32.sqrt()).abs() < 1e-6
     );
+}
+
+#[test]
+fn experience_follows_the_dataset_and_is_scaled_as_it_was() {
+    let mut recording = d4rl();
+    recording.ends[6] = true;
+    let reward = RewardRule::Subtract1.scaling(&[]).unwrap();
+    let actions = Affine { offset: vec![0.03], scale: vec![0.03] };
+    let scaling = Scaling { actions: Some(actions), observations: None, rewards: Some(2.0) };
+    let transitions = Transitions::new(recording, None, reward, scaling);
+    let episode = |observations, actions, rewards, terminated| {
+        transitions.add_episode(PracticeRows { observations, actions, rewards, terminated })
+    };
+    episode(&[10.0, 11.0, 12.0], &[0.045, 0.09], &[3.0, 5.0], false).unwrap();
+    episode(&[20.0, 21.0], &[0.0], &[1.0], true).unwrap();
+    assert_eq!((transitions.len(), transitions.experience_len()), (5, 3));
+    assert_eq!(transitions.episodes(), [0..2, 2..4, 4..5]);
+    assert_eq!(transitions.experience_episodes(), [5..7, 7..8]);
+    let next: Vec<_> = (4..8).map(|index| transitions.next(index)).collect();
+    assert_eq!(next, [None, Some(6), None, None]);
+    let limit = 1.0 - 1e-5;
+    let next: Vec<_> = (5..8).map(|index| transitions.next_action(index)).collect();
+    assert_eq!(next, [Some(vec![limit]), None, None]);
+    let mut batch = Batch::default();
+    transitions.gather(&[7, 1, 6, 5], &mut batch);
+    let expected = Batch {
+        observations: vec![20.0, 1.0, 11.0, 10.0],
+        actions: vec![-limit, -2.0 / 3.0, limit, 0.5],
+        rewards: vec![0.0, 0.0, 2.0, 1.0],
+        next_observations: vec![21.0, 2.0, 12.0, 11.0],
+        masks: vec![0.0, 1.0, 1.0, 1.0],
+        size: 4,
+    };
+    let apart = batch.actions.iter().zip(&expected.actions).map(|(a, b)| (a - b).abs());
+    assert!(apart.fold(0.0, f32::max) < 1e-6, "{batch:?}");
+    assert_eq!(batch, Batch { actions: batch.actions.clone(), ..expected });
+}
+
+#[test]
+fn experience_that_a_dataset_would_be_refused_for_is_refused() {
+    let transitions = transitions(d4rl());
+    let problem = |observations, actions, rewards| {
+        let episode = PracticeRows { observations, actions, rewards, terminated: true };
+        transitions.add_episode(episode).unwrap_err().to_string()
+    };
+    for (problem, expected) in [
+        (problem(&[0.0], &[], &[]), "0 rows, of which none"),
+        (problem(&[0.0], &[0.0], &[0.0]), "`observations` has 1 numbers, but 2 rows of 1 are 2"),
+        (problem(&[0.0; 2], &[0.0; 2], &[0.0]), "`actions` has 2 numbers, but 1 rows of 1 are 1"),
+        (problem(&[0.0, f32::NAN], &[0.0], &[0.0]), "`observations`, row 1: NaN is not"),
+        (problem(&[0.0; 2], &[0.0], &[f32::INFINITY]), "`rewards`, row 0: inf is not"),
+        (problem(&[0.0; 2], &[1.1], &[0.0]), "`actions`, row 0: the action 1.1 is outside"),
+    ] {
+        assert!(problem.contains(expected), "{problem}");
+    }
+    assert_eq!(transitions.experience_len(), 0);
 }

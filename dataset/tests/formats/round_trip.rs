@@ -1,9 +1,12 @@
 use std::fs;
 
-use quad_dataset::{D4rlWriter, Metadata, Problem, RecordedRows, Row};
+use quad_dataset::{
+    D4rlWriter, Metadata, PracticeRows, Problem, RecordedRows, RewardRule, Row, environment,
+    recorded_environment, write_practice,
+};
 use tempfile::tempdir;
 
-use crate::{hopper, peers};
+use crate::{all, hopper, peers, read};
 
 const ROWS: usize = 10_000;
 
@@ -107,4 +110,39 @@ fn a_row_that_would_spoil_the_file_is_refused_as_a_whole() {
     let recorded = RecordedRows::read(&path, hopper()).unwrap();
     assert_eq!(recorded.len(), 1);
     assert_eq!(recorded.row(0), good.row(0));
+}
+
+#[test]
+fn practice_is_read_as_it_was_played() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("practice.hdf5");
+    let numbers = |from: f32, count: usize| Vec::from_iter((0..count).map(|i| from + i as f32));
+    let (long, short, actions) = (numbers(0.0, 4 * 29), numbers(500.0, 3 * 29), vec![0.5; 3 * 8]);
+    let episode = |observations, rewards: &'static [f32], terminated| PracticeRows {
+        observations,
+        actions: &actions[..rewards.len() * 8],
+        rewards,
+        terminated,
+    };
+    let failed = (episode(&long, &[0.0; 3], false), &[0, 2][..]);
+    let reached = (episode(&short, &[0.0, 1.0], true), &[][..]);
+    let umaze = environment::find("antmaze-umaze").unwrap();
+    let episodes = [failed, reached, reached, failed];
+    write_practice(&path, &umaze.name, (29, 8), &METADATA, &episodes).unwrap();
+    assert_eq!(recorded_environment(&path).unwrap().as_deref(), Some("antmaze-umaze"));
+    let transitions = read(&path, Some(umaze), RewardRule::AsIs);
+    // Each truncated episode's last step makes no transition.
+    assert_eq!(transitions.recorded_episodes(), [0..2, 2..4, 4..6, 6..8]);
+    assert_eq!(transitions.statistics().score_mean, Some(50.0));
+    let batch = all(&transitions);
+    assert_eq!(batch.masks, [1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 1.0]);
+    assert_eq!(batch.observations[2 * 29..4 * 29], short[..2 * 29]);
+    assert_eq!(batch.next_observations[..2 * 29], long[29..3 * 29]);
+    let file = hdf5::File::open(&path).unwrap();
+    let marks = file.dataset("infos/intervention").unwrap().read_raw::<bool>().unwrap();
+    let marked = [true, false, true];
+    assert_eq!(marks, [&marked[..], &[false; 4], &marked].concat());
+
+    let error = write_practice(&path, "ant", (27, 8), &METADATA, &episodes).unwrap_err();
+    assert!(error.to_string().contains("`observations` has 116 numbers"), "{error}");
 }
