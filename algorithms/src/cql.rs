@@ -13,7 +13,7 @@ use super::squashed::{Normal, Squashed};
 use super::state_dict::StateDict;
 use candle_core::{Result, Tensor};
 use quad_nn::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Tensors, Weights};
-use quad_policy::PolicyConfig;
+use quad_policy::{GaussianPolicy, PolicyConfig};
 use serde::Deserialize;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -24,8 +24,6 @@ pub(super) const DEFINITION: Definition = Definition {
     read: |table| Ok(start(read(table)?, Cql::new)),
 };
 
-/// Bounds of log σ.
-const LOG_STD: (f32, f32) = (-20.0, 2.0);
 /// Factor of the last layers' initial weights.
 const LAST_LAYER: f64 = 0.01;
 /// Initial log α', and the largest α'.
@@ -97,7 +95,7 @@ impl Phases {
 
 networks! {
     struct Networks(config: &Config, init) {
-        actor: Squashed = Squashed::new(&config.actor, LOG_STD, init)?.with_map(
+        actor: Squashed = Squashed::new(&config.actor, GaussianPolicy::LOG_STD, init)?.with_map(
             [*config.log_std.multiplier, *config.log_std.offset],
             LAST_LAYER,
             init,

@@ -3,7 +3,7 @@
 
 use candle_core::{Result, Tensor};
 use quad_nn::{AdamStep, Ensemble, Gradients, MlpConfig, Tensors, Weights};
-use quad_policy::{GaussianPolicy, GaussianShape, PolicyConfig, gaussian_mean};
+use quad_policy::{GaussianPolicy, GaussianShape, PolicyConfig, Spread, gaussian_mean};
 
 use super::networks::{Initializer, TrainState};
 use super::state_dict::{StateDict, Stateful};
@@ -30,8 +30,7 @@ impl Gaussian {
 
     /// log π(a|s), `[B]`.
     pub fn log_probability(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
-        let log_std = self.log_std.values().clamp(LOG_STD.0, LOG_STD.1)?;
-        log_density(actions, &gaussian_mean(&self.mean, observations)?, &log_std)
+        log_density(actions, &gaussian_mean(&self.mean, observations)?, &self.log_std()?)
     }
 
     /// Moves mean and log σ down a loss `[]`.
@@ -42,9 +41,14 @@ impl Gaussian {
         Ok(())
     }
 
-    /// The policy that acts by the mean.
+    /// The policy that acts by the mean and explores by draws.
     pub fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        gaussian_policy(&self.mean)
+        gaussian_policy(&self.mean, Spread::Shared, Some(self.log_std()?.detach()))
+    }
+
+    /// log σ, `[a]`.
+    fn log_std(&self) -> Result<Tensor> {
+        self.log_std.values().clamp(LOG_STD.0, LOG_STD.1)
     }
 }
 
@@ -63,20 +67,27 @@ pub(super) fn log_density(actions: &Tensor, mean: &Tensor, log_std: &Tensor) -> 
     ((square * -0.5)?.broadcast_sub(log_std)? - half_log_2_pi)?.sum(1)
 }
 
-/// The policy that acts by the tanh of a network's output.
-pub(super) fn gaussian_policy(network: &Ensemble) -> Result<(PolicyConfig, Tensors)> {
+/// The policy that acts by the tanh of a network's output, in its first half with
+/// [`Spread::Squashed`]; with [`Spread::Shared`] `log_std` is its log σ, `[a]`.
+pub(super) fn gaussian_policy(
+    network: &Ensemble,
+    spread: Spread,
+    log_std: Option<Tensor>,
+) -> Result<(PolicyConfig, Tensors)> {
     let shape = network.shape();
+    let halves = if spread == Spread::Squashed { 2 } else { 1 };
     let shape = GaussianShape {
         observation_dim: shape.observation_dim,
-        action_dim: shape.outputs,
+        action_dim: shape.outputs / halves,
         actor: shape.layers.clone(),
+        spread,
     };
-    Ok((PolicyConfig::Gaussian { shape }, GaussianPolicy::tensors(network)?))
+    Ok((PolicyConfig::Gaussian { shape }, GaussianPolicy::tensors(network, log_std)?))
 }
 
 /// The policy that acts by the tanh of the first half of a network's output `[n, 2a]`.
 pub(super) fn first_half_policy(network: &Ensemble) -> Result<(PolicyConfig, Tensors)> {
-    let (mut policy, mut tensors) = gaussian_policy(network)?;
+    let (mut policy, mut tensors) = gaussian_policy(network, Spread::None, None)?;
     let a = network.shape().outputs / 2;
     if let PolicyConfig::Gaussian { shape } = &mut policy {
         shape.action_dim = a;

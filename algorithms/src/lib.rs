@@ -46,6 +46,7 @@ mod random;
 mod rebrac;
 mod replay;
 mod returns;
+mod rlpd;
 mod sfbc;
 mod squashed;
 mod state_dict;
@@ -79,6 +80,7 @@ pub const ALGORITHMS: &[Definition] = &[
     ivr::DEFINITION,
     onestep::DEFINITION,
     rebrac::DEFINITION,
+    rlpd::DEFINITION,
     sfbc::DEFINITION,
     td3bc::DEFINITION,
     xql::DEFINITION,

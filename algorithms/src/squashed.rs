@@ -4,9 +4,9 @@
 
 use candle_core::{Result, Tensor};
 use quad_nn::{AdamStep, Ensemble, Gradients, MlpConfig, Tensors, Weights};
-use quad_policy::PolicyConfig;
+use quad_policy::{PolicyConfig, Spread};
 
-use super::gaussian::first_half_policy;
+use super::gaussian::gaussian_policy;
 use super::networks::{Initializer, TrainState};
 use super::state_dict::{StateDict, Stateful};
 
@@ -68,9 +68,20 @@ impl Squashed {
         Ok(())
     }
 
-    /// The policy that acts by tanh(mean).
+    /// The policy that acts by tanh(mean) and explores by draws. c₁ and c₂ become part of the last
+    /// layer.
     pub fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        first_half_policy(&self.network)
+        let (policy, mut tensors) = gaussian_policy(&self.network, Spread::Squashed, None)?;
+        let Some(map) = &self.map else { return Ok((policy, tensors)) };
+        let (c, shape) = (map.values().detach().to_vec1::<f32>()?, self.network.shape());
+        let (a, last) = (shape.outputs / 2, format!(".{}.", shape.layers.hidden.len()));
+        for (name, tensor) in tensors.iter_mut().filter(|(name, _)| name.contains(&last)) {
+            let columns = tensor.rank() - 1;
+            let offset = if name.ends_with("bias") { c[1] } else { 0.0 };
+            let x = tensor.narrow(columns, a, a)?.affine(c[0].into(), offset.into())?;
+            *tensor = Tensor::cat(&[&tensor.narrow(columns, 0, a)?, &x], columns)?;
+        }
+        Ok((policy, tensors))
     }
 }
 

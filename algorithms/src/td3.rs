@@ -13,7 +13,7 @@ use super::networks::{Initializer, TWIN, WithTarget, networks};
 use super::state_dict::{StateDict, write};
 use candle_core::{DType, Result, Tensor};
 use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors};
-use quad_policy::{PolicyConfig, gaussian_mean};
+use quad_policy::{PolicyConfig, Spread, gaussian_mean};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use toml::Table;
@@ -169,7 +169,7 @@ impl<R: BcRegularizer> Algorithm for Td3<R> {
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        gaussian_policy(&self.networks.actor)
+        gaussian_policy(&self.networks.actor, Spread::None, None)
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {

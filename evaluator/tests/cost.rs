@@ -8,7 +8,7 @@ use candle_core::{DType, Device, Tensor};
 use quad_nn::{Attention, TrajectoryConfig};
 use quad_policy::{
     ActorCriticShape, Choice, DiffuserShape, DiffusionShape, GaussianShape, Header, MlpConfig,
-    PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, ValueGuidance, load_policy,
+    PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, Spread, ValueGuidance, load_policy,
 };
 
 /// Bytes that are not accounted for, such as the embedding of each denoising step.
@@ -53,6 +53,7 @@ fn gaussian(hidden: usize) -> PolicyConfig {
         observation_dim: OBSERVATION_DIM,
         action_dim: ACTION_DIM,
         actor: MlpConfig::mish(&[hidden; 3]),
+        spread: Spread::None,
     };
     PolicyConfig::Gaussian { shape }
 }

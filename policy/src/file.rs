@@ -56,9 +56,9 @@ pub enum PolicyConfig {
         /// Choice among the samples.
         choice: Choice,
     },
-    /// The mean of a Gaussian.
+    /// The mode of a Gaussian.
     Gaussian {
-        /// Shape of the network.
+        /// Shape of the network, and the distribution.
         shape: GaussianShape,
     },
     /// A choice among samples of a score network.
@@ -105,7 +105,10 @@ impl PolicyConfig {
                 add(ACTOR, OneStepActor::shape(shape).layout())?;
                 add(CRITIC, shape.critics().layout())?;
             }
-            Self::Gaussian { shape } => add(ACTOR, shape.actor().layout())?,
+            Self::Gaussian { shape } => {
+                add(ACTOR, shape.actor().layout())?;
+                shape.log_std().map(|log_std| add("", log_std)).transpose()?;
+            }
             Self::Score { shape, .. } => {
                 add(ACTOR, shape.actor().layout())?;
                 add(CRITIC, shape.critic().layout())?;

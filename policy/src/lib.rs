@@ -30,7 +30,7 @@ pub use file::{Header, PolicyConfig, load_policy, read_header, read_tensors, wri
 pub use kinds::actor_critic::ActorCriticShape;
 pub use kinds::diffuser::DiffuserPolicy;
 pub use kinds::diffusion::{DiffusionPolicy, DiffusionShape};
-pub use kinds::gaussian::{GaussianPolicy, GaussianShape, gaussian_mean};
+pub use kinds::gaussian::{GaussianPolicy, GaussianShape, Spread, gaussian_mean};
 pub use kinds::one_step::OneStepActor;
 pub use kinds::planner::{DiffuserShape, Planner, ValueGuidance, with_first_state};
 pub use kinds::score::{ScorePolicy, ScorePolicyShape};

@@ -57,6 +57,19 @@ pub trait Policy: Send + Sync {
         actions: &mut [f32],
     ) -> Result<(), PolicyError>;
 
+    /// Acts as [`Self::act`], but draws from the policy's distribution where that takes its mode.
+    ///
+    /// # Errors
+    /// As [`Self::act`].
+    fn explore(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError> {
+        self.act(observations, states, actions)
+    }
+
     /// Draws the candidates of n ≥ 1 states and their values. From equal states, [`Self::act`] takes
     /// one of these candidates, or the mean of some.
     ///

@@ -99,6 +99,17 @@ impl Policy for Scaled {
         Ok(())
     }
 
+    fn explore(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError> {
+        self.policy.explore(&self.observations(observations), states, actions)?;
+        self.to_user(actions);
+        Ok(())
+    }
+
     fn sample(
         &self,
         observations: &[f32],

@@ -19,6 +19,7 @@ POLICIES = {
     "dql": ["--algorithm", "dql", "--agent", "temperature=0.1"],
     "align-iql": ["--algorithm", "align-iql"],
     "iql": ["--algorithm", "iql"],
+    "cql": ["--algorithm", "cql"],
     "dtql": ["--algorithm", "dtql", "--agent", "critic={hidden=[24, 24], activation=\"mish\", norm=true, norm_epsilon=\"torch\"}",
              "--agent", "candidates=20", "--agent", "temperature=0.1"],
 }

@@ -156,8 +156,9 @@ class Reference:
         """The action for one observation in the user's units, with the candidates and their values, if any."""
         s = self.to_network("observations", observation)
         if self.kind == "gaussian":
-            # The file has the one network as an ensemble of one.
-            return self.to_user(np.tanh(self.mlp("actor.", self.shape["actor"], s[None])).reshape(-1)), None, None
+            # The file has the one network as an ensemble of one. Where it returns log σ, too, that comes last.
+            out = self.mlp("actor.", self.shape["actor"], s[None]).reshape(-1)[: self.shape["action_dim"]]
+            return self.to_user(np.tanh(out)), None, None
         choice = {**self.choice, **changes}
         drawn = self.draw(s, random, choice["candidates"])
         values = self.values(np.tile(s, (len(drawn), 1)), drawn, choice["aggregate"])

@@ -13,7 +13,7 @@ use quad_dataset::{
     Arrays, BatchSampler, Normalize, ReadOptions, RewardRule, Transitions, environment,
 };
 use quad_nn::Tensors;
-use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision};
+use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision, Spread};
 use quad_run::config::hyperparameters::algorithm as definition;
 use quad_run::config::{Schedule, resolve};
 use quad_run::folder::Checkpoint;
@@ -235,7 +235,8 @@ impl Algorithm for InPhases {
 
     fn policy(&self) -> candle_core::Result<(PolicyConfig, Tensors)> {
         let actor = MlpConfig::default();
-        let shape = GaussianShape { observation_dim: 1, action_dim: 1, actor };
+        let shape =
+            GaussianShape { observation_dim: 1, action_dim: 1, actor, spread: Spread::None };
         Ok((PolicyConfig::Gaussian { shape }, Tensors::new()))
     }
 

@@ -10,7 +10,7 @@ use libfuzzer_sys::fuzz_target;
 use quad_nn::{Affine, Layout, MlpConfig, Precision, Scaling};
 use quad_policy::{
     ActorCriticShape, Choice, DiffusionShape, GaussianShape, Header, PolicyConfig, Rule,
-    ScorePolicyShape, load_policy,
+    ScorePolicyShape, Spread, load_policy,
 };
 
 const STATES: usize = 2;
@@ -39,7 +39,9 @@ fn write_seeds() {
     };
     let score = ScorePolicyShape { observation_dim, action_dim, actor, critic, evaluations: 2 };
     let average = choice(Rule::Average { temperature: 0.5, actions: 2 });
-    let gaussian = GaussianShape { observation_dim, action_dim, actor: layers.clone() };
+    let gaussian = |spread| PolicyConfig::Gaussian {
+        shape: GaussianShape { observation_dim, action_dim, actor: layers.clone(), spread },
+    };
     let actions = Some(Affine { offset: vec![3.0], scale: vec![2.0] });
     let scaling = Some(Scaling { actions, ..Scaling::default() });
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus/weights");
@@ -50,7 +52,8 @@ fn write_seeds() {
         ("softmax", diffusion(softmax), None),
         ("squashed", PolicyConfig::Squashed { shape: squashed, choice: softmax }, None),
         ("score", PolicyConfig::Score { shape: score, choice: average }, None),
-        ("gaussian", PolicyConfig::Gaussian { shape: gaussian }, scaling),
+        ("gaussian", gaussian(Spread::Shared), scaling),
+        ("gaussian-squashed", gaussian(Spread::Squashed), None),
     ] {
         let halves = |layout: &Layout| Tensor::full(0.5f32, layout.count(), &Device::Cpu);
         let tensors = policy.tensors(halves).unwrap();

@@ -1,6 +1,7 @@
 //! Tests of the file of a policy.
 
 use super::*;
+use crate::kinds::gaussian::Spread;
 use crate::testing::{file_of, load};
 use quad_nn::MlpConfig;
 use std::fmt::Write;
@@ -39,7 +40,7 @@ fn a_header_that_is_too_long_is_not_read() {
 
 fn gaussian() -> Vec<u8> {
     let actor = MlpConfig::mish(&[4]);
-    let shape = GaussianShape { observation_dim: 3, action_dim: 1, actor };
+    let shape = GaussianShape { observation_dim: 3, action_dim: 1, actor, spread: Spread::None };
     file_of(PolicyConfig::Gaussian { shape }, None, |layout| vec![0.0; layout.count()])
 }
 

@@ -1,16 +1,40 @@
-//! The Gaussian policy, which acts by its mean: tanh of a network of the state.
+//! The Gaussian policy, which acts by its mode, tanh of a network of the state. If it has a
+//! distribution, it explores by draws from it.
 
 use crate::error::{PolicyError, check_numbers, check_range};
 use crate::policy::Policy;
 use crate::sampling::episode::EpisodeState;
 use candle_core::{Device, Result, Tensor};
 use quad_nn::{
-    Ensemble, EnsembleShape, MAX_DIM, MlpConfig, Precision, Tensors, Weighted, bytes, read,
+    Ensemble, EnsembleShape, Init, Layout, MAX_DIM, MlpConfig, Precision, TensorSpec, Tensors,
+    Weighted, bytes, read, take,
 };
 use serde::{Deserialize, Serialize};
 
 /// Prefix of the tensors' names.
 const ACTOR: &str = "actor.";
+/// Name of log σ, `[a]`, of [`Spread::Shared`].
+const LOG_STD: &str = "log_std";
+
+/// Distribution of a Gaussian policy's actions around its mode.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Spread {
+    /// There is none.
+    #[default]
+    None,
+    /// Normal with the mode as its mean and the same σ in all states, clipped to ±1.
+    Shared,
+    /// tanh(u) of a normal u. The network returns its mean, then its log σ, which is clipped to
+    /// −20 … 2.
+    Squashed,
+}
+
+impl Spread {
+    fn is_none(&self) -> bool {
+        *self == Self::None
+    }
+}
 
 /// The shape of a Gaussian policy's network.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -22,19 +46,31 @@ pub struct GaussianShape {
     pub action_dim: usize,
     /// The actor's hidden layers.
     pub actor: MlpConfig,
+    /// Distribution of actions.
+    #[serde(default, skip_serializing_if = "Spread::is_none")]
+    pub spread: Spread,
 }
 
 impl GaussianShape {
-    /// Shape of the actor, whose tanh is the mean.
+    /// Shape of the actor. The tanh of its first a outputs is the mode.
     pub fn actor(&self) -> EnsembleShape {
-        EnsembleShape::of_state(self.observation_dim, &self.actor, self.action_dim)
+        let outputs = self.action_dim * if self.spread == Spread::Squashed { 2 } else { 1 };
+        EnsembleShape::of_state(self.observation_dim, &self.actor, outputs)
+    }
+
+    /// Layout of log σ, `[a]`, of [`Spread::Shared`].
+    pub(crate) fn log_std(&self) -> Option<Layout> {
+        let spec = || TensorSpec::new(LOG_STD.to_owned(), &[self.action_dim], Init::Constant(0.0));
+        (self.spread == Spread::Shared).then(|| Layout::new(vec![spec()]))
     }
 }
 
-/// A policy that acts by the mean.
+/// A policy that acts by the mode.
 pub struct GaussianPolicy {
     shape: GaussianShape,
     actor: Ensemble,
+    /// log σ, `[a]`, of [`Spread::Shared`].
+    log_std: Option<Tensor>,
 }
 
 /// The mean actions, `[n, a]` in (−1, 1), for `observations [n, o]`.
@@ -43,9 +79,14 @@ pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> 
 }
 
 impl GaussianPolicy {
-    /// The tensors of a policy's file.
-    pub fn tensors(actor: &Ensemble) -> Result<Tensors> {
-        actor.weights().tensors(ACTOR)
+    /// Bounds of log σ in [`Spread::Squashed`].
+    pub const LOG_STD: (f32, f32) = (-20.0, 2.0);
+
+    /// The tensors of a policy's file; `log_std`, `[a]`, is of [`Spread::Shared`].
+    pub fn tensors(actor: &Ensemble, log_std: Option<Tensor>) -> Result<Tensors> {
+        let mut tensors = actor.weights().tensors(ACTOR)?;
+        tensors.extend(log_std.map(|log_std| (LOG_STD.to_owned(), log_std)));
+        Ok(tensors)
     }
 
     pub(crate) fn load(
@@ -55,7 +96,33 @@ impl GaussianPolicy {
         check_range("observation_dim", shape.observation_dim, MAX_DIM)?;
         check_range("action_dim", shape.action_dim, MAX_DIM)?;
         let actor = Ensemble::take(shape.actor(), tensors, ACTOR, Precision::F32)?;
-        Ok(Self { shape, actor })
+        let log_std =
+            shape.log_std().map(|_| take(tensors, LOG_STD.to_owned(), &[shape.action_dim]));
+        Ok(Self { log_std: log_std.transpose()?, shape, actor })
+    }
+
+    /// The network's outputs, `[n, a]` or `[n, 2a]`, for `observations`, n × o.
+    fn outputs(&self, observations: &[f32], n: usize) -> Result<Tensor> {
+        let shape = (n, self.shape.observation_dim);
+        let observations = Tensor::from_slice(observations, shape, &Device::Cpu)?;
+        self.actor.state_outputs(&observations)?.squeeze(0)
+    }
+
+    /// Actions `[n, a]` from the distribution, by standard normal noise `[n, a]`.
+    fn draw(&self, observations: &[f32], noise: &Tensor) -> Result<Tensor> {
+        let (n, a) = noise.dims2()?;
+        let out = self.outputs(observations, n)?;
+        let mean = out.narrow(1, 0, a)?;
+        if self.shape.spread == Spread::Squashed {
+            let std = out.narrow(1, a, a)?.clamp(Self::LOG_STD.0, Self::LOG_STD.1)?.exp()?;
+            return (mean + (noise * std)?)?.tanh();
+        }
+        match &self.log_std {
+            Some(log_std) => {
+                (mean.tanh()? + noise.broadcast_mul(&log_std.exp()?)?)?.clamp(-1f32, 1f32)
+            }
+            None => mean.tanh(),
+        }
     }
 }
 
@@ -75,7 +142,8 @@ impl Policy for GaussianPolicy {
     fn memory(&self, states: usize) -> u64 {
         let GaussianShape { observation_dim, action_dim, .. } = self.shape;
         let states = states as u128;
-        let numbers = states * (observation_dim + 2 * action_dim) as u128;
+        // Actions, and what exploring draws: noise, σ and their product.
+        let numbers = states * (observation_dim + 6 * action_dim) as u128;
         bytes(self.shape.actor().floats(states, 1) + numbers)
     }
 
@@ -85,10 +153,82 @@ impl Policy for GaussianPolicy {
         states: &mut [EpisodeState],
         actions: &mut [f32],
     ) -> std::result::Result<(), PolicyError> {
-        let shape = (states.len(), self.shape.observation_dim);
-        let observations = Tensor::from_slice(observations, shape, &Device::Cpu)?;
-        let means = gaussian_mean(&self.actor, &observations)?;
-        read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
+        let out = self.outputs(observations, states.len())?;
+        let modes = out.narrow(1, 0, self.shape.action_dim)?.tanh()?;
+        read(&modes, |modes: &[f32]| actions.copy_from_slice(modes))?;
         check_numbers("an action", actions)
+    }
+
+    fn explore(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> std::result::Result<(), PolicyError> {
+        let a = self.shape.action_dim;
+        let mut noise = vec![0.0; states.len() * a];
+        noise
+            .chunks_exact_mut(a)
+            .zip(states.iter_mut())
+            .for_each(|(x, state)| state.fill_normal(x));
+        let noise = Tensor::from_vec(noise, (states.len(), a), &Device::Cpu)?;
+        let drawn = self.draw(observations, &noise)?;
+        read(&drawn, |drawn: &[f32]| actions.copy_from_slice(drawn))?;
+        check_numbers("an action", actions)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::file::PolicyConfig;
+    use crate::testing::{act, file_of, load};
+    use quad_nn::Activation;
+
+    /// A policy of one number with the mean s/2 before the tanh. log σ is −1, or s.
+    fn policy(spread: Spread) -> Box<dyn Policy> {
+        let actor = MlpConfig { activation: Activation::Relu, ..MlpConfig::mish(&[2]) };
+        let shape = GaussianShape { observation_dim: 1, action_dim: 1, actor, spread };
+        // relu(x) − relu(−x) = x.
+        let first = [1.0, -1.0, 0.0, 0.0];
+        let (last, log_std): (&[f32], _) = match spread {
+            Spread::Squashed => (&[0.5, 1.0, -0.5, -1.0, 0.0, 0.0], vec![]),
+            _ => (&[0.5, -0.5, 0.0], vec![-1.0]),
+        };
+        let mut weights = [[&first[..], last].concat(), log_std].into_iter();
+        let policy = PolicyConfig::Gaussian { shape };
+        load(&file_of(policy, None, |_| weights.next().unwrap())).unwrap()
+    }
+
+    fn explored(policy: &dyn Policy, state: f32, noise: f32) -> f32 {
+        let mut action = [0.0];
+        policy
+            .explore(&[state], &mut [EpisodeState::with_noise(vec![noise])], &mut action)
+            .unwrap();
+        action[0]
+    }
+
+    #[test]
+    fn exploring_draws_from_the_distribution_around_the_mode() {
+        let mode = 0.25f32.tanh();
+        for (spread, expected) in [
+            (Spread::None, [mode, mode]),
+            (Spread::Shared, [mode + 0.4 * (-1f32).exp(), 1.0]),
+            (
+                Spread::Squashed,
+                [(0.25 + 0.4 * 0.5f32.exp()).tanh(), (0.25 + 9.0 * 0.5f32.exp()).tanh()],
+            ),
+        ] {
+            let policy = policy(spread);
+            assert!((act(&*policy, &[0.5], &[1]).unwrap()[0] - mode).abs() < 1e-6);
+            for (noise, expected) in [0.4, 9.0].into_iter().zip(expected) {
+                let found = explored(&*policy, 0.5, noise);
+                assert!((found - expected).abs() < 1e-6, "{spread:?}: {found} for {expected}");
+            }
+        }
+        // log σ is at most 2.
+        let found = explored(&*policy(Spread::Squashed), 40.0, -2.75);
+        assert!((found - (20.0 - 2.75 * 2f32.exp()).tanh()).abs() < 1e-5, "{found}");
     }
 }

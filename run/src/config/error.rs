@@ -26,6 +26,8 @@ pub enum ConfigError {
     NoEnvironment(String),
     #[error("{field} is {value}, but must be {range}")]
     OutOfRange { field: &'static str, value: String, range: String },
+    #[error("a run of 0 steps without practice learns nothing")]
+    NoSteps,
     #[error("{0} cannot go on with practice: its update needs the dataset's own episodes")]
     NoPractice(&'static str),
     #[error("{steps} steps with an evaluation every {interval} are {evaluations} evaluations")]
@@ -43,6 +45,9 @@ impl ConfigError {
             Self::Preset { source, .. } => source.hint(),
             Self::NoEnvironment(_) => {
                 "begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks".to_owned()
+            }
+            Self::NoSteps => {
+                "--steps N learns from the dataset alone, --online-steps N from practice too".to_owned()
             }
             Self::NoPractice(_) => {
                 "leave out --online-steps, or choose an algorithm with a table [online] in `learner presets TASK`".to_owned()

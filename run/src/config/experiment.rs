@@ -126,7 +126,7 @@ impl Experiment {
     /// Checks the numbers that are no hyper-parameters.
     pub(crate) fn check_ranges(&self) -> Result<(), ConfigError> {
         for (field, value, least, most) in [
-            ("steps", self.steps, u64::from(self.online.is_none()), MOST),
+            ("steps", self.steps, 0, MOST),
             ("eval_interval", self.eval_interval, 0, MOST),
             ("seed", self.seed, 0, MOST),
             ("episodes", self.episodes.into(), 1, MOST_EPISODES),
@@ -138,6 +138,9 @@ impl Experiment {
             }
         }
         self.online.as_ref().map_or(Ok(()), Online::check_ranges)?;
+        if self.total_steps() == 0 {
+            return Err(ConfigError::NoSteps);
+        }
         if !(0.0..1.0).contains(&self.hold_out) {
             let (value, range) = (self.hold_out.to_string(), "at least 0 and below 1".to_owned());
             return Err(ConfigError::OutOfRange { field: "hold_out", value, range });

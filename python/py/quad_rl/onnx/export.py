@@ -52,7 +52,7 @@ def model(policy: Policy, **changes: Any) -> ModelProto:
     observations = to_network(file, graph.input("observations", (policy.observation_size,)))
     inputs = {name: graph.input(name, array.shape[1:]) for name, array in drawn.items()}
     if file.kind == "gaussian":
-        return graph.model({"actions": (to_user(file, gaussian.mean(file, observations)), (a,))}, repr(policy))
+        return graph.model({"actions": (to_user(file, gaussian.mode(file, observations)), (a,))}, repr(policy))
     candidates, rule = choice["candidates"], choice["rule"]
     if file.kind == "planner":
         steps = file.shape["replan_every"]

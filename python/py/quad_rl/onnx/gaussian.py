@@ -1,9 +1,12 @@
-"""The Gaussian policy, which acts by its mean."""
+"""The Gaussian policy, which acts by its mode."""
 
 from quad_rl.onnx.file import File
 from quad_rl.onnx.graph import Value
 from quad_rl.onnx.mlp import of_states
 
 
-def mean(file: File, observations: Value) -> Value:
-    return observations.graph("Tanh", of_states(file, "actor.", file.shape["actor"], observations).at(0, 0))
+def mode(file: File, observations: Value) -> Value:
+    out = of_states(file, "actor.", file.shape["actor"], observations).at(0, 0)
+    if file.shape.get("spread") == "squashed":  # log σ follows
+        out = out.slice(1, 0, file.shape["action_dim"])
+    return observations.graph("Tanh", out)

@@ -1,0 +1,179 @@
+//! RLPD (Ball, Smith, Kostrikov and Levine 2023, "Efficient Online Reinforcement Learning with
+//! Offline Data"): soft actor-critic on batches that are half of the dataset, half of experience,
+//! with an ensemble of critics that have layer norm, and many updates for each environment step. It
+//! learns nothing before practice begins. Its update is its authors' code's.
+
+use super::algorithm::{Algorithm, Measured};
+use super::context::{Context, Minibatch};
+use super::definition::{Definition, Metric, Reporting, metrics, read, start};
+use super::error::{AgentError, check};
+use super::hyperparameters::{Count, Positive, Rate, Steps, UnitInterval};
+use super::losses::{Loss, measured, smallest};
+use super::networks::{Initializer, TrainState, WithTarget, networks};
+use super::squashed::Squashed;
+use super::state_dict::StateDict;
+use candle_core::{Result, Tensor};
+use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors, Weights};
+use quad_policy::{GaussianPolicy, PolicyConfig};
+use rand::seq::index::sample;
+use serde::Deserialize;
+use toml::Table;
+
+pub(super) const DEFINITION: Definition = Definition {
+    name: "rlpd",
+    presets: include_str!("../../presets/rlpd.toml"),
+    metrics: METRICS,
+    report: Reporting::PLAIN,
+    read: |table| Ok(start(Config::read(table)?, Rlpd::new)),
+};
+
+const METRICS: &[Metric] = &metrics! {
+    target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(min Q̂_k(s', a') − α·log π(a'|s')) over target_critics of them, drawn in each step, with a' from the policy; without the last term if entropy_backup is false.";
+    critic_loss ["critic loss"] held_out: "Mean over batch and critics of (Q_k(s, a) − y)².";
+    actor_loss ["actor loss"] held_out: "Mean over the batch of α·log π(a|s) − mean of Q_k(s, a) over all critics with a from the policy. Measured in the policy's steps.";
+    entropy ["entropy"] held_out: "−mean over the batch of log π(a|s) with a from the policy; α holds it at −(dimensions of an action)/2. Measured in the policy's steps.";
+    alpha: "α, the weight of the entropy, before its step. Measured in the policy's steps.";
+};
+
+/// RLPD's hyper-parameters: the `[agent]` table of a preset.
+#[derive(Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Config {
+    actor: MlpConfig,
+    critic: MlpConfig,
+    /// Ensemble size K.
+    critics: Count,
+    /// Critics of which the smallest value counts in the target, drawn anew in each step.
+    target_critics: Count,
+    /// Discount γ.
+    gamma: UnitInterval,
+    /// Reward the next action's entropy in the target.
+    entropy_backup: bool,
+    /// Weight α of the entropy at the first step.
+    temperature: Positive,
+    /// Learning rate of actor, critics and α.
+    learning_rate: Positive,
+    /// EMA rate of the target critics.
+    ema_rate: Rate,
+    /// Steps of the critics for each step of policy and α.
+    actor_every: Steps,
+}
+
+impl Config {
+    fn read(table: &Table) -> std::result::Result<Self, AgentError> {
+        let config: Self = read(table)?;
+        let (of, most) = (*config.target_critics, *config.critics);
+        check("target_critics", of, of <= most, "at most agent.critics")?;
+        Ok(config)
+    }
+}
+
+networks! {
+    struct Networks(config: &Config, init) {
+        actor: Squashed = Squashed::new(&config.actor, GaussianPolicy::LOG_STD, init),
+        critic: WithTarget<Ensemble> = init.critics(*config.critics, &config.critic),
+        /// log α, `[1]`.
+        log_alpha: TrainState<Weights> = init.numbers("value", &[config.temperature.ln()]),
+    }
+}
+
+/// The random numbers of one update.
+struct Noise {
+    /// Noise of the next actions in the target, `[B, 1, a]`.
+    next: Tensor,
+    /// Noise of the actions in the actor's loss, `[B, 1, a]`.
+    policy: Tensor,
+    /// Indices of the critics of the target.
+    critics: Tensor,
+}
+
+struct Rlpd {
+    config: Config,
+    context: Context,
+    networks: Networks,
+}
+
+impl Rlpd {
+    fn new(config: Config, context: Context) -> Result<Self> {
+        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
+        Ok(Self { config, context, networks })
+    }
+
+    fn noise(&self, step: u64) -> Result<Noise> {
+        let Config { critics, target_critics, .. } = self.config;
+        let (mut random, shape) =
+            (self.context.random(step), (self.context.batch_size, 1, self.context.action_dim()));
+        let next = random.normal("next_noise", shape)?;
+        let policy = random.normal("policy_noise", shape)?;
+        let critics = random.vector("target_critics", |generator| {
+            let drawn = sample(generator, *critics, *target_critics);
+            Ok(drawn.into_iter().map(|index| index as u32).collect())
+        })?;
+        Ok(Noise { next, policy, critics: Tensor::new(critics, &self.context.device)? })
+    }
+
+    /// α, `[1]`.
+    fn alpha(&self) -> Result<Tensor> {
+        self.networks.log_alpha.values().detach().exp()
+    }
+
+    /// Every critic toward r + γ·mask·(min Q̂_k(s', a') − α·log π(a'|s')).
+    fn critic_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+        let Networks { actor, critic, .. } = &self.networks;
+        let next = actor.constant_distribution(&batch.next_observations)?.draw(&noise.next)?;
+        let values = batch.next_values(&critic.target, &next.actions.squeeze(1)?)?;
+        let mut q = smallest(&values.index_select(&noise.critics, 0)?)?;
+        if self.config.entropy_backup {
+            q = (q - next.log_density.squeeze(1)?.broadcast_mul(&self.alpha()?)?)?;
+        }
+        batch.critic_loss(critic, &batch.target(*self.config.gamma, &q)?)
+    }
+
+    /// The policy toward large entropy and large Q by the mean of all critics; and its entropy, `[]`,
+    /// a constant.
+    fn actor_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<(Loss, Tensor)> {
+        let Networks { actor, critic, .. } = &self.networks;
+        let drawn = actor.distribution(&batch.observations)?.draw(&noise.policy)?;
+        let q = batch.values_at(&critic.detach(), &drawn.actions.squeeze(1)?)?.mean(0)?;
+        let (alpha, log_density) = (self.alpha()?, drawn.log_density.squeeze(1)?);
+        let entropy = log_density.detach().mean_all()?.neg()?;
+        let loss = (log_density.broadcast_mul(&alpha)? - q)?.mean_all()?;
+        let loss = Loss::new("actor_loss", loss).with("entropy", entropy.clone());
+        Ok((loss.with("alpha", alpha), entropy))
+    }
+}
+
+impl Algorithm for Rlpd {
+    /// The policy learns from the last of each `actor_every` batches, after the critics.
+    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+        let (rate, every) = (*self.config.learning_rate, *self.config.actor_every);
+        let mut losses = vec![self.critic_loss(&batch, &noise)?];
+        self.networks.critic.minimize(&losses[0].value, AdamStep::after(step, rate))?;
+        self.networks.critic.soft_update(*self.config.ema_rate)?;
+        if (step + 1).is_multiple_of(every) {
+            let (actor_loss, entropy) = self.actor_loss(&batch, &noise)?;
+            let adam = AdamStep::after(step / every, rate);
+            let excess = (entropy + 0.5 * self.context.action_dim() as f64)?;
+            let Networks { actor, log_alpha, .. } = &mut self.networks;
+            actor.minimize(&actor_loss.value, adam)?;
+            let alpha_loss = (log_alpha.values().exp()?.sum_all()? * excess)?;
+            log_alpha.minimize(&alpha_loss, adam)?;
+            losses.push(actor_loss);
+        }
+        measured(&losses)
+    }
+
+    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+        measured(&[self.critic_loss(&batch, &noise)?, self.actor_loss(&batch, &noise)?.0])
+    }
+
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        self.networks.actor.policy()
+    }
+
+    fn state_dict(&mut self) -> StateDict<'_> {
+        self.networks.state_dict()
+    }
+}
