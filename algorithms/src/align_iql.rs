@@ -17,7 +17,7 @@ use super::losses::{Loss, smallest};
 use super::networks::{TWIN, TrainState, state_value};
 use super::state_dict::StateDict;
 use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Reverse, Tensors, cosine_decay};
+use quad_nn::{AdamStep, Ensemble, MlpConfig, Reverse, Tensors};
 use quad_policy::{Aggregate, Choice, DiffusionPolicy, DiffusionShape, Rule};
 use serde::Deserialize;
 
@@ -38,7 +38,7 @@ pub(super) const METRICS: &[Metric] = &metrics! {
     critic_loss ["critic loss"] held_out: "Mean over critics and batch of (Q_k(s, a) − y)² (IQL's Eq. 6).";
     bc_loss ["BC loss"] held_out: "Mean over the batch of the sum over dimensions of (ε − ε_θ(a^t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
     advantage_mean held_out: "Mean over the batch of the advantage min_k Q̂_k(s, a) − V(s): AlignIQL's policy takes the sample for which it is closest to 0.";
-    learning_rate: "The actor's learning rate; falls to 0 along a cosine.";
+    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and stays there with practice.";
 };
 
 /// The hyper-parameters of AlignIQL and of IDQL: the `[agent]` table of a preset.
@@ -129,8 +129,9 @@ impl DiffusionUpdate for AlignIql {
         sampler.denoising()
     }
 
-    fn begin(&mut self, networks: &mut Networks, step: u64, total_steps: u64) -> Result<()> {
-        let (config, decay) = (&self.config, cosine_decay(step, total_steps));
+    fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
+        // IDQL's authors move only critics and V with practice.
+        let (config, decay) = (&self.config, context.decay(step, 0.0));
         let adam = |rate: f32| AdamStep::after(step, rate);
         networks.actor.adam.set_step(adam(*config.actor_learning_rate * decay))?;
         self.value.adam.set_step(adam(*config.value_learning_rate))?;

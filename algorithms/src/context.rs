@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::{Batch, Transitions};
-use quad_nn::{Ensemble, Precision};
+use quad_nn::{Ensemble, Precision, cosine_decay};
 
 use super::error::AlgorithmError;
 use super::inputs::Inputs;
@@ -42,6 +42,19 @@ impl Context {
     /// Size of an action, a.
     pub fn action_dim(&self) -> usize {
         self.transitions.action_dim()
+    }
+
+    /// The share of the updates with experience that come before update number `step`; `None` in
+    /// those on the dataset alone.
+    pub(super) fn online_share(&self, step: u64) -> Option<f64> {
+        let done = step.checked_sub(self.total_steps)?;
+        Some(done as f64 / self.online_steps.max(1) as f64)
+    }
+
+    /// A factor of learning rates that falls to 0 along a cosine in the updates on the dataset alone,
+    /// and is `online` in those with experience.
+    pub(super) fn decay(&self, step: u64, online: f32) -> f32 {
+        if step < self.total_steps { cosine_decay(step, self.total_steps) } else { online }
     }
 
     /// The random numbers of update number `step`.

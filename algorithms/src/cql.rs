@@ -1,9 +1,11 @@
 //! CQL (Kumar, Zhou, Tucker and Levine 2020, "Conservative Q-Learning for Offline Reinforcement
 //! Learning"): soft actor-critic whose critics are also pushed down at actions that the policy
-//! takes and up at those of the data, so that they do not overestimate the policy's value.
+//! takes and up at those of the data, so that they do not overestimate the policy's value. A run
+//! with practice is Cal-QL, which pushes values down no further than to the data's returns.
 //! Equations are that paper's; docs/deviations.md says which of several codes is followed.
 
 use super::algorithm::{Algorithm, Measured};
+use super::calibration::MonteCarlo;
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, start};
 use super::hyperparameters::{Count, Finite, Positive, Rate, Steps, UnitInterval};
@@ -33,7 +35,7 @@ const MOST_ALPHA_PRIME: f64 = 1e6;
 const METRICS: &[Metric] = &metrics! {
     target_q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', a') with a' from the policy; of several a' the best.";
     critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (the last term of CQL's Eq. 3).";
-    gap ["gap"] held_out: "Mean over batch and critics of log Σ exp Q_k(s, ·) − Q_k(s, a), which the critics also descend (CQL's Eq. 4); below 0 where the data's action is worth more than all others together.";
+    gap ["gap"] held_out: "Mean over batch and critics of log Σ exp Q_k(s, ·) − Q_k(s, a), which the critics also descend (CQL's Eq. 4); below 0 where the data's action is worth more than all others together. With practice the policy's actions count as worth at least the data's discounted return (Cal-QL).";
     actor_loss ["actor loss"] held_out: "Mean over the batch of α·log π(a|s) − min_k Q_k(s, a) with a from the policy; while the policy is cloned, −log π of the data's action is in the place of −min_k Q_k.";
     entropy ["entropy"] held_out: "−mean over the batch of log π(a|s) with a from the policy; α holds it at −(dimensions of an action).";
     alpha: "α, the weight of the entropy in the actor's loss, before its step.";
@@ -129,12 +131,23 @@ struct Cql {
     config: Config,
     context: Context,
     networks: Networks,
+    /// The lower bounds of Cal-QL, in a run with practice.
+    returns: Option<MonteCarlo>,
 }
 
 impl Cql {
     fn new(config: Config, context: Context) -> Result<Self> {
         let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
+        let returns = (context.online_steps > 0)
+            .then(|| MonteCarlo::new(&context.transitions, *config.gamma));
+        Ok(Self { config, context, networks, returns })
+    }
+
+    /// A batch, and the data's returns `[B]` from its transitions on, where they count.
+    fn batch(&self, indices: &[u32]) -> Result<(Minibatch, Option<Tensor>)> {
+        let returns =
+            self.returns.as_ref().map(|returns| returns.of(indices, &self.context.device));
+        Ok((self.context.batch(indices)?, returns.transpose()?))
     }
 
     fn noise(&self, step: u64) -> Result<Noise> {
@@ -180,13 +193,13 @@ impl Cql {
     /// log Σ exp Q_k(s, ·) − Q_k(s, a).
     fn critic_loss(
         &self,
-        batch: &Minibatch,
+        (batch, returns): &(Minibatch, Option<Tensor>),
         current: &Normal,
         next: &Normal,
         noise: &Noise,
     ) -> Result<(Loss, Tensor)> {
         let targets = self.targets(batch, next, &noise.target)?;
-        let (q, gaps) = self.gaps(batch, current, next, noise)?;
+        let (q, gaps) = self.gaps(batch, returns.as_ref(), [current, next], noise)?;
         let loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * TWIN as f64)?;
         let (loss, gap) = (Loss::of_critics(loss, &targets)?, gaps.mean_all()?);
         Ok((loss.with("gap", gap.clone()), gap))
@@ -213,12 +226,13 @@ impl Cql {
 
     /// Q_k(s, a) of the data's actions, and log Σ exp Q_k(s, ·) − Q_k(s, a): Eq. 4 with the sum
     /// over uniform actions and those of the policy at s and s', all at s, each divided by its
-    /// density (appendix F); `[K, B]` each.
+    /// density (appendix F); `[K, B]` each. The policy's actions count as worth at least the `returns`
+    /// (Cal-QL).
     fn gaps(
         &self,
         batch: &Minibatch,
-        current: &Normal,
-        next: &Normal,
+        returns: Option<&Tensor>,
+        [current, next]: [&Normal; 2],
         noise: &Noise,
     ) -> Result<(Tensor, Tensor)> {
         let (b, n, a) = noise.uniform.dims3()?;
@@ -233,7 +247,13 @@ impl Cql {
         let of_data = q.narrow(2, 0, 1)?.squeeze(2)?;
         let uniform = Tensor::full(-(a as f32) * 2f32.ln(), (b, n), q.device())?;
         let densities = Tensor::cat(&[&uniform, &next.log_density, &current.log_density], 1)?;
-        let corrected = q.narrow(2, 1, 3 * n)?.broadcast_sub(&densities)?;
+        let mut others = q.narrow(2, 1, 3 * n)?;
+        if let Some(returns) = returns {
+            let of_policy = others.narrow(2, n, 2 * n)?;
+            let bounded = of_policy.broadcast_maximum(&returns.reshape((1, b, 1))?)?;
+            others = Tensor::cat(&[&others.narrow(2, 0, n)?, &bounded], 2)?;
+        }
+        let corrected = others.broadcast_sub(&densities)?;
         let least = self.config.least_gap.map_or(f32::NEG_INFINITY, |least| *least);
         let gaps = (log_sum_exp(&corrected)? - &of_data)?.maximum(least)?;
         Ok((of_data, gaps))
@@ -266,13 +286,17 @@ fn log_sum_exp(x: &Tensor) -> Result<Tensor> {
 impl Algorithm for Cql {
     /// All losses are those of the networks before the update.
     fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+        if let Some(returns) = &mut self.returns {
+            returns.follow(&self.context.transitions);
+        }
+        let (whole, noise) = (self.batch(indices)?, self.noise(step)?);
+        let batch = &whole.0;
         let slow = AdamStep::after(step, *self.config.actor_learning_rate);
         let fast = AdamStep::after(step, *self.config.critic_learning_rate);
         let actor = &self.networks.actor;
         let current = actor.distribution(&batch.observations)?;
         let next = actor.constant_distribution(&batch.next_observations)?;
-        let (actor_loss, log_density) = self.actor_loss(step, &batch, &current, &noise)?;
+        let (actor_loss, log_density) = self.actor_loss(step, batch, &current, &noise)?;
         self.networks.actor.minimize(&actor_loss.value, slow)?;
         // α holds the entropy at −(dimensions of an action).
         let excess = (log_density - self.context.action_dim() as f64)?;
@@ -280,7 +304,7 @@ impl Algorithm for Cql {
         let alpha_loss = (log_alpha.values().sum_all()? * excess)?.neg()?;
         log_alpha.minimize(&alpha_loss, slow)?;
 
-        let (critic_loss, gap) = self.critic_loss(&batch, &current.detach(), &next, &noise)?;
+        let (critic_loss, gap) = self.critic_loss(&whole, &current.detach(), &next, &noise)?;
         let (weight, alpha_prime) = self.gap_weight(&gap.detach(), fast)?;
         let conservative = ((gap * weight)? * TWIN as f64)?;
         let critic = &mut self.networks.critic;
@@ -290,12 +314,13 @@ impl Algorithm for Cql {
     }
 
     fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+        let (whole, noise) = (self.batch(indices)?, self.noise(step)?);
+        let batch = &whole.0;
         let actor = &self.networks.actor;
         let current = actor.constant_distribution(&batch.observations)?;
         let next = actor.constant_distribution(&batch.next_observations)?;
-        let (actor_loss, _) = self.actor_loss(step, &batch, &current, &noise)?;
-        let (critic_loss, _) = self.critic_loss(&batch, &current, &next, &noise)?;
+        let (actor_loss, _) = self.actor_loss(step, batch, &current, &noise)?;
+        let (critic_loss, _) = self.critic_loss(&whole, &current, &next, &noise)?;
         measured(&[actor_loss, critic_loss])
     }
 

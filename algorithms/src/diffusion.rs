@@ -78,7 +78,7 @@ pub(super) trait DiffusionUpdate: Send {
 
     fn noise(&self, sampler: Sampler<'_>) -> Result<Self::Noise>;
 
-    fn begin(&mut self, networks: &mut Networks, step: u64, total_steps: u64) -> Result<()>;
+    fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()>;
 
     fn update(
         &mut self,
@@ -153,7 +153,7 @@ impl<U: DiffusionUpdate> Algorithm for Diffusion<U> {
         };
         let inputs = (self.context.batch_on(indices, &Device::Cpu)?, noise);
         let Self { update, networks, replay, context, .. } = self;
-        update.begin(networks, step, context.total_steps)?;
+        update.begin(networks, step, context)?;
         replay.start(&context.device, &inputs, |(batch, noise)| {
             update.update(networks, batch, noise)
         })?;

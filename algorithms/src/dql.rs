@@ -154,7 +154,7 @@ impl DiffusionUpdate for Config {
         Ok(Noise { next, policy, denoising, raised })
     }
 
-    fn begin(&mut self, networks: &mut Networks, step: u64, _: u64) -> Result<()> {
+    fn begin(&mut self, networks: &mut Networks, step: u64, _: &Context) -> Result<()> {
         let adam = |rate: f32| AdamStep { rate, clip: Some(*self.gradient_clip), count: step + 1 };
         networks.critic.adam.set_step(adam(*self.critic_learning_rate))?;
         networks.actor.adam.set_step(adam(*self.actor_learning_rate))

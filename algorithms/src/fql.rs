@@ -45,6 +45,8 @@ struct Config {
     target: Aggregate,
     /// Weight α of the distance between the one-step policy and the flow.
     alpha: Positive,
+    /// The same in a run with practice, where it is another.
+    online_alpha: Option<Positive>,
     /// Divide Q by its mean size in the policy's loss.
     normalize_q: bool,
     /// Euler steps of the flow.
@@ -97,7 +99,9 @@ impl Fql {
         let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
         let bc_loss = self.flow_loss(&batch, &start, &times)?;
         let [distill_loss, q_loss] = self.actor_losses(&batch, &policy_noise)?;
-        let actor_loss = ((&distill_loss * f64::from(*self.config.alpha))? + &q_loss)?;
+        let with_practice = self.config.online_alpha.filter(|_| self.context.online_steps > 0);
+        let alpha = f64::from(*with_practice.unwrap_or(self.config.alpha));
+        let actor_loss = ((&distill_loss * alpha)? + &q_loss)?;
         Ok([
             critic_loss,
             Loss::new("bc_loss", bc_loss),

@@ -129,7 +129,7 @@ pub(super) fn context(golden: &Golden, device: &Device) -> Context {
         transitions: Arc::new(transitions(golden)),
         batch_size: golden.count("/batch_size"),
         total_steps: golden.count("/total_steps") as u64,
-        online_steps: 0,
+        online_steps: golden.config["online_steps"].as_u64().unwrap_or(0),
         seed: 0,
         precision: Precision::F32,
         device: device.clone(),

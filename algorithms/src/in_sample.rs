@@ -12,7 +12,7 @@ use super::losses::{Loss, measured, smallest};
 use super::networks::{Initializer, TWIN, TrainState, WithTarget, networks, state_value};
 use super::state_dict::StateDict;
 use candle_core::{DType, Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors, cosine_decay};
+use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors};
 use quad_policy::PolicyConfig;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -31,7 +31,8 @@ pub(super) struct Helps {
 }
 
 /// The help of a learning rate that always decays.
-pub(super) const COSINE: &str = "The actor's learning rate; falls to 0 along a cosine.";
+pub(super) const COSINE: &str =
+    "The actor's learning rate; falls to 0 along a cosine, and is constant with practice.";
 
 /// The metrics of one algorithm.
 pub(super) const fn table(helps: Helps) -> [Metric; 9] {
@@ -94,7 +95,7 @@ pub(super) trait ImplicitLosses: Send {
         1
     }
 
-    /// The actor's learning rate falls to 0 along a cosine.
+    /// The actor's learning rate falls to 0 along a cosine before practice.
     fn actor_rate_decays(&self) -> bool {
         true
     }
@@ -186,7 +187,7 @@ impl<L: ImplicitLosses> Algorithm for InSample<L> {
 
         let actor_loss = self.actor_loss(&batch, &q)?;
         let decays = self.losses.actor_rate_decays();
-        let decay = if decays { cosine_decay(step, self.context.total_steps) } else { 1.0 };
+        let decay = if decays { self.context.decay(step, 1.0) } else { 1.0 };
         let common = self.losses.common();
         let rate = *common.actor_learning_rate * decay;
         self.networks.actor.minimize(&actor_loss.value, AdamStep::after(step, rate))?;

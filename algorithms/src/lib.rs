@@ -7,8 +7,8 @@
 //! - `networks`: networks with optimizers and targets, which an algorithm declares once;
 //!   `state_dict`; `losses`; `hyperparameters`: types that check themselves; `random`; `context`:
 //!   the data and settings of a run.
-//! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; QUAD, Diffusion-QL, AlignIQL and
-//!   IDQL `diffusion`. `fql` stands alone and is the one to read first.
+//! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
+//!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`. `fql` stands alone and is the one to read first.
 //!
 //! A new algorithm is a file here, a line in [`ALGORITHMS`], `presets/NAME.toml`, and a script with
 //! golden folders in `tests/golden`.
@@ -18,6 +18,7 @@
 mod agent;
 mod algorithm;
 mod align_iql;
+mod calibration;
 mod context;
 mod cql;
 mod definition;

@@ -21,7 +21,7 @@ use config::{Config, Guidance, TargetReduce};
 use guidance::{Averages, Guide};
 use metrics::METRICS;
 use noise::Noise;
-use quad_nn::{AdamStep, Reverse, Tensors, cosine_decay, mean_and_variance};
+use quad_nn::{AdamStep, Reverse, Tensors, mean_and_variance};
 use quad_policy::{Choice, DiffusionPolicy, DiffusionShape};
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -121,8 +121,9 @@ impl DiffusionUpdate for Quad {
         Noise::draw(&self.config, sampler)
     }
 
-    fn begin(&mut self, networks: &mut Networks, step: u64, total_steps: u64) -> Result<()> {
-        let (decay, clip) = (cosine_decay(step, total_steps), Some(*self.config.gradient_clip));
+    fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
+        let decay = context.decay(step, *self.config.online_rate);
+        let clip = Some(*self.config.gradient_clip);
         let adam = |rate: f32| AdamStep { rate: rate * decay, clip, count: step + 1 };
         networks.critic.adam.set_step(adam(*self.config.critic_learning_rate))?;
         networks.actor.adam.set_step(adam(*self.config.actor_learning_rate))

@@ -34,6 +34,9 @@ pub(super) struct Common {
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and targets.
     actor_every: Steps,
+    /// Factor of the policy's distance to the data at the end of practice, toward which it moves
+    /// linearly from 1.
+    online_cloning: UnitInterval,
 }
 
 /// Reads a table of hyper-parameters with [`Common`]'s among them.
@@ -51,14 +54,20 @@ pub(super) trait BcRegularizer: Send {
     fn common(&self) -> &Common;
 
     /// Weight of the squared distance between next actions and the data's in the critics' target,
-    /// if there is such a term.
+    /// if there is such a term; with practice there is none.
     fn penalty(&self) -> Option<f32> {
         None
     }
 
     /// The loss `[]` of the policy's actions, `[B, a]`, whose values are `q`, `[2, B]`; and the
-    /// part of it that keeps them near the data's.
-    fn actor_loss(&self, actions: &Tensor, of_data: &Tensor, q: &Tensor) -> Result<[Tensor; 2]>;
+    /// part of it that keeps them near the data's, before it is multiplied by `cloning`.
+    fn actor_loss(
+        &self,
+        actions: &Tensor,
+        of_data: &Tensor,
+        q: &Tensor,
+        cloning: f64,
+    ) -> Result<[Tensor; 2]>;
 }
 
 networks! {
@@ -89,9 +98,10 @@ impl<R: BcRegularizer> Td3<R> {
         Ok(Self { regularizer, context, rows, networks, of_actor })
     }
 
-    /// A batch, and the data's next actions where they count.
-    fn batch(&self, indices: &[u32]) -> Result<(Minibatch, Option<Tensor>)> {
-        let Some(rows) = &self.rows else { return Ok((self.context.batch(indices)?, None)) };
+    /// A batch, and the data's next actions where they count: with practice they do not.
+    fn batch(&self, step: u64, indices: &[u32]) -> Result<(Minibatch, Option<Tensor>)> {
+        let rows = self.rows.as_ref().filter(|_| self.context.online_share(step).is_none());
+        let Some(rows) = rows else { return Ok((self.context.batch(indices)?, None)) };
         let rows = select(rows, indices);
         Ok((self.context.batch(&rows)?, Some(self.context.next_actions(&rows)?)))
     }
@@ -120,10 +130,13 @@ impl<R: BcRegularizer> Td3<R> {
         batch.target(*common.gamma, &q)
     }
 
-    fn actor_losses(&self, batch: &Minibatch) -> Result<[Tensor; 2]> {
+    fn actor_losses(&self, step: u64, batch: &Minibatch) -> Result<[Tensor; 2]> {
         let actions = gaussian_mean(&self.networks.actor, &batch.observations)?;
         let q = batch.values_at(&self.networks.critic.detach(), &actions)?;
-        self.regularizer.actor_loss(&actions, &batch.actions, &q)
+        let last = f64::from(*self.regularizer.common().online_cloning);
+        let share = self.context.online_share(step).unwrap_or(0.0);
+        let cloning = 1.0 - share * (1.0 - last);
+        self.regularizer.actor_loss(&actions, &batch.actions, &q, cloning)
     }
 }
 
@@ -133,7 +146,7 @@ impl<R: BcRegularizer> Algorithm for Td3<R> {
     }
 
     fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, next) = self.batch(indices)?;
+        let (batch, next) = self.batch(step, indices)?;
         let mut losses = vec![self.critic_loss(step, &batch, next.as_ref())?];
         let common = self.regularizer.common();
         let every = *common.actor_every;
@@ -141,7 +154,7 @@ impl<R: BcRegularizer> Algorithm for Td3<R> {
         self.networks.critic.minimize(&losses[0].value, adam)?;
         let first = R::FIRST % every;
         if step % every == first {
-            let [actor_loss, bc_loss] = self.actor_losses(&batch)?;
+            let [actor_loss, bc_loss] = self.actor_losses(step, &batch)?;
             let Networks { actor, critic } = &mut self.networks;
             if R::LAGS {
                 actor.soft_update(*common.ema_rate)?;
@@ -162,8 +175,8 @@ impl<R: BcRegularizer> Algorithm for Td3<R> {
     }
 
     fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, next) = self.batch(indices)?;
-        let [actor_loss, bc_loss] = self.actor_losses(&batch)?;
+        let (batch, next) = self.batch(step, indices)?;
+        let [actor_loss, bc_loss] = self.actor_losses(step, &batch)?;
         let critic_loss = self.critic_loss(step, &batch, next.as_ref())?;
         measured(&[critic_loss, Loss::new("actor_loss", actor_loss).with("bc_loss", bc_loss)])
     }

@@ -1,4 +1,4 @@
-"""One update of CQL (Kumar et al. 2020), with the entropy's and, in a variant, the gap's multiplier learned."""
+"""One update of CQL (Kumar et al. 2020), with the entropy's and, in a variant, the gap's multiplier learned; or of Cal-QL."""
 
 import math
 
@@ -24,18 +24,20 @@ AGENT = {
     "ema_rate": 0.05,
     "phases": {"cloning": 0, "learning": 1},
 }
-FOLDERS = {"cql": (27, "small"), "cql-lagrange": (28, "small"), "cql-cloning": (29, "small")}
+FOLDERS = {"cql": (27, "small"), "cql-lagrange": (28, "small"), "cql-cloning": (29, "small"), "cql-online": (66, "small")}
 VARIANTS = {
     "cql": {},
     "cql-lagrange": {"samples": 5, "threshold": 0.5, "least_gap": 4.0, "phases": {"cloning": 1, "learning": 3}},
     "cql-cloning": {"phases": {"cloning": 1, "learning": 1}},
+    "cql-online": {},
 }
 
 
 def make_config(variant, size):
     hidden, activation = SIZES[size]["hidden"], "mish" if size == "hopper" else "relu"
     networks = dict.fromkeys(("actor", "critic"), shape([hidden, hidden], activation))
-    return implicit.make_config("cql", size, networks | AGENT | VARIANTS[variant])
+    online = {"step": 2300, "online_steps": 1000} if variant == "cql-online" else {}
+    return implicit.make_config("cql", size, networks | AGENT | VARIANTS[variant]) | online
 
 
 # The policy, an ensemble of one: a = tanh(u).
@@ -75,17 +77,19 @@ def actor_loss(actor, critics, batch, alpha, cloning, activation, critic_activat
     return jnp.mean(alpha * density - worth), (drawn, density)
 
 
-def gaps_of(critics, states, actions, others, densities, least, activation):
-    """ln of the mean of exp Q over other actions [B, M, a] less ln π, times M; less Q of the data's; [K, B]."""
+def gaps_of(critics, states, actions, others, densities, bounds, least, activation):
+    """ln of the mean of exp Q, or its bound if that is larger, over other actions [B, M, a] less ln π, times M; less Q of the
+    data's; [K, B].
+    """
     repeated = jnp.broadcast_to(states[:, None], (*others.shape[:2], states.shape[-1]))
-    q = values(critics, repeated, others, activation) - densities
+    q = jnp.maximum(values(critics, repeated, others, activation), bounds) - densities
     return jnp.maximum(jax.nn.logsumexp(q, -1) - values(critics, states, actions, activation), least)
 
 
-def whole_critic_loss(critics, states, actions, targets, others, densities, least, weight, activation):
+def whole_critic_loss(critics, states, actions, targets, others, densities, bounds, least, weight, activation):
     """The critics' loss; also its first term and the gaps."""
     error = critic_loss(critics, states, actions, targets, activation)
-    gaps = gaps_of(critics, states, actions, others, densities, least, activation)
+    gaps = gaps_of(critics, states, actions, others, densities, bounds, least, activation)
     return error + weight * gaps.mean(-1).sum(), (error, gaps)
 
 
@@ -106,14 +110,29 @@ def targets_of(config, state, inputs):
 
 
 def other_actions(config, state, inputs):
-    """Uniform actions, and the policy's at s' and at s; ln of the density of each."""
+    """Uniform actions, and the policy's at s' and at s; ln of the density of each, and its lower bound."""
     activation, uniform = config["agent"]["actor"]["activation"], inputs["uniform_actions"]
     following, next_density = fast_sampled(
         state["actor"], inputs["next_observations"], inputs["next_noise"], activation
     )
     current, density = fast_sampled(state["actor"], inputs["observations"], inputs["current_noise"], activation)
     flat = np.full(uniform.shape[:2], -uniform.shape[-1] * math.log(2))
-    return np.concatenate([uniform, following, current], 1), np.concatenate([flat, next_density, density], 1)
+    bounds = np.full((uniform.shape[0], 3 * uniform.shape[1]), -np.inf)
+    if "online_steps" in config:
+        bounds[:, uniform.shape[1] :] = returns_of(config, inputs)[:, None]
+    return np.concatenate([uniform, following, current], 1), np.concatenate([flat, next_density, density], 1), bounds
+
+
+def returns_of(config, inputs):
+    """Discounted returns to the ends of episodes. One of equal rewards that does not terminate goes on for ever."""
+    gamma, rewards, returns = config["agent"]["gamma"], inputs["rewards"], np.zeros(config["batch_size"])
+    ends = np.flatnonzero((inputs["masks"] == 0) | (inputs["timeouts"] == 1)) + 1
+    for start, end in zip([0, *ends], ends, strict=False):
+        failed = end - start > 1 and inputs["masks"][end - 1] == 1 and np.ptp(rewards[start:end]) == 0
+        for i in reversed(range(start, end)):
+            later = returns[i + 1] if i + 1 < end else 0.0
+            returns[i] = rewards[i] / (1 - gamma) if failed else rewards[i] + gamma * later
+    return returns
 
 
 def actions_of(config, inputs):
@@ -184,6 +203,13 @@ def random_inputs(config, rng, size):
     batch = implicit.random_inputs(config, rng, size)
     # A quarter of the data's actions at the limit, so that clipping shows.
     actions = np.where(rng.random((b, a)) < 0.25, np.copysign(0.99999, batch["actions"]), batch["actions"])
+    if "online_steps" in config:
+        # Episodes of up to four rows, each of which leads to the next; the first fails.
+        batch["rewards"][:3] = -0.25
+        batch["timeouts"] = np.isin(np.arange(b) % 17, (2, 8, 16)) * batch["masks"]
+        batch["timeouts"][-1] = batch["masks"][-1]
+        goes_on = (batch["masks"] == 1) & (batch["timeouts"] == 0)
+        batch["next_observations"][goes_on] = batch["observations"][1:][goes_on[:-1]]
     return batch | {
         "actions": single(actions),
         "policy_noise": single(rng.normal(size=(b, a))),
@@ -196,7 +222,7 @@ def random_inputs(config, rng, size):
 
 def draw(config, variant, size, rng):
     """A state, inputs and what comes out; None where gaps are not on both sides of their bound, if they have one, or close to
-    it.
+    it, or values are close to theirs.
     """
     state, inputs = random_state(config, rng), random_inputs(config, rng, size)
     expected, _ = update(config, state, inputs)
@@ -204,5 +230,11 @@ def draw(config, variant, size, rng):
     if least is not None:
         bounded = expected["gaps"] == least
         if np.any(abs(expected["gaps"] - least)[~bounded] < 1e-3) or not 0.1 < bounded.mean() < 0.9:
+            return None
+    if "online_steps" in config:
+        others, _, bounds = other_actions(config, state, inputs)
+        states = np.broadcast_to(inputs["observations"][:, None], (*others.shape[:2], config["observation_dim"]))
+        excess = fast_values(state["critic"], states, others, config["agent"]["critic"]["activation"]) - bounds
+        if np.any(abs(excess) < 1e-4) or not 0.4 < np.mean(excess > 0) < 0.9:
             return None
     return state, inputs, expected | act(config, state, inputs)

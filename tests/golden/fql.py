@@ -20,6 +20,7 @@ SIZES = {
 AGENT = {
     "gamma": 0.99,
     "alpha": 3.0,
+    "online_alpha": 5.0,
     "flow_steps": 10,
     "learning_rate": 0.02,
     "ema_rate": 0.05,
@@ -34,7 +35,8 @@ def make_config(variant, size):
         "critic": shape([hidden, hidden - 1], "gelu", True) | {"norm_after": True},
     }
     own = {"target": "min" if normalized else "mean", "normalize_q": normalized}
-    return configuration("fql", SIZES[size]["batch_size"], VARIANTS[variant], networks | AGENT | own)
+    online = {"online_steps": 1000} if normalized else {}
+    return configuration("fql", SIZES[size]["batch_size"], VARIANTS[variant], networks | AGENT | own) | online
 
 
 # Networks: flow and one-step policy are ensembles of one.
@@ -100,13 +102,14 @@ def update(config, state, inputs):
     next_q = fast_values(state["target_critic"], inputs["next_observations"], clipped, critic_activation, 1e-6, True)
     next_q = next_q.min(0) if agent["target"] == "min" else next_q.mean(0)
     targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * next_q
+    alpha = agent["online_alpha" if "online_steps" in config else "alpha"]
     led = flow_actions(config, state["flow"], s, inputs["policy_noise"])
     taken = fast_one_step(state["actor"], s, inputs["policy_noise"], activation)
 
     out = dict(state) | {"targets": targets, "target_q_mean": targets.mean(), "flow_actions": np.clip(led, -1, 1)}
     out["critic_loss"], of_critics = critic_gradient(state["critic"], s, a, targets, critic_activation)
     out["bc_loss"], of_flow = flow_gradient(state["flow"], s, a, inputs["start_noise"], inputs["times"], activation)
-    given = state["critic"], s, inputs["policy_noise"], out["flow_actions"], (agent["alpha"], agent["normalize_q"])
+    given = state["critic"], s, inputs["policy_noise"], out["flow_actions"], (alpha, agent["normalize_q"])
     (out["actor_loss"], parts), of_actor = actor_gradient(state["actor"], *given, activation, critic_activation)
     out["distill_loss"], out["q_loss"] = parts
     for name, gradients in ("critic", of_critics), ("flow", of_flow), ("actor", of_actor):

@@ -8,13 +8,14 @@ import implicit
 from implicit import LARGEST_WEIGHT, RATES, SIZES, act, fast_value, value
 from networks import adam_step, compiled, shape
 
-FOLDERS = {"iql": (13, "small")}
+FOLDERS = {"iql": (13, "small"), "iql-online": (62, "small")}
 
 
 def make_config(variant, size):
     networks = dict.fromkeys(("actor", "critic", "value"), shape([SIZES[size]["hidden"]] * 3))
     agent = networks | {"gamma": 0.99, "expectile": 0.7, "temperature": 3.0} | RATES
-    return implicit.make_config("iql", size, agent)
+    online = {"step": 2300, "online_steps": 1000} if variant == "iql-online" else {}
+    return implicit.make_config("iql", size, agent) | online
 
 
 def value_loss(network, states, q, expectile, activation):

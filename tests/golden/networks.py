@@ -85,8 +85,10 @@ def clip_by_norm(gradients, limit):
     return {name: g * np.minimum(1.0, limit / norm) for name, g in gradients.items()}, norm
 
 
-def decayed(rate, config):
-    """Cosine decay from the start value to 0 over the whole run."""
+def decayed(rate, config, online=1.0):
+    """Cosine decay from the start value to 0 over the steps on the dataset alone; a share of it in those with practice."""
+    if config["step"] >= config["total_steps"]:
+        return rate * online
     return rate * 0.5 * (1 + math.cos(math.pi * config["step"] / config["total_steps"]))
 
 

@@ -38,6 +38,7 @@ AGENT = {
     "eta": {"initial": 1.0, "threshold": 0.7, "rate": 0.05, "minimum": 1e-3, "maximum": 100.0},
     "actor_learning_rate": 0.02,
     "critic_learning_rate": 0.03,
+    "online_rate": 0.4,
     "gradient_clip": 0.5,
     "ema_rate": 0.05,
     "nu_ema_rate": 0.1,
@@ -68,6 +69,7 @@ FOLDERS = {
     "constant": (24, "small"),
     "mean": (25, "small"),
     "shuffled": (26, "small"),
+    "quad-online": (63, "small"),
 }
 VARIANTS = {
     "quad": Variant(1235, {}),
@@ -83,6 +85,7 @@ VARIANTS = {
     "constant": Variant(1236, {"guidance": "constant", "lambda": 0.3}),
     "mean": Variant(1237, {"guidance": "mean", "diffusion_steps": 7}),
     "shuffled": Variant(1238, {"guidance": "shuffled", "diffusion_steps": 3}),
+    "quad-online": Variant(2300, {}),
 }
 
 
@@ -176,7 +179,7 @@ def update(config, state, inputs):
     # Critics, and their targets.
     loss, gradients = critic_gradient(state["critic"], s, a, targets, agent["critic"]["activation"])
     gradients, norm = clip_by_norm(gradients, agent["gradient_clip"])
-    out |= adam_step(state, "critic", gradients, decayed(agent["critic_learning_rate"], config), step)
+    out |= adam_step(state, "critic", gradients, decayed(agent["critic_learning_rate"], config, agent["online_rate"]), step)
     out |= {"critic_loss": loss, "critic_gradient_norm": norm}
     out["target_critic"] = follow(state["target_critic"], out["critic"], agent["ema_rate"])
 
@@ -191,7 +194,7 @@ def update(config, state, inputs):
     arguments += (agent["actor"]["activation"],)
     (loss, (bc, pull)), gradients = actor_gradient(state["actor"], *arguments)
     gradients, norm = clip_by_norm(gradients, agent["gradient_clip"])
-    out |= adam_step(state, "actor", gradients, decayed(agent["actor_learning_rate"], config), step)
+    out |= adam_step(state, "actor", gradients, decayed(agent["actor_learning_rate"], config, agent["online_rate"]), step)
     out |= {"actor_loss": loss, "bc_loss": bc, "guidance_loss": pull, "actor_gradient_norm": norm}
 
     # Dual ascent on η, with the actor that has just moved.

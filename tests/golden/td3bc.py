@@ -11,8 +11,22 @@ from implicit import CRITICS, SIZES, critic_gradient, fast_action, mean_action, 
 from networks import adam_step, compiled, fast_values, follow, near, random_moments, random_network, shape, single, values
 
 # The step: in every second one the policy moves, too; TD3+BC counts from 1.
-FOLDERS = {"td3-bc": (51, "small"), "td3-bc-critic": (52, "small"), "rebrac": (54, "small"), "rebrac-critic": (55, "small")}
-VARIANTS = {"td3-bc": 701, "td3-bc-critic": 700, "rebrac": 700, "rebrac-critic": 701}
+FOLDERS = {
+    "td3-bc": (51, "small"),
+    "td3-bc-critic": (52, "small"),
+    "td3-bc-online": (64, "small"),
+    "rebrac": (54, "small"),
+    "rebrac-critic": (55, "small"),
+    "rebrac-online": (65, "small"),
+}
+VARIANTS = {
+    "td3-bc": {"step": 701},
+    "td3-bc-critic": {"step": 700},
+    "td3-bc-online": {"step": 2301, "online_steps": 1000},
+    "rebrac": {"step": 700},
+    "rebrac-critic": {"step": 701},
+    "rebrac-online": {"step": 2300, "online_steps": 1000},
+}
 AGENT = {
     "gamma": 0.99,
     "target_noise": 0.2,
@@ -21,6 +35,7 @@ AGENT = {
     "critic_learning_rate": 0.03,
     "ema_rate": 0.05,
     "actor_every": 2,
+    "online_cloning": 0.6,
 }
 
 
@@ -28,27 +43,33 @@ def make_config(variant, size):
     hidden, activation = SIZES[size]["hidden"], "mish" if size == "hopper" else "relu"
     networks = dict.fromkeys(("actor", "critic"), shape([hidden, hidden], activation))
     if variant.startswith("td3-bc"):
-        return implicit.make_config("td3-bc", size, networks | AGENT | {"weight": 2.5}) | {"step": VARIANTS[variant]}
+        return implicit.make_config("td3-bc", size, networks | AGENT | {"weight": 2.5}) | VARIANTS[variant]
     networks["critic"] = shape([hidden, hidden], activation, True) | {"norm_after": True}
     own = {"actor_penalty": 0.4, "critic_penalty": 0.2}
-    return implicit.make_config("rebrac", size, networks | AGENT | own) | {"step": VARIANTS[variant]}
+    return implicit.make_config("rebrac", size, networks | AGENT | own) | VARIANTS[variant]
 
 
-def actor_losses(actor, critics, states, actions, weight, activation):
+def cloning_of(config):
+    """What the distance to the data is multiplied by: with practice it moves linearly from 1."""
+    done = max(0, config["step"] - config["total_steps"]) / config.get("online_steps", 1)
+    return (1 - done) + done * config["agent"]["online_cloning"]
+
+
+def actor_losses(actor, critics, states, actions, weight, cloning, activation):
     """TD3+BC's: the actor's loss, and the distance to the data in it."""
     taken = mean_action(actor, states, activation)
     q = values(critics, states, taken, activation)[0]
     distance = jnp.mean((taken - actions) ** 2)
-    return -weight / jax.lax.stop_gradient(jnp.mean(jnp.abs(q))) * jnp.mean(q) + distance, distance
+    return -weight / jax.lax.stop_gradient(jnp.mean(jnp.abs(q))) * jnp.mean(q) + cloning * distance, distance
 
 
-def penalized_losses(actor, critics, states, actions, penalty, activation):
+def penalized_losses(actor, critics, states, actions, penalty, cloning, activation):
     """ReBRAC's."""
     taken = mean_action(actor, states, activation)
     q = jnp.min(values(critics, states, taken, activation, after=True), 0)
     distance = jnp.sum((taken - actions) ** 2, -1)
     scale = jax.lax.stop_gradient(1 / jnp.mean(jnp.abs(q)))
-    return jnp.mean(penalty * distance - scale * q), jnp.mean(distance)
+    return jnp.mean(penalty * cloning * distance - scale * q), jnp.mean(distance)
 
 
 def normed_critic_loss(critics, states, actions, targets, activation):
@@ -71,7 +92,7 @@ def update(config, state, inputs):
     activation, rebrac = agent["critic"]["activation"], config["algorithm"] == "rebrac"
     next_actions = np.clip(noisy_actions(config, state, inputs), -1, 1)
     next_q = fast_values(state["target_critic"], inputs["next_observations"], next_actions, activation, 1e-6, rebrac).min(0)
-    if rebrac:
+    if rebrac and "online_steps" not in config:
         next_q = next_q - agent["critic_penalty"] * ((next_actions - inputs["next_actions"]) ** 2).sum(-1)
     targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * next_q
     critic_loss, gradients = (normed_critic_gradient if rebrac else critic_gradient)(state["critic"], s, a, targets, activation)
@@ -79,7 +100,8 @@ def update(config, state, inputs):
     out |= {"targets": targets, "target_q_mean": targets.mean(), "critic_loss": critic_loss}
     if step % agent["actor_every"] == (0 if rebrac else agent["actor_every"] - 1):
         moved, weight = (penalized_gradient, "actor_penalty") if rebrac else (actor_gradient, "weight")
-        (loss, distance), gradients = moved(state["actor"], out["critic"], s, a, agent[weight], activation)
+        weights = agent[weight], cloning_of(config)
+        (loss, distance), gradients = moved(state["actor"], out["critic"], s, a, *weights, activation)
         out |= adam_step(state, "actor", gradients, agent["actor_learning_rate"], step // agent["actor_every"])
         out["target_critic"] = follow(state["target_critic"], out["critic"], agent["ema_rate"])
         # CORL's target follows the policy from before its step.
@@ -107,7 +129,7 @@ def random_state(config, rng, size):
 def random_inputs(config, rng, size):
     shape = config["batch_size"], config["action_dim"]
     inputs = implicit.random_inputs(config, rng, size) | {"target_noise": single(rng.normal(size=shape))}
-    if config["algorithm"] == "rebrac":
+    if config["algorithm"] == "rebrac" and "online_steps" not in config:
         inputs["next_actions"] = single(rng.uniform(-0.99999, 0.99999, shape))
     return inputs
 

@@ -83,10 +83,13 @@ pub(super) struct Config {
     pub candidates: Candidates,
     /// Behavior-cloning strength.
     pub eta: Eta,
-    /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine.
+    /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine before
+    /// practice.
     pub actor_learning_rate: Positive,
-    /// Adam's learning rate for the critics at the first step; decays to 0 along a cosine.
+    /// Adam's learning rate for the critics at the first step; decays likewise.
     pub critic_learning_rate: Positive,
+    /// Factor of both rates with practice.
+    pub online_rate: NotNegative,
     /// Global norm at which each network's gradient is clipped.
     pub gradient_clip: Positive,
     /// EMA rate of both target networks, α_ema.

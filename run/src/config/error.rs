@@ -2,7 +2,7 @@
 
 use std::io;
 
-use quad_algorithms::AgentError;
+use quad_algorithms::{ALGORITHMS, AgentError, Definition, Values};
 
 const PRINT: &str = "`learner presets TASK` prints the keys that a preset may have";
 const KEYS: &str = "`learner presets TASK` prints every key; on the command line --set KEY=VALUE changes one, and \
@@ -28,7 +28,7 @@ pub enum ConfigError {
     OutOfRange { field: &'static str, value: String, range: String },
     #[error("a run of 0 steps without practice learns nothing")]
     NoSteps,
-    #[error("{0} cannot go on with practice: its update needs the dataset's own episodes")]
+    #[error("{0} learns from a dataset alone, not from practice")]
     NoPractice(&'static str),
     #[error("{steps} steps with an evaluation every {interval} are {evaluations} evaluations")]
     Evaluations { steps: u64, interval: u64, evaluations: u64, most: u64 },
@@ -50,7 +50,9 @@ impl ConfigError {
                 "--steps N learns from the dataset alone, --online-steps N from practice too".to_owned()
             }
             Self::NoPractice(_) => {
-                "leave out --online-steps, or choose an algorithm with a table [online] in `learner presets TASK`".to_owned()
+                let can = |known: &&Definition| Values::of(known).for_task(None).contains_key("online");
+                let names = Vec::from_iter(ALGORITHMS.iter().filter(can).map(|known| known.name));
+                format!("leave out --online-steps, or choose one of {}", names.join(", "))
             }
             Self::Evaluations { most, .. } => {
                 format!("choose a larger eval_interval, for at most {most}")

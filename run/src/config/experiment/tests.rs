@@ -36,7 +36,7 @@ fn critics_converge_within_a_demonstration() {
         let demonstration = resolve("hopper-demo", &changes).unwrap();
         let [rate, gamma] =
             ["ema_rate", "gamma"].map(|key| demonstration.agent[key].as_float().unwrap());
-        let steps = demonstration.steps as f64;
+        let steps = demonstration.total_steps() as f64;
         assert!(rate * (1.0 - gamma) * steps > 3.0, "{}: {rate}", algorithm.name);
     }
 }
@@ -71,4 +71,9 @@ fn errors_name_the_problem() {
     refused("hopper-demo", toml! { agent.candidates = 10_001 }, range);
     let iql = toml! { algorithm = "iql" agent.candidates = 2 };
     refused("hopper-demo", iql, "unknown field `candidates`");
+    refused("hopper-demo", toml! { steps = 0 }, "0 steps without practice");
+    let without = toml! { algorithm = "rlpd" online.steps = 0 };
+    refused("hopper-demo", without, "0 steps without practice");
+    let of_data = toml! { algorithm = "sfbc" online.steps = 9 };
+    refused("hopper-demo", of_data, "sfbc learns from a dataset alone");
 }
