@@ -7,7 +7,7 @@ use prometheus::{
 };
 
 /// Ends of a job.
-const OUTCOMES: [&str; 3] = ["scored", "abandoned", "failed"];
+const OUTCOMES: [&str; 4] = ["scored", "practiced", "abandoned", "failed"];
 
 /// The metrics of one evaluator process.
 #[derive(Clone)]
@@ -17,6 +17,8 @@ pub struct Metrics {
     pub environment_steps: IntCounter,
     pub snapshots_received: IntCounter,
     pub episode_score: Histogram,
+    pub practice_episodes: IntCounter,
+    pub practice_rows: IntCounter,
     pub job_duration: Histogram,
     pub select_seconds: Counter,
     pub physics_seconds: Counter,
@@ -47,6 +49,7 @@ impl Metrics {
         };
         let received = "Weight snapshots received whole and verified";
         let score = "Normalized score of each scored episode";
+        let practiced = "Practice episodes that a learner has acknowledged";
         let duration = "Time from a job's hand-out to the end of its last episode";
         let rejected = "Messages from the wire that were not used, by reason";
         let runs = IntGauge::with_opts(opts("runs", "Runs that are being served"))?;
@@ -55,6 +58,8 @@ impl Metrics {
             environment_steps: count("environment_steps_total", "Environment steps taken")?,
             snapshots_received: count("snapshots_received_total", received)?,
             episode_score: histogram("episode_score", score, SCORE_BUCKETS)?,
+            practice_episodes: count("practice_episodes_total", practiced)?,
+            practice_rows: count("practice_rows_total", "Their environment steps")?,
             job_duration: histogram("job_duration_seconds", duration, SECONDS_BUCKETS)?,
             select_seconds: seconds("select_seconds_total", "Time spent choosing actions")?,
             physics_seconds: seconds("physics_seconds_total", "Time spent in the physics")?,
@@ -74,7 +79,12 @@ impl Metrics {
         self.jobs.with_label_values(&["scored"]).inc();
     }
 
-    /// Counts a job that the leaving evaluator hands back, or whose scores the learner refused or
+    /// Counts a practice job whose episodes the learner acknowledged.
+    pub fn job_practiced(&self) {
+        self.jobs.with_label_values(&["practiced"]).inc();
+    }
+
+    /// Counts a job that the leaving evaluator hands back, or whose results the learner refused or
     /// never fetched.
     pub fn job_abandoned(&self) {
         self.jobs.with_label_values(&["abandoned"]).inc();

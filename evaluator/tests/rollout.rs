@@ -7,7 +7,7 @@ use quad_dataset::environment::find;
 use quad_evaluator::sim::{
     Environment, EnvironmentError, Environments, Rollout, Simulations, Step, make,
 };
-use quad_protocol::EpisodeScore;
+use quad_protocol::{Episode, EpisodeScore, Hash};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -123,7 +123,7 @@ impl Environment for Counter {
             return Err(EnvironmentError::Failed { name, reason });
         }
         let reward = self.third_reward.filter(|_| steps == 3.0).unwrap_or(steps);
-        Ok(Step { reward, terminated: steps == 4.0, truncated: false })
+        Ok(Step { reward, terminated: steps == 4.0, ..Step::default() })
     }
 
     fn observation(&self) -> &[f64] {
@@ -161,6 +161,78 @@ fn any_environment_has_its_own_scores_and_errors() {
     counter.breaks = true;
     let broken = count(counter, (2, 1)).unwrap_err().to_string();
     assert_eq!(broken, "the environment \"counter\" failed: a cable is loose");
+}
+
+/// Ends after as many steps as its seed: terminates with seed 1, is cut off with 2, and both with 3.
+/// A person takes the second step.
+#[derive(Default)]
+struct Scripted([f64; 2]);
+
+impl Environment for Scripted {
+    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+        self.0 = [seed as f64, 0.0];
+        Ok(())
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
+        self.0[1] += 1.0;
+        let [seed, steps] = self.0;
+        Ok(Step {
+            reward: steps / 3.0,
+            terminated: steps == seed && seed != 2.0,
+            truncated: steps == seed && seed != 1.0,
+            intervention: (steps == 2.0).then(|| vec![action[0] + 90.0]),
+        })
+    }
+
+    fn observation(&self) -> &[f64] {
+        &self.0
+    }
+
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+        Ok(2.0 * episode_return)
+    }
+}
+
+#[test]
+fn a_recorded_episode_is_what_was_observed_and_done() {
+    let play = |seeds: &[u64]| {
+        let make = || Ok(Box::new(Scripted::default()) as Box<dyn Environment>);
+        let rollout = Rollout::new(make, (2, 1), seeds, |_| ()).unwrap();
+        let mut rollout = rollout.recording(70, Hash::of(b"weights"));
+        while !rollout.is_done() {
+            // A policy that fails leaves no trace.
+            assert!(rollout.step(|_, _, _| Err(anyhow::anyhow!("no action"))).is_err());
+            let select = |observations: &[f32], _: &mut [()], actions: &mut [f32]| {
+                let rows = observations.chunks_exact(2).zip(actions);
+                rows.for_each(|(row, action)| *action = 10.0 * row[0] + row[1]);
+                Ok::<_, EnvironmentError>(())
+            };
+            rollout.step(select).unwrap();
+        }
+        Vec::from_iter(rollout.into_records().into_iter().map(|(_, episode)| episode.unwrap()))
+    };
+    let [third, two] = [1.0 / 3.0, 2.0 / 3.0];
+    let episode = |seed, rewards: &[f64], terminated, observations: &[f32], actions: &[f32]| {
+        let (length, episode_return) = (rewards.len() as u32, rewards.iter().sum::<f64>());
+        Episode {
+            step: 70,
+            weights: Hash::of(b"weights"),
+            score: EpisodeScore { seed, length, episode_return, score: 2.0 * episode_return },
+            terminated,
+            observations: observations.to_vec(),
+            actions: actions.to_vec(),
+            rewards: rewards.iter().map(|&reward| reward as f32).collect(),
+            interventions: if length == 1 { vec![] } else { vec![1] },
+        }
+    };
+    let expected = [
+        episode(3, &[third, two, 1.0], true, &[3., 0., 3., 1., 3., 2., 3., 3.], &[30., 121., 32.]),
+        episode(1, &[third], true, &[1., 0., 1., 1.], &[10.]),
+        episode(2, &[third, two], false, &[2., 0., 2., 1., 2., 2.], &[20., 111.]),
+    ];
+    assert_eq!(play(&[3, 1, 2]), expected);
+    assert_eq!(play(&[2]), expected[2..]);
 }
 
 /// A learner would refuse them.

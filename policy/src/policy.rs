@@ -70,6 +70,11 @@ pub trait Policy: Send + Sync {
         self.act(observations, states, actions)
     }
 
+    /// Changes actions, `n × action_dim`, in units in which they are within ±1.
+    fn change_actions(&self, actions: &mut [f32], change: &mut dyn FnMut(&mut [f32])) {
+        change(actions);
+    }
+
     /// Draws the candidates of n ≥ 1 states and their values. From equal states, [`Self::act`] takes
     /// one of these candidates, or the mean of some.
     ///

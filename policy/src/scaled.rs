@@ -110,6 +110,14 @@ impl Policy for Scaled {
         Ok(())
     }
 
+    fn change_actions(&self, actions: &mut [f32], change: &mut dyn FnMut(&mut [f32])) {
+        if let Some(affine) = &self.scaling.actions {
+            affine.to_network(actions);
+        }
+        self.policy.change_actions(actions, change);
+        self.to_user(actions);
+    }
+
     fn sample(
         &self,
         observations: &[f32],
@@ -175,6 +183,12 @@ mod tests {
         let [plain_one, scaled_one] =
             [&plain, &scaled].map(|policy| policy.with_choice(Choice::best_of(1)).unwrap());
         assert_close(&act(&*scaled_one, &users), &to_user(&act(&*plain_one, &ours)));
+        let mut changed = [38.0, -1.125, 22.0, -0.75];
+        scaled.change_actions(&mut changed, &mut |actions| {
+            assert_eq!(actions, [0.5, -0.5, -0.5, 1.0]);
+            actions.fill(-1.0);
+        });
+        assert_eq!(changed, [14.0, -1.25, 14.0, -1.25]);
         assert!(scaled.memory(3) > plain.memory(3));
         assert_eq!((scaled.noise(), scaled.choice()), (vec![2, 6, 2], plain.choice()));
     }

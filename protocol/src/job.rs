@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bincode::{Decode, Encode};
 
-use crate::codec::Message;
+use crate::codec::{CodecError, Message};
 use crate::hash::Hash;
 use crate::name::Name;
 
@@ -67,7 +67,7 @@ pub enum Exploration {
     /// The policy's, drawn from its distribution where it has one, plus normal noise with this
     /// standard deviation, clipped to [-1, 1].
     Policy {
-        /// Standard deviation of the noise.
+        /// Standard deviation of the noise, from 0 to 1.
         noise: f32,
     },
 }
@@ -110,4 +110,15 @@ impl Message for JobRequest {
 
 impl Message for JobReply {
     const KIND: u8 = 3;
+
+    fn verify(&self) -> Result<(), CodecError> {
+        match self {
+            Self::Job(Job { practice: Some(Exploration::Policy { noise }), .. })
+                if !(0.0..=1.0).contains(noise) =>
+            {
+                Err(CodecError::Malformed(format!("a job's noise is {noise}, not from 0 to 1")))
+            }
+            _ => Ok(()),
+        }
+    }
 }

@@ -75,13 +75,13 @@ impl Environment for PythonEnvironment {
     }
 
     fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
-        let stepped = self.observe(|environment| {
+        self.observe(|environment| {
             let action = PyArray1::from_slice(environment.py(), action);
-            let (observed, reward, terminated, truncated) =
-                environment.call_method1("step", (action,))?.extract()?;
-            Ok((observed, (reward, terminated, truncated)))
-        });
-        stepped.map(|(reward, terminated, truncated)| Step { reward, terminated, truncated })
+            let stepped = environment.call_method1("step", (action,))?;
+            let (observed, reward, terminated, truncated, taken): (_, _, _, _, Option<Vec<f32>>) =
+                stepped.extract()?;
+            Ok((observed, Step { reward, terminated, truncated, intervention: taken }))
+        })
     }
 
     fn observation(&self) -> &[f64] {

@@ -163,6 +163,21 @@ def test_refuses_a_success_that_is_not_boolean(success):
         made.score(0.0)
 
 
+def test_an_intervention_replaces_the_action():
+    class Held(Walk):
+        def step(self, action):
+            *stepped, info = super().step(action)
+            return *stepped, {**info, "intervention": held}
+
+    made = _worker.WrappedEnvironment(Held(), "return")
+    made.reset(1)
+    for held, expected in (None, None), (np.array([[0.5], [1.0], [0.25]]), [0.5, 1.0, 0.25]), ([1, 0, -1], [1.0, 0.0, -1.0]):
+        assert made.step(np.zeros(ACTION, np.float32))[4] == expected
+    for held in [0.5], [np.nan, 0, 0]:
+        with pytest.raises(_worker.EnvironmentFailed, match="must be 3 finite numbers"):
+            made.step(np.zeros(ACTION, np.float32))
+
+
 def test_killed_workers_restart_and_lose_no_score(tmp_path, data):
     # One pool for two runs: Python's workers have one environment, the programs' evaluators the other.
     ours = Learner(tmp_path / "ours", data, steps=3000)

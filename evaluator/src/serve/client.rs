@@ -1,17 +1,19 @@
-//! An evaluator's side of one run: jobs claimed, scores owed, the learner process followed.
+//! An evaluator's side of one run: jobs claimed, results owed, the learner process followed.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use quad_protocol::{Job, JobReply, Name, ScoreReply, ScoreReport, Snapshot, keys};
+use quad_protocol::{Job, JobReply, Name, PieceReply, ScoreReply, ScoreReport, Snapshot, keys};
 use rand::Rng;
+use tokio::time::timeout_at;
 use tracing::{debug, info, warn};
 use zenoh::Wait;
 use zenoh::liveliness::LivelinessToken;
 
 use super::connection::{ANSWER_TIMEOUT, Connection};
+use super::delivery::{Owed, Parcel};
 use super::discovery::Found;
 use super::query::{QueryError, blocking};
 use super::scheduler::Turn;
@@ -20,20 +22,21 @@ use crate::metrics::Metrics;
 
 /// Shortest and longest pause that a learner without work may ask for.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
-/// Time that a leaving evaluator has to deliver its scores; half of it to hand a job back.
+/// Time that a leaving evaluator has to deliver its results; half of it to hand a job back.
 const LEAVE: Duration = Duration::from_secs(2);
 /// Pause of a leaving evaluator after a learner's error.
 const RETRY: Duration = Duration::from_millis(100);
 /// Most characters of a reason that the evaluator sends; the learner accepts no large messages.
 const MAX_REASON_LEN: usize = 1000;
 
-/// A claimed job, until the learner has acknowledged its scores or its return. Meanwhile the
+/// A claimed job, until the learner has acknowledged its results or its return. Meanwhile the
 /// evaluator claims no other.
 struct Claimed {
     id: u64,
     incarnation: u64,
-    /// Scores to deliver; without, the job goes back.
-    scores: Option<ScoreReport>,
+    step: u64,
+    /// Results to deliver; without, the job goes back.
+    owed: Option<Owed>,
     /// Reason of the return, for people.
     failed: Option<String>,
 }
@@ -144,7 +147,8 @@ impl RunClient {
                 self.claimed = Some(Claimed {
                     id: job.id,
                     incarnation: job.incarnation,
-                    scores: None,
+                    step: job.step,
+                    owed: None,
                     failed: None,
                 });
                 Some(job)
@@ -178,41 +182,39 @@ impl RunClient {
         self.claimed.is_some()
     }
 
-    /// Keeps the scores of the claimed job for delivery.
-    pub fn keep(&mut self, report: ScoreReport) {
+    /// Keeps the results of the claimed job for delivery.
+    pub fn keep(&mut self, owed: Owed) {
         if let Some(claimed) = &mut self.claimed {
-            claimed.scores = Some(report);
+            claimed.owed = Some(owed);
         }
     }
 
-    fn scores(&self) -> Option<&ScoreReport> {
-        self.claimed.as_ref()?.scores.as_ref()
+    fn owed(&self) -> Option<&Owed> {
+        self.claimed.as_ref()?.owed.as_ref()
     }
 
-    /// Delivers the kept scores, or hands a failed job back. Keeps them after an error.
+    /// Delivers the kept results, or hands a failed job back. Keeps after an error what is not
+    /// acknowledged.
     pub async fn deliver(&mut self, timeout: Duration) -> Result<(), QueryError> {
-        let Some(report) = self.scores() else { return self.hand_back(timeout).await };
-        let Connection { run, metrics, .. } = &self.connection;
-        let step = report.step;
-        match self.connection.deliver(report, timeout).await? {
-            ScoreReply::Recorded { new, duplicates, .. } => {
-                let scores = report.episodes.iter().map(|episode| episode.score);
-                let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
-                scores.for_each(|score| metrics.episode_score.observe(score));
-                info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
-                metrics.job_scored();
-                self.claimed = None;
-                self.last_warning.clear();
-                self.turn.done(Instant::now(), Duration::ZERO);
-                Ok(())
-            }
-            ScoreReply::Refused { reason, .. } => {
-                warn!(%run, step, "the learner refused the scores: {reason}");
-                metrics.job_abandoned();
-                self.return_job(Some(format!("it refused the scores: {reason}")));
-                self.hand_back(timeout).await
-            }
-        }
+        let connection = &self.connection;
+        let Some(Claimed { step, owed: Some(owed), .. }) = &mut self.claimed else {
+            return self.hand_back(timeout).await;
+        };
+        let (run, step) = (&connection.run, *step);
+        let refused = match owed {
+            Owed::Scores(report) => deliver_scores(connection, report, timeout).await?,
+            Owed::Episodes(parcels) => deliver_episodes(connection, step, parcels, timeout).await?,
+        };
+        let Some(refused) = refused else {
+            self.claimed = None;
+            self.last_warning.clear();
+            self.turn.done(Instant::now(), Duration::ZERO);
+            return Ok(());
+        };
+        warn!(%run, step, "the learner {refused}");
+        connection.metrics.job_abandoned();
+        self.return_job(Some(format!("it {refused}")));
+        self.hand_back(timeout).await
     }
 
     /// Hands back the claimed job, which this evaluator could not run; if there is no answer,
@@ -225,18 +227,22 @@ impl RunClient {
         }
     }
 
-    /// Delivers the scores, or hands the job back, before this evaluator ends.
+    /// Delivers the results, or hands the job back, before this evaluator ends.
     pub async fn leave(mut self) {
         let until = Instant::now() + LEAVE;
         let mut answered = false;
-        while self.scores().is_some() {
-            let Err(error) = self.deliver(LEAVE / 2).await else { return };
+        while let Some(owed) = self.owed() {
+            let is_whole = matches!(owed, Owed::Scores(_));
+            let delivered = timeout_at(until.into(), self.deliver(LEAVE / 2)).await;
+            let run = &self.connection.run;
+            let late = |_| Err(QueryError::NoAnswer(keys::experience(run)));
+            let Err(error) = delivered.unwrap_or_else(late) else { return };
             // A learner that answers with an error has received the scores and may still save them.
             // If the job went back now, others would run it again.
             let retry = matches!(error, QueryError::Unusable { .. });
-            answered |= retry;
+            answered |= retry && is_whole;
             if !retry || Instant::now() + RETRY > until {
-                warn!(run = %self.connection.run, "the learner has not acknowledged the scores: {error}");
+                warn!(%run, "the learner has not acknowledged the results: {error}");
                 break;
             }
             tokio::time::sleep(RETRY).await;
@@ -249,10 +255,10 @@ impl RunClient {
         }
     }
 
-    /// Drops the scores, if any, so that the job goes back.
+    /// Drops the results, if any, so that the job goes back.
     fn return_job(&mut self, reason: Option<String>) {
         if let Some(claimed) = &mut self.claimed {
-            claimed.scores = None;
+            claimed.owed = None;
             claimed.failed = reason.or(claimed.failed.take());
         }
     }
@@ -271,13 +277,66 @@ impl RunClient {
         Ok(())
     }
 
-    /// Stops serving the run, and drops scores that were not acknowledged.
+    /// Stops serving the run, and drops results that were not acknowledged.
     pub fn give_up(self) {
         let Connection { run, metrics, .. } = &self.connection;
         self.snapshots.forget(run);
-        if let Some(report) = self.scores() {
-            warn!(%run, step = report.step, "the learner did not return; its scores are dropped");
+        if let Some(Claimed { step, owed: Some(_), .. }) = self.claimed {
+            warn!(%run, step, "the learner did not return; its results are dropped");
             metrics.job_abandoned();
         }
     }
+}
+
+/// Delivers scores. Returns the refusal of a learner that refuses them.
+async fn deliver_scores(
+    connection: &Connection,
+    report: &ScoreReport,
+    timeout: Duration,
+) -> Result<Option<String>, QueryError> {
+    let Connection { run, metrics, .. } = connection;
+    Ok(match connection.deliver(report, timeout).await? {
+        ScoreReply::Recorded { new, duplicates, .. } => {
+            let scores = report.episodes.iter().map(|episode| episode.score);
+            let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
+            scores.for_each(|score| metrics.episode_score.observe(score));
+            let step = report.step;
+            info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
+            metrics.job_scored();
+            None
+        }
+        ScoreReply::Refused { reason, .. } => Some(format!("refused the scores: {reason}")),
+    })
+}
+
+/// Delivers episodes, each in pieces, and drops those that the learner has acknowledged. Returns the
+/// refusal of a learner that refuses one.
+async fn deliver_episodes(
+    connection: &Connection,
+    step: u64,
+    parcels: &mut VecDeque<Parcel>,
+    timeout: Duration,
+) -> Result<Option<String>, QueryError> {
+    let Connection { run, metrics, .. } = connection;
+    while let Some(parcel) = parcels.front_mut() {
+        match connection.deliver_piece(&parcel.piece(), timeout).await? {
+            PieceReply::Continue { offset, .. } => {
+                let unusable = |reason| QueryError::Unusable { key: keys::experience(run), reason };
+                parcel.continue_at(offset).map_err(unusable)?;
+            }
+            PieceReply::Recorded { duplicate, .. } => {
+                let (seed, rows) = (parcel.seed(), parcel.rows);
+                info!(%run, step, seed, rows, duplicate, "an episode of practice delivered");
+                metrics.practice_episodes.inc();
+                metrics.practice_rows.inc_by(rows);
+                parcels.pop_front();
+            }
+            PieceReply::Refused { reason, .. } => {
+                let seed = parcel.seed();
+                return Ok(Some(format!("refused the episode with seed {seed}: {reason}")));
+            }
+        }
+    }
+    metrics.job_practiced();
+    Ok(None)
 }

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use quad_protocol::{
-    Job, JobReply, JobRequest, Message, Name, Progress, ScoreReply, ScoreReport, Snapshot, encode,
-    keys,
+    Job, JobReply, JobRequest, Message, Name, Piece, PieceReply, Progress, ScoreReply, ScoreReport,
+    Snapshot, encode, keys,
 };
 use tracing::debug;
 use zenoh::qos::CongestionControl;
@@ -78,6 +78,17 @@ impl Connection {
         let check = move |reply: &ScoreReply| is_from(incarnation, reply.incarnation());
         let key = keys::scores(&self.run);
         self.query(key, encode(report)?, timeout, check).await
+    }
+
+    pub async fn deliver_piece(
+        &self,
+        piece: &Piece,
+        timeout: Duration,
+    ) -> Result<PieceReply, QueryError> {
+        let incarnation = self.incarnation;
+        let check = move |reply: &PieceReply| is_from(incarnation, reply.incarnation());
+        let key = keys::experience(&self.run);
+        self.query(key, encode(piece)?, timeout, check).await
     }
 
     /// Requests the snapshot that `job` names.

@@ -1,17 +1,18 @@
-//! Evaluates jobs, one at a time: loads the policy, runs the episodes, reports progress.
+//! Runs jobs, one at a time: loads the policy, plays the episodes, reports progress.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use quad_policy::{Policy, Precision};
-use quad_protocol::{EpisodeScore, Hash, Job, Name, ScoreReport};
+use quad_protocol::{Hash, Job, Name};
 use quad_runtime::Heartbeat;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 use tracing::info;
 
 use super::client::RunClient;
-use super::job::{self, Done, JobError};
+use super::delivery::Owed;
+use super::job::{self, Done, JobError, Played};
 use super::policy::load;
 use crate::metrics::Metrics;
 use crate::sim::Environments;
@@ -32,7 +33,7 @@ pub struct Evaluator {
 
 impl Evaluator {
     /// Runs all episodes of `job`, which the learner of `client` has given out.
-    pub async fn evaluate(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<ScoreReport> {
+    pub async fn evaluate(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<Owed> {
         let metrics = self.metrics.clone();
         let reject = |error: &JobError| metrics.rejected(error.label());
         job::check(job, &*self.environments).inspect_err(reject)?;
@@ -49,10 +50,11 @@ impl Evaluator {
         };
         job::check_memory(job, &*policy).inspect_err(reject)?;
         let arithmetic = Name::new(policy.precision().arithmetic())?;
-        info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "evaluating");
+        let doing = if job.practice.is_some() { "practicing" } else { "evaluating" };
+        info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "{doing}");
         let report = |done: Done| client.publish_progress(job, done.steps, done.episodes);
-        let episodes = self.roll_out(job, policy, report).await?;
-        Ok(ScoreReport::new(job, self.name.clone(), arithmetic, episodes))
+        let played = self.roll_out(job, policy, report).await?;
+        Ok(Owed::new(job, self.name.clone(), arithmetic, played)?)
     }
 
     /// The policy of `job`, kept from the last job or loaded from a snapshot.
@@ -83,7 +85,7 @@ impl Evaluator {
         job: &Job,
         policy: Arc<dyn Policy>,
         report: impl Fn(Done),
-    ) -> anyhow::Result<Vec<EpisodeScore>> {
+    ) -> anyhow::Result<Played> {
         let (tx, rx) = watch::channel(Done::default());
         let (environments, metrics) = (self.environments.clone(), self.metrics.clone());
         let mut episodes = job::start(job.clone(), environments, policy, metrics, tx);

@@ -5,17 +5,19 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_policy::{Policy, PolicyError};
-use quad_protocol::{EpisodeScore, Job};
+use quad_protocol::{Episode, EpisodeScore, Job};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
+use super::exploration::explore;
 use crate::metrics::Metrics;
 use crate::sim::{Environments, Rollout};
 
 /// Most episodes of a job: each is a simulation. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
-/// Most bytes of one network call: far more than the paper's few megabytes, far less than an
-/// evaluator's container has (1 GiB in docker-compose.yml) beside snapshots and the policy.
+/// Most bytes of one network call, and of a practice job's rows: far more than the paper's few
+/// megabytes, far less than an evaluator's container has (1 GiB in docker-compose.yml) beside
+/// snapshots and the policy.
 const MAX_BYTES: u64 = 256 << 20;
 
 /// Reason not to run a job.
@@ -25,6 +27,11 @@ pub enum JobError {
     Size(usize),
     #[error("each of its steps takes {0} bytes of memory, more than {MAX_BYTES}")]
     Memory(u64),
+    #[error(
+        "its practice has an episode of more than {} steps, or takes more than {MAX_BYTES} bytes of memory",
+        Episode::LONGEST
+    )]
+    Rows,
     #[error("its episodes did not end within {} s", Job::LONGEST.as_secs())]
     TooLong,
     #[error("this evaluator has no environment \"{0}\"")]
@@ -39,7 +46,7 @@ impl JobError {
     /// The reason as a metric's label.
     pub fn label(&self) -> &'static str {
         match self {
-            JobError::Size(_) | JobError::Memory(_) => "job_size",
+            JobError::Size(_) | JobError::Memory(_) | JobError::Rows => "job_size",
             JobError::TooLong => "too_long",
             JobError::Environment(_) | JobError::OtherEnvironment { .. } => "environment",
             JobError::Policy(_) => "tensors",
@@ -67,6 +74,9 @@ pub fn check_memory(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
     }
 }
 
+/// The episodes of a job; those of practice with their experience.
+pub type Played = Vec<(EpisodeScore, Option<Episode>)>;
+
 /// Environment steps taken and episodes ended.
 #[derive(Clone, Copy, Default)]
 pub struct Done {
@@ -82,7 +92,7 @@ pub fn start(
     policy: Arc<dyn Policy>,
     metrics: Metrics,
     tx: watch::Sender<Done>,
-) -> JoinHandle<anyhow::Result<Vec<EpisodeScore>>> {
+) -> JoinHandle<anyhow::Result<Played>> {
     tokio::task::spawn_blocking(move || {
         let longest = Job::LONGEST;
         // On a thread of rayon's pool: any other thread would have to wake one, and wait for it, in
@@ -100,11 +110,16 @@ fn run(
     metrics: &Metrics,
     tx: &watch::Sender<Done>,
     longest: Duration,
-) -> anyhow::Result<Vec<EpisodeScore>> {
+) -> anyhow::Result<Played> {
     let started = Instant::now();
     let make = || environments.make(&job.environment, job.environment_seed);
     let sizes = (policy.observation_dim(), policy.action_dim());
     let mut rollout = Rollout::new(make, sizes, &job.seeds, |seed| policy.begin(seed))?;
+    if job.practice.is_some() {
+        rollout = rollout.recording(job.step, job.weights);
+    }
+    let row = size_of::<f32>() * (sizes.0 + sizes.1 + 1);
+    let (mut step, mut rows) = (0, 0);
     while !rollout.is_done() {
         if tx.is_closed() {
             metrics.job_abandoned();
@@ -114,10 +129,18 @@ fn run(
             metrics.rejected(JobError::TooLong.label());
             return Err(JobError::TooLong.into());
         }
+        if job.practice.is_some() && (step == Episode::LONGEST || rows * row as u64 > MAX_BYTES) {
+            metrics.rejected(JobError::Rows.label());
+            return Err(JobError::Rows.into());
+        }
         let stepped = rollout.step(|observations, states, actions| {
-            let acted = policy.act(observations, states, actions);
+            let acted = match job.practice {
+                None => policy.act(observations, states, actions),
+                Some(rule) => explore(rule, policy, observations, states, actions),
+            };
             acted.context("the policy cannot act")
         })?;
+        (step, rows) = (step + 1, rows + stepped.steps);
         let seconds = [stepped.select, stepped.physics].map(|time| time.as_secs_f64());
         metrics.environment_steps.inc_by(stepped.steps);
         metrics.episodes.inc_by(stepped.ended.into());
@@ -130,7 +153,7 @@ fn run(
     }
     let duration = started.elapsed().as_secs_f64();
     metrics.job_duration.observe(duration);
-    Ok(rollout.into_scores())
+    Ok(rollout.into_records())
 }
 
 #[cfg(test)]
@@ -138,7 +161,9 @@ mod tests {
     use std::sync::Mutex;
 
     use quad_policy::{DiffusionShape, MlpConfig, Precision, load_policy};
+    use quad_protocol::{Exploration, Name, decode};
 
+    use super::super::delivery::{Owed, Parcel};
     use super::super::fixtures::{self, file};
     use super::*;
     use crate::sim::{Environment, EnvironmentError, Simulations};
@@ -159,7 +184,7 @@ mod tests {
         environments: &dyn Environments,
         job: &Job,
         longest: Duration,
-    ) -> anyhow::Result<Vec<EpisodeScore>> {
+    ) -> anyhow::Result<Played> {
         let (tx, _rx) = watch::channel(Done::default());
         let (policy, metrics) = (policy(8, 2, 1), Metrics::new().unwrap());
         run(environments, job, &*policy, &metrics, &tx, longest)
@@ -208,6 +233,29 @@ mod tests {
         let error = run_for(&renamed, &job, Duration::ZERO).unwrap_err();
         let too_long = JobError::TooLong.to_string();
         assert_eq!(error.to_string(), too_long);
+    }
+
+    #[test]
+    fn an_episode_of_practice_has_the_same_bytes_whoever_plays_it_and_with_which_others() {
+        let practice = |seeds: &[u64], noise, by: &str| {
+            let practice = Some(Exploration::Policy { noise });
+            let job = Job { seeds: seeds.to_vec(), practice, ..job(0) };
+            let played = run_for(&Simulations, &job, Job::LONGEST).unwrap();
+            let [by, precision] = [by, "f32"].map(|name| Name::new(name).unwrap());
+            let Owed::Episodes(parcels) = Owed::new(&job, by, precision, played).unwrap() else {
+                panic!("it is practice")
+            };
+            let pieces = parcels.iter().map(Parcel::piece);
+            Vec::from_iter(pieces.map(|piece| (piece.seed, piece.hash, piece.bytes)))
+        };
+        let together = practice(&[5, 6, 7], 0.3, "one");
+        for (i, seed) in [(2, 7), (0, 5)] {
+            assert_eq!(practice(&[seed], 0.3, "other"), together[i..=i]);
+        }
+        assert_ne!(practice(&[5], 0.2, "one")[0].1, together[0].1);
+
+        let Episode { step, weights, score, .. } = decode(&together[1].2).unwrap();
+        assert_eq!((step, weights, score.seed), (job(0).step, job(0).weights, 6));
     }
 
     /// A file of some megabytes asks for 66 GB: one value from each of 65,535 tiny critics for each

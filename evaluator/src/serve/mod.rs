@@ -1,4 +1,5 @@
-//! Serving: finds runs, evaluates the snapshots that their learners publish, delivers the scores.
+//! Serving: finds runs, evaluates the snapshots that their learners publish and practices with them,
+//! delivers scores and experience.
 //!
 //! Owns the sessions, one for each endpoint, and the state of all communication with learners,
 //! which need not last. One task on the main thread does the work in turn. A job's episodes run on
@@ -15,12 +16,15 @@
 //! - `client`: the evaluator's state in one run; `connection`: its requests to the learner; `query`:
 //!   a request.
 //! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy from one.
-//! - `evaluate`: one job, from its policy to its scores; `job`: all of its episodes, as one batch.
+//! - `evaluate`: one job, from its policy to its results; `job`: all of its episodes, as one batch;
+//!   `exploration`: the actions of practice; `delivery`: the results, as they are delivered.
 
 mod client;
 mod connection;
+mod delivery;
 mod discovery;
 mod evaluate;
+mod exploration;
 #[cfg(test)]
 mod fixtures;
 mod job;

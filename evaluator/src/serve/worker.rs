@@ -15,14 +15,14 @@ use super::evaluate::Evaluator;
 use super::scheduler;
 use super::snapshot::Snapshots;
 
-/// Time that scores are kept for a learner that is gone, perhaps only disconnected.
-const KEEP_SCORES: Duration = Duration::from_secs(600);
+/// Time that results are kept for a learner that is gone, perhaps only disconnected.
+const KEEP_RESULTS: Duration = Duration::from_secs(600);
 
 /// Serves all runs, one job at a time.
 pub struct Worker {
     evaluator: Evaluator,
     found: watch::Receiver<Runs>,
-    /// Runs with a learner, and runs whose learner is gone but may come back for its scores.
+    /// Runs with a learner, and runs whose learner is gone but may come back for its results.
     clients: BTreeMap<RunKey, RunClient>,
     snapshots: Snapshots,
 }
@@ -32,7 +32,7 @@ impl Worker {
         Worker { evaluator, found, clients: BTreeMap::new(), snapshots: Snapshots::default() }
     }
 
-    /// Serves until `stop` is ready, and returns its result. Then delivers scores that were not
+    /// Serves until `stop` is ready, and returns its result. Then delivers results that were not
     /// acknowledged, and hands unfinished jobs back.
     pub async fn run(
         mut self,
@@ -75,7 +75,7 @@ impl Worker {
                 return false;
             }
             let gone = now - *client.gone.get_or_insert(now);
-            !client.has_job() || gone >= KEEP_SCORES
+            !client.has_job() || gone >= KEEP_RESULTS
         };
         for (_, client) in self.clients.extract_if(.., is_over) {
             client.give_up();
@@ -102,7 +102,7 @@ impl Worker {
     async fn wait(&mut self) -> anyhow::Result<()> {
         let due = self.clients.values().map(|client| match client.gone {
             None => client.turn.ready_at(),
-            Some(since) => since + KEEP_SCORES,
+            Some(since) => since + KEEP_RESULTS,
         });
         let latest = Instant::now() + self.evaluator.beat.interval();
         let until = due.min().map_or(latest, |due| due.min(latest));
@@ -125,12 +125,12 @@ impl Worker {
     }
 }
 
-/// Runs one job, if the last one is acknowledged, and delivers its scores.
+/// Runs one job, if the last one is acknowledged, and delivers its results.
 async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
     if !client.has_job() {
         let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };
         match evaluator.evaluate(&job, client).await {
-            Ok(report) => client.keep(report),
+            Ok(owed) => client.keep(owed),
             Err(error) => {
                 client.fail(&format!("{error:#}")).await;
                 return Err(error.context(format!("a job of step {} failed", job.step)));

@@ -4,13 +4,15 @@ use quad_protocol::EpisodeScore;
 use thiserror::Error;
 
 /// The result of one step of an environment.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Step {
     pub reward: f64,
     /// The task ended the episode: there is no future to bootstrap from.
     pub terminated: bool,
     /// The time limit was reached. As in Gymnasium, `terminated` may be true, too.
     pub truncated: bool,
+    /// The action that a person took in place of the given one, as long as that.
+    pub intervention: Option<Vec<f32>>,
 }
 
 pub trait Environment: Send {

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_protocol::EpisodeScore;
+use quad_protocol::{Episode, EpisodeScore, Hash};
 use rayon::prelude::*;
 
 use super::environment::{Environment, EnvironmentError};
@@ -16,7 +16,7 @@ use super::environment::{Environment, EnvironmentError};
 pub struct Rollout<S> {
     observation_dim: usize,
     action_dim: usize,
-    live: Vec<Episode>,
+    live: Vec<Live>,
     /// One per live episode.
     states: Vec<S>,
     /// [live, observation_dim]
@@ -24,13 +24,14 @@ pub struct Rollout<S> {
     /// [live, action_dim]
     actions: Vec<f32>,
     /// Ended episodes, with their indices among the seeds.
-    scores: Vec<(usize, EpisodeScore)>,
+    ended: Vec<(usize, EpisodeScore, Option<Episode>)>,
 }
 
-struct Episode {
+struct Live {
     environment: Box<dyn Environment>,
     index: usize,
     score: EpisodeScore,
+    record: Option<Episode>,
     ended: bool,
 }
 
@@ -58,7 +59,7 @@ impl<S> Rollout<S> {
             let mut environment = make()?;
             environment.reset(seed)?;
             let score = EpisodeScore { seed, episode_return: 0.0, length: 0, score: 0.0 };
-            Ok(Episode { environment, index, score, ended: false })
+            Ok(Live { environment, index, score, record: None, ended: false })
         };
         let live = seeds.iter().enumerate().map(start);
         Ok(Self {
@@ -68,8 +69,26 @@ impl<S> Rollout<S> {
             states: seeds.iter().copied().map(begin).collect(),
             observations: Vec::new(),
             actions: Vec::new(),
-            scores: Vec::new(),
+            ended: Vec::new(),
         })
+    }
+
+    /// Records the episodes, which have just started, as experience with the snapshot of this step
+    /// and hash.
+    pub fn recording(mut self, step: u64, weights: Hash) -> Self {
+        for live in &mut self.live {
+            live.record = Some(Episode {
+                step,
+                weights,
+                score: live.score,
+                terminated: false,
+                observations: Vec::new(),
+                actions: Vec::new(),
+                rewards: Vec::new(),
+                interventions: Vec::new(),
+            });
+        }
+        self
     }
 
     /// Advances every live episode by one control period. `select` gets the observations [n,
@@ -104,14 +123,8 @@ impl<S> Rollout<S> {
 
     fn observe(&mut self) -> Result<(), EnvironmentError> {
         self.observations.clear();
-        for Episode { environment, .. } in &self.live {
-            let observation = environment.observation();
-            let (found, wanted) = (observation.len(), self.observation_dim);
-            if found != wanted {
-                return Err(EnvironmentError::Observation { found, wanted });
-            }
-            let rounded = observation.iter().map(|&value| value as f32);
-            self.observations.extend(rounded);
+        for Live { environment, .. } in &self.live {
+            self.observations.extend(observe(&**environment, self.observation_dim)?);
         }
         Ok(())
     }
@@ -120,9 +133,15 @@ impl<S> Rollout<S> {
         let before = self.live.len();
         for row in (0..before).rev() {
             if self.live[row].ended {
-                let episode = self.live.swap_remove(row);
+                let mut episode = self.live.swap_remove(row);
                 self.states.swap_remove(row);
-                self.scores.push((episode.index, episode.into_score()?));
+                let score = episode.score()?;
+                if let Some(record) = &mut episode.record {
+                    record.score = score;
+                    let last = observe(&*episode.environment, self.observation_dim)?;
+                    record.observations.extend(last);
+                }
+                self.ended.push((episode.index, score, episode.record));
             }
         }
         Ok((before - self.live.len()) as u32)
@@ -133,15 +152,46 @@ impl<S> Rollout<S> {
     }
 
     /// Scores of the ended episodes, in the order of the seeds.
-    pub fn into_scores(mut self) -> Vec<EpisodeScore> {
-        self.scores.sort_unstable_by_key(|&(index, _)| index);
-        self.scores.into_iter().map(|(_, score)| score).collect()
+    pub fn into_scores(self) -> Vec<EpisodeScore> {
+        self.into_records().into_iter().map(|(score, _)| score).collect()
+    }
+
+    /// Scores of the ended episodes in the order of the seeds, and the episodes if they were
+    /// [recorded](Self::recording).
+    pub fn into_records(mut self) -> Vec<(EpisodeScore, Option<Episode>)> {
+        self.ended.sort_unstable_by_key(|&(index, ..)| index);
+        self.ended.into_iter().map(|(_, score, record)| (score, record)).collect()
     }
 }
 
-impl Episode {
+/// The observation of an environment, rounded.
+fn observe(
+    environment: &dyn Environment,
+    wanted: usize,
+) -> Result<impl Iterator<Item = f32>, EnvironmentError> {
+    let observation = environment.observation();
+    let found = observation.len();
+    match found == wanted {
+        true => Ok(observation.iter().map(|&value| value as f32)),
+        false => Err(EnvironmentError::Observation { found, wanted }),
+    }
+}
+
+impl Live {
     fn step(&mut self, action: &[f32]) -> Result<(), EnvironmentError> {
+        if let Some(record) = &mut self.record {
+            let observation = self.environment.observation();
+            record.observations.extend(observation.iter().map(|&value| value as f32));
+        }
         let step = self.environment.step(action)?;
+        if let Some(record) = &mut self.record {
+            if step.intervention.is_some() {
+                record.interventions.push(self.score.length);
+            }
+            record.actions.extend(step.intervention.as_deref().unwrap_or(action));
+            record.rewards.push(step.reward as f32);
+            record.terminated = step.terminated;
+        }
         self.score.episode_return += step.reward;
         self.score.length += 1;
         // A sum that is not finite stays so.
@@ -149,7 +199,8 @@ impl Episode {
         self.ended = step.terminated || step.truncated || !is_finite;
         Ok(())
     }
-    fn into_score(mut self) -> Result<EpisodeScore, EnvironmentError> {
+
+    fn score(&mut self) -> Result<EpisodeScore, EnvironmentError> {
         let EpisodeScore { seed, episode_return, length, .. } = self.score;
         let check = |what, value| match EpisodeScore::counts(value) {
             true => Ok(value),

@@ -107,7 +107,7 @@ impl Simulation {
             true => self.task.judge(from, &self.physics),
             false => (0.0, true),
         };
-        Step { reward, terminated, truncated }
+        Step { reward, terminated, truncated, intervention: None }
     }
 
     /// Simulated time of a step, seconds.

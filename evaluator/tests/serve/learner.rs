@@ -1,5 +1,6 @@
 //! A learner that has one job and records an evaluator's messages; and the evaluator's process.
 
+use std::collections::BTreeMap;
 use std::process::{Child, Command, ExitStatus};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
@@ -8,8 +9,8 @@ use candle_core::Device;
 use quad_nn::{Layout, Weights};
 use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig};
 use quad_protocol::{
-    Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot,
-    decode, encode, keys,
+    Hash, Job, JobReply, JobRequest, Message, Name, Origin, Piece, ScoreReply, ScoreReport,
+    Snapshot, decode, encode, keys,
 };
 use quad_runtime::{Endpoints, open_session, reachable_at};
 use rand::SeedableRng;
@@ -30,6 +31,7 @@ pub enum Event {
     Weights,
     Progress,
     Scores(ScoreReport),
+    Piece(Piece),
     /// With the reason.
     HandedBack(Option<String>),
 }
@@ -39,12 +41,16 @@ impl Event {
         matches!(self, Event::Scores(_))
     }
 
+    pub fn is_piece(&self) -> bool {
+        matches!(self, Event::Piece(_))
+    }
+
     pub fn is_handed_back(&self) -> bool {
         matches!(self, Event::HandedBack(_))
     }
 }
 
-/// Reaction to scores, claims and returned jobs.
+/// Reaction to scores, pieces of episodes, claims and returned jobs.
 #[derive(Clone, Copy, PartialEq)]
 pub enum Behavior {
     Records,
@@ -58,13 +64,20 @@ pub enum Behavior {
     Refuses,
     /// Leaves the first job that is handed back without an answer.
     LosesHandBack,
+    /// Loses the beginning of the first episode when it gets the third piece.
+    Forgets,
+    /// Leaves the last piece of the first episode without an answer.
+    LosesAnswer,
 }
 
-struct State {
+pub struct State {
     events: Vec<Event>,
-    behavior: Behavior,
+    pub behavior: Behavior,
+    pub incarnation: u64,
     /// Given out until it is done or handed back.
-    job: Option<Job>,
+    pub job: Option<Job>,
+    /// The frames of episodes by their seeds, as far as they have come.
+    pub frames: BTreeMap<u64, Vec<u8>>,
 }
 
 pub struct Learner {
@@ -76,13 +89,17 @@ pub struct Learner {
 
 /// The file of a small diffusion policy for Hopper with random weights.
 pub fn file() -> Vec<u8> {
-    let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[8; 3]), 2, 5);
+    file_for("hopper", (11, 3))
+}
+
+pub fn file_for(environment: &str, sizes: (usize, usize)) -> Vec<u8> {
+    let shape = DiffusionShape::quad(sizes, &MlpConfig::mish(&[8; 3]), 2, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
     let choice = Choice::best_of(2);
     let policy = PolicyConfig::Diffusion { shape, choice };
     let initial = |layout: &Layout| Weights::initial(layout, &mut generator, &Device::Cpu);
     let tensors = policy.tensors(initial).unwrap();
-    let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 10, episodes: 3 };
+    let origin = Origin { environment: environment.to_owned(), seed: 1, step: 10, episodes: 3 };
     let header = Header::new(policy, origin);
     header.to_safetensors(&tensors).unwrap()
 }
@@ -118,12 +135,20 @@ fn reply<M: Message>(query: &Query, message: &M) {
 fn answer(query: &Query, state: &Mutex<State>, weights: &Snapshot) {
     let payload = query.payload().map(|payload| payload.to_bytes());
     let payload = payload.unwrap_or_default();
-    let (run, key, incarnation) = (name("run"), query.key_expr().as_str(), INCARNATION);
+    let (run, key) = (name("run"), query.key_expr().as_str());
     let mut locked = state.lock().unwrap();
+    let incarnation = locked.incarnation;
     if key == keys::weights_at(&run, 10) {
         locked.events.push(Event::Weights);
         reply(query, &snapshot(b"other weights".to_vec()));
         reply(query, weights);
+    } else if key == keys::experience(&run) {
+        let piece: Piece = decode(&payload).unwrap();
+        locked.events.push(Event::Piece(piece.clone()));
+        match locked.behavior {
+            Behavior::DiskFull => query.reply_err("No space left on device").wait().unwrap(),
+            _ => locked.take(piece).into_iter().for_each(|answer| reply(query, &answer)),
+        }
     } else if key == keys::scores(&run) {
         let report: ScoreReport = decode(&payload).unwrap();
         let new = report.episodes.len() as u32;
@@ -179,8 +204,9 @@ impl Learner {
         let listen = Endpoints { listen: any_port, ..Endpoints::default() };
         let session = open_session(&listen).await.unwrap();
         let endpoint = reachable_at(&session, &listen).await.unwrap().remove(0);
-        let (events, job) = (Vec::new(), None);
-        let state = Arc::new(Mutex::new(State { events, behavior, job }));
+        let (events, frames, incarnation) = (Vec::new(), BTreeMap::new(), INCARNATION);
+        let state = State { events, behavior, incarnation, job: None, frames };
+        let state = Arc::new(Mutex::new(state));
         let snapshot = snapshot(file);
         let (shared, weights) = (state.clone(), snapshot.clone());
         let callback = move |query: Query| answer(&query, &shared, &weights);
@@ -206,7 +232,7 @@ impl Learner {
         (learner, evaluator, tokens)
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    pub fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap()
     }
 
@@ -235,7 +261,7 @@ impl Learner {
         self.announce(INCARNATION - 1).await
     }
 
-    async fn announce(&self, incarnation: u64) -> LivelinessToken {
+    pub async fn announce(&self, incarnation: u64) -> LivelinessToken {
         let key = keys::live_learner(&name("run"), incarnation);
         self.session.liveliness().declare_token(key).await.unwrap()
     }

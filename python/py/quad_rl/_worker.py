@@ -107,13 +107,15 @@ class WrappedEnvironment:
         observation, _ = self._run(self.environment.reset, seed=seed)
         return self._row(observation)
 
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool]:
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool, list[float] | None]:
+        size = action.size
         if self.action_shape is not None:
             action = action.reshape(self.action_shape)
         if self.bounds is not None:
             action = np.clip(action, *self.bounds)
         observation, reward, terminated, truncated, self.info = self._run(self.environment.step, action)
-        return self._row(observation), float(reward), bool(terminated), bool(truncated)
+        taken = self.info.get("intervention")
+        return self._row(observation), float(reward), bool(terminated), bool(truncated), _intervention(taken, size)
 
     def score(self, episode_return: float) -> float:
         if self.score_rule == "return":
@@ -127,6 +129,16 @@ class WrappedEnvironment:
             return 100.0 * bool(success)
         low, high = map(float, self.score_rule)
         return 100.0 * (episode_return - low) / (high - low)
+
+
+def _intervention(taken: Any, size: int) -> list[float] | None:
+    """The action that a person took."""
+    if taken is None:
+        return None
+    action = np.asarray(taken, np.float32).ravel()
+    if action.size != size or not np.isfinite(action).all():
+        raise EnvironmentFailed(f'info["intervention"] must be {size} finite numbers, the action that was taken, not {taken!r}')
+    return action.tolist()
 
 
 class Factory:

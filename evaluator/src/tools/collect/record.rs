@@ -120,8 +120,8 @@ impl Recorder {
             }
             let step = self.environment.step(&action);
             self.actions.push(action.iter().copied().map(f64::from).collect());
-            self.steps.push(step);
             self.episode_return += step.reward;
+            self.steps.push(step);
             self.keep_state();
             if self.ended() || spec.normalized_score(self.episode_return) > ceiling {
                 return;

@@ -1,0 +1,87 @@
+//! Results of a job, which the evaluator owes to the learner until they are acknowledged.
+
+use std::collections::VecDeque;
+
+use quad_protocol::{
+    CodecError, Episode, EpisodeScore, Hash, Job, Message, Name, Piece, ScoreReport, encode,
+};
+
+/// The results of a job.
+pub enum Owed {
+    Scores(ScoreReport),
+    /// Practice episodes that are not acknowledged, in the order of their delivery.
+    Episodes(VecDeque<Parcel>),
+}
+
+/// A practice episode on its way to the learner.
+pub struct Parcel {
+    /// Steps of the episode.
+    pub rows: u64,
+    frame: Vec<u8>,
+    /// The next piece, without its bytes.
+    next: Piece,
+}
+
+impl Owed {
+    /// The results of `played` episodes of `job`.
+    ///
+    /// # Errors
+    /// An episode of practice cannot be delivered: a number is not finite, or it is too long.
+    pub fn new(
+        job: &Job,
+        evaluator: Name,
+        precision: Name,
+        played: Vec<(EpisodeScore, Option<Episode>)>,
+    ) -> Result<Owed, CodecError> {
+        if job.practice.is_none() {
+            let scores = played.into_iter().map(|(score, _)| score).collect();
+            return Ok(Owed::Scores(ScoreReport::new(job, evaluator, precision, scores)));
+        }
+        let parcel = |episode: Episode| {
+            episode.verify()?;
+            let frame = encode(&episode)?;
+            let EpisodeScore { seed, length, .. } = episode.score;
+            let next = Piece {
+                evaluator: evaluator.clone(),
+                run: job.run.clone(),
+                incarnation: job.incarnation,
+                job: job.id,
+                precision: precision.clone(),
+                seed,
+                hash: Hash::of(&frame),
+                length: frame.len() as u32,
+                offset: 0,
+                bytes: Vec::new(),
+            };
+            Ok(Parcel { rows: length.into(), frame, next })
+        };
+        let episodes = played.into_iter().filter_map(|(_, episode)| episode);
+        Ok(Owed::Episodes(episodes.map(parcel).collect::<Result<_, _>>()?))
+    }
+}
+
+impl Parcel {
+    pub fn seed(&self) -> u64 {
+        self.next.seed
+    }
+
+    /// The next piece.
+    pub fn piece(&self) -> Piece {
+        let rest = &self.frame[self.next.offset as usize..];
+        Piece { bytes: rest[..rest.len().min(Piece::MOST)].to_vec(), ..self.next.clone() }
+    }
+
+    /// Goes on at the offset that the learner has named. Fails if that is not ahead: a learner that
+    /// has lost what it had gets it after a pause.
+    pub fn continue_at(&mut self, offset: u32) -> Result<(), String> {
+        let Piece { seed, length, .. } = self.next;
+        if offset >= length {
+            return Err(format!("the episode with seed {seed} has {length} bytes, not {offset}"));
+        }
+        let before = std::mem::replace(&mut self.next.offset, offset);
+        match offset > before {
+            true => Ok(()),
+            false => Err(format!("it wants the episode with seed {seed} from byte {offset} again")),
+        }
+    }
+}
