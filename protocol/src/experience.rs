@@ -45,9 +45,12 @@ impl Episode {
     }
 }
 
+/// Bytes of a record's two names, each after its length.
+const NAMES: usize = 2 * (size_of::<u64>() + Name::MAX_LENGTH);
+
 impl Message for Episode {
     const KIND: u8 = 7;
-    const LIMIT: usize = LARGE;
+    const LIMIT: usize = LARGE - NAMES;
 
     fn verify(&self) -> Result<(), CodecError> {
         let Self { score, observations, actions, rewards, interventions, .. } = self;
@@ -68,6 +71,25 @@ impl Message for Episode {
             return malformed("a number of an episode is not finite");
         }
         Ok(())
+    }
+}
+
+/// An episode and who has played it, as the learner keeps it on disk.
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+#[allow(missing_docs)] // The names say it.
+pub struct Record {
+    pub evaluator: Name,
+    /// Arithmetic of the policy, as in a [`ScoreReport`](crate::ScoreReport).
+    pub precision: Name,
+    pub episode: Episode,
+}
+
+impl Message for Record {
+    const KIND: u8 = 10;
+    const LIMIT: usize = LARGE;
+
+    fn verify(&self) -> Result<(), CodecError> {
+        self.episode.verify()
     }
 }
 
@@ -163,7 +185,7 @@ mod tests {
         let broken: [fn(&mut Episode); 7] = [
             |it| it.rewards.clear(),
             |it| it.score.length = 3,
-            |it| drop(it.observations.pop()),
+            |it| it.observations.truncate(5),
             |it| it.actions.push(0.0),
             |it| it.interventions = vec![2],
             |it| it.interventions = vec![1, 1],

@@ -13,6 +13,11 @@ impl Hash {
     pub fn of(bytes: &[u8]) -> Hash {
         Hash(blake3::hash(bytes).into())
     }
+
+    /// The hash as bytes.
+    pub fn bytes(&self) -> &[u8; 32] {
+        &self.0
+    }
 }
 
 impl fmt::Display for Hash {

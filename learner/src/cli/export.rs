@@ -1,4 +1,4 @@
-//! The arguments of `learner export`.
+//! The arguments of `learner export` and `learner export-data`.
 
 use std::path::PathBuf;
 
@@ -28,6 +28,16 @@ pub struct ExportArgs {
     /// License of the data [default: that of a dataset of `learner datasets list`]
     #[arg(long, value_name = "TEXT")]
     pub license: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub struct ExportDataArgs {
+    /// Folder of the run
+    #[arg(value_name = "RUN")]
+    pub run: PathBuf,
+    /// The file to write, in D4RL's layout
+    #[arg(long, value_name = "FILE.hdf5")]
+    pub out: PathBuf,
 }
 
 /// A snapshot of a run: after a gradient step, the one with the best evaluation, or the last.

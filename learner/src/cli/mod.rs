@@ -17,7 +17,7 @@ use quad_run::config::{presets, tasks};
 use quad_run::results::Select;
 use quad_runtime::parse_endpoint;
 
-pub use export::{At, ExportArgs};
+pub use export::{At, ExportArgs, ExportDataArgs};
 pub use judge::JudgeArgs;
 pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
@@ -67,6 +67,8 @@ pub enum Command {
     /// Write a policy's file that stands alone: it says what it has learned from and how good it is
     #[command(after_help = export::EXAMPLES)]
     Export(ExportArgs),
+    /// Write the experience of a run, which evaluators played for it, as a dataset
+    ExportData(ExportDataArgs),
     /// Check in a run's folder that each episode is scored once, with the weights in that folder
     Verify(VerifyArgs),
     /// Check this machine before a run, and say how to fix what is wrong

@@ -4,6 +4,7 @@
 mod doctor;
 mod dry_run;
 mod export;
+mod export_data;
 mod judge;
 mod outside;
 mod page;
@@ -41,6 +42,7 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
         Command::Export(args) => export::export(args),
+        Command::ExportData(args) => export_data::export(args),
         Command::Judge(args) => judge::run(args),
         Command::Verify(args) => check_runs(args),
         Command::List(args) => list_runs(args),

@@ -5,7 +5,8 @@ use std::env;
 use std::fs::{self, File};
 use std::path::Path;
 
-use quad_protocol::{Hash, episode_seeds};
+use quad_protocol::{Episode, EpisodeScore, Hash, Name, Record, episode_seeds};
+use quad_run::folder::RunDir;
 use serde_json::{Value, json};
 
 use crate::run::{HOPPER, Run, paper, small, write_all, write_study};
@@ -42,6 +43,7 @@ fn commands_print_what_their_transcripts_have() {
     write_study("study");
     let _at_work = write_listed();
     write_verified();
+    write_practiced();
     trycmd::TestCases::new()
         .register_bin("learner", Path::new(env!("CARGO_BIN_EXE_learner")))
         .register_bin("sh", Path::new("/bin/sh"))
@@ -192,6 +194,35 @@ fn write_verified() {
             let path = format!("verify/{name}/snapshots/step_000000015.safetensors");
             fs::write(path, snapshot).unwrap();
         }
+    }
+}
+
+/// The runs of export-data.trycmd: one without experience, one with three episodes, in the first of
+/// which a person acted twice.
+fn write_practiced() {
+    let runs = ["practice/none", "practice/run"];
+    runs.map(|path| Run::new("hopper-demo", 5).write(path));
+    let (mut log, _) = RunDir::at(Path::new(runs[1])).experience_log().unwrap();
+    for (number, (length, terminated)) in
+        [(30, true), (60, false), (20, true)].into_iter().enumerate()
+    {
+        let smooth = |count: usize, each: f32| {
+            Vec::from_iter((0..count).map(|i| ((i + 40 * number) as f32 * each).sin()))
+        };
+        let seed = number as u64;
+        let name = |text: &str| Name::new(text).unwrap();
+        let episode = Episode {
+            step: 20_000,
+            weights: Hash::of(b"weights"),
+            score: EpisodeScore { seed, episode_return: length as f64, length, score: 1.0 },
+            terminated,
+            observations: smooth((length as usize + 1) * 11, 0.37),
+            actions: smooth(length as usize * 3, 1.3),
+            rewards: smooth(length as usize, 0.1),
+            interventions: if number == 0 { vec![3, 4] } else { Vec::new() },
+        };
+        log.append(&[Record { evaluator: name("e"), precision: name("f32-avx512"), episode }])
+            .unwrap();
     }
 }
 

@@ -1,4 +1,4 @@
-//! Append-only files of JSON lines.
+//! Append-only files.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -10,7 +10,7 @@ use super::error::{RunDirError, content, io_error};
 use super::lock::Lock;
 use crate::files;
 
-/// A file of JSON lines, opened for appending.
+/// A file of JSON lines, or of other records, opened for appending.
 #[derive(Debug)]
 pub struct Log {
     path: PathBuf,
@@ -19,23 +19,40 @@ pub struct Log {
     length: u64,
     /// True if an incomplete line may follow them.
     torn: bool,
-    /// A log with a lock is synchronized after each write. The run's other log has the same writer
-    /// and needs no lock.
-    lock: Option<Lock>,
+    /// True if each write is synchronized.
+    durable: bool,
+    /// The run's other logs have the same writer and need no lock.
+    _lock: Option<Lock>,
 }
 
 impl Log {
-    /// Opens or creates the file and cuts off an incomplete line at its end.
+    /// Opens or creates a file of lines and cuts off an incomplete line at its end. A log with a
+    /// lock is durable.
     pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
+        let durable = lock.is_some();
+        let log = Self::of_records(path, durable, |bytes| Ok(complete_lines(bytes)))?;
+        Ok(Self { _lock: lock, ..log })
+    }
+
+    /// Opens or creates a file and cuts off all but the first bytes, as many as `complete` counts.
+    pub(super) fn of_records(
+        path: PathBuf,
+        durable: bool,
+        complete: impl FnOnce(&[u8]) -> Result<usize, RunDirError>,
+    ) -> Result<Self, RunDirError> {
         let file = files::append(&path).map_err(io_error("open", &path))?;
-        let mut log = Self { path, file, length: 0, torn: true, lock };
-        log.length = complete_lines(&log.bytes()?) as u64;
+        let mut log = Self { path, file, length: 0, torn: true, durable, _lock: None };
+        log.length = complete(&log.bytes()?)? as u64;
         // Lines that a killed process did not synchronize count from now on.
         log.mend()
             .and_then(|()| log.synchronize())
             .and_then(|()| files::synchronize_folder(&log.path))
             .map_err(io_error("open", &log.path))?;
         Ok(log)
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.path
     }
 
     /// True if it has no complete line.
@@ -51,17 +68,22 @@ impl Log {
                 .map_err(|error| content(&self.path, None, error))?;
             text.push(b'\n');
         }
-        self.write(&text).map_err(io_error("write", &self.path))
+        self.append_bytes(&text)
     }
 
-    fn write(&mut self, text: &[u8]) -> io::Result<()> {
+    /// Appends bytes: all of them, or none if it fails.
+    pub(super) fn append_bytes(&mut self, bytes: &[u8]) -> Result<(), RunDirError> {
+        self.write(bytes).map_err(io_error("write", &self.path))
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.mend()?;
         self.torn = true;
-        let written = self.file.write_all(text).and_then(|()| self.synchronize());
+        let written = self.file.write_all(bytes).and_then(|()| self.synchronize());
         match written {
             Ok(()) => {
                 self.torn = false;
-                self.length += text.len() as u64;
+                self.length += bytes.len() as u64;
             }
             // If this fails, too, the next write tries it again.
             Err(_) => drop(self.mend()),
@@ -70,7 +92,7 @@ impl Log {
     }
 
     fn synchronize(&self) -> io::Result<()> {
-        if self.lock.is_some() { self.file.sync_data() } else { Ok(()) }
+        if self.durable { self.file.sync_data() } else { Ok(()) }
     }
 
     /// Cuts off the incomplete line of a failed write, which would spoil the next line.
@@ -117,4 +139,27 @@ pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
 /// Length of the complete lines, bytes.
 fn complete_lines(text: &[u8]) -> usize {
     text.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{self, OpenOptions};
+
+    use super::*;
+
+    #[test]
+    fn what_a_full_disk_has_torn_off_is_cut_off_by_the_next_write() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log");
+        let mut log = Log::of_records(path.clone(), true, |bytes| Ok(bytes.len())).unwrap();
+        log.append_bytes(b"first,").unwrap();
+        let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let file = std::mem::replace(&mut log.file, full);
+        let error = log.append_bytes(b"second,").unwrap_err();
+        assert!(error.hint().contains("make room"), "{error:?}");
+        fs::write(&path, "first,sec").unwrap();
+        log.file = file;
+        log.append_bytes(b"third,").unwrap();
+        assert_eq!(fs::read_to_string(path).unwrap(), "first,third,");
+    }
 }

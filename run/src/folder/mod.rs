@@ -4,11 +4,12 @@
 //! `scores.jsonl`, the main thread everything else. A learner at work holds a lock on
 //! `scores.jsonl`. Commands that only read may run at any time.
 //!
-//! In reading order: `run_dir`, `find`, `lines`, `lock`, `log`, `checkpoints`, `error`, `resume`,
-//! `verify`.
+//! In reading order: `run_dir`, `find`, `lines`, `lock`, `log`, `experience`, `checkpoints`, `error`,
+//! `resume`, `verify`.
 
 mod checkpoints;
 pub(crate) mod error;
+mod experience;
 mod find;
 mod lines;
 mod lock;
@@ -21,6 +22,7 @@ pub mod verify;
 
 pub use checkpoints::Checkpoint;
 pub use error::RunDirError;
+pub use experience::{ExperienceLog, read_experience};
 pub use find::walk;
 pub use lines::{RunEndpoints, ScoreLine, read_metrics};
 pub use lock::Lock;

@@ -5,6 +5,7 @@
 //! endpoints.json                     the learner's addresses; written as soon as it listens
 //! metrics.jsonl                      training metrics, a line every hundred gradient steps
 //! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgment
+//! experience.log                     the episodes of practice, each written before the evaluator gets its acknowledgment
 //! snapshots/step_000003000.safetensors   target actor and target critics; written before the evaluation of it begins
 //! checkpoints/step_000003000_….safetensors   the newest three training states, to resume from
 //! report.json, learning_curve.svg    written at the end
@@ -30,6 +31,7 @@ use crate::files;
 const CONFIG: &str = "config.toml";
 const ENDPOINTS: &str = "endpoints.json";
 const SCORES: &str = "scores.jsonl";
+pub(super) const EXPERIENCE: &str = "experience.log";
 const FAILED: &str = "failed";
 const SNAPSHOTS: &str = "snapshots";
 
@@ -55,10 +57,10 @@ impl RunDir {
         let run = Self::at(path);
         let snapshots = path.join(SNAPSHOTS);
         files::create_folder(&snapshots).map_err(io_error(CREATE, &snapshots))?;
-        // Of two learners that begin at once, only one gets the lock. Scores without a
-        // configuration are not those of the new run.
+        // Of two learners that begin at once, only one gets the lock. Scores and experience without
+        // a configuration are not those of the new run.
         let scores = run.score_log()?;
-        if Self::is_occupied(path) || !scores.is_empty() {
+        if Self::is_occupied(path) || !scores.is_empty() || path.join(EXPERIENCE).exists() {
             return Err(occupied());
         }
         run.clear_failure()?;

@@ -1,0 +1,40 @@
+//! `learner export-data`: the experience of a run as a dataset.
+
+use anyhow::anyhow;
+use quad_dataset::{DatasetError, Metadata, PracticeRows, write_practice};
+use quad_run::folder::{RunDir, read_experience};
+use quad_runtime::{Hint, print};
+
+use crate::cli::ExportDataArgs;
+
+pub fn export(args: &ExportDataArgs) -> anyhow::Result<()> {
+    let (folder, config) = RunDir::open(&args.run)?;
+    let records = read_experience(folder.path())?;
+    let Some(last) = records.last() else {
+        return Err(anyhow!("{} has no experience", args.run.display())).hint(
+            "`learner train --online-steps N` lets evaluators practice; the learner keeps their episodes",
+        );
+    };
+    let episodes = Vec::from_iter(records.iter().map(|record| {
+        let episode = &record.episode;
+        let rows = PracticeRows {
+            observations: &episode.observations,
+            actions: &episode.actions,
+            rewards: &episode.rewards,
+            terminated: episode.terminated,
+        };
+        (rows, &*episode.interventions)
+    }));
+    let experiment = &config.experiment;
+    let metadata = Metadata {
+        algorithm: &experiment.algorithm,
+        iteration: last.episode.step as i64,
+        seed: experiment.seed,
+    };
+    let (environment, dims) = (&experiment.environment, last.episode.dims());
+    write_practice(&args.out, environment, dims, &metadata, &episodes)
+        .hint_of(DatasetError::hint)?;
+    let rows: usize = episodes.iter().map(|(rows, _)| rows.rewards.len()).sum();
+    let (name, episodes) = (args.out.display(), episodes.len());
+    print(&format!("{name}: {rows} rows of {episodes} episodes in {environment}"))
+}

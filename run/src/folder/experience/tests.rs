@@ -1,0 +1,100 @@
+//! Tests of `experience.log`.
+
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::PathBuf;
+
+use quad_protocol::{Episode, EpisodeScore, Name};
+use tempfile::TempDir;
+
+use super::*;
+use crate::fixtures::config;
+
+/// A record of a practice episode of two steps.
+fn record(seed: u64) -> Record {
+    let score = EpisodeScore { seed, episode_return: 3.0, length: 2, score: 3.0 };
+    let episode = Episode {
+        step: 10,
+        weights: Hash::of(b"weights"),
+        score,
+        terminated: true,
+        observations: vec![0.0, 1.0, 2.0],
+        actions: vec![0.5, -0.5],
+        rewards: vec![1.0, 2.0],
+        interventions: Vec::new(),
+    };
+    let name = |text: &str| Name::new(text).unwrap();
+    Record { evaluator: name("e"), precision: name("f32"), episode }
+}
+
+/// A run with the records of seeds 1, 2 and 3, the path of their file, and its contents.
+fn recorded() -> (TempDir, RunDir, PathBuf, Vec<u8>) {
+    let folder = tempfile::tempdir().unwrap();
+    let (run, _) = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
+    assert_eq!(read_experience(run.path()).unwrap(), []);
+    let (mut log, records) = run.experience_log().unwrap();
+    assert_eq!(records, []);
+    log.append(&[record(1)]).unwrap();
+    log.append(&[record(2), record(3)]).unwrap();
+    let path = run.path().join("experience.log");
+    let bytes = fs::read(&path).unwrap();
+    (folder, run, path, bytes)
+}
+
+#[test]
+fn an_incomplete_record_at_the_end_is_cut_off() {
+    let (_folder, run, path, bytes) = recorded();
+    let record_length = bytes.len() / 3;
+    let [one, two, three] = [1, 2, 3].map(record);
+    for kept in [0, 1, 35, 36, record_length - 1] {
+        fs::write(&path, &bytes[..2 * record_length + kept]).unwrap();
+        assert_eq!(read_experience(run.path()).unwrap(), [one.clone(), two.clone()]);
+        let (mut log, records) = run.experience_log().unwrap();
+        assert_eq!(records, [one.clone(), two.clone()]);
+        log.append(&[three.clone()]).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), bytes, "{kept} bytes");
+    }
+}
+
+#[test]
+fn a_damaged_record_before_another_one_is_an_error() {
+    let (_folder, run, path, bytes) = recorded();
+    let record_length = bytes.len() / 3;
+    // In length, hash, begin and end of the frame of the second.
+    for at in [0, 3, 4, 36, record_length - 1] {
+        let mut damaged = bytes.clone();
+        damaged[record_length + at] ^= 0x40;
+        fs::write(&path, &damaged).unwrap();
+        let error = run.experience_log().unwrap_err();
+        let expected =
+            format!("record 2, at byte {record_length}, is damaged, but one after it is complete");
+        assert!(error.to_string().ends_with(&expected), "{at}: {error}");
+        assert!(error.hint().contains("a copy of the file"));
+        assert!(read_experience(run.path()).is_err());
+        assert_eq!(fs::read(&path).unwrap(), damaged);
+    }
+}
+
+#[test]
+fn a_record_of_another_version_is_an_error() {
+    let (_folder, run, path, _) = recorded();
+    let mut frame = encode(&record(4)).unwrap();
+    frame[4] += 1;
+    let length = (frame.len() as u32).to_le_bytes();
+    fs::write(&path, [&length[..], Hash::of(&frame).bytes(), &frame].concat()).unwrap();
+    let error = run.experience_log().unwrap_err().to_string();
+    assert!(error.contains("record 1: the message has protocol version"), "{error}");
+}
+
+#[test]
+fn experience_is_not_written_through_a_link_or_taken_over() {
+    let (_folder, run, path, bytes) = recorded();
+    let elsewhere = run.path().with_file_name("elsewhere");
+    fs::rename(&path, &elsewhere).unwrap();
+    symlink(&elsewhere, &path).unwrap();
+    assert!(run.experience_log().is_err() && read_experience(run.path()).is_err());
+    assert_eq!(fs::read(&elsewhere).unwrap(), bytes);
+    fs::remove_file(run.path().join("config.toml")).unwrap();
+    let error = RunDir::create(run.path(), &config("a", 0)).unwrap_err();
+    assert!(matches!(error, RunDirError::Occupied(_)), "{error}");
+}
