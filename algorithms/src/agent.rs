@@ -7,10 +7,11 @@ use crate::definition::{Definition, Hyperparameters, Metric};
 use crate::error::AlgorithmError;
 use crate::pool::run_awake;
 use candle_core::Device;
-use quad_dataset::Names;
+use quad_dataset::{Names, Transitions};
 use quad_nn::Scaling;
 use quad_policy::{Header, PolicyError, read_header, read_tensors, write_tensors};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Key of the counters in the metadata of a saved state.
 const COUNTERS: &str = "state";
@@ -20,8 +21,7 @@ pub struct Agent {
     definition: Definition,
     pub(super) algorithm: Box<dyn Algorithm>,
     device: Device,
-    /// Transitions in the dataset.
-    transitions: usize,
+    transitions: Arc<Transitions>,
     /// The maps between the data's units and the algorithm's, unless they are the same.
     scaling: Option<Scaling>,
     /// The dataset's names of observations and actions.
@@ -64,10 +64,10 @@ impl Agent {
         hyperparameters: &Hyperparameters,
         context: Context,
     ) -> Result<Self, AlgorithmError> {
-        let (device, transitions) = (context.device.clone(), context.transitions.len());
-        let scaling = Some(context.transitions.scaling().clone())
-            .filter(|scaling| *scaling != Scaling::default());
-        let names = context.transitions.names().clone();
+        let (device, transitions) = (context.device.clone(), context.transitions.clone());
+        let scaling =
+            Some(transitions.scaling().clone()).filter(|scaling| *scaling != Scaling::default());
+        let names = transitions.names().clone();
         let algorithm = hyperparameters.start(&definition, context)?;
         // Each thread has its own queue on a GPU: what this one made must be there for the next.
         device.synchronize()?;
@@ -76,7 +76,12 @@ impl Agent {
 
     /// The number of examples that batches are drawn from.
     pub fn dataset_len(&self) -> usize {
-        self.algorithm.dataset_len(self.transitions)
+        self.algorithm.dataset_len(self.transitions.len())
+    }
+
+    /// The transitions of the dataset and of experience.
+    pub fn transitions(&self) -> &Arc<Transitions> {
+        &self.transitions
     }
 
     /// The metrics of its updates.

@@ -29,14 +29,15 @@ pub(super) struct Outside {
 
 impl Outside {
     pub fn new(args: &TrainArgs, experiment: &Experiment) -> anyhow::Result<Self> {
-        let endpoints = endpoints(args, experiment.eval_interval)?;
+        let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
+        let endpoints = endpoints(args, needs_evaluators)?;
         let is_default = args.listen.is_none() && args.connect.is_none();
         let cores = available_parallelism()?.get();
         let is_alone = is_default
             && endpoints.certificates.is_none()
             && environment::find(&experiment.environment).is_ok();
         let (count, share) = match args.evaluators {
-            _ if args.dry_run || experiment.eval_interval == 0 => (0, cores),
+            _ if args.dry_run || !needs_evaluators => (0, cores),
             Some(count) => (count, cores),
             None if is_alone => {
                 let left = cores.saturating_sub(training_threads(args.threads)).max(1);
@@ -69,13 +70,13 @@ pub(super) fn training_threads(asked: Option<NonZero<usize>>) -> usize {
     asked.or_else(threads_asked).map_or(cores.min(MOST_THREADS), NonZero::get)
 }
 
-fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
+fn endpoints(args: &TrainArgs, needs_evaluators: bool) -> anyhow::Result<Endpoints> {
     // A learner that starts evaluators uses no certificates: the variable is for other networks.
     let has_evaluators = args.evaluators.is_some_and(|count| count > 0);
     let folder = certificates_folder(args.certificates.clone()).filter(|_| !has_evaluators);
     let certificates = folder.map(|folder| Certificates::read(&folder, Role::Learner));
     let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
-    let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
+    let port = if needs_evaluators { DEFAULT_PORT } else { ANY_PORT };
     let listen = match (&args.listen, &args.connect) {
         (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
         (listen, _) => Vec::from_iter(listen.clone()),

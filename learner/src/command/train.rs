@@ -84,7 +84,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         warn!("{warning}");
     }
     let experiment = &config.experiment;
-    if experiment.eval_interval > 0 && environment::find(&experiment.environment).is_err() {
+    let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
+    if needs_evaluators && environment::find(&experiment.environment).is_err() {
         info!(
             "scores come from evaluators that have the environment {}, which only Python's can (docs/python.md)",
             experiment.environment

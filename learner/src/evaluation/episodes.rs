@@ -1,10 +1,12 @@
-//! One evaluation: its snapshot and the states of its episodes.
+//! Episodes of one snapshot and their states: those of an evaluation, or one of practice.
 
 use std::collections::{BTreeSet, HashMap};
 use std::mem;
 use std::time::{Duration, Instant};
 
-use quad_protocol::{EpisodeScore, Hash};
+use quad_protocol::{EpisodeScore, Exploration, Hash};
+
+use super::outcomes::Opening;
 
 /// An episode is given up after this many lost evaluators: the episode itself may crash them.
 const MOST_ATTEMPTS: u32 = 20;
@@ -15,7 +17,11 @@ const LONGEST_REST: Duration = Duration::from_secs(60);
 
 #[derive(Debug)]
 pub(super) struct Evaluation {
+    /// Gradient step of the snapshot.
+    pub step: u64,
     pub weights: Hash,
+    /// Exploration in an episode of practice.
+    pub practice: Option<Exploration>,
     episodes: Vec<Episode>,
     /// Indices of the episodes by seed.
     indices: HashMap<u64, usize>,
@@ -61,9 +67,11 @@ enum EpisodeState {
 
 impl Evaluation {
     /// An evaluation of the episodes `seeds`, some of which may have a score already.
-    pub fn new(weights: Hash, seeds: &[u64], scores: &[EpisodeScore]) -> Self {
+    pub fn new(step: u64, weights: Hash, seeds: &[u64], scores: &[EpisodeScore]) -> Self {
         let mut evaluation = Self {
+            step,
             weights,
+            practice: None,
             episodes: Vec::new(),
             indices: seeds.iter().enumerate().map(|(index, &seed)| (seed, index)).collect(),
             waiting: (0..seeds.len()).collect(),
@@ -75,6 +83,12 @@ impl Evaluation {
         evaluation.episodes = seeds.iter().map(waiting).collect();
         evaluation.score(scores);
         evaluation
+    }
+
+    /// An episode of practice.
+    pub fn practice(opening: &Opening, weights: Hash) -> Self {
+        let Opening { step, seed, exploration, .. } = *opening;
+        Self { practice: Some(exploration), ..Self::new(step, weights, &[seed], &[]) }
     }
 
     fn set_state(&mut self, index: usize, state: EpisodeState) {
@@ -111,6 +125,15 @@ impl Evaluation {
         self.given_up.iter().map(|&index| self.episodes[index].seed)
     }
 
+    /// Hands out an episode once more, whose evaluator is slow.
+    pub fn hand_out_again(&mut self, job: u64) -> Vec<u64> {
+        let indices = Vec::from_iter(self.handed_out.iter().copied());
+        for &index in &indices {
+            self.set_state(index, EpisodeState::HandedOut { job });
+        }
+        indices.into_iter().map(|index| self.episodes[index].seed).collect()
+    }
+
     /// Hands out episodes that wait and do not rest. After a failure `few` at most, in case the
     /// episode is its cause.
     pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2], now: Instant) -> Vec<u64> {
@@ -135,7 +158,8 @@ impl Evaluation {
             if matches!(episode.state, EpisodeState::HandedOut { job: of } if of == job) {
                 lost.into_iter().for_each(|now| episode.lost(now));
                 let mut state = EpisodeState::Waiting;
-                if episode.lost >= MOST_ATTEMPTS {
+                // The learner waits for practice as long as it takes.
+                if episode.lost >= MOST_ATTEMPTS && self.practice.is_none() {
                     state = EpisodeState::GivenUp;
                     given_up.push(seed);
                 }

@@ -6,6 +6,9 @@
 //! happened too often. For each (step, seed) only the first delivered score counts, whichever
 //! evaluator delivers it.
 //!
+//! A practice episode is handed out like an evaluation's, but alone, before all others, and as often
+//! as it takes.
+//!
 //! It has no thread: the module `live` calls it behind a lock, for microseconds. The current time
 //! is an argument, so tests have a clock of their own.
 //!
@@ -21,7 +24,7 @@ mod scoreboard;
 mod tests;
 mod validate;
 
-pub(crate) use outcomes::{Claim, Claimed, Lost, OtherWeights};
+pub(crate) use outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, Practice};
 pub(crate) use refusal::Refusal;
 pub(crate) use scoreboard::{Rules, Scoreboard};
 pub(crate) use validate::Validated;

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use quad_protocol::{Job, Progress};
 
 use super::refusal::{Refusal, require};
+use super::scoreboard::Key;
 
 /// Longest time until the first environment step, in which an evaluator fetches the weights.
 const PREPARATION: Duration = Duration::from_secs(60);
@@ -12,6 +13,8 @@ const PREPARATION: Duration = Duration::from_secs(60);
 #[derive(Debug)]
 pub(super) struct OpenJob {
     pub job: Job,
+    /// What its episodes belong to.
+    pub key: Key,
     /// Number of the claim that it was handed out for.
     pub attempt: u64,
     /// Longest time without progress.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use quad_protocol::{EpisodeScore, Hash, Job, Name};
+use quad_protocol::{EpisodeScore, Exploration, Hash, Job, Name};
 
 /// Retrained weights differ from the scored ones.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -21,6 +21,26 @@ pub(crate) struct Recorded {
     pub jobs_completed: usize,
     /// All scores of the report's evaluation, in the order of its seeds, if this completed it.
     pub evaluation_completed: Option<Vec<EpisodeScore>>,
+}
+
+/// An episode of practice that evaluators may play.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Opening {
+    /// Number of the episode, from 0: experience enters the buffer in this order.
+    pub episode: u64,
+    /// Gradient step of the snapshot that acts.
+    pub step: u64,
+    pub seed: u64,
+    pub exploration: Exploration,
+}
+
+/// A practice episode as the learner knows it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Practice {
+    /// It is waited for.
+    Open { episode: u64 },
+    /// It was recorded, with a frame of this hash.
+    Recorded(Hash),
 }
 
 /// A request for a job.

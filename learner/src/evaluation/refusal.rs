@@ -18,6 +18,12 @@ pub(crate) enum Refusal {
     Seed(u64),
     #[error("the episode with seed {0} has an impossible length, return or score")]
     Episode(u64),
+    #[error("the run has no practice episode with seed {0}")]
+    Practice(u64),
+    #[error(
+        "the episode with seed {0} has observations or actions of another size, or is too long"
+    )]
+    Rows(u64),
 }
 
 impl Refusal {
@@ -32,6 +38,8 @@ impl Refusal {
             Self::Weights => "unknown_weights",
             Self::Seed(_) => "unknown_seed",
             Self::Episode(_) => "impossible_episode",
+            Self::Practice(_) => "unknown_practice",
+            Self::Rows(_) => "impossible_rows",
         }
     }
 }

@@ -1,28 +1,44 @@
 //! All evaluations of a run.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
-use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
+use quad_protocol::{Episode, EpisodeScore, Hash, Job, Message, Name, Progress, ScoreReport};
 use quad_run::folder::SavedScores;
 
 use super::episodes::Evaluation;
 use super::open_job::OpenJob;
-use super::outcomes::{Claim, Claimed, Lost, OtherWeights, Recorded};
+use super::outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, Practice, Recorded};
 use super::refusal::{Refusal, require};
 
 /// Time after which an evaluator without a job asks again: the larger of this time, and the second
 /// one for each evaluator, so that hundreds of idle ones do not keep the learner busy. A new
 /// snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
+/// The same while there is practice, in which the learner may wait for it.
+const ASK_FOR_PRACTICE: [Duration; 2] = [Duration::from_millis(20); 2];
 /// Time between an evaluator's progress messages, likewise.
 const PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(40)];
 /// Longest time between progress messages.
 const LONGEST_PROGRESS: Duration = Duration::from_secs(20);
 /// Time after which an evaluator without the run's environment asks again.
 const DOES_NOT_FIT: Duration = Duration::from_secs(10);
+
+/// After this time, an evaluator without work gets the practice episode that the learner waits for
+/// once more: the first answer counts.
+const STRAGGLER: Duration = Duration::from_secs(20);
+
+/// Names episodes of one snapshot. Practice comes first, since the learner waits for it, and older
+/// steps before newer ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Key {
+    /// Number of the episode.
+    Practice(u64),
+    /// Gradient step.
+    Evaluation(u64),
+}
 
 /// Constants of all evaluations of a run.
 #[derive(Clone, Debug)]
@@ -33,6 +49,8 @@ pub(crate) struct Rules {
     pub task: Task,
     /// Seed of the run: of its episodes, and of what the environment draws once for the whole run.
     pub seed: u64,
+    /// Sizes of an observation and of an action.
+    pub dims: (usize, usize),
     /// Episodes per evaluation.
     pub episodes: u32,
     /// Most episodes in one job: while as many evaluators as there are could share them, and if
@@ -43,22 +61,42 @@ pub(crate) struct Rules {
     pub lease: Duration,
 }
 
+impl Rules {
+    /// Most bytes of a practice episode's frame.
+    pub fn longest_frame(&self) -> usize {
+        let steps = self.task.max_episode_steps().unwrap_or(Episode::LONGEST).min(Episode::LONGEST);
+        let numbers = self.dims.0 + self.dims.1 + 2;
+        ((steps + 1) * numbers * size_of::<f32>() + (1 << 10)).min(Episode::LIMIT)
+    }
+}
+
 #[derive(Debug)]
 pub(crate) struct Scoreboard {
     pub(super) rules: Arc<Rules>,
-    pub(super) evaluations: BTreeMap<u64, Evaluation>,
+    pub(super) evaluations: BTreeMap<Key, Evaluation>,
     jobs: BTreeMap<Name, OpenJob>,
     next_job: u64,
     /// Scores of an earlier incarnation, by step, whose evaluation is not open yet.
     earlier: BTreeMap<u64, SavedScores>,
+    /// Numbers of the practice episodes that are open, by seed.
+    pub(super) practice: HashMap<u64, u64>,
+    /// Hashes of the recorded practice episodes' frames, by seed.
+    practiced: HashMap<u64, Hash>,
 }
 
 impl Scoreboard {
     /// A scoreboard without evaluations. The scores of an `earlier` incarnation count as soon as
     /// the evaluation of their step is added.
     pub fn new(rules: Arc<Rules>, earlier: BTreeMap<u64, SavedScores>) -> Self {
-        let (evaluations, jobs) = (BTreeMap::new(), BTreeMap::new());
-        Self { rules, evaluations, jobs, next_job: 1, earlier }
+        Self {
+            rules,
+            evaluations: BTreeMap::new(),
+            jobs: BTreeMap::new(),
+            next_job: 1,
+            earlier,
+            practice: HashMap::new(),
+            practiced: HashMap::new(),
+        }
     }
 
     /// Adds an evaluation of the snapshot of `step`, unless there is one. Returns the scores if an
@@ -72,7 +110,8 @@ impl Scoreboard {
         weights: Hash,
         seeds: &[u64],
     ) -> Result<Option<Vec<EpisodeScore>>, OtherWeights> {
-        let known = self.weights(step).map(|weights| weights.to_string());
+        let known = self.evaluations.get(&Key::Evaluation(step));
+        let known = known.map(|evaluation| evaluation.weights.to_string());
         let is_known = known.is_some();
         let earlier = || self.earlier.get(&step).map(|earlier| earlier.weights.clone());
         if let Some(scored) = known.or_else(earlier).filter(|scored| *scored != weights.to_string())
@@ -83,45 +122,85 @@ impl Scoreboard {
             return Ok(None);
         }
         let scores = self.earlier.remove(&step).map(|earlier| earlier.episodes).unwrap_or_default();
-        let evaluation = Evaluation::new(weights, seeds, &scores);
+        let evaluation = Evaluation::new(step, weights, seeds, &scores);
         let complete = evaluation.scores();
-        self.evaluations.insert(step, evaluation);
+        self.evaluations.insert(Key::Evaluation(step), evaluation);
         Ok(complete)
     }
 
-    /// Hash of the snapshot of a step that is evaluated.
+    /// Opens an episode of practice.
+    pub fn open_practice(&mut self, opening: &Opening, weights: Hash) {
+        self.practice.insert(opening.seed, opening.episode);
+        let episode = Evaluation::practice(opening, weights);
+        self.evaluations.insert(Key::Practice(opening.episode), episode);
+    }
+
+    /// Ends practice: episodes that nobody plays yet are not handed out.
+    pub fn end_practice(&mut self) {
+        let evaluations = &mut self.evaluations;
+        evaluations.retain(|_, it| it.practice.is_none() || it.waiting() == 0);
+        self.practice.retain(|_, episode| evaluations.contains_key(&Key::Practice(*episode)));
+    }
+
+    /// The practice episode with this seed, and the step and hash of its snapshot.
+    pub fn practice(&self, seed: u64) -> Option<Practice> {
+        let recorded = self.practiced.get(&seed).map(|hash| Practice::Recorded(*hash));
+        let open = || Some(Practice::Open { episode: *self.practice.get(&seed)? });
+        recorded.or_else(open)
+    }
+
+    /// Records a practice episode, whose frame has this hash, as delivered. Returns the number of
+    /// jobs that this ends.
+    pub fn record_practice(&mut self, seed: u64, hash: Hash) -> usize {
+        self.practiced.insert(seed, hash);
+        let Some(episode) = self.practice.remove(&seed) else { return 0 };
+        let (key, open) = (Key::Practice(episode), self.jobs.len());
+        self.evaluations.remove(&key);
+        self.jobs.retain(|_, open| open.key != key);
+        open - self.jobs.len()
+    }
+
+    /// Hash of the snapshot of a step whose episodes are run.
     pub fn weights(&self, step: u64) -> Option<Hash> {
-        self.evaluations.get(&step).map(|evaluation| evaluation.weights)
+        let evaluation = self.evaluations.get(&Key::Evaluation(step));
+        let mut practice = self.evaluations.range(..Key::Evaluation(0)).map(|(_, episode)| episode);
+        let found = evaluation.or_else(|| practice.find(|episode| episode.step == step));
+        found.map(|evaluation| evaluation.weights)
+    }
+
+    fn of_evaluations(&self) -> impl Iterator<Item = &Evaluation> {
+        self.evaluations.range(Key::Evaluation(0)..).map(|(_, evaluation)| evaluation)
     }
 
     /// Number of episodes that have no score yet, and may still get one: without those that are
     /// [`missing`](Self::missing).
     pub fn pending(&self) -> usize {
-        self.evaluations.values().map(Evaluation::pending).sum()
+        self.of_evaluations().map(Evaluation::pending).sum()
     }
 
     /// Number of evaluations with pending episodes.
     pub fn evaluations_pending(&self) -> usize {
-        self.evaluations.values().filter(|evaluation| evaluation.pending() > 0).count()
+        self.of_evaluations().filter(|evaluation| evaluation.pending() > 0).count()
     }
 
     /// Step and seed of the episodes that have no score and are not handed out any more.
     pub fn missing(&self) -> Vec<(u64, u64)> {
         let mut missing = Vec::new();
-        for (&step, evaluation) in &self.evaluations {
-            missing.extend(evaluation.given_up().map(|seed| (step, seed)));
+        for evaluation in self.evaluations.values() {
+            missing.extend(evaluation.given_up().map(|seed| (evaluation.step, seed)));
         }
         missing
     }
 
-    /// Hands out a job: waiting episodes of the oldest step. An evaluator has one job at a time; a
+    /// Hands out a job: the next practice episode, or waiting episodes of the oldest step. An evaluator has one job at a time; a
     /// repeated claim, after a lost answer, gets the same answer.
     pub fn claim(&mut self, claim: Claim<'_>, now: Instant) -> Claimed {
         let Claim { evaluator, attempt, fits, present } = claim;
         if !fits {
             return Claimed::Wait(DOES_NOT_FIT);
         }
-        let wait = Claimed::Wait(interval(present, ASK_AGAIN));
+        let often = if self.practice.is_empty() { ASK_AGAIN } else { ASK_FOR_PRACTICE };
+        let wait = Claimed::Wait(interval(present, often));
         if let Some(open) = self.jobs.get_mut(evaluator) {
             if open.attempt == attempt {
                 return Claimed::Job { job: open.job.clone(), again: true };
@@ -131,11 +210,16 @@ impl Scoreboard {
         }
         let few = self.rules.job_episodes[0];
         let (id, most) = (self.next_job, self.job_episodes(present));
-        let handed_out = self.evaluations.iter_mut().find_map(|(&step, evaluation)| {
+        let handed_out = self.evaluations.iter_mut().find_map(|(&key, evaluation)| {
             let seeds = evaluation.hand_out(id, [few, most], now);
-            (!seeds.is_empty()).then_some((step, evaluation.weights, seeds))
+            (!seeds.is_empty()).then_some((key, seeds))
         });
-        let Some((step, weights, seeds)) = handed_out else { return wait };
+        let Some((key, seeds)) = handed_out.or_else(|| self.straggler(id, now)) else {
+            return wait;
+        };
+        let Some(Evaluation { step, weights, practice, .. }) = self.evaluations.get(&key) else {
+            return wait;
+        };
         self.next_job += 1;
         let progress = interval(present, PROGRESS);
         // One message may be lost, and the next one late.
@@ -144,17 +228,18 @@ impl Scoreboard {
             id,
             run: self.rules.run.clone(),
             incarnation: self.rules.incarnation,
-            step,
-            weights,
+            step: *step,
+            weights: *weights,
             environment: self.rules.task.environment.clone(),
             environment_seed: self.rules.seed,
             seeds,
-            practice: None,
+            practice: *practice,
             // Often enough to keep the lease.
             progress_milliseconds: progress.min(patience / 3).as_millis() as u64,
         };
         let open = OpenJob {
             job: job.clone(),
+            key,
             attempt,
             patience,
             asked_again: false,
@@ -166,11 +251,21 @@ impl Scoreboard {
         Claimed::Job { job, again: false }
     }
 
+    /// The practice episode that the learner waits for, if its only evaluator takes long.
+    fn straggler(&mut self, job: u64, now: Instant) -> Option<(Key, Vec<u64>)> {
+        let mut first = self.evaluations.first_entry()?;
+        let key = *first.key();
+        let mut players = self.jobs.values().filter(|open| open.key == key);
+        let alone = (players.next(), players.next());
+        let (Key::Practice(_), (Some(only), None)) = (key, alone) else { return None };
+        (now >= only.handed_out + STRAGGLER).then(|| (key, first.get_mut().hand_out_again(job)))
+    }
+
     /// Most episodes of a job: half of an evaluator's share of those that wait, so that none is
     /// idle in the end. Large jobs take fewer messages, and fewer evaluators that fetch the same
     /// weights.
     fn job_episodes(&self, present: usize) -> usize {
-        let waiting: usize = self.evaluations.values().map(Evaluation::waiting).sum();
+        let waiting: usize = self.of_evaluations().map(Evaluation::waiting).sum();
         let [least, most] = self.rules.job_episodes;
         (waiting / (2 * present.max(1))).clamp(least, most)
     }
@@ -194,7 +289,7 @@ impl Scoreboard {
 
     /// Counts the new scores of a report that [`validate`](Self::validate) has accepted.
     pub fn record(&mut self, report: &ScoreReport, new: &[EpisodeScore]) -> Recorded {
-        let Some(evaluation) = self.evaluations.get_mut(&report.step) else {
+        let Some(evaluation) = self.evaluations.get_mut(&Key::Evaluation(report.step)) else {
             return Recorded::default();
         };
         // The report's own job, and others that had some of its episodes because it came late.
@@ -210,10 +305,10 @@ impl Scoreboard {
 
     /// Extends the lease of a job whose scores have come but are not on the disk yet: its evaluator
     /// has done all that it can.
-    pub fn extend_lease(&mut self, report: &ScoreReport, now: Instant) {
-        if let Some(open) = self.jobs.get_mut(&report.evaluator)
-            && report.incarnation == self.rules.incarnation
-            && report.job == open.job.id
+    pub fn extend_lease(&mut self, evaluator: &Name, incarnation: u64, job: u64, now: Instant) {
+        if let Some(open) = self.jobs.get_mut(evaluator)
+            && incarnation == self.rules.incarnation
+            && job == open.job.id
         {
             open.extend(now, Job::LONGEST);
         }
@@ -254,8 +349,11 @@ impl Scoreboard {
     /// Ends the job of an evaluator. Its episodes wait for the next job, except those that are
     /// given up, which it returns.
     fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Option<Vec<(u64, u64)>> {
-        let Job { id, step, seeds, .. } = self.jobs.remove(evaluator)?.job;
-        let given_up = self.evaluations.get_mut(&step)?.take_back(id, &seeds, lost);
+        let OpenJob { key, job: Job { id, step, seeds, .. }, .. } = self.jobs.remove(evaluator)?;
+        let given_up = match self.evaluations.get_mut(&key) {
+            Some(evaluation) => evaluation.take_back(id, &seeds, lost),
+            None => Vec::new(),
+        };
         Some(given_up.into_iter().map(|seed| (step, seed)).collect())
     }
 }

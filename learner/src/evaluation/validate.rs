@@ -2,10 +2,10 @@
 
 use std::collections::BTreeSet;
 
-use quad_protocol::{EpisodeScore, ScoreReport};
+use quad_protocol::{Episode, EpisodeScore, ScoreReport};
 
 use super::refusal::{Refusal, require};
-use super::scoreboard::Scoreboard;
+use super::scoreboard::{Key, Scoreboard};
 
 /// Largest relative difference between a score and the one computed from its return; it allows for
 /// rounding only.
@@ -25,7 +25,8 @@ impl Scoreboard {
     /// writes the new scores to the disk first, then calls [`record`](Self::record).
     pub fn validate(&self, report: &ScoreReport) -> Result<Validated, Refusal> {
         require(report.run == self.rules.run, Refusal::Run)?;
-        let evaluation = self.evaluations.get(&report.step).ok_or(Refusal::Step)?;
+        let evaluation = self.evaluations.get(&Key::Evaluation(report.step));
+        let evaluation = evaluation.ok_or(Refusal::Step)?;
         require(evaluation.weights == report.weights, Refusal::Weights)?;
         let mut validated = Validated { new: Vec::new(), duplicates: 0 };
         let mut seen = BTreeSet::new();
@@ -36,6 +37,21 @@ impl Scoreboard {
             if is_scored { validated.duplicates += 1 } else { validated.new.push(*score) }
         }
         Ok(validated)
+    }
+
+    /// Checks an episode of practice against its opening. Changes nothing, as
+    /// [`validate`](Self::validate).
+    pub fn validate_practice(&self, episode: &Episode) -> Result<(), Refusal> {
+        let seed = episode.score.seed;
+        let key = self.practice.get(&seed).map(|number| Key::Practice(*number));
+        let open = key.and_then(|key| self.evaluations.get(&key)).ok_or(Refusal::Practice(seed))?;
+        require(open.step == episode.step, Refusal::Step)?;
+        require(open.weights == episode.weights, Refusal::Weights)?;
+        require(episode.dims() == self.rules.dims, Refusal::Rows(seed))?;
+        let sum: f64 = episode.rewards.iter().copied().map(f64::from).sum();
+        let size: f64 = episode.rewards.iter().map(|reward| f64::from(reward.abs())).sum();
+        let is_sum = (sum - episode.score.episode_return).abs() <= SCORE_TOLERANCE * size.max(1.0);
+        require(is_sum && self.is_possible(&episode.score), Refusal::Episode(seed))
     }
 
     fn is_possible(&self, score: &EpisodeScore) -> bool {

@@ -8,8 +8,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use quad_protocol::{
-    EpisodeScore, Hash, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport,
-    episode_seeds,
+    Episode, EpisodeScore, Hash, JobReply, JobRequest, Name, Piece, PieceReply, Progress,
+    ScoreReply, ScoreReport, episode_seeds,
 };
 use quad_run::folder::SavedScores;
 use serde_json::{Value, json};
@@ -20,7 +20,7 @@ use super::events::{Event, Events};
 use super::metrics::Metrics;
 use super::requests::NotAccepted;
 use crate::evaluation::{
-    Claim, Claimed, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated,
+    Claim, Claimed, Lost, Opening, OtherWeights, Practice, Refusal, Rules, Scoreboard, Validated,
 };
 
 /// Most characters of an evaluator's error message that the learner logs.
@@ -101,6 +101,44 @@ impl Coordinator {
         }
         self.count(&state);
         Ok(())
+    }
+
+    /// Opens an episode of practice.
+    pub fn open_practice(&self, opening: &Opening, weights: Hash) {
+        self.lock().scoreboard.open_practice(opening, weights);
+    }
+
+    /// Ends practice: what nobody plays yet is not handed out.
+    pub fn end_practice(&self) {
+        self.lock().scoreboard.end_practice();
+    }
+
+    /// Number of this start of the learner.
+    pub fn incarnation(&self) -> u64 {
+        self.rules.incarnation
+    }
+
+    /// The practice episode of a piece, if the run has it and it is not too long.
+    pub(super) fn practice(&self, piece: &Piece) -> Result<Practice, Refusal> {
+        if piece.run != self.rules.run {
+            return Err(Refusal::Run);
+        }
+        if piece.length as usize > self.rules.longest_frame() {
+            return Err(Refusal::Rows(piece.seed));
+        }
+        self.lock().scoreboard.practice(piece.seed).ok_or(Refusal::Practice(piece.seed))
+    }
+
+    /// Checks an episode of practice. Changes nothing.
+    pub(super) fn validate_practice(&self, episode: &Episode) -> Result<(), Refusal> {
+        self.lock().scoreboard.validate_practice(episode)
+    }
+
+    /// Counts an episode of practice that is on the disk. Returns its acknowledgment.
+    pub(super) fn record_practice(&self, seed: u64, frame: Hash) -> PieceReply {
+        let jobs = self.lock().scoreboard.record_practice(seed, frame);
+        self.metrics.jobs("completed", jobs);
+        PieceReply::Recorded { incarnation: self.rules.incarnation, duplicate: false }
     }
 
     /// Hash of the snapshot that is evaluated for a step.
@@ -187,8 +225,8 @@ impl Coordinator {
     }
 
     /// Extends the lease of a job whose scores have arrived but are not on the disk yet.
-    pub fn extend_lease(&self, report: &ScoreReport) {
-        self.lock().scoreboard.extend_lease(report, Instant::now());
+    pub fn extend_lease(&self, evaluator: &Name, incarnation: u64, job: u64) {
+        self.lock().scoreboard.extend_lease(evaluator, incarnation, job, Instant::now());
     }
 
     /// Counts scores of a report that are on the disk. Returns its acknowledgment.

@@ -24,6 +24,7 @@ mod display;
 mod duplicate;
 mod evaluators;
 mod events;
+mod experience;
 mod main_loop;
 mod metrics;
 mod network;

@@ -88,7 +88,7 @@ async fn write_endpoints(run_dir: RunDir, endpoints: RunEndpoints) {
 /// The learner's declarations; dropping it undeclares them.
 pub(super) struct Wire {
     session: Session,
-    _queryables: [Queryable<()>; 3],
+    _queryables: [Queryable<()>; 4],
     _subscribers: [Subscriber<()>; 2],
     _token: LivelinessToken,
 }
@@ -111,6 +111,7 @@ impl Wire {
             serve(&session, keys::weights_at_any_step(run), services, Services::weights).await?,
             serve(&session, keys::jobs(run), services, Services::job).await?,
             serve(&session, keys::scores(run), services, Services::scores).await?,
+            serve(&session, keys::experience(run), services, Services::experience).await?,
         ];
         let zenoh = anyhow::Error::from_boxed;
         let receiver = services.clone();

@@ -1,4 +1,5 @@
-//! The thread `scores`: writes scores to the disk, then counts and acknowledges them.
+//! The thread `scores`: writes scores and experience to the disk, then counts and acknowledges
+//! them.
 //!
 //! All reports that arrived during the last write go together, in one write and one
 //! synchronization. A slow disk delays only acknowledgments.
@@ -6,20 +7,26 @@
 use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 
-use quad_protocol::ScoreReport;
+use quad_protocol::{Piece, ScoreReport};
 use quad_run::folder::{Log, ScoreLine};
 use quad_runtime::Heartbeat;
 
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
+use super::experience::Experience;
 use super::requests::{NotAccepted, Request};
 use crate::evaluation::Validated;
 
 /// Most reports that are written together.
 const MOST_TOGETHER: usize = 256;
 
-/// An evaluator's report with its query; `None` marks the last one to wait for.
-pub(super) type Delivery = Option<(Request, ScoreReport)>;
+/// An evaluator's message with its query.
+pub(super) enum Delivery {
+    Scores(Request, ScoreReport),
+    Piece(Request, Piece),
+    /// Marks the last one to wait for.
+    End,
+}
 
 pub(super) struct Scores {
     /// `scores.jsonl`.
@@ -27,6 +34,8 @@ pub(super) struct Scores {
     pub deliveries: Receiver<Delivery>,
     pub coordinator: Coordinator,
     pub disk: DiskStatus,
+    /// In a run with practice.
+    pub experience: Option<Experience>,
 }
 
 impl Scores {
@@ -42,8 +51,18 @@ impl Scores {
             };
             let mut batch = vec![first];
             batch.extend(self.deliveries.try_iter().take(MOST_TOGETHER - 1));
-            ended = batch.iter().any(Option::is_none);
-            self.record(batch.into_iter().flatten(), beat);
+            let (mut reports, mut pieces) = (Vec::new(), Vec::new());
+            for delivery in batch {
+                match delivery {
+                    Delivery::Scores(request, report) => reports.push((request, report)),
+                    Delivery::Piece(request, piece) => pieces.push((request, piece)),
+                    Delivery::End => ended = true,
+                }
+            }
+            self.record(reports.into_iter(), beat);
+            if let Some(experience) = &mut self.experience {
+                experience.receive(pieces.into_iter(), &mut self.disk, beat);
+            }
         }
         Ok(())
     }
@@ -88,7 +107,8 @@ impl Scores {
                 let error = format!("{:#}", anyhow::Error::from(error));
                 self.disk.refused(beat, &error);
                 for (request, report, _) in batch {
-                    self.coordinator.extend_lease(&report);
+                    let ScoreReport { evaluator, incarnation, job, .. } = &report;
+                    self.coordinator.extend_lease(evaluator, *incarnation, *job);
                     let why = NotAccepted::NotSaved(error.clone());
                     request.reject(&why, &self.coordinator.metrics);
                 }

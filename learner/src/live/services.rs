@@ -2,7 +2,7 @@
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-use quad_protocol::{JobRequest, Progress, ScoreReport, encode, keys};
+use quad_protocol::{JobRequest, Piece, Progress, ScoreReport, encode, keys};
 use tracing::debug;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SampleKind};
@@ -52,11 +52,23 @@ impl Services {
     pub fn scores(&self, mut request: Request) {
         match request.message::<ScoreReport>() {
             Ok(report) => {
-                self.coordinator().extend_lease(&report);
-                self.count_busy(self.deliveries.try_send(Some((request, report))).is_ok());
+                let ScoreReport { evaluator, incarnation, job, .. } = &report;
+                self.coordinator().extend_lease(evaluator, *incarnation, *job);
+                self.deliver(Delivery::Scores(request, report));
             }
             Err(why) => self.answer(&self.answers, request, |_| Err(why)),
         }
+    }
+
+    pub fn experience(&self, mut request: Request) {
+        match request.message::<Piece>() {
+            Ok(piece) => self.deliver(Delivery::Piece(request, piece)),
+            Err(why) => self.answer(&self.answers, request, |_| Err(why)),
+        }
+    }
+
+    fn deliver(&self, delivery: Delivery) {
+        self.count_busy(self.deliveries.try_send(delivery).is_ok());
     }
 
     pub fn weights(&self, request: Request) {

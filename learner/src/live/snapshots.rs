@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use anyhow::anyhow;
 use quad_protocol::Hash;
 use quad_run::folder::{Checkpoint, Log, RunDirError};
 use quad_runtime::{Heartbeat, hinted};
@@ -14,7 +15,7 @@ use super::disk::DiskStatus;
 use super::events::Event;
 use super::metrics::unix_time;
 use super::weights::Weights;
-use crate::evaluation::OtherWeights;
+use crate::evaluation::{Opening, OtherWeights};
 use crate::train::{Output, OutputQueue, TrainedPolicy};
 
 /// Pause after the disk has refused a write.
@@ -65,9 +66,11 @@ impl Snapshots {
     fn save(&mut self, output: &Output) -> anyhow::Result<()> {
         match output {
             Output::Snapshot(policy) => self.snapshot(policy)?,
+            Output::Practice(opening) => self.open_practice(opening)?,
             Output::Checkpoint(checkpoint) => self.checkpoint(checkpoint)?,
             Output::Rows(rows) => self.rows.append(rows)?,
             Output::Ended(outcome) => {
+                self.coordinator().end_practice();
                 self.coordinator().events.send(Event::TrainingEnded(*outcome));
             }
         }
@@ -76,7 +79,7 @@ impl Snapshots {
 
     /// Writes a snapshot, then opens its evaluation and publishes it.
     fn snapshot(&mut self, trained: &TrainedPolicy) -> anyhow::Result<()> {
-        let &TrainedPolicy { step, ref file, evaluate } = trained;
+        let &TrainedPolicy { step, ref file, evaluate, practice } = trained;
         let hash = Hash::of(file);
         let metrics = &self.weights.coordinator.metrics.evaluation;
         metrics.snapshot_bytes.set(file.len() as i64);
@@ -88,11 +91,28 @@ impl Snapshots {
                 return Err(OtherWeights { step, found: hash, scored: known.to_string() }.into());
             }
         }
+        if practice {
+            self.known.insert(step, hash);
+        }
         if evaluate {
-            self.weights.publish(step, hash, file.clone())?;
+            // The jobs must exist first: evaluators claim one as soon as the snapshot arrives.
+            self.coordinator().open(step, hash)?;
             metrics.snapshots_published.inc();
             self.coordinator().events.send(Event::Published { step });
         }
+        if evaluate || practice {
+            self.weights.publish(step, hash, file.clone())?;
+        }
+        Ok(())
+    }
+
+    fn open_practice(&self, opening: &Opening) -> anyhow::Result<()> {
+        let step = opening.step;
+        let Some(hash) = self.known.get(&step) else {
+            let error = anyhow!("the snapshot of step {step}, which is to practice, is missing");
+            return Err(hinted(error, "begin anew with --fresh"));
+        };
+        self.coordinator().open_practice(opening, *hash);
         Ok(())
     }
 

@@ -1,5 +1,6 @@
 //! The threads of a run, started together and ended in order.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -7,22 +8,24 @@ use std::time::Duration;
 
 use quad_algorithms::Agent;
 use quad_dataset::{BatchSampler, Task};
-use quad_run::config::RunConfig;
-use quad_run::folder::{Log, ResumePoint, RunDir};
-use quad_runtime::Health;
+use quad_protocol::{Hash, encode, practice_seed};
+use quad_run::config::{Online, RunConfig};
+use quad_run::folder::{ExperienceRecord, Log, ResumePoint, RunDir};
+use quad_runtime::{Health, Hint};
 
 use super::coordinator::Coordinator;
 use super::disk::{DiskStatus, Writer};
 use super::duplicate::Incarnation;
 use super::events::Events;
+use super::experience::Experience;
 use super::metrics::Metrics;
-use super::scores::Scores;
+use super::scores::{Delivery, Scores};
 use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
 use super::weights::Weights;
 use crate::evaluation::Rules;
-use crate::train::{HeldOut, OutputQueue, Training, origin, resume};
+use crate::train::{HeldOut, Inbox, OutputQueue, Practice, Training, origin, resume};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when
 /// hundreds wait.
@@ -34,6 +37,9 @@ const LEASE: Duration = Duration::from_secs(180);
 pub(crate) const STUCK: Duration = Duration::from_secs(30);
 /// Training is stuck if it has not reported for this long; its slowest steps take seconds.
 const TRAINING_STUCK: Duration = Duration::from_secs(300);
+
+/// A checkpoint without the experience that it has learned from.
+const OTHER_FOLDER: &str = "experience.log belongs to the run: copy it from where the checkpoint is from, or begin anew with --fresh";
 
 /// A run and its state.
 pub(crate) struct Run<'a> {
@@ -70,22 +76,25 @@ impl Threads {
     ) -> anyhow::Result<Self> {
         let Run { incarnation, config, dir, past, mut agent, .. } = run;
         let ResumePoint { checkpoint, snapshots: known, scores: earlier } = past;
+        let experiment = &config.experiment;
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         if let Some(checkpoint) = checkpoint {
             resume(&mut agent, &checkpoint)?;
         }
-        let experiment = &config.experiment;
+        let transitions = agent.transitions().clone();
         let rules = Rules {
             run: incarnation.run.clone(),
             incarnation: incarnation.number,
             task: run.task,
             seed: experiment.seed,
+            dims: (transitions.observation_dim(), transitions.action_dim()),
             episodes: experiment.episodes,
             job_episodes: JOB_EPISODES,
             lease: LEASE,
         };
         let coordinator = Coordinator::new(rules, earlier, metrics.clone(), events.clone());
-        for (&step, &hash) in &known {
+        let schedule = experiment.schedule();
+        for (&step, &hash) in known.iter().filter(|(step, _)| schedule.is_evaluated(**step)) {
             coordinator.open(step, hash)?;
         }
         let weights = Weights::new(incarnation, dir.clone(), coordinator.clone());
@@ -93,7 +102,18 @@ impl Threads {
 
         let disk = |writer| DiskStatus::new(writer, metrics.disk_trouble(writer), events.clone());
         let disk_of_scores = disk(Writer::Scores);
-        let scores = Scores { log: run.scores, deliveries, coordinator, disk: disk_of_scores };
+        let inbox = Inbox::default();
+        let mut practice =
+            Practice::new(experiment, transitions, inbox.clone(), metrics.practice.clone());
+        let experience = match &practice {
+            Some(_) => Some(open_experience(dir, experiment.seed, &inbox, &coordinator)?),
+            None => None,
+        };
+        if let Some(practice) = &mut practice {
+            practice.resume(step).hint(OTHER_FOLDER)?;
+        }
+        let scores =
+            Scores { log: run.scores, deliveries, coordinator, disk: disk_of_scores, experience };
         let writer = Writer::Scores.thread();
         let beat = health.register(writer, STUCK);
         let scores = spawn_alive(writer, events, beat, move |beat| scores.run(beat))?;
@@ -116,8 +136,10 @@ impl Threads {
                 step,
             ),
             agent,
+            practice,
+            saved: None,
             held_out: run.held_out,
-            schedule: experiment.schedule(),
+            schedule,
             origin: origin(experiment),
             checkpoint_every: run.checkpoint_every,
             seconds_before,
@@ -147,7 +169,31 @@ impl Threads {
         self.training.join().ok();
         self.queue.close();
         self.snapshots.join().ok();
-        self.services.deliveries.send(None).ok();
+        self.services.deliveries.send(Delivery::End).ok();
         self.scores.join().ok();
     }
+}
+
+/// Opens the run's log of experience, and puts what it has into the inbox.
+fn open_experience(
+    dir: &RunDir,
+    seed: u64,
+    inbox: &Inbox,
+    coordinator: &Coordinator,
+) -> anyhow::Result<Experience> {
+    let (log, records) = dir.experience_log()?;
+    let mut frames = HashMap::new();
+    for ExperienceRecord { episode, .. } in records {
+        frames.insert(episode.score.seed, episode);
+    }
+    // Seeds are those of the first episodes: more were never open.
+    let most = frames.len() as u64 + Online::MOST_LAG;
+    for number in 0..most {
+        if let Some(episode) = frames.remove(&practice_seed(seed, number)) {
+            coordinator.record_practice(episode.score.seed, Hash::of(&encode(&episode)?));
+            inbox.add(number, episode);
+        }
+    }
+    anyhow::ensure!(frames.is_empty(), "experience.log has episodes of another run");
+    Ok(Experience::new(log, inbox.clone(), coordinator.clone()))
 }

@@ -37,15 +37,13 @@ impl Weights {
         self.session.set(session.clone()).ok();
     }
 
-    /// Opens the evaluation of a snapshot that is on the disk, and publishes it.
+    /// Publishes a snapshot that is on the disk and whose jobs exist.
     ///
     /// # Errors
-    /// The snapshot is too large to be sent, or the step is known with other weights.
+    /// The snapshot is too large to be sent.
     pub fn publish(&self, step: u64, hash: Hash, file: Vec<u8>) -> anyhow::Result<()> {
         let bytes = self.message(step, hash, file)?;
         *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = Some((step, bytes.clone()));
-        // The jobs must exist first: evaluators claim one as soon as the snapshot arrives.
-        self.coordinator.open(step, hash)?;
         if let Some(session) = self.session.get() {
             // An evaluator that does not read loses the snapshot instead of delaying others. It
             // asks for it when it gets a job.

@@ -8,6 +8,7 @@ use prometheus::{
     Counter, Gauge, Histogram, HistogramOpts, IntCounter, IntGauge, Registry, exponential_buckets,
 };
 use quad_algorithms::Metric;
+use quad_protocol::EpisodeScore;
 
 use super::results::held_out_name;
 
@@ -36,7 +37,7 @@ macro_rules! metrics {
         }
 
         impl $Name {
-            fn new(registry: &prometheus::Registry) -> prometheus::Result<Self> {
+            pub fn new(registry: &prometheus::Registry) -> prometheus::Result<Self> {
                 Ok(Self {
                     $($field: $crate::train::register(
                         registry,
@@ -57,6 +58,26 @@ pub(crate) fn register<M: Collector + Clone + 'static>(
     let metric = metric?;
     registry.register(Box::new(metric.clone()))?;
     Ok(metric)
+}
+
+metrics! {
+    /// Metrics of experience that training has absorbed.
+    PracticeMetrics {
+        rows: IntGauge("experience_rows", "Environment steps of practice that training has absorbed"),
+        episodes: IntGauge("experience_episodes", "Episodes of practice that training has absorbed"),
+        episode_return: Gauge("practice_return", "Return of the newest of them"),
+        score: Gauge("practice_score", "Score of the newest of them"),
+        wait_seconds: Counter("practice_wait_seconds_total", "Time that training has waited for practice"),
+    }
+}
+
+impl PracticeMetrics {
+    pub fn absorbed(&self, rows: u64, score: &EpisodeScore) {
+        self.rows.set(i64::try_from(rows).unwrap_or(i64::MAX));
+        self.episodes.inc();
+        self.episode_return.set(score.episode_return);
+        self.score.set(score.score);
+    }
 }
 
 /// Metrics of gradient steps. An update is an atomic store.

@@ -5,7 +5,7 @@
 //! unwritten: it puts its output into the [`OutputQueue`], from which the thread `snapshots` takes
 //! it. The module `live` starts it.
 //!
-//! In reading order: `training` (the loop), `agent` and `device`, `held_out` (metrics on episodes
+//! In reading order: `training` (the loop), `practice` (the order of experience and gradient steps), `agent` and `device`, `held_out` (metrics on episodes
 //! that are kept out), `output_queue`, `metrics`, `results`.
 //! `price` estimates the cost of a run, on its caller's thread.
 
@@ -14,6 +14,7 @@ pub(crate) mod device;
 mod held_out;
 mod metrics;
 mod output_queue;
+mod practice;
 mod price;
 mod results;
 #[cfg(test)]
@@ -22,8 +23,9 @@ mod training;
 
 pub(crate) use agent::{begin, origin, resume};
 pub(crate) use held_out::HeldOut;
-pub(crate) use metrics::{TrainingMetrics, metrics, register};
+pub(crate) use metrics::{PracticeMetrics, TrainingMetrics, metrics, register};
 pub(crate) use output_queue::{Output, OutputQueue};
+pub(crate) use practice::{Inbox, Practice, PracticeError};
 pub(crate) use price::Price;
 pub(crate) use results::{Outcome, TrainedPolicy};
 pub(crate) use training::Training;

@@ -14,6 +14,7 @@ use quad_run::folder::Checkpoint;
 use quad_runtime::Heartbeat;
 
 use super::results::{Outcome, Row, TrainedPolicy};
+use crate::evaluation::Opening;
 
 /// Most bytes of snapshots that wait for the disk: forty of the paper's size.
 const MOST_BYTES: usize = 256 << 20;
@@ -25,6 +26,8 @@ const POLL: Duration = Duration::from_millis(100);
 #[derive(Debug)]
 pub(crate) enum Output {
     Snapshot(TrainedPolicy),
+    /// Practice that may be played with a snapshot before.
+    Practice(Opening),
     Checkpoint(Checkpoint),
     Rows(Vec<Row>),
     /// Comes after all other output.
@@ -39,7 +42,8 @@ pub(crate) struct OutputQueue {
 
 #[derive(Debug, Default)]
 struct Waiting {
-    snapshots: VecDeque<TrainedPolicy>,
+    /// Snapshots, and practice with them.
+    snapshots: VecDeque<Output>,
     checkpoint: Option<Checkpoint>,
     rows: Vec<Row>,
     ended: Option<Outcome>,
@@ -54,7 +58,13 @@ impl OutputQueue {
             beat.alive();
             waiting = self.wait(waiting, POLL);
         }
-        waiting.snapshots.push_back(policy);
+        waiting.snapshots.push_back(Output::Snapshot(policy));
+        self.shared.1.notify_all();
+    }
+
+    /// Adds an episode of practice.
+    pub fn practice(&self, opening: Opening) {
+        self.lock().snapshots.push_back(Output::Practice(opening));
         self.shared.1.notify_all();
     }
 
@@ -116,12 +126,16 @@ impl OutputQueue {
 
 impl Waiting {
     fn bytes(&self) -> usize {
-        self.snapshots.iter().map(|policy| policy.file.len()).sum()
+        let bytes = |output: &Output| match output {
+            Output::Snapshot(policy) => policy.file.len(),
+            _ => 0,
+        };
+        self.snapshots.iter().map(bytes).sum()
     }
 
     fn next(&mut self) -> Option<Output> {
-        if let Some(policy) = self.snapshots.pop_front() {
-            return Some(Output::Snapshot(policy));
+        if let Some(output) = self.snapshots.pop_front() {
+            return Some(output);
         }
         if let Some(checkpoint) = self.checkpoint.take() {
             return Some(Output::Checkpoint(checkpoint));

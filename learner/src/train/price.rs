@@ -35,7 +35,7 @@ impl Price {
             0,
         );
         Ok(Self {
-            step_seconds: mean_step(&mut agent, &mut sampler, experiment.steps)?,
+            step_seconds: mean_step(&mut agent, &mut sampler, experiment.total_steps())?,
             snapshot_bytes: agent.policy(origin(experiment))?.len() as u64,
             checkpoint_bytes: agent.save()?.len() as u64,
         })

@@ -12,8 +12,10 @@ pub(super) const STEPS_PER_ROW: u64 = 100;
 pub(crate) struct TrainedPolicy {
     pub step: u64,
     pub file: Vec<u8>,
-    /// False for the last policy of a run without evaluations, which is only kept.
+    /// True if it is evaluated.
     pub evaluate: bool,
+    /// True if practice is played with it. A policy with neither, the last of a run, is only kept.
+    pub practice: bool,
 }
 
 /// A line of `metrics.jsonl`: means over the gradient steps since the line before.

@@ -32,6 +32,7 @@ mod hopper;
 use hopper::write_hopper;
 
 mod held_out;
+mod practice;
 
 struct Trained {
     outcome: Result<Outcome, TrainError>,
@@ -106,6 +107,8 @@ fn run(agent: Agent, held_out: Option<HeldOut>, schedule: Schedule, stop: bool) 
     let mut training = Training {
         sampler: BatchSampler::new(agent.dataset_len(), 4, 0, agent.step()),
         agent,
+        practice: None,
+        saved: None,
         held_out,
         schedule,
         origin: origin(&resolve("hopper-demo", &toml::Table::new()).unwrap()),
@@ -128,7 +131,7 @@ fn run(agent: Agent, held_out: Option<HeldOut>, schedule: Schedule, stop: bool) 
             Output::Snapshot(policy) => trained.snapshots.push((policy.step, policy.evaluate)),
             Output::Checkpoint(checkpoint) => trained.checkpoint = Some(checkpoint),
             Output::Rows(rows) => trained.rows.extend(rows),
-            Output::Ended(_) => panic!("the loop does not send this"),
+            Output::Practice(_) | Output::Ended(_) => panic!("the loop does not send this"),
         }
     }
     trained

@@ -16,6 +16,7 @@ use tracing::debug;
 use super::held_out::HeldOut;
 use super::metrics::TrainingMetrics;
 use super::output_queue::OutputQueue;
+use super::practice::{Practice, PracticeError};
 use super::results::{Means, Outcome, Row, STEPS_PER_ROW, TrainedPolicy, measured};
 
 /// Least time of training that is spent between two checkpoints for each second that one takes:
@@ -33,6 +34,8 @@ pub(crate) enum TrainError {
     Diverged { step: u64, what: String },
     #[error("gradient step {step} failed")]
     Update { step: u64, source: AlgorithmError },
+    #[error(transparent)]
+    Practice(#[from] PracticeError),
 }
 
 impl TrainError {
@@ -49,7 +52,11 @@ impl TrainError {
 /// The loop of gradient steps and its connections to the other threads.
 pub(crate) struct Training {
     pub agent: Agent,
+    /// Batches of the dataset alone.
     pub sampler: BatchSampler,
+    pub practice: Option<Practice>,
+    /// Gradient step of the newest snapshot.
+    pub saved: Option<u64>,
     pub held_out: Option<HeldOut>,
     pub schedule: Schedule,
     /// Origin of the snapshots; the step is set for each.
@@ -87,9 +94,18 @@ impl Training {
         let mut means = Means::new(metrics.len());
         let mut next_checkpoint = start + self.checkpoint_every;
         while self.agent.step() < steps {
+            if !self.practice(beat)? {
+                let step = self.agent.step();
+                self.save_state(step)?;
+                return Ok(Outcome::Stopped { step });
+            }
             let begin = Instant::now();
             let step = self.agent.step() + 1;
-            let batch = self.sampler.next_items();
+            let online = self.practice.as_mut().filter(|practice| practice.has_begun(step - 1));
+            let batch = match online {
+                Some(practice) => practice.batch(step),
+                None => self.sampler.next_items(),
+            };
             let values = self.agent.update(batch).map_err(TrainError::at(step))?;
             let infinite = measured(metrics, &values).find(|(_, value)| !value.is_finite());
             if let Some((metric, value)) = infinite {
@@ -122,6 +138,28 @@ impl Training {
         Ok(Outcome::Completed)
     }
 
+    /// Absorbs practice until another gradient step goes with it. False if training is to stop.
+    fn practice(&mut self, beat: &Heartbeat) -> Result<bool, TrainError> {
+        let step = self.agent.step();
+        let practice = self.practice.as_ref().filter(|practice| practice.has_begun(step));
+        if practice.is_some_and(|practice| practice.is_snapshot(step)) && self.saved != Some(step) {
+            self.save_policy(step, beat)?;
+        }
+        let Some(practice) = self.practice.as_mut().filter(|practice| practice.has_begun(step))
+        else {
+            return Ok(true);
+        };
+        loop {
+            practice.take_openings().into_iter().for_each(|opening| self.queue.practice(opening));
+            if !practice.is_due(step) {
+                return Ok(true);
+            }
+            if !practice.absorb_next(&self.stop, beat)? {
+                return Ok(false);
+            }
+        }
+    }
+
     /// Empty if the row of this step has no such metrics.
     fn measure_held_out(
         &mut self,
@@ -141,10 +179,13 @@ impl Training {
         let begin = Instant::now();
         debug!(step, "snapshot");
         self.origin.step = step;
+        self.saved = Some(step);
         let file = self.agent.policy(self.origin.clone()).map_err(TrainError::at(step))?;
         self.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
         let evaluate = self.schedule.is_evaluated(step);
-        self.queue.snapshot(TrainedPolicy { step, file, evaluate }, &self.stop, beat);
+        let practice = self.practice.as_ref().is_some_and(|practice| practice.is_snapshot(step));
+        let policy = TrainedPolicy { step, file, evaluate, practice };
+        self.queue.snapshot(policy, &self.stop, beat);
         Ok(())
     }
 

@@ -30,6 +30,9 @@ pub struct Online {
 }
 
 impl Online {
+    /// Largest lag, episodes.
+    pub const MOST_LAG: u64 = 1000;
+
     /// Gradient steps online.
     pub fn updates(&self) -> u64 {
         self.updates_after(self.steps)
@@ -45,18 +48,24 @@ impl Online {
         self.warmup + updates.div_ceil(u64::from(self.updates_per_step))
     }
 
+    /// True if practice is played with the policy after gradient step `step`, where practice begins
+    /// after step `begin`.
+    pub fn is_snapshot(&self, begin: u64, step: u64) -> bool {
+        step >= begin && (step - begin).is_multiple_of(self.snapshot_interval)
+    }
+
+    /// The newest such step up to `step`, which is `begin` at least.
+    pub fn newest_snapshot(&self, begin: u64, step: u64) -> u64 {
+        step - (step - begin) % self.snapshot_interval
+    }
+
     pub(super) fn check_ranges(&self) -> Result<(), ConfigError> {
         const MOST: u64 = 1_000_000_000;
         for (field, value, least, most) in [
             ("online.steps", self.steps, 0, MOST),
             ("online.updates_per_step", self.updates_per_step.into(), 1, 1000),
-            (
-                "online.warmup",
-                self.warmup,
-                0,
-                self.steps.saturating_sub(1).max(MOST * u64::from(self.steps == 0)),
-            ),
-            ("online.lag", self.lag.into(), 1, 1000),
+            ("online.warmup", self.warmup, 0, self.steps.saturating_sub(1)),
+            ("online.lag", self.lag.into(), 1, Self::MOST_LAG),
             ("online.snapshot_interval", self.snapshot_interval, 1, MOST),
         ] {
             if !(least..=most).contains(&value) {

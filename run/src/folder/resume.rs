@@ -109,7 +109,12 @@ impl ResumePoint {
         let scores = by_step(dir.read_scores()?).map_err(|reason| dir.broken_scores(reason))?;
         let mut point = Self { checkpoint, snapshots: BTreeMap::new(), scores };
         let (schedule, step) = (experiment.schedule(), point.step());
-        for at in dir.snapshots()?.into_iter().filter(|at| schedule.is_evaluated(*at)) {
+        let practice = |at| {
+            let online = experiment.online.as_ref();
+            online.is_some_and(|online| online.is_snapshot(experiment.steps, at))
+        };
+        let is_needed = |at: &u64| schedule.is_evaluated(*at) || practice(*at);
+        for at in dir.snapshots()?.into_iter().filter(is_needed) {
             let scored = point.scores.get(&at);
             // The resumed training makes this snapshot again.
             if at > step && scored.is_none() {

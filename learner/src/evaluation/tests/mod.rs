@@ -2,6 +2,7 @@
 
 mod jobs;
 mod leases;
+mod practice;
 mod reports;
 
 use std::collections::BTreeMap;
@@ -42,6 +43,7 @@ impl Bench {
             incarnation: INCARNATION,
             task: quad_dataset::environment::find("hopper").unwrap().into(),
             seed: 5,
+            dims: (11, 3),
             episodes: 7,
             job_episodes: [5, 20],
             lease: LEASE,
@@ -92,7 +94,8 @@ impl Bench {
 
     fn extend_lease(&mut self, report: &ScoreReport, seconds: u64) {
         let now = self.at(seconds);
-        self.board.extend_lease(report, now);
+        let ScoreReport { evaluator, incarnation, job, .. } = report;
+        self.board.extend_lease(evaluator, *incarnation, *job, now);
     }
 
     fn expire(&mut self, seconds: u64) -> usize {

@@ -1,0 +1,110 @@
+//! Tests of practice.
+
+use quad_protocol::{Episode, Exploration};
+
+use super::*;
+use crate::evaluation::{Opening, Practice};
+
+const EXPLORATION: Exploration = Exploration::Policy { noise: 0.1 };
+
+fn opening(episode: u64) -> Opening {
+    Opening { episode, step: 500, seed: 100 + episode, exploration: EXPLORATION }
+}
+
+/// A bench with two open episodes of practice.
+fn bench() -> Bench {
+    let mut bench = Bench::new();
+    (0..2).for_each(|episode| bench.board.open_practice(&opening(episode), hash(500)));
+    bench
+}
+
+fn episode(seed: u64) -> Episode {
+    Episode {
+        step: 500,
+        weights: hash(500),
+        score: EpisodeScore { length: 2, ..score(seed, 3.0) },
+        terminated: false,
+        observations: vec![0.0; 3 * 11],
+        actions: vec![0.0; 2 * 3],
+        rewards: vec![1.0, 2.0],
+        interventions: Vec::new(),
+    }
+}
+
+#[test]
+fn practice_goes_first_one_episode_a_job_in_the_order_of_their_numbers() {
+    let mut bench = bench();
+    let jobs = ["a", "b"].map(|evaluator| bench.job(evaluator, 0));
+    for (job, seed) in jobs.iter().zip([100, 101]) {
+        assert_eq!((job.step, &job.seeds[..], job.weights), (500, &[seed][..], hash(500)));
+        assert_eq!(job.practice, Some(EXPLORATION));
+    }
+    assert_eq!((bench.job("c", 0).step, bench.job("d", 0).practice), (1000, None));
+    assert_eq!(bench.board.pending(), 14, "the run's end waits for evaluations alone");
+    assert_eq!(bench.board.weights(500), Some(hash(500)));
+}
+
+#[test]
+fn an_episode_is_played_until_it_is_recorded_and_counts_once() {
+    let mut bench = bench();
+    for failure in 0..50 {
+        let job = bench.job("a", 100 * failure);
+        assert_eq!(job.seeds, [100], "an evaluation's episode would be given up by now");
+        bench.hand_back("a", &job, Some(100 * failure)).unwrap();
+    }
+    let job = bench.job("a", 10_000);
+    assert_eq!(bench.board.practice(100), Some(Practice::Open { episode: 0 }));
+    assert_eq!(bench.board.record_practice(100, hash(7)), 1);
+    assert_eq!(bench.board.practice(100), Some(Practice::Recorded(hash(7))));
+    assert_eq!(bench.hand_back("a", &job, None), None, "the job is done");
+    assert_eq!(bench.job("a", 10_001).seeds, [101]);
+    assert_eq!(bench.board.practice(102), None);
+}
+
+#[test]
+fn the_episode_that_the_learner_waits_for_goes_to_a_second_evaluator_if_the_first_is_slow() {
+    let mut bench = Bench::new();
+    bench.present = 4;
+    bench.board.open_practice(&opening(0), hash(500));
+    let slow = bench.job("slow", 0);
+    for evaluator in ["a", "b", "c"] {
+        // They have all that waits.
+        while let Claimed::Job { job, .. } = bench.claim(evaluator, 1, 0) {
+            assert_eq!(job.practice, None);
+            bench.deliver(&full_report(&job, evaluator)).unwrap();
+        }
+    }
+    bench.progress(&progress(&slow, "slow", 5), 15).unwrap();
+    assert!(matches!(bench.claim("a", 2, 19), Claimed::Wait(_)));
+    let second = bench.job("a", 20);
+    assert_eq!((&second.seeds, second.practice), (&slow.seeds, slow.practice));
+    assert!(matches!(bench.claim("b", 2, 60), Claimed::Wait(_)), "two are enough");
+    assert_eq!(bench.board.record_practice(100, hash(7)), 2);
+}
+
+#[test]
+fn only_episodes_that_fit_their_opening_are_accepted() {
+    let bench = bench();
+    let check = |change: fn(&mut Episode)| {
+        let mut episode = episode(100);
+        change(&mut episode);
+        bench.board.validate_practice(&episode)
+    };
+    assert_eq!(check(|_| ()), Ok(()));
+    assert_eq!(check(|it| it.score.seed = 102), Err(Refusal::Practice(102)));
+    assert_eq!(check(|it| it.step = 1000), Err(Refusal::Step));
+    assert_eq!(check(|it| it.weights = hash(1)), Err(Refusal::Weights));
+    assert_eq!(check(|it| it.actions = vec![0.0; 2 * 4]), Err(Refusal::Rows(100)));
+    assert_eq!(check(|it| it.rewards[0] = 1.5), Err(Refusal::Episode(100)));
+    assert_eq!(check(|it| it.score.score += 1.0), Err(Refusal::Episode(100)));
+}
+
+#[test]
+fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
+    let mut bench = bench();
+    bench.job("a", 0);
+    bench.board.end_practice();
+    assert_eq!(bench.job("b", 0).practice, None);
+    assert_eq!(bench.board.validate_practice(&episode(100)), Ok(()));
+    assert_eq!(bench.board.validate_practice(&episode(101)), Err(Refusal::Practice(101)));
+}

@@ -1,0 +1,149 @@
+//! Deliveries of practice episodes: pieces are put together, checked, and written to the disk.
+//!
+//! A piece is small, since a learner takes no larger messages. There are as many episodes in
+//! pieces as the run has open, and none is longer than the environment allows.
+
+use std::collections::BTreeMap;
+use std::mem;
+
+use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode};
+use quad_run::folder::{ExperienceLog, ExperienceRecord};
+use quad_runtime::Heartbeat;
+use tracing::warn;
+
+use super::coordinator::Coordinator;
+use super::disk::DiskStatus;
+use super::requests::{NotAccepted, Request};
+use crate::evaluation::{Practice, Refusal};
+use crate::train::Inbox;
+
+/// Practice episodes on their way to the disk, and then to training.
+pub(super) struct Experience {
+    /// `experience.log`.
+    pub log: ExperienceLog,
+    pub inbox: Inbox,
+    pub coordinator: Coordinator,
+    /// The first bytes of frames, and the hashes of the whole, by seed.
+    partial: BTreeMap<u64, (Hash, Vec<u8>)>,
+}
+
+/// A whole episode with its last piece.
+struct Whole {
+    request: Request,
+    number: u64,
+    hash: Hash,
+    record: ExperienceRecord,
+}
+
+impl Experience {
+    pub fn new(log: ExperienceLog, inbox: Inbox, coordinator: Coordinator) -> Self {
+        Self { log, inbox, coordinator, partial: BTreeMap::new() }
+    }
+
+    /// Answers each piece. Episodes that are complete are written together first.
+    pub fn receive(
+        &mut self,
+        pieces: impl Iterator<Item = (Request, Piece)>,
+        disk: &mut DiskStatus,
+        beat: &Heartbeat,
+    ) {
+        let mut whole: Vec<Whole> = Vec::new();
+        for (request, piece) in pieces {
+            self.coordinator.extend_lease(&piece.evaluator, piece.incarnation, piece.job);
+            match self.add(&piece, &whole) {
+                Ok(Added::Reply(reply)) => request.reply(&reply),
+                Ok(Added::Whole { number, episode }) => {
+                    let Piece { evaluator, precision, hash, .. } = piece;
+                    let record = ExperienceRecord { evaluator, precision, episode };
+                    whole.push(Whole { request, number, hash, record });
+                }
+                Err(why) => {
+                    self.coordinator.metrics.reject(why.label());
+                    let (incarnation, reason) = (self.coordinator.incarnation(), why.to_string());
+                    request.reply(&PieceReply::Refused { incarnation, reason });
+                }
+            }
+        }
+        if whole.is_empty() {
+            return;
+        }
+        match self.log.append(whole.iter().map(|whole| &whole.record)) {
+            Ok(()) => {
+                disk.accepted(beat);
+                for Whole { request, number, hash, record } in whole {
+                    let seed = record.episode.score.seed;
+                    self.partial.remove(&seed);
+                    self.inbox.add(number, record.episode);
+                    request.reply(&self.coordinator.record_practice(seed, hash));
+                }
+            }
+            // The last piece completes them again when the evaluators deliver it again.
+            Err(error) => {
+                let error = format!("{:#}", anyhow::Error::from(error));
+                disk.refused(beat, &error);
+                for Whole { request, .. } in whole {
+                    let why = NotAccepted::NotSaved(error.clone());
+                    request.reject(&why, &self.coordinator.metrics);
+                }
+            }
+        }
+    }
+
+    fn add(&mut self, piece: &Piece, whole: &[Whole]) -> Result<Added, NotAccepted> {
+        let incarnation = self.coordinator.incarnation();
+        let seed = piece.seed;
+        let number = match self.coordinator.practice(piece)? {
+            Practice::Open { episode } => episode,
+            Practice::Recorded(hash) => {
+                if hash != piece.hash {
+                    warn!(
+                        seed, evaluator = %piece.evaluator,
+                        "an episode was played again with other bits; the first delivery counts"
+                    );
+                }
+                return Ok(Added::Reply(PieceReply::Recorded { incarnation, duplicate: true }));
+            }
+        };
+        let at = |offset: usize| {
+            let offset = offset as u32;
+            Ok(Added::Reply(PieceReply::Continue { incarnation, offset }))
+        };
+        // Another evaluator's last piece came just before.
+        if whole.iter().any(|whole| whole.number == number) {
+            return at(piece.offset as usize);
+        }
+        let none = || (piece.hash, Vec::new());
+        let (hash, bytes) = self.partial.entry(seed).or_insert_with(none);
+        if *hash != piece.hash && piece.offset == 0 {
+            (*hash, *bytes) = none();
+        }
+        let end = piece.offset as usize + piece.bytes.len();
+        let follows = *hash == piece.hash && (piece.offset as usize) <= bytes.len();
+        if !follows {
+            return at(if *hash == piece.hash { bytes.len() } else { 0 });
+        }
+        if end > bytes.len() {
+            bytes.truncate(piece.offset as usize);
+            bytes.extend_from_slice(&piece.bytes);
+        }
+        if bytes.len() < piece.length as usize {
+            return at(bytes.len());
+        }
+        let found = Hash::of(bytes);
+        if found != piece.hash {
+            mem::take(bytes);
+            return Err(CodecError::Hash { claimed: piece.hash, found }.into());
+        }
+        let episode: Episode = decode(bytes)?;
+        if episode.score.seed != seed {
+            return Err(Refusal::Practice(seed).into());
+        }
+        self.coordinator.validate_practice(&episode)?;
+        Ok(Added::Whole { number, episode })
+    }
+}
+
+enum Added {
+    Reply(PieceReply),
+    Whole { number: u64, episode: Episode },
+}

@@ -1,0 +1,204 @@
+//! Practice in the order of its rows: which gradient steps go with them, and which snapshot plays
+//! the next episodes. All of it is a function of the settings and of the episodes' lengths, so that
+//! neither clocks nor the number of evaluators can change a run.
+
+use std::collections::BTreeMap;
+use std::mem;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use quad_dataset::{OnlineSampler, PracticeRows, Transitions};
+use quad_protocol::{Episode, Exploration, practice_seed};
+use quad_run::config::{Experiment, Online};
+use quad_runtime::Heartbeat;
+
+use super::metrics::PracticeMetrics;
+use crate::evaluation::Opening;
+
+/// Interval at which training checks for a stop while it waits for an episode.
+const POLL: Duration = Duration::from_millis(100);
+
+/// Recorded episodes that training has not absorbed yet, by number. Clones share them.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Inbox {
+    shared: Arc<(Mutex<BTreeMap<u64, Episode>>, Condvar)>,
+}
+
+impl Inbox {
+    pub fn add(&self, number: u64, episode: Episode) {
+        self.lock().insert(number, episode);
+        self.shared.1.notify_all();
+    }
+
+    fn contains(&self, number: u64) -> bool {
+        self.lock().contains_key(&number)
+    }
+
+    fn take(&self, number: u64) -> Option<Episode> {
+        self.lock().remove(&number)
+    }
+
+    /// Waits for an episode; `None` if training is to `stop`.
+    fn wait(&self, number: u64, stop: &AtomicBool, beat: &Heartbeat) -> Option<Episode> {
+        let mut episodes = self.lock();
+        while !stop.load(Ordering::Relaxed) {
+            if let Some(episode) = episodes.remove(&number) {
+                return Some(episode);
+            }
+            beat.alive();
+            let woken = self.shared.1.wait_timeout(episodes, POLL);
+            episodes = woken.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        None
+    }
+
+    // A thread that panicked here left the map as it was before its change or after it.
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<u64, Episode>> {
+        self.shared.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The practice of a run.
+pub(crate) struct Practice {
+    online: Online,
+    /// Gradient steps before practice.
+    begin: u64,
+    seed: u64,
+    /// Rows and episodes absorbed.
+    rows: u64,
+    episodes: u64,
+    /// Episodes opened, the last of which are still to be announced.
+    opened: u64,
+    openings: Vec<Opening>,
+    inbox: Inbox,
+    transitions: Arc<Transitions>,
+    sampler: OnlineSampler,
+    metrics: PracticeMetrics,
+}
+
+/// An episode that does not fit the run's transitions, or is missing from the run's experience.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum PracticeError {
+    #[error(
+        "the experience of the run does not have episode {0}, which its checkpoint has learned from"
+    )]
+    Missing(u64),
+    #[error("practice episode {number} cannot be learned from")]
+    Rows { number: u64, source: quad_dataset::Problem },
+}
+
+impl Practice {
+    /// The practice of an experiment, before its first episode.
+    pub fn new(
+        experiment: &Experiment,
+        transitions: Arc<Transitions>,
+        inbox: Inbox,
+        metrics: PracticeMetrics,
+    ) -> Option<Self> {
+        let online = experiment.online.clone()?;
+        let (seed, begin) = (experiment.seed, experiment.steps);
+        let sampler = OnlineSampler::new(seed, experiment.batch_size as usize, online.share);
+        let lag = online.lag;
+        let mut practice = Self {
+            online,
+            begin,
+            seed,
+            rows: 0,
+            episodes: 0,
+            opened: 0,
+            openings: Vec::new(),
+            inbox,
+            transitions,
+            sampler,
+            metrics,
+        };
+        (0..lag).for_each(|_| practice.open(begin));
+        Some(practice)
+    }
+
+    /// Gradient step up to which training goes on with the rows that it has.
+    fn due(&self) -> u64 {
+        self.begin + self.online.updates_after(self.rows)
+    }
+
+    /// True from the first gradient step of practice on.
+    pub fn has_begun(&self, step: u64) -> bool {
+        step >= self.begin
+    }
+
+    /// True if practice may be played with the policy after this gradient step.
+    pub fn is_snapshot(&self, step: u64) -> bool {
+        self.online.is_snapshot(self.begin, step)
+    }
+
+    /// Absorbs the episodes that a checkpoint of this step has learned from.
+    pub fn resume(&mut self, step: u64) -> Result<(), PracticeError> {
+        while self.has_begun(step) && self.due() < step {
+            let number = self.episodes;
+            let episode = self.inbox.take(number).ok_or(PracticeError::Missing(number))?;
+            self.absorb(&episode)?;
+        }
+        Ok(())
+    }
+
+    /// True if gradient step `step` is the last that goes with the rows so far.
+    pub fn is_due(&self, step: u64) -> bool {
+        step == self.due()
+    }
+
+    /// Waits for the next episode and absorbs it. False if training is to `stop`.
+    pub fn absorb_next(
+        &mut self,
+        stop: &AtomicBool,
+        beat: &Heartbeat,
+    ) -> Result<bool, PracticeError> {
+        let begin = Instant::now();
+        let episode = self.inbox.wait(self.episodes, stop, beat);
+        self.metrics.wait_seconds.inc_by(begin.elapsed().as_secs_f64());
+        episode.map_or(Ok(false), |episode| self.absorb(&episode).map(|()| true))
+    }
+
+    /// Episodes that are open since the last call and not recorded yet.
+    pub fn take_openings(&mut self) -> Vec<Opening> {
+        let mut openings = mem::take(&mut self.openings);
+        let is_open =
+            |it: &Opening| it.episode >= self.episodes && !self.inbox.contains(it.episode);
+        openings.retain(is_open);
+        openings
+    }
+
+    fn absorb(&mut self, episode: &Episode) -> Result<(), PracticeError> {
+        let (number, step) = (self.episodes, self.due());
+        let Episode { observations, actions, rewards, terminated, .. } = episode;
+        let rows = PracticeRows { observations, actions, rewards, terminated: *terminated };
+        let added = self.transitions.add_episode(rows);
+        added.map_err(|source| PracticeError::Rows { number, source })?;
+        self.rows += rewards.len() as u64;
+        self.episodes += 1;
+        self.metrics.absorbed(self.rows, &episode.score);
+        if self.rows < self.online.steps {
+            self.open(step);
+        }
+        Ok(())
+    }
+
+    /// Opens the next episode at this gradient step.
+    fn open(&mut self, step: u64) {
+        let Online { warmup, uniform_warmup, noise, .. } = self.online;
+        let exploration = match uniform_warmup && self.rows < warmup {
+            true => Exploration::Uniform,
+            false => Exploration::Policy { noise },
+        };
+        let (episode, step) = (self.opened, self.online.newest_snapshot(self.begin, step));
+        let seed = practice_seed(self.seed, episode);
+        self.openings.push(Opening { episode, step, seed, exploration });
+        self.opened += 1;
+    }
+
+    /// The rows of gradient step `step`, the first of which is 1.
+    pub fn batch(&mut self, step: u64) -> &[u32] {
+        let sizes = [self.transitions.len(), self.transitions.experience_len()];
+        self.sampler.batch(step, sizes)
+    }
+}

@@ -1,0 +1,134 @@
+//! Tests of the order of practice and gradient steps.
+
+use std::sync::atomic::AtomicBool;
+
+use quad_protocol::{Episode, EpisodeScore, Exploration, Hash, practice_seed};
+use quad_run::config::{Experiment, Online};
+
+use super::*;
+use crate::evaluation::Opening;
+use crate::train::{Inbox, Practice, PracticeMetrics};
+
+/// Rows of the episodes.
+const LENGTHS: [usize; 7] = [3, 4, 2, 6, 1, 9, 5];
+const BEGIN: u64 = 10;
+
+/// 20 environment steps with two gradient steps each, after a warm-up of 5.
+fn experiment() -> Experiment {
+    let mut experiment = resolve("hopper-demo", &toml::Table::new()).unwrap();
+    (experiment.steps, experiment.batch_size) = (BEGIN, 4);
+    experiment.online = Some(Online {
+        steps: 20,
+        updates_per_step: 2,
+        warmup: 5,
+        uniform_warmup: true,
+        share: Some(0.5),
+        noise: 0.1,
+        lag: 2,
+        snapshot_interval: 4,
+    });
+    experiment
+}
+
+fn episode(rows: usize) -> Episode {
+    let score = EpisodeScore { seed: 0, episode_return: 0.0, length: rows as u32, score: 0.0 };
+    Episode {
+        step: 0,
+        weights: Hash::of(b""),
+        score,
+        terminated: true,
+        observations: vec![rows as f32; (rows + 1) * 11],
+        actions: vec![0.5; rows * 3],
+        rewards: vec![1.0; rows],
+        interventions: Vec::new(),
+    }
+}
+
+/// Practice whose first `recorded` episodes have come.
+fn practice(recorded: usize) -> (Practice, Inbox) {
+    let (inbox, registry) = (Inbox::default(), prometheus::Registry::new());
+    let metrics = PracticeMetrics::new(&registry).unwrap();
+    let practice =
+        Practice::new(&experiment(), Arc::new(transitions()), inbox.clone(), metrics).unwrap();
+    (0..).zip(&LENGTHS[..recorded]).for_each(|(number, rows)| inbox.add(number, episode(*rows)));
+    (practice, inbox)
+}
+
+/// An opening, or the batch of a gradient step.
+#[derive(Clone, Debug, PartialEq)]
+enum Happened {
+    Opened(Opening),
+    Updated(u64, Vec<u32>),
+}
+
+/// Trains from a gradient step to the end. Episodes come as late as they may.
+fn happens(practice: &mut Practice, inbox: &Inbox, from: u64) -> Vec<Happened> {
+    let (mut all, stop) = (Vec::new(), AtomicBool::new(false));
+    for step in from..experiment().total_steps() {
+        loop {
+            for opening in practice.take_openings() {
+                inbox.add(opening.episode, episode(LENGTHS[opening.episode as usize]));
+                all.push(Happened::Opened(opening));
+            }
+            if !practice.is_due(step) {
+                break;
+            }
+            assert!(practice.absorb_next(&stop, &beat()).unwrap());
+        }
+        all.push(Happened::Updated(step + 1, practice.batch(step + 1).to_vec()));
+    }
+    all
+}
+
+#[test]
+fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
+    let (mut practice, inbox) = practice(0);
+    assert!(!practice.has_begun(BEGIN - 1) && practice.has_begun(BEGIN));
+    let all = happens(&mut practice, &inbox, BEGIN);
+    let opened = all.iter().filter_map(|happened| match happened {
+        Happened::Opened(opening) => Some(*opening),
+        Happened::Updated(..) => None,
+    });
+    let noise = Exploration::Policy { noise: 0.1 };
+    // After 3, 7, 9, 15 and 16 rows, gradient steps 10, 14, 18, 30 and 32 are due.
+    let expected = [
+        (0, 10, Exploration::Uniform),
+        (1, 10, Exploration::Uniform),
+        (2, 10, Exploration::Uniform),
+        (3, 10, noise),
+        (4, 14, noise),
+        (5, 18, noise),
+        (6, 30, noise),
+    ];
+    let expected = expected.map(|(episode, step, exploration)| Opening {
+        episode,
+        step,
+        seed: practice_seed(0, episode),
+        exploration,
+    });
+    assert_eq!(Vec::from_iter(opened), expected);
+}
+
+#[test]
+fn practice_continues_from_any_step_as_if_it_had_not_stopped() {
+    let (mut whole, inbox) = practice(0);
+    let all = happens(&mut whole, &inbox, BEGIN);
+    for from in BEGIN..experiment().total_steps() {
+        let (mut resumed, inbox) = practice(LENGTHS.len());
+        resumed.resume(from).unwrap();
+        let updates = |all: &[Happened]| {
+            let mut all = all.to_vec();
+            all.retain(|happened| matches!(happened, Happened::Updated(step, _) if *step > from));
+            all
+        };
+        assert_eq!(happens(&mut resumed, &inbox, from), updates(&all), "from step {from}");
+    }
+    let (mut resumed, _) = practice(1);
+    assert!(resumed.resume(experiment().total_steps()).is_err(), "experience is missing");
+}
+
+#[test]
+fn training_that_waits_for_practice_can_be_stopped() {
+    let (mut practice, _) = practice(0);
+    assert!(!practice.absorb_next(&AtomicBool::new(true), &beat()).unwrap());
+}
