@@ -6,8 +6,8 @@
 use std::collections::BTreeMap;
 use std::mem;
 
-use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode};
-use quad_run::folder::{ExperienceLog, ExperienceRecord};
+use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, Record, decode};
+use quad_run::folder::ExperienceLog;
 use quad_runtime::Heartbeat;
 use tracing::warn;
 
@@ -32,7 +32,6 @@ struct Whole {
     request: Request,
     number: u64,
     hash: Hash,
-    record: ExperienceRecord,
 }
 
 impl Experience {
@@ -47,15 +46,15 @@ impl Experience {
         disk: &mut DiskStatus,
         beat: &Heartbeat,
     ) {
-        let mut whole: Vec<Whole> = Vec::new();
+        let (mut whole, mut records) = (Vec::new(), Vec::new());
         for (request, piece) in pieces {
             self.coordinator.extend_lease(&piece.evaluator, piece.incarnation, piece.job);
             match self.add(&piece, &whole) {
                 Ok(Added::Reply(reply)) => request.reply(&reply),
                 Ok(Added::Whole { number, episode }) => {
                     let Piece { evaluator, precision, hash, .. } = piece;
-                    let record = ExperienceRecord { evaluator, precision, episode };
-                    whole.push(Whole { request, number, hash, record });
+                    records.push(Record { evaluator, precision, episode });
+                    whole.push(Whole { request, number, hash });
                 }
                 Err(why) => {
                     self.coordinator.metrics.reject(why.label());
@@ -67,10 +66,10 @@ impl Experience {
         if whole.is_empty() {
             return;
         }
-        match self.log.append(whole.iter().map(|whole| &whole.record)) {
+        match self.log.append(&records) {
             Ok(()) => {
                 disk.accepted(beat);
-                for Whole { request, number, hash, record } in whole {
+                for (Whole { request, number, hash }, record) in whole.into_iter().zip(records) {
                     let seed = record.episode.score.seed;
                     self.partial.remove(&seed);
                     self.inbox.add(number, record.episode);

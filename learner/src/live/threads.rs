@@ -8,9 +8,9 @@ use std::time::Duration;
 
 use quad_algorithms::Agent;
 use quad_dataset::{BatchSampler, Task};
-use quad_protocol::{Hash, encode, practice_seed};
+use quad_protocol::{Hash, Record, encode, practice_seed};
 use quad_run::config::{Online, RunConfig};
-use quad_run::folder::{ExperienceRecord, Log, ResumePoint, RunDir};
+use quad_run::folder::{Log, ResumePoint, RunDir};
 use quad_runtime::{Health, Hint};
 
 use super::coordinator::Coordinator;
@@ -183,7 +183,7 @@ fn open_experience(
 ) -> anyhow::Result<Experience> {
     let (log, records) = dir.experience_log()?;
     let mut frames = HashMap::new();
-    for ExperienceRecord { episode, .. } in records {
+    for Record { episode, .. } in records {
         frames.insert(episode.score.seed, episode);
     }
     // Seeds are those of the first episodes: more were never open.

@@ -98,7 +98,7 @@ impl Practice {
     ) -> Option<Self> {
         let online = experiment.online.clone()?;
         let (seed, begin) = (experiment.seed, experiment.steps);
-        let sampler = OnlineSampler::new(seed, experiment.batch_size as usize, online.share);
+        let sampler = OnlineSampler::new(experiment.batch_size as usize, online.share, seed);
         let lag = online.lag;
         let mut practice = Self {
             online,
@@ -196,9 +196,20 @@ impl Practice {
         self.opened += 1;
     }
 
+    /// Numbers for a line of `metrics.jsonl`: environment steps, return of the newest episode, and
+    /// seconds that this process has waited for practice.
+    pub fn row(&self) -> Vec<(&'static str, f64)> {
+        let metrics = &self.metrics;
+        vec![
+            ("environment_steps", self.rows as f64),
+            ("practice_return", metrics.episode_return.get()),
+            ("practice_wait_seconds", metrics.wait_seconds.get()),
+        ]
+    }
+
     /// The rows of gradient step `step`, the first of which is 1.
     pub fn batch(&mut self, step: u64) -> &[u32] {
-        let sizes = [self.transitions.len(), self.transitions.experience_len()];
-        self.sampler.batch(step, sizes)
+        let (dataset, experience) = (self.transitions.len(), self.transitions.experience_len());
+        self.sampler.items(step, dataset, experience)
     }
 }

@@ -30,6 +30,8 @@ pub(crate) struct Row {
     /// Values on held-out episodes after the last of the steps, in the order of `metrics`; empty if
     /// nothing was measured.
     pub held_out: Vec<Option<f32>>,
+    /// Experience so far; empty before practice.
+    pub practice: Vec<(&'static str, f64)>,
 }
 
 impl Serialize for Row {
@@ -42,6 +44,9 @@ impl Serialize for Row {
         }
         for (metric, value) in measured(self.metrics, &self.held_out) {
             map.serialize_entry(&held_out_name(metric), &value)?;
+        }
+        for (name, value) in &self.practice {
+            map.serialize_entry(name, value)?;
         }
         map.end()
     }

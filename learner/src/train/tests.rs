@@ -191,7 +191,7 @@ fn a_queue_that_the_disk_does_not_empty_keeps_the_newest_checkpoint_and_all_rows
     let checkpoint = |step: u64| Checkpoint { step, state: vec![step as u8] };
     for step in 1..=3 {
         let (values, held_out) = (vec![], vec![]);
-        queue.row(Row { step, seconds: 0.0, metrics: &[], values, held_out });
+        queue.row(Row { step, seconds: 0.0, metrics: &[], values, held_out, practice: Vec::new() });
         queue.checkpoint(checkpoint(step));
     }
     queue.ended(Outcome::Completed);

@@ -122,7 +122,9 @@ impl Training {
             if step.is_multiple_of(STEPS_PER_ROW) || is_last || stopped {
                 let seconds = self.seconds_before + start.elapsed().as_secs_f64();
                 let (values, held_out) = (means.take(), self.measure_held_out(step, is_last)?);
-                self.queue.row(Row { step, seconds, metrics, values, held_out });
+                let online = self.practice.as_ref().filter(|it| it.has_begun(step - 1));
+                let practice = online.map_or(Vec::new(), Practice::row);
+                self.queue.row(Row { step, seconds, metrics, values, held_out, practice });
             }
             if is_last || self.schedule.is_evaluated(step) {
                 self.save_policy(step, beat)?;

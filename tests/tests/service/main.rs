@@ -6,5 +6,6 @@ mod leaving;
 mod local_evaluators;
 mod names;
 mod page;
+mod practice;
 mod runs;
 mod sweep;
