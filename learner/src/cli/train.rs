@@ -37,7 +37,7 @@ weights, bit for bit, as a run without interruption.";
 pub struct TrainArgs {
     /// The task: an environment, a dataset, and the algorithm's values for them (`learner presets`
     /// lists tasks)
-    #[arg(long, value_name = "NAME", value_parser = task_names(), hide_possible_values = true, required_unless_present = "preset")]
+    #[arg(long, value_name = "NAME", value_parser = task_names(), hide_possible_values = true, required_unless_present_any = ["preset", "from"])]
     task: Option<String>,
     /// The algorithm (`learner presets` lists algorithms) [default: quad]
     #[arg(long, value_name = "NAME", value_parser = algorithm_names(), hide_possible_values = true)]
@@ -46,6 +46,10 @@ pub struct TrainArgs {
     /// change
     #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]
     preset: Option<String>,
+    /// Go on with practice where a complete run has ended: with its settings and its last checkpoint,
+    /// in a folder of its own
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["task", "preset", "algorithm", "dataset", "steps"], requires = "online_steps")]
+    pub from: Option<PathBuf>,
     /// The environment in which the policy acts; one that no evaluator simulates can be any name
     /// (docs/python.md) [default: the task's]
     #[arg(long, value_name = "NAME")]

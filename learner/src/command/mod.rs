@@ -5,6 +5,7 @@ mod doctor;
 mod dry_run;
 mod export;
 mod export_data;
+mod from;
 mod judge;
 mod outside;
 mod page;
@@ -19,8 +20,8 @@ use clap_complete::Shell;
 use quad_algorithms::{ALGORITHMS, Definition, Values};
 use quad_dataset::{DatasetError, benchmarks, environment};
 use quad_run::config::{ConfigError, Preset, hyperparameters, tasks};
-use quad_run::folder::RunDirError;
 use quad_run::folder::verify::{self, Findings};
+use quad_run::folder::{RunDirError, practiced};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, hinted, json, print, unfinished};
@@ -170,7 +171,11 @@ fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
             1 => String::new(),
             _ => format!("{}: ", dir.display()),
         };
-        report(about, verify::verify(dir)?)?;
+        report(about.clone(), verify::verify(dir)?)?;
+        if let Some((findings, promise)) = practiced(dir)? {
+            report(about.clone(), findings)?;
+            print(&format!("{about}{promise}"))?;
+        }
         if let Some(other) = &args.same_as {
             for findings in verify::compare(dir, other)? {
                 report(format!("with {}: ", other.display()), findings)?;

@@ -12,7 +12,7 @@ use quad_protocol::Name;
 use quad_run::config::{
     ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters,
 };
-use quad_run::folder::{ExistingRun, Log, ResumePoint, RunDir};
+use quad_run::folder::{Checkpoint, ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
 use quad_runtime::{
     Health, Hint, ListenError, hinted, print, serve_metrics, stay_in_background, unfinished,
@@ -23,6 +23,7 @@ use tokio::time::timeout;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
+use super::from::From;
 use super::outside::{Outside, training_threads};
 use crate::cli::TrainArgs;
 use crate::data::{LocalDataset, Source, load};
@@ -37,7 +38,10 @@ use crate::train::{HeldOut, begin, device};
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
-    let preset = Preset::read(args.preset()).hint_of(ConfigError::hint)?;
+    let (from, preset) = match &args.from {
+        Some(run) => From::read(run).map(|(from, preset)| (Some(from), preset))?,
+        None => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
+    };
     let experiment = preset.resolve(&args.changes()).hint_of(ConfigError::hint)?;
     let label = &preset.label;
     let named = experiment.dataset.as_ref();
@@ -60,7 +64,11 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         Some(path) => path.clone(),
         None => {
             let (variant, seed) = (experiment.variant()?, experiment.seed);
-            Path::new("runs").join(format!("{label}-{variant}-seed{seed}"))
+            let folder = match from {
+                Some(_) => label.clone(),
+                None => format!("{label}-{variant}-seed{seed}"),
+            };
+            Path::new("runs").join(folder)
         }
     };
     let name = run_name(&path)?;
@@ -69,6 +77,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     device::check(args.device, experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
+    from.as_ref().map_or(Ok(()), |from| from.check_dataset(&dataset.sha256))?;
 
     start_pool(args.threads)?;
     let data = load(&dataset.path, &experiment)?;
@@ -104,7 +113,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let mut runtime = Builder::new_multi_thread();
     let runtime =
         runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
-    let run = run_to_end(args, outside, &path, begun, &config, data);
+    let first = from.map(From::into_checkpoint);
+    let run = run_to_end(args, outside, &path, (begun, first), &config, data);
     let ended = runtime.block_on(run);
     let concluded =
         ended.and_then(|(run_dir, ending)| conclude(&runtime, &run_dir, &config, ending));
@@ -138,7 +148,7 @@ async fn run_to_end(
     args: &TrainArgs,
     mut outside: Outside,
     path: &Path,
-    begun: Option<ExistingRun>,
+    (begun, first): (Option<ExistingRun>, Option<Checkpoint>),
     config: &RunConfig,
     data: Split,
 ) -> anyhow::Result<(RunDir, Ending)> {
@@ -166,7 +176,13 @@ async fn run_to_end(
         held_out.and_then(|held_out| HeldOut::new(experiment, device, held_out, &mut agent));
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
-    let (dir, scores, past) = open_or_create(path, begun, args.fresh, config)?;
+    let (dir, scores, mut past) = open_or_create(path, begun, args.fresh, config)?;
+    if past.checkpoint.is_none()
+        && let Some(first) = first
+    {
+        dir.write_checkpoint(&first)?;
+        past.checkpoint = Some(first);
+    }
     // A later start has a larger number; the low bits distinguish two that start in the same
     // millisecond.
     let number = now()? << 16 | u64::from(rand::random::<u16>());

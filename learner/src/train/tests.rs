@@ -88,7 +88,7 @@ fn context(total_steps: u64) -> Context {
 }
 
 const fn schedule(steps: u64, eval_interval: u64) -> Schedule {
-    Schedule { steps, eval_interval }
+    Schedule { start: 0, steps, eval_interval }
 }
 
 fn agent(algorithm: &str, total_steps: u64) -> Agent {

@@ -37,6 +37,10 @@ pub struct Experiment {
     /// which episodes these are.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub hold_out: f64,
+    /// Hash of the checkpoint that the run begins with, another run's after these many steps; `None`
+    /// if it begins with step 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub from: Option<String>,
     /// Gradient steps on the dataset alone.
     pub steps: u64,
     /// Gradient steps between two evaluations; 0 turns evaluations off.
@@ -103,7 +107,8 @@ impl Experiment {
 
     /// The gradient steps and evaluations.
     pub fn schedule(&self) -> Schedule {
-        Schedule { steps: self.total_steps(), eval_interval: self.eval_interval }
+        let start = if self.from.is_some() { self.steps } else { 0 };
+        Schedule { start, steps: self.total_steps(), eval_interval: self.eval_interval }
     }
 
     /// The values that distinguish runs, in one line.

@@ -12,6 +12,7 @@ use toml::{Table, Value};
 use super::error::ConfigError;
 use super::experiment::Experiment;
 use super::hyperparameters;
+use super::run_config::RunConfig;
 use super::tables::merge;
 use super::tasks::{self, Task};
 
@@ -48,6 +49,12 @@ impl Preset {
                 .map_err(|error| ConfigError::Preset { preset: name(), source: Box::new(error) })?,
             own,
         })
+    }
+
+    /// The settings of a run, as `own` keys.
+    pub fn of_run(config: &RunConfig, own: Table) -> Result<Self, ConfigError> {
+        let label = format!("{}-online", config.run.name);
+        Ok(Self { label, task: tasks::named(&config.run.task).ok(), own })
     }
 
     /// Name of the task; the label if the file names none.

@@ -3,7 +3,9 @@
 /// Gradient steps and evaluations of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Schedule {
-    /// Gradient steps.
+    /// The gradient step that the run begins after.
+    pub start: u64,
+    /// The last gradient step.
     pub steps: u64,
     /// Gradient steps between two evaluations; 0 turns evaluations off.
     pub eval_interval: u64,
@@ -13,19 +15,21 @@ impl Schedule {
     /// True if the policy after a gradient step is evaluated.
     pub fn is_evaluated(&self, step: u64) -> bool {
         let is_due = step == self.steps || step.is_multiple_of(self.eval_interval);
-        self.eval_interval > 0 && (1..=self.steps).contains(&step) && is_due
+        self.eval_interval > 0 && step > self.start && step <= self.steps && is_due
     }
 
     /// Number of evaluated policies.
     pub fn evaluations(self) -> u64 {
-        if self.eval_interval == 0 { 0 } else { self.steps.div_ceil(self.eval_interval) }
+        let Self { start, steps, eval_interval } = self;
+        if eval_interval == 0 { 0 } else { steps.div_ceil(eval_interval) - start / eval_interval }
     }
 
     /// The evaluated steps, in ascending order.
     pub fn evaluated_steps(self) -> impl Iterator<Item = u64> {
-        let Self { steps, eval_interval } = self;
+        let Self { start, steps, eval_interval } = self;
+        let skipped = start.checked_div(eval_interval).unwrap_or(0);
         let count = steps.checked_div(eval_interval).unwrap_or(0);
-        let regular = (1..=count).map(move |n| n * eval_interval);
+        let regular = (skipped + 1..=count).map(move |n| n * eval_interval);
         let last = eval_interval > 0 && !steps.is_multiple_of(eval_interval);
         regular.chain(last.then_some(steps))
     }
@@ -37,21 +41,27 @@ mod tests {
 
     #[test]
     fn evaluations_of_a_run_without_end_are_counted() {
-        assert_eq!(Schedule { steps: u64::MAX, eval_interval: 1 }.evaluations(), u64::MAX);
-        let long = Schedule { steps: 1_000_000_000_001, eval_interval: 1000 };
+        assert_eq!(
+            Schedule { start: 0, steps: u64::MAX, eval_interval: 1 }.evaluations(),
+            u64::MAX
+        );
+        let long = Schedule { start: 0, steps: 1_000_000_000_001, eval_interval: 1000 };
         assert_eq!(long.evaluations(), 1_000_000_001);
     }
 
     #[test]
     fn evaluated_steps() {
-        for (steps, eval_interval, expected) in [
-            (10, 5, &[5, 10][..]),
-            (10, 4, &[4, 8, 10]),
-            (10, 20, &[10]),
-            (3, 1, &[1, 2, 3]),
-            (10, 0, &[]),
+        for (start, steps, eval_interval, expected) in [
+            (0, 10, 5, &[5, 10][..]),
+            (0, 10, 4, &[4, 8, 10]),
+            (0, 10, 20, &[10]),
+            (0, 3, 1, &[1, 2, 3]),
+            (0, 10, 0, &[]),
+            (4, 10, 4, &[8, 10]),
+            (5, 10, 4, &[8, 10]),
+            (5, 10, 20, &[10]),
         ] {
-            let schedule = Schedule { steps, eval_interval };
+            let schedule = Schedule { start, steps, eval_interval };
             assert_eq!(Vec::from_iter(schedule.evaluated_steps()), expected, "{schedule:?}");
             assert_eq!(schedule.evaluations(), expected.len() as u64, "{schedule:?}");
             let evaluated = (0..=2 * steps).filter(|step| schedule.is_evaluated(*step));

@@ -37,7 +37,7 @@ impl Findings {
         self.wrong.is_empty()
     }
 
-    fn add(&mut self, kind: &'static str, what: String) {
+    pub(super) fn add(&mut self, kind: &'static str, what: String) {
         let (count, listed) = self.wrong.entry(kind).or_default();
         *count += 1;
         if listed.len() < LISTED {

@@ -1,0 +1,55 @@
+//! `learner verify` on a run with practice: what its experience promises.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use quad_protocol::{Hash, practice_seed};
+
+use super::error::RunDirError;
+use super::experience::read_experience;
+use super::run_dir::RunDir;
+use super::verify::Findings;
+
+/// Another evaluator plays these episodes with the same bits.
+const REPEATABLE: &str =
+    "the run can be repeated bit for bit by evaluators with the same arithmetic";
+/// Some episodes depend on more than weights and seed.
+const LOGGED: &str = "the run can be repeated bit for bit from experience.log alone";
+
+/// Checks that each episode of a run's experience is there once and was played with the snapshot
+/// on disk. Also returns the promise that holds. `None` for a run without practice.
+pub fn practiced(path: &Path) -> Result<Option<(Findings, &'static str)>, RunDirError> {
+    let (dir, config) = RunDir::open(path)?;
+    let experiment = &config.experiment;
+    let Some(online) = &experiment.online else { return Ok(None) };
+    let records = read_experience(path)?;
+    let lengths = records.iter().map(|record| record.episode.rewards.len() as u64);
+    let rows: u64 = lengths.sum();
+    let mut found = Findings { what: "environment steps are recorded", ..Findings::default() };
+    (found.found, found.expected) = (rows.min(online.steps), online.steps);
+    if rows < online.steps {
+        found.add("not recorded yet", format!("{} steps", online.steps - rows));
+    }
+    let most = records.len() as u64 + u64::from(online.lag);
+    let seeds = BTreeSet::from_iter((0..most).map(|j| practice_seed(experiment.seed, j)));
+    let (mut seen, mut arithmetic) = (BTreeSet::new(), BTreeSet::new());
+    let mut is_repeatable = true;
+    for record in &records {
+        let episode = &record.episode;
+        let name = format!("step {}, seed {}", episode.step, episode.score.seed);
+        if !seeds.contains(&episode.score.seed) {
+            found.add("no episode of this run", name.clone());
+        }
+        if !seen.insert(episode.score.seed) {
+            found.add("recorded twice", name.clone());
+        }
+        let hash = dir.read_snapshot(episode.step).map(|file| Hash::of(&file));
+        if hash.is_ok_and(|hash| hash != episode.weights) {
+            is_repeatable = false;
+        }
+        arithmetic.insert(&record.precision);
+        is_repeatable &= episode.interventions.is_empty();
+    }
+    is_repeatable &= arithmetic.len() <= 1;
+    Ok(Some((found, if is_repeatable { REPEATABLE } else { LOGGED })))
+}
