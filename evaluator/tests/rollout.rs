@@ -7,7 +7,7 @@ use quad_dataset::environment::find;
 use quad_evaluator::sim::{
     Environment, EnvironmentError, Environments, Rollout, Simulations, Step, make,
 };
-use quad_protocol::{Episode, EpisodeScore, Hash};
+use quad_protocol::{EpisodeScore, Hash};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -177,12 +177,9 @@ impl Environment for Scripted {
     fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
         self.0[1] += 1.0;
         let [seed, steps] = self.0;
-        Ok(Step {
-            reward: steps / 3.0,
-            terminated: steps == seed && seed != 2.0,
-            truncated: steps == seed && seed != 1.0,
-            intervention: (steps == 2.0).then(|| vec![action[0] + 90.0]),
-        })
+        let (reward, terminated) = (steps / 4.0, steps == seed && seed != 2.0);
+        let intervention = (steps == 2.0).then(|| vec![action[0] + 90.0]);
+        Ok(Step { reward, terminated, truncated: steps == seed && seed != 1.0, intervention })
     }
 
     fn observation(&self) -> &[f64] {
@@ -196,10 +193,11 @@ impl Environment for Scripted {
 
 #[test]
 fn a_recorded_episode_is_what_was_observed_and_done() {
+    let weights = Hash::of(b"weights");
     let play = |seeds: &[u64]| {
         let make = || Ok(Box::new(Scripted::default()) as Box<dyn Environment>);
         let rollout = Rollout::new(make, (2, 1), seeds, |_| ()).unwrap();
-        let mut rollout = rollout.recording(70, Hash::of(b"weights"));
+        let mut rollout = rollout.recording(70, weights);
         while !rollout.is_done() {
             // A policy that fails leaves no trace.
             assert!(rollout.step(|_, _, _| Err(anyhow::anyhow!("no action"))).is_err());
@@ -212,27 +210,22 @@ fn a_recorded_episode_is_what_was_observed_and_done() {
         }
         Vec::from_iter(rollout.into_records().into_iter().map(|(_, episode)| episode.unwrap()))
     };
-    let [third, two] = [1.0 / 3.0, 2.0 / 3.0];
-    let episode = |seed, rewards: &[f64], terminated, observations: &[f32], actions: &[f32]| {
-        let (length, episode_return) = (rewards.len() as u32, rewards.iter().sum::<f64>());
-        Episode {
-            step: 70,
-            weights: Hash::of(b"weights"),
-            score: EpisodeScore { seed, length, episode_return, score: 2.0 * episode_return },
-            terminated,
-            observations: observations.to_vec(),
-            actions: actions.to_vec(),
-            rewards: rewards.iter().map(|&reward| reward as f32).collect(),
-            interventions: if length == 1 { vec![] } else { vec![1] },
-        }
-    };
-    let expected = [
-        episode(3, &[third, two, 1.0], true, &[3., 0., 3., 1., 3., 2., 3., 3.], &[30., 121., 32.]),
-        episode(1, &[third], true, &[1., 0., 1., 1.], &[10.]),
-        episode(2, &[third, two], false, &[2., 0., 2., 1., 2., 2.], &[20., 111.]),
-    ];
-    assert_eq!(play(&[3, 1, 2]), expected);
-    assert_eq!(play(&[2]), expected[2..]);
+    let together = play(&[3, 1, 2]);
+    for (episode, (seed, observed, actions, person)) in together.iter().zip([
+        (3, &[3., 0., 3., 1., 3., 2., 3., 3.][..], &[30., 121., 32.][..], &[1][..]),
+        (1, &[1., 0., 1., 1.], &[10.], &[]),
+        (2, &[2., 0., 2., 1., 2., 2.], &[20., 111.], &[1]),
+    ]) {
+        assert_eq!((episode.step, episode.weights, episode.terminated), (70, weights, seed != 2));
+        assert_eq!((&episode.observations[..], &episode.actions[..]), (observed, actions));
+        assert_eq!(episode.rewards, [0.25, 0.5, 0.75][..seed as usize]);
+        assert_eq!(episode.interventions, person);
+        let episode_return = [0.25, 0.75, 1.5][seed as usize - 1];
+        let score =
+            EpisodeScore { seed, episode_return, length: seed as u32, score: 2.0 * episode_return };
+        assert_eq!(episode.score, score);
+        assert_eq!(play(&[seed])[0], *episode);
+    }
 }
 
 /// A learner would refuse them.

@@ -19,16 +19,14 @@ impl State {
         }
         let whole = frame.len() == piece.length as usize;
         assert!(!whole || Hash::of(frame) == piece.hash);
+        let (offset, reason) = (frame.len() as u32, "its rewards are too good".to_owned());
         match self.behavior {
             Behavior::Silent => None,
-            _ if !whole => Some(PieceReply::Continue { incarnation, offset: frame.len() as u32 }),
+            _ if !whole => Some(PieceReply::Continue { incarnation, offset }),
+            Behavior::Refuses => Some(PieceReply::Refused { incarnation, reason }),
             Behavior::LosesAnswer => {
                 self.behavior = Behavior::Records;
                 None
-            }
-            Behavior::Refuses => {
-                let reason = "its rewards are too good".to_owned();
-                Some(PieceReply::Refused { incarnation, reason })
             }
             _ => {
                 self.job = None;
