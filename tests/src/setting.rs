@@ -10,11 +10,20 @@ pub struct Setting {
     pub candidates: u32,
     pub hidden: u32,
     pub seed: u64,
+    /// Environment steps of practice that follow `steps`; 0 without any.
+    pub online_steps: u64,
 }
 
 /// Four evaluations, over within a second.
-pub const SHORT: Setting =
-    Setting { steps: 80, eval_interval: 20, episodes: 6, candidates: 2, hidden: 16, seed: 1 };
+pub const SHORT: Setting = Setting {
+    steps: 80,
+    eval_interval: 20,
+    episodes: 6,
+    candidates: 2,
+    hidden: 16,
+    seed: 1,
+    online_steps: 0,
+};
 /// A run that is still training when its test is over.
 pub const ENDLESS: Setting = Setting { steps: 100_000_000, eval_interval: 500, ..SHORT };
 /// An endless run without a snapshot to evaluate before the test is over.
@@ -28,7 +37,14 @@ impl Setting {
     }
 
     pub fn to_toml(self) -> String {
-        let Setting { steps, eval_interval, episodes, candidates, hidden, seed } = self;
+        let Setting { steps, eval_interval, episodes, candidates, hidden, seed, online_steps } =
+            self;
+        let online = match online_steps {
+            0 => String::new(),
+            steps => format!(
+                "[online]\nsteps = {steps}\nupdates_per_step = 2\nwarmup = 100\nlag = 3\nsnapshot_interval = 500\n"
+            ),
+        };
         format!(
             r#"task = "hopper-demo"
 steps = {steps}
@@ -44,7 +60,7 @@ critic.hidden = [{hidden}, {hidden}, {hidden}]
 critics = 2
 diffusion_steps = 5
 actor_ema_start = 10
-"#
+{online}"#
         )
     }
 }

@@ -20,9 +20,10 @@ use crate::system::{Fault, Program, System, all_faults};
 /// Gradient steps for each fault, so that training continues until the last of them.
 const STEPS_PER_FAULT: u64 = 12_000;
 
-/// Lets so many faults of those kinds happen.
-fn endure(faults: &[Fault], count: u64) {
-    let steps = STEPS_PER_FAULT * count;
+/// Lets so many faults of those kinds happen, in a run with these environment steps of practice or
+/// without.
+fn endure(faults: &[Fault], count: u64, online_steps: u64) {
+    let steps = if online_steps > 0 { 1000 } else { STEPS_PER_FAULT * count };
     let setting = Setting {
         steps,
         eval_interval: STEPS_PER_FAULT / 2,
@@ -30,6 +31,7 @@ fn endure(faults: &[Fault], count: u64) {
         candidates: 20,
         hidden: 64,
         seed: 9,
+        online_steps,
     };
     let begin = Instant::now();
     let scratch = Scratch::new();
@@ -69,11 +71,19 @@ fn a_few_faults_change_no_bit_of_a_run() {
         Fault::FillDisk,
         Fault::DeliverAgain,
     ];
-    endure(&faults, faults.len() as u64);
+    endure(&faults, faults.len() as u64, 0);
+}
+
+#[test]
+fn a_few_faults_lose_no_row_of_practice_and_change_no_bit() {
+    let kinds = [Program::Learner, Program::Evaluator].map(Fault::Kill);
+    let faults =
+        [&kinds[..], &[Fault::Link(Program::Evaluator, Trouble::Cut), Fault::FillDisk]].concat();
+    endure(&faults, 6, 20_000);
 }
 
 #[test]
 #[ignore = "ten minutes"]
 fn a_hundred_faults_change_no_bit_of_a_run() {
-    endure(&all_faults(), number("QUAD_FAULTS", 100));
+    endure(&all_faults(), number("QUAD_FAULTS", 100), 0);
 }

@@ -21,6 +21,7 @@ pub const SETTING: Setting = Setting {
     candidates: 2,
     hidden: 32,
     seed: 2,
+    online_steps: 0,
 };
 pub const LISTEN: [&str; 4] = ["--listen", "tcp/127.0.0.1:0", "--checkpoint-seconds", "0"];
 

@@ -44,8 +44,15 @@ struct System {
 impl System {
     fn start(cuts: u64) -> System {
         let steps = STEPS_PER_CUT * cuts;
-        let setting =
-            Setting { steps, eval_interval: 1200, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
+        let setting = Setting {
+            steps,
+            eval_interval: 1200,
+            episodes: 4,
+            candidates: 2,
+            hidden: 64,
+            seed: 5,
+            online_steps: 0,
+        };
         // Beside the test's program: where a container keeps temporary files, its filesystem may
         // fail when a program that writes is killed.
         let program = std::env::current_exe().unwrap();

@@ -9,8 +9,15 @@ use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::Scratch;
 
 /// A few seconds of training with evaluations all along.
-const LONG: Setting =
-    Setting { steps: 3000, eval_interval: 300, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
+const LONG: Setting = Setting {
+    steps: 3000,
+    eval_interval: 300,
+    episodes: 4,
+    candidates: 2,
+    hidden: 64,
+    seed: 5,
+    online_steps: 0,
+};
 
 #[test]
 fn a_stopped_learner_resumes_at_its_step() {

@@ -14,8 +14,15 @@ use quad_tests::setting::Setting;
 use quad_tests::small_disk::SmallDisk;
 use quad_tests::system::Scratch;
 
-const SETTING: Setting =
-    Setting { steps: 40, eval_interval: 20, episodes: 2, candidates: 3, hidden: 16, seed: 5 };
+const SETTING: Setting = Setting {
+    steps: 40,
+    eval_interval: 20,
+    episodes: 2,
+    candidates: 3,
+    hidden: 16,
+    seed: 5,
+    online_steps: 0,
+};
 
 fn film(folder: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(binary("evaluator"));

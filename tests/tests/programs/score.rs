@@ -9,8 +9,15 @@ use quad_tests::setting::Setting;
 use quad_tests::system::Scratch;
 use serde_json::{Value, json};
 
-const SETTING: Setting =
-    Setting { steps: 40, eval_interval: 20, episodes: 7, candidates: 3, hidden: 16, seed: 5 };
+const SETTING: Setting = Setting {
+    steps: 40,
+    eval_interval: 20,
+    episodes: 7,
+    candidates: 3,
+    hidden: 16,
+    seed: 5,
+    online_steps: 0,
+};
 
 /// A finished run, evaluated in the arithmetic of that name.
 fn run(scratch: &Scratch, name: &str, precision: &str, scale: &[&str]) -> Learner {

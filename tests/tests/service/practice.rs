@@ -9,8 +9,15 @@ use quad_tests::setting::Setting;
 use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually};
 
-const SETTING: Setting =
-    Setting { steps: 100, eval_interval: 250, episodes: 2, candidates: 2, hidden: 16, seed: 4 };
+const SETTING: Setting = Setting {
+    steps: 100,
+    eval_interval: 250,
+    episodes: 2,
+    candidates: 2,
+    hidden: 16,
+    seed: 4,
+    online_steps: 0,
+};
 const ROWS: usize = 600;
 
 fn learner(scratch: &Scratch, run: &str, rows: usize, listen: &str) -> Learner {

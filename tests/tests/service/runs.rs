@@ -68,6 +68,7 @@ async fn scores_measured_offline_reach_the_next_incarnation() {
         candidates: 1000,
         hidden: 256,
         seed: 1,
+        online_steps: 0,
     };
     let session = router_without_scores(&endpoint, None).await;
     let mut first = scratch.learner_with("run", setting, &["--connect", &endpoint]);
