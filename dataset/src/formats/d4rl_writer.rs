@@ -6,7 +6,7 @@ use std::str::FromStr;
 use hdf5::H5Type;
 use hdf5::types::VarLenUnicode;
 
-use crate::error::{DatasetError, Problem};
+use crate::error::{DatasetError, Problem, RowProblem};
 use crate::formats::new_file::{CHUNK_ROWS, Column, NewFile};
 use crate::formats::recorded::Row;
 use crate::tables::environment::EnvironmentSpec;
@@ -70,15 +70,18 @@ impl D4rlWriter {
         let values =
             [row.observation, row.action, row.next_observation, &reward, row.qpos, row.qvel];
         for (Buffered { column, .. }, values) in self.floats.iter().zip(values) {
-            let width = column.width.unwrap_or(1);
-            let problem = if values.len() != width {
-                format!("has {} numbers, but must have {width}", values.len())
-            } else if let Some(value) = values.iter().find(|&&value| !(value as f32).is_finite()) {
-                format!("has {value}, which is not a finite float32")
-            } else {
-                continue;
+            let (array, expected) = (column.name, column.width.unwrap_or(1));
+            let not_finite = values.iter().map(|value| *value as f32).find(|x| !x.is_finite());
+            let problem = match not_finite.map(RowProblem::NotFinite) {
+                _ if values.len() != expected => {
+                    let environment = self.environment.name.clone();
+                    Problem::Width { array, found: values.len(), expected, environment }
+                }
+                Some(problem) => {
+                    Problem::Rows { array: array.to_owned(), row: self.rows, rows: 1, problem }
+                }
+                None => continue,
             };
-            let problem = Problem::BadRow { row: self.rows, array: column.name, problem };
             return Err(DatasetError::new(self.file.path(), problem));
         }
         for (column, values) in self.floats.iter_mut().zip(values) {
@@ -106,16 +109,13 @@ impl D4rlWriter {
     }
 
     fn write_metadata(&self, metadata: &Metadata) -> hdf5::Result<()> {
-        let text = |value: &str| VarLenUnicode::from_str(value).map_err(|error| error.to_string());
         let group = self.file.hdf5.create_group("metadata")?;
-        group
-            .new_dataset::<VarLenUnicode>()
-            .create("algorithm")?
-            .write_scalar(&text(metadata.algorithm)?)?;
-        group
-            .new_dataset::<VarLenUnicode>()
-            .create("environment")?
-            .write_scalar(&text(&self.environment.name)?)?;
+        for (name, value) in
+            [("algorithm", metadata.algorithm), ("environment", &self.environment.name)]
+        {
+            let value = VarLenUnicode::from_str(value).map_err(|error| error.to_string())?;
+            group.new_dataset::<VarLenUnicode>().create(name)?.write_scalar(&value)?;
+        }
         group.new_dataset::<i64>().create("iteration")?.write_scalar(&metadata.iteration)?;
         group.new_dataset::<u64>().create("seed")?.write_scalar(&metadata.seed)
     }

@@ -1,6 +1,7 @@
 //! Names of foreign formats, and the tools that read them.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, Read};
 use std::path::Path;
 
 use serde_json::Value;
@@ -9,10 +10,13 @@ use crate::error::Load::{self, Convert, Python};
 use crate::error::Problem;
 
 /// Number of leading bytes that identify a format.
-pub(crate) const START: u64 = 256;
+const START: u64 = 256;
 
 const TABLE: Load = Convert(
     "quad-convert FILE --observations COLUMN … --actions COLUMN … --reward COLUMN --episode COLUMN --terminal COLUMN",
+);
+const MATLAB: Load = Python(
+    "load it by scipy.io.loadmat or, if it is of version 7.3, by h5py, which transposes arrays",
 );
 const PICKLE: Load =
     Python("load it by pickle.load, if you trust who wrote it: a pickle can run any program");
@@ -26,17 +30,18 @@ const STARTS: [(&[u8], &str, Load); 8] = [
     (b"\x80\x04", "a Python pickle", PICKLE),
     (b"\x80\x05", "a Python pickle", PICKLE),
     (b"\x93NUMPY", "a single NumPy array", Python("load it by numpy.load")),
-    (
-        b"MATLAB",
-        "a MATLAB file",
-        Python(
-            "load it by scipy.io.loadmat or, if it is of version 7.3, by h5py, which transposes arrays",
-        ),
-    ),
+    (b"MATLAB", "a MATLAB file", MATLAB),
 ];
 
 fn foreign(what: impl Into<String>, load: Load) -> Problem {
-    Problem::Foreign { what: what.into(), load }
+    Problem::Foreign(what.into(), load)
+}
+
+/// A file and its first [`START`] bytes.
+pub(crate) fn start_of(path: &Path) -> io::Result<(File, Vec<u8>)> {
+    let (file, mut start) = (File::open(path)?, Vec::new());
+    (&file).take(START).read_to_end(&mut start)?;
+    Ok((file, start))
 }
 
 /// The problem with a file that is neither HDF5 nor zip, by its first [`START`] bytes.
@@ -80,26 +85,25 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
     }
 }
 
-/// The problem with an HDF5 file of another layout, by the members of its groups.
-pub(crate) fn of_group(
-    members: &[String],
-    within: impl Fn(&str) -> Vec<String>,
-) -> Option<Problem> {
-    let demonstration = members.iter().find(|name| name.starts_with("demo_"))?;
-    Some(match within(demonstration).iter().any(|name| name == "rewards") {
+/// The problem with an HDF5 file of robomimic's layout.
+pub(crate) fn of_robomimic(has_rewards: bool) -> Problem {
+    match has_rewards {
         true => foreign("a robomimic file", Convert("quad-convert FILE --observations KEY …")),
         false => foreign(
             "a file in robomimic's layout without rewards, as Isaac Lab's recorder writes it",
             Convert("quad-convert FILE --observations KEY … --reward success-at-end --success all"),
         ),
-    })
+    }
 }
 
+/// The problem with a zip archive of these files, if it is not NumPy's.
 pub(crate) fn of_archive(files: &[impl AsRef<str>]) -> Option<Problem> {
     let has = |ending: &str| files.iter().any(|name| name.as_ref().ends_with(ending));
-    match (has(".npy"), has("data.pkl")) {
-        (true, _) => None,
-        (false, true) => Some(foreign("a PyTorch file", Python("load it by torch.load"))),
-        (false, false) => Some(Problem::UnknownFormat),
+    if has(".npy") {
+        return None;
     }
+    Some(match has("data.pkl") {
+        true => foreign("a PyTorch file", Python("load it by torch.load")),
+        false => Problem::UnknownFormat,
+    })
 }

@@ -91,7 +91,6 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
         (recording.observation_dim, recording.action_dim) = (observations.width, actions.width);
     }
     let (o, a) = (recording.observation_dim, recording.action_dim);
-    let rows = recording.rows() + steps + 1;
     recording.parts.push((recording.rows(), episode.to_owned()));
     recording.observations.extend(observations.sized(steps + 1, o)?);
     recording.actions.extend(actions.sized(steps, a)?);
@@ -100,12 +99,7 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
     recording.timeouts.extend(file.flags(&array("truncations"), steps)?);
     recording.ends.extend((1..=steps).map(|step| step == steps));
     recording.kinds.extend(std::iter::repeat_n(RowKind::Transition, steps));
-    recording.actions.resize(rows * a, 0.0);
-    recording.rewards.push(0.0);
-    recording.terminals.push(false);
-    recording.timeouts.push(false);
-    recording.ends.push(false);
-    recording.kinds.push(RowKind::LastState);
+    recording.push_last_state();
     Ok(())
 }
 
@@ -118,7 +112,7 @@ fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, 
     let row = |row: usize| columns.iter().flat_map(move |column| column.row(row));
     let values = (0..rows).flat_map(row).copied().collect();
     let width = columns.iter().map(|column| column.width).sum();
-    Array::new(name, &[rows, width], values)
+    Array::new(name, vec![rows, width], values)
 }
 
 /// Order of concatenation: a Dict's arrays by name, a Tuple's by number (`_index_0`, …).

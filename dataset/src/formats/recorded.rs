@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use crate::error::{DatasetError, Problem};
+use crate::error::{DatasetError, Problem, RowProblem};
 use crate::formats::hdf5_file::Hdf5File;
 use crate::tables::environment::{self, EnvironmentSpec};
 
@@ -68,14 +68,13 @@ impl RecordedRows {
     fn of(file: &Hdf5File, environment: &'static EnvironmentSpec) -> Result<Self, Problem> {
         let (rows, _) = file.size("actions")?;
         let table = |array, width| finite(file, array, rows, width);
+        let stored = file.has("next_observations");
+        let stored = stored.then(|| table("next_observations", environment.observation_dim));
         Ok(Self {
             environment,
             observations: table("observations", environment.observation_dim)?,
             actions: table("actions", environment.action_dim)?,
-            next_observations: match file.has("next_observations") {
-                true => Some(table("next_observations", environment.observation_dim)?),
-                false => None,
-            },
+            next_observations: stored.transpose()?,
             rewards: table("rewards", 1)?,
             terminals: file.flags("terminals", rows)?,
             timeouts: file.flags("timeouts", rows)?,
@@ -135,9 +134,11 @@ impl RecordedRows {
 
 fn finite(file: &Hdf5File, array: &str, rows: usize, width: usize) -> Result<Vec<f64>, Problem> {
     let values: Vec<f64> = file.table(array, rows, width)?;
-    if let Some(i) = values.iter().position(|value| !value.is_finite()) {
-        let (row, value) = (i / width, values[i] as f32);
-        return Err(Problem::NotFinite { array: array.to_owned(), row, value, rows: 1 });
+    match values.iter().position(|value| !value.is_finite()) {
+        None => Ok(values),
+        Some(i) => {
+            let (array, problem) = (array.to_owned(), RowProblem::NotFinite(values[i] as f32));
+            Err(Problem::Rows { array, row: i / width, rows: 1, problem })
+        }
     }
-    Ok(values)
 }

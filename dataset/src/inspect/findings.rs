@@ -1,4 +1,4 @@
-use crate::error::such_rows;
+use crate::error::RowProblem;
 use crate::formats::Source;
 use crate::normalize::Normalize;
 use crate::recording::Recording;
@@ -31,9 +31,8 @@ pub(super) fn findings(
         findings.extend(leaps(recording));
     }
     findings.extend(of_ends);
-    let outside = checks::actions_outside(recording);
     findings.extend(
-        outside
+        checks::actions_outside(recording)
             .map(|problem| format!("{problem}; `learner train --normalize actions` trains on it")),
     );
     let rule = environment.map_or(RewardRule::AsIs, |environment| environment.reward);
@@ -52,12 +51,7 @@ fn leaps(recording: &Recording) -> Option<String> {
             from.iter().zip(to).take(2).map(|(from, to)| (to - from).powi(2)).sum::<f32>().sqrt();
         apart > LONGEST_STEP
     };
-    let mut leaps = recording.inside().filter(leap);
-    let (row, rows) = (leaps.next()?, 1 + leaps.count());
-    let (array, row) = recording.place("observations", row);
-    Some(format!(
-        "array `{array}`, row {row}: the next place is more than {LONGEST_STEP} m away, though the episode continues \
-         there{}; are the timeouts out of step with the resets?",
-        such_rows(rows)
-    ))
+    let leaps = recording.inside().filter(leap).map(|row| (row, RowProblem::Leap(LONGEST_STEP)));
+    let problem = checks::first(recording, "observations", leaps)?;
+    Some(format!("{problem}; are the timeouts out of step with the resets?"))
 }

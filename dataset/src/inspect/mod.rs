@@ -9,8 +9,7 @@ use serde::Serialize;
 use crate::checks;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
-use crate::recording::RowKind;
-use crate::statistics::Extent;
+use crate::statistics::Figures;
 use crate::tables::benchmarks;
 use crate::tables::environment::{self, EnvironmentSpec};
 use crate::tables::reward::RewardScaling;
@@ -105,18 +104,9 @@ pub struct Range {
 }
 
 impl Range {
-    fn of(values: impl Iterator<Item = f32>) -> Self {
-        let Extent { min, max, .. } =
-            Extent::of(values.map(f64::from).filter(|value| value.is_finite()));
-        Self { min, max }
-    }
-
-    fn of_columns(values: &[f32], width: usize, rows: impl Fn(usize) -> bool) -> Vec<Self> {
-        let column = |column: usize| {
-            let values = values.iter().skip(column).step_by(width).enumerate();
-            Self::of(values.filter(|(row, _)| rows(*row)).map(|(_, value)| *value))
-        };
-        (0..width).map(column).collect()
+    fn of_columns(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<Self> {
+        let columns = Figures::of_columns(values, width, counts).into_iter();
+        columns.map(|Figures { min, max, .. }| Self { min, max }).collect()
     }
 
     fn constant(ranges: &[Self]) -> Vec<usize> {
@@ -151,10 +141,10 @@ pub fn inspect(
     let lengths: Vec<f64> = episodes.iter().map(|episode| episode.length as f64).collect();
     let returns: Vec<f64> =
         episodes.iter().map(|episode| episode.sum).filter(|sum| sum.is_finite()).collect();
-    let (length, sum) = (Extent::of(lengths.iter().copied()), Extent::of(returns.iter().copied()));
+    let (length, sum) = (Figures::of(&lengths), Figures::of(&returns));
     let steps: f64 = lengths.iter().sum();
     let share = |flags: &[bool]| flags.iter().filter(|&&flag| flag).count() as f64 / steps;
-    let is_step = |row: usize| recording.kinds[row] != RowKind::LastState;
+    let is_step = |row: usize| recording.is_step(row);
     let action_ranges = Range::of_columns(&recording.actions, recording.action_dim, is_step);
     let observation_ranges =
         Range::of_columns(&recording.observations, recording.observation_dim, |_| true);

@@ -13,7 +13,7 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::formats::arrays::Arrays;
 use crate::normalize::{self, Normalize};
-use crate::recording::{Names, Recording};
+use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
 use crate::tables::maze::MazeTask;
 use crate::tables::reward::{RewardRule, RewardScaling};
@@ -78,15 +78,8 @@ pub struct ReadOptions {
 /// timeout, and at a discontinuity. Rows without a transition (D4RL's timeouts) belong to no
 /// episode, but provide the previous row's next action.
 pub struct Transitions {
-    observation_dim: usize,
-    action_dim: usize,
-    /// N × o, scaled; so are `next_observations`.
-    observations: Vec<f32>,
-    /// N × a, scaled and clipped.
-    actions: Vec<f32>,
-    rewards: Vec<f32>,
-    next_observations: Option<Vec<f32>>,
-    terminals: Vec<bool>,
+    /// Scaled; actions are also clipped.
+    recording: Recording,
     /// Rows that start a transition.
     rows: Vec<u32>,
     goes_on: Vec<bool>,
@@ -95,7 +88,6 @@ pub struct Transitions {
     statistics: Statistics,
     warnings: Vec<String>,
     scaling: Scaling,
-    names: Names,
 }
 
 /// Training and validation transitions.
@@ -151,13 +143,10 @@ impl Transitions {
         if let Some(problem) = problems.into_iter().chain(outside).next() {
             return Err(problem);
         }
-        let (recording, held_out, episodes) = match hold_out.is_none() {
-            true => (recording, None, Vec::new()),
-            false => {
-                let (training, held_out, episodes) = recording.hold_out(hold_out);
-                (training, (!episodes.is_empty()).then_some(held_out), episodes)
-            }
-        };
+        let (recording, held_out, episodes) = recording.hold_out(hold_out);
+        if recording.transitions().next().is_none() {
+            return Err(Problem::NoTransitions(recording.rows()));
+        }
         let rewards =
             reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
         let scaling = normalize.scaling(&recording, rewards);
@@ -165,11 +154,8 @@ impl Transitions {
             held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
         let warnings = warnings::warnings(&recording, normalize, reward);
         let training = Self { warnings, ..Self::new(recording, environment, rewards, scaling) };
-        Ok(Split {
-            training,
-            held_out: held_out.filter(|held_out| !held_out.rows.is_empty()),
-            episodes,
-        })
+        let held_out = held_out.filter(|held_out| !held_out.rows.is_empty());
+        Ok(Split { training, held_out, episodes })
     }
 
     fn new(
@@ -183,29 +169,15 @@ impl Transitions {
         let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
         let past_goal = recording.past_goal();
         normalize::apply(&scaling, &mut recording);
-        let Recording {
-            observation_dim, action_dim, observations, mut actions, mut rewards, ..
-        } = recording;
-        actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
-        rewards.iter_mut().for_each(|reward| {
-            *reward = of_rewards.apply(*reward) / scaling.rewards.unwrap_or(1.0)
-        });
-        Self {
-            observation_dim,
-            action_dim,
-            observations,
-            actions,
-            rewards,
-            next_observations: recording.next_observations,
-            terminals: recording.terminals,
-            rows,
-            goes_on,
-            past_goal,
-            statistics,
-            warnings: Vec::new(),
-            scaling,
-            names: recording.names,
+        recording.unused_next_observations = None;
+        for action in &mut recording.actions {
+            *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT);
         }
+        for reward in &mut recording.rewards {
+            *reward = of_rewards.apply(*reward) / scaling.rewards.unwrap_or(1.0);
+        }
+        let warnings = Vec::new();
+        Self { recording, rows, goes_on, past_goal, statistics, warnings, scaling }
     }
 
     /// Number of transitions, at least 1.
@@ -216,12 +188,12 @@ impl Transitions {
 
     /// Dimension of an observation.
     pub fn observation_dim(&self) -> usize {
-        self.observation_dim
+        self.recording.observation_dim
     }
 
     /// Dimension of an action.
     pub fn action_dim(&self) -> usize {
-        self.action_dim
+        self.recording.action_dim
     }
 
     /// Offsets and scales of the normalization; rewards are scaled after the reward rule.
@@ -231,19 +203,20 @@ impl Transitions {
 
     /// Names of the dimensions of observations and actions.
     pub fn names(&self) -> &Names {
-        &self.names
+        &self.recording.names
     }
 
     /// Map of each dimension to mean 0 and standard deviation 1, or scale 0 if it is constant.
     pub fn standard_units(&self) -> Scaling {
-        let counts = |row: usize| self.rows.binary_search(&(row as u32)).is_ok();
+        let Recording { observation_dim, action_dim, observations, actions, kinds, .. } =
+            &self.recording;
+        let is_transition = |row: usize| kinds[row] == RowKind::Transition;
+        let of = |values: &[f32], width: &usize| {
+            Some(normalize::standard_units(values, *width, is_transition))
+        };
         Scaling {
-            observations: Some(normalize::standard_units(
-                &self.observations,
-                self.observation_dim,
-                counts,
-            )),
-            actions: Some(normalize::standard_units(&self.actions, self.action_dim, counts)),
+            observations: of(observations, observation_dim),
+            actions: of(actions, action_dim),
             rewards: None,
         }
     }
@@ -269,8 +242,7 @@ impl Transitions {
     /// transition.
     pub fn next_action(&self, index: u32) -> Option<&[f32]> {
         let row = self.rows[index as usize] as usize;
-        let next = (row + 1) * self.action_dim..(row + 2) * self.action_dim;
-        self.goes_on[row].then(|| &self.actions[next])
+        self.goes_on[row].then(|| self.recording.action(row + 1))
     }
 
     /// Index range of each episode; together they cover all transitions.
@@ -303,22 +275,16 @@ impl Transitions {
 
     /// Copies the transitions at `indices` (below [`len`](Self::len)) into `batch`.
     pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
-        let (o, a) = (self.observation_dim, self.action_dim);
+        let recording = &self.recording;
         batch.clear();
         batch.size = indices.len();
-        batch.observations.reserve(batch.size * o);
-        batch.next_observations.reserve(batch.size * o);
         for &index in indices {
             let row = self.rows[index as usize] as usize;
-            batch.observations.extend_from_slice(&self.observations[row * o..(row + 1) * o]);
-            batch.actions.extend_from_slice(&self.actions[row * a..(row + 1) * a]);
-            batch.rewards.push(self.rewards[row]);
-            let next = match &self.next_observations {
-                Some(next_observations) => &next_observations[row * o..(row + 1) * o],
-                None => &self.observations[(row + 1) * o..(row + 2) * o],
-            };
-            batch.next_observations.extend_from_slice(next);
-            batch.masks.push(if self.terminals[row] { 0.0 } else { 1.0 });
+            batch.observations.extend_from_slice(recording.observation(row));
+            batch.actions.extend_from_slice(recording.action(row));
+            batch.rewards.push(recording.rewards[row]);
+            batch.next_observations.extend_from_slice(recording.next_observation(row));
+            batch.masks.push(if recording.terminals[row] { 0.0 } else { 1.0 });
         }
     }
 }

@@ -10,7 +10,7 @@ mod rewards;
 mod sizes;
 
 use crate::normalize::Normalize;
-use crate::recording::{Recording, RowKind};
+use crate::recording::Recording;
 use crate::tables::reward::RewardRule;
 
 /// Number of evenly spaced rows that are sampled.
@@ -76,10 +76,6 @@ fn percent(part: usize, whole: usize) -> String {
 }
 
 impl Recording {
-    fn is_step(&self, row: usize) -> bool {
-        self.kinds.get(row).is_some_and(|kind| *kind != RowKind::LastState)
-    }
-
     /// Rows with a following step, at most [`ENOUGH`].
     fn some_that_go_on(&self) -> Vec<usize> {
         let apart = self.rows().div_ceil(ENOUGH).max(1);

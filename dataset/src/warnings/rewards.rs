@@ -3,7 +3,7 @@
 use super::ends::MOST_AFTER_GOAL;
 use super::{percent, short};
 use crate::recording::Recording;
-use crate::statistics::Extent;
+use crate::statistics::Figures;
 use crate::tables::reward::RewardScaling;
 
 /// Relative difference that float32 critics lose: Q-values are some hundred times the rewards.
@@ -93,7 +93,8 @@ pub(super) fn size(recording: &Recording) -> Option<String> {
         }
         false => return None,
     };
-    let returns = Extent::of(recording.episodes().iter().map(|episode| episode.sum));
+    let sums = recording.episodes().into_iter().map(|episode| episode.sum);
+    let returns = Figures::of(&Vec::from_iter(sums));
     Some(format!(
         "array `rewards`: of size {} a step (root mean square; episodes return {} to {}), where methods are made for about 1: \
          {weights}; `learner train --normalize rewards` divides them by it",

@@ -7,8 +7,8 @@ use std::path::Path;
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::find;
 use quad_dataset::{
-    DatasetError, EnvironmentSpec, Problem, RecordedRows, Row, environments_of_its_sizes,
-    recorded_environment,
+    ArrayProblem, DatasetError, EnvironmentSpec, Problem, RecordedRows, Row,
+    environments_of_its_sizes, recorded_environment,
 };
 use quad_runtime::Hint;
 use rayon::prelude::*;
@@ -80,7 +80,7 @@ const ENVIRONMENT: &str = "name its environment with --env NAME";
 
 fn hint(error: &DatasetError) -> String {
     match error.problem {
-        Problem::Missing { .. } => OTHER_FILE.to_owned(),
+        Problem::Array(_, ArrayProblem::Missing) => OTHER_FILE.to_owned(),
         _ => error.hint(),
     }
 }
