@@ -1,6 +1,6 @@
 //! The trait of all policies.
 
-use crate::error::PolicyError;
+use crate::error::{PolicyError, Result};
 use crate::sampling::choice::Choice;
 use crate::sampling::episode::EpisodeState;
 use quad_nn::Precision;
@@ -28,7 +28,7 @@ pub trait Policy: Send + Sync {
     ///
     /// # Errors
     /// The policy draws no candidates, it lacks a value function, or a number is out of range.
-    fn with_choice(&self, _choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
+    fn with_choice(&self, _choice: Choice) -> Result<Box<dyn Policy>> {
         Err(PolicyError::NoCandidates)
     }
 
@@ -55,18 +55,14 @@ pub trait Policy: Send + Sync {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> Result<(), PolicyError>;
+    ) -> Result<()>;
 
     /// Draws the candidates of n ≥ 1 states and their values. From equal states, [`Self::act`] takes
     /// one of these candidates, or the mean of some.
     ///
     /// # Errors
     /// The policy has no critics, or an action or its value is NaN.
-    fn sample(
-        &self,
-        _observations: &[f32],
-        _states: &mut [EpisodeState],
-    ) -> Result<Samples, PolicyError> {
+    fn sample(&self, _observations: &[f32], _states: &mut [EpisodeState]) -> Result<Samples> {
         Err(PolicyError::NoCritics)
     }
 
@@ -75,7 +71,7 @@ pub trait Policy: Send + Sync {
     ///
     /// # Errors
     /// The policy has no critics, the lengths do not fit, or a value is NaN.
-    fn value(&self, _observations: &[f32], _actions: &[f32]) -> Result<Vec<f32>, PolicyError> {
+    fn value(&self, _observations: &[f32], _actions: &[f32]) -> Result<Vec<f32>> {
         Err(PolicyError::NoCritics)
     }
 }

@@ -155,12 +155,14 @@ fn summarize(spec: &'static EnvironmentSpec, errors: &[RowError]) -> Option<Repo
     sorted.sort_by(f64::total_cmp);
     let last = sorted.len().checked_sub(1)?;
     let at = |share: f64| sorted[(last as f64 * share).round() as usize];
+    let (median, p99, max) = (at(0.5), at(0.99), at(1.0));
+    let rewards = errors.iter().map(|row| row.reward);
     Some(Report {
         environment: &spec.name,
         transitions: errors.len(),
         compared: sorted.len(),
-        obs_error: ObservationError { median: at(0.5), p99: at(0.99), max: at(1.0) },
-        reward_error: RewardError { max: errors.iter().map(|row| row.reward).fold(0.0, f64::max) },
+        obs_error: ObservationError { median, p99, max },
+        reward_error: RewardError { max: rewards.fold(0.0, f64::max) },
         rewards_differ: errors.iter().filter(|row| row.reward_differs).count(),
         terminals_differ: errors.iter().filter(|row| row.terminal_differs).count(),
     })

@@ -1,16 +1,12 @@
 //! The Gaussian policy, which acts by its mean: tanh of a network of the state.
 
-use crate::error::{PolicyError, check_numbers, check_range};
+use crate::error::{Result, check_dims, check_numbers};
+use crate::kinds::actor_critic::ACTOR;
 use crate::policy::Policy;
 use crate::sampling::episode::EpisodeState;
-use candle_core::{Device, Result, Tensor};
-use quad_nn::{
-    Ensemble, EnsembleShape, MAX_DIM, MlpConfig, Precision, Tensors, Weighted, bytes, read,
-};
+use candle_core::{Device, Tensor};
+use quad_nn::{Ensemble, EnsembleShape, MlpConfig, Precision, Tensors, Weighted, bytes, read};
 use serde::{Deserialize, Serialize};
-
-/// Prefix of the tensors' names.
-const ACTOR: &str = "actor.";
 
 /// The shape of a Gaussian policy's network.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -38,22 +34,18 @@ pub struct GaussianPolicy {
 }
 
 /// The mean actions, `[n, a]` in (−1, 1), for `observations [n, o]`.
-pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> {
+pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> candle_core::Result<Tensor> {
     actor.state_outputs(observations)?.squeeze(0)?.tanh()
 }
 
 impl GaussianPolicy {
     /// The tensors of a policy's file.
-    pub fn tensors(actor: &Ensemble) -> Result<Tensors> {
+    pub fn tensors(actor: &Ensemble) -> candle_core::Result<Tensors> {
         actor.weights().tensors(ACTOR)
     }
 
-    pub(crate) fn load(
-        shape: GaussianShape,
-        tensors: &mut Tensors,
-    ) -> std::result::Result<Self, PolicyError> {
-        check_range("observation_dim", shape.observation_dim, MAX_DIM)?;
-        check_range("action_dim", shape.action_dim, MAX_DIM)?;
+    pub(crate) fn load(shape: GaussianShape, tensors: &mut Tensors) -> Result<Self> {
+        check_dims(shape.observation_dim, shape.action_dim)?;
         let actor = Ensemble::take(shape.actor(), tensors, ACTOR, Precision::F32)?;
         Ok(Self { shape, actor })
     }
@@ -73,9 +65,8 @@ impl Policy for GaussianPolicy {
     }
 
     fn memory(&self, states: usize) -> u64 {
-        let GaussianShape { observation_dim, action_dim, .. } = self.shape;
         let states = states as u128;
-        let numbers = states * (observation_dim + 2 * action_dim) as u128;
+        let numbers = states * (self.observation_dim() + 2 * self.action_dim()) as u128;
         bytes(self.shape.actor().floats(states, 1) + numbers)
     }
 
@@ -84,7 +75,7 @@ impl Policy for GaussianPolicy {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> std::result::Result<(), PolicyError> {
+    ) -> Result<()> {
         let shape = (states.len(), self.shape.observation_dim);
         let observations = Tensor::from_slice(observations, shape, &Device::Cpu)?;
         let means = gaussian_mean(&self.actor, &observations)?;

@@ -1,9 +1,9 @@
 //! Gradient steps and evaluations of a run.
 
-/// Gradient steps and evaluations of a run.
+/// The evaluated steps among all.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Schedule {
-    /// Gradient steps.
+    /// Gradient steps of the run.
     pub steps: u64,
     /// Gradient steps between two evaluations; 0 turns evaluations off.
     pub eval_interval: u64,
@@ -18,12 +18,15 @@ impl Schedule {
 
     /// Number of evaluated policies.
     pub fn evaluations(self) -> u64 {
-        if self.eval_interval == 0 { 0 } else { self.steps.div_ceil(self.eval_interval) }
+        match self.eval_interval {
+            0 => 0,
+            interval => self.steps.div_ceil(interval),
+        }
     }
 
     /// The evaluated steps, in ascending order.
     pub fn evaluated_steps(self) -> impl Iterator<Item = u64> {
-        let Self { steps, eval_interval } = self;
+        let (steps, eval_interval) = (self.steps, self.eval_interval);
         let count = steps.checked_div(eval_interval).unwrap_or(0);
         let regular = (1..=count).map(move |n| n * eval_interval);
         let last = eval_interval > 0 && !steps.is_multiple_of(eval_interval);
@@ -35,10 +38,14 @@ impl Schedule {
 mod tests {
     use super::*;
 
+    fn schedule(steps: u64, eval_interval: u64) -> Schedule {
+        Schedule { steps, eval_interval }
+    }
+
     #[test]
     fn evaluations_of_a_run_without_end_are_counted() {
-        assert_eq!(Schedule { steps: u64::MAX, eval_interval: 1 }.evaluations(), u64::MAX);
-        let long = Schedule { steps: 1_000_000_000_001, eval_interval: 1000 };
+        assert_eq!(schedule(u64::MAX, 1).evaluations(), u64::MAX);
+        let long = schedule(1_000_000_000_001, 1000);
         assert_eq!(long.evaluations(), 1_000_000_001);
     }
 
@@ -51,9 +58,10 @@ mod tests {
             (3, 1, &[1, 2, 3]),
             (10, 0, &[]),
         ] {
-            let schedule = Schedule { steps, eval_interval };
-            assert_eq!(Vec::from_iter(schedule.evaluated_steps()), expected, "{schedule:?}");
-            assert_eq!(schedule.evaluations(), expected.len() as u64, "{schedule:?}");
+            let schedule = schedule(steps, eval_interval);
+            let listed = Vec::from_iter(schedule.evaluated_steps());
+            assert_eq!(listed, expected, "{schedule:?}");
+            assert_eq!(schedule.evaluations(), listed.len() as u64);
             let evaluated = (0..=2 * steps).filter(|step| schedule.is_evaluated(*step));
             assert_eq!(Vec::from_iter(evaluated), expected, "{schedule:?}");
         }

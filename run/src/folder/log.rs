@@ -70,7 +70,10 @@ impl Log {
     }
 
     fn synchronize(&self) -> io::Result<()> {
-        if self.lock.is_some() { self.file.sync_data() } else { Ok(()) }
+        match &self.lock {
+            Some(_) => self.file.sync_data(),
+            None => Ok(()),
+        }
     }
 
     /// Cuts off the incomplete line of a failed write, which would spoil the next line.
