@@ -25,7 +25,7 @@ pub(crate) fn problems(
         let found = [("observations", o, spec.observation_dim), ("actions", a, spec.action_dim)];
         for (array, found, expected) in found.into_iter().filter(|(_, found, dim)| found != dim) {
             let environment = spec.name.clone();
-            problems.push(Problem::Width { array, found, expected, environment });
+            problems.push(Problem::Width(array, found, environment, expected));
         }
     }
     let next_observations = recording.next_observations.as_deref().unwrap_or_default();

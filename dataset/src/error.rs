@@ -34,7 +34,7 @@ pub enum Problem {
     Io(#[from] io::Error),
     #[error("neither an HDF5 file nor an npz archive")]
     UnknownFormat,
-    #[error("a folder without main_data.hdf5, so no Minari dataset that is stored as HDF5")]
+    #[error("a folder without Minari's main_data.hdf5")]
     UnknownFolder,
     #[error("{0}, which is none of the formats that are read")]
     Foreign(String, Load),
@@ -50,31 +50,27 @@ pub enum Problem {
     DamagedNpz(#[from] zip::result::ZipError),
     #[error("cannot be understood")]
     Metadata(#[from] serde_json::Error),
-    #[error(
-        "the attribute `layout` is {0:?}, but the only value with a meaning is \"transitions\""
-    )]
+    #[error("the attribute `layout` is {0:?}, but may only be \"transitions\"")]
     UnknownLayout(String),
-    #[error("the attribute `{name}` has {found} texts, but a row has {expected} numbers")]
-    Names { name: &'static str, found: usize, expected: usize },
+    #[error("the attribute `{0}` has {1} texts for {2} numbers")]
+    Names(&'static str, usize, usize),
     #[error("array `{0}` {1}")]
     Array(String, #[source] ArrayProblem),
     #[error("array `{array}`, row {row}: {problem}{}", such_rows(*.rows))]
     Rows { array: String, row: usize, rows: usize, problem: RowProblem },
-    #[error("{found} episodes, but metadata.json says {expected}")]
-    Episodes { found: usize, expected: usize },
+    #[error("{0} episodes, but metadata.json says {1}")]
+    Episodes(usize, usize),
     #[error("recorded in `{claimed}`, which is not `{expected}`")]
     OtherEnvironment { claimed: String, expected: String, is_simulated: bool },
     #[error("recorded in `OGBench`, which is not `{0}`")]
     OtherMaze(String),
-    #[error("`{array}` has {found} numbers a row, but `{environment}` has {expected}")]
-    Width { array: &'static str, found: usize, expected: usize, environment: String },
-    #[error("{0} rows without any terminal or timeout, as if they were one endless episode")]
+    #[error("`{0}` has {1} numbers a row, but `{2}` has {3}")]
+    Width(&'static str, usize, String, usize),
+    #[error("{0} rows without a terminal or timeout: one endless episode")]
     Endless(usize),
     #[error("{0} rows, of which none makes a transition")]
     NoTransitions(usize),
-    #[error(
-        "all trajectories have the same return, so the reward rule `locomotion` cannot scale them"
-    )]
+    #[error("`locomotion` cannot scale the rewards: all returns are the same")]
     SameReturns,
     #[error("cannot be written")]
     Write(#[source] hdf5::Error),
@@ -90,11 +86,9 @@ pub enum ArrayProblem {
     Group,
     #[error("holds {0}, but must hold {1}")]
     Type(String, &'static str),
-    #[error(
-        "holds whole numbers, as if actions were discrete; only continuous ones can be learned"
-    )]
+    #[error("holds whole numbers, but only continuous actions can be learned")]
     DiscreteActions,
-    #[error("has shape {0:?}, but must have one or two axes: rows, and the numbers in each")]
+    #[error("has shape {0:?}, but must have rows, or rows of numbers")]
     Axes(Vec<usize>),
     #[error("has shape {0:?}, but must have {1:?}")]
     Shape(Vec<usize>, [usize; 2]),
@@ -136,10 +130,16 @@ pub enum RowProblem {
     NotBoolean(f32),
     #[error("the action {0} is outside [-1, 1]")]
     ActionOutside(f32),
-    #[error("not the observation of the row that follows, though the episode continues there")]
+    #[error("not the observation of the next row, though the episode goes on")]
     Stray,
-    #[error("the next place is more than {0} m away, though the episode continues there")]
+    #[error("the next place is more than {0} m away, though the episode goes on")]
     Leap(f32),
+}
+
+impl RowProblem {
+    pub(crate) fn at(self, array: &str, row: usize) -> Problem {
+        Problem::Rows { array: array.to_owned(), row, rows: 1, problem: self }
+    }
 }
 
 /// Remedy for a foreign format.
@@ -183,7 +183,7 @@ impl Problem {
             Self::OtherMaze(_) => {
                 "choose one of its own tasks, such as antmaze-large-navigate-singletask-task1-v0, or another dataset"
             }
-            Self::Width { .. } => {
+            Self::Width(..) => {
                 "choose a dataset of that environment, or a task in the environment it was recorded in"
             }
             Self::Io(_) => "check the path and its permissions",
@@ -193,7 +193,10 @@ impl Problem {
             Self::UnknownFolder => {
                 "give the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0"
             }
-            Self::Truncated { .. } | Self::DamagedHdf5(_) | Self::DamagedNpz(_) => {
+            Self::Truncated { .. }
+            | Self::DamagedHdf5(_)
+            | Self::DamagedNpz(_)
+            | Self::Array(_, Unreadable(_)) => {
                 "the file was cut off or damaged on its way: fetch or copy it again; the program that writes one of your own must close it"
             }
             Self::Locked(_) => {
@@ -202,13 +205,12 @@ impl Problem {
             Self::NotClosed(_) => {
                 "let that program close it; if the program is gone, `h5clear --status FILE` (of HDF5's tools) frees what it wrote"
             }
-            Self::Metadata(_) => {
+            Self::Metadata(_) | Self::Episodes(..) => {
                 "fetch the Minari dataset again; metadata.json is what Minari writes beside the data"
             }
-            Self::UnknownLayout(_) | Self::Names { .. } => {
+            Self::UnknownLayout(_) | Self::Names(..) => {
                 "see docs/data.md for what the attribute means"
             }
-            Self::Episodes { .. } => "the dataset is incomplete: fetch it again",
             Self::Endless(_) => {
                 "set `timeouts` to 1 at the last row of each episode that did not terminate"
             }
@@ -222,21 +224,19 @@ impl Problem {
             Self::Array(array, Missing) if array == "rewards" => {
                 "learning needs a reward for each step; a task such as antmaze-large-navigate-singletask-task1-v0 has those of OGBench's mazes, and with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds others"
             }
-            Self::Array(_, Missing) => "docs/data.md says which arrays each kind of file must have",
             Self::Array(_, Group) => {
                 "an observation may be an array or a Dict of arrays, but not a Dict of Dicts: with quad_rl installed, `quad-convert FOLDER --out my-robot.hdf5` makes one row of it"
             }
             Self::Array(_, DiscreteActions) => {
                 "store continuous actions as float32; where they leave [-1, 1], `learner train --normalize actions` scales them"
             }
-            Self::Array(_, Type(..) | Axes(_) | Shape(..)) => {
-                "docs/data.md says which shape and type each array must have; all arrays need the same number of rows"
+            Self::Array(_, Missing | Type(..) | Axes(_) | Shape(..)) => {
+                "docs/data.md says which arrays a file must have, and of which shape and type; all need the same number of rows"
             }
             Self::Array(_, Oversized(..)) => {
                 "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
             }
             Self::Array(_, Filter(_) | Elsewhere) => REWRITE,
-            Self::Array(_, Unreadable(_)) => "the file is damaged: fetch or copy it again",
             Self::Rows { problem: NotFinite(_), .. } => {
                 "leave out or repair these rows: a single one would spoil every weight"
             }

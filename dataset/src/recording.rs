@@ -80,12 +80,12 @@ impl Recording {
 
     /// True if an action is taken in a row; false in an episode's final state, and after the end.
     pub(crate) fn is_step(&self, row: usize) -> bool {
-        self.kinds.get(row).is_some_and(|kind| *kind != RowKind::LastState)
+        row < self.rows() && self.kinds[row] != RowKind::LastState
     }
 
-    pub(crate) fn transitions(&self) -> impl Iterator<Item = u32> {
-        let kinds = self.kinds.iter().zip(0..);
-        kinds.filter(|(kind, _)| **kind == RowKind::Transition).map(|(_, row)| row)
+    /// Rows that start a transition.
+    pub(crate) fn transitions(&self) -> impl Iterator<Item = usize> {
+        (0..self.rows()).filter(|&row| self.kinds[row] == RowKind::Transition)
     }
 
     /// True where the episode has reached its goal in an earlier row.
@@ -116,7 +116,7 @@ impl Recording {
     /// Returns of trajectories as the locomotion rule defines them: runs of transitions up to a
     /// terminal, the end of an episode, or a discontinuity.
     pub(crate) fn trajectory_returns(&self) -> Vec<f64> {
-        let mut rows = self.transitions().map(|row| row as usize).peekable();
+        let mut rows = self.transitions().peekable();
         let (mut returns, mut open) = (Vec::new(), 0.0);
         while let Some(row) = rows.next() {
             open += f64::from(self.rewards[row]);
@@ -142,15 +142,17 @@ impl Recording {
 
     /// True if `following`, the next transition after `row`, starts in its next state.
     fn continues(&self, row: usize, following: usize) -> bool {
-        following == row + 1
-            || !differ(self.observation(following), self.observation(row + 1), Rounding::default())
+        let (start, next) = (self.observation(following), self.observation(row + 1));
+        following == row + 1 || !differ(start, next, Rounding::default())
     }
 
     /// True if a row's stored next observation differs from the following row's observation.
     pub(crate) fn jumps(&self, row: usize) -> bool {
-        let stored = self.next_observations.as_ref().or(self.unused_next_observations.as_ref());
+        let unused = self.unused_next_observations.as_ref();
+        let stored = self.next_observations.as_ref().or(unused);
         stored.filter(|_| row + 1 < self.rows()).is_some_and(|stored| {
-            differ(self.row_of(stored, row), self.observation(row + 1), self.rounding)
+            let (next, following) = (self.row_of(stored, row), self.observation(row + 1));
+            differ(next, following, self.rounding)
         })
     }
 
@@ -174,8 +176,9 @@ impl Recording {
 }
 
 fn differ(a: &[f32], b: &[f32], rounding: Rounding) -> bool {
-    let apart = a.iter().zip(b).filter(|(a, b)| !rounding.explains(**a, **b));
-    apart.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt() > SAME_OBSERVATION
+    let pairs = a.iter().zip(b).filter(|(a, b)| !rounding.explains(**a, **b));
+    let square: f64 = pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum();
+    square.sqrt() > SAME_OBSERVATION
 }
 
 #[cfg(test)]
@@ -202,8 +205,9 @@ pub(crate) mod tests {
     #[test]
     fn rows_are_found_again_in_their_part() {
         let mut recording = recording(&[RowKind::Transition; 6]);
-        assert_eq!(recording.place("rewards", 4), ("rewards".to_owned(), 4));
+        let found = |recording: &Recording| recording.place("rewards", 4);
+        assert_eq!(found(&recording), ("rewards".to_owned(), 4));
         recording.parts = vec![(0, "episode_0".to_owned()), (3, "episode_1".to_owned())];
-        assert_eq!(recording.place("rewards", 4), ("episode_1/rewards".to_owned(), 1));
+        assert_eq!(found(&recording), ("episode_1/rewards".to_owned(), 1));
     }
 }

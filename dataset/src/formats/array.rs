@@ -50,10 +50,7 @@ impl Array<f32> {
         let values = self.sized(rows, 1)?;
         match values.iter().position(|&value| value != 0.0 && value != 1.0) {
             None => Ok(values.into_iter().map(|value| value == 1.0).collect()),
-            Some(row) => {
-                let problem = RowProblem::NotBoolean(values[row]);
-                Err(Problem::Rows { array, row, rows: 1, problem })
-            }
+            Some(row) => Err(RowProblem::NotBoolean(values[row]).at(&array, row)),
         }
     }
 }

@@ -1,14 +1,13 @@
 //! Transitions in memory, and the custom layout: HDF5 with one row per transition.
 
 use std::path::Path;
-use std::str::FromStr;
 
 use hdf5::types::VarLenUnicode;
 
 use crate::checks;
 use crate::error::{ArrayProblem, DatasetError, Problem};
 use crate::formats::hdf5_file::Hdf5File;
-use crate::formats::new_file::{Column, NewFile};
+use crate::formats::new_file::{Column, NewFile, text};
 use crate::recording::{Names, Recording, RowKind};
 use crate::rounding::Rounding;
 
@@ -111,7 +110,8 @@ pub(super) fn read_own(file: &Hdf5File) -> Result<Recording, Problem> {
 pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result<(), DatasetError> {
     let path = path.as_ref();
     let error = |problem| DatasetError::new(path, problem);
-    let recording = Recording { names, ..arrays.into_recording().map_err(error)? };
+    let mut recording = arrays.into_recording().map_err(error)?;
+    recording.names = names;
     if let Some(problem) = checks::problems(&recording, None).into_iter().next() {
         return Err(error(problem));
     }
@@ -121,15 +121,11 @@ pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result
 }
 
 fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
-    let layout = VarLenUnicode::from_str(LAYOUT).map_err(|error| error.to_string())?;
-    file.hdf5.new_attr::<VarLenUnicode>().create("layout")?.write_scalar(&layout)?;
-    for (name, texts) in [
-        (OBSERVATION_NAMES, &recording.names.observations),
-        (ACTION_NAMES, &recording.names.actions),
-    ] {
-        let texts =
-            texts.iter().map(|text| VarLenUnicode::from_str(text)).collect::<Result<Vec<_>, _>>();
-        let texts = texts.map_err(|error| error.to_string())?;
+    let layout = file.hdf5.new_attr::<VarLenUnicode>().create("layout")?;
+    layout.write_scalar(&text(LAYOUT)?)?;
+    let Names { observations, actions } = &recording.names;
+    for (name, texts) in [(OBSERVATION_NAMES, observations), (ACTION_NAMES, actions)] {
+        let texts = texts.iter().map(|name| text(name)).collect::<Result<Vec<_>, _>>()?;
         if !texts.is_empty() {
             file.hdf5.new_attr_builder().with_data(&texts).create(name)?;
         }
@@ -144,8 +140,6 @@ fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
     ] {
         Column::create::<f32>(file, name, width)?.append(values)?;
     }
-    for (name, flags) in [("terminals", &recording.terminals), ("timeouts", &recording.timeouts)] {
-        Column::create::<bool>(file, name, None)?.append(flags)?;
-    }
-    Ok(())
+    Column::create::<bool>(file, "terminals", None)?.append(&recording.terminals)?;
+    Column::create::<bool>(file, "timeouts", None)?.append(&recording.timeouts)
 }

@@ -28,7 +28,8 @@ const FLAGS: &str = "booleans (h5py's enum, or numbers that are 0 or 1)";
 /// Version of the linked HDF5 library, and true if it reads compressed arrays such as D4RL's.
 pub fn hdf5_library() -> (String, bool) {
     let (major, minor, release) = hdf5::library_version();
-    (format!("{major}.{minor}.{release}"), hdf5::filters::deflate_available())
+    let version = format!("{major}.{minor}.{release}");
+    (version, hdf5::filters::deflate_available())
 }
 
 pub(crate) struct Hdf5File {
@@ -50,7 +51,8 @@ impl Hdf5File {
         }
         let refused = |source| refusal(&plain, &start, bytes, source);
         let file = hdf5::File::open(path).map_err(refused)?;
-        Ok(Self { path: path.into(), file, bytes })
+        let path = path.to_owned();
+        Ok(Self { path, file, bytes })
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -87,8 +89,10 @@ impl Hdf5File {
     ) -> Result<Vec<String>, Problem> {
         let Ok(holder) = self.file.attr(name) else { return Ok(Vec::new()) };
         let texts = texts_in(&holder).unwrap_or_default();
-        let found = texts.len();
-        if found == expected { Ok(texts) } else { Err(Problem::Names { name, found, expected }) }
+        match texts.len() == expected {
+            true => Ok(texts),
+            false => Err(Problem::Names(name, texts.len(), expected)),
+        }
     }
 
     /// Rows and width of an array.
@@ -140,7 +144,8 @@ impl Hdf5File {
         let read = || {
             let dataset = self.dataset(array)?;
             let descriptor = descriptor(&dataset, expected)?;
-            check_size(&dataset.shape(), self.bytes.saturating_mul(MAX_COMPRESSION), self.bytes)?;
+            let most = self.bytes.saturating_mul(MAX_COMPRESSION);
+            check_size(&dataset.shape(), most, self.bytes)?;
             Ok((dataset.shape(), values(&dataset, descriptor)?))
         };
         let (shape, values) = read().map_err(|problem: ArrayProblem| problem.of(array))?;
@@ -151,17 +156,19 @@ impl Hdf5File {
         if !self.has(array) {
             return Err(ArrayProblem::Missing);
         }
-        let dataset = self.file.dataset(array).map_err(|source| match self.file.group(array) {
+        let problem = |source: hdf5::Error| match self.file.group(array) {
             Ok(_) => ArrayProblem::Group,
             Err(_) if self.is_link(array) => ArrayProblem::Elsewhere,
             Err(_) => source.into(),
-        })?;
+        };
+        let dataset = self.file.dataset(array).map_err(problem)?;
         let creation = dataset.dcpl()?;
         let elsewhere = dataset.filename() != self.file.filename();
         if elsewhere || creation.layout() == Layout::Virtual || !creation.external().is_empty() {
             return Err(ArrayProblem::Elsewhere);
         }
-        match creation.filters().iter().find(|filter| !filter.is_available()) {
+        let filters = creation.filters();
+        match filters.iter().find(|filter| !filter.is_available()) {
             Some(filter) => Err(ArrayProblem::Filter(filter_name(filter.id()))),
             None => Ok(dataset),
         }
@@ -172,7 +179,8 @@ impl Hdf5File {
         let (group, name) = array.rsplit_once('/').unwrap_or(("/", array));
         let links = |group: hdf5::Group| group.links(IndexType::Name, IterationOrder::Native);
         let links = self.file.group(group).and_then(links).unwrap_or_default();
-        links.iter().any(|(link, info)| link == name && info.link_type != LinkType::Hard)
+        let mut links = links.iter().filter(|(link, _)| link == name);
+        links.any(|(_, info)| info.link_type != LinkType::Hard)
     }
 }
 
@@ -187,7 +195,8 @@ fn descriptor(
         return Err(wrong(format!("elements of {} bytes", datatype.size())));
     }
     use TypeDescriptor::{Boolean, Enum, Float, Integer, Unsigned};
-    match datatype.to_descriptor().map_err(|error| wrong(error.to_string()))? {
+    let descriptor = datatype.to_descriptor();
+    match descriptor.map_err(|error| wrong(error.to_string()))? {
         number @ (Float(_) | Integer(_) | Unsigned(_)) => Ok(number),
         flag @ (Boolean | Enum(_)) if expected == FLAGS => Ok(flag),
         other => Err(wrong(other.to_string())),
@@ -230,7 +239,8 @@ fn text_in(holder: &Container) -> Option<String> {
 /// Texts in an attribute or an array, of variable or fixed length, ASCII or UTF-8.
 fn texts_in(holder: &Container) -> Option<Vec<String>> {
     fn as_type<T: H5Type + Display>(holder: &Container) -> Option<Vec<String>> {
-        Some(holder.read_raw::<T>().ok()?.iter().map(T::to_string).collect())
+        let texts = holder.read_raw::<T>().ok()?;
+        Some(texts.iter().map(T::to_string).collect())
     }
     as_type::<VarLenUnicode>(holder)
         .or_else(|| as_type::<VarLenAscii>(holder))

@@ -68,7 +68,7 @@ pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Pr
     let mut recording = Recording { terminal_array: "terminations", ..Recording::default() };
     let episodes = episodes(file);
     if let Some(expected) = metadata.total_episodes.filter(|&expected| expected != episodes) {
-        return Err(Problem::Episodes { found: episodes, expected });
+        return Err(Problem::Episodes(episodes, expected));
     }
     for episode in 0..episodes {
         append(file, &format!("{EPISODE}{episode}"), &mut recording)?;

@@ -22,10 +22,11 @@ impl NpzFile {
         let file = File::open(path).map_err(|source| error(source.into()))?;
         let archive =
             ZipArchive::new(BufReader::new(file)).map_err(|source| error(source.into()))?;
+        let path = path.to_owned();
         let files = Vec::from_iter(archive.file_names().filter_map(Result::ok));
         match foreign::of_archive(&files) {
             Some(problem) => Err(error(problem)),
-            None => Ok(Self { path: path.into(), archive }),
+            None => Ok(Self { path, archive }),
         }
     }
 

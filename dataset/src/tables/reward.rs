@@ -46,7 +46,7 @@ impl Default for RewardScaling {
 impl RewardScaling {
     /// Root mean square of the training rewards; NaN without rewards.
     pub(crate) fn size(self, recording: &Recording) -> f64 {
-        let rewards = recording.transitions().map(|row| recording.rewards[row as usize]);
+        let rewards = recording.transitions().map(|row| recording.rewards[row]);
         let rewards = rewards.map(|reward| f64::from(self.apply(reward)));
         Figures::of(&Vec::from_iter(rewards.filter(|reward| reward.is_finite()))).size
     }

@@ -148,7 +148,7 @@ mod tests {
             for (part, rows) in [(&held_out, own), (&training, others)] {
                 let rewards = Vec::from_iter(rows.into_iter().map(|row| row as f32));
                 assert_eq!(part.rewards[..rewards.len()], rewards);
-                let is_last = |row: u32| row as usize + 1 == part.rows();
+                let is_last = |row: usize| row + 1 == part.rows();
                 assert!(!part.transitions().any(is_last), "no next state");
             }
             assert_eq!(held_out.parts, [(0, format!("{}", rows.start))]);

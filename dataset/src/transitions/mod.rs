@@ -41,20 +41,6 @@ pub struct Batch {
     pub size: usize,
 }
 
-impl Batch {
-    fn clear(&mut self) {
-        for array in [
-            &mut self.observations,
-            &mut self.actions,
-            &mut self.rewards,
-            &mut self.next_observations,
-            &mut self.masks,
-        ] {
-            array.clear();
-        }
-    }
-}
-
 /// Options of [`Transitions::read`].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ReadOptions {
@@ -114,13 +100,13 @@ impl Transitions {
         options: &ReadOptions,
         hold_out: HoldOut<'_>,
     ) -> Result<Split, DatasetError> {
-        let (path, ReadOptions { environment, task, .. }) = (path.as_ref(), *options);
+        let path = path.as_ref();
         let error = |problem| DatasetError::new(path, problem);
         let mut source = Source::open(path)?;
-        if let Some(environment) = environment {
+        if let Some(environment) = options.environment {
             source.check_environment(environment).map_err(error)?;
         }
-        let recording = source.read(environment, task)?;
+        let recording = source.read(options.environment, options.task)?;
         Self::split(recording, options, hold_out).map_err(error)
     }
 
@@ -128,8 +114,8 @@ impl Transitions {
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
-        let options = ReadOptions::default();
-        Ok(Self::split(recording, &options, HoldOut::NONE).map_err(error)?.training)
+        let split = Self::split(recording, &ReadOptions::default(), HoldOut::NONE);
+        Ok(split.map_err(error)?.training)
     }
 
     fn split(
@@ -137,24 +123,24 @@ impl Transitions {
         options: &ReadOptions,
         hold_out: HoldOut<'_>,
     ) -> Result<Split, Problem> {
-        let ReadOptions { environment, reward, normalize, .. } = *options;
-        let problems = checks::problems(&recording, environment);
-        let outside = if normalize.actions { None } else { checks::actions_outside(&recording) };
-        if let Some(problem) = problems.into_iter().chain(outside).next() {
+        let environment = options.environment;
+        let outside = checks::actions_outside(&recording).filter(|_| !options.normalize.actions);
+        let problems = checks::problems(&recording, environment).into_iter().chain(outside);
+        if let Some(problem) = problems.into_iter().next() {
             return Err(problem);
         }
         let (recording, held_out, episodes) = recording.hold_out(hold_out);
         if recording.transitions().next().is_none() {
             return Err(Problem::NoTransitions(recording.rows()));
         }
-        let rewards =
-            reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
-        let scaling = normalize.scaling(&recording, rewards);
-        let held_out =
-            held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
-        let warnings = warnings::warnings(&recording, normalize, reward);
-        let training = Self { warnings, ..Self::new(recording, environment, rewards, scaling) };
-        let held_out = held_out.filter(|held_out| !held_out.rows.is_empty());
+        let returns = recording.trajectory_returns();
+        let rewards = options.reward.scaling(&returns).ok_or(Problem::SameReturns)?;
+        let scaling = options.normalize.scaling(&recording, rewards);
+        let new = |recording| Self::new(recording, environment, rewards, scaling.clone());
+        let held_out = held_out.map(new).filter(|held_out| !held_out.rows.is_empty());
+        let warnings = warnings::warnings(&recording, options.normalize, options.reward);
+        let mut training = new(recording);
+        training.warnings = warnings;
         Ok(Split { training, held_out, episodes })
     }
 
@@ -164,9 +150,9 @@ impl Transitions {
         of_rewards: RewardScaling,
         scaling: Scaling,
     ) -> Self {
-        let rows: Vec<u32> = recording.transitions().collect();
+        let rows = Vec::from_iter(recording.transitions().map(|row| row as u32));
         let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
-        let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
+        let goes_on = Vec::from_iter((0..recording.rows()).map(|row| recording.goes_on(row)));
         let past_goal = recording.past_goal();
         normalize::apply(&scaling, &mut recording);
         recording.unused_next_observations = None;
@@ -208,15 +194,12 @@ impl Transitions {
 
     /// Map of each dimension to mean 0 and standard deviation 1, or scale 0 if it is constant.
     pub fn standard_units(&self) -> Scaling {
-        let Recording { observation_dim, action_dim, observations, actions, kinds, .. } =
-            &self.recording;
-        let is_transition = |row: usize| kinds[row] == RowKind::Transition;
-        let of = |values: &[f32], width: &usize| {
-            Some(normalize::standard_units(values, *width, is_transition))
-        };
+        let all = &self.recording;
+        let is_transition = |row: usize| all.kinds[row] == RowKind::Transition;
+        let of = |values, width| Some(normalize::standard_units(values, width, is_transition));
         Scaling {
-            observations: of(observations, observation_dim),
-            actions: of(actions, action_dim),
+            observations: of(&all.observations, all.observation_dim),
+            actions: of(&all.actions, all.action_dim),
             rewards: None,
         }
     }
@@ -260,9 +243,10 @@ impl Transitions {
 
     /// [`Self::episodes`] that start a recorded episode; the recording may continue after a goal.
     pub fn recorded_episodes(&self) -> Vec<Range<u32>> {
-        let is_past =
-            |episode: &Range<u32>| self.past_goal[self.rows[episode.start as usize] as usize];
-        self.episodes().into_iter().filter(|episode| !is_past(episode)).collect()
+        let mut episodes = self.episodes();
+        let row = |episode: &Range<u32>| self.rows[episode.start as usize] as usize;
+        episodes.retain(|episode| !self.past_goal[row(episode)]);
+        episodes
     }
 
     /// First index of each run of `length ≥ 1` consecutive transitions within an episode.
@@ -275,16 +259,21 @@ impl Transitions {
 
     /// Copies the transitions at `indices` (below [`len`](Self::len)) into `batch`.
     pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
-        let recording = &self.recording;
-        batch.clear();
+        let all = &self.recording;
+        batch.observations.clear();
+        batch.actions.clear();
+        batch.rewards.clear();
+        batch.next_observations.clear();
+        batch.masks.clear();
         batch.size = indices.len();
         for &index in indices {
             let row = self.rows[index as usize] as usize;
-            batch.observations.extend_from_slice(recording.observation(row));
-            batch.actions.extend_from_slice(recording.action(row));
-            batch.rewards.push(recording.rewards[row]);
-            batch.next_observations.extend_from_slice(recording.next_observation(row));
-            batch.masks.push(if recording.terminals[row] { 0.0 } else { 1.0 });
+            let (state, next) = (all.observation(row), all.next_observation(row));
+            batch.observations.extend_from_slice(state);
+            batch.actions.extend_from_slice(all.action(row));
+            batch.rewards.push(all.rewards[row]);
+            batch.next_observations.extend_from_slice(next);
+            batch.masks.push(f32::from(u8::from(!all.terminals[row])));
         }
     }
 }

@@ -133,7 +133,7 @@ fn an_array_that_is_not_what_it_must_be() {
         ("but must hold booleans (h5py's enum, or numbers that are 0 or 1)", &|path| {
             replace(path, "terminals", &[ROWS], &[text; ROWS]);
         }),
-        ("must have one or two axes: rows, and the numbers in each", &|path| {
+        ("must have rows, or rows of numbers", &|path| {
             replace(path, "observations", &[ROWS, 1, 11], &half[..ROWS * 11]);
         }),
         ("array `timeouts`, row 3: 2 is neither 0 nor 1", &|path| {
@@ -177,9 +177,8 @@ fn actions_that_rounding_puts_outside_the_unit_box() {
 fn an_endless_episode() {
     let (_folder, path) = scratch("long.hdf5");
     write(&path, &steps(50, 11, 3));
-    let message = |rows: usize| {
-        format!("{rows} rows without any terminal or timeout, as if they were one endless episode")
-    };
+    let message =
+        |rows: usize| format!("{rows} rows without a terminal or timeout: one endless episode");
     assert_refused(&path, None, &message(50), "timeouts");
     write(&path, &steps(1000, 11, 3));
     assert!(try_read(&path, Some(hopper())).is_ok(), "as many steps as Hopper allows");

@@ -1,14 +1,14 @@
 use std::path::Path;
 
-use quad_dataset::{EnvironmentSpec, RewardRule, environment, recorded_environment};
+use quad_dataset::{RewardRule, environment, recorded_environment};
 
 use crate::{
-    all, assert_refused, compare, hopper, peers, put, read, scratch, shared, steps, try_read,
-    write, written,
+    Environment, all, assert_refused, compare, hopper, peers, put, read, scratch, shared, steps,
+    try_read, write, written,
 };
 
 /// Compares a file with the output of `peers.py reference`.
-fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>) {
+fn compare_with_rules(path: &Path, environment: Environment) {
     let (_folder, out) = scratch("reference.hdf5");
     let limit = environment.map_or(0, |spec| spec.max_episode_steps).to_string();
     let is_maze = environment.is_some_and(|spec| spec.maze.is_some());
@@ -34,8 +34,8 @@ fn every_version_follows_the_rules() {
 fn rows_that_do_not_follow_one_another_are_refused() {
     let Some((_folder, path)) = written("generate", "shuffled", "d4rl.hdf5") else { return };
     // The last row and two ends of episodes are not compared.
-    let message = "array `next_observations`, row 0: not the observation of the row that follows, though the episode \
-                   continues there (597 such rows)";
+    let message = "array `next_observations`, row 0: not the observation of the next row, though the episode goes on \
+                   (597 such rows)";
     assert_refused(
         &path,
         Some(hopper()),

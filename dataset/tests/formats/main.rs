@@ -24,6 +24,8 @@ mod own;
 mod round_trip;
 mod warnings;
 
+type Environment = Option<&'static EnvironmentSpec>;
+
 fn hopper() -> &'static EnvironmentSpec {
     environment::find("hopper").unwrap()
 }
@@ -45,32 +47,20 @@ fn scratch(name: &str) -> (TempDir, PathBuf) {
     (folder, path)
 }
 
-fn options(environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> ReadOptions {
+fn options(environment: Environment, reward: RewardRule) -> ReadOptions {
     let task = environment.and_then(|environment| relabeling(&environment.name));
     ReadOptions { environment, task, reward, normalize: Normalize::default() }
 }
 
-fn read(
-    path: &Path,
-    environment: Option<&'static EnvironmentSpec>,
-    reward: RewardRule,
-) -> Transitions {
+fn read(path: &Path, environment: Environment, reward: RewardRule) -> Transitions {
     Transitions::read(path, &options(environment, reward)).unwrap()
 }
 
-fn try_read(
-    path: &Path,
-    environment: Option<&'static EnvironmentSpec>,
-) -> Result<Transitions, DatasetError> {
+fn try_read(path: &Path, environment: Environment) -> Result<Transitions, DatasetError> {
     Transitions::read(path, &options(environment, RewardRule::AsIs))
 }
 
-fn assert_refused(
-    path: &Path,
-    environment: Option<&'static EnvironmentSpec>,
-    message: &str,
-    hint: &str,
-) {
+fn assert_refused(path: &Path, environment: Environment, message: &str, hint: &str) {
     let error = try_read(path, environment).err().expect(message);
     assert_error(&error, message, hint);
 }
@@ -119,7 +109,7 @@ fn all(transitions: &Transitions) -> Batch {
     batch
 }
 
-fn compare(path: &Path, environment: Option<&'static EnvironmentSpec>, reference: &Path) {
+fn compare(path: &Path, environment: Environment, reference: &Path) {
     let reference = hdf5::File::open(reference).unwrap();
     let array = |name: &str| reference.dataset(name).unwrap().read_raw::<f32>().unwrap();
 

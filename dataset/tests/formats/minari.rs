@@ -1,10 +1,12 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use quad_dataset::{EnvironmentSpec, environment, recorded_environment};
+use quad_dataset::{environment, recorded_environment};
 use tempfile::{TempDir, tempdir};
 
-use crate::{all, assert_refused, compare, hopper, peers_in, put, scratch, shared, try_read};
+use crate::{
+    Environment, all, assert_refused, compare, hopper, peers_in, put, scratch, shared, try_read,
+};
 
 const ID: &str = "made/up-v0";
 
@@ -14,12 +16,7 @@ fn root(kind: &str) -> Option<(TempDir, PathBuf)> {
     peers_in(root.path(), &["write-minari", kind, ID]).then_some((root, dataset))
 }
 
-fn compare_with_minari(
-    root: &Path,
-    id: &str,
-    kind: &str,
-    environment: Option<&'static EnvironmentSpec>,
-) {
+fn compare_with_minari(root: &Path, id: &str, kind: &str, environment: Environment) {
     let (_folder, out) = scratch("reference.hdf5");
     if peers_in(root, &["minari-reference", kind, id, out.to_str().unwrap()]) {
         for path in ["", "data", "data/main_data.hdf5"] {
@@ -46,7 +43,7 @@ fn arrays_and_a_dict_in_alphabetical_order_and_a_tuple_in_its_own() {
 #[test]
 fn datasets_that_are_refused() {
     let group = "`episode_0/observations/achieved_goal` is a group of arrays, but must be an array";
-    let discrete = "only continuous ones can be learned";
+    let discrete = "only continuous actions can be learned";
     let maze = "recorded in `AntMaze_UMaze-v4`, which is not `antmaze-umaze`";
     let walker = "recorded in `Walker2d-v5`, which is not `walker2d`";
     // Another simulation is learned from, but not scored in ours.

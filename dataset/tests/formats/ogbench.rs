@@ -51,7 +51,8 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
 
 #[test]
 fn files_that_are_refused() {
-    let discrete = "array `actions` holds whole numbers, as if actions were discrete; only continuous ones can be learned";
+    let discrete =
+        "array `actions` holds whole numbers, but only continuous actions can be learned";
     let maze = "recorded in `OGBench`, which is not `antmaze-medium`";
     let task = "antmaze-large-navigate-singletask-task1-v0";
     for (variant, name, message, hint) in [

@@ -61,10 +61,11 @@ fn the_layout_is_read_however_the_text_is_stored() {
 
 #[test]
 fn layouts_and_actions_that_are_refused() {
-    let layout = "but the only value with a meaning is \"transitions\"";
+    let layout = "but may only be \"transitions\"";
     let unknown = format!("the attribute `layout` is \"transition\", {layout}");
     let number = format!("the attribute `layout` is \"\", {layout}");
-    let discrete = "array `actions` holds whole numbers, as if actions were discrete; only continuous ones can be learned";
+    let discrete =
+        "array `actions` holds whole numbers, but only continuous actions can be learned";
     for (arguments, message, hint) in [
         (&["unknown"][..], &*unknown, "docs/data.md"),
         (&["number"], &number, "docs/data.md"),
@@ -120,7 +121,7 @@ fn arrays_are_written_and_read_again() {
     assert_eq!((from_file.names(), from_arrays.names()), (&names, &Names::default()));
     let few = Names { actions: Vec::new(), observations: names.observations[1..].to_vec() };
     write_own(&path, small, few).unwrap();
-    let message = "the attribute `observation_names` has 2 texts, but a row has 3 numbers";
+    let message = "the attribute `observation_names` has 2 texts for 3 numbers";
     assert_refused(&path, None, message, "docs/data.md");
 }
 
@@ -135,13 +136,13 @@ fn arrays_that_would_be_refused_are_not_written() {
         ("array `actions` has shape [11], but must have [6, 2]", |arrays| {
             arrays.actions.truncate(11)
         }),
-        ("as if they were one endless episode", |arrays| {
+        ("6 rows without a terminal or timeout: one endless episode", |arrays| {
             (arrays.terminals[2], arrays.timeouts[5]) = (false, false)
         }),
         ("0 rows, of which none makes a transition", |arrays| {
             *arrays = Arrays { observation_dim: 3, action_dim: 2, ..Arrays::default() }
         }),
-        ("one or two axes: rows, and the numbers in each", |arrays| {
+        ("must have rows, or rows of numbers", |arrays| {
             (arrays.action_dim, arrays.actions) = (0, Vec::new())
         }),
     ];

@@ -64,6 +64,7 @@ fn recordings_and_files_of_others() {
         ("data/hopper_medium_replay.hdf5", "hopper"),
         ("data/halfcheetah_medium_replay.hdf5", "halfcheetah"),
         ("data/walker2d_medium_replay.hdf5", "walker2d"),
+        ("data/antmaze_umaze.hdf5", "antmaze-umaze"),
         ("data/antmaze_umaze_direct.hdf5", "antmaze-umaze"),
         ("data/antmaze_medium_play.hdf5", "antmaze-medium"),
         ("fixtures/hopper_fixture-v2.hdf5", "hopper"),
