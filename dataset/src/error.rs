@@ -1,6 +1,5 @@
 //! Errors of reading and writing datasets. Messages name the file and, if possible, array and row.
 
-use std::error::Error;
 use std::io;
 use std::path::PathBuf;
 
@@ -99,24 +98,14 @@ pub enum ArrayProblem {
     #[error("is not in this file: it leads to numbers that lie elsewhere")]
     Elsewhere,
     #[error("cannot be read")]
-    Unreadable(#[source] Box<dyn Error + Send + Sync>),
+    Unreadable(#[from] hdf5::Error),
+    #[error("cannot be read")]
+    UnreadableNpz(#[from] io::Error),
 }
 
 impl ArrayProblem {
     pub(crate) fn of(self, array: &str) -> Problem {
         Problem::Array(array.to_owned(), self)
-    }
-}
-
-impl From<hdf5::Error> for ArrayProblem {
-    fn from(source: hdf5::Error) -> Self {
-        Self::Unreadable(source.into())
-    }
-}
-
-impl From<io::Error> for ArrayProblem {
-    fn from(source: io::Error) -> Self {
-        Self::Unreadable(source.into())
     }
 }
 
@@ -138,7 +127,8 @@ pub enum RowProblem {
 
 impl RowProblem {
     pub(crate) fn at(self, array: &str, row: usize) -> Problem {
-        Problem::Rows { array: array.to_owned(), row, rows: 1, problem: self }
+        let (array, rows, problem) = (array.to_owned(), 1, self);
+        Problem::Rows { array, row, rows, problem }
     }
 }
 
@@ -152,7 +142,10 @@ pub enum Load {
 }
 
 fn such_rows(rows: usize) -> String {
-    if rows > 1 { format!(" ({rows} such rows)") } else { String::new() }
+    match rows {
+        1 => String::new(),
+        _ => format!(" ({rows} such rows)"),
+    }
 }
 
 impl Problem {
@@ -196,7 +189,7 @@ impl Problem {
             Self::Truncated { .. }
             | Self::DamagedHdf5(_)
             | Self::DamagedNpz(_)
-            | Self::Array(_, Unreadable(_)) => {
+            | Self::Array(_, Unreadable(_) | UnreadableNpz(_)) => {
                 "the file was cut off or damaged on its way: fetch or copy it again; the program that writes one of your own must close it"
             }
             Self::Locked(_) => {

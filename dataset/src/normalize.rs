@@ -51,11 +51,12 @@ impl Normalize {
         let is_step = |row: usize| recording.is_step(row);
         let states = || standard_units(observations, *observation_dim, is_transition);
         let actions = || unit_ranges(&Figures::of_columns(actions, *action_dim, is_step));
+        let size = self.rewards.then(|| rule.size(recording) as f32);
         Scaling {
             observations: self.observations.then(states),
             actions: self.actions.then(actions),
             // All-zero rewards stay unscaled.
-            rewards: self.rewards.then(|| rule.size(recording) as f32).filter(|size| *size > 0.0),
+            rewards: size.filter(|size| *size > 0.0),
         }
     }
 }
@@ -63,7 +64,8 @@ impl Normalize {
 pub(crate) fn apply(scaling: &Scaling, recording: &mut Recording) {
     if let Some(affine) = &scaling.observations {
         affine.to_network(&mut recording.observations);
-        affine.to_network(recording.next_observations.as_deref_mut().unwrap_or_default());
+        let next = recording.next_observations.as_deref_mut();
+        affine.to_network(next.unwrap_or_default());
     }
     if let Some(affine) = &scaling.actions {
         affine.to_network(&mut recording.actions);
@@ -81,7 +83,8 @@ pub(crate) fn standard_units(
         true => (figures.min as f32, 0.0), // By rounding, the deviation might not be 0.
         false => (figures.mean as f32, figures.deviation as f32),
     };
-    let (offset, scale) = Figures::of_columns(values, width, counts).iter().map(of).unzip();
+    let columns = Figures::of_columns(values, width, counts);
+    let (offset, scale) = columns.iter().map(of).unzip();
     Affine { offset, scale }
 }
 

@@ -15,6 +15,9 @@ const START: u64 = 256;
 const TABLE: Load = Convert(
     "quad-convert FILE --observations COLUMN … --actions COLUMN … --reward COLUMN --episode COLUMN --terminal COLUMN",
 );
+const ARROW: Load = Python("load it by pandas.read_feather");
+const JSON: Load = Python("load it by json.load or pandas.read_json");
+const NUMPY: Load = Python("load it by numpy.load");
 const MATLAB: Load = Python(
     "load it by scipy.io.loadmat or, if it is of version 7.3, by h5py, which transposes arrays",
 );
@@ -24,12 +27,12 @@ const PICKLE: Load =
 /// First bytes of a file, name of its format, and remedy.
 const STARTS: [(&[u8], &str, Load); 8] = [
     (b"PAR1", "a Parquet file", TABLE),
-    (b"ARROW1", "an Arrow file", Python("load it by pandas.read_feather")),
+    (b"ARROW1", "an Arrow file", ARROW),
     (b"\x80\x02", "a Python pickle", PICKLE),
     (b"\x80\x03", "a Python pickle", PICKLE),
     (b"\x80\x04", "a Python pickle", PICKLE),
     (b"\x80\x05", "a Python pickle", PICKLE),
-    (b"\x93NUMPY", "a single NumPy array", Python("load it by numpy.load")),
+    (b"\x93NUMPY", "a single NumPy array", NUMPY),
     (b"MATLAB", "a MATLAB file", MATLAB),
 ];
 
@@ -49,18 +52,17 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
     if let Some((_, what, load)) = STARTS.iter().find(|(bytes, _, _)| start.starts_with(bytes)) {
         return foreign(*what, *load);
     }
-    let text = start.utf8_chunks().next().filter(|chunk| start.len() - chunk.valid().len() < 4);
-    let text = text.map_or("", |chunk| chunk.valid());
+    let chunk = start.utf8_chunks().next().map_or("", |chunk| chunk.valid());
+    // The last character may be cut off.
+    let text = if start.len() - chunk.len() < 4 { chunk } else { "" };
     let first_line = text.lines().next().unwrap_or_default();
-    match text {
-        text if text.contains(|c: char| c.is_control() && !c.is_whitespace()) => {
-            Problem::UnknownFormat
-        }
-        text if text.starts_with(['{', '[']) => {
-            foreign("a JSON file", Python("load it by json.load or pandas.read_json"))
-        }
-        _ if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", TABLE),
-        _ => Problem::UnknownFormat,
+    if text.contains(|c: char| c.is_control() && !c.is_whitespace()) {
+        return Problem::UnknownFormat;
+    }
+    match text.starts_with(['{', '[']) {
+        true => foreign("a JSON file", JSON),
+        false if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", TABLE),
+        false => Problem::UnknownFormat,
     }
 }
 
@@ -75,14 +77,12 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
         );
         return foreign(format!("a LeRobot dataset of version {version}"), load);
     }
-    let format =
-        text("data/metadata.json", "data_format").or_else(|| text("metadata.json", "data_format"));
-    match format.filter(|format| format != "hdf5") {
-        Some(format) => {
-            foreign(format!("a Minari dataset stored as {format}"), Convert("quad-convert FOLDER"))
-        }
-        None => Problem::UnknownFolder,
-    }
+    let format = |file| text(file, "data_format").filter(|format| format != "hdf5");
+    let Some(format) = format("data/metadata.json").or_else(|| format("metadata.json")) else {
+        return Problem::UnknownFolder;
+    };
+    let load = Convert("quad-convert FOLDER");
+    foreign(format!("a Minari dataset stored as {format}"), load)
 }
 
 /// The problem with an HDF5 file of robomimic's layout.

@@ -43,7 +43,8 @@ impl Source {
         let error = |problem| DatasetError::new(path, problem);
         let file = data_file(path)?;
         if path.is_dir() {
-            return Ok(Self::Minari(Hdf5File::open(&file)?, minari::Metadata::read(&file)?));
+            let metadata = minari::Metadata::read(&file)?;
+            return Ok(Self::Minari(Hdf5File::open(&file)?, metadata));
         }
         let (_, start) = foreign::start_of(path).map_err(|source| error(source.into()))?;
         if Format::of(&start) == Some(Format::Npz) {
@@ -61,8 +62,7 @@ impl Source {
             return Err(error(foreign::of_robomimic(has_rewards)));
         }
         if path.ends_with(minari::DATA_FILE) || file.has("episode_0") {
-            let metadata = minari::Metadata::read(path)?;
-            return Ok(Self::Minari(file, metadata));
+            return Ok(Self::Minari(file, minari::Metadata::read(path)?));
         }
         Ok(Self::D4rl(file))
     }

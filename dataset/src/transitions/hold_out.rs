@@ -37,8 +37,8 @@ pub(crate) fn chosen(hold_out: HoldOut<'_>, episodes: usize) -> Vec<usize> {
     };
     let mut numbers = Vec::from_iter(0..episodes);
     numbers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed ^ PURPOSE));
-    let count =
-        if fraction > 0.0 { ((fraction * episodes as f64).round() as usize).max(1) } else { 0 };
+    let count = (fraction * episodes as f64).round() as usize;
+    let count = count.max(usize::from(fraction > 0.0));
     numbers.truncate(count.min(episodes.saturating_sub(1)));
     numbers.sort_unstable();
     numbers
@@ -129,7 +129,8 @@ mod tests {
             Transition, Transition, Transition, Dropped, Transition, LastState, Transition,
         ]);
         (whole.ends[1], whole.terminals[1], whole.ends[3]) = (true, true, true);
-        whole.parts = [0, 2, 4, 6].map(|first| (first, format!("{first}"))).to_vec();
+        let part = |first: usize| (first, first.to_string());
+        whole.parts = [0, 2, 4, 6].map(part).to_vec();
         whole
     }
 
@@ -139,9 +140,10 @@ mod tests {
         assert_eq!(whole().rows_of_episodes(), episodes);
         let mut seen = BTreeSet::new();
         for seed in 0..20 {
-            let (training, held_out, out) =
-                whole().hold_out(HoldOut::Fraction { fraction: 0.25, seed });
-            let ([number], held_out) = (&out[..], held_out.unwrap()) else { panic!("{out:?}") };
+            let hold_out = HoldOut::Fraction { fraction: 0.25, seed };
+            let (training, held_out, out) = whole().hold_out(hold_out);
+            let (number, held_out) = (&out[0], held_out.unwrap());
+            assert_eq!(out.len(), 1);
             let rows = &episodes[*number];
             let (own, others): (Vec<usize>, _) = (0..7).partition(|row| rows.contains(row));
             // Rewards equal row indices; one more row, a final state, may follow.
@@ -151,7 +153,7 @@ mod tests {
                 let is_last = |row: usize| row + 1 == part.rows();
                 assert!(!part.transitions().any(is_last), "no next state");
             }
-            assert_eq!(held_out.parts, [(0, format!("{}", rows.start))]);
+            assert_eq!(held_out.parts, [(0, rows.start.to_string())]);
             let again = whole().hold_out(HoldOut::Episodes(&out));
             assert_eq!(again.0.rewards, training.rewards);
             seen.insert(*number);

@@ -56,7 +56,8 @@ fn truncated_anywhere() {
     let whole = fs::read(&path).unwrap();
     for length in (97..whole.len()).step_by(97) {
         fs::write(&path, &whole[..length]).unwrap();
-        refused(&path, &format!("cut short: {length} bytes are there of {}", whole.len()));
+        let message = format!("cut short: {length} bytes are there of {}", whole.len());
+        refused(&path, &message);
     }
 }
 
@@ -93,77 +94,67 @@ fn a_missing_array() {
     assert_error(&error, "array `infos/qpos` is missing", "");
 }
 
+/// Replaces an array of a whole file, and checks the end of the message.
+fn spoiled<T: H5Type>(array: &str, shape: &[usize], data: &[T], message: &str) {
+    let (_folder, path) = subject();
+    assert_eq!(try_read(&path, Some(hopper())).unwrap().len(), ROWS - 1);
+    replace(&path, array, shape, data);
+    assert_refused(&path, Some(hopper()), message, "");
+}
+
 #[test]
 fn an_array_that_is_not_what_it_must_be() {
+    let half = [0.5f32; ROWS * 17];
+    let message = "`observations` has 17 numbers a row, but `hopper` has 11";
+    spoiled("observations", &[ROWS, 17], &half, message);
+    let message = "`actions` has 6 numbers a row, but `hopper` has 3";
+    spoiled("actions", &[ROWS, 6], &half[..ROWS * 6], message);
+    let message = "array `rewards` has shape [19], but must have [20, 1]";
+    spoiled("rewards", &[ROWS - 1], &half[..ROWS - 1], message);
+    let message = "array `terminals` has shape [20, 2], but must have [20, 1]";
+    spoiled("terminals", &[ROWS, 2], &[false; ROWS * 2], message);
+    let message = "has shape [20, 1, 11], but must have rows, or rows of numbers";
+    spoiled("observations", &[ROWS, 1, 11], &half[..ROWS * 11], message);
+    let message = "array `actions` holds bool, but must hold numbers";
+    spoiled("actions", &[ROWS, 3], &[false; ROWS * 3], message);
+    let message = "but must hold booleans (h5py's enum, or numbers that are 0 or 1)";
     let text: FixedAscii<4> = FixedAscii::from_ascii(b"true").unwrap();
-    let (half, mut unknown, mut large) = ([0.5f32; ROWS * 17], [0.5f32; ROWS * 11], [0.5f64; ROWS]);
+    spoiled("terminals", &[ROWS], &[text; ROWS], message);
+    let message = "20 rows, of which none makes a transition";
+    spoiled("timeouts", &[ROWS], &[true; ROWS], message);
+}
+
+#[test]
+fn a_number_that_is_not_what_it_must_be() {
+    let mut unknown = [0.5f32; ROWS * 11];
     unknown[7 * 11 + 3] = f32::NAN;
     unknown[8 * 11..9 * 11].fill(f32::INFINITY);
+    let message = "array `observations`, row 7: NaN is not a finite float32 (2 such rows)";
+    spoiled("observations", &[ROWS, 11], &unknown, message);
+    let mut large = [0.5f64; ROWS];
     large[19] = 1e39;
-    let flag = |value: i32| {
-        let mut flags = [0; ROWS];
-        flags[3] = value;
-        flags
-    };
+    let message = "array `rewards`, row 19: inf is not a finite float32";
+    spoiled("rewards", &[ROWS], &large, message);
     let mut outside = [1.0f32; ROWS * 3];
     outside[16..20].fill(-30.0);
-    type Spoil<'a> = &'a dyn Fn(&Path);
-    let cases: [(&str, Spoil<'_>); 15] = [
-        ("`observations` has 17 numbers a row, but `hopper` has 11", &|path| {
-            replace(path, "observations", &[ROWS, 17], &half);
-        }),
-        ("`actions` has 6 numbers a row, but `hopper` has 3", &|path| {
-            replace(path, "actions", &[ROWS, 6], &half[..ROWS * 6]);
-        }),
-        ("array `rewards` has shape [19], but must have [20, 1]", &|path| {
-            replace(path, "rewards", &[ROWS - 1], &half[..ROWS - 1]);
-        }),
-        ("array `terminals` has shape [20, 2], but must have [20, 1]", &|path| {
-            replace(path, "terminals", &[ROWS, 2], &[false; ROWS * 2]);
-        }),
-        ("array `observations`, row 7: NaN is not a finite float32 (2 such rows)", &|path| {
-            replace(path, "observations", &[ROWS, 11], &unknown);
-        }),
-        ("array `rewards`, row 19: inf is not a finite float32", &|path| {
-            replace(path, "rewards", &[ROWS], &large)
-        }),
-        ("array `actions` holds bool, but must hold numbers", &|path| {
-            replace(path, "actions", &[ROWS, 3], &[false; ROWS * 3]);
-        }),
-        ("but must hold booleans (h5py's enum, or numbers that are 0 or 1)", &|path| {
-            replace(path, "terminals", &[ROWS], &[text; ROWS]);
-        }),
-        ("must have rows, or rows of numbers", &|path| {
-            replace(path, "observations", &[ROWS, 1, 11], &half[..ROWS * 11]);
-        }),
-        ("array `timeouts`, row 3: 2 is neither 0 nor 1", &|path| {
-            replace(path, "timeouts", &[ROWS], &flag(2))
-        }),
-        ("array `timeouts`, row 3: -1 is neither 0 nor 1", &|path| {
-            replace(path, "timeouts", &[ROWS], &flag(-1))
-        }),
-        ("array `timeouts`, row 3: 127 is neither 0 nor 1", &|path| {
-            replace(path, "timeouts", &[ROWS], &flag(256))
-        }),
-        ("20 rows, of which none makes a transition", &|path| {
-            replace(path, "timeouts", &[ROWS], &[true; ROWS])
-        }),
-        ("array `actions`, row 5: the action -30 is outside [-1, 1] (2 such rows)", &|path| {
-            replace(path, "actions", &[ROWS, 3], &outside)
-        }),
-        ("array `rewards` is a group of arrays, but must be an array", &|path| {
-            let file = hdf5::File::open_rw(path).unwrap();
-            file.unlink("rewards").unwrap();
-            file.create_group("rewards").unwrap();
-        }),
-    ];
-    for (expected, spoil) in cases {
-        let (_folder, path) = subject();
-        let whole = try_read(&path, Some(hopper())).unwrap();
-        assert_eq!(whole.len(), ROWS - 1, "the subject itself is whole");
-        spoil(&path);
-        assert_refused(&path, Some(hopper()), expected, "");
+    let message = "array `actions`, row 5: the action -30 is outside [-1, 1] (2 such rows)";
+    spoiled("actions", &[ROWS, 3], &outside, message);
+    for (value, found) in [(2, 2), (-1, -1), (256, 127)] {
+        let mut flags = [0; ROWS];
+        flags[3] = value;
+        let message = format!("array `timeouts`, row 3: {found} is neither 0 nor 1");
+        spoiled("timeouts", &[ROWS], &flags, &message);
     }
+}
+
+#[test]
+fn a_group_in_place_of_an_array() {
+    let (_folder, path) = subject();
+    let file = hdf5::File::open_rw(&path).unwrap();
+    file.unlink("rewards").unwrap();
+    file.create_group("rewards").unwrap();
+    drop(file);
+    refused(&path, "array `rewards` is a group of arrays, but must be an array");
 }
 
 #[test]
@@ -181,11 +172,14 @@ fn an_endless_episode() {
         |rows: usize| format!("{rows} rows without a terminal or timeout: one endless episode");
     assert_refused(&path, None, &message(50), "timeouts");
     write(&path, &steps(1000, 11, 3));
-    assert!(try_read(&path, Some(hopper())).is_ok(), "as many steps as Hopper allows");
+    // As many steps as Hopper allows.
+    assert!(try_read(&path, Some(hopper())).is_ok());
     write(&path, &steps(1001, 11, 3));
     refused(&path, &message(1001));
     // Without `timeouts`, Hopper's time limit truncates.
-    hdf5::File::open_rw(&path).unwrap().unlink("timeouts").unwrap();
+    let file = hdf5::File::open_rw(&path).unwrap();
+    file.unlink("timeouts").unwrap();
+    drop(file);
     assert!(try_read(&path, Some(hopper())).is_ok());
 }
 

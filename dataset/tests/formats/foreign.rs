@@ -14,9 +14,12 @@ use crate::{all, assert_error, assert_refused, put, read, scratch};
 
 const ROWS: usize = 300;
 
+const NONE: &str = "which is none of the formats that are read";
+
 fn zip(file: &str) -> Vec<u8> {
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
-    archive.start_file(file, SimpleFileOptions::default()).unwrap();
+    let options = SimpleFileOptions::default();
+    archive.start_file(file, options).unwrap();
     archive.finish().unwrap().into_inner()
 }
 
@@ -65,7 +68,7 @@ fn folders_of_other_formats_are_named() {
         fs::write(path, format!("{{\"{key}\": \"{value}\"}}")).unwrap();
         assert_named(folder.path(), what);
         let error = data_file(folder.path()).unwrap_err();
-        assert_error(&error, &format!(" {value}, which is none of the formats that are read"), "");
+        assert_error(&error, &format!(" {value}, {NONE}"), "");
     }
     let empty = tempdir().unwrap();
     let problem = data_file(empty.path()).unwrap_err().problem;
@@ -88,7 +91,7 @@ fn a_robomimic_file_is_named() {
         assert_named(&path, what);
     }
     let hint = "quad-convert FILE --observations KEY … --reward success-at-end --success all";
-    assert_refused(&path, None, "which is none of the formats that are read", hint);
+    assert_refused(&path, None, NONE, hint);
 }
 
 /// A file whose arrays `write` puts.
@@ -111,7 +114,8 @@ fn plain(file: &hdf5::File, name: &str, values: &Array2<f32>) {
 
 fn lzf(file: &hdf5::File, name: &str, values: &Array2<f32>) {
     let builder = file.new_dataset_builder().with_data(values);
-    builder.chunk((100, values.ncols())).shuffle().lzf().create(name).unwrap();
+    let builder = builder.chunk((100, values.ncols())).shuffle();
+    builder.lzf().create(name).unwrap();
 }
 
 #[test]
@@ -177,14 +181,16 @@ fn arrays_that_lie_elsewhere() {
 #[test]
 fn a_file_whose_writer_never_closed_it() {
     let (folder, path) = scratch("log.hdf5");
-    let options = hdf5::File::with_options();
-    let file = options.clone().with_fapl(|access| access.libver_latest()).create(&path).unwrap();
+    let mut options = hdf5::File::with_options();
+    let file = options.with_fapl(|access| access.libver_latest()).create(&path);
+    let file = file.unwrap();
     plain(&file, "observations", &Array2::zeros((ROWS, 3)));
     file.flush().unwrap();
     // State on disk while the writer is open.
     let copy = folder.path().join("copy.hdf5");
     fs::copy(&path, &copy).unwrap();
-    assert_refused(&copy, None, "not closed by the program that wrote it", "h5clear");
+    let message = "not closed by the program that wrote it";
+    assert_refused(&copy, None, message, "h5clear");
     drop(file);
 }
 
@@ -202,10 +208,10 @@ fn write_archive(path: &Path, masks: [u32; 8]) {
     let quarters = (0..8).map(|i| f16::from_f32(i as f32 / 4.0));
     put(&mut archive, "observations", quarters.collect());
     put(&mut archive, "actions", vec![f16::from_f32(0.5); 8]);
-    put(&mut archive, "rewards", (0..8).map(|i| -3 * i).collect::<Vec<i16>>());
-    put(&mut archive, "terminals", (0..8).map(|i| u16::from(i == 7)).collect());
+    put(&mut archive, "rewards", vec![0i16, -3, -6, -9, -12, -15, -18, -21]);
+    put(&mut archive, "terminals", vec![0u16, 0, 0, 0, 0, 0, 0, 1]);
     put(&mut archive, "masks", masks.to_vec());
-    put(&mut archive, "valids", (0..8).map(|i| u64::from(i < 7)).collect());
+    put(&mut archive, "valids", vec![1u64, 1, 1, 1, 1, 1, 1, 0]);
     archive.finish().unwrap();
 }
 
@@ -220,6 +226,7 @@ fn an_archive_of_short_numbers_is_read() {
     for (last, terminals, timeouts) in [(0, 1.0 / 7.0, 0.0), (1, 0.0, 1.0 / 7.0)] {
         write_archive(&path, [1, 1, 1, 1, 1, 1, last, last]);
         let inspection = inspect(&path, None).unwrap();
-        assert_eq!((inspection.terminals, inspection.timeouts), (terminals, timeouts));
+        let shares = (inspection.terminals, inspection.timeouts);
+        assert_eq!(shares, (terminals, timeouts));
     }
 }

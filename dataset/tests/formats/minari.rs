@@ -78,7 +78,7 @@ fn damaged_metadata_and_missing_episodes() {
     let data = dataset.join("data/main_data.hdf5");
     hdf5::File::open_rw(&data).unwrap().unlink("episode_3").unwrap();
     let message = ": 3 episodes, but metadata.json says 4";
-    assert_refused(&dataset, Some(hopper()), message, "incomplete");
+    assert_refused(&dataset, Some(hopper()), message, "again");
 }
 
 fn write_tuple(path: &Path) {

@@ -1,9 +1,6 @@
 use std::path::Path;
 
-use quad_dataset::{
-    Arrays, Batch, HoldOut, Inspection, Names, RewardRule, Statistics, Transitions, inspect,
-    write_own,
-};
+use quad_dataset::{Arrays, HoldOut, Names, RewardRule, Transitions, inspect, write_own};
 use tempfile::tempdir;
 
 use crate::{all, assert_error, assert_refused, options, peers, peers_in, read, scratch, try_read};
@@ -21,27 +18,28 @@ fn the_ten_lines_of_the_page_write_what_is_read() {
     assert_eq!(lines.lines().count(), 10);
     let folder = tempdir().unwrap();
     std::fs::write(folder.path().join("lines.py"), lines).unwrap();
-    if !peers_in(folder.path(), &["write-log", "log.npz"])
-        || !peers_in(folder.path(), &["run", "lines.py"])
-    {
+    let run = |arguments: &[&str]| peers_in(folder.path(), arguments);
+    if !run(&["write-log", "log.npz"]) || !run(&["run", "lines.py"]) {
         return;
     }
 
     let transitions = read(&folder.path().join("my-robot.hdf5"), None, RewardRule::AsIs);
-    let Batch { observations, actions, rewards, next_observations, masks, size } =
-        all(&transitions);
-    assert_eq!((size, transitions.observation_dim(), transitions.action_dim()), (12, 5, 2));
+    let batch = all(&transitions);
+    let sizes = (batch.size, transitions.observation_dim(), transitions.action_dim());
+    assert_eq!(sizes, (12, 5, 2));
     // `peers.py write-log` has the same formulas: s = 10 i + j, s' = s + 5, a = ±1/2, r = i.
     for i in 0..12 {
         let state = [0.0, 1.0, 2.0, 3.0, 4.0].map(|j| 10.0 * i as f32 + j);
-        assert_eq!(observations[5 * i..][..5], state);
-        assert_eq!(next_observations[5 * i..][..5], state.map(|x| x + 5.0));
-        assert_eq!((&actions[2 * i..][..2], rewards[i]), (&[0.5, -0.5][..], i as f32));
-        assert_eq!(masks[i], if i == 3 { 0.0 } else { 1.0 });
+        assert_eq!(batch.observations[5 * i..][..5], state);
+        assert_eq!(batch.next_observations[5 * i..][..5], state.map(|x| x + 5.0));
+        assert_eq!(batch.actions[2 * i..][..2], [0.5, -0.5]);
+        assert_eq!(batch.rewards[i], i as f32);
+        assert_eq!(batch.masks[i], if i == 3 { 0.0 } else { 1.0 });
     }
     // Episodes of 4 (terminal), 6 (timeout) and 2 (open) rows.
-    let Statistics { episodes, return_min, return_max, score_mean, .. } = *transitions.statistics();
-    assert_eq!((episodes, return_min, return_max, score_mean), (3, 6.0, 39.0, None));
+    let found = transitions.statistics();
+    let returns = (found.return_min, found.return_max);
+    assert_eq!((found.episodes, returns, found.score_mean), (3, (6.0, 39.0), None));
 }
 
 #[test]
@@ -104,10 +102,11 @@ fn arrays_are_written_and_read_again() {
     let files = Vec::from_iter(files.map(|file| file.unwrap().path()));
     assert_eq!(files, [&*path], "nothing partial is left, and what was there is replaced");
 
-    let Inspection { format, transitions, episodes, action_range, refused, problems, .. } =
-        inspect(&path, None).unwrap();
-    assert_eq!((format, transitions, episodes, refused), ("transitions", 6, 2, false));
-    assert_eq!(action_range.max, 30.0);
+    let found = inspect(&path, None).unwrap();
+    let sizes = (found.transitions, found.episodes);
+    assert_eq!((found.format, sizes, found.refused), ("transitions", (6, 2), false));
+    assert_eq!(found.action_range.max, 30.0);
+    let problems = found.problems;
     assert!(problems[0].contains("--normalize actions"), "{problems:?}");
     let message = "the action 24.5 is outside [-1, 1] (6 such rows)";
     assert_refused(&path, None, message, "--normalize actions");
