@@ -109,7 +109,7 @@ async fn an_evaluator_that_leaves_in_the_middle_of_a_job_hands_it_back() {
     let scratch = Scratch::new();
     // It need not be finished, so it is as long as jobs can be.
     let sizes = Setting { candidates: 1000, hidden: 256, ..ENDLESS };
-    let setting = Setting { eval_interval: 10, episodes: 40, ..sizes };
+    let setting = Setting { steps: 10_000_000, eval_interval: 10, episodes: 40, ..sizes };
     let learner = scratch.learner("run", setting);
     let behind = free_endpoint();
     let _router = router_without_scores(&behind, Some(&learner.endpoint())).await;
