@@ -87,7 +87,7 @@ mod tests {
 
     #[test]
     fn a_shift_of_ogbenchs_terminals_is_not_put_down_to_masks() {
-        let kind = |row: usize| match row % 30 == 0 && row > 0 {
+        let kind = |row: usize| match row > 0 && row.is_multiple_of(30) {
             true => RowKind::LastState,
             false => RowKind::Transition,
         };
