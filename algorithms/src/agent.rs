@@ -40,16 +40,10 @@ struct Counters {
 
 /// A saved state from which training cannot continue.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // The messages say what each variant is.
 pub enum StateError {
-    /// A state of another algorithm.
     #[error("the state is of the algorithm {found}, this run is of {expected}")]
-    Algorithm {
-        /// The state's.
-        found: String,
-        /// The run's.
-        expected: &'static str,
-    },
-    /// Tensors that are missing, unknown or of another shape.
+    Algorithm { found: String, expected: &'static str },
     #[error(transparent)]
     Policy(#[from] PolicyError),
 }
@@ -65,8 +59,8 @@ impl Agent {
         context: Context,
     ) -> Result<Self, AlgorithmError> {
         let (device, transitions) = (context.device.clone(), context.transitions.clone());
-        let scaling =
-            Some(transitions.scaling().clone()).filter(|scaling| *scaling != Scaling::default());
+        let scaling = Some(transitions.scaling().clone());
+        let scaling = scaling.filter(|scaling| *scaling != Scaling::default());
         let names = transitions.names().clone();
         let algorithm = hyperparameters.start(&definition, context)?;
         // Each thread has its own queue on a GPU: what this one made must be there for the next.
@@ -106,9 +100,6 @@ impl Agent {
 
     /// Performs an update on the examples with these indices. Returns the metrics in the order of
     /// their table; `None` for those that this update did not measure.
-    ///
-    /// # Errors
-    /// Candle fails.
     pub fn update(&mut self, indices: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
         let (algorithm, step) = (&mut self.algorithm, self.step);
         let measured = match self.device.is_cpu() {
@@ -121,23 +112,15 @@ impl Agent {
 
     /// Computes the losses of the last update on other examples, as [`Self::update`] returns them,
     /// but only the metrics that are measured on held-out episodes. Changes nothing.
-    ///
-    /// # Errors
-    /// Candle fails.
     pub fn evaluate(&self, indices: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
         let measured = self.algorithm.evaluate(self.step.saturating_sub(1), indices)?;
-        let metrics = self.metrics().iter();
-        Ok(self
-            .in_order(&measured)
-            .zip(metrics)
-            .map(|(value, metric)| value.filter(|_| metric.held_out))
-            .collect())
+        let values = self.in_order(&measured).zip(self.metrics());
+        Ok(values.map(|(value, metric)| value.filter(|_| metric.held_out)).collect())
     }
 
     fn in_order(&self, measured: &Measured) -> impl Iterator<Item = Option<f32>> {
-        let value =
-            |name| measured.iter().find(|(known, _)| *known == name).map(|(_, value)| *value);
-        self.metrics().iter().map(move |metric| value(metric.name))
+        let of = |metric: &Metric| measured.iter().find(|(name, _)| *name == metric.name);
+        self.metrics().iter().map(move |metric| Some(of(metric)?.1))
     }
 
     /// The file of the current policy, with its origin.
@@ -146,10 +129,10 @@ impl Agent {
     /// A weight is not finite.
     pub fn policy(&self, origin: impl Serialize) -> Result<Vec<u8>, AlgorithmError> {
         let (policy, tensors) = self.algorithm.policy()?;
-        let Names { observations: observation_names, actions: action_names } = self.names.clone();
-        let scaling = self.scaling.clone();
-        let header =
-            Header { scaling, observation_names, action_names, ..Header::new(policy, origin) };
+        let mut header = Header::new(policy, origin);
+        header.scaling = self.scaling.clone();
+        header.observation_names = self.names.observations.clone();
+        header.action_names = self.names.actions.clone();
         Ok(header.to_safetensors(&tensors)?)
     }
 
@@ -158,8 +141,9 @@ impl Agent {
     /// # Errors
     /// A number is not finite.
     pub fn save(&mut self) -> Result<Vec<u8>, AlgorithmError> {
-        let counters = Counters { algorithm: self.definition.name.to_owned(), step: self.step };
-        Ok(write_tensors(&self.algorithm.state_dict().save()?, COUNTERS, &counters)?)
+        let (algorithm, step) = (self.definition.name.to_owned(), self.step);
+        let tensors = self.algorithm.state_dict().save()?;
+        Ok(write_tensors(&tensors, COUNTERS, &Counters { algorithm, step })?)
     }
 
     /// Resumes from a saved state, bit for bit if the run's configuration is the same.

@@ -4,22 +4,12 @@
 //! takes the one whose Q is closest to V. Equations of critics and V are IQL's; what is left out,
 //! and what its authors' code does, is in docs/deviations.md.
 
-use super::algorithm::Measured;
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
 use super::denoising::Denoising;
 use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler};
-use super::hyperparameters::{
-    Candidates, Count, NotNegative, OpenUnit, Positive, Rate, UnitInterval,
-};
 use super::iql::expectile_loss;
-use super::losses::{Loss, smallest};
-use super::networks::{TWIN, TrainState, state_value};
-use super::state_dict::StateDict;
-use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Reverse, Tensors};
-use quad_policy::{Aggregate, Choice, DiffusionPolicy, DiffusionShape, Rule};
-use serde::Deserialize;
+use super::prelude::*;
+use quad_nn::Reverse;
+use quad_policy::{DiffusionPolicy, DiffusionShape};
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "align-iql",
@@ -41,16 +31,14 @@ pub(super) const METRICS: &[Metric] = &metrics! {
     learning_rate: "The actor's learning rate; falls to 0 along a cosine, and stays there with practice.";
 };
 
-/// The hyper-parameters of AlignIQL and of IDQL: the `[agent]` table of a preset.
+/// The hyper-parameters of AlignIQL and of IDQL.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Config {
     actor: MlpConfig,
     critic: MlpConfig,
     value: MlpConfig,
-    /// Denoising steps T.
     diffusion_steps: Count,
-    /// Discount γ.
     gamma: UnitInterval,
     /// The expectile τ of the value function.
     expectile: OpenUnit,
@@ -63,7 +51,6 @@ pub(super) struct Config {
     ema_rate: Rate,
     /// EMA rate of the target actor.
     actor_ema_rate: Rate,
-    /// Actions that an evaluated policy draws in each state.
     candidates: Candidates,
 }
 
@@ -130,12 +117,13 @@ impl DiffusionUpdate for AlignIql {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
-        // IDQL's authors move only critics and V with practice.
-        let (config, decay) = (&self.config, context.decay(step, 0.0));
+        let (config, Networks { actor, critic }) = (&self.config, networks);
         let adam = |rate: f32| AdamStep::after(step, rate);
-        networks.actor.adam.set_step(adam(*config.actor_learning_rate * decay))?;
+        // IDQL's authors move only critics and V with practice.
+        let decayed = *config.actor_learning_rate * context.decay(step, 0.0);
+        actor.adam.set_step(adam(decayed))?;
         self.value.adam.set_step(adam(*config.value_learning_rate))?;
-        networks.critic.adam.set_step(adam(*config.critic_learning_rate))
+        critic.adam.set_step(adam(*config.critic_learning_rate))
     }
 
     fn update(
@@ -179,8 +167,7 @@ impl DiffusionUpdate for AlignIql {
         let Networks { actor, critic } = networks;
         let value = (self.rule == Rule::Nearest).then_some(&*self.value);
         let tensors = DiffusionPolicy::tensors(&actor.target, &critic.target, value)?;
-        let candidates = *self.config.candidates;
-        Ok((Choice { candidates, aggregate: Aggregate::Min, rule: self.rule }, tensors))
+        Ok((Choice::new(*self.config.candidates, Aggregate::Min, self.rule), tensors))
     }
 
     fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {

@@ -4,19 +4,11 @@
 //! with practice is Cal-QL, which pushes values down no further than to the data's returns.
 //! Equations are that paper's; docs/deviations.md says which of several codes is followed.
 
-use super::algorithm::{Algorithm, Measured};
 use super::calibration::MonteCarlo;
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
-use super::hyperparameters::{Count, Finite, Positive, Rate, Steps, UnitInterval};
-use super::losses::{Loss, largest, measured, smallest};
-use super::networks::{Initializer, TWIN, TrainState, WithTarget, networks};
+use super::prelude::*;
 use super::squashed::{Normal, Squashed};
-use super::state_dict::StateDict;
-use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, EnsembleShape, MlpConfig, Tensors, Weights};
-use quad_policy::{GaussianPolicy, PolicyConfig};
-use serde::Deserialize;
+use quad_nn::Weights;
+use quad_policy::GaussianPolicy;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "cql",
@@ -42,13 +34,11 @@ const METRICS: &[Metric] = &metrics! {
     alpha_prime: "α', which the weight of the gap is multiplied by, before its step; rises while the gap is above the threshold. Measured with a threshold only.";
 };
 
-/// CQL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     actor: MlpConfig,
     critic: MlpConfig,
-    /// Discount γ.
     gamma: UnitInterval,
     /// Weight of the conservative gap in the critics' loss, the paper's α.
     weight: Positive,
@@ -114,7 +104,6 @@ networks! {
     }
 }
 
-/// The random numbers of one update.
 struct Noise {
     /// Noise of the action in the actor's loss, `[B, 1, a]`.
     policy: Tensor,
@@ -174,8 +163,7 @@ impl Cql {
         let Networks { critic, log_alpha, .. } = &self.networks;
         let drawn = current.draw(&noise.policy)?;
         let log_density = drawn.log_density.squeeze(1)?;
-        let (phases, total_steps) = (&self.config.phases, self.context.total_steps);
-        let gain = match phases.is_cloning(step, total_steps) {
+        let gain = match self.config.phases.is_cloning(step, self.context.total_steps) {
             true => current.log_density(&self.actions(batch)?)?,
             false => {
                 let actions = drawn.actions.squeeze(1)?;
@@ -238,11 +226,10 @@ impl Cql {
         let (b, n, a) = noise.uniform.dims3()?;
         let [next, current] = [next.draw(&noise.next)?, current.draw(&noise.current)?];
         // [B, 1 + 3N, a]: one pass through the critics for all.
-        let actions =
-            [&self.actions(batch)?.unsqueeze(1)?, &noise.uniform, &next.actions, &current.actions];
+        let of_data = self.actions(batch)?.unsqueeze(1)?;
+        let actions = [&of_data, &noise.uniform, &next.actions, &current.actions];
         let actions = Tensor::cat(&actions, 1)?.flatten(0, 1)?;
-        let critics = &self.networks.critic;
-        let q = batch.values_at(critics, &actions)?;
+        let q = batch.values_at(&self.networks.critic, &actions)?;
         let q = q.reshape((TWIN, b, 1 + 3 * n))?;
         let of_data = q.narrow(2, 0, 1)?.squeeze(2)?;
         let uniform = Tensor::full(-(a as f32) * 2f32.ln(), (b, n), q.device())?;

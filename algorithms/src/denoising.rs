@@ -19,14 +19,16 @@ pub(super) struct Denoising {
 
 impl Inputs for Denoising {
     fn tensors(&mut self) -> Vec<&mut Tensor> {
-        vec![&mut self.t, &mut self.epsilon, &mut self.signal, &mut self.deviation]
+        let Self { t, epsilon, signal, deviation } = self;
+        vec![t, epsilon, signal, deviation]
     }
 }
 
 impl Denoising {
     pub fn new(t: &[u32], epsilon: Tensor, schedule: &Schedule) -> Result<Self> {
         let (signal, deviation) = schedule.noising(t, epsilon.dim(1)?, epsilon.device())?;
-        Ok(Self { t: Tensor::new(t, epsilon.device())?, epsilon, signal, deviation })
+        let t = Tensor::new(t, epsilon.device())?;
+        Ok(Self { t, epsilon, signal, deviation })
     }
 
     /// √ᾱ_t·a + √(1 − ᾱ_t)·ε of actions a, all `[B, a]`.

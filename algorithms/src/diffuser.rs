@@ -6,25 +6,11 @@
 
 mod windows;
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::Context;
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
-use super::error::{AgentError, AlgorithmError, check};
-use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Steps, UnitInterval};
-use super::losses::{Loss, measured};
-use super::networks::{Initializer, WithTarget, networks};
-use super::state_dict::StateDict;
-use candle_core::{Result, Tensor};
+use super::prelude::*;
 use candle_nn::loss::mse;
-use quad_nn::{
-    AdamStep, Layout, Schedule, Tensors, TrajectoryConfig, TrajectoryModel, TrajectoryValue,
-    Weighted, Weights,
-};
-use quad_policy::{
-    Choice, DiffuserPolicy, DiffuserShape, PolicyConfig, ValueGuidance, with_first_state,
-};
+use quad_nn::{Layout, Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, Weights};
+use quad_policy::{DiffuserPolicy, DiffuserShape, ValueGuidance, with_first_state};
 use rand::Rng;
-use serde::Deserialize;
 use windows::{Batch, Windows};
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -43,13 +29,11 @@ const METRICS: &[Metric] = &metrics! {
     return_mean held_out: "Mean over the batch of the discounted return from a window's first step to the end of its episode, with the terminal penalty.";
 };
 
-/// Diffuser's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     /// Shape of both networks.
     network: TrajectoryConfig,
-    /// Denoising steps T.
     diffusion_steps: Count,
     /// Discount γ of returns.
     gamma: UnitInterval,
@@ -68,7 +52,6 @@ struct Config {
     /// … and are copies before this step.
     ema_start: u64,
     guidance: ValueGuidance,
-    /// Plans that an evaluated policy draws in each state.
     candidates: Candidates,
     /// Steps that it takes by one plan.
     replan_every: Count,

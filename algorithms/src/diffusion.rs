@@ -1,17 +1,13 @@
 //! Training of a diffusion policy with critics. An algorithm of this kind is a [`DiffusionUpdate`].
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch};
 use super::denoising::Denoising;
 use super::inputs::Inputs;
-use super::losses::{Computed, Loss};
-use super::networks::{Initializer, WithTarget, networks};
+use super::losses::Computed;
+use super::prelude::*;
 use super::random::Random;
 use super::replay::Replay;
-use super::state_dict::StateDict;
-use candle_core::{Device, Result, Tensor};
-use quad_nn::{Ensemble, NoisePredictor, Tensors, Weighted};
-use quad_policy::{Choice, DiffusionShape, PolicyConfig};
+use quad_nn::NoisePredictor;
+use quad_policy::DiffusionShape;
 use rand::Rng;
 
 networks! {

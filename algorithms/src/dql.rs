@@ -3,20 +3,15 @@
 //! toward actions of large Q, by the gradient through its whole reverse chain. Equations are that
 //! paper's; where its authors' code does otherwise, docs/deviations.md says so.
 
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
 use super::denoising::Denoising;
 use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler};
-use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Steps, UnitInterval};
 use super::inputs::Inputs;
-use super::losses::{Loss, largest, smallest};
-use super::networks::TWIN;
-use candle_core::{Device, Result, Tensor};
+use super::prelude::*;
 use candle_nn::loss::mse;
-use quad_nn::{AdamStep, MlpConfig, Reverse, Tensors};
-use quad_policy::{Aggregate, Choice, DiffusionPolicy, DiffusionShape, Rule};
+use quad_nn::Reverse;
+use quad_policy::{DiffusionPolicy, DiffusionShape};
 use rand::Rng;
-use serde::Deserialize;
+use rand_chacha::ChaCha8Rng;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "dql",
@@ -36,15 +31,12 @@ const METRICS: &[Metric] = &metrics! {
     actor_gradient_norm: "Global norm of the actor's gradient before clipping.";
 };
 
-/// Diffusion-QL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     actor: MlpConfig,
     critic: MlpConfig,
-    /// Denoising steps T.
     diffusion_steps: Count,
-    /// Discount γ.
     gamma: UnitInterval,
     /// Strength η of Q beside cloning.
     eta: NotNegative,
@@ -63,13 +55,11 @@ struct Config {
     actor_ema_every: Steps,
     /// … and at least this.
     actor_ema_start: u64,
-    /// Actions that an evaluated policy draws in each state.
     candidates: Candidates,
     /// Temperature of the softmax by which one of them is drawn, in units of Q.
     temperature: Positive,
 }
 
-/// The random numbers of one update.
 #[derive(Clone)]
 struct Noise {
     /// Noise of the sampled next actions, `[T, B·S, a]`.
@@ -146,18 +136,17 @@ impl DiffusionUpdate for Config {
         let next = sampler.chain("next_noise", *self.samples)?;
         let policy = sampler.chain("policy_noise", 1)?;
         let denoising = sampler.denoising()?;
-        let first = sampler
-            .random
-            .vector("first_critic", |generator| Ok(vec![generator.random_range(0..TWIN) as u32]))?
-            [0];
+        let first = |generator: &mut ChaCha8Rng| Ok(vec![generator.random_range(0..TWIN) as u32]);
+        let first = sampler.random.vector("first_critic", first)?[0];
         let raised = Tensor::new(&[first, 1 - first], &Device::Cpu)?;
         Ok(Noise { next, policy, denoising, raised })
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, _: &Context) -> Result<()> {
-        let adam = |rate: f32| AdamStep { rate, clip: Some(*self.gradient_clip), count: step + 1 };
-        networks.critic.adam.set_step(adam(*self.critic_learning_rate))?;
-        networks.actor.adam.set_step(adam(*self.actor_learning_rate))
+        let Networks { actor, critic } = networks;
+        let adam = |rate: f32| AdamStep::after(step, rate).clipped(*self.gradient_clip);
+        critic.adam.set_step(adam(*self.critic_learning_rate))?;
+        actor.adam.set_step(adam(*self.actor_learning_rate))
     }
 
     /// Algorithm 1's loop, but for the target actor.
@@ -194,7 +183,7 @@ impl DiffusionUpdate for Config {
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
         let Networks { actor, critic } = networks;
         let tensors = DiffusionPolicy::tensors(actor, &critic.target, None)?;
-        let rule = Rule::Softmax { temperature: *self.temperature };
-        Ok((Choice { candidates: *self.candidates, aggregate: Aggregate::Min, rule }, tensors))
+        let rule = Rule::softmax(*self.temperature);
+        Ok((Choice::new(*self.candidates, Aggregate::Min, rule), tensors))
     }
 }

@@ -4,26 +4,13 @@
 //! the data's: inside that trust region π_θ moves toward large Q, and no chain of denoising steps
 //! is ever sampled. Where the authors' code says more than their paper, docs/deviations.md has it.
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
 use super::gaussian::log_density;
-use super::hyperparameters::{
-    Candidates, NotNegative, OpenUnit, Positive, Rate, Steps, UnitInterval,
-};
 use super::iql::expectile_loss;
-use super::losses::{Loss, measured, smallest};
-use super::networks::{Initializer, TWIN, TrainState, WithTarget, networks, state_value};
-use super::phases::first_steps;
+use super::prelude::*;
 use super::random::Random;
 use super::squashed::{Normal, Squashed};
-use super::state_dict::StateDict;
-use candle_core::{Device, Result, Tensor};
-use quad_nn::{
-    AdamStep, Denoiser, DenoiserShape, Ensemble, MlpConfig, NoiseLevels, Tensors, cosine_decay,
-};
-use quad_policy::{ActorCriticShape, Aggregate, Choice, PolicyConfig, Rule, SquashedActor};
-use serde::Deserialize;
+use quad_nn::{Denoiser, DenoiserShape, NoiseLevels};
+use quad_policy::{ActorCriticShape, SquashedActor};
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "dtql",
@@ -49,7 +36,6 @@ const METRICS: &[Metric] = &metrics! {
     learning_rate: "The learning rate of both policies.";
 };
 
-/// DTQL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
@@ -59,7 +45,6 @@ struct Config {
     diffusion: MlpConfig,
     critic: MlpConfig,
     value: MlpConfig,
-    /// Discount γ.
     gamma: UnitInterval,
     /// The expectile τ of the value function.
     expectile: OpenUnit,
@@ -75,7 +60,6 @@ struct Config {
     cosine: bool,
     /// EMA rate of the target critics.
     ema_rate: Rate,
-    /// Actions that an evaluated policy draws in each state.
     candidates: Candidates,
     /// Temperature of the softmax by which one of them is drawn, in units of Q.
     temperature: Positive,
@@ -126,7 +110,6 @@ impl Noising {
     }
 }
 
-/// The random numbers of one update.
 struct Noise {
     /// Noise on the data's actions.
     cloning: Noising,
@@ -197,15 +180,14 @@ impl Dtql {
         let q = batch.values_at(&critic.detach(), &actions)?;
         let q_loss = smallest(&q)?.mean_all()?.neg()?;
         let mut loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
-        let likelihood =
-            (*self.config.likelihood > 0.0).then(|| likelihood_loss(&distribution, &batch.actions));
-        let likelihood = likelihood.transpose()?;
-        if let Some(likelihood) = &likelihood {
-            loss = (loss + (likelihood * f64::from(*self.config.likelihood))?)?;
+        let (weight, mut likelihood) = (*self.config.likelihood, None);
+        if weight > 0.0 {
+            let of_data = likelihood_loss(&distribution, &batch.actions)?;
+            loss = (loss + (&of_data * f64::from(weight))?)?;
+            likelihood = Some(of_data);
         }
-        let loss =
-            Loss::new("actor_loss", loss).with("trust_loss", trust_loss).with("q_loss", q_loss);
-        Ok(loss.with("likelihood_loss", likelihood))
+        let loss = Loss::new("actor_loss", loss).with("trust_loss", trust_loss);
+        Ok(loss.with("q_loss", q_loss).with("likelihood_loss", likelihood))
     }
 }
 
@@ -241,9 +223,11 @@ impl Algorithm for Dtql {
     fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
         let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
         let pretraining = self.pretraining();
-        let (steps, total) =
-            (step.saturating_sub(pretraining), self.context.total_steps - pretraining);
-        let decay = if self.config.cosine { cosine_decay(steps, total) } else { 1.0 };
+        let steps = step.saturating_sub(pretraining);
+        let decay = match self.config.cosine {
+            true => cosine_decay(steps, self.context.total_steps - pretraining),
+            false => 1.0,
+        };
         let adam = AdamStep::after(step, *self.config.learning_rate * decay);
         let of_values = AdamStep::after(step, *self.config.critic_learning_rate * decay);
         let [value_loss, critic_loss] = self.value_losses(&batch)?;
@@ -277,9 +261,8 @@ impl Algorithm for Dtql {
 
     /// The one-step policy, which draws one of its candidates by the target critics' values.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let (candidates, temperature) = (*self.config.candidates, *self.config.temperature);
-        let (aggregate, rule) = (Aggregate::Min, Rule::Softmax { temperature });
-        let choice = Choice { candidates, aggregate, rule };
+        let rule = Rule::softmax(*self.config.temperature);
+        let choice = Choice::new(*self.config.candidates, Aggregate::Min, rule);
         let (actor, critics) = (&self.networks.actor.network, &self.networks.critic.target);
         let shape = ActorCriticShape::of(actor, critics);
         let tensors = ActorCriticShape::tensors(actor, critics)?;

@@ -4,25 +4,20 @@ use quad_policy::PolicyError;
 
 /// Reasons for which an algorithm cannot start or be saved.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // The messages say what each variant is.
 pub enum AlgorithmError {
-    /// A policy or state that lacks a tensor or has one that is not finite.
     #[error(transparent)]
     Policy(#[from] PolicyError),
-    /// Hyper-parameters that cannot be used.
     #[error(transparent)]
     Agent(#[from] AgentError),
-    /// A dataset of single transitions.
     #[error("no transition of the dataset has a next action, which this algorithm learns from")]
     NoNextAction,
-    /// A dataset whose episodes are all shorter than this.
     #[error("no episode of the dataset has {0} transitions (agent.shortest_episode)")]
     ShortEpisodes(usize),
-    /// A dataset without a window of this many transitions.
     #[error(
         "no episode of the dataset has {0} transitions, which this algorithm plans ahead, and none terminates"
     )]
     NoWindow(usize),
-    /// A tensor that cannot be computed or moved.
     #[error("candle failed")]
     Candle(#[from] candle_core::Error),
 }
@@ -50,20 +45,12 @@ impl AlgorithmError {
 
 /// Hyper-parameters that cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // The messages say what each variant is.
 pub enum AgentError {
-    /// A key that is missing, unknown or of the wrong type.
     #[error("[agent]: {0}")]
     Parse(#[from] toml::de::Error),
-    /// A value outside its range.
     #[error("agent.{field} is {value}, but must be {range}")]
-    Range {
-        /// Name within the `[agent]` table.
-        field: &'static str,
-        /// The value that was given.
-        value: String,
-        /// The values that are allowed.
-        range: &'static str,
-    },
+    Range { field: &'static str, value: String, range: &'static str },
 }
 
 /// Checks that a hyper-parameter is in its range.
@@ -73,5 +60,6 @@ pub(super) fn check(
     holds: bool,
     range: &'static str,
 ) -> Result<(), AgentError> {
-    if holds { Ok(()) } else { Err(AgentError::Range { field, value: value.to_string(), range }) }
+    let value = value.to_string();
+    if holds { Ok(()) } else { Err(AgentError::Range { field, value, range }) }
 }

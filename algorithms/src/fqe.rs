@@ -6,20 +6,9 @@
 //! It makes no policy, so it is not among [`ALGORITHMS`](crate::ALGORITHMS): `learner judge` runs it.
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests;
 
-use super::algorithm::Measured;
-use super::context::{Context, Minibatch, select};
-use super::definition::read;
-use super::error::{AgentError, AlgorithmError};
-use super::hyperparameters::{NotNegative, Positive, Rate, UnitInterval};
-use super::losses::{Loss, measured};
-use super::networks::{Initializer, WithTarget, networks};
-use super::state_dict::StateDict;
-use candle_core::{Device, Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Weighted};
-use serde::Deserialize;
+use super::prelude::*;
 
 const SETTINGS: &str = "
 critic = { hidden = [256, 256], activation = \"relu\" }
@@ -33,7 +22,6 @@ ema_rate = 1e-2
 #[serde(deny_unknown_fields)]
 pub struct FqeConfig {
     critic: MlpConfig,
-    /// Discount γ.
     gamma: UnitInterval,
     learning_rate: Positive,
     /// Share of the learning rate by which each step shrinks the weights.

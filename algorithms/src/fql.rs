@@ -2,18 +2,10 @@
 //! step is distilled from it while it climbs the critics. No gradient passes through the flow's
 //! steps. Its update is its authors' code's; equations are that paper's.
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
-use super::hyperparameters::{Candidates, Count, Positive, Rate, UnitInterval};
-use super::losses::{Loss, measured, smallest};
-use super::networks::{Initializer, TWIN, TrainState, WithTarget, networks};
-use super::state_dict::StateDict;
-use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, Tensors};
-use quad_policy::{ActorCriticShape, Aggregate, Choice, OneStepActor, PolicyConfig, Rule};
+use super::prelude::*;
+use candle_nn::loss::mse;
+use quad_policy::{ActorCriticShape, OneStepActor};
 use rand::Rng;
-use serde::Deserialize;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "fql",
@@ -32,14 +24,12 @@ const METRICS: &[Metric] = &metrics! {
     actor_loss ["actor loss"] held_out: "alpha·distill_loss + q_loss (FQL's Eq. 7).";
 };
 
-/// FQL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     /// The hidden layers of the flow's velocity, and of the one-step policy.
     actor: MlpConfig,
     critic: MlpConfig,
-    /// Discount γ.
     gamma: UnitInterval,
     /// Reduction of the two critics' values in their target.
     target: Aggregate,
@@ -102,13 +92,8 @@ impl Fql {
         let with_practice = self.config.online_alpha.filter(|_| self.context.online_steps > 0);
         let alpha = f64::from(*with_practice.unwrap_or(self.config.alpha));
         let actor_loss = ((&distill_loss * alpha)? + &q_loss)?;
-        Ok([
-            critic_loss,
-            Loss::new("bc_loss", bc_loss),
-            Loss::new("actor_loss", actor_loss)
-                .with("distill_loss", distill_loss)
-                .with("q_loss", q_loss),
-        ])
+        let actor_loss = Loss::new("actor_loss", actor_loss).with("distill_loss", distill_loss);
+        Ok([critic_loss, Loss::new("bc_loss", bc_loss), actor_loss.with("q_loss", q_loss)])
     }
 
     /// y = r + γ·mask·Q̂(s', π(s', z)), `[B]`.
@@ -128,7 +113,7 @@ impl Fql {
         let velocity = (&batch.actions - start)?;
         let x = (start + velocity.broadcast_mul(times)?)?;
         let predicted = velocity_of(&self.networks.flow, &batch.observations, &x, times)?;
-        (predicted - velocity)?.sqr()?.mean_all()
+        mse(&predicted, &velocity)
     }
 
     /// The flow's actions, `[B, a]`, by Euler steps from this noise; constants.
@@ -147,9 +132,9 @@ impl Fql {
     /// The squared distance of the one-step policy's actions to the flow's, and −Q of these actions,
     /// divided by the mean of |Q| with `normalize_q`; both `[]`.
     fn actor_losses(&self, batch: &Minibatch, noise: &Tensor) -> Result<[Tensor; 2]> {
-        let actions = self.networks.actor.outputs(&batch.observations, noise)?.squeeze(0)?;
-        let distill_loss =
-            (&actions - self.flow_actions(&batch.observations, noise)?)?.sqr()?.mean_all()?;
+        let observations = &batch.observations;
+        let actions = self.networks.actor.outputs(observations, noise)?.squeeze(0)?;
+        let distill_loss = mse(&actions, &self.flow_actions(observations, noise)?)?;
         let actions = actions.clamp(-1f32, 1f32)?;
         let q = batch.values_at(&self.networks.critic.detach(), &actions)?.mean(0)?;
         let mut q_loss = q.mean_all()?.neg()?;
@@ -188,8 +173,7 @@ impl Algorithm for Fql {
 
     /// The one-step policy, which chooses by the target critics.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let (candidates, aggregate) = (*self.config.candidates, self.config.target);
-        let choice = Choice { candidates, aggregate, rule: Rule::Best };
+        let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
         let (actor, critics) = (&self.networks.actor, &self.networks.critic.target);
         let shape = ActorCriticShape::of(actor, critics);
         let tensors = ActorCriticShape::tensors(actor, critics)?;

@@ -4,8 +4,7 @@
 //! its sample of the largest value.
 
 use super::align_iql::{Config, METRICS};
-use super::definition::{Definition, Reporting, read, start};
-use quad_policy::Rule;
+use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "idql",

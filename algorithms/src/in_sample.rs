@@ -2,19 +2,9 @@
 //! the target critics' smaller value, a Gaussian policy is cloned from the data with weights, and
 //! twin critics move toward r + γ·V(s'). An algorithm of this kind is an [`ImplicitLosses`].
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch};
-use super::definition::{Metric, metrics, read_with};
-use super::error::AgentError;
+use super::definition::read_with;
 use super::gaussian::Gaussian;
-use super::hyperparameters::{Positive, Rate, UnitInterval};
-use super::losses::{Loss, measured, smallest};
-use super::networks::{Initializer, TWIN, TrainState, WithTarget, networks, state_value};
-use super::state_dict::StateDict;
-use candle_core::{DType, Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors};
-use quad_policy::PolicyConfig;
-use serde::Deserialize;
+use super::prelude::*;
 use serde::de::DeserializeOwned;
 use toml::Table;
 
@@ -55,7 +45,6 @@ pub(super) struct Common {
     actor: MlpConfig,
     critic: MlpConfig,
     value: MlpConfig,
-    /// Discount γ.
     gamma: UnitInterval,
     actor_learning_rate: Positive,
     critic_learning_rate: Positive,

@@ -2,11 +2,8 @@
 //! Q-Learning"): a value function learned by expectile regression, and a Gaussian policy cloned
 //! from the data with advantages as weights. Equations are that paper's.
 
-use super::definition::{Definition, Metric, Reporting, start};
-use super::hyperparameters::{OpenUnit, Positive};
 use super::in_sample::{COSINE, Common, Helps, ImplicitLosses, InSample, read, table};
-use candle_core::{DType, Result, Tensor};
-use serde::Deserialize;
+use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "iql",
@@ -24,7 +21,6 @@ const METRICS: &[Metric] = &table(Helps {
     learning_rate: COSINE,
 });
 
-/// IQL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {

@@ -4,11 +4,8 @@
 //! SQL, sparse Q-learning, or EQL, exponential Q-learning. Equations are that paper's; where its
 //! authors' code does something else, docs/deviations.md says what holds.
 
-use super::definition::{Definition, Metric, Reporting, Variant, start};
-use super::hyperparameters::Positive;
 use super::in_sample::{COSINE, Common, Helps, ImplicitLosses, InSample, read, scale_down, table};
-use candle_core::{Result, Tensor};
-use serde::Deserialize;
+use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "ivr",
@@ -55,7 +52,6 @@ struct Alpha {
     exponential: Positive,
 }
 
-/// IVR's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {

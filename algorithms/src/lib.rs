@@ -6,7 +6,7 @@
 //! - [`Algorithm`]: the interface to the learner; [`Agent`]: an algorithm in training.
 //! - `networks`: networks with optimizers and targets, which an algorithm declares once;
 //!   `state_dict`; `losses`; `hyperparameters`: types that check themselves; `random`; `context`:
-//!   the data and settings of a run.
+//!   the data and settings of a run. `prelude` has the names of these for an algorithm's file.
 //! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
 //!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`. `fql` stands alone and is the one to read first.
 //!
@@ -42,6 +42,7 @@ mod networks;
 mod onestep;
 mod phases;
 mod pool;
+mod prelude;
 mod quad;
 mod random;
 mod rebrac;
@@ -88,8 +89,6 @@ pub const ALGORITHMS: &[Definition] = &[
 ];
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod golden;
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests;

@@ -3,21 +3,9 @@
 //! value Q^β is learned from the data's own next actions, and β is improved once. No value of the
 //! improved policy is ever asked for.
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch, select};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
-use super::error::AlgorithmError;
 use super::gaussian::{first_half_policy, log_density};
-use super::hyperparameters::{Count, Positive, Rate, Steps, UnitInterval};
 use super::in_sample::weighted;
-use super::losses::{Loss, measured};
-use super::networks::{Initializer, TrainState, WithTarget, networks};
-use super::phases::{first_steps, phase};
-use super::state_dict::StateDict;
-use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors, Weighted};
-use quad_policy::PolicyConfig;
-use serde::Deserialize;
+use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "onestep",
@@ -40,14 +28,12 @@ const METRICS: &[Metric] = &metrics! {
     clipped_share held_out: "Third phase: share of the batch, 0 to 1, whose weight is clipped at 100.";
 };
 
-/// Onestep-RL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     /// β's hidden layers, and π's.
     behavior: MlpConfig,
     critic: MlpConfig,
-    /// Discount γ.
     gamma: UnitInterval,
     /// Inverse temperature of the advantages.
     temperature: Positive,

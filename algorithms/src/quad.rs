@@ -9,20 +9,17 @@ mod metrics;
 mod noise;
 mod summary;
 
-use super::algorithm::Measured;
-use super::context::{Context, Minibatch};
-use super::definition::{Axis, Definition, Reporting, Variant, start};
+use super::definition::Axis;
 use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler};
-use super::losses::{Loss, largest};
-use super::state_dict::{StateDict, write};
-use candle_core::{Result, Tensor};
+use super::prelude::*;
+use super::state_dict::write;
 use candle_nn::loss::mse;
 use config::{Config, Guidance, TargetReduce};
 use guidance::{Averages, Guide};
 use metrics::METRICS;
 use noise::Noise;
-use quad_nn::{AdamStep, Reverse, Tensors, mean_and_variance};
-use quad_policy::{Choice, DiffusionPolicy, DiffusionShape};
+use quad_nn::{Reverse, mean_and_variance};
+use quad_policy::{DiffusionPolicy, DiffusionShape};
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "quad",
@@ -122,11 +119,11 @@ impl DiffusionUpdate for Quad {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
-        let decay = context.decay(step, *self.config.online_rate);
-        let clip = Some(*self.config.gradient_clip);
-        let adam = |rate: f32| AdamStep { rate: rate * decay, clip, count: step + 1 };
-        networks.critic.adam.set_step(adam(*self.config.critic_learning_rate))?;
-        networks.actor.adam.set_step(adam(*self.config.actor_learning_rate))
+        let (config, Networks { actor, critic }) = (&self.config, networks);
+        let decay = context.decay(step, *config.online_rate);
+        let adam = |rate| AdamStep::after(step, rate * decay).clipped(*config.gradient_clip);
+        critic.adam.set_step(adam(*config.critic_learning_rate))?;
+        actor.adam.set_step(adam(*config.actor_learning_rate))
     }
 
     /// Algorithm 1's loop, but for the target actor.

@@ -3,12 +3,8 @@
 //! critics, each with its own weight. Its update is CORL's, in which its authors published it;
 //! equations are that paper's.
 
-use super::definition::{Definition, Metric, Reporting, metrics, start};
-use super::hyperparameters::NotNegative;
-use super::losses::smallest;
+use super::prelude::*;
 use super::td3::{BcRegularizer, Common, Td3, read};
-use candle_core::{Result, Tensor};
-use serde::Deserialize;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "rebrac",
@@ -25,7 +21,6 @@ const METRICS: &[Metric] = &metrics! {
     bc_loss held_out: "Mean over the batch of Σ (π(s) − a)², summed over dimensions, in the policy's last step.";
 };
 
-/// ReBRAC's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {

@@ -3,26 +3,14 @@
 //! returns; then returns are planned anew with what the critic says of the clone's actions, and
 //! another critic learns these. The policy takes the best of the clone's samples.
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch, select};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
-use super::error::{AgentError, AlgorithmError, check};
-use super::hyperparameters::{Candidates, Count, Positive, Steps, UnitInterval};
-use super::losses::{Loss, measured};
-use super::networks::{Initializer, TrainState, networks};
-use super::phases::{first_steps, phase};
+use super::prelude::*;
 use super::random::{Purpose, stream};
 use super::returns::Returns;
-use super::state_dict::StateDict;
-use candle_core::{Device, Result, Tensor};
 use quad_dataset::Batch;
-use quad_nn::{
-    AdamStep, ContinuousNoise, DpmSolver, Ensemble, MlpConfig, ScoreNetwork, ScoreShape, Tensors,
-};
-use quad_policy::{Aggregate, Choice, PolicyConfig, Rule, ScorePolicy, ScorePolicyShape};
+use quad_nn::{ContinuousNoise, DpmSolver, ScoreNetwork, ScoreShape};
+use quad_policy::{ScorePolicy, ScorePolicyShape};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
-use serde::Deserialize;
 use std::ops::Range;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -45,14 +33,12 @@ const METRICS: &[Metric] = &metrics! {
     v_mean ["V"]: "Planning: mean over the step's states of V(s) = Σ softmax(Q/planning_temperature)·Q over actions of the clone, in units of the return.";
 };
 
-/// SfBC's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
     /// The score network's narrowing blocks.
     actor: MlpConfig,
     critic: MlpConfig,
-    /// Discount γ.
     gamma: UnitInterval,
     /// Evaluations of the score network for an action.
     evaluations: Count,
@@ -96,14 +82,15 @@ networks! {
     struct Networks(config: &Config, init) {
         /// ε_θ.
         actor: TrainState<ScoreNetwork> = {
-            let (observation_dim, action_dim) =
-                (init.context.observation_dim(), init.context.action_dim());
-            let shape = ScoreShape { observation_dim, action_dim, layers: config.actor.clone() };
+            let shape = ScoreShape {
+                observation_dim: init.context.observation_dim(),
+                action_dim: init.context.action_dim(),
+                layers: config.actor.clone(),
+            };
             // Of the stream behind the networks'. They are a function of the seed: no state.
-            let frequencies = init.context.random_for(Purpose::Weights, 2).vector(
-                "frequencies",
-                |generator| ScoreShape::frequencies(generator)?.to_vec1::<f32>(),
-            )?;
+            let mut random = init.context.random_for(Purpose::Weights, 2);
+            let draw = |generator: &mut _| ScoreShape::frequencies(generator)?.to_vec1::<f32>();
+            let frequencies = random.vector("frequencies", draw)?;
             let frequencies = Tensor::new(frequencies, &Device::Cpu)?;
             init.network(&shape.layout(), |weights| ScoreNetwork::new(shape, weights, frequencies))
         },
@@ -177,8 +164,8 @@ impl Sfbc {
         adam: AdamStep,
     ) -> Result<Measured> {
         let indices = Tensor::from_slice(indices, indices.len(), &Device::Cpu)?;
-        let targets =
-            self.returns.targets.index_select(&indices, 0)?.to_device(&self.context.device)?;
+        let targets = self.returns.targets.index_select(&indices, 0)?;
+        let targets = targets.to_device(&self.context.device)?;
         let loss = batch.critic_loss(&self.networks.critic, &targets)?;
         self.networks.critic.minimize(&loss.value, adam)?;
         measured(&[loss])
@@ -198,13 +185,12 @@ impl Sfbc {
     /// Keeps V(s) = Σ softmax(Q/temperature)·Q over S actions of the clone, in units of the return,
     /// for the states in a range.
     fn value(&mut self, states: Range<usize>) -> Result<()> {
-        let (first, count, Networks { actor, critic }) =
-            (states.start, states.len(), &self.networks);
+        let (first, Networks { actor, critic }) = (states.start, &self.networks);
         let rows = &self.rows[states];
         let observations = self.context.batch(rows)?.observations;
         let solver = DpmSolver::new(*self.config.evaluations);
         let actions = actor.sample(&solver, &observations, &self.noise(rows)?)?;
-        let q = critic.detach().values(&observations, &actions)?.reshape((count, ()))?;
+        let q = critic.detach().values(&observations, &actions)?.reshape((rows.len(), ()))?;
         let exponents = q.broadcast_sub(&q.max_keepdim(1)?)?;
         let weights = (exponents / f64::from(*self.config.planning_temperature))?.exp()?;
         let values = ((&weights * q)?.sum(1)? / weights.sum(1)?)?;
@@ -216,12 +202,11 @@ impl Sfbc {
         let (count, a) = (*self.config.samples, self.context.action_dim());
         let of = |row: &u32| {
             let mut generator = stream(self.context.seed, Purpose::Actions, u64::from(*row));
-            (0..count * a).map(move |_| StandardNormal.sample(&mut generator))
+            (0..count * a).map(move |_| -> f32 { StandardNormal.sample(&mut generator) })
         };
-        let numbers = self
-            .context
-            .random_for(Purpose::Actions, 0)
-            .vector("planning_noise", |_| Ok(rows.iter().flat_map(of).collect::<Vec<f32>>()))?;
+        let mut random = self.context.random_for(Purpose::Actions, 0);
+        let numbers =
+            random.vector("planning_noise", |_| Ok(rows.iter().flat_map(of).collect()))?;
         Tensor::from_vec(numbers, (rows.len() * count, a), &self.context.device)
     }
 }
@@ -241,9 +226,9 @@ impl Algorithm for Sfbc {
         let of_actor = AdamStep::after(steps, *self.config.actor_learning_rate);
         let of_critic = AdamStep::after(steps, *self.config.critic_learning_rate);
         if phase == 2 {
-            let length = u128::from(first_steps[3] - first_steps[2]);
-            let before =
-                |steps: u64| (u128::from(steps) * self.rows.len() as u128 / length) as usize;
+            let [rows, length] =
+                [self.rows.len() as u64, first_steps[3] - first_steps[2]].map(u128::from);
+            let before = |steps: u64| (u128::from(steps) * rows / length) as usize;
             return self.plan(before(steps)..before(steps + 1));
         }
         let batch = self.context.batch(&select(&self.rows, indices))?;
@@ -266,8 +251,7 @@ impl Algorithm for Sfbc {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let (temperature, actions) = (*self.config.temperature, *self.config.averaged);
         let rule = Rule::Average { temperature, actions };
-        let (candidates, aggregate) = (*self.config.candidates, Aggregate::Mean);
-        let choice = Choice { candidates, aggregate, rule };
+        let choice = Choice::new(*self.config.candidates, Aggregate::Mean, rule);
         let shape = ScorePolicyShape {
             observation_dim: self.context.observation_dim(),
             action_dim: self.context.action_dim(),

@@ -143,7 +143,6 @@ fn log_density(u: &Tensor, noise: &Tensor, log_std: &Tensor) -> Result<Tensor> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use candle_core::Device;

@@ -2,19 +2,12 @@
 //! TD3+BC and ReBRAC. Critics move in every step, the policy and the targets in every
 //! `actor_every`-th. An algorithm of this kind is a [`BcRegularizer`].
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch, select};
 use super::definition::read_with;
-use super::error::{AgentError, AlgorithmError};
 use super::gaussian::gaussian_policy;
-use super::hyperparameters::{NotNegative, Positive, Rate, Steps, UnitInterval};
-use super::losses::{Loss, joined, measured, smallest};
-use super::networks::{Initializer, TWIN, WithTarget, networks};
-use super::state_dict::{StateDict, write};
-use candle_core::{DType, Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors};
-use quad_policy::{PolicyConfig, Spread, gaussian_mean};
-use serde::Deserialize;
+use super::losses::joined;
+use super::prelude::*;
+use super::state_dict::write;
+use quad_policy::{Spread, gaussian_mean};
 use serde::de::DeserializeOwned;
 use toml::Table;
 
@@ -23,7 +16,6 @@ use toml::Table;
 pub(super) struct Common {
     actor: MlpConfig,
     critic: MlpConfig,
-    /// Discount γ.
     gamma: UnitInterval,
     /// Standard deviation of the noise in the targets' actions, and its largest size.
     target_noise: NotNegative,

@@ -2,11 +2,8 @@
 //! whose policy also stays near the data's actions. Its update is its authors' code's; equations
 //! are that paper's.
 
-use super::definition::{Definition, Metric, Reporting, metrics, start};
-use super::hyperparameters::Positive;
+use super::prelude::*;
 use super::td3::{BcRegularizer, Common, Td3, read};
-use candle_core::{Result, Tensor};
-use serde::Deserialize;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "td3-bc",
@@ -23,7 +20,6 @@ const METRICS: &[Metric] = &metrics! {
     bc_loss held_out: "Mean over batch and dimensions of (π(s) − a)², in the policy's last step.";
 };
 
-/// TD3+BC's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {

@@ -3,12 +3,8 @@
 //! data, β·ln E exp(Q/β), without a sample of a policy. What its authors' scripts add for single
 //! datasets is in `pairs` and `value_steps`.
 
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, start};
-use super::hyperparameters::{Count, NotNegative, Positive};
 use super::in_sample::{Common, Helps, ImplicitLosses, InSample, read, scale_down, table};
-use candle_core::{Result, Tensor};
-use serde::Deserialize;
+use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "xql",
@@ -29,7 +25,6 @@ const METRICS: &[Metric] = &table(Helps {
     learning_rate: "The actor's learning rate; falls to 0 along a cosine, and is constant with practice or if actor_rate_decays is false.",
 });
 
-/// XQL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {

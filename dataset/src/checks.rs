@@ -1,7 +1,7 @@
 //! Checks that refuse a dataset before training.
 
-use crate::error::Problem;
-use crate::recording::{Recording, RowKind};
+use crate::error::{Problem, RowProblem};
+use crate::recording::Recording;
 use crate::tables::environment::EnvironmentSpec;
 
 /// Distance outside [-1, 1] that rounding explains; such actions are clipped.
@@ -27,38 +27,36 @@ pub(crate) fn problems(
     environment: Option<&EnvironmentSpec>,
 ) -> Vec<Problem> {
     let rows = recording.rows();
+    let (o, a) = (recording.observation_dim, recording.action_dim);
     let mut problems = Vec::new();
     if recording.transitions().next().is_none() {
-        problems.push(Problem::NoTransitions { rows });
+        problems.push(Problem::NoTransitions(rows));
     }
-    if let Some(environment) = environment {
-        let width = |array, found, expected| {
-            let environment = environment.name.clone();
-            (found != expected && rows > 0).then_some(Problem::Width {
-                array,
-                found,
-                expected,
-                environment,
-            })
-        };
-        problems.extend(width(
-            "observations",
-            recording.observation_dim,
-            environment.observation_dim,
-        ));
-        problems.extend(width("actions", recording.action_dim, environment.action_dim));
+    if let Some(spec) = environment.filter(|_| rows > 0) {
+        let found = [("observations", o, spec.observation_dim), ("actions", a, spec.action_dim)];
+        for (array, found, expected) in found.into_iter().filter(|(_, found, dim)| found != dim) {
+            let environment = spec.name.clone();
+            problems.push(Problem::Width(array, found, environment, expected));
+        }
     }
-    let (o, a) = (recording.observation_dim, recording.action_dim);
     let next_observations = recording.next_observations.as_deref().unwrap_or_default();
-    let is_step = |row: usize| recording.kinds[row] != RowKind::LastState;
-    problems.extend(not_finite(recording, "observations", &recording.observations, o, |_| true));
-    problems.extend(not_finite(recording, "next_observations", next_observations, o, |_| true));
-    problems.extend(not_finite(recording, "actions", &recording.actions, a, is_step));
-    problems.extend(not_finite(recording, "rewards", &recording.rewards, 1, is_step));
+    for (column, values, width) in [
+        ("observations", &*recording.observations, o),
+        ("next_observations", next_observations, o),
+        ("actions", &recording.actions, a),
+        ("rewards", &recording.rewards, 1),
+    ] {
+        // A final state has nothing but an observation.
+        let wrong = of_numbers(values, width, |row, value| {
+            let counts = column == "observations" || recording.is_step(row);
+            (counts && !value.is_finite()).then_some(RowProblem::NotFinite(value))
+        });
+        problems.extend(first(recording, column, wrong));
+    }
     problems.extend(strays(recording).and_then(|(problem, refused)| refused.then_some(problem)));
     let limit = environment.map_or(0, |environment| environment.max_episode_steps);
     if rows > limit && !recording.ends.contains(&true) && !recording.terminals.contains(&true) {
-        problems.push(Problem::Endless { rows });
+        problems.push(Problem::Endless(rows));
     }
     problems
 }
@@ -66,48 +64,42 @@ pub(crate) fn problems(
 /// Rows whose stored next observation is not the following row's, and true if they are refused.
 /// D4RL files are refused above [`MOST_STRAYS`], because training uses the following row.
 pub(crate) fn strays(recording: &Recording) -> Option<(Problem, bool)> {
-    let unused = recording.unused_next_observations.as_ref();
-    let stored = recording.next_observations.as_ref().or(unused)?;
-    let mut strays = recording.inside().filter(|&row| recording.jumps(stored, row));
-    let (row, rows) = (strays.next()?, 1 + strays.count());
-    let refused = unused.is_some() && rows as f64 > MOST_STRAYS * recording.inside().count() as f64;
-    Some((Problem::Stray { row, rows }, refused))
-}
-
-fn not_finite(
-    recording: &Recording,
-    column: &str,
-    values: &[f32],
-    width: usize,
-    counts: impl Fn(usize) -> bool,
-) -> Option<Problem> {
-    let (row, value, rows) = first(values, width, |row, value| counts(row) && !value.is_finite())?;
-    let (array, row) = recording.place(column, row);
-    Some(Problem::NotFinite { array, row, value, rows })
+    let strays = Vec::from_iter(recording.inside().filter(|&row| recording.jumps(row)));
+    let most = MOST_STRAYS * recording.inside().count() as f64;
+    let refused = recording.unused_next_observations.is_some() && strays.len() as f64 > most;
+    let wrong = strays.into_iter().map(|row| (row, RowProblem::Stray));
+    Some((first(recording, "next_observations", wrong)?, refused))
 }
 
 /// Actions outside [-1, 1]; refused unless actions are normalized.
 pub(crate) fn actions_outside(recording: &Recording) -> Option<Problem> {
-    let is_outside = |row: usize, value: f32| {
-        let is_step = recording.kinds[row] != RowKind::LastState;
-        is_step && value.is_finite() && value.abs() > 1.0 + ACTION_TOLERANCE
-    };
-    let (row, value, rows) = first(&recording.actions, recording.action_dim, is_outside)?;
-    let (array, row) = recording.place("actions", row);
-    Some(Problem::ActionOutside { array, row, value, rows })
+    let outside = of_numbers(&recording.actions, recording.action_dim, |row, value| {
+        let is_outside = value.is_finite() && value.abs() > 1.0 + ACTION_TOLERANCE;
+        (recording.is_step(row) && is_outside).then_some(RowProblem::ActionOutside(value))
+    });
+    first(recording, "actions", outside)
 }
 
-/// Row and value of the first wrong number, and the count of such rows.
-fn first(
+/// Each row with a wrong number, and the problem of the first.
+fn of_numbers(
     values: &[f32],
     width: usize,
-    is_wrong: impl Fn(usize, f32) -> bool,
-) -> Option<(usize, f32, usize)> {
-    let wrong_in = |(row, values): (usize, &[f32])| {
-        let value = values.iter().find(|&&value| is_wrong(row, value))?;
-        Some((row, *value))
-    };
-    let mut wrong = values.chunks_exact(width.max(1)).enumerate().filter_map(wrong_in);
-    let (row, value) = wrong.next()?;
-    Some((row, value, 1 + wrong.count()))
+    problem: impl Fn(usize, f32) -> Option<RowProblem>,
+) -> impl Iterator<Item = (usize, RowProblem)> {
+    let rows = values.chunks_exact(width.max(1)).enumerate();
+    rows.filter_map(move |(row, values)| {
+        Some((row, values.iter().find_map(|value| problem(row, *value))?))
+    })
+}
+
+/// The problem of the first of some wrong rows, with their number.
+pub(crate) fn first(
+    recording: &Recording,
+    column: &str,
+    mut wrong: impl Iterator<Item = (usize, RowProblem)>,
+) -> Option<Problem> {
+    let (row, problem) = wrong.next()?;
+    let rows = 1 + wrong.count();
+    let (array, row) = recording.place(column, row);
+    Some(Problem::Rows { array, row, rows, problem })
 }

@@ -22,7 +22,7 @@ mod tables;
 mod transitions;
 mod warnings;
 
-pub use error::{DatasetError, Load, Problem};
+pub use error::{ArrayProblem, DatasetError, Load, Problem, RowProblem};
 pub use formats::arrays::{Arrays, write_own};
 pub use formats::d4rl_writer::{D4rlWriter, Metadata, write_practice};
 pub use formats::hdf5_file::hdf5_library;

@@ -2,6 +2,7 @@ use quad_kernels::scaling::{Affine, Scaling};
 use serde::{Deserialize, Serialize};
 
 use crate::recording::{Recording, RowKind};
+use crate::statistics::Figures;
 use crate::tables::reward::RewardScaling;
 
 /// Columns to normalize before training. Files list them by name, in any order.
@@ -26,21 +27,18 @@ enum Column {
 
 impl From<Vec<Column>> for Normalize {
     fn from(columns: Vec<Column>) -> Self {
-        let [actions, observations, rewards] =
-            [Column::Actions, Column::Observations, Column::Rewards]
-                .map(|column| columns.contains(&column));
-        Self { actions, observations, rewards }
+        let is = |column| columns.contains(&column);
+        let (actions, observations) = (is(Column::Actions), is(Column::Observations));
+        Self { actions, observations, rewards: is(Column::Rewards) }
     }
 }
 
 impl From<Normalize> for Vec<Column> {
     fn from(Normalize { actions, observations, rewards }: Normalize) -> Self {
-        let columns = [
-            (actions, Column::Actions),
-            (observations, Column::Observations),
-            (rewards, Column::Rewards),
-        ];
-        columns.into_iter().filter_map(|(is, column)| is.then_some(column)).collect()
+        let actions = actions.then_some(Column::Actions);
+        let observations = observations.then_some(Column::Observations);
+        let rewards = rewards.then_some(Column::Rewards);
+        actions.into_iter().chain(observations).chain(rewards).collect()
     }
 }
 
@@ -50,73 +48,51 @@ impl Normalize {
     pub(crate) fn scaling(self, recording: &Recording, rule: RewardScaling) -> Scaling {
         let Recording { observation_dim, action_dim, observations, actions, kinds, .. } = recording;
         let is_transition = |row: usize| kinds[row] == RowKind::Transition;
-        let is_step = |row: usize| kinds[row] != RowKind::LastState;
+        let is_step = |row: usize| recording.is_step(row);
+        let states = || standard_units(observations, *observation_dim, is_transition);
+        let actions = || unit_ranges(&Figures::of_columns(actions, *action_dim, is_step));
+        let size = self.rewards.then(|| rule.size(recording) as f32);
         Scaling {
-            observations: self
-                .observations
-                .then(|| affine(observations, *observation_dim, is_transition, standard)),
-            actions: self.actions.then(|| affine(actions, *action_dim, is_step, unit_range)),
+            observations: self.observations.then(states),
+            actions: self.actions.then(actions),
             // All-zero rewards stay unscaled.
-            rewards: self.rewards.then(|| rule.size(recording) as f32).filter(|size| *size > 0.0),
+            rewards: size.filter(|size| *size > 0.0),
         }
     }
-}
-
-pub(crate) fn standard_units(
-    values: &[f32],
-    width: usize,
-    counts: impl Fn(usize) -> bool,
-) -> Affine {
-    affine(values, width, counts, standard)
 }
 
 pub(crate) fn apply(scaling: &Scaling, recording: &mut Recording) {
     if let Some(affine) = &scaling.observations {
         affine.to_network(&mut recording.observations);
-        affine.to_network(recording.next_observations.as_deref_mut().unwrap_or_default());
+        let next = recording.next_observations.as_deref_mut();
+        affine.to_network(next.unwrap_or_default());
     }
     if let Some(affine) = &scaling.actions {
         affine.to_network(&mut recording.actions);
     }
 }
 
-/// Map of each column by the offset and scale that `of` computes from the rows that count.
-fn affine(
+/// Map of each column to mean 0 and standard deviation 1 in the rows that count. A column that is
+/// constant, in float32, has scale 0.
+pub(crate) fn standard_units(
     values: &[f32],
     width: usize,
     counts: impl Fn(usize) -> bool,
-    of: fn(&[f64]) -> (f64, f64),
 ) -> Affine {
-    let column = |column: usize| {
-        let values = values.iter().skip(column).step_by(width).enumerate();
-        let values: Vec<f64> =
-            values.filter(|(row, _)| counts(*row)).map(|(_, value)| f64::from(*value)).collect();
-        let (offset, scale) = of(&values);
-        // The scale is 0 if the column is constant in float32.
-        (offset as f32, scale as f32)
+    let of = |figures: &Figures| match figures.min == figures.max {
+        true => (figures.min as f32, 0.0), // By rounding, the deviation might not be 0.
+        false => (figures.mean as f32, figures.deviation as f32),
     };
-    let (offset, scale) = (0..width).map(column).unzip();
+    let columns = Figures::of_columns(values, width, counts);
+    let (offset, scale) = columns.iter().map(of).unzip();
     Affine { offset, scale }
 }
 
-fn standard(values: &[f64]) -> (f64, f64) {
-    let (min, max) = range(values);
-    if min == max {
-        return (min, 0.0); // By rounding, the deviation might not be 0.
-    }
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
-    let variance = values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count;
-    (mean, variance.sqrt())
-}
-
-fn unit_range(values: &[f64]) -> (f64, f64) {
-    let (min, max) = range(values);
-    ((min + max) / 2.0, (max - min) / 2.0)
-}
-
-fn range(values: &[f64]) -> (f64, f64) {
-    values
-        .iter()
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(min, max), &x| (x.min(min), x.max(max)))
+/// Map of each column from its range to [-1, 1].
+fn unit_ranges(columns: &[Figures]) -> Affine {
+    let of = |Figures { min, max, .. }: &Figures| {
+        (((min + max) / 2.0) as f32, ((max - min) / 2.0) as f32)
+    };
+    let (offset, scale) = columns.iter().map(of).unzip();
+    Affine { offset, scale }
 }

@@ -1,6 +1,6 @@
 //! Episodes of practice.
 
-use crate::error::Problem;
+use crate::error::{ArrayProblem, Problem};
 use crate::recording::{Recording, RowKind};
 
 /// An episode of practice of n steps, in the environment's units.
@@ -24,30 +24,29 @@ impl PracticeRows<'_> {
             [("observations", self.observations, n + 1, o), ("actions", self.actions, n, a)];
         for (array, numbers, rows, width) in arrays {
             if numbers.len() != rows * width {
-                let (array, found) = (array.to_owned(), numbers.len());
-                return Err(Problem::Numbers { array, found, rows, width });
+                return Err(ArrayProblem::Shape(vec![numbers.len()], [rows, width]).of(array));
             }
         }
-        if n == 0 { Err(Problem::NoTransitions { rows: 0 }) } else { Ok(n) }
+        if n == 0 { Err(Problem::NoTransitions(0)) } else { Ok(n) }
     }
 
     /// The steps and the last state as n + 1 rows.
     pub(crate) fn recording(&self, o: usize, a: usize) -> Result<Recording, Problem> {
         let n = self.steps(o, a)?;
-        let padded = |numbers: &[f32], width: usize| [numbers, &vec![0.0; width]].concat();
-        let only_last = |flag: bool| Vec::from_iter((0..=n).map(|row| flag && row + 1 == n));
-        let mut kinds = vec![RowKind::Transition; n];
-        kinds.push(RowKind::LastState);
-        Ok(Recording {
+        let only_last = |flag: bool| Vec::from_iter((1..=n).map(|step| flag && step == n));
+        let mut recording = Recording {
             observation_dim: o,
             action_dim: a,
             observations: self.observations.to_vec(),
-            actions: padded(self.actions, a),
-            rewards: padded(self.rewards, 1),
-            kinds,
+            actions: self.actions.to_vec(),
+            rewards: self.rewards.to_vec(),
+            kinds: vec![RowKind::Transition; n],
             terminals: only_last(self.terminated),
+            timeouts: vec![false; n],
             ends: only_last(true),
             ..Recording::default()
-        })
+        };
+        recording.push_last_state();
+        Ok(recording)
     }
 }

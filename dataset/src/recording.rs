@@ -1,5 +1,5 @@
 use crate::rounding::Rounding;
-use crate::statistics::{Episode, returns};
+use crate::statistics::Episode;
 
 /// Largest difference between two copies of the same observation.
 const SAME_OBSERVATION: f64 = 1e-6;
@@ -59,16 +59,33 @@ impl Recording {
     }
 
     pub(crate) fn observation(&self, row: usize) -> &[f32] {
-        &self.observations[row * self.observation_dim..(row + 1) * self.observation_dim]
+        self.row_of(&self.observations, row)
     }
 
     pub(crate) fn action(&self, row: usize) -> &[f32] {
         &self.actions[row * self.action_dim..(row + 1) * self.action_dim]
     }
 
-    pub(crate) fn transitions(&self) -> impl Iterator<Item = u32> {
-        let kinds = self.kinds.iter().zip(0..);
-        kinds.filter(|(kind, _)| **kind == RowKind::Transition).map(|(_, row)| row)
+    /// State after a row's step.
+    pub(crate) fn next_observation(&self, row: usize) -> &[f32] {
+        match &self.next_observations {
+            Some(stored) => self.row_of(stored, row),
+            None => self.observation(row + 1),
+        }
+    }
+
+    fn row_of<'a>(&self, observations: &'a [f32], row: usize) -> &'a [f32] {
+        &observations[row * self.observation_dim..(row + 1) * self.observation_dim]
+    }
+
+    /// True if an action is taken in a row; false in an episode's final state, and after the end.
+    pub(crate) fn is_step(&self, row: usize) -> bool {
+        row < self.rows() && self.kinds[row] != RowKind::LastState
+    }
+
+    /// Rows that start a transition.
+    pub(crate) fn transitions(&self) -> impl Iterator<Item = usize> {
+        (0..self.rows()).filter(|&row| self.kinds[row] == RowKind::Transition)
     }
 
     /// True where the episode has reached its goal in an earlier row.
@@ -86,7 +103,7 @@ impl Recording {
     pub(crate) fn episodes(&self) -> Vec<Episode> {
         let mut episodes = Vec::new();
         let mut open = Episode::default();
-        for row in (0..self.rows()).filter(|&row| self.kinds[row] != RowKind::LastState) {
+        for row in (0..self.rows()).filter(|&row| self.is_step(row)) {
             open.push(f64::from(self.rewards[row]), self.goal);
             if self.ends[row] {
                 episodes.push(std::mem::take(&mut open));
@@ -99,41 +116,54 @@ impl Recording {
     /// Returns of trajectories as the locomotion rule defines them: runs of transitions up to a
     /// terminal, the end of an episode, or a discontinuity.
     pub(crate) fn trajectory_returns(&self) -> Vec<f64> {
-        let following = self.transitions().skip(1).map(Some).chain([None]);
-        let rows = self.transitions().zip(following).map(|(row, following)| {
-            let row = row as usize;
-            let ends = self.terminals[row]
-                || self.ends[row]
-                || following.is_none_or(|following| !self.continues(row, following as usize));
-            (self.rewards[row], ends)
-        });
-        returns(rows)
+        let mut rows = self.transitions().peekable();
+        let (mut returns, mut open) = (Vec::new(), 0.0);
+        while let Some(row) = rows.next() {
+            open += f64::from(self.rewards[row]);
+            let goes_on = rows.peek().is_some_and(|next| self.continues(row, *next));
+            if self.terminals[row] || self.ends[row] || !goes_on {
+                returns.push(std::mem::take(&mut open));
+            }
+        }
+        returns
     }
 
     pub(crate) fn inside(&self) -> impl Iterator<Item = usize> {
         let last = self.rows().saturating_sub(1);
-        (0..last).filter(|&row| self.kinds[row] != RowKind::LastState && !self.ends[row])
+        (0..last).filter(|&row| self.is_step(row) && !self.ends[row])
     }
 
     /// True if the following row is the next step of the episode and starts in `row`'s next state.
     pub(crate) fn goes_on(&self, row: usize) -> bool {
-        let ends = self.ends[row] || self.terminals[row] || self.kinds[row] == RowKind::LastState;
-        let is_step = self.kinds.get(row + 1).is_some_and(|kind| *kind != RowKind::LastState);
-        !ends
-            && is_step
-            && !self.next_observations.as_ref().is_some_and(|next| self.jumps(next, row))
+        let ends = self.ends[row] || self.terminals[row];
+        let are_steps = self.is_step(row) && self.is_step(row + 1);
+        are_steps && !ends && !(self.next_observations.is_some() && self.jumps(row))
     }
 
     /// True if `following`, the next transition after `row`, starts in its next state.
     fn continues(&self, row: usize, following: usize) -> bool {
-        following == row + 1
-            || !differ(self.observation(following), self.observation(row + 1), Rounding::default())
+        let (start, next) = (self.observation(following), self.observation(row + 1));
+        following == row + 1 || !differ(start, next, Rounding::default())
     }
 
     /// True if a row's stored next observation differs from the following row's observation.
-    pub(crate) fn jumps(&self, next_observations: &[f32], row: usize) -> bool {
-        let next = &next_observations[row * self.observation_dim..(row + 1) * self.observation_dim];
-        row + 1 < self.rows() && differ(next, self.observation(row + 1), self.rounding)
+    pub(crate) fn jumps(&self, row: usize) -> bool {
+        let unused = self.unused_next_observations.as_ref();
+        let stored = self.next_observations.as_ref().or(unused);
+        stored.filter(|_| row + 1 < self.rows()).is_some_and(|stored| {
+            let (next, following) = (self.row_of(stored, row), self.observation(row + 1));
+            differ(next, following, self.rounding)
+        })
+    }
+
+    /// Appends a final state to all columns but the observations.
+    pub(crate) fn push_last_state(&mut self) {
+        self.actions.resize(self.actions.len() + self.action_dim, 0.0);
+        self.rewards.push(0.0);
+        self.kinds.push(RowKind::LastState);
+        for flags in [&mut self.terminals, &mut self.timeouts, &mut self.ends] {
+            flags.push(false);
+        }
     }
 
     /// Path of the array that holds `row` of a column, and the index there.
@@ -146,8 +176,9 @@ impl Recording {
 }
 
 fn differ(a: &[f32], b: &[f32], rounding: Rounding) -> bool {
-    let apart = a.iter().zip(b).filter(|(a, b)| !rounding.explains(**a, **b));
-    apart.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt() > SAME_OBSERVATION
+    let pairs = a.iter().zip(b).filter(|(a, b)| !rounding.explains(**a, **b));
+    let square: f64 = pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum();
+    square.sqrt() > SAME_OBSERVATION
 }
 
 #[cfg(test)]
@@ -174,8 +205,9 @@ pub(crate) mod tests {
     #[test]
     fn rows_are_found_again_in_their_part() {
         let mut recording = recording(&[RowKind::Transition; 6]);
-        assert_eq!(recording.place("rewards", 4), ("rewards".to_owned(), 4));
+        let found = |recording: &Recording| recording.place("rewards", 4);
+        assert_eq!(found(&recording), ("rewards".to_owned(), 4));
         recording.parts = vec![(0, "episode_0".to_owned()), (3, "episode_1".to_owned())];
-        assert_eq!(recording.place("rewards", 4), ("episode_1/rewards".to_owned(), 1));
+        assert_eq!(found(&recording), ("episode_1/rewards".to_owned(), 1));
     }
 }

@@ -11,10 +11,11 @@ pub(crate) struct Rounding {
 }
 
 impl Rounding {
-    /// Tolerance of float16 if exactly one of the arrays was rounded, else 0.
-    pub(crate) fn between(one: &[f32], other: &[f32]) -> Self {
+    /// Tolerance of float16 if there are two arrays of which one was rounded, else 0.
+    pub(crate) fn between(one: &[f32], other: Option<&Vec<f32>>) -> Self {
         let is_half = |values: &[f32]| values.iter().all(|x| x.to_bits() & HALF == 0);
-        Self { relative: if is_half(one) != is_half(other) { DISTANCE } else { 0.0 } }
+        let is_one = other.is_some_and(|other| is_half(one) != is_half(other));
+        Self { relative: if is_one { DISTANCE } else { 0.0 } }
     }
 
     pub(crate) fn explains(self, one: f32, other: f32) -> bool {

@@ -1,19 +1,41 @@
-/// Minimum, mean and maximum; NaN without numbers.
+/// Figures of some numbers; NaN without numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Extent {
+pub(crate) struct Figures {
     pub(crate) min: f64,
     pub(crate) mean: f64,
     pub(crate) max: f64,
+    pub(crate) deviation: f64,
+    /// Root mean square.
+    pub(crate) size: f64,
 }
 
-impl Extent {
-    pub(crate) fn of(values: impl Iterator<Item = f64>) -> Self {
-        let (mut count, mut sum, mut min, mut max) = (0.0, 0.0, f64::NAN, f64::NAN);
-        for value in values {
-            (count, sum) = (count + 1.0, sum + value);
-            (min, max) = (value.min(min), value.max(max));
+impl Figures {
+    pub(crate) fn of(values: &[f64]) -> Self {
+        let count = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / count;
+        let square_around =
+            |center: f64| values.iter().map(|x| (x - center).powi(2)).sum::<f64>() / count;
+        Self {
+            min: values.iter().copied().fold(f64::NAN, f64::min),
+            mean,
+            max: values.iter().copied().fold(f64::NAN, f64::max),
+            deviation: square_around(mean).sqrt(),
+            size: square_around(0.0).sqrt(),
         }
-        Self { min, mean: sum / count, max }
+    }
+
+    /// Figures of each column's finite numbers in the rows that count.
+    pub(crate) fn of_columns(
+        values: &[f32],
+        width: usize,
+        counts: impl Fn(usize) -> bool,
+    ) -> Vec<Self> {
+        let column = |column: usize| {
+            let values = values.iter().skip(column).step_by(width).enumerate();
+            let values = values.filter(|(row, value)| counts(*row) && value.is_finite());
+            Self::of(&Vec::from_iter(values.map(|(_, value)| f64::from(*value))))
+        };
+        (0..width).map(column).collect()
     }
 }
 
@@ -33,20 +55,4 @@ impl Episode {
         }
         self.reached |= goal && reward > 0.0;
     }
-}
-
-/// Undiscounted returns of pairs (reward, end of episode), including an unfinished last episode.
-pub(crate) fn returns(rewards: impl Iterator<Item = (f32, bool)>) -> Vec<f64> {
-    let mut finished = Vec::new();
-    let mut open = None;
-    for (reward, ends) in rewards {
-        let sum = open.take().unwrap_or(0.0) + f64::from(reward);
-        if ends {
-            finished.push(sum);
-        } else {
-            open = Some(sum);
-        }
-    }
-    finished.extend(open);
-    finished
 }

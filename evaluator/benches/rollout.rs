@@ -26,13 +26,16 @@ const STEPS: usize = 4;
 fn policies() -> impl Iterator<Item = (&'static str, Box<dyn Policy>)> {
     let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[256; 3]), 10, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
-    let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(CANDIDATES) };
+    let choice = Choice::best_of(CANDIDATES);
+    let policy = PolicyConfig::Diffusion { shape, choice };
     let initial = |layout: &Layout| Weights::initial(layout, &mut generator, &Device::Cpu);
     let tensors = policy.tensors(initial).expect("weights");
     let file = Header::new(policy, ()).to_safetensors(&tensors).expect("finite weights");
     let precisions = [Precision::F32, Precision::Bf16].into_iter();
-    precisions.filter(|precision| precision.is_available()).map(move |precision| {
-        (precision.name(), load_policy(&file, precision).expect("a policy's file"))
+    let available = precisions.filter(|precision| precision.is_available());
+    available.map(move |precision| {
+        let policy = load_policy(&file, precision).expect("a policy's file");
+        (precision.name(), policy)
     })
 }
 

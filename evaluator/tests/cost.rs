@@ -37,21 +37,19 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-const OBSERVATION_DIM: usize = 11;
-const ACTION_DIM: usize = 3;
+const SIZES: (usize, usize) = (11, 3);
 
 fn diffusion(hidden: usize, critics: usize, steps: usize, choice: Choice) -> PolicyConfig {
     let layers = MlpConfig::mish(&[hidden; 3]);
-    let sizes = (OBSERVATION_DIM, ACTION_DIM);
-    let mut shape = DiffusionShape::quad(sizes, &layers, critics, steps);
+    let mut shape = DiffusionShape::quad(SIZES, &layers, critics, steps);
     shape.value = (choice.rule == Rule::Nearest).then_some(layers);
     PolicyConfig::Diffusion { shape, choice }
 }
 
 fn gaussian(hidden: usize) -> PolicyConfig {
     let shape = GaussianShape {
-        observation_dim: OBSERVATION_DIM,
-        action_dim: ACTION_DIM,
+        observation_dim: SIZES.0,
+        action_dim: SIZES.1,
         actor: MlpConfig::mish(&[hidden; 3]),
         spread: Spread::None,
     };
@@ -63,8 +61,8 @@ fn squashed(hidden: usize, norm: bool) -> PolicyConfig {
     let mut critic = actor.clone();
     critic.norm = norm;
     let shape = ActorCriticShape {
-        observation_dim: OBSERVATION_DIM,
-        action_dim: ACTION_DIM,
+        observation_dim: SIZES.0,
+        action_dim: SIZES.1,
         actor,
         critic,
         critics: 2,
@@ -75,8 +73,8 @@ fn squashed(hidden: usize, norm: bool) -> PolicyConfig {
 
 fn score(widths: &[usize], candidates: u32) -> PolicyConfig {
     let shape = ScorePolicyShape {
-        observation_dim: OBSERVATION_DIM,
-        action_dim: ACTION_DIM,
+        observation_dim: SIZES.0,
+        action_dim: SIZES.1,
         actor: MlpConfig::mish(widths),
         critic: MlpConfig::mish(&[8]),
         evaluations: 4,
@@ -92,14 +90,20 @@ fn diffuser(
     attention: Option<[usize; 2]>,
     plans: u32,
 ) -> PolicyConfig {
-    let attention = attention.map(|[heads, width]| Attention { heads, width });
-    let multipliers = multipliers.to_vec();
+    let network = TrajectoryConfig {
+        horizon,
+        channels,
+        multipliers: multipliers.to_vec(),
+        groups: 8,
+        attention: attention.map(|[heads, width]| Attention { heads, width }),
+    };
+    let guidance = ValueGuidance { steps: 1, scale: 0.1, stop: 0 };
     let shape = DiffuserShape {
-        observation_dim: OBSERVATION_DIM,
-        action_dim: ACTION_DIM,
-        network: TrajectoryConfig { horizon, channels, multipliers, groups: 8, attention },
+        observation_dim: SIZES.0,
+        action_dim: SIZES.1,
+        network,
         diffusion_steps: 3,
-        guidance: ValueGuidance { steps: 1, scale: 0.1, stop: 0 },
+        guidance,
         replan_every: 1,
         units: Scaling::default(),
     };
@@ -112,6 +116,7 @@ fn actions_take_no_more_memory_than_the_policy_says() {
     let best_of = Choice::best_of;
     let mut nearest = best_of(1000);
     nearest.rule = Rule::Nearest;
+    let halfcheetah = Some([4, 32]);
     let cases = [
         ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
         ("many critics", diffusion(1, 4096, 1, best_of(32)), 64),
@@ -124,7 +129,7 @@ fn actions_take_no_more_memory_than_the_policy_says() {
         ("a score network", score(&[512, 256, 128], 32), 10),
         ("a score network of one block", score(&[64], 1000), 64),
         ("Hopper's planner", diffuser((32, 32), &[1, 2, 4, 8], None, 64), 1),
-        ("HalfCheetah's", diffuser((4, 32), &[1, 4, 8], Some([4, 32]), 64), 1),
+        ("HalfCheetah's", diffuser((4, 32), &[1, 4, 8], halfcheetah, 64), 1),
         ("many plans", diffuser((16, 16), &[1, 2, 4], None, 8), 64),
         ("one step", diffuser((1, 32), &[1], Some([16, 64]), 1000), 4),
     ];
@@ -136,8 +141,8 @@ fn actions_take_no_more_memory_than_the_policy_says() {
         let policy = load_policy(&file, Precision::F32).unwrap();
         let said = policy.memory(n) as usize;
         let mut states: Vec<_> = (0..n as u64).map(|seed| policy.begin(seed)).collect();
-        let (observations, mut actions) =
-            (vec![0.5; n * OBSERVATION_DIM], vec![0.0; n * ACTION_DIM]);
+        let observations = vec![0.5; n * SIZES.0];
+        let mut actions = vec![0.0; n * SIZES.1];
         let mut act = || policy.act(&observations, &mut states, &mut actions).unwrap();
         // Allocates the threads' own buffers.
         act();

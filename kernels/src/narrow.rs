@@ -49,6 +49,7 @@ fn load(x: &[f32], at: usize) -> [f32; LANES] {
 }
 
 /// Operands of the first layer.
+#[derive(Clone, Copy)]
 pub struct FirstLayer<'a> {
     /// State part of the pre-activation, `states × width`.
     pub base: &'a [f32],

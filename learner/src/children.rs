@@ -24,7 +24,9 @@ pub(crate) struct Process {
 impl Process {
     pub fn start(command: &mut Command) -> io::Result<Self> {
         let mut child = command.spawn()?;
-        Ok(Self { pid: Pid::from_child(&child), status: spawn_blocking(move || child.wait()) })
+        let pid = Pid::from_child(&child);
+        let status = spawn_blocking(move || child.wait());
+        Ok(Self { pid, status })
     }
 
     /// Waits for the end of the process. Cancel safe.
@@ -48,7 +50,8 @@ impl Process {
 /// a terminal's Ctrl-C, and it ends with the thread that starts it.
 pub(crate) fn prepare(command: &mut Command, log: &Path) -> io::Result<()> {
     let file = files::append(log)?;
-    command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).process_group(0);
+    command.stdin(Stdio::null()).stdout(file.try_clone()?);
+    command.stderr(file).process_group(0);
     // SAFETY: the new process makes one system call, which may be made between fork and exec.
     #[allow(unsafe_code)]
     unsafe {

@@ -33,15 +33,14 @@ pub(crate) struct LocalEvaluators {
 
 impl LocalEvaluators {
     /// Prepares `count` evaluators, which share `cores` cores. Does not start them.
-    ///
-    /// # Errors
-    /// There is no program `evaluator` beside this program, nor on the PATH.
     pub fn new(count: usize, cores: usize) -> anyhow::Result<Self> {
         if count == 0 {
             return Ok(Self::default());
         }
-        let sibling = std::env::current_exe().ok().map(|own| own.with_file_name(EVALUATOR));
-        let program = sibling.filter(|path| path.exists()).unwrap_or_else(|| EVALUATOR.into());
+        let mut program = std::env::current_exe()?.with_file_name(EVALUATOR);
+        if !program.exists() {
+            program = EVALUATOR.into();
+        }
         let output = Command::new(&program)
             .arg("--version")
             .output()
@@ -64,9 +63,6 @@ impl LocalEvaluators {
     /// are named after `owner`, the run or study: several learners may meet at one router.
     ///
     /// Needs a `LocalSet` on the main thread: the system ends the evaluators with their thread.
-    ///
-    /// # Errors
-    /// A log file cannot be made.
     pub fn start(
         &mut self,
         endpoints: &[String],
@@ -81,7 +77,8 @@ impl LocalEvaluators {
             prepare(&mut command, &log)
                 .with_context(|| format!("an evaluator cannot log to {}", log.display()))?;
             let (stop, report) = (self.stop.clone(), report.clone());
-            self.running.spawn_local(keep_running(command, log.clone(), stop, report));
+            let running = keep_running(command, log.clone(), stop, report);
+            self.running.spawn_local(running);
             self.log = Some(log);
         }
         Ok(())
@@ -100,7 +97,8 @@ impl LocalEvaluators {
             hide_certificates(&mut command, endpoint);
         }
         if threads_asked().is_none() {
-            command.env("RAYON_NUM_THREADS", self.cores.div_ceil(self.count).to_string());
+            let share = self.cores.div_ceil(self.count);
+            command.env("RAYON_NUM_THREADS", share.to_string());
         }
         command
     }

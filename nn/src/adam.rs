@@ -33,7 +33,14 @@ pub struct AdamStep {
 impl AdamStep {
     /// The step after `steps` others, without clipping.
     pub fn after(steps: u64, rate: f32) -> Self {
-        Self { rate, clip: None, count: steps + 1 }
+        let (clip, count) = (None, steps + 1);
+        Self { rate, clip, count }
+    }
+
+    /// The step with its gradient scaled down to this norm.
+    pub fn clipped(mut self, norm: f32) -> Self {
+        self.clip = Some(norm);
+        self
     }
 }
 
@@ -43,7 +50,8 @@ impl Adam {
         let values = weights.values();
         let zeros = |shape: &[usize]| Tensor::zeros(shape, DType::F32, values.device());
         let (moments, rates) = (zeros(&[2, values.elem_count()])?, zeros(&[3])?);
-        Ok(Self { moments, decay, step: AdamStep::after(0, 0.0), rates })
+        let step = AdamStep::after(0, 0.0);
+        Ok(Self { moments, decay, step, rates })
     }
 
     /// Sets the hyper-parameters of the steps that follow. A step captured in a CUDA graph reads
@@ -51,9 +59,9 @@ impl Adam {
     pub fn set_step(&mut self, step: AdamStep) -> Result<()> {
         self.step = step;
         if self.rates.device().is_cuda() {
-            let AdamRates { rate, decay, correction } =
-                AdamRates::new(step.rate, self.decay, step.count);
-            overwrite(&self.rates, &Tensor::new(&[rate, decay, correction], &Device::Cpu)?)?;
+            let rates = AdamRates::new(step.rate, self.decay, step.count);
+            let rates = [rates.rate, rates.decay, rates.correction];
+            overwrite(&self.rates, &Tensor::new(&rates, &Device::Cpu)?)?;
         }
         Ok(())
     }
@@ -120,12 +128,11 @@ impl Adam {
     fn plain_step(&mut self, weights: &mut Weights, gradient: &Tensor) -> Result<Tensor> {
         let AdamStep { rate, clip, count } = self.step;
         let size = gradient.sqr()?.sum_all()?.sqrt()?;
-        let gradient = match clip {
-            Some(clip) => {
-                gradient.broadcast_mul(&(size.recip()? * f64::from(clip))?.minimum(1f32)?)?
-            }
-            None => gradient.clone(),
-        };
+        let mut gradient = gradient.clone();
+        if let Some(clip) = clip {
+            let scale = (size.recip()? * f64::from(clip))?.minimum(1f32)?;
+            gradient = gradient.broadcast_mul(&scale)?;
+        }
         let first = ((self.moments.get(0)? * BETA1)? + (&gradient * (1.0 - BETA1))?)?;
         let second = ((self.moments.get(1)? * BETA2)? + (gradient.sqr()? * (1.0 - BETA2))?)?;
         let unbiased = (&first / (1.0 - BETA1.powf(count as f64)))?;

@@ -28,7 +28,8 @@ impl Ensemble {
     /// taken.
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
         let networks = Mlp::new(shape.layers(), "");
-        Self { shape, networks, weights, packing: Packing::new(precision) }
+        let packing = Packing::new(precision);
+        Self { shape, networks, weights, packing }
     }
 
     /// Loads an ensemble that acts, removing its tensors from `tensors`.
@@ -42,7 +43,7 @@ impl Ensemble {
         Ok(Self::new(shape, weights, precision).packed()?)
     }
 
-    /// The shape.
+    /// Sizes and hidden layers.
     pub fn shape(&self) -> &EnsembleShape {
         &self.shape
     }
@@ -67,15 +68,16 @@ impl Ensemble {
     /// weights, observations and actions.
     pub fn outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         self.check(observations, actions)?;
-        let constant =
-            !(self.weights.values().track_op() || observations.track_op() || actions.track_op());
-        let fast = constant && self.networks.is_fast(&self.weights);
-        let packed = if fast { self.packing.kernels(&self.networks, &self.weights)? } else { None };
-        let observations =
-            plain::repeat_rows(observations, actions.dim(0)? / observations.dim(0)?)?;
-        let inputs = [&observations, actions];
-        let inputs = if self.shape.action_dim == 0 { &inputs[..1] } else { &inputs };
-        self.networks.forward_by(packed, &self.weights, inputs)
+        let (networks, weights) = (&self.networks, &self.weights);
+        let mut packed = None;
+        let differentiable = [weights.values(), observations, actions].map(Tensor::track_op);
+        if differentiable == [false; 3] && networks.is_fast(weights) {
+            packed = self.packing.kernels(networks, weights)?;
+        }
+        let repeat = actions.dim(0)? / observations.dim(0)?;
+        let inputs = [&plain::repeat_rows(observations, repeat)?, actions];
+        let count = if self.shape.action_dim == 0 { 1 } else { 2 };
+        networks.forward_by(packed, weights, &inputs[..count])
     }
 
     /// Q_k(s, a), `[K, rows]`, of networks with one output, for the arguments of
@@ -91,8 +93,8 @@ impl Ensemble {
 
     /// The outputs of networks of s alone, `[K, n, outputs]`.
     pub fn state_outputs(&self, observations: &Tensor) -> Result<Tensor> {
-        let none =
-            Tensor::zeros((observations.dim(0)?, 0), observations.dtype(), observations.device())?;
+        let shape = (observations.dim(0)?, 0);
+        let none = Tensor::zeros(shape, observations.dtype(), observations.device())?;
         self.outputs(observations, &none)
     }
 
@@ -124,12 +126,10 @@ impl Ensemble {
     }
 
     fn check(&self, observations: &Tensor, actions: &Tensor) -> Result<()> {
-        let EnsembleShape { observation_dim, action_dim, .. } = self.shape;
+        let sizes = (self.shape.observation_dim, self.shape.action_dim);
         let ((n, o), (rows, a)) = (observations.dims2()?, actions.dims2()?);
-        if n == 0 || rows == 0 || rows % n != 0 || (o, a) != (observation_dim, action_dim) {
-            bail!(
-                "networks of {observation_dim} and {action_dim} numbers got {n} × {o} and {rows} × {a}"
-            );
+        if n == 0 || rows == 0 || rows % n != 0 || (o, a) != sizes {
+            bail!("networks of {sizes:?} numbers got {n} × {o} and {rows} × {a}");
         }
         Ok(())
     }
@@ -140,7 +140,7 @@ impl Ensemble {
         let repeat = actions.dim(0)? / observations.dim(0)?;
         let (action_dim, layers) = (self.shape.action_dim, &self.networks.layers);
         let observations = plain::repeat_rows(observations, repeat)?;
-        if !layers.norm {
+        if !layers.config.norm {
             let x = Tensor::cat(&[&observations, actions], 1)?;
             let pass = Pass::forward(layers, &self.weights, &x, true)?;
             let (_, gradients) = pass.backward(&pass.out.ones_like()?, false, true)?;
@@ -175,12 +175,10 @@ pub fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
         }
         for member in x.chunks_exact(mean.len()) {
             let squares = member.iter().zip(&mean).map(|(x, mean)| (x - mean) * (x - mean));
-            variance
-                .iter_mut()
-                .zip(squares)
-                .for_each(|(variance, square)| *variance += square * share);
+            variance.iter_mut().zip(squares).for_each(|(sum, square)| *sum += square * share);
         }
         (mean, variance)
     })?;
-    Ok((Tensor::from_vec(mean, shape, x.device())?, Tensor::from_vec(variance, shape, x.device())?))
+    let tensor = |numbers| Tensor::from_vec(numbers, shape, x.device());
+    Ok((tensor(mean)?, tensor(variance)?))
 }

@@ -2,26 +2,27 @@
 
 /// Weights that do not fit a network.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // The messages say what each variant is.
 pub enum NetworkError {
-    /// A tensor is missing.
     #[error("the weights lack the tensor {0:?}")]
     Missing(String),
-    /// A tensor has the wrong type or shape.
     #[error("tensor {name:?} has type and shape {found}, expected {expected}")]
-    Shape {
-        /// Name of the tensor.
-        name: String,
-        /// Its type and shape.
-        found: String,
-        /// The network's type and shape.
-        expected: String,
-    },
-    /// A weight is NaN or infinite.
+    Shape { name: String, found: String, expected: String },
     #[error("tensor {0:?} holds a number that is not finite")]
     NotFinite(String),
-    /// Candle cannot compute or move a tensor.
     #[error("candle failed")]
     Candle(#[from] candle_core::Error),
+}
+
+impl NetworkError {
+    /// Tells the user how to fix it.
+    pub fn hint(&self) -> &'static str {
+        match self {
+            Self::NotFinite(_) => "its training has diverged: take an earlier snapshot",
+            Self::Candle(_) => "smaller networks and batches take less memory",
+            _ => "read the file with the version that wrote it, or copy it again",
+        }
+    }
 }
 
 /// Largest width of a layer, and largest ensemble, that a file may ask for.

@@ -46,7 +46,7 @@ fn layers(generator: &mut ChaCha8Rng) -> MlpConfig {
 fn shape(generator: &mut ChaCha8Rng) -> EnsembleShape {
     let dims = (generator.random_range(1..20), generator.random_range(0..8));
     let (members, outputs) = (generator.random_range(1..5), generator.random_range(1..40));
-    EnsembleShape { outputs, ..EnsembleShape::critics(members, dims, &layers(generator)) }
+    EnsembleShape::critics(members, dims, &layers(generator)).with_outputs(outputs)
 }
 
 fn ensemble(generator: &mut ChaCha8Rng, shape: &EnsembleShape) -> Ensemble {
@@ -71,9 +71,9 @@ fn gradients_match_finite_differences() -> Result<()> {
     let cases = ACTIVATIONS.into_iter().flat_map(|f| norms.map(|norm| (f, norm)));
     for (activation, (norm, norm_after, depth)) in cases {
         let generator = &mut ChaCha8Rng::seed_from_u64(depth as u64);
-        let layers =
-            MlpConfig { activation, norm, norm_after, ..MlpConfig::mish(&[24, 32, 7][..depth]) };
-        let shape = EnsembleShape { outputs: 2, ..EnsembleShape::critics(2, (4, 3), &layers) };
+        let mut layers = MlpConfig::mish(&[24, 32, 7][..depth]);
+        (layers.activation, layers.norm, layers.norm_after) = (activation, norm, norm_after);
+        let shape = EnsembleShape::critics(2, (4, 3), &layers).with_outputs(2);
         let networks = ensemble(generator, &shape);
         let s = Var::from_tensor(&tensor(generator, (5, 4)))?;
         let a = Var::from_tensor(&tensor(generator, (10, 3)))?;
@@ -86,9 +86,12 @@ fn gradients_match_finite_differences() -> Result<()> {
             Ensemble::new(shape.clone(), weights, Precision::F32).outputs(s, a)
         };
         let what = |of: &str| format!("{of}: {layers:?}");
-        check_gradient((&what("weights"), 1e-3, 0.02), (&w, &of_w), |w| outputs(w, &s, &a))?;
-        check_gradient((&what("observations"), 1e-3, 0.02), (&s, of_s), |s| outputs(&w, s, &a))?;
-        check_gradient((&what("actions"), 1e-3, 0.02), (&a, of_a), |a| outputs(&w, &s, a))?;
+        let check = |of, at, gradient, outputs: &dyn Fn(&Tensor) -> Result<Tensor>| {
+            check_gradient((&what(of), 1e-3, 0.02), (at, gradient), outputs)
+        };
+        check("weights", &w, &of_w, &|w| outputs(w, &s, &a))?;
+        check("observations", &s, of_s, &|s| outputs(&w, s, &a))?;
+        check("actions", &a, of_a, &|a| outputs(&w, &s, a))?;
 
         // Many steps: clipping leaves the first ones no gradient.
         let predictor = noise_predictor(generator, layers.clone(), 8);
@@ -116,25 +119,27 @@ fn ensembles_match_plain_operations() -> Result<()> {
         let rows = if shape.action_dim == 0 { states } else { states * repeat };
         let s = tensor(generator, (states, shape.observation_dim));
         let a = Var::from_tensor(&tensor(generator, (rows, shape.action_dim)))?;
-        let what = |of: &str| format!("{of}: {shape:?}, {rows} rows of {states}");
+        let close = |of: &str, found: &Tensor, expected: &Tensor| {
+            assert_close(&format!("{of}: {shape:?}, {rows} rows of {states}"), found, expected);
+        };
         let (fast, plain) = (networks.outputs(&s, &a)?, plainly(|| networks.outputs(&s, &a))?);
-        assert_close(&what("outputs"), &fast, &plain);
-        assert_close(&what("constants"), &networks.detach().outputs(&s, &a.detach())?, &plain);
+        close("outputs", &fast, &plain);
+        close("constants", &networks.detach().outputs(&s, &a.detach())?, &plain);
         let gradients = |loss: &Tensor| {
             let gradients = Gradients::of(loss)?;
             let of_weights = gradients.with_respect_to(networks.weights())?.copy()?;
             Result::Ok((of_weights, gradients.store.get(&a).cloned()))
         };
         let (fast, plain) = (gradients(&loss(&fast)?)?, gradients(&loss(&plain)?)?);
-        assert_close(&what("gradient of weights"), &fast.0, &plain.0);
+        close("gradient of weights", &fast.0, &plain.0);
         let once = loss(&networks.outputs(&s, &a)?)?;
         let twice = gradients(&(once + loss(&networks.outputs(&s, &a)?)?)?)?;
-        assert_close(&what("gradient of two passes"), &twice.0, &(fast.0 * 2.0)?);
+        close("gradient of two passes", &twice.0, &(fast.0 * 2.0)?);
         if shape.action_dim > 0 {
-            assert_close(&what("gradient of actions"), &fast.1.unwrap(), &plain.1.unwrap());
-            let critics = ensemble(generator, &EnsembleShape { outputs: 1, ..shape.clone() });
+            close("gradient of actions", &fast.1.unwrap(), &plain.1.unwrap());
+            let critics = ensemble(generator, &shape.clone().with_outputs(1));
             let gradients = || critics.action_gradients(&s, &a);
-            assert_close(&what("action gradients"), &gradients()?, &plainly(gradients)?);
+            close("action gradients", &gradients()?, &plainly(gradients)?);
         }
     }
     Ok(())
@@ -164,12 +169,11 @@ fn noise_predictors_match_plain_operations() -> Result<()> {
         let generator = &mut ChaCha8Rng::seed_from_u64(seed);
         let (layers, steps) = (layers(generator), generator.random_range(1..7));
         let actor = noise_predictor(generator, layers, steps);
-        let NoiseShape { observation_dim, action_dim, .. } = *actor.shape();
-        let rows = generator.random_range(1..300);
-        let (s, a) =
-            (tensor(generator, (rows, observation_dim)), tensor(generator, (rows, action_dim)));
-        let t: Vec<u32> = (0..rows).map(|_| generator.random_range(1..=steps as u32)).collect();
-        let t = Tensor::from_vec(t, rows, &Device::Cpu)?;
+        let (rows, action_dim) = (generator.random_range(1..300), actor.shape().action_dim);
+        let s = tensor(generator, (rows, actor.shape().observation_dim));
+        let a = tensor(generator, (rows, action_dim));
+        let t = (0..rows).map(|_| generator.random_range(1..=steps as u32));
+        let t = Tensor::from_iter(t, &Device::Cpu)?;
         let (fast, plain) = (actor.predict(&s, &a, &t)?, plainly(|| actor.predict(&s, &a, &t))?);
         assert_close("predictions", &fast, &plain);
         assert_close("constants", &actor.detach().predict(&s, &a, &t)?, &plain);
@@ -242,8 +246,10 @@ fn bf16_is_close_to_f32_and_follows_the_weights() -> Result<()> {
 #[test]
 fn wrong_shapes_are_errors() {
     let generator = &mut ChaCha8Rng::seed_from_u64(0);
-    let ensemble = ensemble(generator, &EnsembleShape::critics(2, (4, 2), &MlpConfig::mish(&[8])));
-    for (s, a) in [((5, 4), (5, 3)), ((5, 3), (5, 2)), ((5, 4), (7, 2)), ((5, 4), (0, 2))] {
-        assert!(ensemble.values(&random(s, 1), &random(a, 2)).is_err(), "{s:?} {a:?}");
+    let shape = EnsembleShape::critics(2, (4, 2), &MlpConfig::mish(&[8]));
+    let ensemble = ensemble(generator, &shape);
+    for [n, o, rows, a] in [[5, 4, 5, 3], [5, 3, 5, 2], [5, 4, 7, 2], [5, 4, 0, 2]] {
+        let values = ensemble.values(&random((n, o), 1), &random((rows, a), 2));
+        assert!(values.is_err(), "{n} × {o} and {rows} × {a}");
     }
 }

@@ -23,7 +23,6 @@ mod error;
 mod gpu;
 mod gradients;
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod implementations;
 mod layers;
 mod pool;
@@ -32,7 +31,6 @@ mod score;
 mod shape;
 mod slices;
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod testing;
 mod trajectory;
 mod weighted;

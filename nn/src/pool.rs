@@ -2,6 +2,10 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// Values that are not in use.
 #[derive(Default)]
 pub(crate) struct Pool<T>(Mutex<Vec<T>>);
@@ -9,7 +13,7 @@ pub(crate) struct Pool<T>(Mutex<Vec<T>>);
 impl<T: Default> Pool<T> {
     /// Lends a value until the result is dropped.
     pub fn lend(self: &Arc<Self>) -> Pooled<T> {
-        let value = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
+        let value = lock(&self.0).pop().unwrap_or_default();
         Pooled { value: Mutex::new(value), pool: self.clone() }
     }
 }
@@ -22,13 +26,13 @@ pub(crate) struct Pooled<T: Default> {
 
 impl<T: Default> Pooled<T> {
     pub fn lock(&self) -> MutexGuard<'_, T> {
-        self.value.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.value)
     }
 }
 
 impl<T: Default> Drop for Pooled<T> {
     fn drop(&mut self) {
-        let value = std::mem::take(self.value.get_mut().unwrap_or_else(PoisonError::into_inner));
-        self.pool.0.lock().unwrap_or_else(PoisonError::into_inner).push(value);
+        let value = std::mem::take(&mut *self.lock());
+        lock(&self.pool.0).push(value);
     }
 }

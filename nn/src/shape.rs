@@ -32,17 +32,23 @@ impl EnsembleShape {
         (observation_dim, action_dim): (usize, usize),
         layers: &MlpConfig,
     ) -> Self {
-        Self { members, observation_dim, action_dim, layers: layers.clone(), outputs: 1 }
+        let (layers, outputs) = (layers.clone(), 1);
+        Self { members, observation_dim, action_dim, layers, outputs }
     }
 
     /// One network of s.
     pub fn of_state(observation_dim: usize, layers: &MlpConfig, outputs: usize) -> Self {
-        Self { outputs, ..Self::critics(1, (observation_dim, 0), layers) }
+        Self::critics(1, (observation_dim, 0), layers).with_outputs(outputs)
+    }
+
+    /// The networks with this number of outputs.
+    pub fn with_outputs(self, outputs: usize) -> Self {
+        Self { outputs, ..self }
     }
 
     pub(crate) fn layers(&self) -> Layers {
-        let inputs = self.observation_dim + self.action_dim;
-        Layers::new(self.members, inputs, &self.layers, self.outputs, 0)
+        let sizes = (self.observation_dim + self.action_dim, self.outputs);
+        Layers::new(self.members, sizes, self.layers.clone(), 0)
     }
 
     /// Numbers held by a forward pass of all networks, with `repeat` rows for each state.
@@ -96,13 +102,14 @@ impl NoiseShape {
     /// The network that embeds a denoising step.
     pub(crate) fn time_layers(&self) -> Layers {
         let hidden = self.layers.embedding(TIME_EMBEDDING);
-        Layers::new(1, TIME_FEATURES, &hidden, TIME_EMBEDDING, 0)
+        Layers::new(1, (TIME_FEATURES, TIME_EMBEDDING), hidden, 0)
     }
 
     /// The network of [s, a^t, embedding].
     pub(crate) fn trunk_layers(&self) -> Layers {
-        let input = self.observation_dim + self.action_dim + TIME_EMBEDDING;
-        Layers::new(1, input, &self.layers, self.action_dim, self.time_layers().range().end)
+        let inputs = self.observation_dim + self.action_dim + TIME_EMBEDDING;
+        let start = self.time_layers().range().end;
+        Layers::new(1, (inputs, self.action_dim), self.layers.clone(), start)
     }
 
     /// Tensors `time.{0,1}` and `trunk.{0..}`, each with `.kernel` `[in, out]` and `.bias` `[out]`.

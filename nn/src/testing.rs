@@ -14,9 +14,8 @@ pub(crate) fn random(shape: impl Into<Shape>, seed: u64) -> Tensor {
 /// Numbers from U(−1, 1).
 pub(crate) fn tensor(generator: &mut ChaCha8Rng, shape: impl Into<Shape>) -> Tensor {
     let shape = shape.into();
-    let numbers: Vec<f32> =
-        (0..shape.elem_count()).map(|_| generator.random_range(-1.0..1.0)).collect();
-    Tensor::from_vec(numbers, shape, &Device::Cpu).unwrap()
+    let numbers = (0..shape.elem_count()).map(|_| generator.random_range(-1.0f32..1.0));
+    Tensor::from_vec(numbers.collect(), shape, &Device::Cpu).unwrap()
 }
 
 /// Trainable weights: initial ones plus a little, so that biases are not 0.
@@ -94,15 +93,12 @@ pub(crate) fn check_gradients(
     let gradients = loss(&outputs(&tensors)?)?.backward()?;
     for (i, variable) in variables.iter().enumerate() {
         let gradient = gradients.get(variable).unwrap();
-        check_gradient(
-            (&format!("{what}, argument {i}"), 1e-3, 0.01),
-            (&arguments[i], gradient),
-            |x| {
-                let mut arguments = arguments.to_vec();
-                arguments[i] = x.clone();
-                outputs(&arguments)
-            },
-        )?;
+        let what = format!("{what}, argument {i}");
+        check_gradient((&what, 1e-3, 0.01), (&arguments[i], gradient), |x| {
+            let mut arguments = arguments.to_vec();
+            arguments[i] = x.clone();
+            outputs(&arguments)
+        })?;
     }
     Ok(())
 }

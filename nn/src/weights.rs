@@ -23,14 +23,12 @@ pub enum Init {
     Orthogonal(f32),
 }
 
-/// A named tensor in a flat vector.
+/// A tensor in a flat vector, its name within the network (e.g. `trunk.0.kernel`) and initial values.
 #[derive(Clone, Debug)]
+#[allow(missing_docs)] // See above.
 pub struct TensorSpec {
-    /// Name within the network, e.g. `trunk.0.kernel`.
     pub name: String,
-    /// Shape.
     pub shape: Vec<usize>,
-    /// Initial values.
     pub init: Init,
 }
 
@@ -151,8 +149,10 @@ pub fn take(
 /// Checks that a tensor holds neither a NaN nor an infinity.
 pub fn check_finite(name: &str, tensor: &Tensor) -> std::result::Result<(), NetworkError> {
     let numbers = tensor.flatten_all()?.to_vec1::<f32>()?;
-    let finite = numbers.iter().all(|x| x.is_finite());
-    if finite { Ok(()) } else { Err(NetworkError::NotFinite(name.to_owned())) }
+    match numbers.iter().all(|x| x.is_finite()) {
+        true => Ok(()),
+        false => Err(NetworkError::NotFinite(name.to_owned())),
+    }
 }
 
 /// The weights of one network: a vector on one of candle's devices.
@@ -272,7 +272,6 @@ impl Weights {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use crate::testing::{assert_close, numbers};

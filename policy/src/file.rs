@@ -1,6 +1,6 @@
 //! The file of a policy: tensors and a header.
 
-use crate::error::{PolicyError, VERSION};
+use crate::error::{PolicyError, Result, VERSION};
 use crate::kinds::actor_critic::{ACTOR, ActorCriticShape, CRITIC};
 use crate::kinds::diffuser::{self, DiffuserPolicy};
 use crate::kinds::diffusion::{DiffusionPolicy, DiffusionShape, VALUE};
@@ -33,49 +33,22 @@ const MAX_HEADER: u64 = 1 << 20;
 /// The kind of a policy, the shapes of its networks, and its choice among candidates.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
+#[allow(missing_docs)]
 pub enum PolicyConfig {
     /// A choice among samples of a diffusion model.
-    Diffusion {
-        /// Shapes of the networks.
-        shape: DiffusionShape,
-        /// Choice among the samples.
-        choice: Choice,
-    },
+    Diffusion { shape: DiffusionShape, choice: Choice },
     /// A choice among samples of a tanh-squashed Gaussian.
-    Squashed {
-        /// Shapes of the networks.
-        shape: ActorCriticShape,
-        /// Choice among the samples.
-        choice: Choice,
-    },
+    Squashed { shape: ActorCriticShape, choice: Choice },
     /// A choice among actions of a network of state and noise.
     #[serde(rename = "one-step")]
-    OneStep {
-        /// Shapes of the networks.
-        shape: ActorCriticShape,
-        /// Choice among the samples.
-        choice: Choice,
-    },
+    OneStep { shape: ActorCriticShape, choice: Choice },
     /// The mode of a Gaussian.
-    Gaussian {
-        /// Shape of the network, and the distribution.
-        shape: GaussianShape,
-    },
+    Gaussian { shape: GaussianShape },
     /// A choice among samples of a score network.
-    Score {
-        /// Shapes of the networks.
-        shape: ScorePolicyShape,
-        /// Choice among the samples.
-        choice: Choice,
-    },
+    Score { shape: ScorePolicyShape, choice: Choice },
     /// The first actions of a choice among plans.
     #[serde(rename = "planner")]
-    Diffuser {
-        /// Shapes of the networks, and the guidance.
-        shape: DiffuserShape,
-        /// Choice among the plans.
-        choice: Choice,
-    },
+    Diffuser { shape: DiffuserShape, choice: Choice },
 }
 
 impl PolicyConfig {
@@ -116,8 +89,9 @@ impl PolicyConfig {
                 tensors.insert(FREQUENCIES.to_owned(), frequencies);
             }
             Self::Diffuser { shape, .. } => {
-                add(diffuser::MODEL, TrajectoryModel::layout(&shape.network, shape.width()))?;
-                add(diffuser::VALUE, TrajectoryValue::layout(&shape.network, shape.width()))?;
+                let (config, width) = (&shape.network, shape.width());
+                add(diffuser::MODEL, TrajectoryModel::layout(config, width))?;
+                add(diffuser::VALUE, TrajectoryValue::layout(config, width))?;
             }
         }
         Ok(tensors)
@@ -175,7 +149,7 @@ impl<O: Serialize> Header<O> {
     ///
     /// # Errors
     /// A weight is not finite.
-    pub fn to_safetensors(&self, tensors: &Tensors) -> Result<Vec<u8>, PolicyError> {
+    pub fn to_safetensors(&self, tensors: &Tensors) -> Result<Vec<u8>> {
         write_tensors(tensors, HEADER, self)
     }
 }
@@ -185,7 +159,7 @@ impl<O: DeserializeOwned> Header<O> {
     ///
     /// # Errors
     /// As [`read_header`], or [`PolicyError::Version`].
-    pub fn read(file: &[u8]) -> Result<Self, PolicyError> {
+    pub fn read(file: &[u8]) -> Result<Self> {
         read_header(file, HEADER).map_err(|error| match (error, read_header(file, HEADER)) {
             (PolicyError::Header(source), Ok(Written { version })) if version != VERSION => {
                 PolicyError::Version { version, source }
@@ -199,33 +173,36 @@ impl<O: DeserializeOwned> Header<O> {
 ///
 /// # Errors
 /// The header is wrong, or the tensors are not exactly those of its networks, all finite.
-pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>, PolicyError> {
-    let Header { policy, scaling, origin: IgnoredAny, .. } = Header::read(file)?;
-    let mut tensors = read_tensors(file)?;
-    let policy: Box<dyn Policy> = match policy {
+pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>> {
+    let header = Header::<IgnoredAny>::read(file)?;
+    let tensors = &mut read_tensors(file)?;
+    let policy: Box<dyn Policy> = match header.policy {
         PolicyConfig::Diffusion { shape, choice } => {
-            Box::new(DiffusionPolicy::load(shape, choice, &mut tensors, precision)?)
+            Box::new(DiffusionPolicy::load(&shape, choice, tensors, precision)?)
         }
         PolicyConfig::Squashed { shape, choice } => {
             let actor = SquashedActor::shape(&shape);
-            Box::new(shape.load(actor, SquashedActor::new, choice, &mut tensors, precision)?)
+            Box::new(shape.load(actor, SquashedActor::new, choice, tensors, precision)?)
         }
         PolicyConfig::OneStep { shape, choice } => {
             let actor = OneStepActor::shape(&shape);
-            Box::new(shape.load(actor, OneStepActor::new, choice, &mut tensors, precision)?)
+            Box::new(shape.load(actor, OneStepActor::new, choice, tensors, precision)?)
         }
-        PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
+        PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, tensors)?),
         PolicyConfig::Score { shape, choice } => {
-            Box::new(ScorePolicy::load(shape, choice, &mut tensors, precision)?)
+            Box::new(ScorePolicy::load(&shape, choice, tensors, precision)?)
         }
         PolicyConfig::Diffuser { shape, choice } => {
             let units = shape.units.clone();
-            scaled(Box::new(DiffuserPolicy::load(shape, choice, &mut tensors)?), Some(units))?
+            scaled(Box::new(DiffuserPolicy::load(shape, choice, tensors)?), units)?
         }
     };
-    match tensors.into_keys().next() {
-        Some(name) => Err(PolicyError::Unexpected(name)),
-        None => scaled(policy, scaling),
+    if let Some(name) = tensors.keys().next() {
+        return Err(PolicyError::Unexpected(name.clone()));
+    }
+    match header.scaling {
+        Some(scaling) => scaled(policy, scaling),
+        None => Ok(policy),
     }
 }
 
@@ -234,11 +211,7 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
 ///
 /// # Errors
 /// A number is not finite.
-pub fn write_tensors(
-    tensors: &Tensors,
-    key: &str,
-    header: &impl Serialize,
-) -> Result<Vec<u8>, PolicyError> {
+pub fn write_tensors(tensors: &Tensors, key: &str, header: &impl Serialize) -> Result<Vec<u8>> {
     let mut here = BTreeMap::new();
     for (name, tensor) in tensors {
         check_finite(name, tensor)?;
@@ -252,7 +225,7 @@ pub fn write_tensors(
 ///
 /// # Errors
 /// Bytes that are not a safetensors file, or lack the header.
-pub fn read_header<T: DeserializeOwned>(file: &[u8], key: &'static str) -> Result<T, PolicyError> {
+pub fn read_header<T: DeserializeOwned>(file: &[u8], key: &'static str) -> Result<T> {
     check_header(file)?;
     let (_, metadata) = SafeTensors::read_metadata(file)?;
     let header = metadata.metadata().as_ref().and_then(|metadata| metadata.get(key));
@@ -260,14 +233,14 @@ pub fn read_header<T: DeserializeOwned>(file: &[u8], key: &'static str) -> Resul
 }
 
 /// Reads all tensors of a safetensors file, on the CPU.
-pub fn read_tensors(bytes: &[u8]) -> Result<Tensors, PolicyError> {
+pub fn read_tensors(bytes: &[u8]) -> Result<Tensors> {
     check_header(bytes)?;
-    let file = SafeTensors::deserialize(bytes)?;
-    file.tensors().into_iter().map(|(name, view)| Ok((name, view.load(&Device::Cpu)?))).collect()
+    let tensors = SafeTensors::deserialize(bytes)?.tensors().into_iter();
+    tensors.map(|(name, view)| Ok((name, view.load(&Device::Cpu)?))).collect()
 }
 
 /// Checks the length of the header, the file's first eight bytes. A shorter file is refused later.
-fn check_header(file: &[u8]) -> Result<(), PolicyError> {
+fn check_header(file: &[u8]) -> Result<()> {
     match file.first_chunk() {
         Some(length) if u64::from_le_bytes(*length) > MAX_HEADER => {
             Err(SafeTensorError::HeaderTooLarge.into())
@@ -277,5 +250,4 @@ fn check_header(file: &[u8]) -> Result<(), PolicyError> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests;

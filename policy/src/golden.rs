@@ -59,8 +59,8 @@ fn golden_choices() -> Result<()> {
             Some((name.strip_prefix("target_")?.to_owned(), tensor.clone()))
         };
         let mut tensors = golden.state.iter().filter_map(network).collect();
-        let policy =
-            DiffusionPolicy::load(shape(&golden), choice, &mut tensors, Precision::F32).unwrap();
+        let policy = DiffusionPolicy::load(&shape(&golden), choice, &mut tensors, Precision::F32);
+        let policy = policy.unwrap();
         let numbers = |name: &str| golden.input(name, &Device::Cpu).flatten_all()?.to_vec1::<f32>();
         let observations = numbers("select_observations")?;
         let (drawn, values) = policy.draw(&observations, numbers("select_noise")?).unwrap();

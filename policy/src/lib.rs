@@ -15,14 +15,12 @@
 mod error;
 mod file;
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod golden;
 mod kinds;
 mod policy;
 mod sampling;
 mod scaled;
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod testing;
 
 pub use error::PolicyError;

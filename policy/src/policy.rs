@@ -1,6 +1,6 @@
 //! The trait of all policies.
 
-use crate::error::PolicyError;
+use crate::error::{PolicyError, Result};
 use crate::sampling::choice::Choice;
 use crate::sampling::episode::EpisodeState;
 use quad_nn::Precision;
@@ -28,7 +28,7 @@ pub trait Policy: Send + Sync {
     ///
     /// # Errors
     /// The policy draws no candidates, it lacks a value function, or a number is out of range.
-    fn with_choice(&self, _choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
+    fn with_choice(&self, _choice: Choice) -> Result<Box<dyn Policy>> {
         Err(PolicyError::NoCandidates)
     }
 
@@ -55,7 +55,7 @@ pub trait Policy: Send + Sync {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> Result<(), PolicyError>;
+    ) -> Result<()>;
 
     /// Acts as [`Self::act`], but draws from the policy's distribution where that takes its mode.
     ///
@@ -80,11 +80,7 @@ pub trait Policy: Send + Sync {
     ///
     /// # Errors
     /// The policy has no critics, or an action or its value is NaN.
-    fn sample(
-        &self,
-        _observations: &[f32],
-        _states: &mut [EpisodeState],
-    ) -> Result<Samples, PolicyError> {
+    fn sample(&self, _observations: &[f32], _states: &mut [EpisodeState]) -> Result<Samples> {
         Err(PolicyError::NoCritics)
     }
 
@@ -93,7 +89,7 @@ pub trait Policy: Send + Sync {
     ///
     /// # Errors
     /// The policy has no critics, the lengths do not fit, or a value is NaN.
-    fn value(&self, _observations: &[f32], _actions: &[f32]) -> Result<Vec<f32>, PolicyError> {
+    fn value(&self, _observations: &[f32], _actions: &[f32]) -> Result<Vec<f32>> {
         Err(PolicyError::NoCritics)
     }
 }

@@ -1,6 +1,6 @@
 //! A policy in the user's units.
 
-use crate::error::PolicyError;
+use crate::error::{PolicyError, Result};
 use crate::policy::{Policy, Samples};
 use crate::sampling::choice::Choice;
 use crate::sampling::episode::EpisodeState;
@@ -17,11 +17,7 @@ struct Scaled {
 }
 
 /// The policy in the user's units.
-pub(crate) fn scaled(
-    policy: Box<dyn Policy>,
-    scaling: Option<Scaling>,
-) -> Result<Box<dyn Policy>, PolicyError> {
-    let Some(scaling) = scaling else { return Ok(policy) };
+pub(crate) fn scaled(policy: Box<dyn Policy>, scaling: Scaling) -> Result<Box<dyn Policy>> {
     for (what, affine, columns) in [
         ("observations", &scaling.observations, policy.observation_dim()),
         ("actions", &scaling.actions, policy.action_dim()),
@@ -70,7 +66,7 @@ impl Policy for Scaled {
         self.policy.choice()
     }
 
-    fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
+    fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>> {
         let policy = self.policy.with_choice(choice)?;
         Ok(Box::new(Self { policy, scaling: self.scaling.clone() }))
     }
@@ -93,7 +89,7 @@ impl Policy for Scaled {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> Result<(), PolicyError> {
+    ) -> Result<()> {
         self.policy.act(&self.observations(observations), states, actions)?;
         self.to_user(actions);
         Ok(())
@@ -104,7 +100,7 @@ impl Policy for Scaled {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> Result<(), PolicyError> {
+    ) -> Result<()> {
         self.policy.explore(&self.observations(observations), states, actions)?;
         self.to_user(actions);
         Ok(())
@@ -118,24 +114,19 @@ impl Policy for Scaled {
         self.to_user(actions);
     }
 
-    fn sample(
-        &self,
-        observations: &[f32],
-        states: &mut [EpisodeState],
-    ) -> Result<Samples, PolicyError> {
+    fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Samples> {
         let mut samples = self.policy.sample(&self.observations(observations), states)?;
         self.to_user(&mut samples.actions);
         Ok(samples)
     }
 
-    fn value(&self, observations: &[f32], actions: &[f32]) -> Result<Vec<f32>, PolicyError> {
+    fn value(&self, observations: &[f32], actions: &[f32]) -> Result<Vec<f32>> {
         let actions = to_network(self.scaling.actions.as_ref(), actions);
         self.policy.value(&self.observations(observations), &actions)
     }
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use crate::testing::{act, diffusion_file, load, sample};
@@ -144,13 +135,8 @@ mod tests {
         Some(Affine { offset: offset.to_vec(), scale: scale.to_vec() })
     }
 
-    fn scaling() -> Scaling {
-        let observations = affine(&[100.0, -3.0, 0.5, 0.0], &[8.0, 0.5, 1.0, 4.0]);
-        Scaling { observations, actions: affine(&[30.0, -1.0], &[16.0, 0.25]), rewards: None }
-    }
-
     /// One policy in the networks' and in the user's units.
-    fn pair(scaling: Scaling) -> [Result<Box<dyn Policy>, PolicyError>; 2] {
+    fn pair(scaling: Scaling) -> [Result<Box<dyn Policy>>; 2] {
         [None, Some(scaling)]
             .map(|scaling| load(&diffusion_file(Choice::best_of(6), 1.0, None, scaling)))
     }
@@ -162,13 +148,16 @@ mod tests {
 
     #[test]
     fn observations_and_actions_are_converted() {
-        let [plain, scaled] = pair(scaling()).map(Result::unwrap);
+        let observations = affine(&[100.0, -3.0, 0.5, 0.0], &[8.0, 0.5, 1.0, 4.0]);
+        let actions = affine(&[30.0, -1.0], &[16.0, 0.25]);
+        let scaling = Scaling { observations, actions, rewards: None };
+        let [plain, scaled] = pair(scaling).map(Result::unwrap);
         // The same numbers in both units, without rounding.
         let ours = [1.0, 1.0, 1.0, -1.0, 0.0, 0.0, 0.0, 2.0];
         let users = [108.0, -2.5, 1.5, -4.0, 100.0, -3.0, 0.5, 8.0];
-        let to_user = |actions: &[f32]| -> Vec<f32> {
-            actions.chunks_exact(2).flat_map(|a| [30.0 + 16.0 * a[0], -1.0 + 0.25 * a[1]]).collect()
-        };
+        let user = |a: &[f32]| [30.0 + 16.0 * a[0], -1.0 + 0.25 * a[1]];
+        let to_user =
+            |actions: &[f32]| -> Vec<f32> { actions.chunks_exact(2).flat_map(user).collect() };
         let act = |policy: &dyn Policy, observations| act(policy, observations, &[4, 5]).unwrap();
         let taken = act(&*scaled, &users);
         assert_close(&taken, &to_user(&act(&*plain, &ours)));
@@ -180,9 +169,9 @@ mod tests {
 
         let value = scaled.value(&users, &[38.0, -1.125, 22.0, -0.75]).unwrap();
         assert_eq!(value, plain.value(&ours, &[0.5, -0.5, -0.5, 1.0]).unwrap());
-        let [plain_one, scaled_one] =
-            [&plain, &scaled].map(|policy| policy.with_choice(Choice::best_of(1)).unwrap());
-        assert_close(&act(&*scaled_one, &users), &to_user(&act(&*plain_one, &ours)));
+        let of_one = |policy: &dyn Policy| policy.with_choice(Choice::best_of(1)).unwrap();
+        let ours = act(&*of_one(&*plain), &ours);
+        assert_close(&act(&*of_one(&*scaled), &users), &to_user(&ours));
         let mut changed = [38.0, -1.125, 22.0, -0.75];
         scaled.change_actions(&mut changed, &mut |actions| {
             assert_eq!(actions, [0.5, -0.5, -0.5, 1.0]);
@@ -197,24 +186,33 @@ mod tests {
     fn a_constant_number_is_returned_exactly_and_not_seen() {
         let observations = affine(&[100.0, -3.0, 0.1, 0.0], &[8.0, 0.5, 0.0, 4.0]);
         let actions = affine(&[30.0, 0.1], &[16.0, 0.0]);
-        let [plain, scaled] =
-            pair(Scaling { observations, actions, rewards: Some(200.0) }).map(Result::unwrap);
-        let action = act(&*scaled, &[108.0, -2.5, 0.1, -4.0], &[4]).unwrap();
-        assert_eq!(action, act(&*scaled, &[108.0, -2.5, 90.0, -4.0], &[4]).unwrap());
-        let ours = act(&*plain, &[1.0, 1.0, 0.0, -1.0], &[4]).unwrap();
-        assert_close(&action, &[30.0 + 16.0 * ours[0], 0.1]);
-        let samples = sample(&*scaled, &[108.0, -2.5, 0.1, -4.0], &[4]).unwrap();
-        assert!(samples.actions.chunks_exact(2).all(|action| action[1] == 0.1));
-        let value = scaled.value(&[108.0, -2.5, 0.1, -4.0], &[38.0, 0.1]).unwrap();
-        assert_eq!(value, plain.value(&[1.0, 1.0, 0.0, -1.0], &[0.5, 0.0]).unwrap());
+        let scaling = Scaling { observations, actions, rewards: Some(200.0) };
+        let [plain, scaled] = pair(scaling).map(Result::unwrap);
+        let (ours, users) = ([1.0, 1.0, 0.0, -1.0], [108.0, -2.5, 0.1, -4.0]);
+        let action = act(&*scaled, &users, &[4]).unwrap();
+        let other = [108.0, -2.5, 90.0, -4.0];
+        assert_eq!(action, act(&*scaled, &other, &[4]).unwrap());
+        let expected = act(&*plain, &ours, &[4]).unwrap();
+        assert_close(&action, &[30.0 + 16.0 * expected[0], 0.1]);
+        let samples = sample(&*scaled, &users, &[4]).unwrap();
+        assert!(samples.actions.chunks_exact(2).all(|a| a[1] == 0.1));
+        let value = scaled.value(&users, &[38.0, 0.1]).unwrap();
+        assert_eq!(value, plain.value(&ours, &[0.5, 0.0]).unwrap());
     }
 
     #[test]
     fn a_scaling_that_does_not_fit_is_refused() {
-        let refused = |scaling| matches!(&pair(scaling)[1], Err(PolicyError::Scaling { .. }));
-        assert!(!refused(scaling()) && !refused(Scaling { observations: None, ..scaling() }));
-        assert!(refused(Scaling { observations: affine(&[0.0; 3], &[1.0; 3]), ..scaling() }));
-        assert!(refused(Scaling { actions: affine(&[0.0; 2], &[1.0, -1.0]), ..scaling() }));
-        assert!(refused(Scaling { actions: affine(&[0.0; 2], &[1.0]), ..scaling() }));
+        let good = affine(&[0.0; 2], &[1.0; 2]);
+        for (observations, actions, expected) in [
+            (None, good.clone(), false),
+            (affine(&[0.0; 4], &[1.0; 4]), good.clone(), false),
+            (affine(&[0.0; 3], &[1.0; 3]), good, true),
+            (None, affine(&[0.0; 2], &[1.0, -1.0]), true),
+            (None, affine(&[0.0; 2], &[1.0]), true),
+        ] {
+            let [_, scaled] = pair(Scaling { observations, actions, rewards: None });
+            let refused = matches!(scaled, Err(PolicyError::Scaling { .. }));
+            assert_eq!(refused, expected);
+        }
     }
 }

@@ -1,12 +1,13 @@
 //! Helpers of tests.
 
-use crate::error::PolicyError;
+use crate::error::Result;
 use crate::file::{Header, PolicyConfig, load_policy};
+use crate::kinds::actor_critic::ActorCriticShape;
 use crate::kinds::diffusion::DiffusionShape;
 use crate::policy::{Policy, Samples};
 use crate::sampling::choice::Choice;
 use candle_core::{Device, Tensor};
-use quad_nn::{Layout, MlpConfig, Precision, Scaling, Weights};
+use quad_nn::{Activation, Layout, MlpConfig, Precision, Scaling, Tensors, Weights};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -17,7 +18,14 @@ pub(crate) fn file_of(
     mut values: impl FnMut(&Layout) -> Vec<f32>,
 ) -> Vec<u8> {
     let tensors = policy.tensors(|layout| Tensor::new(values(layout), &Device::Cpu)).unwrap();
-    Header { scaling, ..Header::new(policy, ()) }.to_safetensors(&tensors).unwrap()
+    let mut header = Header::new(policy, ());
+    header.scaling = scaling;
+    header.to_safetensors(&tensors).unwrap()
+}
+
+/// The file of a policy that lacks the weights.
+pub(crate) fn without_tensors(policy: PolicyConfig) -> Vec<u8> {
+    Header::new(policy, ()).to_safetensors(&Tensors::new()).unwrap()
 }
 
 /// The file of a policy with initial weights.
@@ -26,6 +34,21 @@ pub(crate) fn initial(policy: PolicyConfig) -> Vec<u8> {
     file_of(policy, None, |layout| {
         Weights::initial(layout, generator, &Device::Cpu).unwrap().to_vec1().unwrap()
     })
+}
+
+pub(crate) fn layers(activation: Activation, hidden: &[usize]) -> MlpConfig {
+    MlpConfig { activation, ..MlpConfig::mish(hidden) }
+}
+
+/// The shape of a policy of one number of state, whose two critics and actor have two units.
+pub(crate) fn of_two_units(action_dim: usize) -> ActorCriticShape {
+    ActorCriticShape {
+        observation_dim: 1,
+        action_dim,
+        actor: layers(Activation::Relu, &[2]),
+        critic: layers(Activation::Relu, &[2]),
+        critics: 2,
+    }
 }
 
 /// The shape of a small diffusion policy.
@@ -47,32 +70,26 @@ pub(crate) fn diffusion_file(
     file_of(PolicyConfig::Diffusion { shape, choice }, scaling, |layout| {
         let (size, last) = sizes.next().unwrap();
         let signed = |i: usize| [size, -size][i / 3 % 2];
-        let count = layout.count();
-        (1..=count).map(|i| if i == count { last } else { signed(i) }).collect()
+        let mut weights: Vec<f32> = (1..layout.count()).map(signed).collect();
+        weights.push(last);
+        weights
     })
 }
 
-pub(crate) fn load(file: &[u8]) -> Result<Box<dyn Policy>, PolicyError> {
+pub(crate) fn load(file: &[u8]) -> Result<Box<dyn Policy>> {
     load_policy(file, Precision::F32)
 }
 
 /// The actions at the first step of episodes with these seeds.
-pub(crate) fn act(
-    policy: &dyn Policy,
-    observations: &[f32],
-    seeds: &[u64],
-) -> Result<Vec<f32>, PolicyError> {
+pub(crate) fn act(policy: &dyn Policy, observations: &[f32], seeds: &[u64]) -> Result<Vec<f32>> {
     let mut states: Vec<_> = seeds.iter().map(|seed| policy.begin(*seed)).collect();
     let mut actions = vec![0.0; seeds.len() * policy.action_dim()];
-    policy.act(observations, &mut states, &mut actions).map(|()| actions)
+    policy.act(observations, &mut states, &mut actions)?;
+    Ok(actions)
 }
 
 /// The candidates at the first step of episodes with these seeds.
-pub(crate) fn sample(
-    policy: &dyn Policy,
-    observations: &[f32],
-    seeds: &[u64],
-) -> Result<Samples, PolicyError> {
+pub(crate) fn sample(policy: &dyn Policy, observations: &[f32], seeds: &[u64]) -> Result<Samples> {
     let mut states: Vec<_> = seeds.iter().map(|seed| policy.begin(*seed)).collect();
     policy.sample(observations, &mut states)
 }

@@ -29,17 +29,22 @@ pub fn open_named(path: &Path) -> io::Result<File> {
 
 /// Opens or makes a file for appending and reading; links, pipes and devices are errors.
 pub fn append(path: &Path) -> io::Result<File> {
-    open_as(OpenOptions::new().create(true).read(true).append(true), OFlags::NOFOLLOW, path)
+    let mut options = OpenOptions::new();
+    open_as(options.create(true).read(true).append(true), OFlags::NOFOLLOW, path)
 }
 
 fn open_as(options: &mut OpenOptions, link: OFlags, path: &Path) -> io::Result<File> {
     // Without NONBLOCK, the system waits for the other end of a pipe.
     let flags = link | OFlags::NONBLOCK | OFlags::NOCTTY;
-    let file = options.custom_flags(flags.bits() as i32).open(path).map_err(|error| {
-        let is_none = matches!(Errno::from_io_error(&error), Some(Errno::LOOP | Errno::NXIO));
-        if is_none { no_file() } else { error }
+    let opened = options.custom_flags(flags.bits() as i32).open(path);
+    let file = opened.map_err(|error| match Errno::from_io_error(&error) {
+        Some(Errno::LOOP | Errno::NXIO) => no_file(),
+        _ => error,
     })?;
-    if file.metadata()?.is_file() { Ok(file) } else { Err(no_file()) }
+    match file.metadata()?.is_file() {
+        true => Ok(file),
+        false => Err(no_file()),
+    }
 }
 
 pub(crate) fn no_file() -> io::Error {
@@ -102,8 +107,8 @@ pub(crate) fn optional<T>(result: io::Result<T>) -> io::Result<Option<T>> {
 pub(crate) fn remove_partial_files(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
-        let is_partial = entry.path().extension().is_some_and(|ending| ending == PARTIAL);
-        if is_partial && entry.file_type().is_ok_and(|kind| kind.is_file() || kind.is_symlink()) {
+        // This fails for folders.
+        if entry.path().extension().is_some_and(|ending| ending == PARTIAL) {
             fs::remove_file(entry.path()).ok();
         }
     }
@@ -123,9 +128,8 @@ pub(crate) fn create_folder(path: &Path) -> io::Result<()> {
 
 /// Makes the names in the folder of `path` durable.
 pub fn synchronize_folder(path: &Path) -> io::Result<()> {
-    let folder =
-        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    File::open(folder)?.sync_all()
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
 }
 
 #[cfg(test)]

@@ -6,10 +6,9 @@ use serde::Serialize;
 
 /// Format of a report.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
 pub enum Style {
-    /// Aligned columns.
     Text,
-    /// Markdown.
     Markdown,
     /// LaTeX with the package booktabs.
     Latex,
@@ -18,10 +17,9 @@ pub enum Style {
 /// A paragraph or a table of a report.
 #[derive(Serialize)]
 #[serde(rename_all = "lowercase")]
+#[allow(missing_docs)]
 pub enum Block {
-    /// Lines of text.
     Text(String),
-    /// A table.
     Table(Table),
 }
 
@@ -59,8 +57,8 @@ impl Table {
 
     /// A table with a row for each item.
     pub fn of<T>(items: &[T], columns: &[Column<T>]) -> Self {
-        let header = Vec::from_iter(columns.iter().map(|(name, alignment, _)| (*name, *alignment)));
-        let mut table = Self::new(&header);
+        let header = columns.iter().map(|(name, alignment, _)| (*name, *alignment));
+        let mut table = Self::new(&Vec::from_iter(header));
         for item in items {
             table.push(Vec::from_iter(columns.iter().map(|(_, _, cell)| cell(item))));
         }
@@ -69,14 +67,16 @@ impl Table {
 
     /// Adds a row with a cell for each column. Control characters become spaces.
     pub fn push(&mut self, row: impl Into<Vec<String>>) {
-        self.rows.push(row.into().iter().map(|cell| cell.replace(char::is_control, " ")).collect());
+        let cells = row.into().into_iter();
+        self.rows.push(cells.map(|cell| cell.replace(char::is_control, " ")).collect());
     }
 
     /// The table as text.
     pub fn render(&self, style: Style) -> String {
         match style {
             Style::Text => {
-                self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat()
+                let line = |cells: &[String]| format!("{}\n", cells.join("  ").trim_end());
+                self.lines(line).concat()
             }
             Style::Markdown => {
                 let escape = |row: &Vec<String>| row.iter().map(|cell| markdown(cell)).collect();
@@ -91,7 +91,8 @@ impl Table {
                 let line = |row: &Vec<String>| {
                     let cells = Vec::from_iter(row.iter().map(|cell| latex(cell))).join(" & ");
                     // After the \\ of another row, these would be its options.
-                    let guard = if cells.trim_start().starts_with(['[', '*']) { "{}" } else { "" };
+                    let is_option = cells.trim_start().starts_with(['[', '*']);
+                    let guard = if is_option { "{}" } else { "" };
                     format!("{guard}{cells} \\\\\n")
                 };
                 let mut lines: Vec<String> = self.rows.iter().map(line).collect();
@@ -108,7 +109,8 @@ impl Table {
     /// The rows, with cells as wide as their columns.
     fn lines(&self, line: impl Fn(&[String]) -> String) -> Vec<String> {
         let width = |column: usize| {
-            self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0)
+            let cells = self.rows.iter().map(|row| row[column].chars().count());
+            cells.max().unwrap_or(0)
         };
         let widths: Vec<usize> = (0..self.right.len()).map(width).collect();
         let pad = |((cell, width), right): ((&String, &usize), &bool)| match right {

@@ -6,12 +6,13 @@ use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use rustls::CertificateError::{BadSignature, UnknownIssuer};
 use rustls::crypto::ring;
 use rustls::pki_types::pem::{Error as PemError, PemObject};
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
 use rustls::server::WebPkiClientVerifier;
 use rustls::sign::CertifiedKey;
-use rustls::{CertificateError, Error as TlsError, RootCertStore};
+use rustls::{Error as TlsError, RootCertStore};
 use serde_json::{Value, json};
 use tracing::{info, warn};
 use x509_parser::extensions::GeneralName;
@@ -80,7 +81,8 @@ impl CertificatesError {
     }
 
     fn new(path: &Path, problem: impl Into<String>, hint: &'static str) -> Self {
-        Self { path: path.to_owned(), problem: problem.into(), hint }
+        let (path, problem) = (path.to_owned(), problem.into());
+        Self { path, problem, hint }
     }
 }
 
@@ -120,9 +122,9 @@ impl Certificates {
         match verify(&chain, authorities) {
             Ok(()) => {}
             // An authority of the same name may have another key.
-            Err(TlsError::InvalidCertificate(
-                CertificateError::UnknownIssuer | CertificateError::BadSignature,
-            )) => return refuse(format!("is of another authority than {}", ca.display()), HINT),
+            Err(TlsError::InvalidCertificate(UnknownIssuer | BadSignature)) => {
+                return refuse(format!("is of another authority than {}", ca.display()), HINT);
+            }
             Err(other) => {
                 return refuse(format!("does not pass with {}: {other}", ca.display()), HINT);
             }
@@ -131,7 +133,8 @@ impl Certificates {
             let problem = format!("is not the key of {}", own.display());
             return Err(CertificatesError::new(&key, problem, HINT));
         }
-        Ok(Self { folder: folder.to_owned(), expires, hosts })
+        let folder = folder.to_owned();
+        Ok(Self { folder, expires, hosts })
     }
 
     /// True if the operator should renew the certificate.
@@ -165,16 +168,21 @@ impl fmt::Display for Certificates {
         let (path, hosts) = (self.folder.join(FILES[1]), self.hosts.join(", "));
         write!(f, "{} is valid until {}", path.display(), self.expires)?;
         // An evaluator's certificate names no host: an evaluator never listens.
-        if hosts.is_empty() { Ok(()) } else { write!(f, ", to listen at {hosts}") }
+        match hosts.is_empty() {
+            true => Ok(()),
+            false => write!(f, ", to listen at {hosts}"),
+        }
     }
 }
 
 /// All certificates of a file. While an authority is replaced, ca.pem has the old and the new one.
 fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, CertificatesError> {
-    CertificateDer::pem_file_iter(path)
-        .and_then(Iterator::collect::<Result<Vec<_>, _>>)
-        .and_then(|all| if all.is_empty() { Err(PemError::NoItemsFound) } else { Ok(all) })
-        .map_err(|error| unreadable(path, "certificate", &error))
+    let all = CertificateDer::pem_file_iter(path).and_then(Iterator::collect);
+    match all {
+        Ok(all) if Vec::is_empty(&all) => Err(PemError::NoItemsFound),
+        all => all,
+    }
+    .map_err(|error| unreadable(path, "certificate", &error))
 }
 
 fn unreadable(path: &Path, wanted: &str, error: &PemError) -> CertificatesError {
@@ -194,12 +202,11 @@ fn verify(
     for authority in authorities {
         roots.add(authority)?;
     }
-    let verifier = WebPkiClientVerifier::builder_with_provider(
-        Arc::new(roots),
-        Arc::new(ring::default_provider()),
-    );
-    let verifier = verifier.build().map_err(|error| TlsError::General(error.to_string()))?;
-    verifier.verify_client_cert(&chain[0], &chain[1..], UnixTime::now()).map(|_| ())
+    let provider = Arc::new(ring::default_provider());
+    let verifier = WebPkiClientVerifier::builder_with_provider(roots.into(), provider).build();
+    let verifier = verifier.map_err(|error| TlsError::General(error.to_string()))?;
+    verifier.verify_client_cert(&chain[0], &chain[1..], UnixTime::now())?;
+    Ok(())
 }
 
 /// The names and addresses in a certificate.
@@ -214,7 +221,8 @@ fn hosts(certificate: &X509Certificate<'_>) -> Vec<String> {
         _ => None,
     };
     let names = certificate.subject_alternative_name().ok().flatten();
-    names.iter().flat_map(|names| &names.value.general_names).filter_map(host).collect()
+    let names = names.iter().flat_map(|names| &names.value.general_names);
+    names.filter_map(host).collect()
 }
 
 /// True if a host is only this machine's name for itself.

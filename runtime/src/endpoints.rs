@@ -116,17 +116,17 @@ pub const DEFAULT_PORT: u16 = 7447;
 
 /// The default endpoint at which learner and evaluator of one machine meet.
 pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> String {
-    format!("{}127.0.0.1:{port}", if certificates.is_some() { PROTECTED } else { OPEN })
+    let protocol = certificates.map_or(OPEN, |_| PROTECTED);
+    format!("{protocol}127.0.0.1:{port}")
 }
 
 /// Checks an endpoint from the command line and returns it unchanged: a `value_parser`.
 pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
-    if [OPEN, PROTECTED].iter().any(|protocol| text.starts_with(protocol))
-        && text.parse::<EndPoint>().is_ok()
-    {
-        return Ok(text.to_owned());
+    let is_known = text.starts_with(OPEN) || text.starts_with(PROTECTED);
+    match is_known && text.parse::<EndPoint>().is_ok() {
+        true => Ok(text.to_owned()),
+        false => Err(SessionError::NotAnEndpoint(text.to_owned())),
     }
-    Err(SessionError::NotAnEndpoint(text.to_owned()))
 }
 
 /// HOST:PORT of an endpoint, between its protocol and its options: `tcp/127.0.0.1:0#iface=lo`.
@@ -157,8 +157,7 @@ mod tests {
         ] {
             let listen = ["tcp/127.0.0.1:1", endpoint].map(str::to_owned).to_vec();
             let endpoints = Endpoints { listen, ..Endpoints::default() };
-            let expected = if is_local { None } else { Some(endpoint) };
-            assert_eq!(endpoints.open_to_all(), expected);
+            assert_eq!(endpoints.open_to_all(), (!is_local).then_some(endpoint));
             assert_eq!(endpoints.has_open_port(), has_open_port, "{endpoint}");
         }
     }

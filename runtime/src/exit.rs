@@ -42,22 +42,30 @@ impl<T, E: Into<anyhow::Error>> Hint<T> for Result<T, E> {
 /// An error with a hint, unless the error has one already.
 pub fn hinted(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> anyhow::Error {
     let error = error.into();
-    if error.is::<Hinted>() {
-        error
-    } else {
-        Hinted { error, hint: hint.to_string(), unfinished: false }.into()
+    match error.is::<Hinted>() {
+        true => error,
+        false => with_hint(error, hint, false),
     }
 }
 
 /// An error that means "not finished": the same command continues the work. The exit code is
 /// [`UNFINISHED`].
 pub fn unfinished(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> anyhow::Error {
-    Hinted { error: error.into(), hint: hint.to_string(), unfinished: true }.into()
+    with_hint(error.into(), hint, true)
 }
 
 /// The hints of an error.
 pub fn hints(error: &anyhow::Error) -> impl Iterator<Item = &str> {
-    error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).map(|hinted| &*hinted.hint)
+    all_hinted(error).map(|hinted| &*hinted.hint)
+}
+
+fn with_hint(error: anyhow::Error, hint: impl fmt::Display, unfinished: bool) -> anyhow::Error {
+    let hint = hint.to_string();
+    Hinted { error, hint, unfinished }.into()
+}
+
+fn all_hinted(error: &anyhow::Error) -> impl Iterator<Item = &Hinted> {
+    error.chain().filter_map(|cause| cause.downcast_ref())
 }
 
 /// An error with a hint; text and cause are the wrapped error's.
@@ -134,9 +142,10 @@ pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> 
     wait_for_children();
     let result = main();
     drop(logging);
-    let Err(error) = result else { return ExitCode::SUCCESS };
-    let mut causes = error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>());
-    let unfinished = causes.any(|hinted| hinted.unfinished);
+    let Err(error) = result else {
+        return ExitCode::SUCCESS;
+    };
+    let unfinished = all_hinted(&error).any(|hinted| hinted.unfinished);
     // If stderr is closed, only the exit code can say something.
     write_stderr(show(&error).as_bytes()).ok();
     if unfinished {
@@ -200,10 +209,10 @@ mod tests {
     fn shows_causes_and_the_innermost_hint_without_control_characters() {
         let io = || io::Error::other("in use");
         let failed = |result: anyhow::Result<()>| result.unwrap_err();
+        let unread = Err(io()).context("cannot read a.hdf5");
         for (error, shown) in [
             (
-                failed(Err(io()).context("cannot read a.hdf5").hint("record it").hint("try again"))
-                    .context("cannot learn"),
+                failed(unread.hint("record it").hint("try again")).context("cannot learn"),
                 "error: cannot learn\n  because: cannot read a.hdf5\n  because: in use\nhint: record it\n",
             ),
             (failed(Err(io()).context("cannot listen: in use")), "error: cannot listen: in use\n"),

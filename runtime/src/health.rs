@@ -15,7 +15,8 @@ impl Health {
     /// Registers a component that will report at least every `limit`; it counts as alive now.
     pub fn register(&self, name: impl Into<String>, limit: Duration) -> Heartbeat {
         let state = State { last: Instant::now(), ending: Ending::Running, problem: None };
-        let component = Component { name: name.into(), limit, state: Mutex::new(state) };
+        let (name, state) = (name.into(), Mutex::new(state));
+        let component = Component { name, limit, state };
         let component = Arc::new(component);
         lock(&self.components).push(component.clone());
         Heartbeat { component }

@@ -55,8 +55,9 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
         );
     }
     let wrong = |error| {
-        let endpoints = [&endpoints.listen[..], &endpoints.connect[..]].concat().join(", ");
-        SessionError::Endpoint { endpoints, reason: for_people(error) }
+        let endpoints = [&endpoints.listen[..], &endpoints.connect].concat().join(", ");
+        let reason = for_people(error);
+        SessionError::Endpoint { endpoints, reason }
     };
     let config = config(endpoints).map_err(wrong)?;
     // Zenoh's future blocks its thread until there is a connection. Nothing joins the new thread: if
@@ -87,8 +88,10 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
 
 fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     let listens = !endpoints.listen.is_empty();
-    let mode = if listens { "peer" } else { "client" };
-    let max_message_size = if listens { MAX_FRAGMENTED } else { MAX_SNAPSHOT_SIZE };
+    let (mode, max_message_size) = match listens {
+        true => ("peer", MAX_FRAGMENTED),
+        false => ("client", MAX_SNAPSHOT_SIZE),
+    };
     let retry = RETRY.map(|pause| pause.as_millis() as u64);
     let mut settings = vec![
         ("mode", json!(mode)),

@@ -77,18 +77,22 @@ async fn first_of(signals: &mut [(&'static str, Signal)]) -> &'static str {
 
 /// Sets handlers. A signal whose handler cannot be set keeps its default action: it ends the process.
 fn listen() -> Vec<(&'static str, Signal)> {
-    let always = [("SIGINT", SignalKind::interrupt()), ("SIGTERM", SignalKind::terminate())];
-    let unless_ignored =
-        [("SIGHUP", SignalKind::hangup()), ("SIGUSR1", SignalKind::user_defined1())];
-    let others = unless_ignored.into_iter().filter(|(_, kind)| !is_ignored(*kind));
-    let prepared = always.into_iter().chain(others).filter_map(|(name, kind)| match signal(kind) {
-        Ok(signal) => Some((name, signal)),
-        Err(error) => {
-            warn!("cannot prepare for a clean shutdown by {name}: {error}");
-            None
+    let mut prepared = Vec::new();
+    for (name, kind, may_be_ignored) in [
+        ("SIGINT", SignalKind::interrupt(), false),
+        ("SIGTERM", SignalKind::terminate(), false),
+        ("SIGHUP", SignalKind::hangup(), true),
+        ("SIGUSR1", SignalKind::user_defined1(), true),
+    ] {
+        if may_be_ignored && is_ignored(kind) {
+            continue;
         }
-    });
-    prepared.collect()
+        match signal(kind) {
+            Ok(signal) => prepared.push((name, signal)),
+            Err(error) => warn!("cannot prepare for a clean shutdown by {name}: {error}"),
+        }
+    }
+    prepared
 }
 
 /// True if the process ignores a signal, as `nohup` makes it ignore SIGHUP.

@@ -16,11 +16,13 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const LULL: Duration = Duration::from_millis(500);
 
 fn listening_at(endpoint: &str) -> Endpoints {
-    Endpoints { listen: vec![endpoint.to_owned()], ..Endpoints::default() }
+    let listen = vec![endpoint.to_owned()];
+    Endpoints { listen, ..Endpoints::default() }
 }
 
 fn connecting_to(endpoint: &str) -> Endpoints {
-    Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() }
+    let connect = vec![endpoint.to_owned()];
+    Endpoints { connect, ..Endpoints::default() }
 }
 
 /// A session at a free port, and its endpoint.
@@ -48,8 +50,10 @@ async fn declare_learner(session: &Session) -> impl Sized + use<> {
 }
 
 async fn ask(session: &Session, request: Vec<u8>) -> Vec<u8> {
-    let replies = session.get("quad/run/jobs").payload(request).timeout(PATIENCE).await.unwrap();
-    replies.recv_async().await.unwrap().result().unwrap().payload().to_bytes().into_owned()
+    let request = session.get("quad/run/jobs").payload(request);
+    let replies = request.timeout(PATIENCE).await.unwrap();
+    let reply = replies.recv_async().await.unwrap();
+    reply.result().unwrap().payload().to_bytes().into_owned()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -72,13 +76,14 @@ async fn a_session_that_listens_drops_fragmented_messages() {
 async fn unusable_endpoints_are_errors_at_once() {
     let (_session, endpoint) = meeting_point().await;
     let open = async |endpoints: Endpoints| {
-        timeout(PATIENCE, open_session(&endpoints)).await.unwrap().err().unwrap()
+        let opened = timeout(PATIENCE, open_session(&endpoints)).await;
+        opened.unwrap().err().unwrap()
     };
     assert!(matches!(open(Endpoints::default()).await, SessionError::NoEndpoint));
     let text = open(listening_at(&endpoint)).await.to_string();
     assert!(text.contains(&endpoint) && text.contains("in use"), "{text}");
     assert!(!text.contains(".rs:"), "{text}");
-    for wrong in ["127.0.0.1:7447", "udp/127.0.0.1:7447", "smoke/signals:1", "tcp", "tcp/", ""] {
+    for wrong in "127.0.0.1:7447 udp/127.0.0.1:7447 smoke/signals:1 tcp tcp/ ".split(' ') {
         let error = open(connecting_to(wrong)).await;
         assert!(matches!(&error, SessionError::NotAnEndpoint(it) if it == wrong), "{error}");
     }
@@ -100,7 +105,8 @@ async fn connections_beyond_the_limit_wait_until_one_leaves() {
     }
     let mut sessions = Vec::new();
     while sessions.len() < MOST {
-        sessions.push(timeout(PATIENCE, rx.recv()).await.expect("there is room").unwrap());
+        let session = timeout(PATIENCE, rx.recv()).await;
+        sessions.push(session.expect("there is room").unwrap());
     }
     assert!(timeout(2 * LULL, rx.recv()).await.is_err(), "one too many");
     for session in [&sessions[0], &sessions[MOST - 1]] {

@@ -7,6 +7,7 @@ use std::time::Instant;
 use tempfile::{TempDir, tempdir};
 use zenoh::{Config, Session};
 
+use crate::process::stdout;
 use crate::{PATIENCE, peers};
 
 /// A folder of certificates, one of each role, besides an expired one.
@@ -25,9 +26,8 @@ impl Certificates {
             &["monitor", "monitor"],
             &["--days", "0", "evaluator", "expired"],
         ];
-        made.iter()
-            .all(|arguments| peers::certificates(folder.path(), arguments))
-            .then_some(Certificates { folder })
+        let are_made = made.iter().all(|arguments| peers::certificates(folder.path(), arguments));
+        are_made.then_some(Certificates { folder })
     }
 
     /// Makes an evaluator's certificate anew.
@@ -48,9 +48,8 @@ impl Certificates {
               -extfile extensions -enddate "$(date -u -d "+$1 seconds" +%Y%m%d%H%M%SZ)" -out "$2/cert.pem"
         "#;
         let arguments = ["-euc", script, "sh", &seconds.to_string(), name];
-        let output =
-            Command::new("sh").args(arguments).current_dir(self.folder.path()).output().unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let mut sh = Command::new("sh");
+        stdout(&sh.args(arguments).current_dir(self.folder.path()).output().unwrap());
     }
 
     /// The folder of all of them.
@@ -89,28 +88,18 @@ pub async fn connect(
     trusted: &Path,
     folder: Option<&Path>,
 ) -> zenoh::Result<Session> {
-    let mut config = Config::default();
-    let mut settings = vec![
-        ("mode", "\"client\"".to_owned()),
-        ("connect/endpoints", format!("[{endpoint:?}]")),
-        ("connect/timeout_ms", "2000".to_owned()),
-        ("connect/exit_on_failure", "true".to_owned()),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("transport/link/tls/root_ca_certificate", format!("{:?}", trusted.join("ca.pem"))),
-    ];
-    if let Some(folder) = folder {
-        settings.push(("transport/link/tls/enable_mtls", "true".to_owned()));
-        settings.push((
-            "transport/link/tls/connect_certificate",
-            format!("{:?}", folder.join("cert.pem")),
-        ));
-        settings.push((
-            "transport/link/tls/connect_private_key",
-            format!("{:?}", folder.join("key.pem")),
-        ));
-    }
-    for (key, value) in settings {
-        config.insert_json5(key, &value).unwrap();
-    }
-    zenoh::open(config).await
+    let shown = folder.map_or(String::new(), |folder| {
+        let [certificate, key] = ["cert.pem", "key.pem"].map(|file| folder.join(file));
+        format!(
+            "enable_mtls: true, connect_certificate: {certificate:?}, connect_private_key: {key:?}"
+        )
+    });
+    let authority = trusted.join("ca.pem");
+    let config = format!(
+        "{{ mode: 'client',
+            connect: {{ endpoints: [{endpoint:?}], timeout_ms: 2000, exit_on_failure: true }},
+            scouting: {{ multicast: {{ enabled: false }} }},
+            transport: {{ link: {{ tls: {{ root_ca_certificate: {authority:?}, {shown} }} }} }} }}"
+    );
+    zenoh::open(Config::from_json5(&config)?).await
 }

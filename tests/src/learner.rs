@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use quad_run::folder::{RunDir, RunEndpoints, ScoreLine};
 
-use crate::process::{Process, binary};
+use crate::process::{Process, binary, stdout};
 use crate::{PATIENCE, eventually, http};
 
 pub struct Learner {
@@ -64,20 +64,7 @@ impl Learner {
     /// Fails unless `learner verify` finds every episode of every evaluation scored once, with the
     /// snapshot on disk.
     pub fn assert_complete(&self) {
-        self.verify(&[]);
-    }
-
-    fn verify(&self, flags: &[&Path]) -> String {
-        let mut verify = Command::new(binary("learner"));
-        let output = verify
-            .arg("verify")
-            .arg(&self.run_dir)
-            .args(flags)
-            .output()
-            .expect("the learner was found before");
-        let found = String::from_utf8_lossy(&output.stdout).into_owned();
-        assert!(output.status.success(), "{found}");
-        found
+        verify(&self.run_dir, &[]);
     }
 
     /// Fails unless snapshots, scores and the last checkpoint are those of another run, bit for
@@ -87,7 +74,7 @@ impl Learner {
             learner.files("checkpoints").pop_last().expect("there is a checkpoint")
         };
         assert!(last(self) == last(other), "the last checkpoints differ");
-        self.verify(&[Path::new("--same-as"), &other.run_dir])
+        verify(&self.run_dir, &[Path::new("--same-as"), &other.run_dir])
     }
 
     /// The whole files of a folder in the run's, name by name; none if it is not there.
@@ -101,6 +88,12 @@ impl Learner {
     pub fn snapshot(&self, step: u64) -> PathBuf {
         RunDir::at(&self.run_dir).snapshot_path(step)
     }
+}
+
+/// What `learner verify` says of a run; it must be content.
+pub fn verify(run_dir: &Path, flags: &[&Path]) -> String {
+    let mut verify = Command::new(binary("learner"));
+    stdout(&verify.arg("verify").arg(run_dir).args(flags).output().unwrap())
 }
 
 fn name_of(path: &Path) -> Option<String> {

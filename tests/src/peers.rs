@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::process::binary;
+use crate::process::{command, stdout};
 
 /// Fails the test if QUAD_REQUIRE_PEERS=1 (`deploy/test.sh`), else says that it is skipped.
 fn missing(what: &str, remedy: &str) {
@@ -20,10 +20,8 @@ pub fn python(packages: &[&str]) -> Option<PathBuf> {
     match Command::new(&python).args(["-c", &imports]).output() {
         Ok(output) if output.status.success() => Some(python),
         _ => {
-            missing(
-                &format!("{} with {}", python.display(), packages.join(", ")),
-                "make it with deploy/setup.sh --tests, or name another by QUAD_PYTHON",
-            );
+            let what = format!("{} with {}", python.display(), packages.join(", "));
+            missing(&what, "make it with deploy/setup.sh --tests, or name another by QUAD_PYTHON");
             None
         }
     }
@@ -32,19 +30,7 @@ pub fn python(packages: &[&str]) -> Option<PathBuf> {
 /// Runs a script of tests/peers; gives what it printed.
 pub fn run_python(python: &Path, script: &str, arguments: &[&Path]) -> String {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("peers").join(script);
-    let output = Command::new(python)
-        .arg(&script)
-        .args(arguments)
-        .output()
-        .expect("Python was found before");
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(
-        output.status.success(),
-        "{} ended with {}:\n{errors}",
-        script.display(),
-        output.status
-    );
-    String::from_utf8_lossy(&output.stdout).into_owned()
+    stdout(&Command::new(python).arg(script).args(arguments).output().unwrap())
 }
 
 /// Makes certificates with deploy/zenoh/certificates.sh in `folder`; false if the test is to be
@@ -54,13 +40,7 @@ pub fn certificates(folder: &Path, arguments: &[&str]) -> bool {
         return false;
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh/certificates.sh");
-    let output = Command::new(script)
-        .arg("--in")
-        .arg(folder)
-        .args(arguments)
-        .output()
-        .expect("there is bash");
-    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    stdout(&Command::new(script).arg("--in").arg(folder).args(arguments).output().unwrap());
     true
 }
 
@@ -75,23 +55,18 @@ pub fn has_chromium() -> bool {
 }
 
 fn has(program: &str, version: &[&str], package: &str) -> bool {
-    let found =
-        Command::new(program).args(version).output().is_ok_and(|output| output.status.success());
+    let found = Command::new(program).args(version).output();
+    let found = found.is_ok_and(|output| output.status.success());
     if !found {
-        missing(
-            program,
-            &format!("install it with: apt-get install --no-install-recommends {package}"),
-        );
+        missing(program, &format!("apt-get install --no-install-recommends {package}"));
     }
     found
 }
 
 /// Asks `evaluator doctor` for EGL; without it the test is skipped.
 pub fn has_egl() -> bool {
-    let output =
-        Command::new(binary("evaluator")).arg("doctor").output().expect("the evaluator starts");
-    let found =
-        String::from_utf8_lossy(&output.stdout).lines().any(|line| line.contains("can be made"));
+    let output = command("evaluator doctor").output().unwrap();
+    let found = String::from_utf8_lossy(&output.stdout).contains("can be made");
     if !found {
         missing("EGL with Mesa's software driver", "install it with: deploy/setup.sh --tests");
     }

@@ -8,7 +8,7 @@ use std::time::Duration;
 use crate::eventually;
 
 /// Path of a file that cargo built.
-fn built(path: &str) -> PathBuf {
+pub fn built(path: &str) -> PathBuf {
     let test = std::env::current_exe().expect("a test knows its own executable");
     // target/release/deps/test-123 → target/release/name
     test.parent().and_then(Path::parent).expect("a test lies two folders below target/").join(path)
@@ -16,22 +16,14 @@ fn built(path: &str) -> PathBuf {
 
 pub fn binary(name: &str) -> PathBuf {
     let path = built(name);
-    assert!(
-        path.exists(),
-        "{} is missing; build it with: cargo build --release --bins",
-        path.display()
-    );
+    assert!(path.exists(), "{path:?} is missing; cargo build --release --bins makes it");
     path
 }
 
 /// Command line prefix that preloads an example of this crate.
 pub fn preload(example: &str) -> Vec<String> {
     let library = built(&format!("examples/lib{example}.so"));
-    assert!(
-        library.exists(),
-        "{} is missing; cargo build --release --examples makes it",
-        library.display()
-    );
+    assert!(library.exists(), "{library:?} is missing; cargo build --release --examples makes it");
     vec!["env".to_owned(), format!("LD_PRELOAD={}", library.display())]
 }
 
@@ -50,8 +42,9 @@ pub fn succeeds(line: &str) -> String {
 
 /// The stdout of a program that has succeeded.
 pub fn stdout(output: &Output) -> String {
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8_lossy(&output.stdout).into_owned()
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
+    text
 }
 
 /// Asserts exit code 1, and `sentence` in the error and `hint` in its hint.
@@ -61,6 +54,20 @@ pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
     let advice = text.split_once("hint: ").map(|(_, advice)| advice).unwrap_or_default();
     assert!(text.contains(sentence), "`{sentence}` is not in\n{text}");
     assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
+}
+
+/// Sends a signal by its name, e.g. `TERM` or `KILL`, to a process.
+pub fn signal(signal: &str, process: u32) {
+    // The shell's own `kill`: a slim Debian has no program of that name.
+    let command = format!("kill -{signal} {process}");
+    let status = Command::new("sh").args(["-c", &command]).status().expect("there is a shell");
+    assert!(status.success(), "{command}: {status}");
+}
+
+/// The processes that a process has started.
+pub fn children(of: u32) -> Vec<u32> {
+    let list = fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
+    list.split_whitespace().map(|id| id.parse().unwrap()).collect()
 }
 
 /// A running program, killed when dropped. A failing test prints the ends of its output.
@@ -104,18 +111,20 @@ impl Process {
         assert!(log.contains(text), "`{text}` is not in the log of {}:\n{log}", self.name);
     }
 
+    /// Asserts that its log does not have `text`.
+    pub fn assert_not_said(&self, text: &str) {
+        let log = self.log();
+        assert!(!log.contains(text), "`{text}` is in the log of {}:\n{log}", self.name);
+    }
+
     /// Waits for its end with this exit code.
     pub fn assert_ends(&mut self, code: i32, patience: Duration) {
         let status = self.wait(patience);
         assert_eq!(status.code(), Some(code), "{} ended with {status}:\n{}", self.name, self.log());
     }
 
-    /// Sends a signal by its name, e.g. `TERM` or `KILL`.
     pub fn signal(&self, signal: &str) {
-        // The shell's own `kill`: a slim Debian has no program of that name.
-        let command = format!("kill -{signal} {}", self.child.id());
-        let status = Command::new("sh").args(["-c", &command]).status().expect("there is a shell");
-        assert!(status.success(), "{command}: {status}");
+        self::signal(signal, self.id());
     }
 
     pub fn id(&self) -> u32 {
@@ -154,7 +163,7 @@ impl Process {
     pub fn terminate(&mut self, patience: Duration) -> ExitStatus {
         self.signal("TERM");
         let status = self.wait(patience);
-        assert!(!self.log().contains("something has not ended"), "{} had to end itself", self.name);
+        self.assert_not_said("something has not ended");
         status
     }
 }
@@ -166,14 +175,8 @@ impl Drop for Process {
         if std::thread::panicking() {
             for (kind, text) in [("stderr", self.log()), ("stdout", self.out())] {
                 let lines: Vec<_> = text.lines().collect();
-                let end = &lines[lines.len().saturating_sub(40)..];
-                eprintln!(
-                    "--- {} {kind}, last {} of {} lines\n{}",
-                    self.name,
-                    end.len(),
-                    lines.len(),
-                    end.join("\n")
-                );
+                let end = lines[lines.len().saturating_sub(40)..].join("\n");
+                eprintln!("--- the end of {}'s {kind}\n{end}", self.name);
             }
         }
     }

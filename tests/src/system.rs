@@ -69,17 +69,19 @@ impl Scratch {
         arguments: &[&str],
     ) -> Learner {
         let run_dir = self.path().join(run);
-        let name = run_dir.file_name().and_then(|name| name.to_str()).expect("a run has a name");
-        let preset = self.preset(name, setting);
         fs::remove_file(run_dir.join("endpoints.json")).ok();
-        let mut command = through(launcher, "learner");
-        command.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(self.dataset());
-        command.arg("--run-dir").arg(&run_dir).args(arguments);
-        if !arguments.contains(&"--http") {
-            command.args(["--http", "127.0.0.1:0"]);
-        }
-        let process = Process::start(name, self.path(), command);
+        let mut command = self.train(launcher, &run_dir, setting);
+        command.args(arguments);
+        let process = Process::start(name_of(&run_dir), self.path(), command);
         Learner { process, run_dir }
+    }
+
+    /// The command that trains a run on the dataset.
+    pub fn train(&self, launcher: &[String], run_dir: &Path, setting: Setting) -> Command {
+        let mut command = through(launcher, "learner");
+        command.arg("train").arg("--preset").arg(self.preset(name_of(run_dir), setting));
+        command.arg("--dataset").arg(self.dataset()).arg("--run-dir").arg(run_dir);
+        command
     }
 
     pub fn evaluator(&self, name: &str, endpoint: &str) -> Evaluator {
@@ -100,6 +102,10 @@ impl Scratch {
         command.args(["serve", "--name", name]).args(arguments);
         Evaluator { process: Process::start(name, self.path(), command) }
     }
+}
+
+fn name_of(run_dir: &Path) -> &str {
+    run_dir.file_name().and_then(|name| name.to_str()).expect("a run has a name")
 }
 
 fn through(launcher: &[String], program: &str) -> Command {

@@ -26,13 +26,11 @@ pub(super) enum Guidance {
     Shuffled,
 }
 
-/// Reduction of a critic's values of several sampled next actions.
+/// Reduction of a critic's values of several sampled next actions: the maximum in AntMaze.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum TargetReduce {
-    /// Their mean (locomotion).
     Mean,
-    /// Their maximum (AntMaze).
     Max,
 }
 
@@ -46,25 +44,18 @@ pub(super) struct Eta {
     pub threshold: Option<Positive>,
     /// Step size α_η of dual ascent.
     pub rate: NotNegative,
-    /// Smallest η.
     pub minimum: NotNegative,
-    /// Largest η.
     pub maximum: NotNegative,
 }
 
-/// QUAD's hyper-parameters.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Config {
-    /// The noise predictor's hidden layers.
     pub actor: MlpConfig,
-    /// The critics' hidden layers.
     pub critic: MlpConfig,
     /// Ensemble size K.
     pub critics: Count,
-    /// Denoising steps T.
     pub diffusion_steps: Count,
-    /// Discount γ.
     pub gamma: UnitInterval,
     /// Pessimism ρ of the lower confidence bound (Eq. 20).
     pub rho: NotNegative,
@@ -77,11 +68,9 @@ pub(super) struct Config {
     pub lambda: Option<UnitInterval>,
     /// Next actions sampled per next state for the target, S.
     pub samples: Count,
-    /// Reduction of their values.
     pub target_reduce: TargetReduce,
     /// Actions that an evaluated policy draws in each state, N_a (Eq. 25).
     pub candidates: Candidates,
-    /// Behavior-cloning strength.
     pub eta: Eta,
     /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine before
     /// practice.

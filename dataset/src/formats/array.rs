@@ -1,4 +1,4 @@
-use crate::error::Problem;
+use crate::error::{ArrayProblem, Problem, RowProblem};
 
 /// N rows of numbers, read from shape N × width, or N if the width is 1. `values` is N × width.
 pub(crate) struct Array<T> {
@@ -9,13 +9,13 @@ pub(crate) struct Array<T> {
 }
 
 impl<T> Array<T> {
-    pub(crate) fn new(name: &str, shape: &[usize], values: Vec<T>) -> Result<Self, Problem> {
-        let (name, shape) = (name.to_owned(), shape.to_vec());
-        match shape[..] {
-            [_] => Ok(Self { name, shape, width: 1, values }),
-            [_, width] if width > 0 => Ok(Self { name, shape, width, values }),
-            _ => Err(Problem::Axes { array: name, found: shape }),
-        }
+    pub(crate) fn new(name: &str, shape: Vec<usize>, values: Vec<T>) -> Result<Self, Problem> {
+        let width = match shape[..] {
+            [_] => 1,
+            [_, width] if width > 0 => width,
+            _ => return Err(ArrayProblem::Axes(shape).of(name)),
+        };
+        Ok(Self { name: name.to_owned(), shape, width, values })
     }
 
     pub(crate) fn rows(&self) -> usize {
@@ -27,24 +27,18 @@ impl<T> Array<T> {
     }
 
     pub(crate) fn of_rows(self, rows: usize) -> Result<Self, Problem> {
-        match self.rows() == rows {
-            true => Ok(self),
-            false => Err(Problem::Shape {
-                expected: vec![rows, self.width],
-                array: self.name,
-                found: self.shape,
-            }),
-        }
+        let width = self.width;
+        self.of_shape(rows, width)
     }
 
     pub(crate) fn sized(self, rows: usize, width: usize) -> Result<Vec<T>, Problem> {
+        Ok(self.of_shape(rows, width)?.values)
+    }
+
+    fn of_shape(self, rows: usize, width: usize) -> Result<Self, Problem> {
         match (self.rows(), self.width) == (rows, width) {
-            true => Ok(self.values),
-            false => Err(Problem::Shape {
-                array: self.name,
-                found: self.shape,
-                expected: vec![rows, width],
-            }),
+            true => Ok(self),
+            false => Err(ArrayProblem::Shape(self.shape, [rows, width]).of(&self.name)),
         }
     }
 }
@@ -52,11 +46,20 @@ impl<T> Array<T> {
 impl Array<f32> {
     /// One flag per row; all values must be 0 or 1.
     pub(crate) fn into_flags(self, rows: usize) -> Result<Vec<bool>, Problem> {
-        let name = self.name.clone();
+        let array = self.name.clone();
         let values = self.sized(rows, 1)?;
         match values.iter().position(|&value| value != 0.0 && value != 1.0) {
             None => Ok(values.into_iter().map(|value| value == 1.0).collect()),
-            Some(row) => Err(Problem::NotBoolean { array: name, row, value: values[row] }),
+            Some(row) => Err(RowProblem::NotBoolean(values[row]).at(&array, row)),
         }
+    }
+}
+
+/// Refuses a shape of more numbers than `most`, or of more rows than indices, in a file of `bytes`.
+pub(crate) fn check_size(shape: &[usize], most: u64, bytes: u64) -> Result<(), ArrayProblem> {
+    let claimed = shape.iter().fold(1u64, |product, &axis| product.saturating_mul(axis as u64));
+    match claimed > most || shape.first().is_some_and(|&rows| rows > u32::MAX as usize) {
+        true => Err(ArrayProblem::Oversized(shape.to_vec(), bytes)),
+        false => Ok(()),
     }
 }

@@ -1,16 +1,21 @@
-//! Transitions in memory, and the writer of the custom layout.
+//! Transitions in memory, and the custom layout: HDF5 with one row per transition.
 
 use std::path::Path;
-use std::str::FromStr;
 
 use hdf5::types::VarLenUnicode;
 
 use crate::checks;
-use crate::error::{DatasetError, Problem};
-use crate::formats::new_file::{Column, NewFile};
-use crate::formats::own::{self, ACTION_NAMES, OBSERVATION_NAMES};
+use crate::error::{ArrayProblem, DatasetError, Problem};
+use crate::formats::hdf5_file::Hdf5File;
+use crate::formats::new_file::{Column, NewFile, text};
 use crate::recording::{Names, Recording, RowKind};
 use crate::rounding::Rounding;
+
+/// Value of the root attribute `layout` that distinguishes this layout from D4RL's.
+pub(super) const LAYOUT: &str = "transitions";
+
+const OBSERVATION_NAMES: &str = "observation_names";
+const ACTION_NAMES: &str = "action_names";
 
 /// N transitions in memory, ordered by episode.
 #[derive(Clone, Debug, Default)]
@@ -43,21 +48,16 @@ impl Arrays {
             ("terminals", 1, self.terminals.len()),
             ("timeouts", 1, self.timeouts.len()),
         ] {
-            let array = array.to_owned();
             if width == 0 {
-                return Err(Problem::Axes { array, found: vec![rows, 0] });
+                return Err(ArrayProblem::Axes(vec![rows, 0]).of(array));
             }
             if found != rows * width {
-                return Err(Problem::Numbers { array, found, rows, width });
+                return Err(ArrayProblem::Shape(vec![found], [rows, width]).of(array));
             }
         }
-        let ends = self
-            .terminals
-            .iter()
-            .zip(&self.timeouts)
-            .map(|(terminal, timeout)| *terminal || *timeout);
+        let ends = (0..rows).map(|row| self.terminals[row] || self.timeouts[row]);
         Ok(Recording {
-            rounding: Rounding::between(&self.observations, &self.next_observations),
+            rounding: Rounding::between(&self.observations, Some(&self.next_observations)),
             observation_dim: o,
             action_dim: a,
             kinds: vec![RowKind::Transition; rows],
@@ -74,13 +74,44 @@ impl Arrays {
     }
 }
 
+/// Reads the custom layout. Terminals and timeouts end an episode; without `timeouts`, so does a
+/// next observation that differs from the following row's observation.
+pub(super) fn read_own(file: &Hdf5File) -> Result<Recording, Problem> {
+    let observations = file.numbers("observations")?;
+    let (rows, observation_dim) = (observations.rows(), observations.width);
+    let actions = file.actions("actions")?.of_rows(rows)?;
+    let has_timeouts = file.has("timeouts");
+    let arrays = Arrays {
+        observation_dim,
+        action_dim: actions.width,
+        observations: observations.values,
+        actions: actions.values,
+        rewards: file.table("rewards", rows, 1)?,
+        next_observations: file.table("next_observations", rows, observation_dim)?,
+        terminals: file.flags("terminals", rows)?,
+        timeouts: match has_timeouts {
+            true => file.flags("timeouts", rows)?,
+            false => vec![false; rows],
+        },
+    };
+    let mut recording = arrays.into_recording()?;
+    if !has_timeouts {
+        recording.ends =
+            (0..rows).map(|row| recording.terminals[row] || recording.jumps(row)).collect();
+    }
+    recording.names.observations = file.names(OBSERVATION_NAMES, observation_dim)?;
+    recording.names.actions = file.names(ACTION_NAMES, recording.action_dim)?;
+    Ok(recording)
+}
+
 /// Writes the custom layout (docs/data.md) in compressed float32, with `names` as attributes.
 /// Arrays that the reader would refuse are an error, except that actions may have any range. An
 /// existing file is replaced once the new one is complete.
 pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result<(), DatasetError> {
     let path = path.as_ref();
     let error = |problem| DatasetError::new(path, problem);
-    let recording = Recording { names, ..arrays.into_recording().map_err(error)? };
+    let mut recording = arrays.into_recording().map_err(error)?;
+    recording.names = names;
     if let Some(problem) = checks::problems(&recording, None).into_iter().next() {
         return Err(error(problem));
     }
@@ -90,15 +121,11 @@ pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result
 }
 
 fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
-    let layout = VarLenUnicode::from_str(own::LAYOUT).map_err(|error| error.to_string())?;
-    file.hdf5.new_attr::<VarLenUnicode>().create("layout")?.write_scalar(&layout)?;
-    for (name, texts) in [
-        (OBSERVATION_NAMES, &recording.names.observations),
-        (ACTION_NAMES, &recording.names.actions),
-    ] {
-        let texts =
-            texts.iter().map(|text| VarLenUnicode::from_str(text)).collect::<Result<Vec<_>, _>>();
-        let texts = texts.map_err(|error| error.to_string())?;
+    let layout = file.hdf5.new_attr::<VarLenUnicode>().create("layout")?;
+    layout.write_scalar(&text(LAYOUT)?)?;
+    let Names { observations, actions } = &recording.names;
+    for (name, texts) in [(OBSERVATION_NAMES, observations), (ACTION_NAMES, actions)] {
+        let texts = texts.iter().map(|name| text(name)).collect::<Result<Vec<_>, _>>()?;
         if !texts.is_empty() {
             file.hdf5.new_attr_builder().with_data(&texts).create(name)?;
         }
@@ -113,8 +140,6 @@ fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
     ] {
         Column::create::<f32>(file, name, width)?.append(values)?;
     }
-    for (name, flags) in [("terminals", &recording.terminals), ("timeouts", &recording.timeouts)] {
-        Column::create::<bool>(file, name, None)?.append(flags)?;
-    }
-    Ok(())
+    Column::create::<bool>(file, "terminals", None)?.append(&recording.terminals)?;
+    Column::create::<bool>(file, "timeouts", None)?.append(&recording.timeouts)
 }

@@ -26,32 +26,26 @@ pub(super) fn read(
         (false, None) => vec![false; rows],
     };
     // The recording continues after the goal: only timeouts end an episode.
-    let goal =
-        environment.is_some_and(|environment| environment.maze.is_some()) || file.has("infos/goal");
+    let is_maze = environment.is_some_and(|environment| environment.maze.is_some());
+    let goal = is_maze || file.has("infos/goal");
     let until_timeout = goal && timeouts.contains(&true);
-    let ends = terminals
-        .iter()
-        .zip(&timeouts)
-        .map(|(&terminal, &timeout)| timeout || (terminal && !until_timeout));
-    let kind = |(row, &timeout): (usize, &bool)| match timeout || row + 1 == rows {
+    let ends = (0..rows).map(|row| timeouts[row] || (terminals[row] && !until_timeout));
+    let kind = |row: usize| match timeouts[row] || row + 1 == rows {
         true => RowKind::Dropped,
         false => RowKind::Transition,
     };
-    let unused_next_observations = match file.has("next_observations") {
-        true => Some(file.table("next_observations", rows, observations.width)?),
-        false => None,
-    };
-    let stored: Option<&Vec<f32>> = unused_next_observations.as_ref();
+    let stored = file.has("next_observations");
+    let stored = stored.then(|| file.table("next_observations", rows, observations.width));
+    let unused_next_observations = stored.transpose()?;
     let mut recording = Recording {
-        rounding: stored
-            .map(|stored| Rounding::between(&observations.values, stored))
-            .unwrap_or_default(),
+        rounding: Rounding::between(&observations.values, unused_next_observations.as_ref()),
         observation_dim: observations.width,
         action_dim: actions.width,
         observations: observations.values,
         actions: actions.values,
         rewards: file.table("rewards", rows, 1)?,
-        kinds: timeouts.iter().enumerate().map(kind).collect(),
+        unused_next_observations,
+        kinds: (0..rows).map(kind).collect(),
         ends: ends.collect(),
         terminals,
         terminal_array: "terminals",
@@ -59,11 +53,8 @@ pub(super) fn read(
         goal,
         ..Recording::default()
     };
-    if let Some(stored) = unused_next_observations {
-        for row in 0..rows {
-            recording.ends[row] |= recording.terminals[row] && recording.jumps(&stored, row);
-        }
-        recording.unused_next_observations = Some(stored);
+    for row in 0..rows {
+        recording.ends[row] |= recording.terminals[row] && recording.jumps(row);
     }
     Ok(recording)
 }

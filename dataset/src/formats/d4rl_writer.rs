@@ -1,13 +1,11 @@
 //! Writer of D4RL's layout, in float32.
 
 use std::path::Path;
-use std::str::FromStr;
 
 use hdf5::H5Type;
-use hdf5::types::VarLenUnicode;
 
-use crate::error::{DatasetError, Problem};
-use crate::formats::new_file::{CHUNK_ROWS, Column, NewFile};
+use crate::error::{DatasetError, Problem, RowProblem};
+use crate::formats::new_file::{CHUNK_ROWS, Column, NewFile, text};
 use crate::formats::recorded::Row;
 use crate::practice::PracticeRows;
 use crate::tables::environment::EnvironmentSpec;
@@ -29,19 +27,14 @@ pub struct D4rlWriter {
     environment: &'static EnvironmentSpec,
     file: NewFile,
     rows: usize,
-    floats: Vec<Buffered<f32>>,
-    flags: Vec<Buffered<bool>>,
+    columns: Vec<Buffered>,
 }
 
-/// Numeric columns, in the order in which `push` writes them.
-const FLOATS: [&str; 6] =
-    ["observations", "actions", "next_observations", "rewards", "infos/qpos", "infos/qvel"];
-const FLAGS: [&str; 2] = ["terminals", "timeouts"];
-
 /// Column with up to one chunk of rows not yet written.
-struct Buffered<T> {
+struct Buffered {
     column: Column,
-    buffer: Vec<T>,
+    is_flag: bool,
+    buffer: Vec<f32>,
 }
 
 impl D4rlWriter {
@@ -51,45 +44,47 @@ impl D4rlWriter {
         environment: &'static EnvironmentSpec,
     ) -> Result<Self, DatasetError> {
         let file = NewFile::create(path.as_ref())?;
-        let EnvironmentSpec { observation_dim: o, action_dim: a, qpos_dim, qvel_dim, .. } =
-            *environment;
-        let widths = [Some(o), Some(a), Some(o), None, Some(qpos_dim), Some(qvel_dim)];
-        let columns = || -> hdf5::Result<_> {
-            file.hdf5.create_group("infos")?;
-            let floats =
-                FLOATS.iter().zip(widths).map(|(name, width)| Buffered::create(&file, name, width));
-            let flags = FLAGS.iter().map(|name| Buffered::create(&file, name, None));
-            Ok((floats.collect::<hdf5::Result<_>>()?, flags.collect::<hdf5::Result<_>>()?))
-        };
-        let (floats, flags) = columns().map_err(|source| file.failed(source))?;
-        Ok(Self { environment, file, rows: 0, floats, flags })
+        let columns = columns(&file, environment).map_err(|source| file.failed(source))?;
+        Ok(Self { environment, file, rows: 0, columns })
     }
 
     /// Appends a row. Other dimensions and numbers not finite in float32 are refused.
     pub fn push(&mut self, row: &Row) -> Result<(), DatasetError> {
-        let reward = [row.reward];
-        let values =
-            [row.observation, row.action, row.next_observation, &reward, row.qpos, row.qvel];
-        for (Buffered { column, .. }, values) in self.floats.iter().zip(values) {
-            let width = column.width.unwrap_or(1);
-            let problem = if values.len() != width {
-                format!("has {} numbers, but must have {width}", values.len())
-            } else if let Some(value) = values.iter().find(|&&value| !(value as f32).is_finite()) {
-                format!("has {value}, which is not a finite float32")
-            } else {
-                continue;
-            };
-            let problem = Problem::BadRow { row: self.rows, array: column.name, problem };
+        let number = |flag: bool| [f64::from(u8::from(flag))];
+        // In the order of `columns`.
+        let values = [
+            row.observation,
+            row.action,
+            row.next_observation,
+            &[row.reward],
+            row.qpos,
+            row.qvel,
+            &number(row.terminal),
+            &number(row.timeout),
+        ];
+        let problem = self
+            .columns
+            .iter()
+            .zip(values)
+            .find_map(|(column, values)| self.problem(&column.column, values));
+        if let Some(problem) = problem {
             return Err(DatasetError::new(self.file.path(), problem));
         }
-        for (column, values) in self.floats.iter_mut().zip(values) {
+        for (column, values) in self.columns.iter_mut().zip(values) {
             column.buffer.extend(values.iter().map(|&value| value as f32));
-        }
-        for (column, flag) in self.flags.iter_mut().zip([row.terminal, row.timeout]) {
-            column.buffer.push(flag);
         }
         self.rows += 1;
         if self.rows.is_multiple_of(CHUNK_ROWS) { self.flush() } else { Ok(()) }
+    }
+
+    fn problem(&self, column: &Column, values: &[f64]) -> Option<Problem> {
+        let (array, found, expected) = (column.name, values.len(), column.width.unwrap_or(1));
+        if found != expected {
+            let environment = self.environment.name.clone();
+            return Some(Problem::Width(array, found, environment, expected));
+        }
+        let value = values.iter().map(|value| *value as f32).find(|value| !value.is_finite())?;
+        Some(RowProblem::NotFinite(value).at(array, self.rows))
     }
 
     /// Number of rows so far.
@@ -100,40 +95,64 @@ impl D4rlWriter {
     /// Writes the remaining rows and renames the file.
     pub fn finish(mut self, metadata: &Metadata) -> Result<(), DatasetError> {
         self.flush()?;
-        write_metadata(&self.file, &self.environment.name, metadata)
-            .map_err(|source| self.file.failed(source))?;
-        let Self { file, floats, flags, .. } = self;
-        drop((floats, flags));
-        file.finish()
+        let written = write_metadata(&self.file, &self.environment.name, metadata);
+        written.map_err(|source| self.file.failed(source))?;
+        drop(self.columns);
+        self.file.finish()
     }
 
     fn flush(&mut self) -> Result<(), DatasetError> {
-        let floats = self.floats.iter_mut().try_for_each(Buffered::flush);
-        let flushed = floats.and_then(|()| self.flags.iter_mut().try_for_each(Buffered::flush));
+        let flushed = self.columns.iter_mut().try_for_each(Buffered::flush);
         flushed.map_err(|source| self.file.failed(source))
     }
 }
 
-impl<T: H5Type> Buffered<T> {
-    fn create(file: &NewFile, name: &'static str, width: Option<usize>) -> hdf5::Result<Self> {
-        Ok(Self { column: Column::create::<T>(file, name, width)?, buffer: Vec::new() })
-    }
+fn columns(file: &NewFile, spec: &EnvironmentSpec) -> hdf5::Result<Vec<Buffered>> {
+    file.hdf5.create_group("infos")?;
+    let (o, a) = (Some(spec.observation_dim), Some(spec.action_dim));
+    let columns = [
+        ("observations", o),
+        ("actions", a),
+        ("next_observations", o),
+        ("rewards", None),
+        ("infos/qpos", Some(spec.qpos_dim)),
+        ("infos/qvel", Some(spec.qvel_dim)),
+        ("terminals", None),
+        ("timeouts", None),
+    ];
+    let create = |(name, width)| {
+        let is_flag = matches!(name, "terminals" | "timeouts");
+        let column = match is_flag {
+            true => Column::create::<bool>(file, name, width)?,
+            false => Column::create::<f32>(file, name, width)?,
+        };
+        let buffer = Vec::new();
+        Ok(Buffered { column, is_flag, buffer })
+    };
+    columns.into_iter().map(create).collect()
+}
 
+impl Buffered {
     fn flush(&mut self) -> hdf5::Result<()> {
-        self.column.append(&self.buffer)?;
+        let flags = || Vec::from_iter(self.buffer.iter().map(|value| *value == 1.0));
+        match self.is_flag {
+            true => self.column.append(&flags())?,
+            false => self.column.append(&self.buffer)?,
+        }
         self.buffer.clear();
         Ok(())
     }
 }
 
 fn write_metadata(file: &NewFile, environment: &str, metadata: &Metadata) -> hdf5::Result<()> {
-    let text = |value: &str| VarLenUnicode::from_str(value).map_err(|error| error.to_string());
-    let group = file.hdf5.create_group("metadata")?;
-    for (name, value) in [("algorithm", metadata.algorithm), ("environment", environment)] {
-        group.new_dataset::<VarLenUnicode>().create(name)?.write_scalar(&text(value)?)?;
+    fn put<T: H5Type>(group: &hdf5::Group, name: &str, value: &T) -> hdf5::Result<()> {
+        group.new_dataset::<T>().create(name)?.write_scalar(value)
     }
-    group.new_dataset::<i64>().create("iteration")?.write_scalar(&metadata.iteration)?;
-    group.new_dataset::<u64>().create("seed")?.write_scalar(&metadata.seed)
+    let group = file.hdf5.create_group("metadata")?;
+    put(&group, "algorithm", &text(metadata.algorithm)?)?;
+    put(&group, "environment", &text(environment)?)?;
+    put(&group, "iteration", &metadata.iteration)?;
+    put(&group, "seed", &metadata.seed)
 }
 
 /// Writes episodes of practice in an environment of these sizes of observation and action, without
@@ -163,13 +182,15 @@ pub fn write_practice(
     }
     let file = NewFile::create(path)?;
     let write = || {
-        let floats = [observations, actions, next_observations, rewards];
-        for ((name, width), values) in
-            FLOATS.iter().zip([Some(o), Some(a), Some(o), None]).zip(&floats)
-        {
+        for (name, width, values) in [
+            ("observations", Some(o), &observations),
+            ("actions", Some(a), &actions),
+            ("next_observations", Some(o), &next_observations),
+            ("rewards", None, &rewards),
+        ] {
             Column::create::<f32>(&file, name, width)?.append(values)?;
         }
-        for (name, flags) in FLAGS.iter().zip([&terminals, &timeouts]) {
+        for (name, flags) in [("terminals", &terminals), ("timeouts", &timeouts)] {
             Column::create::<bool>(&file, name, None)?.append(flags)?;
         }
         if interventions.contains(&true) {

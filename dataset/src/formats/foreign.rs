@@ -1,6 +1,7 @@
 //! Names of foreign formats, and the tools that read them.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, Read};
 use std::path::Path;
 
 use serde_json::Value;
@@ -9,10 +10,16 @@ use crate::error::Load::{self, Convert, Python};
 use crate::error::Problem;
 
 /// Number of leading bytes that identify a format.
-pub(crate) const START: u64 = 256;
+const START: u64 = 256;
 
 const TABLE: Load = Convert(
     "quad-convert FILE --observations COLUMN … --actions COLUMN … --reward COLUMN --episode COLUMN --terminal COLUMN",
+);
+const ARROW: Load = Python("load it by pandas.read_feather");
+const JSON: Load = Python("load it by json.load or pandas.read_json");
+const NUMPY: Load = Python("load it by numpy.load");
+const MATLAB: Load = Python(
+    "load it by scipy.io.loadmat or, if it is of version 7.3, by h5py, which transposes arrays",
 );
 const PICKLE: Load =
     Python("load it by pickle.load, if you trust who wrote it: a pickle can run any program");
@@ -20,23 +27,24 @@ const PICKLE: Load =
 /// First bytes of a file, name of its format, and remedy.
 const STARTS: [(&[u8], &str, Load); 8] = [
     (b"PAR1", "a Parquet file", TABLE),
-    (b"ARROW1", "an Arrow file", Python("load it by pandas.read_feather")),
+    (b"ARROW1", "an Arrow file", ARROW),
     (b"\x80\x02", "a Python pickle", PICKLE),
     (b"\x80\x03", "a Python pickle", PICKLE),
     (b"\x80\x04", "a Python pickle", PICKLE),
     (b"\x80\x05", "a Python pickle", PICKLE),
-    (b"\x93NUMPY", "a single NumPy array", Python("load it by numpy.load")),
-    (
-        b"MATLAB",
-        "a MATLAB file",
-        Python(
-            "load it by scipy.io.loadmat or, if it is of version 7.3, by h5py, which transposes arrays",
-        ),
-    ),
+    (b"\x93NUMPY", "a single NumPy array", NUMPY),
+    (b"MATLAB", "a MATLAB file", MATLAB),
 ];
 
 fn foreign(what: impl Into<String>, load: Load) -> Problem {
-    Problem::Foreign { what: what.into(), load }
+    Problem::Foreign(what.into(), load)
+}
+
+/// A file and its first [`START`] bytes.
+pub(crate) fn start_of(path: &Path) -> io::Result<(File, Vec<u8>)> {
+    let (file, mut start) = (File::open(path)?, Vec::new());
+    (&file).take(START).read_to_end(&mut start)?;
+    Ok((file, start))
 }
 
 /// The problem with a file that is neither HDF5 nor zip, by its first [`START`] bytes.
@@ -44,18 +52,17 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
     if let Some((_, what, load)) = STARTS.iter().find(|(bytes, _, _)| start.starts_with(bytes)) {
         return foreign(*what, *load);
     }
-    let text = start.utf8_chunks().next().filter(|chunk| start.len() - chunk.valid().len() < 4);
-    let text = text.map_or("", |chunk| chunk.valid());
+    let chunk = start.utf8_chunks().next().map_or("", |chunk| chunk.valid());
+    // The last character may be cut off.
+    let text = if start.len() - chunk.len() < 4 { chunk } else { "" };
     let first_line = text.lines().next().unwrap_or_default();
-    match text {
-        text if text.contains(|c: char| c.is_control() && !c.is_whitespace()) => {
-            Problem::UnknownFormat
-        }
-        text if text.starts_with(['{', '[']) => {
-            foreign("a JSON file", Python("load it by json.load or pandas.read_json"))
-        }
-        _ if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", TABLE),
-        _ => Problem::UnknownFormat,
+    if text.contains(|c: char| c.is_control() && !c.is_whitespace()) {
+        return Problem::UnknownFormat;
+    }
+    match text.starts_with(['{', '[']) {
+        true => foreign("a JSON file", JSON),
+        false if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", TABLE),
+        false => Problem::UnknownFormat,
     }
 }
 
@@ -70,36 +77,33 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
         );
         return foreign(format!("a LeRobot dataset of version {version}"), load);
     }
-    let format =
-        text("data/metadata.json", "data_format").or_else(|| text("metadata.json", "data_format"));
-    match format.filter(|format| format != "hdf5") {
-        Some(format) => {
-            foreign(format!("a Minari dataset stored as {format}"), Convert("quad-convert FOLDER"))
-        }
-        None => Problem::UnknownFolder,
-    }
+    let format = |file| text(file, "data_format").filter(|format| format != "hdf5");
+    let Some(format) = format("data/metadata.json").or_else(|| format("metadata.json")) else {
+        return Problem::UnknownFolder;
+    };
+    let load = Convert("quad-convert FOLDER");
+    foreign(format!("a Minari dataset stored as {format}"), load)
 }
 
-/// The problem with an HDF5 file of another layout, by the members of its groups.
-pub(crate) fn of_group(
-    members: &[String],
-    within: impl Fn(&str) -> Vec<String>,
-) -> Option<Problem> {
-    let demonstration = members.iter().find(|name| name.starts_with("demo_"))?;
-    Some(match within(demonstration).iter().any(|name| name == "rewards") {
+/// The problem with an HDF5 file of robomimic's layout.
+pub(crate) fn of_robomimic(has_rewards: bool) -> Problem {
+    match has_rewards {
         true => foreign("a robomimic file", Convert("quad-convert FILE --observations KEY …")),
         false => foreign(
             "a file in robomimic's layout without rewards, as Isaac Lab's recorder writes it",
             Convert("quad-convert FILE --observations KEY … --reward success-at-end --success all"),
         ),
-    })
+    }
 }
 
+/// The problem with a zip archive of these files, if it is not NumPy's.
 pub(crate) fn of_archive(files: &[impl AsRef<str>]) -> Option<Problem> {
     let has = |ending: &str| files.iter().any(|name| name.as_ref().ends_with(ending));
-    match (has(".npy"), has("data.pkl")) {
-        (true, _) => None,
-        (false, true) => Some(foreign("a PyTorch file", Python("load it by torch.load"))),
-        (false, false) => Some(Problem::UnknownFormat),
+    if has(".npy") {
+        return None;
     }
+    Some(match has("data.pkl") {
+        true => foreign("a PyTorch file", Python("load it by torch.load")),
+        false => Problem::UnknownFormat,
+    })
 }

@@ -3,15 +3,14 @@
 
 use std::fmt::Display;
 use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use hdf5::dataset::Layout;
 use hdf5::types::{FixedAscii, FixedUnicode, TypeDescriptor, VarLenAscii, VarLenUnicode};
 use hdf5::{Container, H5Type, IndexType, IterationOrder, LinkType};
 
-use crate::error::{DatasetError, Problem};
-use crate::formats::array::Array;
+use crate::error::{ArrayProblem, DatasetError, Problem};
+use crate::formats::array::{Array, check_size};
 use crate::formats::foreign;
 use crate::tables::benchmarks::Format;
 
@@ -29,7 +28,8 @@ const FLAGS: &str = "booleans (h5py's enum, or numbers that are 0 or 1)";
 /// Version of the linked HDF5 library, and true if it reads compressed arrays such as D4RL's.
 pub fn hdf5_library() -> (String, bool) {
     let (major, minor, release) = hdf5::library_version();
-    (format!("{major}.{minor}.{release}"), hdf5::filters::deflate_available())
+    let version = format!("{major}.{minor}.{release}");
+    (version, hdf5::filters::deflate_available())
 }
 
 pub(crate) struct Hdf5File {
@@ -40,14 +40,19 @@ pub(crate) struct Hdf5File {
 
 impl Hdf5File {
     pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
-        let io_error = |source| DatasetError::new(path, Problem::Io(source));
-        let mut start = Vec::new();
-        let plain = File::open(path).map_err(io_error)?;
-        let bytes = plain.metadata().map_err(io_error)?.len();
-        (&plain).take(foreign::START).read_to_end(&mut start).map_err(io_error)?;
-        let refused = |source| DatasetError::new(path, refusal(&plain, &start, bytes, source));
+        Self::checked(path).map_err(|problem| DatasetError::new(path, problem))
+    }
+
+    fn checked(path: &Path) -> Result<Self, Problem> {
+        let (plain, start) = foreign::start_of(path)?;
+        let bytes = plain.metadata()?.len();
+        if Format::of(&start) != Some(Format::Hdf5) {
+            return Err(foreign::of_start(&start));
+        }
+        let refused = |source| refusal(&plain, &start, bytes, source);
         let file = hdf5::File::open(path).map_err(refused)?;
-        Ok(Self { path: path.into(), file, bytes })
+        let path = path.to_owned();
+        Ok(Self { path, file, bytes })
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -76,39 +81,38 @@ impl Hdf5File {
         Some(text_in(&*self.file.attr(name).ok()?).unwrap_or_default())
     }
 
-    /// Root attribute of `count` texts; empty if absent.
-    pub(crate) fn names(&self, attribute: &str, count: usize) -> Result<Vec<String>, Problem> {
-        let Ok(holder) = self.file.attr(attribute) else { return Ok(Vec::new()) };
-        match texts_in(&holder).unwrap_or_default() {
-            texts if texts.len() == count => Ok(texts),
-            texts => Err(Problem::Names {
-                attribute: attribute.to_owned(),
-                found: texts.len(),
-                expected: count,
-            }),
+    /// Root attribute of `expected` texts; empty if absent.
+    pub(crate) fn names(
+        &self,
+        name: &'static str,
+        expected: usize,
+    ) -> Result<Vec<String>, Problem> {
+        let Ok(holder) = self.file.attr(name) else { return Ok(Vec::new()) };
+        let texts = texts_in(&holder).unwrap_or_default();
+        match texts.len() == expected {
+            true => Ok(texts),
+            false => Err(Problem::Names(name, texts.len(), expected)),
         }
     }
 
+    /// Rows and width of an array.
     pub(crate) fn size(&self, array: &str) -> Result<(usize, usize), Problem> {
-        let empty = Array::<f32>::new(array, &self.dataset(array)?.shape(), Vec::new())?;
+        let dataset = self.dataset(array).map_err(|problem| problem.of(array))?;
+        let empty = Array::<f32>::new(array, dataset.shape(), Vec::new())?;
         Ok((empty.rows(), empty.width))
     }
 
     /// Array of numbers, converted to `T`; NaN is allowed.
     pub(crate) fn numbers<T: H5Type>(&self, array: &str) -> Result<Array<T>, Problem> {
-        let dataset = self.dataset(array)?;
-        self.descriptor(&dataset, array, NUMBERS)?;
-        let shape = self.check_size(&dataset, array)?;
-        let values = dataset.read_raw::<T>().map_err(|source| unreadable(array, source))?;
-        Array::new(array, &shape, values)
+        self.read(array, NUMBERS, |dataset, _| Ok(dataset.read_raw()?))
     }
 
     /// Array of actions, which must be of a floating-point type.
     pub(crate) fn actions(&self, array: &str) -> Result<Array<f32>, Problem> {
-        match self.descriptor(&self.dataset(array)?, array, NUMBERS)? {
-            TypeDescriptor::Float(_) => self.numbers(array),
-            _ => Err(Problem::DiscreteActions { array: array.to_owned() }),
-        }
+        self.read(array, NUMBERS, |dataset, descriptor| match descriptor {
+            TypeDescriptor::Float(_) => Ok(dataset.read_raw()?),
+            _ => Err(ArrayProblem::DiscreteActions),
+        })
     }
 
     pub(crate) fn table<T: H5Type>(
@@ -121,38 +125,51 @@ impl Hdf5File {
     }
 
     pub(crate) fn flags(&self, array: &str, rows: usize) -> Result<Vec<bool>, Problem> {
-        let dataset = self.dataset(array)?;
-        let descriptor = self.descriptor(&dataset, array, FLAGS)?;
-        let shape = self.check_size(&dataset, array)?;
-        let values = match descriptor {
-            TypeDescriptor::Float(_) => dataset.read_raw::<f32>(),
+        let flags = self.read(array, FLAGS, |dataset, descriptor| match descriptor {
+            TypeDescriptor::Float(_) => Ok(dataset.read_raw::<f32>()?),
             // A damaged file may hold any byte, which is undefined behavior in a `bool`. HDF5's
             // conversion saturates, so no other value becomes 0 or 1.
-            _ => dataset.read_raw::<i8>().map(|values| values.into_iter().map(f32::from).collect()),
-        };
-        let values = values.map_err(|source| unreadable(array, source))?;
-        Array::new(array, &shape, values).and_then(|array| array.into_flags(rows))
+            _ => Ok(dataset.read_raw::<i8>()?.into_iter().map(f32::from).collect()),
+        });
+        flags?.into_flags(rows)
     }
 
-    fn dataset(&self, array: &str) -> Result<hdf5::Dataset, Problem> {
+    /// Array whose type and size are checked before `values` reads it.
+    fn read<T>(
+        &self,
+        array: &str,
+        expected: &'static str,
+        values: impl Fn(&hdf5::Dataset, TypeDescriptor) -> Result<Vec<T>, ArrayProblem>,
+    ) -> Result<Array<T>, Problem> {
+        let read = || {
+            let dataset = self.dataset(array)?;
+            let descriptor = descriptor(&dataset, expected)?;
+            let most = self.bytes.saturating_mul(MAX_COMPRESSION);
+            check_size(&dataset.shape(), most, self.bytes)?;
+            Ok((dataset.shape(), values(&dataset, descriptor)?))
+        };
+        let (shape, values) = read().map_err(|problem: ArrayProblem| problem.of(array))?;
+        Array::new(array, shape, values)
+    }
+
+    fn dataset(&self, array: &str) -> Result<hdf5::Dataset, ArrayProblem> {
         if !self.has(array) {
-            return Err(Problem::Missing { array: array.to_owned() });
+            return Err(ArrayProblem::Missing);
         }
-        let name = || array.to_owned();
-        let dataset = self.file.dataset(array).map_err(|source| match self.file.group(array) {
-            Ok(_) => Problem::Group { array: name() },
-            Err(_) if self.is_link(array) => Problem::Elsewhere { array: name() },
-            Err(_) => unreadable(array, source),
-        })?;
-        let creation = dataset.dcpl().map_err(|source| unreadable(array, source))?;
+        let problem = |source: hdf5::Error| match self.file.group(array) {
+            Ok(_) => ArrayProblem::Group,
+            Err(_) if self.is_link(array) => ArrayProblem::Elsewhere,
+            Err(_) => source.into(),
+        };
+        let dataset = self.file.dataset(array).map_err(problem)?;
+        let creation = dataset.dcpl()?;
         let elsewhere = dataset.filename() != self.file.filename();
         if elsewhere || creation.layout() == Layout::Virtual || !creation.external().is_empty() {
-            return Err(Problem::Elsewhere { array: name() });
+            return Err(ArrayProblem::Elsewhere);
         }
-        match creation.filters().iter().find(|filter| !filter.is_available()) {
-            Some(filter) => {
-                Err(Problem::Filter { array: name(), filter: filter_name(filter.id()) })
-            }
+        let filters = creation.filters();
+        match filters.iter().find(|filter| !filter.is_available()) {
+            Some(filter) => Err(ArrayProblem::Filter(filter_name(filter.id()))),
             None => Ok(dataset),
         }
     }
@@ -160,60 +177,33 @@ impl Hdf5File {
     /// True for a soft or external link.
     fn is_link(&self, array: &str) -> bool {
         let (group, name) = array.rsplit_once('/').unwrap_or(("/", array));
-        let links = self
-            .file
-            .group(group)
-            .and_then(|group| group.links(IndexType::Name, IterationOrder::Native));
-        links
-            .unwrap_or_default()
-            .iter()
-            .any(|(link, info)| link == name && info.link_type != LinkType::Hard)
-    }
-
-    fn descriptor(
-        &self,
-        dataset: &hdf5::Dataset,
-        array: &str,
-        expected: &'static str,
-    ) -> Result<TypeDescriptor, Problem> {
-        let wrong = |found: String| Problem::Type { array: array.to_owned(), found, expected };
-        let datatype = dataset.dtype().map_err(|source| unreadable(array, source))?;
-        // `to_descriptor` reads an enum's member into 8 bytes, whatever its size in the file.
-        if datatype.size() > MAX_ELEMENT_BYTES {
-            return Err(wrong(format!("elements of {} bytes", datatype.size())));
-        }
-        let descriptor = datatype.to_descriptor().map_err(|error| wrong(error.to_string()))?;
-        match descriptor {
-            TypeDescriptor::Float(_) | TypeDescriptor::Integer(_) | TypeDescriptor::Unsigned(_) => {
-                Ok(descriptor)
-            }
-            TypeDescriptor::Boolean | TypeDescriptor::Enum(_) if expected == FLAGS => {
-                Ok(descriptor)
-            }
-            other => Err(wrong(other.to_string())),
-        }
-    }
-
-    fn check_size(&self, dataset: &hdf5::Dataset, array: &str) -> Result<Vec<usize>, Problem> {
-        let shape = dataset.shape();
-        let claimed = shape.iter().fold(1u64, |product, &axis| product.saturating_mul(axis as u64));
-        let rows = shape.first().copied().unwrap_or(0);
-        if claimed > self.bytes.saturating_mul(MAX_COMPRESSION) || rows > u32::MAX as usize {
-            let array = array.to_owned();
-            return Err(Problem::Oversized { array, found: shape, bytes: self.bytes });
-        }
-        Ok(shape)
+        let links = |group: hdf5::Group| group.links(IndexType::Name, IterationOrder::Native);
+        let links = self.file.group(group).and_then(links).unwrap_or_default();
+        let mut links = links.iter().filter(|(link, _)| link == name);
+        links.any(|(_, info)| info.link_type != LinkType::Hard)
     }
 }
 
-fn unreadable(array: &str, source: hdf5::Error) -> Problem {
-    Problem::Unreadable { array: array.to_owned(), source: source.into() }
+fn descriptor(
+    dataset: &hdf5::Dataset,
+    expected: &'static str,
+) -> Result<TypeDescriptor, ArrayProblem> {
+    let wrong = |found: String| ArrayProblem::Type(found, expected);
+    let datatype = dataset.dtype()?;
+    // `to_descriptor` reads an enum's member into 8 bytes, whatever its size in the file.
+    if datatype.size() > MAX_ELEMENT_BYTES {
+        return Err(wrong(format!("elements of {} bytes", datatype.size())));
+    }
+    use TypeDescriptor::{Boolean, Enum, Float, Integer, Unsigned};
+    let descriptor = datatype.to_descriptor();
+    match descriptor.map_err(|error| wrong(error.to_string()))? {
+        number @ (Float(_) | Integer(_) | Unsigned(_)) => Ok(number),
+        flag @ (Boolean | Enum(_)) if expected == FLAGS => Ok(flag),
+        other => Err(wrong(other.to_string())),
+    }
 }
 
 fn refusal(file: &File, start: &[u8], bytes: u64, source: hdf5::Error) -> Problem {
-    if Format::of(start) != Some(Format::Hdf5) {
-        return foreign::of_start(start);
-    }
     if file.try_lock_shared().is_err() {
         return Problem::Locked(source);
     }
@@ -249,7 +239,8 @@ fn text_in(holder: &Container) -> Option<String> {
 /// Texts in an attribute or an array, of variable or fixed length, ASCII or UTF-8.
 fn texts_in(holder: &Container) -> Option<Vec<String>> {
     fn as_type<T: H5Type + Display>(holder: &Container) -> Option<Vec<String>> {
-        Some(holder.read_raw::<T>().ok()?.iter().map(T::to_string).collect())
+        let texts = holder.read_raw::<T>().ok()?;
+        Some(texts.iter().map(T::to_string).collect())
     }
     as_type::<VarLenUnicode>(holder)
         .or_else(|| as_type::<VarLenAscii>(holder))

@@ -21,15 +21,17 @@ const EPISODE: &str = "episode_";
 pub fn minari_folder(id: &str) -> PathBuf {
     let root = match std::env::var_os("MINARI_DATASETS_PATH") {
         Some(root) if !root.is_empty() => PathBuf::from(root),
-        _ => std::env::home_dir().unwrap_or_default().join(".minari/datasets"),
+        _ => {
+            let home = std::env::home_dir().unwrap_or_default();
+            home.join(".minari/datasets")
+        }
     };
     root.join(id).join("data")
 }
 
 pub(super) fn data_file(folder: &Path) -> Option<PathBuf> {
-    [folder.join(DATA_FILE), folder.join("data").join(DATA_FILE)]
-        .into_iter()
-        .find(|path| path.exists())
+    let paths = [folder.join(DATA_FILE), folder.join("data").join(DATA_FILE)];
+    paths.into_iter().find(|path| path.exists())
 }
 
 #[derive(Default, Deserialize)]
@@ -67,8 +69,9 @@ impl Metadata {
 pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Problem> {
     let mut recording = Recording { terminal_array: "terminations", ..Recording::default() };
     let episodes = episodes(file);
-    if let Some(expected) = metadata.total_episodes.filter(|&expected| expected != episodes) {
-        return Err(Problem::Episodes { found: episodes, expected });
+    let expected = metadata.total_episodes.unwrap_or(episodes);
+    if expected != episodes {
+        return Err(Problem::Episodes(episodes, expected));
     }
     for episode in 0..episodes {
         append(file, &format!("{EPISODE}{episode}"), &mut recording)?;
@@ -78,7 +81,8 @@ pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Pr
 
 fn episodes(file: &Hdf5File) -> usize {
     let numbers = file.members("/").unwrap_or_default();
-    numbers.iter().filter_map(|name| name.strip_prefix(EPISODE)?.parse::<usize>().ok()).count()
+    let number = |name: &String| name.strip_prefix(EPISODE)?.parse::<usize>().ok();
+    numbers.iter().filter_map(number).count()
 }
 
 /// Appends an episode of T steps as T + 1 rows, the last of which is its final state.
@@ -91,41 +95,36 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
         (recording.observation_dim, recording.action_dim) = (observations.width, actions.width);
     }
     let (o, a) = (recording.observation_dim, recording.action_dim);
-    let rows = recording.rows() + steps + 1;
     recording.parts.push((recording.rows(), episode.to_owned()));
-    recording.observations.extend(observations.sized(steps + 1, o)?);
+    let states = observations.sized(steps + 1, o)?;
+    let rewards: Vec<f32> = file.table(&array("rewards"), steps, 1)?;
+    let terminals = file.flags(&array("terminations"), steps)?;
+    let timeouts = file.flags(&array("truncations"), steps)?;
+    recording.observations.extend(states);
     recording.actions.extend(actions.sized(steps, a)?);
-    recording.rewards.extend(file.table::<f32>(&array("rewards"), steps, 1)?);
-    recording.terminals.extend(file.flags(&array("terminations"), steps)?);
-    recording.timeouts.extend(file.flags(&array("truncations"), steps)?);
+    recording.rewards.extend(rewards);
+    recording.terminals.extend(terminals);
+    recording.timeouts.extend(timeouts);
     recording.ends.extend((1..=steps).map(|step| step == steps));
-    recording.kinds.extend(std::iter::repeat_n(RowKind::Transition, steps));
-    recording.actions.resize(rows * a, 0.0);
-    recording.rewards.push(0.0);
-    recording.terminals.push(false);
-    recording.timeouts.push(false);
-    recording.ends.push(false);
-    recording.kinds.push(RowKind::LastState);
+    recording.kinds.resize(recording.ends.len(), RowKind::Transition);
+    recording.push_last_state();
     Ok(())
 }
 
 fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, Problem> {
     let Some(members) = file.members(name) else { return file.numbers(name) };
-    let columns = parts(members)
-        .into_iter()
-        .map(|part| file.numbers(&format!("{name}/{part}"))?.of_rows(rows));
+    let read = |part: String| file.numbers(&format!("{name}/{part}"))?.of_rows(rows);
+    let columns = parts(members).into_iter().map(read);
     let columns: Vec<Array<f32>> = columns.collect::<Result<_, _>>()?;
     let row = |row: usize| columns.iter().flat_map(move |column| column.row(row));
     let values = (0..rows).flat_map(row).copied().collect();
     let width = columns.iter().map(|column| column.width).sum();
-    Array::new(name, &[rows, width], values)
+    Array::new(name, vec![rows, width], values)
 }
 
 /// Order of concatenation: a Dict's arrays by name, a Tuple's by number (`_index_0`, …).
 fn parts(mut names: Vec<String>) -> Vec<String> {
-    let number = |name: &String| {
-        name.strip_prefix("_index_").and_then(|number| number.parse::<usize>().ok())
-    };
+    let number = |name: &String| name.strip_prefix("_index_")?.parse::<usize>().ok();
     names.sort_by_key(number); // Names without a number keep their order.
     names
 }

@@ -8,11 +8,8 @@ mod minari;
 mod new_file;
 mod npz_file;
 mod ogbench;
-mod own;
 pub(crate) mod recorded;
 
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use self::hdf5_file::Hdf5File;
@@ -28,12 +25,10 @@ pub use minari::minari_folder;
 /// The file with the data: `main_data.hdf5` of a Minari folder, else the path itself.
 pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {
     let path = path.as_ref();
-    match path.is_dir() {
-        true => {
-            minari::data_file(path).ok_or_else(|| DatasetError::new(path, foreign::of_folder(path)))
-        }
-        false => Ok(path.to_owned()),
+    if !path.is_dir() {
+        return Ok(path.to_owned());
     }
+    minari::data_file(path).ok_or_else(|| DatasetError::new(path, foreign::of_folder(path)))
 }
 
 pub(crate) enum Source {
@@ -48,42 +43,28 @@ impl Source {
         let error = |problem| DatasetError::new(path, problem);
         let file = data_file(path)?;
         if path.is_dir() {
-            return Ok(Self::Minari(Hdf5File::open(&file)?, minari::Metadata::read(&file)?));
+            let metadata = minari::Metadata::read(&file)?;
+            return Ok(Self::Minari(Hdf5File::open(&file)?, metadata));
         }
-        let mut start = Vec::new();
-        let file = File::open(path).map_err(|source| error(Problem::Io(source)))?;
-        file.take(foreign::START)
-            .read_to_end(&mut start)
-            .map_err(|source| error(Problem::Io(source)))?;
-        match Format::of(&start) {
-            Some(Format::Hdf5) => Self::hdf5(Hdf5File::open(path)?),
-            Some(Format::Npz) => Ok(Self::OgBench(NpzFile::open(path)?)),
-            None => Err(error(foreign::of_start(&start))),
+        let (_, start) = foreign::start_of(path).map_err(|source| error(source.into()))?;
+        if Format::of(&start) == Some(Format::Npz) {
+            return Ok(Self::OgBench(NpzFile::open(path)?));
         }
-    }
-
-    fn hdf5(file: Hdf5File) -> Result<Self, DatasetError> {
+        let file = Hdf5File::open(path)?;
         match file.attribute("layout") {
-            Some(layout) if layout == own::LAYOUT => return Ok(Self::Own(file)),
-            Some(found) => {
-                return Err(DatasetError::new(file.path(), Problem::UnknownLayout { found }));
-            }
+            Some(layout) if layout == arrays::LAYOUT => return Ok(Self::Own(file)),
+            Some(layout) => return Err(error(Problem::UnknownLayout(layout))),
             None => {}
         }
-        let within = |group: &str| file.members(&format!("data/{group}")).unwrap_or_default();
-        if let Some(problem) =
-            file.members("data").and_then(|members| foreign::of_group(&members, within))
-        {
-            return Err(DatasetError::new(file.path(), problem));
+        let groups = file.members("data").unwrap_or_default();
+        if let Some(name) = groups.iter().find(|name| name.starts_with("demo_")) {
+            let has_rewards = file.has(&format!("data/{name}/rewards"));
+            return Err(error(foreign::of_robomimic(has_rewards)));
         }
-        let is_minari = file.path().ends_with(minari::DATA_FILE) || file.has("episode_0");
-        match is_minari {
-            true => {
-                let metadata = minari::Metadata::read(file.path())?;
-                Ok(Self::Minari(file, metadata))
-            }
-            false => Ok(Self::D4rl(file)),
+        if path.ends_with(minari::DATA_FILE) || file.has("episode_0") {
+            return Ok(Self::Minari(file, minari::Metadata::read(path)?));
         }
+        Ok(Self::D4rl(file))
     }
 
     pub(crate) fn format(&self) -> &'static str {
@@ -109,18 +90,15 @@ impl Source {
         let expected = asked.name.clone();
         let is_other_maze = asked.maze.is_some() && benchmarks::relabeling(&asked.name).is_none();
         if matches!(self, Self::OgBench(_)) && is_other_maze {
-            return Err(Problem::OtherMaze { expected });
+            return Err(Problem::OtherMaze(expected));
         }
         let Some(claimed) = self.environment() else { return Ok(()) };
         let simulation = environment::find(&claimed).map(EnvironmentSpec::simulation);
-        match simulation == Ok(asked.simulation()) {
-            true => Ok(()),
-            false => Err(Problem::OtherEnvironment {
-                claimed,
-                expected,
-                is_simulated: simulation.is_ok(),
-            }),
+        if simulation == Ok(asked.simulation()) {
+            return Ok(());
         }
+        let is_simulated = simulation.is_ok();
+        Err(Problem::OtherEnvironment { claimed, expected, is_simulated })
     }
 
     pub(crate) fn lacks_timeouts(&self) -> bool {
@@ -136,7 +114,7 @@ impl Source {
     ) -> Result<Recording, DatasetError> {
         let (path, recording) = match self {
             Self::D4rl(file) => (file.path(), d4rl::read(file, environment)),
-            Self::Own(file) => (file.path(), own::read(file)),
+            Self::Own(file) => (file.path(), arrays::read_own(file)),
             Self::Minari(file, metadata) => (file.path(), minari::read(file, metadata)),
             Self::OgBench(file) => {
                 let recording = ogbench::read(file, task);

@@ -3,8 +3,10 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use hdf5::plist::DatasetCreate;
+use hdf5::types::VarLenUnicode;
 use hdf5::{H5Type, Hyperslab, SliceOrIndex};
 use hdf5_sys::h5p::H5Pset_obj_track_times;
 use ndarray::ArrayViewD;
@@ -27,29 +29,27 @@ pub(crate) struct NewFile {
 
 impl NewFile {
     pub(crate) fn create(path: &Path) -> Result<Self, DatasetError> {
-        let mut partial = path.to_owned().into_os_string();
+        let io_error = |source: io::Error| DatasetError::new(path, source);
+        let mut partial = path.as_os_str().to_owned();
         partial.push(".partial");
         let partial = PathBuf::from(partial);
         if let Some(folder) = path.parent() {
-            fs::create_dir_all(folder)
-                .map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
+            fs::create_dir_all(folder).map_err(io_error)?;
         }
         if path.is_dir() {
-            return Err(DatasetError::new(path, Problem::Io(io::ErrorKind::IsADirectory.into())));
+            return Err(io_error(io::ErrorKind::IsADirectory.into()));
         }
         // Leftover of a killed process, or a link through which HDF5 would write into another file.
-        let made = fs::remove_file(&partial).or_else(|error| match error.kind() {
-            io::ErrorKind::NotFound => Ok(()),
-            _ => Err(error),
-        });
-        let made = made.and_then(|()| fs::File::create_new(&partial));
-        made.map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
+        match fs::remove_file(&partial) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(io_error(error)),
+            _ => fs::File::create_new(&partial).map_err(io_error)?,
+        };
         // The earliest format is read by all HDF5 versions, and its groups have no timestamps.
-        let hdf5 = hdf5::File::with_options()
-            .with_fapl(|access| access.libver_earliest())
-            .create(&partial);
+        let mut builder = hdf5::File::with_options();
+        let hdf5 = builder.with_fapl(|access| access.libver_earliest()).create(&partial);
         let hdf5 = hdf5.map_err(|source| DatasetError::new(path, Problem::Write(source)))?;
-        Ok(Self { path: path.to_owned(), partial, hdf5 })
+        let path = path.to_owned();
+        Ok(Self { path, partial, hdf5 })
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -62,13 +62,17 @@ impl NewFile {
 
     /// Closes and renames the file; its columns must be dropped before.
     pub(crate) fn finish(self) -> Result<(), DatasetError> {
-        let Self { path, partial, hdf5 } = self;
-        drop(hdf5);
-        fs::File::open(&partial)
+        drop(self.hdf5);
+        fs::File::open(&self.partial)
             .and_then(|file| file.sync_all())
-            .and_then(|()| fs::rename(&partial, &path))
-            .map_err(|source| DatasetError::new(path, Problem::Io(source)))
+            .and_then(|()| fs::rename(&self.partial, &self.path))
+            .map_err(|source| DatasetError::new(self.path, source))
     }
+}
+
+/// A text as HDF5 stores it.
+pub(crate) fn text(text: &str) -> hdf5::Result<VarLenUnicode> {
+    Ok(VarLenUnicode::from_str(text).map_err(|error| error.to_string())?)
 }
 
 /// Creation properties without timestamps, so that equal rows give files with equal hashes.
@@ -95,15 +99,16 @@ impl Column {
         name: &'static str,
         width: Option<usize>,
     ) -> hdf5::Result<Self> {
-        let builder =
-            file.hdf5.new_dataset::<T>().set_create_plist(&timeless()?).deflate(GZIP_LEVEL);
+        let builder = file.hdf5.new_dataset::<T>().set_create_plist(&timeless()?);
+        let builder = builder.deflate(GZIP_LEVEL);
         let dataset = match width {
-            None => builder.chunk((CHUNK_ROWS,)).shape((0..,)).create(name)?,
+            None => builder.chunk((CHUNK_ROWS,)).shape((0..,)),
             Some(width) => {
                 let rows = (CHUNK_NUMBERS / width).clamp(1, CHUNK_ROWS);
-                builder.chunk((rows, width)).shape((0.., width)).create(name)?
+                builder.chunk((rows, width)).shape((0.., width))
             }
         };
+        let dataset = dataset.create(name)?;
         Ok(Self { name, width, dataset, rows: 0 })
     }
 

@@ -1,5 +1,5 @@
 use std::fs::File;
-use std::io::{self, BufReader};
+use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use npyz::half::f16;
@@ -7,8 +7,8 @@ use npyz::{DType, Deserialize, NpyFile, Order, TypeChar};
 use zip::ZipArchive;
 use zip::result::ZipError;
 
-use crate::error::{DatasetError, Problem};
-use crate::formats::array::Array;
+use crate::error::{ArrayProblem, DatasetError, Problem};
+use crate::formats::array::{Array, check_size};
 use crate::formats::foreign;
 
 pub(crate) struct NpzFile {
@@ -18,16 +18,16 @@ pub(crate) struct NpzFile {
 
 impl NpzFile {
     pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
-        let file =
-            File::open(path).map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
-        let archive = ZipArchive::new(BufReader::new(file))
-            .map_err(|source| DatasetError::new(path, Problem::DamagedNpz(source)))?;
-        if let Some(problem) =
-            foreign::of_archive(&archive.file_names().filter_map(Result::ok).collect::<Vec<_>>())
-        {
-            return Err(DatasetError::new(path, problem));
+        let error = |problem| DatasetError::new(path, problem);
+        let file = File::open(path).map_err(|source| error(source.into()))?;
+        let archive =
+            ZipArchive::new(BufReader::new(file)).map_err(|source| error(source.into()))?;
+        let path = path.to_owned();
+        let files = Vec::from_iter(archive.file_names().filter_map(Result::ok));
+        match foreign::of_archive(&files) {
+            Some(problem) => Err(error(problem)),
+            None => Ok(Self { path, archive }),
         }
-        Ok(Self { path: path.into(), archive })
     }
 
     pub(crate) fn has(&self, array: &str) -> bool {
@@ -62,34 +62,35 @@ impl NpzFile {
     }
 
     fn read(&mut self, array: &str, continuous: bool) -> Result<Array<f32>, Problem> {
-        let name = array.to_owned();
         let entry = self.archive.by_name(&entry(array)).map_err(|error| match error {
-            ZipError::FileNotFound => Problem::Missing { array: name.clone() },
-            other => Problem::DamagedNpz(other),
+            ZipError::FileNotFound => ArrayProblem::Missing.of(array),
+            other => other.into(),
         })?;
-        let bytes = entry.size();
-        let unreadable =
-            |source: io::Error| Problem::Unreadable { array: name.clone(), source: source.into() };
-        let mut reader = BufReader::new(entry);
-        let file = NpyFile::new(&mut reader).map_err(unreadable)?;
-        if continuous && holds_whole_numbers(&file.dtype()) {
-            return Err(Problem::DiscreteActions { array: name });
-        }
-        let shape: Vec<usize> = file.shape().iter().map(|&axis| axis as usize).collect();
-        let claimed = shape.iter().fold(1u64, |product, &axis| product.saturating_mul(axis as u64));
-        if claimed > bytes || shape.first().is_some_and(|&rows| rows > u32::MAX as usize) {
-            return Err(Problem::Oversized { array: name, found: shape, bytes });
-        }
-        let order = file.order();
-        let values = floats(file, &name)?;
-        // The checksum is compared at the end of the entry.
-        io::copy(&mut reader, &mut io::sink()).map_err(unreadable)?;
-        Array::new(
-            array,
-            &shape,
-            if order == Order::Fortran { by_rows(&shape, &values) } else { values },
-        )
+        let (shape, values) =
+            values(entry.size(), entry, continuous).map_err(|problem| problem.of(array))?;
+        Array::new(array, shape, values)
     }
+}
+
+/// Shape and values, in row-major order, of a NumPy file of `bytes`.
+fn values(
+    bytes: u64,
+    entry: impl Read,
+    continuous: bool,
+) -> Result<(Vec<usize>, Vec<f32>), ArrayProblem> {
+    let mut reader = BufReader::new(entry);
+    let file = NpyFile::new(&mut reader)?;
+    if continuous && holds_whole_numbers(&file.dtype()) {
+        return Err(ArrayProblem::DiscreteActions);
+    }
+    let shape: Vec<usize> = file.shape().iter().map(|&axis| axis as usize).collect();
+    check_size(&shape, bytes, bytes)?;
+    let is_by_columns = file.order() == Order::Fortran;
+    let values = floats(file)?;
+    // The checksum is compared at the end of the entry.
+    io::copy(&mut reader, &mut io::sink())?;
+    let values = if is_by_columns { by_rows(&shape, &values) } else { values };
+    Ok((shape, values))
 }
 
 fn entry(array: &str) -> String {
@@ -101,40 +102,36 @@ fn holds_whole_numbers(dtype: &DType) -> bool {
     matches!(element.type_char(), TypeChar::Bool | TypeChar::Int | TypeChar::Uint)
 }
 
-fn floats<R: io::Read>(file: NpyFile<R>, array: &str) -> Result<Vec<f32>, Problem> {
-    let DType::Plain(element) = file.dtype() else {
-        return Err(wrong_type(array, file.dtype().descr()));
-    };
+fn floats(file: NpyFile<impl Read>) -> Result<Vec<f32>, ArrayProblem> {
+    let DType::Plain(element) = file.dtype() else { return Err(wrong_type(&file.dtype())) };
     match (element.type_char(), element.size_field()) {
-        (TypeChar::Float, 2) => convert::<f16, R>(file, array, f32::from),
-        (TypeChar::Float, 4) => convert::<f32, R>(file, array, |value| value),
-        (TypeChar::Float, 8) => convert::<f64, R>(file, array, |value| value as f32),
-        (TypeChar::Bool, 1) => convert::<bool, R>(file, array, |value| f32::from(u8::from(value))),
-        (TypeChar::Int, 1) => convert::<i8, R>(file, array, f32::from),
-        (TypeChar::Int, 2) => convert::<i16, R>(file, array, f32::from),
-        (TypeChar::Int, 4) => convert::<i32, R>(file, array, |value| value as f32),
-        (TypeChar::Int, 8) => convert::<i64, R>(file, array, |value| value as f32),
-        (TypeChar::Uint, 1) => convert::<u8, R>(file, array, f32::from),
-        (TypeChar::Uint, 2) => convert::<u16, R>(file, array, f32::from),
-        (TypeChar::Uint, 4) => convert::<u32, R>(file, array, |value| value as f32),
-        (TypeChar::Uint, 8) => convert::<u64, R>(file, array, |value| value as f32),
-        _ => Err(wrong_type(array, element.to_string())),
+        (TypeChar::Float, 2) => convert(file, f16::to_f32),
+        (TypeChar::Float, 4) => convert(file, |value: f32| value),
+        (TypeChar::Float, 8) => convert(file, |value: f64| value as f32),
+        (TypeChar::Bool, 1) => convert(file, |value: bool| f32::from(u8::from(value))),
+        (TypeChar::Int, 1) => convert(file, |value: i8| value as f32),
+        (TypeChar::Int, 2) => convert(file, |value: i16| value as f32),
+        (TypeChar::Int, 4) => convert(file, |value: i32| value as f32),
+        (TypeChar::Int, 8) => convert(file, |value: i64| value as f32),
+        (TypeChar::Uint, 1) => convert(file, |value: u8| value as f32),
+        (TypeChar::Uint, 2) => convert(file, |value: u16| value as f32),
+        (TypeChar::Uint, 4) => convert(file, |value: u32| value as f32),
+        (TypeChar::Uint, 8) => convert(file, |value: u64| value as f32),
+        _ => Err(wrong_type(&file.dtype())),
     }
 }
 
-fn convert<T: Deserialize, R: io::Read>(
-    file: NpyFile<R>,
-    array: &str,
+fn convert<T: Deserialize>(
+    file: NpyFile<impl Read>,
     to_f32: impl Fn(T) -> f32,
-) -> Result<Vec<f32>, Problem> {
-    let found = file.dtype().descr();
-    let values = file.data::<T>().map_err(|_| wrong_type(array, found))?;
-    let values: io::Result<Vec<f32>> = values.map(|value| value.map(&to_f32)).collect();
-    values.map_err(|source| Problem::Unreadable { array: array.to_owned(), source: source.into() })
+) -> Result<Vec<f32>, ArrayProblem> {
+    let dtype = file.dtype();
+    let values = file.data::<T>().map_err(|_| wrong_type(&dtype))?;
+    Ok(values.map(|value| value.map(&to_f32)).collect::<io::Result<_>>()?)
 }
 
-fn wrong_type(array: &str, found: String) -> Problem {
-    Problem::Type { array: array.to_owned(), found, expected: "numbers or booleans" }
+fn wrong_type(found: &DType) -> ArrayProblem {
+    ArrayProblem::Type(found.descr(), "numbers or booleans")
 }
 
 /// Row-major copy of a column-major array.

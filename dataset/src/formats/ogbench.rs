@@ -17,10 +17,9 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
         true => file.flags("masks", rows)?,
         false => vec![true; rows],
     };
-    let next_observations = match file.has("next_observations") {
-        true => Some(file.table("next_observations", rows, observation_dim)?),
-        false => None,
-    };
+    let stored = file.has("next_observations");
+    let stored = stored.then(|| file.table("next_observations", rows, observation_dim));
+    let next_observations = stored.transpose()?;
     let last_states: Vec<bool> = match (&next_observations, file.has("valids")) {
         (Some(_), _) => vec![false; rows],
         (None, true) => file.flags("valids", rows)?.into_iter().map(|valid| !valid).collect(),
@@ -33,11 +32,8 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
     };
     let ends: Vec<bool> = (0..rows).map(is_last).collect();
     let kind = |&last: &bool| if last { RowKind::LastState } else { RowKind::Transition };
-    let stored: Option<&Vec<f32>> = next_observations.as_ref();
     Ok(Recording {
-        rounding: stored
-            .map(|stored| Rounding::between(&observations.values, stored))
-            .unwrap_or_default(),
+        rounding: Rounding::between(&observations.values, next_observations.as_ref()),
         observation_dim,
         action_dim: actions.width,
         observations: observations.values,

@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use crate::error::{DatasetError, Problem};
+use crate::error::{DatasetError, Problem, RowProblem};
 use crate::formats::hdf5_file::Hdf5File;
 use crate::tables::environment::{self, EnvironmentSpec};
 
@@ -45,12 +45,10 @@ pub fn environments_of_its_sizes(
     path: impl AsRef<Path>,
 ) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
     let file = Hdf5File::open(path.as_ref())?;
-    let size = |array| file.size(array).map_err(|problem| DatasetError::new(file.path(), problem));
-    let sizes = (size("observations")?.1, size("actions")?.1);
-    Ok(environment::all()
-        .iter()
-        .filter(|spec| (spec.observation_dim, spec.action_dim) == sizes)
-        .collect())
+    let sizes = file.size("observations").and_then(|(_, o)| Ok((o, file.size("actions")?.1)));
+    let sizes = sizes.map_err(|problem| DatasetError::new(file.path(), problem))?;
+    let fits = |spec: &&EnvironmentSpec| (spec.observation_dim, spec.action_dim) == sizes;
+    Ok(environment::all().iter().filter(fits).collect())
 }
 
 const GOAL_DIM: usize = 2;
@@ -68,20 +66,20 @@ impl RecordedRows {
     fn of(file: &Hdf5File, environment: &'static EnvironmentSpec) -> Result<Self, Problem> {
         let (rows, _) = file.size("actions")?;
         let table = |array, width| finite(file, array, rows, width);
+        let stored = file.has("next_observations");
+        let stored = stored.then(|| table("next_observations", environment.observation_dim));
+        let goals = environment.maze.map(|_| table("infos/goal", GOAL_DIM));
         Ok(Self {
             environment,
             observations: table("observations", environment.observation_dim)?,
             actions: table("actions", environment.action_dim)?,
-            next_observations: match file.has("next_observations") {
-                true => Some(table("next_observations", environment.observation_dim)?),
-                false => None,
-            },
+            next_observations: stored.transpose()?,
             rewards: table("rewards", 1)?,
             terminals: file.flags("terminals", rows)?,
             timeouts: file.flags("timeouts", rows)?,
             qpos: table("infos/qpos", environment.qpos_dim)?,
             qvel: table("infos/qvel", environment.qvel_dim)?,
-            goals: environment.maze.map(|_| table("infos/goal", GOAL_DIM)).transpose()?,
+            goals: goals.transpose()?,
         })
     }
 
@@ -97,24 +95,24 @@ impl RecordedRows {
 
     /// Row `i < len()`.
     pub fn row(&self, i: usize) -> Row<'_> {
-        let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } =
-            *self.environment;
+        let spec = self.environment;
         let at = |width: usize| i * width..(i + 1) * width;
         Row {
-            observation: &self.observations[at(observation_dim)],
-            action: &self.actions[at(action_dim)],
+            observation: &self.observations[at(spec.observation_dim)],
+            action: &self.actions[at(spec.action_dim)],
             next_observation: self.next_observation(i),
             reward: self.rewards[i],
             terminal: self.terminals[i],
             timeout: self.timeouts[i],
-            qpos: &self.qpos[at(qpos_dim)],
-            qvel: &self.qvel[at(qvel_dim)],
+            qpos: &self.qpos[at(spec.qpos_dim)],
+            qvel: &self.qvel[at(spec.qvel_dim)],
         }
     }
 
     /// Goal at row `i` if the file has goals: x and y.
     pub fn goal(&self, i: usize) -> Option<&[f64]> {
-        self.goals.as_ref().map(|goals| &goals[i * GOAL_DIM..][..GOAL_DIM])
+        let goals = self.goals.as_ref()?;
+        Some(&goals[i * GOAL_DIM..][..GOAL_DIM])
     }
 
     /// Stored next observation, or the following row's if no episode ends in between.
@@ -135,9 +133,8 @@ impl RecordedRows {
 
 fn finite(file: &Hdf5File, array: &str, rows: usize, width: usize) -> Result<Vec<f64>, Problem> {
     let values: Vec<f64> = file.table(array, rows, width)?;
-    if let Some(i) = values.iter().position(|value| !value.is_finite()) {
-        let (row, value) = (i / width, values[i] as f32);
-        return Err(Problem::NotFinite { array: array.to_owned(), row, value, rows: 1 });
+    match values.iter().position(|value| !value.is_finite()) {
+        None => Ok(values),
+        Some(i) => Err(RowProblem::NotFinite(values[i] as f32).at(array, i / width)),
     }
-    Ok(values)
 }

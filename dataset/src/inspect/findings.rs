@@ -1,4 +1,4 @@
-use crate::error::such_rows;
+use crate::error::RowProblem;
 use crate::formats::Source;
 use crate::normalize::Normalize;
 use crate::recording::Recording;
@@ -16,13 +16,11 @@ pub(super) fn findings(
 ) -> Vec<String> {
     let mut findings = Vec::new();
     if source.lacks_timeouts() {
-        findings.push(match environment {
-            Some(environment) => format!(
-                "no array `timeouts`: an episode is taken to end after the {} steps of {}",
-                environment.max_episode_steps, environment.name
-            ),
-            None => "no array `timeouts`: only a terminal is taken to end an episode".to_owned(),
-        });
+        let end = match environment {
+            Some(spec) => format!("after the {} steps of {}", spec.max_episode_steps, spec.name),
+            None => "at a terminal alone".to_owned(),
+        };
+        findings.push(format!("no array `timeouts`: an episode is taken to end {end}"));
     }
     let of_ends = warnings::of_ends(recording);
     if of_ends.is_empty() {
@@ -32,10 +30,8 @@ pub(super) fn findings(
     }
     findings.extend(of_ends);
     let outside = checks::actions_outside(recording);
-    findings.extend(
-        outside
-            .map(|problem| format!("{problem}; `learner train --normalize actions` trains on it")),
-    );
+    let remedy = "`learner train --normalize actions` trains on it";
+    findings.extend(outside.map(|problem| format!("{problem}; {remedy}")));
     let rule = environment.map_or(RewardRule::AsIs, |environment| environment.reward);
     findings.extend(warnings::of_numbers(recording, Normalize::default(), rule));
     findings
@@ -48,16 +44,11 @@ fn leaps(recording: &Recording) -> Option<String> {
     }
     let leap = |&row: &usize| {
         let (from, to) = (recording.observation(row), recording.observation(row + 1));
-        let apart =
-            from.iter().zip(to).take(2).map(|(from, to)| (to - from).powi(2)).sum::<f32>().sqrt();
-        apart > LONGEST_STEP
+        let apart = from.iter().zip(to).take(2).map(|(from, to)| (to - from).powi(2));
+        apart.sum::<f32>().sqrt() > LONGEST_STEP
     };
-    let mut leaps = recording.inside().filter(leap);
-    let (row, rows) = (leaps.next()?, 1 + leaps.count());
-    let (array, row) = recording.place("observations", row);
-    Some(format!(
-        "array `{array}`, row {row}: the next place is more than {LONGEST_STEP} m away, though the episode continues \
-         there{}; are the timeouts out of step with the resets?",
-        such_rows(rows)
-    ))
+    let leaps = recording.inside().filter(leap);
+    let leaps = leaps.map(|row| (row, RowProblem::Leap(LONGEST_STEP)));
+    let problem = checks::first(recording, "observations", leaps)?;
+    Some(format!("{problem}; are the timeouts out of step with the resets?"))
 }

@@ -9,74 +9,56 @@ use serde::Serialize;
 use crate::checks;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
-use crate::recording::RowKind;
-use crate::statistics::Extent;
+use crate::statistics::Figures;
 use crate::tables::benchmarks;
 use crate::tables::environment::{self, EnvironmentSpec};
 use crate::tables::reward::RewardScaling;
 
 pub use histogram::Histogram;
 
-/// Statistics and problems of a dataset. Numbers that are not finite are excluded; a statistic of
+/// Statistics and problems of a dataset: lengths of episodes in steps, and ranges of the numbers in a
+/// column or in all. Numbers that are not finite are excluded; a statistic of
 /// no numbers is NaN, null in JSON.
 #[derive(Debug, Serialize)]
+#[allow(missing_docs)] // The names say what each is.
 pub struct Inspection {
-    /// File or folder.
     pub path: PathBuf,
     /// `D4RL`, `Minari`, `OGBench` or `transitions`, the custom layout.
     pub format: &'static str,
     /// Environment given by the caller, else the one named in the file.
     pub environment: Option<String>,
-    /// Number of transitions.
     pub transitions: usize,
     /// Number of episodes, including one truncated by the end of the file.
     pub episodes: usize,
-    /// Dimension of an observation.
     pub observation_dim: usize,
-    /// Dimension of an action.
     pub action_dim: usize,
-    /// Length of the shortest episode.
     pub min_length: f64,
-    /// Mean episode length.
     pub mean_length: f64,
-    /// Length of the longest episode.
     pub max_length: f64,
     /// Smallest undiscounted return, as in [`Statistics`](crate::Statistics).
     pub min_return: f64,
-    /// Mean return.
     pub mean_return: f64,
-    /// Largest return.
     pub max_return: f64,
     /// Normalized scores by D4RL's reference returns, if the environment is known.
     #[serde(flatten)]
     pub scores: Option<Scores>,
-    /// Names of the observation dimensions; empty if the source has none.
+    /// Empty if the source has none.
     pub observation_names: Vec<String>,
-    /// Names of the action dimensions; empty if the source has none.
     pub action_names: Vec<String>,
     /// Indices of constant observation dimensions.
     pub constant_observations: Vec<usize>,
-    /// Indices of constant action dimensions.
     pub constant_actions: Vec<usize>,
     /// Root mean square of the rewards; hyperparameters are tuned for about 1.
     pub reward_size: f64,
-    /// Smallest and largest reward.
     pub reward_range: Range,
-    /// Smallest and largest value in an action.
     pub action_range: Range,
-    /// Range of each action dimension.
     pub action_ranges: Vec<Range>,
-    /// Smallest and largest value in an observation.
     pub observation_range: Range,
-    /// Range of each observation dimension.
     pub observation_ranges: Vec<Range>,
-    /// Fraction of terminal steps.
+    /// Fraction of the steps; so are timeouts.
     pub terminals: f64,
-    /// Fraction of timeouts.
     pub timeouts: f64,
-    /// Histogram of returns.
     pub returns: Histogram,
-    /// Histogram of episode lengths.
     pub lengths: Histogram,
     /// Problems, one sentence each: first those that training refuses.
     pub problems: Vec<String>,
@@ -86,37 +68,25 @@ pub struct Inspection {
 
 /// Normalized scores of the episodes.
 #[derive(Debug, Serialize)]
+#[allow(missing_docs)] // The names say what each is.
 pub struct Scores {
-    /// Minimum.
     pub min_score: f64,
-    /// Mean.
     pub mean_score: f64,
-    /// Maximum.
     pub max_score: f64,
 }
 
 /// Smallest and largest of some numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[allow(missing_docs)] // The names say what each is.
 pub struct Range {
-    /// Minimum.
     pub min: f64,
-    /// Maximum.
     pub max: f64,
 }
 
 impl Range {
-    fn of(values: impl Iterator<Item = f32>) -> Self {
-        let Extent { min, max, .. } =
-            Extent::of(values.map(f64::from).filter(|value| value.is_finite()));
-        Self { min, max }
-    }
-
-    fn of_columns(values: &[f32], width: usize, rows: impl Fn(usize) -> bool) -> Vec<Self> {
-        let column = |column: usize| {
-            let values = values.iter().skip(column).step_by(width).enumerate();
-            Self::of(values.filter(|(row, _)| rows(*row)).map(|(_, value)| *value))
-        };
-        (0..width).map(column).collect()
+    fn of_columns(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<Self> {
+        let columns = Figures::of_columns(values, width, counts).into_iter();
+        columns.map(|Figures { min, max, .. }| Self { min, max }).collect()
     }
 
     fn constant(ranges: &[Self]) -> Vec<usize> {
@@ -151,10 +121,10 @@ pub fn inspect(
     let lengths: Vec<f64> = episodes.iter().map(|episode| episode.length as f64).collect();
     let returns: Vec<f64> =
         episodes.iter().map(|episode| episode.sum).filter(|sum| sum.is_finite()).collect();
-    let (length, sum) = (Extent::of(lengths.iter().copied()), Extent::of(returns.iter().copied()));
+    let (length, sum) = (Figures::of(&lengths), Figures::of(&returns));
     let steps: f64 = lengths.iter().sum();
     let share = |flags: &[bool]| flags.iter().filter(|&&flag| flag).count() as f64 / steps;
-    let is_step = |row: usize| recording.kinds[row] != RowKind::LastState;
+    let is_step = |row: usize| recording.is_step(row);
     let action_ranges = Range::of_columns(&recording.actions, recording.action_dim, is_step);
     let observation_ranges =
         Range::of_columns(&recording.observations, recording.observation_dim, |_| true);

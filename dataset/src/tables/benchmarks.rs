@@ -21,7 +21,7 @@ pub struct Benchmark {
     pub cache: Cache,
     /// Source argument of `quad-convert` for tasks without a dataset.
     pub converter: Option<String>,
-    host: Option<Host>,
+    pub(super) host: Option<Host>,
     names: Templates,
     rules: Rules,
     tasks_per_place: Option<usize>,
@@ -79,7 +79,7 @@ pub struct Cache {
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Host {
+pub(super) struct Host {
     pub license: String,
     pub folders: Vec<String>,
 }
@@ -115,13 +115,8 @@ struct Family {
     reach: f64,
     #[serde(default)]
     measured: usize,
-    #[serde(default = "first")]
-    default_task: usize,
+    default_task: Option<usize>,
     places: Vec<Place>,
-}
-
-fn first() -> usize {
-    1
 }
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -130,14 +125,9 @@ struct Place {
     name: String,
     maze: Option<String>,
     simulation: Option<String>,
-    #[serde(default = "thousand")]
-    max_episode_steps: usize,
+    max_episode_steps: Option<usize>,
     #[serde(default)]
     data: Vec<String>,
-}
-
-fn thousand() -> usize {
-    1000
 }
 
 #[derive(Deserialize)]
@@ -182,28 +172,28 @@ pub(super) fn environments() -> &'static [BenchmarkEnvironment] {
 }
 
 pub(super) fn environment(name: &str) -> Option<&'static BenchmarkEnvironment> {
-    environments().iter().find(|environment| environment.name == name)
+    environments().iter().find(|one| one.name == name)
 }
 
 /// Task that labels an environment's datasets with rewards, if they have none.
 pub fn relabeling(environment: &str) -> Option<MazeTask> {
-    self::environment(environment)
-        .filter(|environment| environment.benchmark.rules.relabel)
-        .and_then(|environment| environment.task)
+    let environment = self::environment(environment)?;
+    environment.task.filter(|_| environment.benchmark.rules.relabel)
 }
 
 impl Benchmark {
     fn environments(&'static self) -> impl Iterator<Item = BenchmarkEnvironment> {
-        let places = self
-            .family
-            .iter()
-            .flat_map(|family| family.places.iter().map(move |place| (family, place)));
-        places.flat_map(move |(family, place)| {
-            let numbered = (1..=self.tasks_per_place.unwrap_or(0))
-                .map(|number| (number, format!("-task{number}")));
-            let tasks = [(family.default_task, String::new())].into_iter().chain(numbered);
+        let of_place = move |family: &'static Family, place| {
+            let numbers = 1..=self.tasks_per_place.unwrap_or(0);
+            let tasks = numbers.map(|number| (number, format!("-task{number}")));
+            let default = (family.default_task.unwrap_or(1), String::new());
+            let tasks = [default].into_iter().chain(tasks);
             tasks.map(move |(number, suffix)| self.environment(family, place, number, suffix))
-        })
+        };
+        let of_family = move |family: &'static Family| {
+            family.places.iter().flat_map(move |place| of_place(family, place))
+        };
+        self.family.iter().flat_map(of_family)
     }
 
     fn environment(
@@ -214,11 +204,12 @@ impl Benchmark {
         suffix: String,
     ) -> BenchmarkEnvironment {
         let name = |suffix| fill(&self.names.environment, &place.name, "", suffix);
-        let maze = place.maze.as_deref();
-        let cells = maze.and_then(|maze| self.cells.get(maze)?.get(number - 1));
+        let name_of_maze = place.maze.as_deref();
+        let cells = name_of_maze.and_then(|maze| self.cells.get(maze)?.get(number - 1));
         let center = |[row, column]: Cell| [column, row].map(|i| (f64::from(i) - 1.0) * CELL);
-        let robot = TABLE.robot.iter().find(|robot| Some(&robot.name) == family.robot.as_ref());
-        let map = maze.and_then(|maze| TABLE.maze.get(maze));
+        let is_robot = |robot: &&Robot| Some(&robot.name) == family.robot.as_ref();
+        let robot = TABLE.robot.iter().find(is_robot);
+        let maze = robot.zip(name_of_maze.and_then(|maze| TABLE.maze.get(maze)));
         BenchmarkEnvironment {
             name: name(&suffix),
             benchmark: self,
@@ -232,35 +223,33 @@ impl Benchmark {
                 judged: self.rules.judged,
                 measured: family.measured,
             }),
-            simulator: robot.zip(map).map(|(robot, map)| Simulator::Maze(robot, map)),
-            max_episode_steps: place.max_episode_steps,
+            simulator: maze.map(|(robot, map)| Simulator::Maze(robot, map)),
+            max_episode_steps: place.max_episode_steps.unwrap_or(1000),
             place,
             suffix,
         }
-    }
-
-    pub(crate) fn host(&self) -> Option<&Host> {
-        self.host.as_ref()
     }
 }
 
 impl BenchmarkEnvironment {
     /// Reward rule of the benchmark for tasks in mazes, else none.
     pub fn reward(&self) -> RewardRule {
-        self.task.map_or(RewardRule::AsIs, |_| self.benchmark.rules.reward)
+        let reward = self.benchmark.rules.reward;
+        if self.task.is_some() { reward } else { RewardRule::AsIs }
     }
 
     fn datasets(&self) -> impl Iterator<Item = (&'static str, String)> {
         let template = self.benchmark.names.dataset.as_deref();
-        let kinds = template
-            .into_iter()
-            .flat_map(|template| self.place.data.iter().map(move |data| (template, &**data)));
-        kinds.map(|(template, data)| (data, fill(template, &self.place.name, data, "")))
+        let of = move |data: &'static String| {
+            Some((&**data, fill(template?, &self.place.name, data, "")))
+        };
+        self.place.data.iter().filter_map(of)
     }
 }
 
 fn fill(template: &str, place: &str, data: &str, task: &str) -> String {
-    template.replace("{place}", place).replace("{data}", data).replace("{task}", task)
+    let name = template.replace("{place}", place).replace("{data}", data);
+    name.replace("{task}", task)
 }
 
 /// Task with its environment and dataset.
@@ -281,17 +270,18 @@ pub struct BenchmarkTask {
 
 /// All tasks named by a rule, grouped by dataset.
 pub fn tasks() -> impl Iterator<Item = BenchmarkTask> {
-    environments().chunk_by(|one, other| std::ptr::eq(one.place, other.place)).flat_map(|place| {
+    let places = environments().chunk_by(|one, other| std::ptr::eq(one.place, other.place));
+    places.flat_map(|place| {
         place[0].datasets().flat_map(move |(data, dataset)| {
             place.iter().filter_map(move |environment| {
-                let BenchmarkEnvironment { benchmark, place, suffix, task, .. } = environment;
-                let template = benchmark.names.task.as_ref()?;
+                let benchmark = environment.benchmark;
+                let (template, suffix) = (benchmark.names.task.as_ref()?, &environment.suffix);
                 Some(BenchmarkTask {
-                    name: fill(template, &place.name, data, suffix),
+                    name: fill(template, &environment.place.name, data, suffix),
                     benchmark,
                     environment: environment.name.clone(),
                     dataset: dataset.clone(),
-                    maze: *task,
+                    maze: environment.task,
                     is_default: suffix.is_empty(),
                 })
             })
@@ -305,33 +295,39 @@ mod tests {
 
     #[test]
     fn rows_become_tasks() {
-        for (name, expected) in [
-            ("antmaze-large-singletask-v0", Some(([0.0, 0.0], [36.0, 24.0], 0.5, 0))),
-            ("antmaze-giant-singletask-task4-v0", Some(([8.0, 28.0], [44.0, 16.0], 0.5, 0))),
-            ("pointmaze-large-singletask-task4-v0", Some(([28.0, 8.0], [12.0, 16.0], 1.0, 0))),
-            ("humanoidmaze-medium-singletask-task3-v0", Some(([8.0, 16.0], [4.0, 12.0], 0.5, 0))),
-            ("antsoccer-arena-singletask-v0", Some(([20.0, 20.0], [0.0, 20.0], 0.5, 15))),
-            ("antmaze-large-singletask-task6-v0", None),
-            ("antmaze-large-singletask-task0-v0", None),
-            ("antmaze-large", None),
-            ("cube-single-singletask-v0", None),
+        for (place, task, [x, y, goal_x, goal_y], reach, measured) in [
+            ("antmaze-large", "", [0.0, 0.0, 36.0, 24.0], 0.5, 0),
+            ("antmaze-giant", "-task4", [8.0, 28.0, 44.0, 16.0], 0.5, 0),
+            ("pointmaze-large", "-task4", [28.0, 8.0, 12.0, 16.0], 1.0, 0),
+            ("humanoidmaze-medium", "-task3", [8.0, 16.0, 4.0, 12.0], 0.5, 0),
+            ("antsoccer-arena", "", [20.0, 20.0, 0.0, 20.0], 0.5, 15),
         ] {
-            let found =
-                relabeling(name).map(|task| (task.start, task.goal, task.reach, task.measured));
-            assert_eq!(found, expected, "{name}");
+            let task = relabeling(&format!("{place}-singletask{task}-v0")).unwrap();
+            assert_eq!((task.start, task.goal), ([x, y], [goal_x, goal_y]), "{place}");
+            assert_eq!((task.reach, task.measured), (reach, measured), "{place}");
+        }
+        for name in [
+            "antmaze-large-singletask-task6-v0",
+            "antmaze-large-singletask-task0-v0",
+            "antmaze-large",
+            "cube-single-singletask-v0",
+        ] {
+            assert_eq!(relabeling(name), None, "{name}");
         }
         for environment in environments() {
-            let Rules { relabel, judged, .. } = environment.benchmark.rules;
-            assert!(
-                !relabel || judged == Judged::BeforeStep,
-                "labels are of the state before a step"
-            );
-            let Some(task) = environment.task else { continue };
-            let Some(Simulator::Maze(_, map)) = environment.simulator else { continue };
+            let rules = &environment.benchmark.rules;
+            // Labels are of the state before a step.
+            assert!(!rules.relabel || rules.judged == Judged::BeforeStep);
+            let (Some(task), Some(Simulator::Maze(_, map))) =
+                (environment.task, environment.simulator.clone())
+            else {
+                continue;
+            };
             let is_free = |[x, y]: [f64; 2]| {
                 map[(y / CELL) as usize + 1].as_bytes()[(x / CELL) as usize + 1] == b'0'
             };
-            assert!(is_free(task.start) && is_free(task.goal), "{}", environment.name);
+            let name = &environment.name;
+            assert!(is_free(task.start) && is_free(task.goal), "{name}");
         }
     }
 
@@ -339,13 +335,20 @@ mod tests {
     fn tasks_and_datasets_are_those_that_are_published() {
         let all = Vec::from_iter(tasks());
         assert_eq!(all.len(), 42 * 6);
-        let names = |at: usize| (&*all[at].name, &*all[at].environment, &*all[at].dataset);
-        let (task, environment) =
-            ("antmaze-medium-navigate-singletask-task1-v0", "antmaze-medium-singletask-task1-v0");
-        assert_eq!(names(36 + 1), (task, environment, "antmaze-medium-navigate-v0"));
-        let (task, environment) =
-            ("puzzle-4x6-noisy-singletask-task5-v0", "puzzle-4x6-singletask-task5-v0");
-        assert_eq!(names(42 * 6 - 1), (task, environment, "puzzle-4x6-noisy-v0"));
-        assert!(all.iter().all(|task| task.name != "antmaze-giant-explore-singletask-v0"));
+        let mut found = [36 + 1, 42 * 6 - 1]
+            .into_iter()
+            .flat_map(|at| [&*all[at].name, &*all[at].environment, &*all[at].dataset]);
+        for name in [
+            "antmaze-medium-navigate-singletask-task1-v0",
+            "antmaze-medium-singletask-task1-v0",
+            "antmaze-medium-navigate-v0",
+            "puzzle-4x6-noisy-singletask-task5-v0",
+            "puzzle-4x6-singletask-task5-v0",
+            "puzzle-4x6-noisy-v0",
+        ] {
+            assert_eq!(found.next(), Some(name));
+        }
+        let unpublished = "antmaze-giant-explore-singletask-v0";
+        assert!(all.iter().all(|task| task.name != unpublished));
     }
 }

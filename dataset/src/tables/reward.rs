@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::recording::Recording;
+use crate::statistics::Figures;
 
 /// Transformation of rewards before training. Statistics and scores use the recorded rewards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,15 +44,11 @@ impl Default for RewardScaling {
 }
 
 impl RewardScaling {
-    /// Root mean square of the training rewards.
+    /// Root mean square of the training rewards; NaN without rewards.
     pub(crate) fn size(self, recording: &Recording) -> f64 {
-        let squares = recording
-            .transitions()
-            .map(|row| f64::from(self.apply(recording.rewards[row as usize])).powi(2));
-        let (count, sum) = squares
-            .filter(|x| x.is_finite())
-            .fold((0.0, 0.0), |(count, sum), square| (count + 1.0, sum + square));
-        if count > 0.0 { f64::sqrt(sum / count) } else { 0.0 }
+        let rewards = recording.transitions().map(|row| recording.rewards[row]);
+        let rewards = rewards.map(|reward| f64::from(self.apply(reward)));
+        Figures::of(&Vec::from_iter(rewards.filter(|reward| reward.is_finite()))).size
     }
 
     pub(crate) fn apply(self, reward: f32) -> f32 {
@@ -64,9 +61,8 @@ impl RewardRule {
     pub(crate) fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
         let (subtract, times) = match self {
             Self::Locomotion => {
-                let max = returns.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-                let min = returns.iter().copied().fold(f64::INFINITY, f64::min);
-                if max <= min {
+                let Figures { min, max, .. } = Figures::of(returns);
+                if min == max {
                     return None;
                 }
                 (0.0, 1000.0 / (max - min))

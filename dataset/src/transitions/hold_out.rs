@@ -27,10 +27,6 @@ pub enum HoldOut<'a> {
 
 impl HoldOut<'_> {
     pub(crate) const NONE: Self = Self::Episodes(&[]);
-
-    pub(crate) fn is_none(self) -> bool {
-        matches!(self, Self::Fraction { fraction: 0.0, .. } | Self::Episodes([]))
-    }
 }
 
 /// Indices in ascending order. A fraction above 0 leaves at least one episode on each side.
@@ -41,8 +37,8 @@ pub(crate) fn chosen(hold_out: HoldOut<'_>, episodes: usize) -> Vec<usize> {
     };
     let mut numbers = Vec::from_iter(0..episodes);
     numbers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed ^ PURPOSE));
-    let count =
-        if fraction > 0.0 { ((fraction * episodes as f64).round() as usize).max(1) } else { 0 };
+    let count = (fraction * episodes as f64).round() as usize;
+    let count = count.max(usize::from(fraction > 0.0));
     numbers.truncate(count.min(episodes.saturating_sub(1)));
     numbers.sort_unstable();
     numbers
@@ -62,47 +58,47 @@ impl Recording {
         episodes
     }
 
-    /// Training episodes, held-out episodes, and the indices of the latter.
-    pub(crate) fn hold_out(&self, hold_out: HoldOut<'_>) -> (Recording, Recording, Vec<usize>) {
+    /// Training episodes, held-out episodes if there are any, and the indices of the latter.
+    pub(crate) fn hold_out(self, hold_out: HoldOut<'_>) -> (Self, Option<Self>, Vec<usize>) {
         let episodes = self.rows_of_episodes();
         let out = chosen(hold_out, episodes.len());
-        let (mut training, mut held_out) = (self.like(), self.like());
+        if out.is_empty() {
+            return (self, None, out);
+        }
+        let mut parts = [self.like(), self.like()];
         for (number, rows) in episodes.into_iter().enumerate() {
-            let part =
-                if out.binary_search(&number).is_ok() { &mut held_out } else { &mut training };
-            part.extend(self, rows);
+            parts[usize::from(out.binary_search(&number).is_ok())].extend(&self, rows);
         }
-        for part in [&mut training, &mut held_out] {
-            part.close();
-        }
-        (training, held_out, out)
+        parts.iter_mut().for_each(Self::close);
+        let [training, held_out] = parts;
+        (training, Some(held_out), out)
     }
 
     fn like(&self) -> Recording {
-        let Recording { observation_dim, action_dim, goal, rounding, terminal_array, .. } = *self;
-        let (names, next_observations) =
-            (self.names.clone(), self.next_observations.as_ref().map(|_| Vec::new()));
-        let sizes = Recording {
-            observation_dim,
-            action_dim,
-            goal,
-            rounding,
-            terminal_array,
+        Recording {
+            observation_dim: self.observation_dim,
+            action_dim: self.action_dim,
+            next_observations: self.next_observations.as_ref().map(|_| Vec::new()),
+            rounding: self.rounding,
+            terminal_array: self.terminal_array,
+            goal: self.goal,
+            names: self.names.clone(),
             ..Recording::default()
-        };
-        Recording { names, next_observations, ..sizes }
+        }
     }
 
-    fn extend(&mut self, from: &Recording, rows: Range<usize>) {
-        let (o, a) = (from.observation_dim, from.action_dim);
-        let (of_observations, of_actions) =
-            (rows.start * o..rows.end * o, rows.start * a..rows.end * a);
-        self.observations.extend_from_slice(&from.observations[of_observations.clone()]);
-        self.actions.extend_from_slice(&from.actions[of_actions]);
-        self.rewards.extend_from_slice(&from.rewards[rows.clone()]);
-        if let (Some(next), Some(from)) = (&mut self.next_observations, &from.next_observations) {
-            next.extend_from_slice(&from[of_observations]);
+    pub(super) fn extend(&mut self, from: &Recording, rows: Range<usize>) {
+        if let Some((_, group)) = from.parts.iter().find(|(first, _)| *first == rows.start) {
+            self.parts.push((self.rows(), group.clone()));
         }
+        let columns = |width: usize| rows.start * width..rows.end * width;
+        let (states, actions) = (columns(from.observation_dim), columns(from.action_dim));
+        if let (Some(next), Some(from)) = (&mut self.next_observations, &from.next_observations) {
+            next.extend_from_slice(&from[states.clone()]);
+        }
+        self.observations.extend_from_slice(&from.observations[states]);
+        self.actions.extend_from_slice(&from.actions[actions]);
+        self.rewards.extend_from_slice(&from.rewards[rows.clone()]);
         self.kinds.extend_from_slice(&from.kinds[rows.clone()]);
         self.terminals.extend_from_slice(&from.terminals[rows.clone()]);
         self.timeouts.extend_from_slice(&from.timeouts[rows.clone()]);
@@ -114,67 +110,62 @@ impl Recording {
         if self.kinds.last() != Some(&RowKind::Transition) || self.next_observations.is_some() {
             return;
         }
-        let (last, o, a) = (self.rows() - 1, self.observation_dim, self.action_dim);
-        self.observations.extend_from_within(last * o..);
-        self.actions.extend_from_within(last * a..);
-        self.rewards.push(0.0);
-        self.kinds.push(RowKind::LastState);
-        self.terminals.push(false);
-        self.timeouts.push(false);
-        self.ends.push(false);
+        let last = (self.rows() - 1) * self.observation_dim;
+        self.observations.extend_from_within(last..);
+        self.push_last_state();
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
     use crate::recording::tests::recording;
 
-    #[test]
-    fn episodes_are_kept_out_whole() {
+    fn whole() -> Recording {
         use RowKind::{Dropped, LastState, Transition};
         let mut whole = recording(&[
             Transition, Transition, Transition, Dropped, Transition, LastState, Transition,
         ]);
         (whole.ends[1], whole.terminals[1], whole.ends[3]) = (true, true, true);
-        assert_eq!(whole.rows_of_episodes(), [0..2, 2..4, 4..6, 6..7]);
-        let (mut seen, hold_out) = (Vec::new(), |seed| HoldOut::Fraction { fraction: 0.25, seed });
+        let part = |first: usize| (first, first.to_string());
+        whole.parts = [0, 2, 4, 6].map(part).to_vec();
+        whole
+    }
+
+    #[test]
+    fn episodes_are_kept_out_whole() {
+        let episodes = [0..2, 2..4, 4..6, 6..7];
+        assert_eq!(whole().rows_of_episodes(), episodes);
+        let mut seen = BTreeSet::new();
         for seed in 0..20 {
-            let (training, held_out, out) = whole.hold_out(hold_out(seed));
+            let hold_out = HoldOut::Fraction { fraction: 0.25, seed };
+            let (training, held_out, out) = whole().hold_out(hold_out);
+            let (number, held_out) = (&out[0], held_out.unwrap());
             assert_eq!(out.len(), 1);
-            let rows = whole.rows_of_episodes()[out[0]].clone();
+            let rows = &episodes[*number];
+            let (own, others): (Vec<usize>, _) = (0..7).partition(|row| rows.contains(row));
             // Rewards equal row indices; one more row, a final state, may follow.
-            assert_eq!(
-                &held_out.rewards[..rows.len()],
-                Vec::from_iter(rows.clone().map(|row| row as f32))
-            );
-            let again = whole.hold_out(HoldOut::Episodes(&out));
-            assert_eq!(
-                (again.0.rewards, again.1.rewards),
-                (training.rewards.clone(), held_out.rewards.clone())
-            );
-            let others = (0..7).filter(|row| !rows.contains(row)).map(|row| row as f32);
-            assert_eq!(&training.rewards[..7 - rows.len()], Vec::from_iter(others));
-            for part in [training, held_out] {
-                assert!(
-                    part.transitions().all(|row| (row as usize) + 1 < part.rows()),
-                    "no next state"
-                );
+            for (part, rows) in [(&held_out, own), (&training, others)] {
+                let rewards = Vec::from_iter(rows.into_iter().map(|row| row as f32));
+                assert_eq!(part.rewards[..rewards.len()], rewards);
+                let is_last = |row: usize| row + 1 == part.rows();
+                assert!(!part.transitions().any(is_last), "no next state");
             }
-            seen.push(out[0]);
+            assert_eq!(held_out.parts, [(0, rows.start.to_string())]);
+            let again = whole().hold_out(HoldOut::Episodes(&out));
+            assert_eq!(again.0.rewards, training.rewards);
+            seen.insert(*number);
         }
-        seen.sort_unstable();
-        seen.dedup();
-        assert_eq!(seen, [0, 1, 2, 3], "by the seed");
+        assert_eq!(seen.len(), 4, "by the seed");
     }
 
     #[test]
     fn one_episode_is_left_to_learn_from() {
         let count =
-            |fraction, episodes| chosen(HoldOut::Fraction { fraction, seed: 0 }, episodes).len();
-        assert_eq!(
-            [count(0.0, 10), count(0.1, 10), count(0.01, 10), count(0.9, 2), count(0.5, 1)],
-            [0, 1, 1, 1, 0]
-        );
+            |(fraction, episodes)| chosen(HoldOut::Fraction { fraction, seed: 0 }, episodes).len();
+        let counts = [(0.0, 10), (0.1, 10), (0.01, 10), (0.9, 2), (0.5, 1)].map(count);
+        assert_eq!(counts, [0, 1, 1, 1, 0]);
     }
 }

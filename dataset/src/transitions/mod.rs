@@ -16,7 +16,7 @@ use crate::formats::Source;
 use crate::formats::arrays::Arrays;
 use crate::normalize::{self, Normalize};
 use crate::practice::PracticeRows;
-use crate::recording::{Names, Recording};
+use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
 use crate::tables::maze::MazeTask;
 use crate::tables::reward::{RewardRule, RewardScaling};
@@ -61,7 +61,6 @@ pub struct Transitions {
     warnings: Vec<String>,
     reward: RewardScaling,
     scaling: Scaling,
-    names: Names,
 }
 
 /// Training and validation transitions.
@@ -88,13 +87,13 @@ impl Transitions {
         options: &ReadOptions,
         hold_out: HoldOut<'_>,
     ) -> Result<Split, DatasetError> {
-        let (path, ReadOptions { environment, task, .. }) = (path.as_ref(), *options);
+        let path = path.as_ref();
         let error = |problem| DatasetError::new(path, problem);
         let mut source = Source::open(path)?;
-        if let Some(environment) = environment {
+        if let Some(environment) = options.environment {
             source.check_environment(environment).map_err(error)?;
         }
-        let recording = source.read(environment, task)?;
+        let recording = source.read(options.environment, options.task)?;
         Self::split(recording, options, hold_out).map_err(error)
     }
 
@@ -102,8 +101,8 @@ impl Transitions {
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
-        let options = ReadOptions::default();
-        Ok(Self::split(recording, &options, HoldOut::NONE).map_err(error)?.training)
+        let split = Self::split(recording, &ReadOptions::default(), HoldOut::NONE);
+        Ok(split.map_err(error)?.training)
     }
 
     fn split(
@@ -111,33 +110,30 @@ impl Transitions {
         options: &ReadOptions,
         hold_out: HoldOut<'_>,
     ) -> Result<Split, Problem> {
-        let ReadOptions { environment, reward, normalize, .. } = *options;
-        checks::accept(&recording, environment, normalize.actions)?;
-        let (recording, held_out, episodes) = match hold_out.is_none() {
-            true => (recording, None, Vec::new()),
-            false => {
-                let (training, held_out, episodes) = recording.hold_out(hold_out);
-                (training, (!episodes.is_empty()).then_some(held_out), episodes)
-            }
-        };
-        let rewards =
-            reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
-        let scaling = normalize.scaling(&recording, rewards);
-        let held_out =
-            held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
-        let warnings = warnings::warnings(&recording, normalize, reward);
-        let training = Self { warnings, ..Self::new(recording, environment, rewards, scaling) };
-        Ok(Split { training, held_out: held_out.filter(|held_out| held_out.len() > 0), episodes })
+        let environment = options.environment;
+        checks::accept(&recording, environment, options.normalize.actions)?;
+        let (recording, held_out, episodes) = recording.hold_out(hold_out);
+        if recording.transitions().next().is_none() {
+            return Err(Problem::NoTransitions(recording.rows()));
+        }
+        let returns = recording.trajectory_returns();
+        let rewards = options.reward.scaling(&returns).ok_or(Problem::SameReturns)?;
+        let scaling = options.normalize.scaling(&recording, rewards);
+        let new = |recording| Self::new(recording, environment, rewards, scaling.clone());
+        let held_out = held_out.map(new).filter(|held_out| held_out.len() > 0);
+        let warnings = warnings::warnings(&recording, options.normalize, options.reward);
+        let mut training = new(recording);
+        training.warnings = warnings;
+        Ok(Split { training, held_out, episodes })
     }
 
     fn new(
-        mut recording: Recording,
+        recording: Recording,
         environment: Option<&EnvironmentSpec>,
         reward: RewardScaling,
         scaling: Scaling,
     ) -> Self {
         let (episodes, past_goal) = (recording.episodes(), recording.past_goal());
-        let names = std::mem::take(&mut recording.names);
         let dataset = Rows::new(recording, reward, &scaling);
         Self {
             experience: RwLock::new(dataset.none()),
@@ -147,7 +143,6 @@ impl Transitions {
             dataset,
             reward,
             scaling,
-            names,
         }
     }
 
@@ -159,12 +154,12 @@ impl Transitions {
 
     /// Dimension of an observation.
     pub fn observation_dim(&self) -> usize {
-        self.dataset.observation_dim
+        self.dataset.recording.observation_dim
     }
 
     /// Dimension of an action.
     pub fn action_dim(&self) -> usize {
-        self.dataset.action_dim
+        self.dataset.recording.action_dim
     }
 
     /// Offsets and scales of the normalization; rewards are scaled after the reward rule.
@@ -174,18 +169,18 @@ impl Transitions {
 
     /// Names of the dimensions of observations and actions.
     pub fn names(&self) -> &Names {
-        &self.names
+        &self.dataset.recording.names
     }
 
     /// Map of each dimension of the dataset to mean 0 and standard deviation 1, or scale 0 if it is
     /// constant.
     pub fn standard_units(&self) -> Scaling {
-        let Rows { observation_dim, action_dim, observations, actions, .. } = &self.dataset;
-        let counts = |row: usize| self.dataset.starts.binary_search(&(row as u32)).is_ok();
-        let units = |values, width| Some(normalize::standard_units(values, width, counts));
+        let all = &self.dataset.recording;
+        let is_transition = |row: usize| all.kinds[row] == RowKind::Transition;
+        let of = |values, width| Some(normalize::standard_units(values, width, is_transition));
         Scaling {
-            observations: units(observations, *observation_dim),
-            actions: units(actions, *action_dim),
+            observations: of(&all.observations, all.observation_dim),
+            actions: of(&all.actions, all.action_dim),
             rewards: None,
         }
     }
@@ -206,7 +201,7 @@ impl Transitions {
         let recording = episode.recording(self.observation_dim(), self.action_dim())?;
         checks::accept(&recording, None, self.scaling.actions.is_some())?;
         let rows = Rows::new(recording, self.reward, &self.scaling);
-        self.experience.write().unwrap_or_else(PoisonError::into_inner).extend(rows);
+        self.experience.write().unwrap_or_else(PoisonError::into_inner).extend(&rows);
         Ok(())
     }
 
@@ -255,9 +250,10 @@ impl Transitions {
 
     /// [`Self::episodes`] that start a recorded episode; the recording may continue after a goal.
     pub fn recorded_episodes(&self) -> Vec<Range<u32>> {
-        let first = |episode: &Range<u32>| self.dataset.starts[episode.start as usize];
-        let is_past = |episode: &Range<u32>| self.past_goal[first(episode) as usize];
-        self.episodes().into_iter().filter(|episode| !is_past(episode)).collect()
+        let mut episodes = self.episodes();
+        let row = |episode: &Range<u32>| self.dataset.starts[episode.start as usize] as usize;
+        episodes.retain(|episode| !self.past_goal[row(episode)]);
+        episodes
     }
 
     /// First index of each run of `length ≥ 1` consecutive transitions within an episode.
@@ -273,8 +269,6 @@ impl Transitions {
         let experience = self.experience();
         batch.clear();
         batch.size = indices.len();
-        batch.observations.reserve(batch.size * self.observation_dim());
-        batch.next_observations.reserve(batch.size * self.observation_dim());
         for &index in indices {
             match self.in_experience(index) {
                 None => self.dataset.copy_to(batch, index),

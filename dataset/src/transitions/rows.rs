@@ -42,63 +42,43 @@ impl Batch {
     }
 }
 
-/// N rows, scaled. An index counts transitions only.
-#[derive(Default)]
+/// Rows of a dataset or of experience. An index counts transitions only.
 pub(super) struct Rows {
-    pub observation_dim: usize,
-    pub action_dim: usize,
-    /// N × o.
-    pub observations: Vec<f32>,
-    /// N × a, clipped.
-    pub actions: Vec<f32>,
-    rewards: Vec<f32>,
-    /// N × o, if the source has them; else a transition leads to the following row.
-    next_observations: Option<Vec<f32>>,
-    terminals: Vec<bool>,
+    /// Scaled; actions are also clipped.
+    pub recording: Recording,
     /// Rows that start a transition.
     pub starts: Vec<u32>,
     goes_on: Vec<bool>,
 }
 
 impl Rows {
-    pub fn new(mut recording: Recording, reward: RewardScaling, scaling: &Scaling) -> Self {
-        let starts = recording.transitions().collect();
-        let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
+    pub fn new(mut recording: Recording, of_rewards: RewardScaling, scaling: &Scaling) -> Self {
+        let starts = Vec::from_iter(recording.transitions().map(|row| row as u32));
+        let goes_on = Vec::from_iter((0..recording.rows()).map(|row| recording.goes_on(row)));
         normalize::apply(scaling, &mut recording);
-        let Recording {
-            observation_dim, action_dim, observations, mut actions, mut rewards, ..
-        } = recording;
-        actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
-        let size = scaling.rewards.unwrap_or(1.0);
-        rewards.iter_mut().for_each(|it| *it = reward.apply(*it) / size);
-        Self {
-            observation_dim,
-            action_dim,
-            observations,
-            actions,
-            rewards,
-            next_observations: recording.next_observations,
-            terminals: recording.terminals,
-            starts,
-            goes_on,
+        recording.unused_next_observations = None;
+        for action in &mut recording.actions {
+            *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT);
         }
+        for reward in &mut recording.rewards {
+            *reward = of_rewards.apply(*reward) / scaling.rewards.unwrap_or(1.0);
+        }
+        Self { recording, starts, goes_on }
     }
 
     /// No rows, of the same dimensions.
     pub fn none(&self) -> Self {
-        let Self { observation_dim, action_dim, .. } = *self;
-        Self { observation_dim, action_dim, ..Self::default() }
+        let Recording { observation_dim, action_dim, .. } = self.recording;
+        let recording = Recording { observation_dim, action_dim, ..Recording::default() };
+        Self { recording, starts: Vec::new(), goes_on: Vec::new() }
     }
 
     /// Adds rows without next observations of their own.
-    pub fn extend(&mut self, rows: Self) {
-        let first = self.rewards.len() as u32;
-        self.observations.extend(rows.observations);
-        self.actions.extend(rows.actions);
-        self.rewards.extend(rows.rewards);
-        self.terminals.extend(rows.terminals);
+    pub fn extend(&mut self, rows: &Self) {
+        let first = self.recording.rows() as u32;
+        self.recording.extend(&rows.recording, 0..rows.recording.rows());
         self.starts.extend(rows.starts.iter().map(|row| first + row));
-        self.goes_on.extend(rows.goes_on);
+        self.goes_on.extend(&rows.goes_on);
     }
 
     /// Number of transitions.
@@ -114,8 +94,7 @@ impl Rows {
 
     pub fn next_action(&self, index: u32) -> Option<&[f32]> {
         let row = self.starts[index as usize] as usize;
-        let next = (row + 1) * self.action_dim..(row + 2) * self.action_dim;
-        self.goes_on[row].then(|| &self.actions[next])
+        self.goes_on[row].then(|| self.recording.action(row + 1))
     }
 
     pub fn episodes(&self) -> Vec<Range<u32>> {
@@ -131,16 +110,11 @@ impl Rows {
     }
 
     pub fn copy_to(&self, batch: &mut Batch, index: u32) {
-        let (o, a) = (self.observation_dim, self.action_dim);
-        let row = self.starts[index as usize] as usize;
-        batch.observations.extend_from_slice(&self.observations[row * o..(row + 1) * o]);
-        batch.actions.extend_from_slice(&self.actions[row * a..(row + 1) * a]);
-        batch.rewards.push(self.rewards[row]);
-        let next = match &self.next_observations {
-            Some(next_observations) => &next_observations[row * o..(row + 1) * o],
-            None => &self.observations[(row + 1) * o..(row + 2) * o],
-        };
-        batch.next_observations.extend_from_slice(next);
-        batch.masks.push(if self.terminals[row] { 0.0 } else { 1.0 });
+        let (all, row) = (&self.recording, self.starts[index as usize] as usize);
+        batch.observations.extend_from_slice(all.observation(row));
+        batch.actions.extend_from_slice(all.action(row));
+        batch.rewards.push(all.rewards[row]);
+        batch.next_observations.extend_from_slice(all.next_observation(row));
+        batch.masks.push(f32::from(u8::from(!all.terminals[row])));
     }
 }

@@ -1,6 +1,6 @@
 //! Summary statistics of a dataset.
 
-use crate::statistics::{Episode, Extent};
+use crate::statistics::{Episode, Figures};
 use crate::tables::environment::EnvironmentSpec;
 
 /// Size of a dataset and quality of its behavior policy, by the recorded rewards.
@@ -26,7 +26,7 @@ impl Statistics {
         transitions: usize,
         episodes: &[Episode],
     ) -> Self {
-        let returns = Extent::of(episodes.iter().map(|episode| episode.sum));
+        let returns = Figures::of(&Vec::from_iter(episodes.iter().map(|episode| episode.sum)));
         Self {
             transitions,
             episodes: episodes.len(),

@@ -1,7 +1,7 @@
 //! Flags with another meaning than the end of a task: masks, discounts, lasting successes.
 
 use super::percent;
-use crate::recording::Recording;
+use crate::recording::{Recording, RowKind};
 
 const FEWEST: usize = 10;
 /// Largest plausible fraction of terminals: episodes of two steps.
@@ -10,8 +10,9 @@ const MOST_TERMINALS: f64 = 0.5;
 pub(super) const MOST_AFTER_GOAL: f64 = 0.8;
 /// Mean squared step, relative to that between random rows, above which states are reset.
 const RESET: f64 = 0.5;
+
 pub(super) fn meaning(recording: &Recording) -> Option<String> {
-    let steps = (0..recording.rows()).filter(|&row| recording.is_step(row)).count();
+    let steps = recording.kinds.iter().filter(|kind| **kind != RowKind::LastState).count();
     let array = recording.terminal_array;
     if recording.goal {
         let after = recording.past_goal().iter().filter(|past| **past).count();
@@ -32,10 +33,11 @@ fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
     let inner = |row: &usize| {
         recording.is_step(*row) && recording.is_step(row + 1) && !recording.timeouts[*row]
     };
-    let (set, others): (Vec<usize>, _) =
-        (0..recording.rows()).filter(inner).partition(|row| recording.terminals[*row]);
-    let terminals = recording.terminals.iter().filter(|terminal| **terminal).count();
-    let again = set.iter().filter(|row| recording.terminals[**row + 1]).count();
+    let flags = &recording.terminals;
+    let inner = (0..recording.rows()).filter(inner);
+    let (set, others): (Vec<usize>, _) = inner.partition(|row| flags[*row]);
+    let terminals = flags.iter().filter(|terminal| **terminal).count();
+    let again = set.iter().filter(|row| flags[**row + 1]).count();
     let is_most = terminals as f64 > MOST_TERMINALS * steps as f64;
     if set.len() < FEWEST
         || !(is_most || 2 * again > terminals)
@@ -44,14 +46,12 @@ fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
         return None;
     }
     let is_mask = is_most && (others.is_empty() || step_length(recording, &others) >= RESET);
-    let (may, what_to_do) = match is_mask {
-        true => ("a mask or a discount (1 − done) in place of the flag?", "write 1 − it"),
-        false => {
-            ("a success that stays set after the goal?", "end each episode at the first such row")
-        }
+    let cause = match is_mask {
+        true => "a mask or a discount (1 − done) in place of the flag? write 1 − it",
+        false => "a success that stays set after the goal? end each episode at the first such row",
     };
     Some(format!(
-        "array `{array}`: says in {} of the rows that the task is over, but states go on after them; {may} {what_to_do}, or critics \
+        "array `{array}`: says in {} of the rows that the task is over, but states go on after them; {cause}, or critics \
          learn of nothing that follows",
         percent(terminals, steps)
     ))
@@ -71,5 +71,5 @@ fn step_length(recording: &Recording, rows: &[usize]) -> f64 {
     };
     let mut lengths: Vec<f64> = (0..width).filter_map(length).collect();
     lengths.sort_by(f64::total_cmp);
-    lengths.get(lengths.len() / 2).copied().unwrap_or(f64::INFINITY)
+    *lengths.get(lengths.len() / 2).unwrap_or(&f64::INFINITY)
 }

@@ -19,37 +19,39 @@ type Columns = Vec<Vec<f64>>;
 
 pub(super) fn observations(recording: &Recording) -> Option<String> {
     let rows = recording.some_that_go_on();
-    let rows: Vec<usize> = rows.iter().copied().step_by(rows.len().div_ceil(ROWS).max(1)).collect();
+    let apart = rows.len().div_ceil(ROWS).max(1);
+    let rows = Vec::from_iter(rows.into_iter().step_by(apart));
     let (o, a) = (recording.observation_dim, recording.action_dim);
     if rows.len() < FEWEST.max(10 * (o + a)) {
         return None;
     }
     let columns = |width: usize, at: &dyn Fn(usize, usize) -> f32| -> Columns {
-        (0..width).map(|i| rows.iter().map(|row| f64::from(at(*row, i))).collect()).collect()
+        let column = |i| rows.iter().map(|row| f64::from(at(*row, i))).collect();
+        (0..width).map(column).collect()
     };
     let states = columns(o, &|row, i| recording.observation(row)[i]);
     let constant = vec![vec![1.0; rows.len()]];
     let given = basis(constant.iter().chain(&states).cloned());
-    let sizes = states.iter().map(|column| square(column));
-    let steps =
+    let mut steps =
         columns(o, &|row, i| recording.observation(row + 1)[i] - recording.observation(row)[i]);
-    let steps = steps.into_iter().map(|column| without(column, &given)).zip(sizes);
-    let steps: Columns = steps
-        .filter(|(step, size)| square(step) > ROUNDING.powi(2) * size)
-        .map(|(step, _)| step)
-        .collect();
+    for (step, state) in steps.iter_mut().zip(&states) {
+        *step = without(std::mem::take(step), &given);
+        if square(step) <= ROUNDING.powi(2) * square(state) {
+            step.clear();
+        }
+    }
+    steps.retain(|step| !step.is_empty());
     let own = columns(a, &|row, i| recording.action(row)[i]);
     let next = columns(a, &|row, i| recording.action(row + 1)[i]);
 
     let of_mean = basis(constant.into_iter());
-    let sum = |basis: &Columns| {
-        own.iter().map(|column| square(&without(column.clone(), basis))).sum::<f64>()
+    let sum = |basis: &Columns| -> f64 {
+        own.iter().map(|action| square(&without(action.clone(), basis))).sum()
     };
     let [own_share, next_share] = [&own, &next].map(|actions| {
-        let basis = basis(actions.iter().map(|column| without(column.clone(), &given)));
-        let explained =
-            steps.iter().map(|step| 1.0 - square(&without(step.clone(), &basis)) / square(step));
-        explained.fold(0.0, f64::max)
+        let basis = basis(actions.iter().map(|action| without(action.clone(), &given)));
+        let rest = |step: &Vec<f64>| square(&without(step.clone(), &basis)) / square(step);
+        steps.iter().map(|step| 1.0 - rest(step)).fold(0.0, f64::max)
     });
     let is_late =
         next_share > EXPLAINED.max(TIMES * own_share) && sum(&given) > FREE * sum(&of_mean);
@@ -85,7 +87,9 @@ fn basis(columns: impl Iterator<Item = Vec<f64>>) -> Columns {
 fn without(mut column: Vec<f64>, basis: &Columns) -> Vec<f64> {
     for direction in basis.iter().chain(basis) {
         let along: f64 = column.iter().zip(direction).map(|(x, y)| x * y).sum();
-        column.iter_mut().zip(direction).for_each(|(x, y)| *x -= along * y);
+        for (x, y) in column.iter_mut().zip(direction) {
+            *x -= along * y;
+        }
     }
     column
 }

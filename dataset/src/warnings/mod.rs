@@ -10,7 +10,7 @@ mod rewards;
 mod sizes;
 
 use crate::normalize::Normalize;
-use crate::recording::{Recording, RowKind};
+use crate::recording::Recording;
 use crate::tables::reward::RewardRule;
 
 /// Number of evenly spaced rows that are sampled.
@@ -21,9 +21,7 @@ pub(crate) fn warnings(
     normalize: Normalize,
     rule: RewardRule,
 ) -> Vec<String> {
-    let mut warnings = of_ends(recording);
-    warnings.extend(of_numbers(recording, normalize, rule));
-    warnings
+    [of_ends(recording), of_numbers(recording, normalize, rule)].concat()
 }
 
 pub(crate) fn of_ends(recording: &Recording) -> Vec<String> {
@@ -40,14 +38,15 @@ pub(crate) fn of_numbers(
 ) -> Vec<String> {
     let copied = copied::actions(recording);
     let rest = rest::observations(recording);
-    let late =
-        if copied.is_some() || rest.is_some() { None } else { late::observations(recording) };
+    let is_other = copied.is_some() || rest.is_some();
+    let late = (!is_other).then(|| late::observations(recording)).flatten();
     let mut warnings = Vec::from_iter(rewards::alike(recording));
     if warnings.is_empty() {
         warnings.extend(rewards::after_goal(recording));
         // A task's rule or normalization sets the size.
-        let is_own = rule == RewardRule::AsIs && !normalize.rewards;
-        warnings.extend(if is_own { rewards::size(recording) } else { None });
+        if rule == RewardRule::AsIs && !normalize.rewards {
+            warnings.extend(rewards::size(recording));
+        }
     }
     warnings.extend(copied.into_iter().chain(rest).chain(late));
     warnings.extend(sizes::columns(recording, normalize));
@@ -59,30 +58,28 @@ pub(crate) fn named(columns: &[usize], names: &[String]) -> String {
         Some(name) => format!("{column} ({name})"),
         None => column.to_string(),
     };
-    let word = if columns.len() == 1 { "column" } else { "columns" };
-    format!("{word} {}", Vec::from_iter(columns.iter().map(one)).join(", "))
+    let columns = Vec::from_iter(columns.iter().map(one));
+    let ending = if columns.len() == 1 { "" } else { "s" };
+    format!("column{ending} {}", columns.join(", "))
 }
 
 fn short(x: f64) -> String {
-    if x == 0.0 || x.abs() >= 0.1 { format!("{x:.1}") } else { format!("{x:.1e}") }
+    match x == 0.0 || x.abs() >= 0.1 {
+        true => format!("{x:.1}"),
+        false => format!("{x:.1e}"),
+    }
 }
 
 fn percent(part: usize, whole: usize) -> String {
-    format!("{:.3}", 100.0 * part as f64 / whole as f64)
-        .trim_end_matches('0')
-        .trim_end_matches('.')
-        .to_owned()
-        + " %"
+    let percent = format!("{:.3}", 100.0 * part as f64 / whole as f64);
+    let short = percent.trim_end_matches('0').trim_end_matches('.');
+    format!("{short} %")
 }
 
 impl Recording {
-    fn is_step(&self, row: usize) -> bool {
-        self.kinds.get(row).is_some_and(|kind| *kind != RowKind::LastState)
-    }
-
     /// Rows with a following step, at most [`ENOUGH`].
     fn some_that_go_on(&self) -> Vec<usize> {
-        let apart = self.rows().div_ceil(ENOUGH).max(1);
-        (0..self.rows()).step_by(apart).filter(|&row| self.goes_on(row)).collect()
+        let rows = (0..self.rows()).step_by(self.rows().div_ceil(ENOUGH).max(1));
+        rows.filter(|&row| self.goes_on(row)).collect()
     }
 }

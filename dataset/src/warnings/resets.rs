@@ -20,19 +20,25 @@ pub(crate) fn out_of_step(recording: &Recording) -> Vec<String> {
     // Groups per episode cannot be shifted; a final state ends its episode, not the row before.
     let inner = 1..recording.rows().saturating_sub(2);
     let inner = inner.filter(|row| recording.parts.is_empty() && !is_last(row + 1));
-    let ends: Vec<usize> = inner.filter(|&row| recording.ends[row] || is_last(row)).collect();
+    let ends = inner.filter(|&row| recording.ends[row] || is_last(row));
+    let ends: Vec<usize> = ends.collect();
     if ends.is_empty() {
         return Vec::new();
     }
     let lengths = lengths(recording);
     let longest = (CANDIDATES * ends.len()).min(lengths.len() / STEPS_BETWEEN_RESETS);
-    let limit =
-        *lengths.clone().select_nth_unstable_by(lengths.len() - 1 - longest, f64::total_cmp).1;
+    let mut sorted = lengths.clone();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let limit = sorted[lengths.len() - 1 - longest];
+    let judged = |name, flags: &[usize]| judge(name, flags, &lengths, limit);
+    if recording.terminal_array == "masks" {
+        // OGBench's `terminals` mark the end of a trajectory, for whatever reason.
+        return Vec::from_iter(judged("terminals", &ends));
+    }
     let (timeouts, terminals): (Vec<usize>, _) =
-        ends.iter().partition(|&&row| recording.timeouts[row]);
-    let judged = [(recording.terminal_array, terminals), ("timeouts", timeouts)]
-        .map(|(name, flags)| judge(name, &flags, &lengths, limit));
-    judged.into_iter().flatten().collect()
+        ends.into_iter().partition(|&row| recording.timeouts[row]);
+    let terminals = judged(recording.terminal_array, &terminals);
+    terminals.into_iter().chain(judged("timeouts", &timeouts)).collect()
 }
 
 /// Counts the offsets of resets, which are longer than `limit`, from flags.
@@ -62,14 +68,37 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
 /// Squared length of each step, with each dimension scaled by its root mean square step.
 fn lengths(recording: &Recording) -> Vec<f64> {
     let square = |row: usize, i: usize| {
-        let apart =
-            f64::from(recording.observation(row + 1)[i]) - f64::from(recording.observation(row)[i]);
-        if apart.is_finite() { apart * apart } else { 0.0 }
+        let (from, to) = (recording.observation(row)[i], recording.observation(row + 1)[i]);
+        let square = (f64::from(to) - f64::from(from)).powi(2);
+        if square.is_finite() { square } else { 0.0 }
     };
     let steps = 0..recording.rows().saturating_sub(1);
-    let columns = 0..recording.observation_dim;
     let mean = |i: usize| steps.clone().map(|row| square(row, i)).sum::<f64>() / steps.len() as f64;
-    let moving: Vec<(usize, f64)> =
-        columns.map(|i| (i, mean(i))).filter(|(_, mean)| *mean > 0.0).collect();
-    steps.clone().map(|row| moving.iter().map(|&(i, mean)| square(row, i) / mean).sum()).collect()
+    let moving = (0..recording.observation_dim).map(|i| (i, mean(i)));
+    let moving = Vec::from_iter(moving.filter(|(_, mean)| *mean > 0.0));
+    let length = |row| moving.iter().map(|&(i, mean)| square(row, i) / mean).sum();
+    steps.clone().map(length).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recording::tests::recording;
+
+    #[test]
+    fn a_shift_of_ogbenchs_terminals_is_not_put_down_to_masks() {
+        let kind = |row: usize| match row > 0 && row.is_multiple_of(30) {
+            true => RowKind::LastState,
+            false => RowKind::Transition,
+        };
+        let mut recording = recording(&Vec::from_iter((0..600).map(kind)));
+        for row in 0..600 {
+            recording.observations[row] = (1000 * (row / 30) % 7000 + row % 30) as f32;
+            recording.ends[row] = row % 30 == 29;
+        }
+        recording.terminal_array = "masks";
+        let warnings = out_of_step(&recording);
+        let [warning] = &warnings[..] else { panic!("{warnings:?}") };
+        assert!(warning.starts_with("array `terminals`: one row late"), "{warning}");
+    }
 }

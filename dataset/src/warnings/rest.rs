@@ -28,10 +28,8 @@ pub(super) fn observations(recording: &Recording) -> Option<String> {
              of a sensor slower than control? record one at each step, or keep only the rows where it is new"
         ));
     }
-    let width = recording.observation_dim;
-    let stored = recording.next_observations.as_ref()?;
-    let share =
-        at_rest(&|row| &stored[row * width..(row + 1) * width] == recording.observation(row))?;
+    recording.next_observations.as_ref()?;
+    let share = at_rest(&|row| recording.next_observation(row) == recording.observation(row))?;
     Some(format!(
         "array `next_observations`: is the observation of its own row in {share} of the steps; store the one after the step"
     ))

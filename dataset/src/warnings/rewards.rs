@@ -3,7 +3,7 @@
 use super::ends::MOST_AFTER_GOAL;
 use super::{percent, short};
 use crate::recording::Recording;
-use crate::statistics::Extent;
+use crate::statistics::Figures;
 use crate::tables::reward::RewardScaling;
 
 /// Relative difference that float32 critics lose: Q-values are some hundred times the rewards.
@@ -15,18 +15,6 @@ const SMALLEST: f32 = 0.01;
 /// Fraction of the rows after reaching the goal that must be at the goal.
 const STAYS: f64 = 0.9;
 
-#[derive(Clone, Copy, PartialEq)]
-enum Goal {
-    /// No reward yet.
-    New,
-    /// Lower value only.
-    Ahead,
-    /// Lower, then higher value.
-    Reached,
-    /// Higher value first, so that it marks no goal.
-    None,
-}
-
 /// Reward of each step, and true at the end of an episode.
 fn steps(recording: &Recording) -> impl Iterator<Item = (f32, bool)> {
     let rows = (0..recording.rows()).filter(|&row| recording.is_step(row));
@@ -35,11 +23,13 @@ fn steps(recording: &Recording) -> impl Iterator<Item = (f32, bool)> {
 
 pub(super) fn alike(recording: &Recording) -> Option<String> {
     let (first, _) = steps(recording).next()?;
-    let (least, most) =
-        steps(recording).fold((first, first), |(least, most), (x, _)| (least.min(x), most.max(x)));
-    let is_finite = steps(recording).all(|(reward, _)| reward.is_finite());
-    let terminals = recording.terminals.contains(&true) && first != 0.0;
-    let but = if terminals { " but how soon an episode terminates" } else { "" };
+    let rewards = || steps(recording).map(|(reward, _)| reward);
+    let (least, most) = (rewards().fold(first, f32::min), rewards().fold(first, f32::max));
+    let is_finite = rewards().all(f32::is_finite);
+    let but = match recording.terminals.contains(&true) && first != 0.0 {
+        true => " but how soon an episode terminates",
+        false => "",
+    };
     (is_finite && most - least <= ALIKE * most.abs().max(least.abs())).then(|| {
         format!(
             "array `rewards`: all are alike ({first}), so nothing distinguishes good from bad{but}"
@@ -56,19 +46,18 @@ pub(super) fn after_goal(recording: &Recording) -> Option<String> {
     if recording.goal || steps(recording).any(|(reward, _)| reward != first && reward != other) {
         return None;
     }
-    let (mut all, mut after, mut stay, mut goal) = (0, 0, 0, Goal::New);
+    let (mut all, mut after, mut stay) = (0, 0, 0);
+    // A goal's reward is low, then high.
+    let (mut starts_low, mut is_reached) = (None, false);
     for (reward, ends) in steps(recording) {
-        let is_after = goal == Goal::Reached;
+        let is_high = reward == high;
         all += 1;
-        after += usize::from(is_after);
-        stay += usize::from(is_after && reward == high);
-        goal = match (goal, reward == high) {
-            _ if ends => Goal::New,
-            (Goal::New, true) => Goal::None,
-            (Goal::New, false) => Goal::Ahead,
-            (Goal::Ahead, true) => Goal::Reached,
-            (goal, _) => goal,
-        };
+        after += usize::from(is_reached);
+        stay += usize::from(is_reached && is_high);
+        is_reached |= *starts_low.get_or_insert(!is_high) && is_high;
+        if ends {
+            (starts_low, is_reached) = (None, false);
+        }
     }
     (after as f64 > MOST_AFTER_GOAL * all as f64 && stay as f64 > STAYS * after as f64).then(|| {
         format!(
@@ -82,10 +71,8 @@ pub(super) fn after_goal(recording: &Recording) -> Option<String> {
 
 pub(super) fn size(recording: &Recording) -> Option<String> {
     let size = RewardScaling::default().size(recording);
-    let largest = recording
-        .transitions()
-        .map(|row| recording.rewards[row as usize].abs())
-        .fold(0.0, f32::max);
+    let rewards = recording.transitions().map(|row| recording.rewards[row].abs());
+    let largest = rewards.fold(0.0, f32::max);
     let weights = match size > LARGEST {
         true => "exp(β · advantage) is then 0 or cut off",
         false if largest > 0.0 && largest < SMALLEST => {
@@ -93,7 +80,8 @@ pub(super) fn size(recording: &Recording) -> Option<String> {
         }
         false => return None,
     };
-    let returns = Extent::of(recording.episodes().iter().map(|episode| episode.sum));
+    let sums = recording.episodes().into_iter().map(|episode| episode.sum);
+    let returns = Figures::of(&Vec::from_iter(sums));
     Some(format!(
         "array `rewards`: of size {} a step (root mean square; episodes return {} to {}), where methods are made for about 1: \
          {weights}; `learner train --normalize rewards` divides them by it",

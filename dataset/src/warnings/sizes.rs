@@ -3,6 +3,7 @@
 use super::{named, short};
 use crate::normalize::Normalize;
 use crate::recording::{Recording, RowKind};
+use crate::statistics::Figures;
 
 /// Largest accepted root mean square of a dimension. At this size of one of a simulated cart's
 /// four, IQL's critic loss after 3,000 steps was twice that with all near 1; at three times,
@@ -17,10 +18,10 @@ pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String
         recording;
     let mut warnings = Vec::new();
     if !normalize.observations {
-        let columns =
-            moments(observations, *observation_dim, |row| kinds[row] == RowKind::Transition);
-        let (large, largest) = most(&columns, |[size, _]| (size > LARGEST).then_some(size));
-        warnings.extend((!large.is_empty()).then(|| {
+        let is_transition = |row: usize| kinds[row] == RowKind::Transition;
+        let columns = Figures::of_columns(observations, *observation_dim, is_transition);
+        let is_large = |column: &Figures| (column.size > LARGEST).then_some(column.size);
+        warnings.extend(most(&columns, is_large).map(|(large, largest)| {
             format!(
                 "array `observations`: far from ±1 in {}, of size {largest:.0}, which spoils training; `learner train --normalize observations` \
                  trains on it",
@@ -30,43 +31,31 @@ pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String
         warnings.extend(small("observations", &columns, &names.observations));
     }
     if !normalize.actions {
-        let columns = moments(actions, *action_dim, |row| kinds[row] != RowKind::LastState);
+        let columns = Figures::of_columns(actions, *action_dim, |row| recording.is_step(row));
         warnings.extend(small("actions", &columns, &names.actions));
     }
     warnings
 }
 
-fn small(array: &str, columns: &[[f64; 2]], names: &[String]) -> Option<String> {
-    let changes = |[size, deviation]: [f64; 2]| deviation < SMALLEST && deviation > ROUNDING * size;
-    let (small, largest) = most(columns, |column| changes(column).then_some(column[1]));
-    (!small.is_empty()).then(|| {
-        format!(
-            "array `{array}`: hardly changes in {}, by a standard deviation of {}, which networks do not tell from 0; `learner train \
-             --normalize {array}` trains on it",
-            named(&small, names),
-            short(largest)
-        )
-    })
-}
-
-fn most(columns: &[[f64; 2]], of: impl Fn([f64; 2]) -> Option<f64>) -> (Vec<usize>, f64) {
-    let found = columns.iter().enumerate().filter_map(|(i, column)| Some((i, of(*column)?)));
-    let (numbers, figures): (Vec<usize>, Vec<f64>) = found.unzip();
-    (numbers, figures.into_iter().fold(0.0, f64::max))
-}
-
-/// Root mean square and standard deviation of each column's finite numbers.
-fn moments(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<[f64; 2]> {
-    let mut sums = vec![[0.0; 3]; width];
-    for (_, row) in values.chunks_exact(width.max(1)).enumerate().filter(|(row, _)| counts(*row)) {
-        for ([count, sum, squares], x) in sums.iter_mut().zip(row).filter(|(_, x)| x.is_finite()) {
-            let x = f64::from(*x);
-            (*count, *sum, *squares) = (*count + 1.0, *sum + x, *squares + x * x);
-        }
-    }
-    let of = |[count, sum, squares]: [f64; 3]| {
-        let square = squares / count;
-        [square.sqrt(), (square - (sum / count).powi(2)).max(0.0).sqrt()]
+fn small(array: &str, columns: &[Figures], names: &[String]) -> Option<String> {
+    let is_small = |Figures { size, deviation, .. }: &Figures| {
+        (*deviation < SMALLEST && *deviation > ROUNDING * size).then_some(*deviation)
     };
-    sums.into_iter().map(of).collect()
+    let (small, largest) = most(columns, is_small)?;
+    Some(format!(
+        "array `{array}`: hardly changes in {}, by a standard deviation of {}, which networks do not tell from 0; `learner train \
+         --normalize {array}` trains on it",
+        named(&small, names),
+        short(largest)
+    ))
+}
+
+/// Columns with a figure, and the largest figure.
+fn most(
+    columns: &[Figures],
+    figure: impl Fn(&Figures) -> Option<f64>,
+) -> Option<(Vec<usize>, f64)> {
+    let found = columns.iter().enumerate().filter_map(|(i, column)| Some((i, figure(column)?)));
+    let (found, figures): (Vec<usize>, Vec<f64>) = found.unzip();
+    Some((found, figures.into_iter().reduce(f64::max)?))
 }

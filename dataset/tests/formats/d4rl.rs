@@ -1,18 +1,19 @@
 use std::path::Path;
 
-use quad_dataset::{EnvironmentSpec, RewardRule, environment, recorded_environment};
-use tempfile::tempdir;
+use quad_dataset::{RewardRule, environment, recorded_environment};
 
-use crate::{all, compare, generated, hopper, peers, put, read, shared, try_read};
+use crate::{
+    Environment, all, assert_refused, compare, hopper, peers, put, read, scratch, shared, steps,
+    try_read, write, written,
+};
 
 /// Compares a file with the output of `peers.py reference`.
-fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>) {
-    let folder = tempdir().unwrap();
-    let out = folder.path().join("reference.hdf5");
-    let limit = environment.map_or(0, |environment| environment.max_episode_steps).to_string();
-    let goal =
-        if environment.is_some_and(|environment| environment.maze.is_some()) { "1" } else { "0" };
-    if peers(&["reference", path.to_str().unwrap(), &limit, goal, out.to_str().unwrap()]) {
+fn compare_with_rules(path: &Path, environment: Environment) {
+    let (_folder, out) = scratch("reference.hdf5");
+    let limit = environment.map_or(0, |spec| spec.max_episode_steps).to_string();
+    let is_maze = environment.is_some_and(|spec| spec.maze.is_some());
+    let [from, to] = [path, &out].map(|path| path.to_str().unwrap());
+    if peers(&["reference", from, &limit, if is_maze { "1" } else { "0" }, to]) {
         compare(path, environment, &out);
     }
 }
@@ -20,33 +21,33 @@ fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>
 #[test]
 fn every_version_follows_the_rules() {
     for variant in ["plain", "float64", "columns", "integers", "v0", "v1"] {
-        let Some((_folder, path)) = generated(variant) else { return };
+        let Some((_folder, path)) = written("generate", variant, "d4rl.hdf5") else { return };
         compare_with_rules(&path, Some(hopper()));
         assert_eq!(recorded_environment(&path).unwrap(), None);
+        if variant == "plain" {
+            compare_with_rules(&path, None);
+        }
     }
-    let Some((_folder, path)) = generated("plain") else { return };
-    compare_with_rules(&path, None);
 }
 
 #[test]
 fn rows_that_do_not_follow_one_another_are_refused() {
-    let Some((_folder, path)) = generated("shuffled") else { return };
-    let error = try_read(&path, Some(hopper())).err().unwrap();
+    let Some((_folder, path)) = written("generate", "shuffled", "d4rl.hdf5") else { return };
     // The last row and two ends of episodes are not compared.
-    let expected = "array `next_observations`, row 0: not the observation of the row that follows, though the episode \
-                    continues there (597 such rows)";
-    assert!(error.to_string().ends_with(expected), "{error}");
-    assert!(
-        error.hint().contains("`layout`") && error.hint().contains("timeouts"),
-        "{}",
-        error.hint()
+    let message = "array `next_observations`, row 0: not the observation of the next row, though the episode goes on \
+                   (597 such rows)";
+    assert_refused(
+        &path,
+        Some(hopper()),
+        message,
+        "where episodes end in `terminals` and `timeouts`",
     );
+    assert_refused(&path, Some(hopper()), message, "the attribute `layout`");
 }
 
 #[test]
 fn antmaze_goes_on_after_the_goal() {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("antmaze.hdf5");
+    let (_folder, path) = scratch("antmaze.hdf5");
     if peers(&["generate-antmaze", path.to_str().unwrap()]) {
         let umaze = environment::find("antmaze-umaze").unwrap();
         compare_with_rules(&path, Some(umaze));
@@ -77,15 +78,15 @@ fn recorded_files() {
 
 #[test]
 fn a_recording_with_a_goal_goes_on_after_it_in_whatever_environment() {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("goal.hdf5");
-    let file = hdf5::File::create(&path).unwrap();
-    let flags = |rows: &[usize]| std::array::from_fn::<_, 8, _>(|row| rows.contains(&row));
-    put(&file, "observations", &[8, 2], &std::array::from_fn::<f32, 16, _>(|i| i as f32));
-    put(&file, "actions", &[8, 1], &[0.5f32; 8]);
-    put(&file, "rewards", &[8], &flags(&[2, 3, 6]).map(f32::from));
-    put(&file, "terminals", &[8], &flags(&[2, 3, 6]));
-    put(&file, "timeouts", &[8], &flags(&[4, 7]));
+    let (_folder, path) = scratch("goal.hdf5");
+    let mut arrays = steps(8, 2, 1);
+    arrays.rewards.fill(0.0);
+    for row in [2, 3, 6] {
+        (arrays.rewards[row], arrays.terminals[row]) = (1.0, true);
+    }
+    (arrays.timeouts[4], arrays.timeouts[7]) = (true, true);
+    let file = write(&path, &arrays);
+    file.flush().unwrap();
     assert_eq!(try_read(&path, None).unwrap().statistics().episodes, 5);
     file.create_group("infos").unwrap();
     put(&file, "infos/goal", &[8, 2], &[0.0f32; 16]);

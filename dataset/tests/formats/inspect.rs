@@ -1,31 +1,25 @@
-use std::path::Path;
+use quad_dataset::{Arrays, RewardRule, environment, inspect};
 
-use ndarray::{Array1, Array2};
-use quad_dataset::{RewardRule, environment, inspect};
-use tempfile::tempdir;
+use crate::{hopper, peers, read, scratch, steps, write, written};
 
-use crate::{generated, hopper, peers, read, shared};
-
-fn write_robot(path: &Path, spoil: impl Fn(&mut Array2<f32>, &mut Array2<f32>, &mut Array1<f32>)) {
-    let mut observations = Array2::from_shape_fn((10, 3), |(i, j)| (i + j) as f32);
-    let mut actions =
-        Array2::from_shape_fn((10, 2), |(i, j)| if j == 0 { 0.5 } else { -0.1 * i as f32 });
-    let mut rewards = Array1::from_shape_fn(10, |i| i as f32);
-    spoil(&mut observations, &mut actions, &mut rewards);
-    let file = hdf5::File::create(path).unwrap();
-    let flags = |row: usize| Array1::from_shape_fn(10, |i| i == row);
-    file.new_dataset_builder().with_data(&observations).create("observations").unwrap();
-    file.new_dataset_builder().with_data(&actions).create("actions").unwrap();
-    file.new_dataset_builder().with_data(&rewards).create("rewards").unwrap();
-    file.new_dataset_builder().with_data(&flags(3)).create("terminals").unwrap();
-    file.new_dataset_builder().with_data(&flags(7)).create("timeouts").unwrap();
+fn robot() -> Arrays {
+    let row = |row: usize| Vec::from_iter((0..10).map(|i| i == row));
+    Arrays {
+        observation_dim: 3,
+        action_dim: 2,
+        observations: (0..30).map(|i| (i / 3 + i % 3) as f32).collect(),
+        actions: (0..10).flat_map(|i| [0.5, -0.1 * i as f32]).collect(),
+        rewards: (0..10).map(|i| i as f32).collect(),
+        next_observations: Vec::new(),
+        terminals: row(3),
+        timeouts: row(7),
+    }
 }
 
 #[test]
 fn figures_of_a_file_that_can_be_followed_by_eye() {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("robot.hdf5");
-    write_robot(&path, |_, _, _| ());
+    let (_folder, path) = scratch("robot.hdf5");
+    write(&path, &robot());
     let json = serde_json::to_value(inspect(&path, None).unwrap()).unwrap();
     for (field, expected) in [
         ("transitions", 8.0), // the timeout and the last row make none
@@ -49,40 +43,29 @@ fn figures_of_a_file_that_can_be_followed_by_eye() {
 
 #[test]
 fn figures_are_those_of_training() {
-    let Some((_folder, path)) = generated("plain") else { return };
+    let Some((_folder, path)) = written("generate", "plain", "d4rl.hdf5") else { return };
     let inspection = inspect(&path, Some(hopper())).unwrap();
     let statistics = *read(&path, Some(hopper()), RewardRule::AsIs).statistics();
-    assert_eq!(
-        (inspection.transitions, inspection.episodes),
-        (statistics.transitions, statistics.episodes)
-    );
+    let ours = (inspection.transitions, inspection.episodes, inspection.refused);
+    assert_eq!(ours, (statistics.transitions, statistics.episodes, false));
     let ours = [inspection.min_return, inspection.mean_return, inspection.max_return];
     assert_eq!(ours, [statistics.return_min, statistics.return_mean, statistics.return_max]);
     assert_eq!(inspection.scores.as_ref().map(|scores| scores.mean_score), statistics.score_mean);
-    assert_eq!(
-        (inspection.refused, inspection.problems.len()),
-        (false, 0),
-        "{:?}",
-        inspection.problems
-    );
+    assert_eq!(inspection.problems, [""; 0]);
     let text = inspection.to_string();
-    for words in
-        ["transitions   21\n", "returns of the episodes\n", "no problems found", "score  ", "####"]
-    {
+    let figures = ["transitions   21\n", "score  ", "####"];
+    for words in figures.into_iter().chain(["returns of the episodes\n", "no problems found"]) {
         assert!(text.contains(words), "{words} is not in\n{text}");
     }
 }
 
 #[test]
 fn everything_that_is_wrong_is_named_at_once() {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("robot.hdf5");
-    write_robot(&path, |observations, actions, rewards| {
-        observations[[5, 1]] = f32::NAN;
-        observations[[6, 0]] = f32::INFINITY;
-        actions[[2, 0]] = 7.5;
-        rewards[8] = f32::NAN;
-    });
+    let (_folder, path) = scratch("robot.hdf5");
+    let mut robot = robot();
+    (robot.observations[16], robot.observations[18]) = (f32::NAN, f32::INFINITY);
+    (robot.actions[4], robot.rewards[8]) = (7.5, f32::NAN);
+    write(&path, &robot);
     let inspection = inspect(&path, Some(hopper())).unwrap();
     assert_eq!(
         inspection.problems,
@@ -95,26 +78,15 @@ fn everything_that_is_wrong_is_named_at_once() {
         ]
     );
     assert!(inspection.refused && inspection.to_string().contains("training refuses this dataset"));
-    assert_eq!(
-        (inspection.mean_return, inspection.max_return),
-        (14.0, 22.0),
-        "the third episode has no return"
-    );
+    let returns = (inspection.mean_return, inspection.max_return);
+    assert_eq!(returns, (14.0, 22.0), "the third episode has no return");
     assert_eq!(inspection.observation_range.max, 11.0);
 }
 
 #[test]
 fn an_empty_file_is_described_too() {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("empty.hdf5");
-    let file = hdf5::File::create(&path).unwrap();
-    for (name, width) in [("observations", 3), ("actions", 2), ("rewards", 1), ("terminals", 1)] {
-        file.new_dataset_builder()
-            .with_data(&Array2::<f32>::zeros((0, width)))
-            .create(name)
-            .unwrap();
-    }
-    drop(file);
+    let (_folder, path) = scratch("empty.hdf5");
+    write(&path, &steps(0, 3, 2));
     let inspection = inspect(&path, None).unwrap();
     assert_eq!((inspection.transitions, inspection.episodes, inspection.refused), (0, 0, true));
     assert_eq!(inspection.problems[0], "0 rows, of which none makes a transition");
@@ -123,24 +95,14 @@ fn an_empty_file_is_described_too() {
 }
 
 #[test]
-fn missing_timeouts_and_stored_observations_that_do_not_follow() {
-    let Some((_folder, path)) = generated("v0") else { return };
-    let problems = inspect(&path, Some(hopper())).unwrap().problems;
-    assert_eq!(
-        problems,
-        ["no array `timeouts`: an episode is taken to end after the 1000 steps of hopper"]
-    );
-    let Some((_folder, path)) = generated("v1") else { return };
-    let problems = inspect(&path, Some(hopper())).unwrap().problems;
-    let expected = "array `next_observations`, row 100: not the observation of the row that follows, though the episode \
-                    continues there; is a timeout missing?";
-    assert_eq!(problems, [expected]);
-}
-
-#[test]
-fn a_maze_that_is_left_by_a_leap() {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("antmaze.hdf5");
+fn missing_timeouts_and_observations_that_do_not_follow() {
+    let v0 = "no array `timeouts`: an episode is taken to end after the 1000 steps of hopper";
+    let v1 = "array `next_observations`, row 100: not the observation of the next row, though the episode goes on; is a timeout missing?";
+    for (variant, problem) in [("v0", v0), ("v1", v1)] {
+        let Some((_folder, path)) = written("generate", variant, "d4rl.hdf5") else { return };
+        assert_eq!(inspect(&path, Some(hopper())).unwrap().problems, [problem]);
+    }
+    let (_folder, path) = scratch("antmaze.hdf5");
     let umaze = environment::find("antmaze-umaze").unwrap();
     if !peers(&["generate-antmaze", path.to_str().unwrap()]) {
         return;
@@ -150,23 +112,4 @@ fn a_maze_that_is_left_by_a_leap() {
     assert_eq!(inspection.scores.unwrap().mean_score, 80.0);
     let [problem] = &inspection.problems[..] else { panic!("{:?}", inspection.problems) };
     assert!(problem.contains("more than 1 m away") && problem.contains("out of step"), "{problem}");
-}
-
-#[test]
-fn recorded_files_are_without_problems() {
-    for (name, environment, transitions, episodes) in [
-        ("hopper_medium_replay", "hopper", 101_028 - 1 - 8, 897),
-        ("halfcheetah_medium_replay", "halfcheetah", 100_000 - 100, 100),
-        ("antmaze_umaze", "antmaze-umaze", 70_000 - 100, 100),
-        ("antmaze_medium_play", "antmaze-medium", 100_000 - 100, 100),
-    ] {
-        let Some(path) = shared(&format!("data/{name}.hdf5")) else { continue };
-        let inspection = inspect(&path, Some(environment::find(environment).unwrap())).unwrap();
-        assert_eq!(inspection.problems, [""; 0], "{name}");
-        assert_eq!(
-            (inspection.transitions, inspection.episodes),
-            (transitions, episodes),
-            "{name}"
-        );
-    }
 }

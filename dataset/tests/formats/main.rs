@@ -8,7 +8,7 @@ use hdf5::H5Type;
 use ndarray::ArrayViewD;
 use quad_dataset::benchmarks::relabeling;
 use quad_dataset::{
-    Batch, DatasetError, EnvironmentSpec, Normalize, ReadOptions, RewardRule, Transitions,
+    Arrays, Batch, DatasetError, EnvironmentSpec, Normalize, ReadOptions, RewardRule, Transitions,
     environment,
 };
 use tempfile::{TempDir, tempdir};
@@ -24,6 +24,8 @@ mod own;
 mod round_trip;
 mod warnings;
 
+type Environment = Option<&'static EnvironmentSpec>;
+
 fn hopper() -> &'static EnvironmentSpec {
     environment::find("hopper").unwrap()
 }
@@ -38,24 +40,62 @@ fn shared(path: &str) -> Option<PathBuf> {
     exists.then_some(path)
 }
 
-fn options(environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> ReadOptions {
+/// Folder with the path of a file in it.
+fn scratch(name: &str) -> (TempDir, PathBuf) {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join(name);
+    (folder, path)
+}
+
+fn options(environment: Environment, reward: RewardRule) -> ReadOptions {
     let task = environment.and_then(|environment| relabeling(&environment.name));
     ReadOptions { environment, task, reward, normalize: Normalize::default() }
 }
 
-fn read(
-    path: &Path,
-    environment: Option<&'static EnvironmentSpec>,
-    reward: RewardRule,
-) -> Transitions {
+fn read(path: &Path, environment: Environment, reward: RewardRule) -> Transitions {
     Transitions::read(path, &options(environment, reward)).unwrap()
 }
 
-fn try_read(
-    path: &Path,
-    environment: Option<&'static EnvironmentSpec>,
-) -> Result<Transitions, DatasetError> {
+fn try_read(path: &Path, environment: Environment) -> Result<Transitions, DatasetError> {
     Transitions::read(path, &options(environment, RewardRule::AsIs))
+}
+
+fn assert_refused(path: &Path, environment: Environment, message: &str, hint: &str) {
+    let error = try_read(path, environment).err().expect(message);
+    assert_error(&error, message, hint);
+}
+
+/// Checks the end of a message and a part of its hint.
+fn assert_error(error: &DatasetError, message: &str, hint: &str) {
+    let (found, advice) = (error.to_string(), error.hint());
+    assert!(found.ends_with(message), "{found}, not {message}");
+    assert!(advice.contains(hint), "{advice}, not {hint}");
+}
+
+/// Steps of equal numbers within [-1, 1], without an end.
+fn steps(rows: usize, observation_dim: usize, action_dim: usize) -> Arrays {
+    Arrays {
+        observation_dim,
+        action_dim,
+        observations: vec![0.5; rows * observation_dim],
+        actions: vec![0.5; rows * action_dim],
+        rewards: vec![1.0; rows],
+        next_observations: vec![0.5; rows * observation_dim],
+        terminals: vec![false; rows],
+        timeouts: vec![false; rows],
+    }
+}
+
+/// Writes D4RL's layout without next observations.
+fn write(path: &Path, arrays: &Arrays) -> hdf5::File {
+    let (file, rows) = (hdf5::File::create(path).unwrap(), arrays.rewards.len());
+    let (o, a) = (arrays.observation_dim, arrays.action_dim);
+    put(&file, "observations", &[rows, o], &arrays.observations);
+    put(&file, "actions", &[rows, a], &arrays.actions);
+    put(&file, "rewards", &[rows], &arrays.rewards);
+    put(&file, "terminals", &[rows], &arrays.terminals);
+    put(&file, "timeouts", &[rows], &arrays.timeouts);
+    file
 }
 
 fn put<T: H5Type>(file: &hdf5::Group, array: &str, shape: &[usize], data: &[T]) {
@@ -64,13 +104,12 @@ fn put<T: H5Type>(file: &hdf5::Group, array: &str, shape: &[usize], data: &[T]) 
 }
 
 fn all(transitions: &Transitions) -> Batch {
-    let indices: Vec<u32> = (0..transitions.len() as u32).collect();
     let mut batch = Batch::default();
-    transitions.gather(&indices, &mut batch);
+    transitions.gather(&Vec::from_iter(0..transitions.len() as u32), &mut batch);
     batch
 }
 
-fn compare(path: &Path, environment: Option<&'static EnvironmentSpec>, reference: &Path) {
+fn compare(path: &Path, environment: Environment, reference: &Path) {
     let reference = hdf5::File::open(reference).unwrap();
     let array = |name: &str| reference.dataset(name).unwrap().read_raw::<f32>().unwrap();
 
@@ -92,30 +131,26 @@ fn compare(path: &Path, environment: Option<&'static EnvironmentSpec>, reference
         ours.return_min,
         ours.return_max,
     ];
-    let theirs = reference.dataset("statistics").unwrap().read_raw::<f64>().unwrap();
-    for (ours, theirs) in figures.iter().zip(&theirs) {
-        assert!((ours - theirs).abs() <= 1e-9 * theirs.abs(), "{figures:?} against {theirs:?}");
+    let theirs = reference.dataset("statistics").unwrap();
+    for (ours, theirs) in figures.iter().zip(theirs.read_raw::<f64>().unwrap()) {
+        assert!((ours - theirs).abs() <= 1e-9 * theirs.abs(), "{figures:?}");
     }
-    assert_eq!(
-        ours.score_mean,
-        environment.map(|environment| environment.normalized_score(ours.return_mean))
-    );
+    let score = environment.map(|spec| spec.normalized_score(ours.return_mean));
+    assert_eq!(ours.score_mean, score);
 }
 
 fn assert_close(name: &str, ours: &[f32], theirs: &[f32]) {
+    let is_close =
+        |(ours, theirs): (&f32, &f32)| (ours - theirs).abs() <= 1e-6 * theirs.abs().max(1e-3);
     assert_eq!(ours.len(), theirs.len(), "{name}");
-    for (i, (ours, theirs)) in ours.iter().zip(theirs).enumerate() {
-        assert!(
-            (ours - theirs).abs() <= 1e-6 * theirs.abs().max(1e-3),
-            "{name} {i}: {ours} against {theirs}"
-        );
-    }
+    let apart = ours.iter().zip(theirs).position(|pair| !is_close(pair));
+    assert_eq!(apart, None, "{name}: {ours:?} against {theirs:?}");
 }
 
-fn generated(variant: &str) -> Option<(TempDir, PathBuf)> {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("generated.hdf5");
-    peers(&["generate", variant, path.to_str().unwrap()]).then_some((folder, path))
+/// A file that `peers.py` writes by a command with a variant; see [`peers`].
+fn written(command: &str, variant: &str, name: &str) -> Option<(TempDir, PathBuf)> {
+    let (folder, path) = scratch(name);
+    peers(&[command, variant, path.to_str().unwrap()]).then_some((folder, path))
 }
 
 /// Runs `peers.py`. Without Python it returns false, or panics if QUAD_REQUIRE_PEERS=1.
@@ -138,11 +173,9 @@ fn peers_in(folder: &Path, arguments: &[&str]) -> bool {
     }
     let mut command = Command::new(python);
     command.arg(here.join("tests/formats/peers.py")).args(arguments);
-    let output = command.current_dir(folder).env("MINARI_DATASETS_PATH", folder).output().unwrap();
-    assert!(
-        output.status.success(),
-        "peers.py {arguments:?}:\n{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
+    command.current_dir(folder).env("MINARI_DATASETS_PATH", folder);
+    let output = command.output().unwrap();
+    let complaint = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "peers.py {arguments:?}:\n{complaint}");
     true
 }

@@ -1,96 +1,61 @@
+use std::fs;
 use std::path::{Path, PathBuf};
 
-use quad_dataset::{DatasetError, EnvironmentSpec, Transitions, environment, recorded_environment};
+use quad_dataset::{environment, recorded_environment};
 use tempfile::{TempDir, tempdir};
 
-use crate::{all, compare, hopper, peers_in, put, shared, try_read};
+use crate::{
+    Environment, all, assert_refused, compare, hopper, peers_in, put, scratch, shared, try_read,
+};
 
-struct Root(TempDir);
+const ID: &str = "made/up-v0";
 
-impl Root {
-    fn new(kind: &str) -> Option<Self> {
-        let this = Self(tempdir().unwrap());
-        peers_in(this.0.path(), &["write-minari", kind, "made/up-v0"]).then_some(this)
-    }
-
-    fn dataset(&self) -> PathBuf {
-        self.0.path().join("made/up-v0")
-    }
-
-    fn metadata(&self) -> PathBuf {
-        self.dataset().join("data/metadata.json")
-    }
-
-    fn read(
-        &self,
-        environment: Option<&'static EnvironmentSpec>,
-    ) -> Result<Transitions, DatasetError> {
-        try_read(&self.dataset(), environment)
-    }
-
-    fn error(&self) -> DatasetError {
-        self.read(Some(hopper())).err().unwrap()
-    }
+/// Minari's folder with one dataset, and the dataset's folder.
+fn root(kind: &str) -> Option<(TempDir, PathBuf)> {
+    let (root, dataset) = scratch(ID);
+    peers_in(root.path(), &["write-minari", kind, ID]).then_some((root, dataset))
 }
 
-fn compare_with_minari(
-    root: &Path,
-    id: &str,
-    kind: &str,
-    environment: Option<&'static EnvironmentSpec>,
-) {
-    let folder = tempdir().unwrap();
-    let out = folder.path().join("reference.hdf5");
-    let arguments = ["minari-reference", kind, id, out.to_str().unwrap()];
-    if peers_in(root, &arguments) {
-        let dataset = root.join(id);
-        for path in [dataset.clone(), dataset.join("data"), dataset.join("data/main_data.hdf5")] {
-            compare(&path, environment, &out);
+fn compare_with_minari(root: &Path, id: &str, kind: &str, environment: Environment) {
+    let (_folder, out) = scratch("reference.hdf5");
+    if peers_in(root, &["minari-reference", kind, id, out.to_str().unwrap()]) {
+        for path in ["", "data", "data/main_data.hdf5"] {
+            compare(&root.join(id).join(path), environment, &out);
         }
     }
 }
 
 #[test]
-fn observations_in_an_array() {
-    let Some(root) = Root::new("hopper") else { return };
-    assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some("hopper"));
-    compare_with_minari(root.0.path(), "made/up-v0", "hopper", Some(hopper()));
-}
-
-#[test]
-fn another_simulation_is_learned_from_but_not_scored_in_ours() {
-    for (kind, id, ours) in
-        [("antmaze", "AntMaze_UMaze-v4", "antmaze-umaze"), ("walker2d", "Walker2d-v5", "walker2d")]
-    {
-        let Some(root) = Root::new(kind) else { return };
-        assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some(id));
-        let error = root.read(environment::find(ours).ok()).err().unwrap();
-        assert!(
-            error.to_string().ends_with(&format!("recorded in `{id}`, which is not `{ours}`")),
-            "{error}"
-        );
-        assert!(error.hint().contains("--task own-data"), "{}", error.hint());
-        compare_with_minari(root.0.path(), "made/up-v0", kind, None);
+fn arrays_and_a_dict_in_alphabetical_order_and_a_tuple_in_its_own() {
+    for (kind, recorded, spec) in [
+        ("hopper", "hopper", Some(hopper())),
+        ("walker2d", "Walker2d-v5", None),
+        ("antmaze", "AntMaze_UMaze-v4", None),
+        ("own", "Robot-v0", None),
+        ("tuple", "Robot-v0", None),
+    ] {
+        let Some((root, dataset)) = root(kind) else { return };
+        assert_eq!(recorded_environment(&dataset).unwrap().as_deref(), Some(recorded));
+        compare_with_minari(root.path(), ID, kind, spec);
     }
 }
 
 #[test]
-fn a_dict_becomes_a_row_in_alphabetical_order_and_a_tuple_in_its_own() {
-    for kind in ["own", "tuple"] {
-        let Some(root) = Root::new(kind) else { return };
-        assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some("Robot-v0"));
-        compare_with_minari(root.0.path(), "made/up-v0", kind, None);
+fn datasets_that_are_refused() {
+    let group = "`episode_0/observations/achieved_goal` is a group of arrays, but must be an array";
+    let discrete = "only continuous actions can be learned";
+    let maze = "recorded in `AntMaze_UMaze-v4`, which is not `antmaze-umaze`";
+    let walker = "recorded in `Walker2d-v5`, which is not `walker2d`";
+    // Another simulation is learned from, but not scored in ours.
+    for (kind, name, message, hint) in [
+        ("antmaze", "antmaze-umaze", maze, "--task own-data"),
+        ("walker2d", "walker2d", walker, "--task own-data"),
+        ("nested", "", group, "Dict of arrays"),
+        ("discrete", "", discrete, "float32"),
+    ] {
+        let Some((_root, dataset)) = root(kind) else { return };
+        assert_refused(&dataset, environment::find(name).ok(), message, hint);
     }
-}
-
-#[test]
-fn a_dict_in_a_dict() {
-    let Some(root) = Root::new("nested") else { return };
-    let error = root.read(None).err().unwrap();
-    let expected =
-        "`episode_0/observations/achieved_goal` is a group of arrays, but must be an array";
-    assert!(error.to_string().ends_with(expected), "{error}");
-    assert!(error.hint().contains("Dict") && !error.hint().contains("damaged"), "{}", error.hint());
 }
 
 #[test]
@@ -102,32 +67,31 @@ fn a_dataset_that_minari_wrote_elsewhere() {
 
 #[test]
 fn damaged_metadata_and_missing_episodes() {
-    let Some(root) = Root::new("hopper") else { return };
-    let whole = std::fs::read_to_string(root.metadata()).unwrap();
-    std::fs::write(root.metadata(), &whole[..whole.len() / 2]).unwrap();
-    assert_eq!(
-        root.error().to_string(),
-        format!("{}: cannot be understood", root.metadata().display())
-    );
+    let Some((_root, dataset)) = root("hopper") else { return };
+    let metadata = dataset.join("data/metadata.json");
+    let whole = fs::read_to_string(&metadata).unwrap();
+    fs::write(&metadata, &whole[..whole.len() / 2]).unwrap();
+    let message = format!("{}: cannot be understood", metadata.display());
+    assert_refused(&dataset, Some(hopper()), &message, "metadata.json");
 
-    std::fs::write(root.metadata(), whole).unwrap();
-    let data = root.dataset().join("data/main_data.hdf5");
+    fs::write(&metadata, whole).unwrap();
+    let data = dataset.join("data/main_data.hdf5");
     hdf5::File::open_rw(&data).unwrap().unlink("episode_3").unwrap();
-    let text = root.error().to_string();
-    assert!(text.ends_with(": 3 episodes, but metadata.json says 4"), "{text}");
+    let message = ": 3 episodes, but metadata.json says 4";
+    assert_refused(&dataset, Some(hopper()), message, "again");
 }
 
 fn write_tuple(path: &Path) {
     let file = hdf5::File::create(path).unwrap();
-    let observations =
-        file.create_group("episode_0").unwrap().create_group("observations").unwrap();
+    let episode = file.create_group("episode_0").unwrap();
+    let observations = episode.create_group("observations").unwrap();
     for number in 0..11 {
         put(&observations, &format!("_index_{number}"), &[3, 1], &[number as f32; 3]);
     }
-    put(&file, "episode_0/actions", &[2, 1], &[0.5f32; 2]);
-    put(&file, "episode_0/rewards", &[2], &[1.0f32, 2.0]);
-    put(&file, "episode_0/terminations", &[2], &[false, true]);
-    put(&file, "episode_0/truncations", &[2], &[false; 2]);
+    put(&episode, "actions", &[2, 1], &[0.5f32; 2]);
+    put(&episode, "rewards", &[2], &[1.0f32, 2.0]);
+    put(&episode, "terminations", &[2], &[false, true]);
+    put(&episode, "truncations", &[2], &[false; 2]);
 }
 
 #[test]
@@ -137,11 +101,8 @@ fn a_long_tuple_keeps_its_order_whatever_its_file_is_called() {
         let path = folder.path().join(name);
         write_tuple(&path);
         let batch = all(&try_read(&path, None).unwrap());
-        assert_eq!(
-            batch.observations[..11],
-            Vec::from_iter((0..11).map(|number| number as f32)),
-            "{name}"
-        );
+        let expected = Vec::from_iter((0..11).map(|number| number as f32));
+        assert_eq!(batch.observations[..11], expected, "{name}");
         assert_eq!(batch.rewards, [1.0, 2.0]);
     }
 }

@@ -7,8 +7,8 @@ use std::path::Path;
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::find;
 use quad_dataset::{
-    DatasetError, EnvironmentSpec, Problem, RecordedRows, Row, environments_of_its_sizes,
-    recorded_environment,
+    ArrayProblem, DatasetError, EnvironmentSpec, Problem, RecordedRows, Row,
+    environments_of_its_sizes, recorded_environment,
 };
 use quad_runtime::Hint;
 use rayon::prelude::*;
@@ -80,7 +80,7 @@ const ENVIRONMENT: &str = "name its environment with --env NAME";
 
 fn hint(error: &DatasetError) -> String {
     match error.problem {
-        Problem::Missing { .. } => OTHER_FILE.to_owned(),
+        Problem::Array(_, ArrayProblem::Missing) => OTHER_FILE.to_owned(),
         _ => error.hint(),
     }
 }
@@ -155,12 +155,14 @@ fn summarize(spec: &'static EnvironmentSpec, errors: &[RowError]) -> Option<Repo
     sorted.sort_by(f64::total_cmp);
     let last = sorted.len().checked_sub(1)?;
     let at = |share: f64| sorted[(last as f64 * share).round() as usize];
+    let (median, p99, max) = (at(0.5), at(0.99), at(1.0));
+    let rewards = errors.iter().map(|row| row.reward);
     Some(Report {
         environment: &spec.name,
         transitions: errors.len(),
         compared: sorted.len(),
-        obs_error: ObservationError { median: at(0.5), p99: at(0.99), max: at(1.0) },
-        reward_error: RewardError { max: errors.iter().map(|row| row.reward).fold(0.0, f64::max) },
+        obs_error: ObservationError { median, p99, max },
+        reward_error: RewardError { max: rewards.fold(0.0, f64::max) },
         rewards_differ: errors.iter().filter(|row| row.reward_differs).count(),
         terminals_differ: errors.iter().filter(|row| row.terminal_differs).count(),
     })

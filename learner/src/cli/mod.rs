@@ -216,6 +216,3 @@ fn parse_preset(text: &str) -> Result<String, String> {
     }
     Err(tasks::unknown_hint(text) + "; a file of your own must end in .toml")
 }
-
-#[cfg(test)]
-mod tests;

@@ -92,19 +92,3 @@ fn parse_shard(text: &str) -> Result<Shard, String> {
         _ => Err("write it like 2/3, the second of three parts".to_owned()),
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_run_is_in_one_shard() {
-        let shards = ["1/3", "2/3", "3/3"].map(|text| parse_shard(text).unwrap());
-        for index in 0..20 {
-            assert_eq!(shards.iter().filter(|shard| shard.has(index)).count(), 1, "{index}");
-        }
-        for wrong in ["0/3", "4/3", "1", "1/0", "a/b", "-1/3"] {
-            assert!(parse_shard(wrong).unwrap_err().contains("2/3"), "{wrong}");
-        }
-    }
-}

@@ -149,7 +149,8 @@ impl TrainArgs {
     /// The name of a task, or the path of a preset file.
     pub fn preset(&self) -> &str {
         // clap requires one of them.
-        self.task.as_deref().or(self.preset.as_deref()).unwrap_or_default()
+        let named = self.task.as_deref().or(self.preset.as_deref());
+        named.unwrap_or_default()
     }
 
     /// The values that the command line changes: `--agent` overrides `--set`, and other flags
@@ -165,7 +166,8 @@ impl TrainArgs {
         set("algorithm", self.algorithm.clone().map(Value::from));
         set("environment", self.env.clone().map(Value::from));
         set("dataset", self.dataset.clone().map(Value::from));
-        set("normalize", (!self.normalize.is_empty()).then(|| self.normalize.clone().into()));
+        let normalize = Some(self.normalize.clone()).filter(|names| !names.is_empty());
+        set("normalize", normalize.map(Value::from));
         set("hold_out", self.hold_out.map(Value::from));
         let flags = &self.overrides;
         set("steps", flags.steps.map(Value::from));
@@ -179,7 +181,8 @@ impl TrainArgs {
         set("eval_interval", flags.eval_interval.map(Value::from));
         set("episodes", flags.episodes.map(Value::from));
         set("seed", flags.seed.map(Value::from));
-        set("precision", flags.precision.map(|precision| precision.name().into()));
+        let precision = flags.precision.map(Precision::name);
+        set("precision", precision.map(Value::from));
         changes
     }
 }

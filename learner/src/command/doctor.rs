@@ -15,7 +15,10 @@ use crate::data;
 pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let mut findings = Findings::default();
     doctor::threads(&mut findings);
-    let fastest = if Precision::Bf16.is_available() { "bf16, by --precision bf16" } else { "f32" };
+    let fastest = match Precision::Bf16.is_available() {
+        true => "bf16, by --precision bf16",
+        false => "f32",
+    };
     findings.ok("precision", format!("this CPU is fastest in {fastest}"));
     hdf5(&mut findings);
     let elsewhere = "another folder is chosen by --run-dir";
@@ -44,7 +47,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
 
 fn locks(findings: &mut Findings, run_dir: &Path) {
     let path = absolute(run_dir).unwrap_or_else(|_| run_dir.to_owned());
-    let folder = path.ancestors().find(|folder| folder.is_dir()).unwrap_or(&path);
+    let folder = path.ancestors().find(|folder| folder.is_dir());
+    let folder = folder.unwrap_or(&path);
     let shown = folder.display();
     match Lock::is_possible(folder) {
         Ok(true) => findings.ok("locks", format!("files have locks in {shown}")),
@@ -55,7 +59,8 @@ fn locks(findings: &mut Findings, run_dir: &Path) {
             findings.warn("locks", found, hint);
         }
         Err(error) => {
-            findings.fail("locks", format!("{shown}: {error}"), "choose another --run-dir")
+            let found = format!("{shown}: {error}");
+            findings.fail("locks", found, "choose another --run-dir");
         }
     }
 }

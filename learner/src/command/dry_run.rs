@@ -14,8 +14,8 @@ use crate::train::Price;
 pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
     let (experiment, steps) = (&config.experiment, config.experiment.total_steps());
     let price = Price::measure(experiment, config.run.device, transitions)?;
-    let (milliseconds, hours) =
-        (price.step_seconds * 1e3, price.step_seconds * steps as f64 / 3600.0);
+    let milliseconds = price.step_seconds * 1e3;
+    let hours = price.step_seconds * steps as f64 / 3600.0;
     print(&format!(
         "# folder: {}\n# data: {}\n# time: {milliseconds:.1} ms a gradient step, measured over a second; {hours:.2} hours for \
          all {steps}\n# memory: {}, without evaluators\n# disk: {} for snapshots and checkpoints\n\n{}",

@@ -17,13 +17,11 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let (mut report, lines) = RunReport::with_scores(&args.run)?;
     let folder = RunDir::at(&args.run);
     let steps = folder.snapshots()?;
+    let best = report.best().map(|best| best.step);
     let (step, what) = match args.step {
         At::Step(step) => (Some(step), "after that step"),
         At::Last => (steps.last().copied(), "yet"),
-        At::Best => {
-            let best = report.best().map(|best| best.step);
-            (best, "with a complete evaluation")
-        }
+        At::Best => (best, "with a complete evaluation"),
     };
     let run = args.run.display();
     let Some(step) = step.filter(|step| steps.contains(step)) else {
@@ -37,13 +35,14 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let (header, tensors) = read()
         .map_err(|error: PolicyError| anyhow!("{} is not a policy: {error}", path.display()))?;
     let weights = Hash::of(&file).to_string();
-    if lines.iter().any(|line| line.step == step && line.weights != weights) {
+    let mut scored = lines.iter().filter(|line| line.step == step);
+    if scored.any(|line| line.weights != weights) {
         warn!(
             "the file has no score: that of step {step} is of other weights (learner verify {run})"
         );
-        report.evaluations.retain(|evaluation| evaluation.step != step);
+        report.evaluations.retain(|it| it.step != step);
     }
-    report.judgments.retain(|judgment| judgment.weights == weights);
+    report.judgments.retain(|it| it.weights == weights);
     let about = about(&report, step, args.license.as_deref());
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
     let name = args.out.display();
@@ -52,16 +51,15 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     print(&format!("{name}: {run} @ {step}, {bytes} bytes"))
 }
 
-/// The description in the file's header.
 fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
     let (data, experiment) = (&report.config.dataset, &report.config.experiment);
     let name = experiment.dataset.clone().unwrap_or_default();
-    let entry = Source::parse(&name).ok().and_then(|source| Some(source.entry()?.license.clone()));
-    let license = license.map(str::to_owned).or(entry);
+    let entry = Source::parse(&name).ok().and_then(|source| source.entry());
+    let license = license.or(entry.map(|entry| &*entry.license));
     if license.is_none() {
         warn!("the file does not say which license the data has; --license says it");
     }
-    let score = report.evaluations.iter().find(|evaluation| evaluation.step == step);
+    let score = report.evaluations.iter().find(|it| it.step == step);
     if let Some(part) = score.filter(|score| !score.complete) {
         warn!(
             "the score is of {} of {} episodes, which the file says, too",

@@ -6,13 +6,13 @@ mod dry_run;
 mod export;
 mod export_data;
 mod from;
-mod judge;
 mod outside;
 mod page;
 mod sweep;
 mod train;
 
 use std::fmt::Alignment::{Left, Right};
+use std::io;
 
 use anyhow::anyhow;
 use clap::CommandFactory;
@@ -24,15 +24,17 @@ use quad_run::folder::verify::{self, Findings};
 use quad_run::folder::{RunDirError, practiced};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
-use quad_runtime::{Hint, hinted, json, print, unfinished};
+use quad_runtime::{Hint, hinted, json, print, stay_in_background, unfinished};
 use serde::Serialize;
+use tokio::runtime::{Builder, Runtime};
 use tracing::{info, warn};
 
 use crate::cli::{
-    Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, ListArgs, PresetsArgs, ReportArgs,
-    VerifyArgs,
+    Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, JudgeArgs, ListArgs, PresetsArgs,
+    ReportArgs, VerifyArgs,
 };
 use crate::data::{Source, cache};
+use crate::judge::{Budget, judge};
 use crate::report::{Report, draw_all, write_html};
 
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
@@ -44,7 +46,7 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Report(args) => report(args),
         Command::Export(args) => export::export(args),
         Command::ExportData(args) => export_data::export(args),
-        Command::Judge(args) => judge::run(args),
+        Command::Judge(args) => rank(args),
         Command::Verify(args) => check_runs(args),
         Command::List(args) => list_runs(args),
         Command::Page(args) => page::show(args),
@@ -62,7 +64,13 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
     })
 }
 
-/// Prints a result as JSON or as text.
+/// A runtime for all that is neither training nor Zenoh, which have threads of their own.
+fn runtime() -> io::Result<Runtime> {
+    let mut runtime = Builder::new_multi_thread();
+    runtime.worker_threads(2).enable_all();
+    runtime.on_thread_start(stay_in_background).build()
+}
+
 fn show(
     as_json: bool,
     result: &impl Serialize,
@@ -79,33 +87,35 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.metrics {
         return print_metrics(args.algorithm.as_deref());
     }
-    let header = ["task", "environment", "dataset", "what it is"];
-    let mut task_table = Table::new(&header.map(|name| (name, Left)));
+    let mut known = table(["task", "environment", "dataset", "what it is"]);
     for task in tasks::all().iter().filter(|task| task.is_listed) {
         let [environment, dataset] =
             ["environment", "dataset"].map(|key| task.text(key).unwrap_or("-"));
-        task_table.push([&*task.name, environment, dataset, &task.about].map(str::to_owned));
+        known.push([&*task.name, environment, dataset, &task.about].map(str::to_owned));
     }
-    let header = ["algorithm", "what it is", "its authors give values for", "GFLOP a step"];
-    let mut algorithms = Table::new(&header.map(|name| (name, Left)));
+    let given = "its authors give values for";
+    let mut algorithms = table(["algorithm", "what it is", given, "GFLOP a step"]);
     for definition in ALGORITHMS {
-        let Values { about, given, gflop, .. } = Values::of(definition);
-        let given = given.iter();
-        let given = given.map(|(benchmark, tasks)| format!("{benchmark}: {}", tasks.join(", ")));
-        let given = Vec::from_iter(given).join("; ");
-        algorithms.push([definition.name.to_owned(), about, given, gflop]);
+        let (name, values) = (definition.name.to_owned(), Values::of(definition));
+        let of_benchmark = |(name, tasks): (_, &Vec<_>)| format!("{name}: {}", tasks.join(", "));
+        let given = Vec::from_iter(values.given.iter().map(of_benchmark)).join("; ");
+        algorithms.push([name, values.about, given, values.gflop]);
     }
-    print(&format!("{}\n{}", task_table.render(Style::Text), algorithms.render(Style::Text)))
+    let [known, algorithms] = [known, algorithms].map(|table| table.render(Style::Text));
+    print(&format!("{known}\n{algorithms}"))
 }
 
-/// Prints the metrics of all algorithms, or of one.
+fn table<const N: usize>(header: [&str; N]) -> Table {
+    Table::new(&header.map(|name| (name, Left)))
+}
+
 fn print_metrics(algorithm: Option<&str>) -> anyhow::Result<()> {
     let mut tables = Vec::new();
     for Definition { name, metrics, .. } in ALGORITHMS {
         if algorithm.is_some_and(|asked| asked != *name) {
             continue;
         }
-        let mut table = Table::new(&[*name, "held out", "what it is"].map(|title| (title, Left)));
+        let mut table = table([*name, "held out", "what it is"]);
         for metric in *metrics {
             let held_out = if metric.held_out { "yes" } else { "" };
             table.push([metric.name, held_out, metric.help].map(str::to_owned));
@@ -154,10 +164,9 @@ fn all_readable(unreadable: usize) -> anyhow::Result<()> {
     if unreadable == 0 {
         return Ok(());
     }
-    Err(anyhow!("{unreadable} folders cannot be read")).hint(
-        "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode is \
-         scored again",
-    )
+    let hint = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode is \
+                scored again";
+    Err(anyhow!("{unreadable} folders cannot be read")).hint(hint)
 }
 
 fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
@@ -189,10 +198,17 @@ fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
 fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
     let entries = list::list(&args.dirs);
     show(args.json, &entries, || list::table(&entries))?;
-    let unreadable =
-        Vec::from_iter(entries.iter().filter_map(list::Entry::unreadable)).join("\n  ");
-    anyhow::ensure!(unreadable.is_empty(), "some runs cannot be read:\n  {unreadable}");
+    let unreadable = Vec::from_iter(entries.iter().filter_map(list::Entry::unreadable));
+    let text = unreadable.join("\n  ");
+    anyhow::ensure!(text.is_empty(), "some runs cannot be read:\n  {text}");
     Ok(())
+}
+
+fn rank(args: &JudgeArgs) -> anyhow::Result<()> {
+    let (steps, seeds) = (args.steps, args.seeds);
+    let ranking = judge(&args.policies, args.gamma, Budget { steps, seeds })?;
+    let blocks = ranking.blocks().map(|block| block.render(Style::Text));
+    show(args.json, &ranking, || blocks.join("\n"))
 }
 
 fn completions(shell: Shell) -> anyhow::Result<()> {
@@ -210,9 +226,8 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<()> {
 fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
     match command {
         DatasetsCommand::List => {
-            let header =
-                [("dataset", Left), ("environment", Left), ("size", Right), ("in the cache", Left)];
-            let mut table = Table::new(&header);
+            let [size, cache] = [("size", Right), ("in the cache", Left)];
+            let mut table = Table::new(&[("dataset", Left), ("environment", Left), size, cache]);
             for dataset in cache::list() {
                 table.push(dataset?);
             }
@@ -225,7 +240,8 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
             print(&format!("{table}\ncache folders: {folders}"))
         }
         DatasetsCommand::Fetch { name } => {
-            print(&Source::named(name)?.obtain()?.path.display().to_string())
+            let dataset = Source::named(name)?.obtain()?;
+            print(&dataset.path.display().to_string())
         }
         DatasetsCommand::Inspect(args) => inspect(args),
     }

@@ -45,7 +45,8 @@ impl Outside {
             }
             None => (0, cores),
         };
-        Ok(Self { endpoints, evaluators: LocalEvaluators::new(count, share)?, is_default })
+        let evaluators = LocalEvaluators::new(count, share)?;
+        Ok(Self { endpoints, evaluators, is_default })
     }
 
     /// Starts to open the session. If another learner on this machine has the usual port, it takes
@@ -67,7 +68,8 @@ impl Outside {
 /// core, up to a limit.
 pub(super) fn training_threads(asked: Option<NonZero<usize>>) -> usize {
     let cores = available_parallelism().map_or(1, NonZero::get);
-    asked.or_else(threads_asked).map_or(cores.min(MOST_THREADS), NonZero::get)
+    let asked = asked.or_else(threads_asked);
+    asked.map_or(cores.min(MOST_THREADS), NonZero::get)
 }
 
 fn endpoints(args: &TrainArgs, needs_evaluators: bool) -> anyhow::Result<Endpoints> {

@@ -10,9 +10,7 @@ use anyhow::{Context, anyhow};
 use quad_run::folder::{Lock, RunDirError};
 use quad_run::status::State;
 use quad_run::table::{Style, Table};
-use quad_runtime::{
-    Hint, SessionError, hinted, open_router, print, stay_in_background, threads_asked, unfinished,
-};
+use quad_runtime::{Hint, SessionError, open_router, print, threads_asked, unfinished};
 use tokio::sync::mpsc;
 use tokio::task::LocalSet;
 use tracing::{info, warn};
@@ -27,32 +25,31 @@ type Runs = Vec<(PlannedRun, State)>;
 pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     let study = Study::read(&args.study, &args.only, &args.set)?;
     let folder = args.runs.join(&study.name);
-    let runs = chosen(&study, args, &folder)?;
-    let split = |runs: Runs, state| -> (Runs, Runs) {
-        runs.into_iter().partition(|(_, found)| *found == state)
-    };
-    let (count, listed) = (runs.len(), args.list.then(|| list(&runs)));
-    let (unreadable, runs) = split(runs, State::Unreadable);
-    if let Some(text) = listed {
-        print(&text)?;
-        return all_readable(unreadable.len());
+    let mut runs = chosen(&study, args, &folder)?;
+    let count = |state| runs.iter().filter(|(_, found)| *found == state).count();
+    let [complete, unreadable, new] =
+        [State::Complete, State::Unreadable, State::NotBegun].map(count);
+    if args.list {
+        print(&list(&runs))?;
+        return all_readable(unreadable);
     }
     info!("{}: {}", study.name, study.about);
-    let (complete, left) = split(runs, State::Complete);
-    let begun = left.iter().filter(|(_, state)| *state != State::NotBegun).count();
-    let (complete, todo) = (complete.len(), left.len());
-    info!("{count} runs: {complete} complete, {todo} to do, of which {begun} have begun");
+    let (all, todo) = (runs.len(), runs.len() - complete - unreadable);
+    let begun = todo - new;
+    info!("{all} runs: {complete} complete, {todo} to do, of which {begun} have begun");
+    let mut failed = Vec::new();
+    for (run, _) in runs.iter().filter(|(_, state)| *state == State::Unreadable) {
+        failed.push(format!("{}: its folder cannot be read", run.name));
+    }
+    runs.retain(|(_, state)| !matches!(state, State::Complete | State::Unreadable));
     let mut ended = match todo {
         0 => Outcome::default(),
-        _ => work(args, &study.name, &folder, left)?,
+        _ => work(args, &study.name, &folder, runs)?,
     };
-    for (run, _) in unreadable {
-        ended.failed.push(format!("{}: its folder cannot be read", run.name));
-    }
-    conclude(&folder, count, ended)
+    ended.failed.extend(failed);
+    conclude(&folder, all, ended)
 }
 
-/// Makes a folder.
 fn make(folder: &Path) -> anyhow::Result<()> {
     let failed = || format!("cannot make the folder {}", folder.display());
     fs::create_dir_all(folder).with_context(failed)
@@ -64,10 +61,10 @@ fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
     make(folder)?;
     let path = folder.join("sweep.lock");
     let is_part = args.index.is_some() || args.shard.is_some() || !args.only.is_empty();
-    let lock = if is_part { Lock::share(&path) } else { Lock::take(&path) };
+    let take = if is_part { Lock::share } else { Lock::take };
     let hint =
         "wait for its end; --list prints how far it is, --shard shares a study among machines";
-    lock.map_err(|error| match error {
+    take(&path).map_err(|error| match error {
         in_use @ RunDirError::InUse(_) => unfinished(in_use, hint),
         other => other.into(),
     })
@@ -83,40 +80,46 @@ fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs
             chosen.push((run.clone(), run.state(&folder.join(&run.name))?));
         }
     }
-    match args.index {
-        Some(index) if chosen.is_empty() => {
-            Err(hinted(anyhow!("there is no run {index}"), "--list prints them"))
-        }
-        _ => Ok(chosen),
+    if let Some(index) = args.index.filter(|_| chosen.is_empty()) {
+        return Err(anyhow!("there is no run {index}")).hint("--list prints them");
     }
+    Ok(chosen)
 }
 
 fn list(runs: &Runs) -> String {
     let mut table = Table::new(&[("index", Right), ("run", Left), ("state", Left)]);
-    for (PlannedRun { index, name, experiment, .. }, state) in runs {
-        table.push([index.to_string(), name.clone(), state.text(experiment.total_steps())]);
+    for (run, state) in runs {
+        let (index, state) = (run.index.to_string(), state.text(run.experiment.total_steps()));
+        table.push([index, run.name.clone(), state]);
     }
     table.render(Style::Text)
 }
 
 /// The number of learners at a time, and of cores that they leave to evaluators.
 fn shares(cores: usize, threads: usize, jobs: Option<u16>, runs: usize) -> (usize, usize) {
-    let jobs = jobs.map_or(cores * 3 / 4 / threads, usize::from).clamp(1, runs);
-    (jobs, cores.saturating_sub(jobs.saturating_mul(threads)).max(1))
+    let jobs = jobs.map_or(cores * 3 / 4 / threads, usize::from);
+    let jobs = jobs.clamp(1, runs);
+    let left = cores.saturating_sub(jobs.saturating_mul(threads));
+    (jobs, left.max(1))
 }
 
 fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Outcome> {
     let threads = threads_asked().map_or(1, usize::from);
-    let (jobs, cores) = shares(available_parallelism()?.get(), threads, args.jobs, left.len());
-    let count = if args.connect.is_some() { 0 } else { args.evaluators.unwrap_or(cores) };
+    let cores = available_parallelism()?.get();
+    let (jobs, cores) = shares(cores, threads, args.jobs, left.len());
+    let count = args.evaluators.unwrap_or(cores);
+    let count = if args.connect.is_some() { 0 } else { count };
     let mut evaluators = LocalEvaluators::new(count, cores)?;
     // Fetched once, not by each learner.
     let mut datasets = BTreeMap::<Option<String>, Option<PathBuf>>::new();
     for (run, _) in &left {
-        datasets.entry(run.experiment.dataset.clone()).or_insert_with(|| {
+        let fetch = || {
             let refused = |error| warn!("no run on the data of {} can begin: {error:#}", run.name);
-            run.source.obtain().map_err(refused).map(|dataset| dataset.path).ok()
-        });
+            let dataset = run.source.obtain().map_err(refused);
+            dataset.ok().map(|dataset| dataset.path)
+        };
+        let dataset = run.experiment.dataset.clone();
+        datasets.entry(dataset).or_insert_with(fetch);
     }
     let mut step_seconds = BTreeMap::new();
     // A single run, such as a task of an array job, starts at once and prints its own forecast.
@@ -127,12 +130,11 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     }
     let _lock = lock(args, folder)?;
     // Tasks of an array job must not write into each other's logs.
-    let logs = args.index.map_or(folder.to_owned(), |_| folder.join(&left[0].0.name));
+    let own = args.index.map_or("", |_| &*left[0].0.name);
+    let logs = folder.join(own);
     make(&logs)?;
 
-    let mut runtime = tokio::runtime::Builder::new_multi_thread();
-    let runtime =
-        runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
+    let runtime = super::runtime()?;
     let ended = runtime.block_on(async {
         // Outside the `LocalSet`, in which Zenoh may not block its thread.
         let (_router, endpoint) = match args.connect.clone() {
@@ -142,9 +144,9 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
                 (Some(router), endpoint)
             }
         };
+        let shown = folder.display();
         info!(
-            "{jobs} at a time; learners and evaluators meet at {endpoint}; logs are {}/RUN/learner.log",
-            folder.display()
+            "{jobs} at a time; learners and evaluators meet at {endpoint}; logs are {shown}/RUN/learner.log"
         );
         let (tx, lines) = mpsc::unbounded_channel();
         let report = move |line| drop(tx.send(line));
@@ -162,25 +164,24 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
 }
 
 fn conclude(folder: &Path, count: usize, ended: Outcome) -> anyhow::Result<()> {
-    let Outcome { unfinished: stopped, failed } = ended;
-    if !failed.is_empty() {
-        let error =
-            anyhow!("{} of {count} runs have failed:\n  {}", failed.len(), failed.join("\n  "));
-        return Err(error).hint("fix it and run the same command: unfinished runs continue");
+    let (stopped, failed) = (ended.unfinished, ended.failed.len());
+    if failed > 0 {
+        let reasons = ended.failed.join("\n  ");
+        return Err(anyhow!("{failed} of {count} runs have failed:\n  {reasons}"))
+            .hint("fix it and run the same command: unfinished runs continue");
     }
     if stopped > 0 {
+        let error = anyhow!("{stopped} of {count} runs are not complete");
         let kept = "what they have reached is kept, and the same command continues from there";
-        return Err(unfinished(anyhow!("{stopped} of {count} runs are not complete"), kept));
+        return Err(unfinished(error, kept));
     }
-    print(&format!("all {count} runs are complete: learner report {}", folder.display()))
+    let folder = folder.display();
+    print(&format!("all {count} runs are complete: learner report {folder}"))
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::Parser;
-
     use super::*;
-    use crate::cli::{Cli, Command};
 
     #[test]
     fn learners_and_evaluators_share_the_cores() {
@@ -189,26 +190,5 @@ mod tests {
         assert_eq!(shares(1, 1, None, 20), (1, 1));
         assert_eq!(shares(16, 1, Some(40), 20), (20, 1));
         assert_eq!(shares(16, usize::MAX, Some(2), 20), (2, 1));
-    }
-
-    #[test]
-    fn shards_share_the_selected_runs() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("mine.toml");
-        let text = "about = 'x'\nrun = { task = 'hopper-demo', dataset = 'x.hdf5' }\n\
-                    axes = { seed = [0, 1, 2], batch_size = [8, 16] }";
-        fs::write(&path, text).unwrap();
-        let path = path.to_str().unwrap();
-        let of_shard = |shard: &str| {
-            let words = ["learner", "sweep", path, "--only", "batch_size=16", "--shard", shard];
-            let Command::Sweep(args) = Cli::try_parse_from(words).unwrap().command else {
-                panic!("{words:?}")
-            };
-            let study = Study::read(&args.study, &args.only, &args.set).unwrap();
-            Vec::from_iter(
-                chosen(&study, &args, folder.path()).unwrap().iter().map(|(run, _)| run.index),
-            )
-        };
-        assert_eq!([of_shard("1/2"), of_shard("2/2")], [vec![1, 5], vec![3]]);
     }
 }

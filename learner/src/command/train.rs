@@ -14,10 +14,8 @@ use quad_run::config::{
 };
 use quad_run::folder::{Checkpoint, ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
-use quad_runtime::{
-    Health, Hint, ListenError, hinted, print, serve_metrics, stay_in_background, unfinished,
-};
-use tokio::runtime::{Builder, Runtime};
+use quad_runtime::{Health, Hint, ListenError, hinted, print, serve_metrics, unfinished};
+use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tracing::{debug, info, warn};
@@ -44,33 +42,18 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     };
     let experiment = preset.resolve(&args.changes()).hint_of(ConfigError::hint)?;
     let label = &preset.label;
-    let named = experiment.dataset.as_ref();
-    let named = named.ok_or_else(|| anyhow!("preset {label} names no dataset"));
-    let benchmark = preset.task.and_then(|task| task.benchmark);
-    let converted =
-        benchmark.and_then(|benchmark| Some((benchmark, benchmark.converter.as_ref()?)));
-    let missing = match converted {
-        Some((benchmark, converter)) => format!(
-            "its rewards come from {}'s simulator: with quad_rl and {converter} installed, `quad-convert {converter}:{} --out \
-             FILE` makes a file for --dataset FILE",
-            benchmark.name,
-            preset.task_name()
-        ),
-        None => record_hint(&experiment),
+    let Some(dataset) = &experiment.dataset else {
+        return Err(anyhow!("preset {label} names no dataset"))
+            .hint(convert_hint(&preset).unwrap_or_else(|| record_hint(&experiment)));
     };
-    let source = Source::parse(named.hint(missing)?)?;
+    let source = Source::parse(dataset)?;
     source.check_environment(&experiment.environment)?;
-    let path = match &args.run_dir {
-        Some(path) => path.clone(),
-        None => {
-            let (variant, seed) = (experiment.variant()?, experiment.seed);
-            let folder = match from {
-                Some(_) => label.clone(),
-                None => format!("{label}-{variant}-seed{seed}"),
-            };
-            Path::new("runs").join(folder)
-        }
+    let (variant, seed) = (experiment.variant()?, experiment.seed);
+    let usual = || match from {
+        Some(_) => Path::new("runs").join(label),
+        None => Path::new("runs").join(format!("{label}-{variant}-seed{seed}")),
     };
+    let path = args.run_dir.clone().unwrap_or_else(usual);
     let name = run_name(&path)?;
     let begun = ExistingRun::open(&path, args.fresh)?;
     let outside = Outside::new(args, &experiment)?;
@@ -108,11 +91,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         return dry_run::estimate(&path, &config, data.training);
     }
 
-    // Zenoh and training have threads of their own; this runtime serves the metrics and the main
-    // loop.
-    let mut runtime = Builder::new_multi_thread();
-    let runtime =
-        runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
+    let runtime = super::runtime()?;
     let first = from.map(From::into_checkpoint);
     let run = run_to_end(args, outside, &path, (begun, first), &config, data);
     let ended = runtime.block_on(run);
@@ -132,7 +111,17 @@ fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
         .hint("choose fewer by --threads or RAYON_NUM_THREADS")
 }
 
-/// A hint for a run without a dataset.
+/// A hint for a run without a dataset, of a benchmark whose files lack the rewards.
+fn convert_hint(preset: &Preset) -> Option<String> {
+    let (task, benchmark) = (preset.task_name(), preset.task?.benchmark?);
+    let (name, converter) = (&benchmark.name, benchmark.converter.as_ref()?);
+    Some(format!(
+        "its rewards come from {name}'s simulator: with quad_rl and {converter} installed, `quad-convert {converter}:{task} --out \
+         FILE` makes a file for --dataset FILE"
+    ))
+}
+
+/// A hint for any other run without a dataset.
 fn record_hint(experiment: &Experiment) -> String {
     let name = &experiment.environment;
     let can_record = environment::find(name).is_ok_and(|spec| spec.maze.is_none());
@@ -143,7 +132,6 @@ fn record_hint(experiment: &Experiment) -> String {
     format!("name a file as `dataset`, on the command line by --dataset FILE; {other}")
 }
 
-/// Runs the threads and the main loop until the run ends.
 async fn run_to_end(
     args: &TrainArgs,
     mut outside: Outside,
@@ -164,16 +152,16 @@ async fn run_to_end(
         coordinator: Arc::default(),
     };
     let coordinator = page_state.coordinator.clone();
-    let page = page::routes(path.to_owned(), Some(Arc::new(move || page_state.to_json())))?;
+    let live = Arc::new(move || page_state.to_json());
+    let page = page::routes(path.to_owned(), Some(live));
     let server = serve_metrics(args.http, registry, health.clone(), page).await;
     let server = server.hint_of(ListenError::hint)?;
     info!("page: http://{}/", server.address);
-    let Split { training, held_out, .. } = data;
-    let (observation_dim, action_dim) = (training.observation_dim(), training.action_dim());
-    let task = Task::new(&experiment.environment, observation_dim, action_dim);
-    let mut agent = begin(experiment, device, training)?;
-    let held_out =
-        held_out.and_then(|held_out| HeldOut::new(experiment, device, held_out, &mut agent));
+    let (o, a) = (data.training.observation_dim(), data.training.action_dim());
+    let task = Task::new(&experiment.environment, o, a);
+    let mut agent = begin(experiment, device, data.training)?;
+    let held_out = data.held_out;
+    let held_out = held_out.and_then(|data| HeldOut::new(experiment, device, data, &mut agent));
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
     let (dir, scores, mut past) = open_or_create(path, begun, args.fresh, config)?;
@@ -186,7 +174,8 @@ async fn run_to_end(
     // A later start has a larger number; the low bits distinguish two that start in the same
     // millisecond.
     let number = now()? << 16 | u64::from(rand::random::<u16>());
-    let incarnation = Incarnation { run: run.clone(), number };
+    let run = run.clone();
+    let incarnation = Incarnation { run, number };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let run = Run {
         incarnation: incarnation.clone(),
@@ -218,7 +207,6 @@ async fn run_to_end(
     Ok((dir, main_loop.run(opening).await))
 }
 
-/// Opens or makes the run's folder, and reads its state.
 fn open_or_create(
     path: &Path,
     begun: Option<ExistingRun>,
@@ -247,38 +235,30 @@ fn conclude(
     ending: Ending,
 ) -> anyhow::Result<()> {
     let folder = run_dir.path().display();
-    let reported = match &ending {
-        Ending::Complete => summarize(run_dir),
-        // The disk may hang, and after a signal there is little time.
-        _ => {
-            let dir = run_dir.clone();
-            let report = runtime.spawn_blocking(move || summarize(&dir));
-            let report = runtime.block_on(async { timeout(REPORT_PATIENCE, report).await });
-            report.map_err(anyhow::Error::from).and_then(|report| report?)
-        }
-    };
     let kept = format!(
         "everything up to the newest checkpoint is kept in {folder}; the same command continues from there"
     );
-    let Experiment { steps, environment, .. } = &config.experiment;
+    let (steps, environment) = (config.experiment.steps, &config.experiment.environment);
     let error = match ending {
-        Ending::Complete => return all_scored(reported?),
+        Ending::Complete => return all_scored(summarize(run_dir)?),
         Ending::Failed(error) => hinted(error, kept),
-        Ending::Interrupted => {
-            let error =
-                anyhow!("interrupted before the end of {steps} steps and their evaluations");
-            unfinished(error, kept)
-        }
-        Ending::Unscored => {
-            let error = anyhow!(
+        Ending::Interrupted => unfinished(
+            anyhow!("interrupted before the end of {steps} steps and their evaluations"),
+            kept,
+        ),
+        Ending::Unscored => unfinished(
+            anyhow!(
                 "training is complete, but no evaluator came that has the environment {environment}"
-            );
-            let hint = "start one and give the same command again, which waits for the scores; or let the learner start \
-                        some, by --evaluators N";
-            unfinished(error, hint)
-        }
+            ),
+            "start one and give the same command again, which waits for the scores; or let the learner start some, by \
+             --evaluators N",
+        ),
     };
-    if let Err(error) = reported {
+    // The disk may hang, and after a signal there is little time.
+    let dir = run_dir.clone();
+    let report = runtime.spawn_blocking(move || summarize(&dir));
+    let report = async { anyhow::Ok(timeout(REPORT_PATIENCE, report).await???) };
+    if let Err(error) = runtime.block_on(report) {
         warn!("the run has no report: {error:#}");
     }
     Err(error)
@@ -286,11 +266,12 @@ fn conclude(
 
 fn all_scored(report: RunReport) -> anyhow::Result<()> {
     let missing = report.episodes_missing;
-    if missing == 0 {
-        return Ok(());
-    }
+    let error = anyhow!("training is complete, but {missing} episodes have no score");
     let hint = "the log says why; fix it, and the same command hands them out again";
-    Err(anyhow!("training is complete, but {missing} episodes have no score")).hint(hint)
+    match missing {
+        0 => Ok(()),
+        _ => Err(hinted(error, hint)),
+    }
 }
 
 fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
@@ -300,7 +281,8 @@ fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
         run_dir.write_json("report.json", &report)?;
         let picture = run_dir.path().join("learning_curve.svg");
         learning_curve(&report).write_svg(&picture)?;
-        text = format!("\n{}\nlearning curve: {}\n", report.text(), picture.display());
+        let (scores, picture) = (report.text(), picture.display());
+        text = format!("\n{scores}\nlearning curve: {picture}\n");
     }
     print(&format!("{text}run folder: {}", run_dir.path().display()))?;
     Ok(report)
@@ -308,9 +290,9 @@ fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
 
 /// The run's name: the folder's name, which is also part of its Zenoh keys.
 fn run_name(path: &Path) -> anyhow::Result<Name> {
-    let folder = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    let folder = path.file_name().unwrap_or_default().to_string_lossy();
     Name::new(folder)
-        .with_context(|| format!("the run folder {} gives no name for the run", path.display()))
+        .with_context(|| format!("the run folder {path:?} gives no name for the run"))
         .hint("its last part must be 1 to 64 letters, digits, dots, dashes or underscores")
 }
 
@@ -319,7 +301,8 @@ fn machine(precision: Precision) -> String {
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let name = name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
-    format!("{name}, {} threads, {}", rayon::current_num_threads(), precision.arithmetic())
+    let (threads, arithmetic) = (rayon::current_num_threads(), precision.arithmetic());
+    format!("{name}, {threads} threads, {arithmetic}")
 }
 
 fn run_config(

@@ -10,16 +10,16 @@ use quad_runtime::Hint;
 
 use super::partial::partial_files;
 
-/// The folder of a benchmark's files.
 pub fn folder(benchmark: &Benchmark) -> anyhow::Result<PathBuf> {
     let Cache { folder, variable } = &benchmark.cache;
-    let named = variable.as_ref().and_then(std::env::var_os).filter(|named| !named.is_empty());
-    if let Some(named) = named {
+    let named = variable.as_ref().and_then(std::env::var_os);
+    if let Some(named) = named.filter(|named| !named.is_empty()) {
         return Ok(named.into());
     }
-    let hint = variable.as_ref().map_or("name a home folder in HOME".to_owned(), |variable| {
-        format!("name a folder in {variable}")
-    });
+    let hint = match variable {
+        Some(variable) => format!("name a folder in {variable}"),
+        None => "name a home folder in HOME".to_owned(),
+    };
     let home = std::env::home_dir().filter(|home| !home.as_os_str().is_empty());
     home.map(|home| home.join(folder))
         .ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
@@ -30,17 +30,17 @@ pub fn folder(benchmark: &Benchmark) -> anyhow::Result<PathBuf> {
 /// checksums.
 pub fn list() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
     catalog::all().iter().map(|dataset| {
-        let size =
-            dataset.bytes.map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string());
+        let size = dataset.bytes.map(|bytes| HumanBytes(bytes).to_string());
         let path = folder(dataset.benchmark)?.join(&dataset.file);
-        Ok([dataset.name.clone(), dataset.environment.clone(), size, state(dataset, &path)])
+        let (size, state) = (size.unwrap_or("unknown".to_owned()), state(dataset, &path));
+        Ok([dataset.name.clone(), dataset.environment.clone(), size, state])
     })
 }
 
 fn state(dataset: &NamedDataset, path: &Path) -> String {
     let found = path.metadata().map(|metadata| metadata.len());
-    let part = partial_files(path).into_iter().map(|(_, length)| length).max();
-    match (found, part) {
+    let parts = partial_files(path).into_iter();
+    match (found, parts.map(|(_, length)| length).max()) {
         (Ok(found), _) if dataset.bytes.is_some_and(|bytes| bytes != found) => {
             format!("another file of {found} bytes")
         }

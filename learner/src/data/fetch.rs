@@ -20,7 +20,6 @@ mod tests;
 /// Attempts at one address without progress.
 const ATTEMPTS: u32 = 4;
 
-/// A dataset on this machine.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LocalDataset {
     /// The file, or the folder of a Minari dataset.
@@ -65,7 +64,7 @@ impl Fetcher {
             match self.fetch_from(&address, dataset, &mut partial, &progress) {
                 Ok(sha256) => {
                     partial.finish(&path).map_err(local)?;
-                    let checksum = if dataset.sha256.is_some() { " and checksum" } else { "" };
+                    let checksum = dataset.sha256.as_ref().map_or("", |_| " and checksum");
                     progress.say(&format!("{}: size{checksum} verified", path.display()));
                     return Ok(LocalDataset { path, sha256 });
                 }
@@ -76,9 +75,9 @@ impl Fetcher {
                 }
             }
         }
-        Err(anyhow!("no address has the dataset {}{refusals}", dataset.name)).hint(format!(
-            "fetch the file elsewhere and put it at {}, or name a mirror in QUAD_DATASETS_URL",
-            path.display()
+        let (name, path) = (&dataset.name, path.display());
+        Err(anyhow!("no address has the dataset {name}{refusals}")).hint(format!(
+            "fetch the file elsewhere and put it at {path}, or name a mirror in QUAD_DATASETS_URL"
         ))
     }
 
@@ -130,11 +129,11 @@ impl Fetcher {
 fn check(dataset: &NamedDataset, partial: &mut Partial) -> Result<String, Failure> {
     verify(dataset, &partial.path)?.or_else(|mismatch| {
         partial.clear()?;
-        Err(Failure::Lasting(format!("what came is not the file and is deleted: {mismatch}")))
+        let reason = format!("what came is not the file and is deleted: {mismatch}");
+        Err(Failure::Lasting(reason))
     })
 }
 
-/// An error of the local disk.
 fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
     let hint = match (&dataset.benchmark.cache.variable, error.kind()) {
         (None, _) => {
@@ -146,5 +145,6 @@ fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
         (Some(variable), _) => format!("name a folder that you may write to in {variable}"),
     };
     let (name, folder) = (&dataset.name, folder.display());
-    hinted(Error::new(error).context(format!("cannot keep the dataset {name} in {folder}")), hint)
+    let text = format!("cannot keep the dataset {name} in {folder}");
+    hinted(Error::new(error).context(text), hint)
 }

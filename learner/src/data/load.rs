@@ -18,18 +18,18 @@ pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
         reward: experiment.reward,
         normalize: experiment.normalize,
     };
-    let hold_out = HoldOut::Fraction { fraction: experiment.hold_out, seed: experiment.seed };
-    let result = Transitions::read_split(path, &options, hold_out);
-    let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
-    let split =
-        result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;
+    let (fraction, seed) = (experiment.hold_out, experiment.seed);
+    let hold_out = HoldOut::Fraction { fraction, seed };
+    let result = Transitions::read_split(path, &options, hold_out).hint_of(DatasetError::hint);
+    let path = path.display();
+    let split = result.with_context(|| format!("cannot learn from {path}"))?;
     for warning in split.training.warnings() {
-        tracing::warn!("{}: {warning}", path.display());
+        tracing::warn!("{path}: {warning}");
     }
     let (there, batch) = (split.training.len(), experiment.batch_size);
     if there < batch as usize {
-        return Err(anyhow!("{there} transitions are fewer than a batch of {batch}"))
-            .hint("record more data, or ask for less with --set batch_size=N");
+        let error = anyhow!("{there} transitions are fewer than a batch of {batch}");
+        return Err(error).hint("record more data, or ask for less with --set batch_size=N");
     }
     Ok(split)
 }

@@ -22,7 +22,6 @@ pub enum Source {
     Named(&'static NamedDataset),
     /// A dataset that Minari's own client has fetched, by its ID.
     Minari(String),
-    /// A file or folder.
     Path(PathBuf),
 }
 
@@ -41,14 +40,13 @@ impl Source {
         }
     }
 
-    /// The catalog's dataset of that name.
     pub fn named(name: &str) -> anyhow::Result<Self> {
         const LIST: &str =
             "`learner datasets list` prints all names; to train on a file, give its path";
         let known = catalog::all().iter().map(|dataset| dataset.name.as_str());
         let nearest = did_you_mean(name, known);
-        let found = catalog::find(name).map(Self::Named);
-        found.ok_or_else(|| anyhow!("unknown dataset `{name}`")).hint(nearest + LIST)
+        let found = catalog::find(name).with_context(|| format!("unknown dataset `{name}`"));
+        Ok(Self::Named(found.hint(nearest + LIST)?))
     }
 
     /// The entry of the catalog, for a path by the file's name.
@@ -62,30 +60,32 @@ impl Source {
 
     /// Refuses data of another simulation than that of `environment`.
     pub fn check_environment(&self, environment: &str) -> anyhow::Result<()> {
-        match self.entry() {
-            Some(NamedDataset { name, environment: other, .. })
-                if simulation_of(other) != simulation_of(environment) =>
-            {
-                Err(anyhow!("{name} is a dataset of {other}, but the policy is for {environment}"))
-                    .hint("choose a task in the dataset's environment, or another --dataset")
-            }
-            _ => Ok(()),
+        let Some(NamedDataset { name, environment: other, .. }) = self.entry() else {
+            return Ok(());
+        };
+        if simulation_of(other) == simulation_of(environment) {
+            return Ok(());
         }
+        Err(anyhow!("{name} is a dataset of {other}, but the policy is for {environment}"))
+            .hint("choose a task in the dataset's environment, or another --dataset")
     }
 
     /// Finds the data on this machine, or fetches it, and computes its checksum.
     pub fn obtain(&self) -> anyhow::Result<LocalDataset> {
         match self {
             Self::Named(dataset) => {
-                let mirror = std::env::var(MIRROR).ok().filter(|mirror| !mirror.is_empty());
-                Fetcher::new(mirror).fetch(dataset, &cache::folder(dataset.benchmark)?)
+                let mirror = std::env::var(MIRROR).ok();
+                let fetcher = Fetcher::new(mirror.filter(|mirror| !mirror.is_empty()));
+                fetcher.fetch(dataset, &cache::folder(dataset.benchmark)?)
             }
             Self::Minari(id) => {
                 let path = quad_dataset::minari_folder(id);
                 if !path.exists() {
-                    return Err(anyhow!("the dataset {MINARI}{id} is not in {}", path.display())).hint(format!(
+                    let hint = format!(
                         "fetch it by Minari's own client: pip install minari, then: minari download {id}"
-                    ));
+                    );
+                    let path = path.display();
+                    return Err(anyhow!("the dataset {MINARI}{id} is not in {path}")).hint(hint);
                 }
                 local(path)
             }

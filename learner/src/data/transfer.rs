@@ -9,9 +9,7 @@ use ureq::{Agent, Body, Error};
 
 use super::partial::Partial;
 
-/// Bytes that are read at a time.
 const CHUNK: usize = 1 << 16;
-/// Time limit of a connection.
 const CONNECT: Duration = Duration::from_secs(10);
 
 #[derive(Debug)]
@@ -68,15 +66,17 @@ pub fn transfer(
         }
         status => return Err(refusal(status)),
     }
-    let found = response.body().content_length().map(|rest| partial.length + rest);
-    if let (Some(expected), Some(found)) = (expected, found)
-        && found != expected
-    {
-        let mismatch = format!("the server's file has {found} bytes, but must have {expected}");
-        return Err(Failure::Lasting(mismatch));
-    }
-    let Some(bytes) = expected.or(found) else {
-        return Err(Failure::Lasting("the server does not say how large the file is".to_owned()));
+    let rest = response.body().content_length();
+    let bytes = match (expected, rest.map(|rest| partial.length + rest)) {
+        (Some(expected), Some(found)) if found != expected => {
+            let reason = format!("the server's file has {found} bytes, but must have {expected}");
+            return Err(Failure::Lasting(reason));
+        }
+        (Some(bytes), _) | (None, Some(bytes)) => bytes,
+        (None, None) => {
+            let reason = "the server does not say how large the file is";
+            return Err(Failure::Lasting(reason.to_owned()));
+        }
     };
     progress.start(partial.length, bytes);
     append(response.body_mut(), bytes, partial, progress)
@@ -92,15 +92,17 @@ fn append(
     let mut reader = body.as_reader().take(bytes.saturating_sub(partial.length));
     let mut chunk = vec![0; CHUNK];
     while partial.length < bytes {
-        let broken = |why| {
-            Failure::Passing(format!("the connection broke after {} bytes: {why}", partial.length))
+        let why = match reader.read(&mut chunk) {
+            Ok(0) => "it was closed".to_owned(),
+            Err(error) => error.to_string(),
+            Ok(count) => {
+                partial.append(&chunk[..count])?;
+                progress.advance(partial.length);
+                continue;
+            }
         };
-        match reader.read(&mut chunk) {
-            Ok(0) => return Err(broken("it was closed".to_owned())),
-            Ok(count) => partial.append(&chunk[..count])?,
-            Err(error) => return Err(broken(error.to_string())),
-        }
-        progress.advance(partial.length);
+        let reason = format!("the connection broke after {} bytes: {why}", partial.length);
+        return Err(Failure::Passing(reason));
     }
     Ok(())
 }
@@ -126,5 +128,6 @@ fn refusal(status: StatusCode) -> Failure {
 /// First byte of a part, by `Content-Range: bytes FIRST-LAST/SIZE`.
 fn first_byte(response: &Response<Body>) -> Option<u64> {
     let range = response.headers().get("content-range")?.to_str().ok()?;
-    range.strip_prefix("bytes ")?.split_once('-')?.0.parse().ok()
+    let (first, _) = range.strip_prefix("bytes ")?.split_once('-')?;
+    first.parse().ok()
 }

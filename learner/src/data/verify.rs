@@ -14,7 +14,8 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
     let mut file = files::open_named(path)?;
     let found = file.metadata()?.len();
     if let Some(expected) = dataset.bytes.filter(|expected| *expected != found) {
-        return Ok(Err(format!("it has {found} bytes, but must have {expected}")));
+        let mismatch = format!("it has {found} bytes, but must have {expected}");
+        return Ok(Err(mismatch));
     }
     let mut start = Vec::new();
     let format = dataset.benchmark.format;
@@ -24,12 +25,12 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
         return Ok(Err(format!("it is not an {}", format.name())));
     }
     let found = sha256(path)?;
-    match &dataset.sha256 {
+    Ok(match &dataset.sha256 {
         Some(expected) if *expected != found => {
-            Ok(Err(format!("its SHA-256 is {found}, but must be {expected}")))
+            Err(format!("its SHA-256 is {found}, but must be {expected}"))
         }
-        _ => Ok(Ok(found)),
-    }
+        _ => Ok(found),
+    })
 }
 
 /// SHA-256 of a file in lower-case hexadecimal.

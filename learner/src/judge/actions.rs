@@ -2,11 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use quad_dataset::Batch;
 use quad_policy::{Policy, Scaling};
 use rayon::prelude::*;
 
-use super::data::Data;
+use super::data::{Data, gather};
 
 /// States per call of a policy, fewer if they take more than [`MEMORY`].
 const STATES: usize = 256;
@@ -27,13 +26,11 @@ pub(super) struct Actions {
 impl Actions {
     pub fn of(policy: &dyn Policy, data: &Data) -> anyhow::Result<Self> {
         let scaling = data.training.scaling();
-        let mut training = Batch::default();
-        data.training.gather(&Vec::from_iter(0..data.training.len() as u32), &mut training);
-        Ok(Self {
-            next: scaled(scaling, act(policy, scaling, &training.next_observations, 0)?),
-            first: scaled(scaling, act(policy, scaling, &data.first.observations, JUDGED)?),
-            compared: act(policy, scaling, &data.compared.observations, 2 * JUDGED)?,
-        })
+        let all = gather(&data.training, &Vec::from_iter(0..data.training.len() as u32));
+        let next = act(policy, scaling, &all.next_observations, 0)?;
+        let first = act(policy, scaling, &data.first.observations, JUDGED)?;
+        let compared = act(policy, scaling, &data.compared.observations, 2 * JUDGED)?;
+        Ok(Self { next: scaled(scaling, next), first: scaled(scaling, first), compared })
     }
 
     /// Estimates how long [`Self::of`] takes, by a few states.
@@ -56,14 +53,17 @@ fn act(
 ) -> anyhow::Result<Vec<f32>> {
     let (o, a) = (policy.observation_dim(), policy.action_dim());
     let mut observations = observations.to_vec();
-    scaling.observations.iter().for_each(|affine| affine.to_user(&mut observations));
+    if let Some(affine) = &scaling.observations {
+        affine.to_user(&mut observations);
+    }
     let mut actions = vec![0.0; observations.len() / o * a];
     let mut states = STATES;
     while states > 1 && policy.memory(states) > MEMORY {
         states /= 2;
     }
-    let chunks = observations.par_chunks(states * o).zip(actions.par_chunks_mut(states * a));
-    chunks.enumerate().try_for_each(|(chunk, (observations, actions))| {
+    let chunks = actions.par_chunks_mut(states * a).enumerate();
+    let chunks = chunks.zip(observations.par_chunks(states * o));
+    chunks.try_for_each(|((chunk, actions), observations)| {
         let seeds = (seed + (chunk * states) as u64..).take(observations.len() / o);
         let mut episodes = Vec::from_iter(seeds.map(|seed| policy.begin(seed)));
         policy.act(observations, &mut episodes, actions)
@@ -73,9 +73,10 @@ fn act(
 
 /// From the data's units to [−1, 1].
 fn scaled(scaling: &Scaling, mut actions: Vec<f32>) -> Vec<f32> {
-    scaling.actions.iter().for_each(|affine| affine.to_network(&mut actions));
-    actions.iter_mut().for_each(|action| *action = action.clamp(-1.0, 1.0));
-    actions
+    if let Some(affine) = &scaling.actions {
+        affine.to_network(&mut actions);
+    }
+    actions.into_iter().map(|action| action.clamp(-1.0, 1.0)).collect()
 }
 
 #[cfg(test)]
@@ -85,7 +86,6 @@ mod tests {
 
     use super::*;
 
-    /// Its actions are its observations.
     struct Echo;
 
     impl Policy for Echo {
@@ -119,7 +119,8 @@ mod tests {
     #[test]
     fn policies_act_in_the_datas_units() {
         let affine = |offset: [f32; 2], scale: [f32; 2]| {
-            Some(Affine { offset: offset.into(), scale: scale.into() })
+            let (offset, scale) = (offset.into(), scale.into());
+            Some(Affine { offset, scale })
         };
         let scaling = Scaling {
             observations: affine([100.0, -3.0], [10.0, 2.0]),

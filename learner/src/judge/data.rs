@@ -41,41 +41,39 @@ impl Data {
     /// Reads the dataset of these snapshots. Every episode that one of their runs has held out is
     /// judged, so that all are judged in the same states.
     pub fn read(snapshots: &[Snapshot]) -> anyhow::Result<Self> {
-        let first = &snapshots.first().context("there is no policy to judge")?.config;
-        let run = &first.run.name;
-        let environment = &first.experiment.environment;
+        let first = snapshots.first().context("there is no policy to judge")?;
+        let (run, data) = (&first.config.run.name, &first.config.dataset);
+        let environment = &first.config.experiment.environment;
         for Snapshot { config, .. } in snapshots {
             let (other, theirs) = (&config.run.name, &config.experiment.environment);
-            if config.dataset.sha256 != first.dataset.sha256 {
-                return Err(anyhow!("{run} and {other} have not learned from the same data"))
+            if config.dataset.sha256 != data.sha256 {
+                let error = anyhow!("{run} and {other} have not learned from the same data");
+                return Err(error)
                     .hint("judge them apart: values that come from different data do not compare");
             }
             if theirs != environment {
-                return Err(anyhow!(
-                    "{run} is of the environment {environment}, {other} of {theirs}"
-                ))
-                .hint("judge them apart: values of different rewards do not compare");
+                let others = format!("{other} of {theirs}");
+                return Err(anyhow!("{run} is of the environment {environment}, {others}"))
+                    .hint("judge them apart: values of different rewards do not compare");
             }
         }
-        let dataset = Source::Path(first.dataset.path.clone())
-            .obtain()
-            .hint(format!("put the data of the run {run} back"))?;
-        if first.dataset.sha256.as_ref().is_some_and(|sha256| *sha256 != dataset.sha256) {
+        let source = Source::Path(data.path.clone());
+        let hint = format!("put the data of the run {run} back");
+        let dataset = source.obtain().hint(hint)?;
+        if data.sha256.is_some() && data.sha256 != Some(dataset.sha256.clone()) {
             let path = dataset.path.display();
-            return Err(anyhow!("{path} is not the data that {run} has learned from"))
-                .hint("put a copy of that file in its place");
+            let error = anyhow!("{path} is not the data that {run} has learned from");
+            return Err(error).hint("put a copy of that file in its place");
         }
-        let episodes: BTreeSet<usize> =
-            snapshots.iter().flat_map(|snapshot| &snapshot.held_out).copied().collect();
-        let episodes = Vec::from_iter(episodes);
-        let hold_out = if episodes.is_empty() {
+        let held_out = snapshots.iter().flat_map(|snapshot| &snapshot.held_out);
+        let episodes = Vec::from_iter(BTreeSet::from_iter(held_out.copied()));
+        let mut hold_out = HoldOut::Episodes(&episodes);
+        if episodes.is_empty() {
             warn!(
                 "no run has held out episodes (--hold-out), so the policies are judged in some that they have learned from"
             );
-            HoldOut::Fraction { fraction: HELD_OUT, seed: 0 }
-        } else {
-            HoldOut::Episodes(&episodes)
-        };
+            hold_out = HoldOut::Fraction { fraction: HELD_OUT, seed: 0 };
+        }
         let options = ReadOptions {
             environment: environment::find(environment).ok(),
             task: benchmarks::relabeling(environment),
@@ -142,7 +140,9 @@ impl Data {
     /// Distance of a policy's actions from the data's at the compared states.
     pub fn distance(&self, actions: &[f32]) -> f64 {
         let mut recorded = self.compared.actions.clone();
-        self.held_out.scaling().actions.iter().for_each(|affine| affine.to_user(&mut recorded));
+        if let Some(affine) = &self.held_out.scaling().actions {
+            affine.to_user(&mut recorded);
+        }
         distance(&recorded, actions, self.held_out.action_dim())
     }
 }
@@ -165,7 +165,8 @@ fn distance(data: &[f32], policy: &[f32], action_dim: usize) -> f64 {
     }
     let known = Vec::from_iter(variances.iter().copied().flatten());
     let typical = if known.is_empty() { 1.0 } else { mean(known) };
-    mean(errors.iter().zip(variances).map(|(error, v)| error / v.unwrap_or(typical))).sqrt()
+    let scaled = |(error, v): (f64, Option<f64>)| error / v.unwrap_or(typical);
+    mean(errors.into_iter().zip(variances).map(scaled)).sqrt()
 }
 
 pub(super) fn mean(values: impl IntoIterator<Item = impl Into<f64>>) -> f64 {
@@ -177,7 +178,7 @@ pub(super) fn mean(values: impl IntoIterator<Item = impl Into<f64>>) -> f64 {
     sum / count
 }
 
-fn gather(transitions: &Transitions, rows: &[u32]) -> Batch {
+pub(super) fn gather(transitions: &Transitions, rows: &[u32]) -> Batch {
     let mut batch = Batch::default();
     transitions.gather(rows, &mut batch);
     batch
@@ -230,18 +231,19 @@ mod tests {
             .unwrap()
         };
         let (training, held_out) = (transitions(&[false]), Some(transitions(&[true, false])));
-        let split = Split { training, held_out, episodes: vec![1, 2] };
+        let episodes = vec![1, 2];
+        let split = Split { training, held_out, episodes };
         let data = Data::of(split, String::new(), String::new()).unwrap();
         let units = Units { offset: 100.0, scale: 10.0, least: 0.0, most: 1000.0 };
         let fqes = [0, 1].map(|seed| {
             let config = FqeConfig::with_discount(0.5).unwrap();
             Fqe::of_behavior(config, units, data.context(seed)).unwrap()
         });
-        let last = gather(&data.held_out, &[5]);
-        let values = fqes.iter().map(|fqe| fqe.values(&last.observations, &last.actions).unwrap());
-        let after = mean(values.flatten());
-        let expected = (2.0 + 2.0 + 2.0 + 2.0 + 2.0 + after / 4.0) / 2.0;
         let recorded = data.recorded_value(&fqes, 0.5).unwrap();
-        assert!((recorded - expected).abs() < 1e-4, "{recorded} is not {expected}");
+        let last = gather(&data.held_out, &[5]);
+        let values = fqes.map(|fqe| fqe.values(&last.observations, &last.actions).unwrap());
+        let after = mean(values.concat());
+        let expected = (2.0 + 2.0 + 2.0 + 2.0 + 2.0 + after / 4.0) / 2.0;
+        assert!((recorded - expected).abs() < 1e-4, "{recorded}, {expected}");
     }
 }

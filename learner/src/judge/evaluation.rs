@@ -83,7 +83,8 @@ impl Evaluation<'_> {
             updates(&mut fqe, &mut sampler, 0..TIMED)?;
             let begin = Instant::now();
             updates(&mut fqe, &mut sampler, TIMED..2 * TIMED)?;
-            Ok(begin.elapsed().mul_f64(self.budget.steps as f64 / TIMED as f64))
+            let times = self.budget.steps as f64 / TIMED as f64;
+            Ok(begin.elapsed().mul_f64(times))
         })?;
         Ok(times.into_iter().max().unwrap_or_default())
     }
@@ -99,14 +100,17 @@ impl Evaluation<'_> {
         let mut sampler = self.sampler(fqe, seed);
         let step = |point: usize| self.budget.steps * point as u64 / POINTS as u64;
         for point in 0..POINTS {
-            curve.losses.push(updates(fqe, &mut sampler, step(point)..step(point + 1))?);
-            curve.values.push(mean(fqe.values(&self.data.first.observations, first)?));
+            let loss = updates(fqe, &mut sampler, step(point)..step(point + 1))?;
+            let values = fqe.values(&self.data.first.observations, first)?;
+            curve.losses.push(loss);
+            curve.values.push(mean(values));
         }
         Ok(curve)
     }
 
     fn sampler(&self, fqe: &Fqe, seed: u64) -> BatchSampler {
-        BatchSampler::new(fqe.dataset_len(), self.data.context(seed).batch_size, seed, 0)
+        let batch_size = self.data.context(seed).batch_size;
+        BatchSampler::new(fqe.dataset_len(), batch_size, seed, 0)
     }
 
     /// Runs all seeds in parallel, each on its share of the cores: updates this small gain little
@@ -125,7 +129,8 @@ impl Evaluation<'_> {
                 threads.push(scope.spawn(move || pool.install(|| work(seed))));
             }
             let join = |thread: thread::ScopedJoinHandle<anyhow::Result<T>>| {
-                thread.join().map_err(|_| anyhow!("an evaluation panicked"))?
+                let result = thread.join();
+                result.map_err(|_| anyhow!("an evaluation panicked"))?
             };
             threads.into_iter().map(join).collect()
         })
@@ -134,18 +139,18 @@ impl Evaluation<'_> {
 
 /// Mean loss of these updates.
 fn updates(fqe: &mut Fqe, sampler: &mut BatchSampler, steps: Range<u64>) -> anyhow::Result<f64> {
-    let (mut sum, count) = (0.0, steps.end - steps.start);
+    let mut losses = Vec::new();
     for step in steps {
         let metrics = fqe.update(step, sampler.next_items())?;
         let loss = metrics.iter().find(|(name, _)| *name == "critic_loss");
-        sum += loss.map_or(0.0, |(_, loss)| f64::from(*loss));
+        losses.extend(loss.map(|(_, loss)| *loss));
     }
-    Ok(sum / count as f64)
+    Ok(mean(losses))
 }
 
 /// The estimate from one learning curve per seed.
 pub(super) fn estimate(curves: &[LearningCurve], units: &Units) -> Estimate {
-    let mut estimate = Estimate { values: Vec::new(), doubts: Vec::new() };
+    let (mut estimates, mut doubts) = (Vec::new(), Vec::new());
     let tolerance = TOLERANCE * (units.most - units.least);
     let bounds = units.least - tolerance..=units.most + tolerance;
     for (seed, LearningCurve { values, losses }) in curves.iter().enumerate() {
@@ -154,18 +159,19 @@ pub(super) fn estimate(curves: &[LearningCurve], units: &Units) -> Estimate {
             |points: &[f64]| mean(points[POINTS - 2 * LAST..POINTS - LAST].iter().copied());
         let (value, value_before) = (last(values), before(values));
         let (loss, loss_before) = (last(losses), before(losses));
-        let mut doubt = |text: String| estimate.doubts.push(format!("seed {seed}: {text}"));
+        let mut doubt = |text: String| doubts.push(format!("seed {seed}: {text}"));
         if !bounds.contains(&value) {
             doubt(format!("{value:.2} is beyond what rewards allow"));
         } else if (value - value_before).abs() > CONVERGED * units.scale {
             doubt(format!("still moves, from {value_before:.2} to {value:.2}"));
         }
         if loss > GROWTH * loss_before {
-            doubt(format!("the loss grows, from {loss_before:.3} to {loss:.3}"));
+            let growth = format!("from {loss_before:.3} to {loss:.3}");
+            doubt(format!("the loss grows, {growth}"));
         }
-        estimate.values.push(value);
+        estimates.push(value);
     }
-    estimate
+    Estimate { values: estimates, doubts }
 }
 
 #[cfg(test)]
@@ -186,9 +192,10 @@ mod tests {
         ] {
             let points =
                 |[before, last]: [f64; 2]| [vec![before; POINTS - LAST], vec![last; LAST]].concat();
-            let curve = LearningCurve { values: points(values), losses: points(losses) };
-            let found = estimate(&[curve], &units);
-            assert_eq!(found.values, [values[1]]);
+            let expected = values[1];
+            let [values, losses] = [values, losses].map(points);
+            let found = estimate(&[LearningCurve { values, losses }], &units);
+            assert_eq!(found.values, [expected]);
             assert_eq!(found.doubts.is_empty(), doubt.is_empty());
             assert!(found.doubts.concat().contains(doubt), "{doubt}");
         }

@@ -19,7 +19,6 @@ use std::time::Duration;
 use anyhow::Context;
 use quad_algorithms::{FqeConfig, Units};
 use quad_run::results::{Conditions, Judgment, Ranking};
-use quad_runtime::Hint;
 use tracing::{info, warn};
 
 use actions::Actions;
@@ -31,8 +30,7 @@ use snapshots::Snapshot;
 /// Judges the last snapshots of runs, or single snapshots. Judgments that the folders have under
 /// the same conditions are not computed again.
 pub(crate) fn judge(paths: &[PathBuf], gamma: f32, budget: Budget) -> anyhow::Result<Ranking> {
-    let config =
-        FqeConfig::with_discount(gamma).hint("γ is between 0 and 1, 1 left out: --gamma 0.99")?;
+    let config = FqeConfig::with_discount(gamma)?;
     let snapshots = snapshots::find(paths)?;
     let data = Data::read(&snapshots)?;
     let conditions = Conditions {
@@ -45,10 +43,8 @@ pub(crate) fn judge(paths: &[PathBuf], gamma: f32, budget: Budget) -> anyhow::Re
     };
     let (mut judgments, mut remaining) = (Vec::new(), Vec::new());
     for snapshot in &snapshots {
-        let known = Judgment::read_all(&snapshot.folder)?
-            .into_iter()
-            .find(|known| known.weights == snapshot.weights && known.conditions == conditions);
-        match known {
+        let mut known = Judgment::read_all(&snapshot.folder)?.into_iter();
+        match known.find(|it| it.weights == snapshot.weights && it.conditions == conditions) {
             Some(known) => judgments.push(known),
             None => remaining.push(snapshot),
         }
@@ -73,12 +69,12 @@ fn judge_all(
     let recorded = data.recorded_value(&fqes, conditions.gamma)?;
     let behavior = estimate(&curves, &evaluation.units);
     for (snapshot, number) in snapshots.iter().zip(1..) {
-        let Snapshot { folder, step, policy, .. } = snapshot;
-        let actions = Actions::of(&**policy, data)?;
+        let (folder, step) = (&snapshot.folder, snapshot.step);
+        let actions = Actions::of(&*snapshot.policy, data)?;
         let curves = evaluation.of_policy(&actions, &fqes)?;
         let judgment = Judgment {
             run: folder.path().to_owned(),
-            step: *step,
+            step,
             weights: snapshot.weights.clone(),
             conditions: conditions.clone(),
             estimate: estimate(&curves, &evaluation.units),
@@ -107,9 +103,9 @@ fn forecast(evaluation: &Evaluation<'_>, snapshots: &[&Snapshot]) -> anyhow::Res
     let evaluating = evaluation.time()? * (snapshots.len() as u32 + 1);
     let minutes = |time: Duration| format!("{:.1}", time.as_secs_f64() / 60.0);
     let (all, acting) = (minutes(acting + evaluating), minutes(acting));
+    let count = snapshots.len();
     info!(
-        "judging {} policies takes about {all} minutes, {acting} of them to ask the policies for actions",
-        snapshots.len()
+        "judging {count} policies takes about {all} minutes, {acting} of them to ask the policies for actions"
     );
     Ok(())
 }

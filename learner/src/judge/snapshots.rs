@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, anyhow};
+use anyhow::anyhow;
 use quad_policy::{Policy, Precision, load_policy};
 use quad_protocol::Hash;
 use quad_run::config::RunConfig;
@@ -32,16 +32,10 @@ pub(super) fn find(paths: &[PathBuf]) -> anyhow::Result<Vec<Snapshot>> {
             snapshots.push(of_file(path)?);
             continue;
         }
-        let mut unreadable = None;
-        let runs = walk(path, &mut |path, error| unreadable = Some((path.to_owned(), error)));
+        let runs = walk(path, &mut |_, _| ());
         if runs.is_empty() {
-            return match unreadable {
-                Some((path, error)) => {
-                    Err(error).with_context(|| format!("cannot read {}", path.display()))
-                }
-                None => Err(anyhow!("there is no run in {}", path.display())),
-            }
-            .hint(HELP);
+            // Fails with the reason.
+            RunDir::at(path).read_config().hint(HELP)?;
         }
         for run in runs {
             let folder = RunDir::at(&run);
@@ -59,16 +53,17 @@ pub(super) fn find(paths: &[PathBuf]) -> anyhow::Result<Vec<Snapshot>> {
 
 fn of_file(path: &Path) -> anyhow::Result<Snapshot> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let number = name.strip_prefix("step_").and_then(|name| name.strip_suffix(".safetensors"));
-    let step = number.and_then(|number| number.parse().ok());
-    let run = path.parent().and_then(Path::parent).filter(|folder| RunDir::is_occupied(folder));
-    match (step, run) {
-        (Some(step), Some(run)) => Snapshot::read(RunDir::at(run), step),
-        _ => Err(anyhow!(
-            "{} is in no run's folder, so that nothing says what it has learned from",
-            path.display()
-        ))
-        .hint(HELP),
+    let number = name.trim_start_matches("step_").trim_end_matches(".safetensors");
+    let run = path.parent().and_then(Path::parent).map(RunDir::at);
+    match (number.parse(), run) {
+        (Ok(step), Some(run)) if run.snapshot_path(step) == path => Snapshot::read(run, step),
+        _ => {
+            let path = path.display();
+            Err(anyhow!(
+                "{path} is in no run's folder, so that nothing says what it has learned from"
+            ))
+            .hint(HELP)
+        }
     }
 }
 

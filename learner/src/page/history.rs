@@ -47,8 +47,8 @@ impl History {
     pub fn refresh(&mut self) -> io::Result<()> {
         let bytes = new_lines(&self.path, &mut self.offset)?;
         for line in bytes.split(|byte| *byte == b'\n') {
-            let Ok(line) = serde_json::from_slice(line) else { continue };
-            let mut line: BTreeMap<String, Option<f64>> = line;
+            let line: Result<BTreeMap<String, Option<f64>>, _> = serde_json::from_slice(line);
+            let Ok(mut line) = line else { continue };
             let mut take = |name| line.remove(name).flatten().unwrap_or_default();
             let (step, seconds) = (take("step"), take("seconds"));
             while self.rows.pop_if(|last| last.step >= step).is_some() {
@@ -67,7 +67,8 @@ impl History {
                 Some(Some(value)) => (*value, 1),
                 _ => (0.0, 0),
             };
-            self.push(Row { step, seconds, values: self.names.iter().map(value).collect() });
+            let values = self.names.iter().map(value).collect();
+            self.push(Row { step, seconds, values });
         }
         Ok(())
     }
@@ -106,15 +107,16 @@ impl Row {
 /// `[step, seconds, mean, …]`, null where a metric was not measured.
 impl Serialize for Row {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let means = self.values.iter().map(|(sum, count)| sum / f64::from(*count));
-        serializer.collect_seq([self.step, self.seconds].into_iter().chain(means).map(rounded))
+        let mut numbers = vec![self.step, self.seconds];
+        numbers.extend(self.values.iter().map(|(sum, count)| sum / f64::from(*count)));
+        serializer.collect_seq(numbers.into_iter().map(rounded))
     }
 }
 
-/// None if it is not finite.
 fn rounded(value: f64) -> Option<f64> {
     let text = format!("{value:.*e}", SIGNIFICANT_DIGITS - 1);
-    text.parse().ok().filter(|rounded: &f64| rounded.is_finite())
+    let rounded: f64 = text.parse().ok()?;
+    rounded.is_finite().then_some(rounded)
 }
 
 #[cfg(test)]

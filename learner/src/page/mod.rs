@@ -1,7 +1,7 @@
 //! The web page of runs: a learner shows its own run, `learner page` all runs below a folder.
 //!
-//! The web server's tasks query one thread, which reads run folders and caches its answers, so
-//! neither a slow disk nor a busy browser slows down training.
+//! One thread at a time reads run folders, and caches its answers, so neither a slow disk nor a busy
+//! browser slows down training.
 //!
 //! In reading order: `reader` reads the runs, `history` keeps the metrics of one. The browser's
 //! side is `assets/page`.
@@ -9,11 +9,8 @@
 mod history;
 mod reader;
 
-use std::io;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::mpsc::{SyncSender, sync_channel};
-use std::thread;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use axum::Router;
 use axum::body::Bytes;
@@ -22,9 +19,10 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use serde_json::Value;
-use tokio::sync::oneshot;
+use tokio::sync::Semaphore;
+use tokio::task::spawn_blocking;
 
-use reader::{Query, Reader, Request};
+use reader::Reader;
 
 /// Queries that wait for the reader; the server answers more of them with 503.
 const MAX_QUERIES: usize = 64;
@@ -47,20 +45,18 @@ const FILES: [(&str, &str, &str); 6] = [
     ("/dygraph.js", "text/javascript", asset!("dygraph.min.js")),
 ];
 
-/// Describes a learner's current state.
 pub(crate) type Live = Arc<dyn Fn() -> Value + Send + Sync>;
 
 #[derive(Clone)]
 struct Site {
-    queries: SyncSender<Request>,
+    reader: Arc<Mutex<Reader>>,
+    queries: Arc<Semaphore>,
     live: Option<Live>,
 }
 
 /// The page at `/` and its API, of the runs in or below a folder; `live` describes the learner of
 /// the folder's own run.
-pub(crate) fn routes(root: PathBuf, live: Option<Live>) -> io::Result<Router> {
-    let (queries, rx) = sync_channel(MAX_QUERIES);
-    thread::Builder::new().name("page".to_owned()).spawn(move || Reader::new(root).run(&rx))?;
+pub(crate) fn routes(root: PathBuf, live: Option<Live>) -> Router {
     let mut router = Router::new();
     for (path, kind, text) in FILES {
         let headers = [
@@ -75,15 +71,17 @@ pub(crate) fn routes(root: PathBuf, live: Option<Live>) -> io::Result<Router> {
         .route("/api/runs", get(runs))
         .route("/api/run/{*name}", get(run))
         .route("/api/live", get(live_state));
-    Ok(router.with_state(Site { queries, live }))
+    let reader = Arc::new(Mutex::new(Reader::new(root)));
+    let queries = Arc::new(Semaphore::new(MAX_QUERIES));
+    router.with_state(Site { reader, queries, live })
 }
 
 async fn runs(State(site): State<Site>) -> Response {
-    site.query(Query::Runs).await
+    site.read(|reader| Some(reader.list())).await
 }
 
 async fn run(State(site): State<Site>, Path(name): Path<String>) -> Response {
-    site.query(Query::Run(name)).await
+    site.read(|reader| reader.run_page(name)).await
 }
 
 async fn live_state(State(site): State<Site>) -> Response {
@@ -91,12 +89,19 @@ async fn live_state(State(site): State<Site>) -> Response {
 }
 
 impl Site {
-    async fn query(self, query: Query) -> Response {
-        let (tx, rx) = oneshot::channel();
-        if self.queries.try_send((query, tx)).is_err() {
+    async fn read(
+        self,
+        read: impl FnOnce(&mut Reader) -> Option<Bytes> + Send + 'static,
+    ) -> Response {
+        let Ok(query) = self.queries.try_acquire_owned() else {
             return StatusCode::SERVICE_UNAVAILABLE.into_response();
-        }
-        json(rx.await.ok().flatten())
+        };
+        let answer = spawn_blocking(move || {
+            let _query = query;
+            let reader = self.reader.lock();
+            read(&mut reader.unwrap_or_else(PoisonError::into_inner))
+        });
+        json(answer.await.ok().flatten())
     }
 }
 

@@ -1,43 +1,28 @@
-//! The thread that reads run folders for the page. A hanging disk blocks no other thread.
+//! Reads run folders for the page.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::slice;
-use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use quad_run::folder::RunDir;
 use quad_run::results::RunReport;
 use quad_run::status::list;
-use quad_runtime::stay_in_background;
 use serde_json::{Value, json};
-use tokio::sync::oneshot;
 
 use super::history::History;
 
-/// Lifetime of cached answers.
 const RUN_LIFETIME: Duration = Duration::from_secs(1);
 const LIST_LIFETIME: Duration = Duration::from_secs(5);
 /// Runs whose history is kept in memory.
 const MAX_RUNS: usize = 64;
 const EPISODES: usize = 20;
 
-pub(super) enum Query {
-    /// The list of runs.
-    Runs,
-    /// The run of this name in the list.
-    Run(String),
-}
-
-/// A query and the channel for its answer: JSON, or nothing if there is no such run.
-pub(super) type Request = (Query, oneshot::Sender<Option<Bytes>>);
-
 #[derive(Default)]
 pub(super) struct Reader {
     root: PathBuf,
     list: Cache,
-    /// Folders by name in the list.
     dirs: HashMap<String, PathBuf>,
     runs: HashMap<String, (RunPage, Cache)>,
 }
@@ -58,23 +43,12 @@ impl Reader {
         Self { root, ..Self::default() }
     }
 
-    /// Answers until the web server is dropped.
-    pub fn run(mut self, requests: &Receiver<Request>) {
-        stay_in_background();
-        while let Ok((query, tx)) = requests.recv() {
-            let answer = match query {
-                Query::Runs => Some(self.list()),
-                Query::Run(name) => self.run_page(name),
-            };
-            tx.send(answer).ok();
-        }
-    }
-
-    fn list(&mut self) -> Bytes {
+    /// The list of runs as JSON.
+    pub fn list(&mut self) -> Bytes {
         self.list.get(LIST_LIFETIME, || {
             let entries = list::list(slice::from_ref(&self.root));
-            let dirs = entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone()));
-            self.dirs = dirs.collect();
+            let named = |entry: &list::Entry| (entry.name.clone(), entry.dir.clone());
+            self.dirs = entries.iter().map(named).collect();
             let with_page = |entry: &list::Entry| {
                 let mut json = json!(entry);
                 if json["at_work"] == true {
@@ -87,7 +61,8 @@ impl Reader {
         })
     }
 
-    fn run_page(&mut self, name: String) -> Option<Bytes> {
+    /// The run of this name in the list as JSON; nothing if there is none.
+    pub fn run_page(&mut self, name: String) -> Option<Bytes> {
         if !self.dirs.contains_key(&name) {
             self.list();
         }
@@ -97,8 +72,8 @@ impl Reader {
         }
         let new = || (RunPage::of(dir), Cache::default());
         let (run, cache) = self.runs.entry(name).or_insert_with(new);
-        let read = || run.read().unwrap_or_else(|error| json!({ "error": format!("{error:#}") }));
-        Some(cache.get(RUN_LIFETIME, read))
+        let failed = |error| json!({ "error": format!("{error:#}") });
+        Some(cache.get(RUN_LIFETIME, || run.read().unwrap_or_else(failed)))
     }
 }
 

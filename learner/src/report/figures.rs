@@ -18,7 +18,6 @@ use super::summary::Report;
 
 const BAND: &str = "mean over seeds, with its 95 % interval";
 
-/// Writes all figures into a folder, as SVG and as PNG.
 pub fn draw_all(folder: &Path, report: &Report) -> anyhow::Result<()> {
     fs::create_dir_all(folder)
         .with_context(|| format!("cannot make {}", folder.display()))
@@ -52,7 +51,8 @@ pub fn all(report: &Report) -> Vec<(String, Plot)> {
         plots.push((curve_name(task), curves(task, groups)));
     }
     for Definition { name, report, .. } in ALGORITHMS {
-        plots.extend(report.axis.map(|axis| (axis.key.to_owned(), over(axis, name, &by_task))));
+        let Some(axis) = report.axis else { continue };
+        plots.push((axis.key.to_owned(), over(axis, name, &by_task)));
     }
     plots.retain(|(_, plot)| !plot.is_empty());
     plots
@@ -60,26 +60,28 @@ pub fn all(report: &Report) -> Vec<(String, Plot)> {
 
 /// The learning curve of one run: mean over an evaluation's episodes ± one standard deviation.
 pub fn learning_curve(run: &RunReport) -> Plot {
-    let mut points = Vec::new();
+    let mut line = Line { label: format!("{} ({})", run.run, run.variant), points: Vec::new() };
+    let mut episodes = 0;
     for evaluation in &run.evaluations {
         let (value, std) = (evaluation.score.mean, evaluation.score.std);
         let (low, high) = (std.map(|std| value - std), std.map(|std| value + std));
-        points.push((evaluation.step as f64, Estimate { value, low, high }));
+        line.points.push((evaluation.step as f64, Estimate { value, low, high }));
+        episodes = episodes.max(evaluation.episodes);
     }
-    let episodes = run.evaluations.iter().map(|it| it.episodes).max().unwrap_or(0);
     let measure = run.measure_with_unit();
     Plot {
         title: format!("{}: {measure} over {episodes} episodes", run.run),
         x: "gradient steps",
         y: measure,
         references: vec![dataset_mean(run)],
-        lines: vec![Line { label: format!("{} ({})", run.run, run.variant), points }],
+        lines: vec![line],
         ..Plot::default()
     }
 }
 
 fn dataset_mean(run: &RunReport) -> (String, f64) {
-    (format!("dataset mean {:.1}", run.dataset_score), run.dataset_score)
+    let mean = run.dataset_score;
+    (format!("dataset mean {mean:.1}"), mean)
 }
 
 fn curves(task: &str, groups: &[&GroupReport]) -> Plot {
@@ -114,14 +116,16 @@ fn curve(group: &GroupReport) -> Line {
     let plural = if group.runs.len() == 1 { "" } else { "s" };
     let part = group.reached.map_or("", |_| ", not complete");
     let label = format!("{} ({} seed{plural}{part})", group.method, group.runs.len());
-    Line { label, points: steps.iter().map(|step| **step as f64).zip(means).collect() }
+    let points = steps.iter().map(|step| **step as f64).zip(means).collect();
+    Line { label, points }
 }
 
 fn profiles(report: &Report) -> Plot {
     let mut lines = Vec::new();
     for MethodReport { method, profile, .. } in &report.study {
-        let points = profile.iter().map(|point| (point.threshold, point.share)).collect();
-        lines.push(Line { label: method.clone(), points });
+        let label = method.clone();
+        let points = profile.iter().map(|it| (it.threshold, it.share)).collect();
+        lines.push(Line { label, points });
     }
     lines.retain(|line| !line.points.is_empty());
     Plot {
@@ -169,13 +173,13 @@ fn over_on_task(axis: Axis, task: &str, groups: &[&GroupReport]) -> Plot {
     let mut lines = Vec::new();
     for mut groups in by_settings.into_values().filter(|groups| groups.len() > 1) {
         groups.sort_by(|(one, _), (other, _)| one.total_cmp(other));
-        let names = groups[0].1.method.split(", ").filter(|part| !part.starts_with(&key));
-        let mut line = Line { label: Vec::from_iter(names).join(", "), points: Vec::new() };
+        let (mut names, mut points) = (Vec::from_iter(groups[0].1.method.split(", ")), Vec::new());
+        names.retain(|name| !name.starts_with(&key));
         for (value, group) in groups {
             let score = statistics::estimates(&[&vec![group.scores.clone()]], mean)[0];
-            line.points.push((value.log10(), score));
+            points.push((value.log10(), score));
         }
-        lines.push(line);
+        lines.push(Line { label: names.join(", "), points });
     }
     Plot {
         title: format!("{task} over {}", axis.symbol),

@@ -26,8 +26,6 @@ pub struct GroupReport {
     pub method: String,
     /// The most important hyper-parameters.
     pub agent: String,
-    /// Names of the variant in published tables.
-    pub methods: Vec<&'static str>,
     /// Planned gradient steps.
     pub steps: u64,
     /// Step of the last complete evaluation, if the runs are not complete.
@@ -67,15 +65,16 @@ pub struct GroupReport {
 impl GroupReport {
     /// `4 seeds, 2000000 steps on cpu, scored in f32`.
     pub fn provenance(&self) -> String {
-        let seeds = self.seeds.len();
+        let (seeds, scored_in) = (self.seeds.len(), &self.scored_in);
         let plural = if seeds == 1 { "" } else { "s" };
-        let goals = if self.goals.is_some() { " with a goal each" } else { "" };
+        let goals = self.goals.map_or("", |_| " with a goal each");
         let (steps, device) = (self.steps_in_words(), self.device.name());
-        format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {}", self.scored_in)
+        format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {scored_in}")
     }
 
     pub fn measure(&self) -> &'static str {
-        self.runs.first().map_or("return", RunReport::measure_with_unit)
+        let first = self.runs.first();
+        first.map_or("return", RunReport::measure_with_unit)
     }
 
     pub fn by_seed(&self) -> impl Iterator<Item = (&u64, &f64)> {
@@ -91,7 +90,6 @@ impl GroupReport {
 }
 
 struct Group<'a> {
-    /// Algorithm and variant.
     variant: [&'a str; 2],
     /// Without the seed.
     settings: Settings,
@@ -144,7 +142,8 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     // any other value makes another method.
     let mut differing: BTreeMap<[&str; 2], BTreeSet<&String>> = BTreeMap::new();
     for (index, one) in groups.iter().enumerate() {
-        for other in groups[..index].iter().filter(|other| other.variant == one.variant) {
+        let earlier = groups[..index].iter();
+        for other in earlier.filter(|other| other.variant == one.variant) {
             let other_task = one.task() != other.task();
             let keys = differences(&one.settings, &other.settings)
                 .filter(|key| !(other_task && one.is_preset(key) && other.is_preset(key)));
@@ -184,7 +183,8 @@ fn report(
             left_out.push(format!("{dir} has no complete evaluation"));
         } else if let Some(first) = counted.iter().find(|other| other.seed == seed) {
             let first = first.dir.display();
-            left_out.push(format!("{dir} has seed {seed} like {first}, which is counted"));
+            let reason = format!("{dir} has seed {seed} like {first}, which is counted");
+            left_out.push(reason);
         } else {
             counted.push(run);
         }
@@ -202,9 +202,12 @@ fn report(
     let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
     let published = published::scores(&first.task);
     let environment = environment::find(&first.config.experiment.environment);
-    let has_one_goal = environment
-        .is_ok_and(|known| known.maze.is_some_and(|maze| maze.draw == GoalDraw::EachInstance));
-    let unfinished = counted.iter().filter(|run| !run.is_complete());
+    let maze = environment.ok().and_then(|known| known.maze);
+    let has_one_goal = maze.is_some_and(|maze| maze.draw == GoalDraw::EachInstance);
+    let mut unfinished = Vec::new();
+    for run in counted.iter().filter(|run| !run.is_complete()) {
+        unfinished.push(format!("in {} {}", run.dir.display(), run.how_complete()));
+    }
     let departures = match published.is_empty() {
         true => Vec::new(),
         false => departures(&counted, &scored_in, select),
@@ -215,7 +218,6 @@ fn report(
         variant: first.variant.clone(),
         method,
         agent: first.agent.clone(),
-        methods: published::methods(&first.algorithm, &first.variant),
         steps: first.steps,
         reached: first.reached(),
         device: first.config.run.device,
@@ -227,9 +229,7 @@ fn report(
         mean_last_5: spread(|run| run.mean_last_5),
         mean_last_50000_steps: spread(|run| run.mean_last_50000_steps),
         best: spread(best).filter(|_| select == Select::Best),
-        unfinished: unfinished
-            .map(|run| format!("in {} {}", run.dir.display(), run.how_complete()))
-            .collect(),
+        unfinished,
         left_out,
         differs,
         dirs: runs.iter().map(|run| run.dir.clone()).collect(),

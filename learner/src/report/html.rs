@@ -28,7 +28,8 @@ pub fn write(path: &Path, report: &Report) -> anyhow::Result<()> {
     let mut templates = Environment::new();
     // A template of this name escapes what is filled in: a run's name is no HTML.
     templates.add_template("report.html", include_str!("../../assets/report.html"))?;
-    let page = templates.get_template("report.html")?.render(Serde(content(report)?))?;
+    let template = templates.get_template("report.html")?;
+    let page = template.render(Serde(content(report)?))?;
     files::replace(path, page.as_bytes())
         .with_context(|| format!("cannot write {}", path.display()))
 }
@@ -41,7 +42,10 @@ fn content(report: &Report) -> anyhow::Result<Value> {
     for (_, plot) in figures::all(report) {
         plots.push(json!({ "title": plot.title, "svg": plot.svg()? }));
     }
-    let groups = report.groups.iter().map(|group| of_group(group, &report.runs));
+    let mut groups = Vec::new();
+    for group in &report.groups {
+        groups.push(of_group(group, &report.runs)?);
+    }
     Ok(json!({
         "title": Vec::from_iter(tasks).join(", "),
         "subtitle": format!("{} run{plural}, {complete} complete", report.runs.len()),
@@ -49,7 +53,7 @@ fn content(report: &Report) -> anyhow::Result<Value> {
         "blocks": report.summaries(true),
         "figures": plots,
         "films": films(&report.runs),
-        "groups": groups.collect::<anyhow::Result<Value>>()?,
+        "groups": groups,
         "commands": commands(&report.runs),
     }))
 }
@@ -80,7 +84,8 @@ fn film(path: &Path, magic: &[u8]) -> Result<Vec<u8>> {
         return Err(ErrorKind::FileTooLarge.into());
     }
     let bytes = files::rest(&mut file, 0)?;
-    if bytes.starts_with(magic) { Ok(bytes) } else { Err(Error::other("it is no such picture")) }
+    let is_film = bytes.starts_with(magic);
+    is_film.then_some(bytes).ok_or_else(|| Error::other("it is no such picture"))
 }
 
 fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Value> {
@@ -93,20 +98,25 @@ fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Value> {
         let data = &run.config.dataset;
         let name = run.config.experiment.dataset.as_deref().unwrap_or_default();
         let sha256 = data.sha256.as_deref().unwrap_or("unknown");
-        let returns = format!("returns from {:.1} to {:.1}", data.min_return, data.max_return);
-        Some(format!("{name}: {}, {returns}\nSHA-256 {sha256}", data.summary()))
+        let (summary, least, most) = (data.summary(), data.min_return, data.max_return);
+        let returns = format!("returns from {least:.1} to {most:.1}");
+        Some(format!("{name}: {summary}, {returns}\nSHA-256 {sha256}"))
     };
-    let summary =
-        |run: &RunReport| Some(format!("{}: {}", run.run, run.summary.as_ref()?.text.trim()));
-    let title = runs.iter().find_map(|run| Some(run.summary.as_ref()?.title)).unwrap_or_default();
+    let version = |run: &RunReport| Some(format!("version {}", run.config.run.version));
+    let machine = |run: &RunReport| run.config.run.machine.clone();
+    let summary = |run: &RunReport| {
+        let text = run.summary.as_ref()?.text.trim();
+        Some(format!("{}: {text}", run.run))
+    };
+    let mut titles = runs.iter().filter_map(|run| Some(run.summary.as_ref()?.title));
     let mut facts = vec![
         ("algorithm", group.agent.clone()),
         ("runs", group.provenance()),
         ("data", distinct(&dataset)),
-        ("learner", distinct(&|run| Some(format!("version {}", run.config.run.version)))),
-        ("trained on", distinct(&|run| run.config.run.machine.clone())),
+        ("learner", distinct(&version)),
+        ("trained on", distinct(&machine)),
         ("departures", group.departures.join("\n")),
-        (title, distinct(&summary)),
+        (titles.next().unwrap_or_default(), distinct(&summary)),
     ];
     facts.retain(|(_, value)| !value.is_empty());
     let first = &runs.first().context("a group has runs")?.config;

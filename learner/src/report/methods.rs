@@ -74,7 +74,8 @@ pub fn aggregate(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>)
             comparable.push(Vec::new());
         }
         let methods = &mut comparable[index];
-        match methods.iter_mut().find(|method| method[0].method == group.method) {
+        let mut known = methods.iter_mut();
+        match known.find(|method| method[0].method == group.method) {
             Some(method) => method.push(group),
             None => methods.push(vec![group]),
         }
@@ -82,10 +83,11 @@ pub fn aggregate(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>)
     let reports = comparable.iter().flatten().map(of_method).collect();
     let mut comparisons = Vec::new();
     for methods in &comparable {
-        comparisons.extend(methods[1..].iter().filter_map(|method| compare(method, &methods[0])));
+        let others = methods[1..].iter();
+        comparisons.extend(others.filter_map(|method| compare(method, &methods[0])));
     }
     let p_values = Vec::from_iter(comparisons.iter().filter_map(|comparison| comparison.p));
-    let tested = comparisons.iter_mut().filter(|comparison| comparison.p.is_some());
+    let tested = comparisons.iter_mut().filter(|it| it.p.is_some());
     for (comparison, p) in tested.zip(statistics::holm(&p_values)) {
         comparison.p_holm = Some(p);
     }
@@ -100,26 +102,29 @@ fn of_method(method: &Method) -> MethodReport {
     let count = if first.normalized { 61 } else { 0 };
     let thresholds = Vec::from_iter((0..count).map(|index| f64::from(2 * index)));
     let statistics = |drawn: &[Runs]| {
-        let of = [interquartile_mean, mean_of_means, median_of_means, optimality_gap];
-        let mut values = Vec::from_iter(of.map(|of| of(&drawn[0])));
-        values.extend(thresholds.iter().map(|at| fraction_above(&drawn[0], *at)));
+        let runs = &drawn[0];
+        let mut values = vec![interquartile_mean(runs), mean_of_means(runs)];
+        values.extend([median_of_means(runs), optimality_gap(runs)]);
+        values.extend(thresholds.iter().map(|at| fraction_above(runs, *at)));
         values
     };
     let estimates = statistics::estimates(&[&runs], statistics);
-    let shares = thresholds.iter().zip(&estimates[4..]);
+    let mut profile = Vec::new();
+    for (&threshold, &share) in thresholds.iter().zip(&estimates[4..]) {
+        profile.push(ProfilePoint { threshold, share });
+    }
     let seeds = || runs.iter().map(Vec::len);
+    let all_seeds = method.iter().flat_map(|group| &group.seeds);
     MethodReport {
         method: first.method.clone(),
         measure: first.measure(),
         tasks: method.iter().map(|group| group.task.clone()).collect(),
-        seeds: method.iter().flat_map(|group| &group.seeds).copied().collect(),
+        seeds: all_seeds.copied().collect(),
         iqm: estimates[0],
         mean: estimates[1],
         median: estimates[2],
         optimality_gap: first.normalized.then_some(estimates[3]),
-        profile: shares
-            .map(|(threshold, share)| ProfilePoint { threshold: *threshold, share: *share })
-            .collect(),
+        profile,
         seeds_per_task: [seeds().min(), seeds().max()].map(Option::unwrap_or_default),
     }
 }
@@ -128,7 +133,8 @@ fn of_method(method: &Method) -> MethodReport {
 fn compare(method: &Method, against: &Method) -> Option<Comparison> {
     let (mut tasks, mut x, mut y, mut differences) = (vec![], Runs::new(), Runs::new(), vec![]);
     for one in method {
-        let Some(other) = against.iter().find(|other| other.task == one.task) else { continue };
+        let other = against.iter().find(|other| other.task == one.task);
+        let Some(other) = other else { continue };
         tasks.push(one.task.clone());
         x.push(one.scores.clone());
         y.push(other.scores.clone());
@@ -164,17 +170,17 @@ impl MethodReport {
     }
 
     fn seeds_in_words(&self) -> String {
-        let [fewest, most] = self.seeds_per_task;
-        if fewest == most { most.to_string() } else { format!("{fewest} to {most}") }
+        match self.seeds_per_task {
+            [fewest, most] if fewest == most => most.to_string(),
+            [fewest, most] => format!("{fewest} to {most}"),
+        }
     }
 }
 
-/// The number as text, or a dash.
 fn number(value: Option<f64>, digits: usize) -> String {
     value.map_or("-".to_owned(), |value| format!("{value:.digits$}"))
 }
 
-/// All methods and comparisons as tables.
 pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Block> {
     let mut notes = format!(
         "Over tasks and seeds, in brackets the 95 % interval of the bootstrap: {RESAMPLES} times, seeds are drawn in each task \

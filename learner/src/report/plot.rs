@@ -37,7 +37,6 @@ const COLORS: [RGBColor; 7] = [
 #[derive(Clone, Debug, Default)]
 pub struct Plot {
     pub title: String,
-    /// Labels of the axes.
     pub x: &'static str,
     pub y: &'static str,
     /// True if x is the base-10 logarithm of the number that the axis shows.
@@ -76,7 +75,8 @@ impl Plot {
         let (width, height) = self.size();
         let (width, height) = (width * PNG_SCALE, height * PNG_SCALE);
         let mut pixels = vec![0; (width * height * 3) as usize];
-        self.render(BitMapBackend::with_buffer(&mut pixels, (width, height)), PNG_SCALE)?;
+        let backend = BitMapBackend::with_buffer(&mut pixels, (width, height));
+        self.render(backend, PNG_SCALE)?;
         let mut file = Vec::new();
         let mut encoder = png::Encoder::new(&mut file, width, height);
         encoder.set_color(png::ColorType::Rgb);
@@ -89,9 +89,9 @@ impl Plot {
             && self.panels.iter().all(Self::is_empty)
     }
 
-    /// Rows and columns of panels.
     fn grid(&self) -> (usize, usize) {
-        (self.panels.len().div_ceil(COLUMNS), self.panels.len().min(COLUMNS))
+        let count = self.panels.len();
+        (count.div_ceil(COLUMNS), count.min(COLUMNS))
     }
 
     fn size(&self) -> (u32, u32) {
@@ -115,15 +115,14 @@ impl Plot {
         drawn.map_err(|error| anyhow!("cannot draw {}: {error}", self.title))
     }
 
-    /// Without infinite and huge values.
     fn finite(&self) -> Self {
         let is_finite = |value: &f64| value.abs() < LARGEST;
         let mut plot = self.clone();
-        plot.panels.iter_mut().for_each(|panel| *panel = panel.finite());
+        plot.panels = self.panels.iter().map(Self::finite).collect();
         plot.references.retain(|(_, y)| is_finite(y));
-        for line in &mut plot.lines {
-            line.points.retain(|(x, y)| is_finite(x) && is_finite(&y.value));
-            for (_, y) in &mut line.points {
+        for Line { points, .. } in &mut plot.lines {
+            points.retain(|(x, y)| is_finite(x) && is_finite(&y.value));
+            for (_, y) in points {
                 (y.low, y.high) = (y.low.filter(is_finite), y.high.filter(is_finite));
             }
         }
@@ -135,8 +134,8 @@ impl Plot {
         DB::ErrorType: 'static,
     {
         if !self.panels.is_empty() {
-            let areas = area.split_evenly(self.grid());
-            return self.panels.iter().zip(areas).try_for_each(|(it, area)| it.draw(&area, scale));
+            let mut panels = self.panels.iter().zip(area.split_evenly(self.grid()));
+            return panels.try_for_each(|(it, area)| it.draw(&area, scale));
         }
         let font = |size: u32| ("sans-serif", size * scale).into_font();
         let (x, y) = self.limits();
@@ -166,7 +165,8 @@ impl Plot {
             let ends = [(x.start, *y), (x.end, *y)];
             let style = REFERENCE.stroke_width(2 * scale);
             let line = DashedLineSeries::new(ends, 6 * scale, 4 * scale, style);
-            chart.draw_series(line)?.label(name).legend(legend(REFERENCE, scale));
+            let drawn = chart.draw_series(line)?.label(name);
+            drawn.legend(legend(REFERENCE, scale));
         }
         for (line, color) in self.lines.iter().zip(COLORS.iter().cycle()) {
             line.draw(&mut chart, *color, scale)?;
@@ -201,9 +201,9 @@ impl Plot {
         for (_, value) in &self.references {
             extend(&mut y, *value);
         }
-        let labels = self.lines.len() + self.references.len();
-        let room = if self.is_falling { 0.0 } else { 0.05 * labels as f64 };
-        y.end = y.start + (y.end - y.start) * (1.05 + room);
+        let labels = (self.lines.len() + self.references.len()) as f64;
+        let room = 0.05 + 0.05 * labels * f64::from(!self.is_falling);
+        y.end += (y.end - y.start) * room;
         (x, y)
     }
 }
@@ -222,7 +222,8 @@ impl Line {
         DB::ErrorType: 'static,
     {
         let edge = |end: fn(&Estimate) -> Option<f64>| {
-            self.points.iter().filter_map(move |(x, y)| Some((*x, end(y)?)))
+            let points = self.points.iter();
+            points.filter_map(move |(x, y)| Some((*x, end(y)?)))
         };
         let band = Vec::from_iter(edge(|y| y.high).chain(edge(|y| y.low).rev()));
         if !band.is_empty() {
@@ -230,7 +231,8 @@ impl Line {
         }
         let points = Vec::from_iter(self.points.iter().map(|(x, y)| (*x, y.value)));
         let line = LineSeries::new(points.clone(), color.stroke_width(2 * scale));
-        chart.draw_series(line)?.label(&self.label).legend(legend(color, scale));
+        let drawn = chart.draw_series(line)?.label(&self.label);
+        drawn.legend(legend(color, scale));
         if points.len() <= MAX_MARKERS {
             let marker = |point| Circle::new(point, 3 * scale, color.filled());
             chart.draw_series(points.into_iter().map(marker))?;

@@ -8,7 +8,6 @@ use quad_run::table::{Block, Table};
 
 use super::groups::GroupReport;
 
-/// A published score and its task.
 type Score<'a> = (&'a str, &'a Published);
 
 /// The published table of this name with footnotes, of the tasks that some of these runs are on;
@@ -17,7 +16,9 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
     let in_table =
         |group: &&GroupReport| published::tables(&group.task, &group.algorithm).contains(&name);
     let groups = Vec::from_iter(groups.iter().filter(in_table));
-    let Some(first) = groups.first() else { return Vec::new() };
+    if groups.is_empty() {
+        return Vec::new();
+    }
     let tasks = once_each(groups.iter().map(|group| &*group.task));
     let ours = once_each(groups.iter().map(|group| &*group.method));
     let mut scores: Vec<Score> = Vec::new();
@@ -28,9 +29,9 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
         scores.extend(in_table.map(|score| (*task, score)));
     }
     let theirs = methods(scores.iter());
-    let reasons = scores.iter().flat_map(|(_, score)| &score.remarks);
-    let mut notes =
-        Footnotes { ours: Vec::new(), theirs: once_each(reasons.map(|remark| remark.reason)) };
+    let remarks = scores.iter().flat_map(|(_, score)| &score.remarks);
+    let reasons = once_each(remarks.map(|remark| remark.reason));
+    let mut notes = Footnotes { ours: Vec::new(), theirs: reasons };
 
     let mut header = vec![("task".to_owned(), Left)];
     header.extend(ours.iter().map(|method| (format!("ours: {method}"), Right)));
@@ -39,22 +40,21 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
     for task in tasks {
         let mut row = vec![task.to_owned()];
         for method in &ours {
-            let groups =
-                groups.iter().filter(|group| group.task == task && group.method == *method);
+            let is_it = |group: &&&GroupReport| group.task == task && group.method == *method;
             // Complete runs come first.
-            let group = groups.min_by_key(|group| group.reached.is_some());
+            let group = groups.iter().filter(is_it).min_by_key(|it| it.reached.is_some());
             row.push(group.map_or("-".to_owned(), |group| notes.ours(group)));
         }
         for method in &theirs {
-            let score = scores.iter().find(|(of, score)| *of == task && score.method == *method);
+            let is_it = |(of, score): &&Score| *of == task && score.method == *method;
+            let score = scores.iter().find(is_it);
             row.push(score.map_or("-".to_owned(), |(_, score)| notes.theirs(score)));
         }
         table.push(row);
     }
+    let last = published::last(&groups[0].task);
     let score = match select {
-        Select::Last => {
-            format!("the mean of its last {} evaluations", published::last(&first.task))
-        }
+        Select::Last => format!("the mean of its last {last} evaluations"),
         Select::Best => "its best evaluation".to_owned(),
     };
     let protocol = scores.first().map_or("", |(_, score)| score.protocol);
@@ -62,7 +62,8 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
         "{name}. Ours: mean ± standard deviation over seeds, divided by n - 1 (in parentheses: by n); a run's score is {score}. \
          {protocol}\n"
     );
-    vec![Block::Text(title), Block::Table(table), Block::Text(notes.text(&scores, select))]
+    let notes = notes.text(&scores, select);
+    vec![Block::Text(title), Block::Table(table), Block::Text(notes)]
 }
 
 fn methods<'a>(scores: impl Iterator<Item = &'a Score<'a>>) -> Vec<&'static str> {
@@ -80,7 +81,8 @@ impl Footnotes {
     fn ours(&mut self, group: &GroupReport) -> String {
         let mut note = group.provenance();
         if !group.departures.is_empty() {
-            note += &format!(". Not its authors' protocol: {}", group.departures.join("; "));
+            let departures = group.departures.join("; ");
+            note += &format!(". Not its authors' protocol: {departures}");
         }
         if let Some(goals) = group.goals {
             note += &format!(
@@ -102,8 +104,10 @@ impl Footnotes {
 
     /// A score as published, with the letters of its remarks.
     fn theirs(&self, score: &Published) -> String {
-        let std = score.score.std.map(|std| format!(" ± {std:.1}")).unwrap_or_default();
-        let mut text = format!("{:.1}{std} ", score.score.mean);
+        let mut text = format!("{:.1} ", score.score.mean);
+        if let Some(std) = score.score.std {
+            text += &format!("± {std:.1} ");
+        }
         for (letter, reason) in self.lettered() {
             if score.remarks.iter().any(|remark| remark.reason == reason) {
                 text.push(letter);
@@ -125,16 +129,15 @@ impl Footnotes {
         text += &format!("- Sources: {}.\n", sources.join("; "));
         for (letter, reason) in self.lettered() {
             let (mut on, mut instead, mut selected) = (Vec::new(), Vec::new(), "");
-            for score in scores {
-                let remarks = &score.1.remarks;
-                let Some(remark) = remarks.iter().find(|remark| remark.reason == reason) else {
-                    continue;
-                };
-                on.push(score);
-                if remark.selected {
-                    selected = "selected by test returns: ";
+            for score @ (task, published) in scores {
+                for remark in published.remarks.iter().filter(|it| it.reason == reason) {
+                    on.push(score);
+                    if remark.selected {
+                        selected = "selected by test returns: ";
+                    }
+                    let in_task = |mean| format!(" {mean:.1} in {task}");
+                    instead.extend(remark.instead.map(in_task));
                 }
-                instead.extend(remark.instead.map(|mean| format!(" {mean:.1} in {}", score.0)));
             }
             let (methods, instead) = (methods(on.into_iter()).join(", "), instead.join(","));
             text += &format!("- {letter} ({methods}): {selected}{reason}{instead}\n");

@@ -77,14 +77,15 @@ impl Report {
             }
         }
         blocks.extend(self.summaries(style != Style::Text));
-        blocks.iter().map(|block| block.render(style)).collect::<Vec<_>>().join("\n")
+        let blocks = blocks.iter().map(|block| block.render(style));
+        Vec::from_iter(blocks).join("\n")
     }
 
     /// All tables but those of single runs. `single`: also aggregates the seeds of a single run.
     pub fn summaries(&self, single: bool) -> Vec<Block> {
         let paragraph = |text: String| (!text.is_empty()).then_some(Block::Text(text));
-        let mut blocks =
-            Vec::from_iter(paragraph(self.select.warning().unwrap_or_default().to_owned()));
+        let warning = self.select.warning().unwrap_or_default();
+        let mut blocks = Vec::from_iter(paragraph(warning.to_owned()));
         if self.runs.len() > 1 || single {
             blocks.extend(self.over_seeds());
             blocks.extend(paragraph(self.not_counted()));
@@ -92,12 +93,10 @@ impl Report {
         if self.runs.len() > 1 && !self.study.is_empty() {
             blocks.extend(methods::tables(&self.study, &self.comparisons));
         }
-        let unreadable = self.unreadable.iter();
-        blocks.extend(paragraph(
-            unreadable.map(|it| format!("Not in this report: {it}.\n")).collect(),
-        ));
-        let judgments = self.runs.iter().flat_map(|run| run.judgments.iter().cloned());
-        blocks.extend(Ranking::of(judgments).iter().flat_map(Ranking::blocks));
+        let missing = |it: &String| format!("Not in this report: {it}.\n");
+        blocks.extend(paragraph(self.unreadable.iter().map(missing).collect()));
+        let judgments = self.runs.iter().flat_map(|run| &run.judgments);
+        blocks.extend(Ranking::of(judgments.cloned()).iter().flat_map(Ranking::blocks));
         for name in all_tables() {
             blocks.extend(published::table(name, &self.groups, self.select));
         }
@@ -141,7 +140,8 @@ impl Report {
         let differs = "what differs from other runs of the task and algorithm";
         columns.push((differs, Left, |it| it.differs.join(", ")));
         let title = "Over seeds: mean ± standard deviation of the runs, divided by n - 1 (in parentheses: by n).\n";
-        [Block::Text(title.to_owned()), Block::Table(Table::of(&self.groups, &columns))]
+        let table = Table::of(&self.groups, &columns);
+        [Block::Text(title.to_owned()), Block::Table(table)]
     }
 
     fn not_counted(&self) -> String {

@@ -18,8 +18,9 @@ pub(super) type Combination<'a> = Vec<(&'a str, &'a Value)>;
 pub(super) fn axes(table: &Table) -> Result<Vec<Axis>, Vec<String>> {
     let (mut axes, mut problems) = (Vec::new(), Vec::new());
     for (key, value) in tables::keys(table) {
-        let Some(values) = value.as_array() else {
-            problems.push(format!("axis {key} is {value}, but must be a list: {key} = [{value}]"));
+        let Some(values) = value.as_array().cloned() else {
+            let list = format!("{key} = [{value}]");
+            problems.push(format!("axis {key} is {value}, but must be a list: {list}"));
             continue;
         };
         if values.is_empty() {
@@ -29,20 +30,24 @@ pub(super) fn axes(table: &Table) -> Result<Vec<Axis>, Vec<String>> {
         if let Some((_, value)) = values.iter().enumerate().find(is_repeated) {
             problems.push(format!("axis {key} has the value {value} twice"));
         }
-        axes.push(Axis { key, values: values.clone() });
+        axes.push(Axis { key, values });
     }
     if axes.is_empty() && problems.is_empty() {
         problems.push("[axes] names no axis, such as seed = [0, 1, 2]".to_owned());
     }
     axes.sort_by_key(|axis| rank(&axis.key));
-    if problems.is_empty() { Ok(axes) } else { Err(problems) }
+    match problems[..] {
+        [] => Ok(axes),
+        _ => Err(problems),
+    }
 }
 
 /// Seeds change last: an interrupted study has compared everything by some seeds, and more seeds
 /// only extend the list.
 fn rank(key: &str) -> usize {
     let order = ["seed", "task", "preset", "dataset", "algorithm", "method"];
-    order.iter().position(|known| *known == key).unwrap_or(order.len())
+    let place = order.iter().position(|known| *known == key);
+    place.unwrap_or(order.len())
 }
 
 /// The Cartesian product of the axes, the last axis changing first.
@@ -51,7 +56,8 @@ pub(super) fn combinations(axes: &[Axis]) -> Vec<Combination<'_>> {
     for Axis { key, values } in axes {
         let mut longer = Vec::new();
         for prefix in &all {
-            longer.extend(values.iter().map(|value| [&prefix[..], &[(&**key, value)]].concat()));
+            let with = |value| [&prefix[..], &[(&**key, value)]].concat();
+            longer.extend(values.iter().map(with));
         }
         all = longer;
     }

@@ -17,6 +17,7 @@ use crate::train::Price;
 /// Further configurations are assumed to cost as much as the mean of these.
 const MAX_MEASURED: usize = 20;
 
+#[derive(Default)]
 pub(crate) struct Cost {
     /// Seconds of a gradient step, by the run's index.
     pub step_seconds: BTreeMap<usize, f64>,
@@ -24,7 +25,6 @@ pub(crate) struct Cost {
     seconds: f64,
     /// Final disk space of all runs together.
     bytes: u64,
-    /// Number of measured configurations.
     measured: usize,
 }
 
@@ -53,7 +53,8 @@ impl Cost {
             });
             prices.insert(key, price.unwrap_or_default());
         }
-        let measured = prices.values().filter(|price| price.step_seconds > 0.0).count();
+        let known = prices.values().filter(|price| price.step_seconds > 0.0);
+        let measured = known.count();
         let mean = |value: fn(&Price) -> f64| {
             prices.values().map(value).sum::<f64>() / measured.max(1) as f64
         };
@@ -62,7 +63,7 @@ impl Cost {
             snapshot_bytes: mean(|price| price.snapshot_bytes as f64) as u64,
             checkpoint_bytes: mean(|price| price.checkpoint_bytes as f64) as u64,
         };
-        let mut cost = Self { step_seconds: BTreeMap::new(), seconds: 0.0, bytes: 0, measured };
+        let mut cost = Self { measured, ..Self::default() };
         for (run, state) in runs {
             let price = prices.get(&configuration(run)).copied().unwrap_or(mean);
             let steps = run.experiment.total_steps();

@@ -22,12 +22,10 @@ impl Display {
         Self { bar }
     }
 
-    /// Time between updates.
     pub fn interval(&self) -> Duration {
         Duration::from_secs(if self.bar.is_hidden() { 30 } else { 1 })
     }
 
-    /// Prints an event.
     pub fn print(&self, text: &str) {
         if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(clean(text)) }
     }

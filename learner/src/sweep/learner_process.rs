@@ -28,7 +28,6 @@ const LAST_READ: Duration = Duration::from_secs(1);
 #[derive(Clone)]
 pub(crate) struct LearnerOptions {
     pub threads: usize,
-    /// The router.
     pub endpoint: String,
     /// Address of the page, for a single learner.
     pub http: Option<SocketAddr>,
@@ -52,7 +51,8 @@ pub(super) enum End {
 
 impl LearnerProcess {
     pub fn new(run: PlannedRun, state: State, study: &Path) -> Self {
-        Self { dir: study.join(&run.name), from: state.step(run.experiment.total_steps()), run }
+        let (dir, steps) = (study.join(&run.name), run.experiment.total_steps());
+        Self { run, dir, from: state.step(steps) }
     }
 
     /// Runs the learner to its end, or stops it. The system ends the learner with the calling
@@ -60,11 +60,11 @@ impl LearnerProcess {
     /// nor Ctrl-C.
     pub async fn run(self, options: LearnerOptions, stop: CancellationToken) -> (Self, End, Pace) {
         let begun = Pace { step: self.from, ..Pace::default() };
-        let (end, pace) = match self.supervise(options, stop).await {
-            Ok(Some(ended)) => ended,
-            Ok(None) => (End::Unfinished, begun),
-            Err(error) => (End::Failed(format!("{error:#}")), begun),
-        };
+        let ended = self.supervise(options, stop).await.unwrap_or_else(|error| {
+            let reason = format!("{error:#}");
+            Some((End::Failed(reason), begun))
+        });
+        let (end, pace) = ended.unwrap_or((End::Unfinished, begun));
         (self, end, pace)
     }
 
@@ -76,7 +76,8 @@ impl LearnerProcess {
     ) -> anyhow::Result<Option<(End, Pace)>> {
         let this = self.clone();
         let prepared = spawn_blocking(move || this.prepare(&options));
-        let Some(prepared) = stop.run_until_cancelled(prepared).await else { return Ok(None) };
+        let prepared = stop.run_until_cancelled(prepared).await;
+        let Some(prepared) = prepared else { return Ok(None) };
         let mut command = prepared??;
         let mut learner = Process::start(&mut command)
             .with_context(|| format!("{}: cannot start a learner", self.run.name))?;
@@ -93,21 +94,19 @@ impl LearnerProcess {
         }
     }
 
-    /// Makes the run's folder and the learner's command.
     fn prepare(&self, options: &LearnerOptions) -> anyhow::Result<Command> {
         let Self { run, dir, .. } = self;
-        let LearnerOptions { threads, endpoint, http } = options;
         let mut command = Command::new(std::env::current_exe()?);
-        command.args(["train", "--preset", &run.preset, "--connect", endpoint, "--run-dir"]);
-        command.arg(dir);
-        if let Some(address) = http {
+        command.args(["train", "--preset", &run.preset, "--run-dir"]);
+        command.arg(dir).args(["--connect", &options.endpoint]);
+        if let Some(address) = options.http {
             command.args(["--http", &address.to_string()]);
         }
         for (key, value) in tables::keys(&run.changes) {
             command.args(["--set", &format!("{key}={value}")]);
         }
-        command.env("RAYON_NUM_THREADS", threads.to_string());
-        hide_certificates(&mut command, endpoint);
+        command.env("RAYON_NUM_THREADS", options.threads.to_string());
+        hide_certificates(&mut command, &options.endpoint);
         let folder = RunDir::at(dir);
         command.env(FAILURE_FILE, folder.failure_path());
         fs::create_dir_all(dir)
@@ -138,45 +137,11 @@ impl LearnerProcess {
             dir.mark_failed(&reason).ok();
             reason
         });
-        End::Failed(format!("{}: {reason} ({})", self.run.name, log(&self.dir).display()))
+        let (name, log) = (&self.run.name, log(&self.dir));
+        End::Failed(format!("{name}: {reason} ({})", log.display()))
     }
 }
 
 fn log(dir: &Path) -> PathBuf {
     dir.join("learner.log")
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-mod tests {
-    use std::os::unix::process::ExitStatusExt;
-
-    use super::*;
-    use crate::sweep::Study;
-
-    #[test]
-    fn the_reason_of_a_failure() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("mine.toml");
-        let text = "about = 'x'\nrun = { task = 'hopper-demo', dataset = 'x.hdf5' }\naxes = { seed = [0] }";
-        fs::write(&file, text).unwrap();
-        let run = Study::read(&file, &[], &[]).unwrap().runs.remove(0);
-        let learner = LearnerProcess::new(run, State::NotBegun, folder.path());
-        fs::create_dir_all(&learner.dir).unwrap();
-        let killed = || Ok(ExitStatus::from_raw(9));
-        for (failure, reason) in [
-            (None, "the learner ended by signal: 9 (SIGKILL)"),
-            (Some("a loose cable"), "a loose cable"),
-        ] {
-            let dir = RunDir::at(&learner.dir);
-            dir.clear_failure().unwrap();
-            if let Some(failure) = failure {
-                dir.mark_failed(failure).unwrap();
-            }
-            let End::Failed(said) = learner.conclude(killed(), false) else { panic!("{reason}") };
-            assert!(said.starts_with(&format!("seed0: {reason}")), "{said}");
-            assert_eq!(dir.failure().as_deref(), Some(reason));
-        }
-        assert!(matches!(learner.conclude(killed(), true), End::Unfinished), "it was stopped");
-    }
 }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
 use std::pin::pin;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use indicatif::HumanDuration;
 use quad_run::status::{Pace, State};
@@ -19,7 +19,6 @@ use super::study::PlannedRun;
 use crate::local_evaluators::LocalEvaluators;
 
 pub(crate) struct Sweep {
-    /// Folder of the study.
     pub folder: PathBuf,
     pub waiting: VecDeque<(PlannedRun, State)>,
     /// Runs at a time.
@@ -36,16 +35,15 @@ pub(crate) struct Sweep {
 pub(crate) struct Outcome {
     /// Number of runs that the same command continues.
     pub unfinished: usize,
-    /// The reason of each failed run.
     pub failed: Vec<String>,
 }
 
+#[derive(Default)]
 struct Progress {
     /// Learners and their last known progress, by the run's index.
     running: BTreeMap<usize, (LearnerProcess, Pace)>,
     complete: usize,
     failed: Vec<String>,
-    begin: Instant,
     /// Estimated seconds of the work that learners have done that have ended.
     done: f64,
 }
@@ -59,13 +57,7 @@ impl Sweep {
         let (count, display) = (self.waiting.len(), Display::new());
         let mut ticker = time::interval(display.interval());
         ticker.tick().await; // The first tick is immediate.
-        let mut progress = Progress {
-            running: BTreeMap::new(),
-            complete: 0,
-            failed: Vec::new(),
-            begin: Instant::now(),
-            done: 0.0,
-        };
+        let (mut progress, begin) = (Progress::default(), Instant::now());
         let (mut learners, mut reading) = (JoinSet::new(), JoinSet::new());
         loop {
             while learners.len() < self.jobs
@@ -82,7 +74,7 @@ impl Sweep {
             tokio::select! {
                 _ = ticker.tick() => match reading.is_empty() {
                     true => drop(reading.spawn_blocking(read(&progress))),
-                    false => display.show(&self.lines(&progress)),
+                    false => display.show(&self.lines(&progress, begin.elapsed())),
                 },
                 Some(line) = self.lines.recv() => display.print(&line),
                 Some(Ok((learner, end, pace))) = learners.join_next() => {
@@ -92,7 +84,7 @@ impl Sweep {
                     for (index, pace) in paces {
                         progress.running.entry(index).and_modify(|(_, known)| *known = pace);
                     }
-                    display.show(&self.lines(&progress));
+                    display.show(&self.lines(&progress, begin.elapsed()));
                 }
                 () = &mut shutdown, if !stop.is_cancelled() => {
                     display.print("stopping; the runs at work save their checkpoints");
@@ -132,8 +124,7 @@ impl Sweep {
         }
     }
 
-    /// A line for each running learner, and a total.
-    fn lines(&self, progress: &Progress) -> Vec<String> {
+    fn lines(&self, progress: &Progress, elapsed: Duration) -> Vec<String> {
         let Progress { running, complete, failed, .. } = progress;
         let (mut lines, mut done, mut left) = (Vec::new(), progress.done, 0.0);
         for (LearnerProcess { run, from, .. }, pace) in running.values() {
@@ -152,7 +143,7 @@ impl Sweep {
             total += &format!(", {} failed", failed.len());
         }
         if done > 0.0 {
-            let left = HumanDuration(progress.begin.elapsed().mul_f64(left / done));
+            let left = HumanDuration(elapsed.mul_f64(left / done));
             total += &format!(", {left} left");
         }
         lines.push(total);
@@ -161,13 +152,16 @@ impl Sweep {
 
     /// Estimated seconds from one step of a run to another.
     fn seconds(&self, run: &PlannedRun, from: u64, to: u64) -> f64 {
-        to.saturating_sub(from) as f64 * self.step_seconds.get(&run.index).copied().unwrap_or(1.0)
+        let each = self.step_seconds.get(&run.index).copied();
+        to.saturating_sub(from) as f64 * each.unwrap_or(1.0)
     }
 }
 
-/// Reads the progress of the running learners.
 fn read(progress: &Progress) -> impl FnOnce() -> Vec<(usize, Pace)> + use<> {
-    let dirs = progress.running.iter().map(|(index, (learner, _))| (*index, learner.dir.clone()));
-    let dirs = Vec::from_iter(dirs);
-    move || dirs.into_iter().map(|(index, dir)| (index, Pace::read(&dir))).collect()
+    let mut dirs = Vec::new();
+    for (index, (learner, _)) in &progress.running {
+        dirs.push((*index, learner.dir.clone()));
+    }
+    let read = |(index, dir): (usize, PathBuf)| (index, Pace::read(&dir));
+    move || dirs.into_iter().map(read).collect()
 }

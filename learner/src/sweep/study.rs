@@ -77,7 +77,8 @@ impl PlannedRun {
     /// The state of the run in a folder. Fails if that is a run with other settings.
     pub fn state(&self, dir: &Path) -> anyhow::Result<State> {
         if !RunDir::is_occupied(dir) {
-            return Ok(RunDir::at(dir).failure().map_or(State::NotBegun, |_| State::Failed(0)));
+            let failed = RunDir::at(dir).failure();
+            return Ok(failed.map_or(State::NotBegun, |_| State::Failed(0)));
         }
         let report = match RunReport::scored(dir) {
             Ok(report) => report,
@@ -111,14 +112,17 @@ impl Study {
             .with_context(|| format!("cannot read {}", path.display()))
             .hint(HELP)?;
         let unusable = format!("{} cannot be used", path.display());
-        let file: File = toml::from_str(&text).with_context(|| unusable.clone()).hint(HELP)?;
+        let file = toml::from_str(&text).with_context(|| unusable.clone());
+        let file: File = file.hint(HELP)?;
         let runs = file.runs(only, set).map_err(|(problems, hints)| {
             let mut hints = Vec::from_iter(hints);
             hints.push(HELP.to_owned());
-            hinted(anyhow!("{unusable}:\n  {}", problems.join("\n  ")), hints.join("; "))
+            let error = anyhow!("{unusable}:\n  {}", problems.join("\n  "));
+            hinted(error, hints.join("; "))
         })?;
-        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(Self { name, about: file.about, runs })
+        let name = path.file_stem().unwrap_or_default();
+        let (name, about) = (name.to_string_lossy().into_owned(), file.about);
+        Ok(Self { name, about, runs })
     }
 }
 
@@ -197,7 +201,8 @@ impl File {
         let dataset = experiment.dataset.as_deref().context("it names no dataset");
         let source = Source::parse(dataset.hint("add to [run] a line dataset = \"FILE\"")?)?;
         source.check_environment(&experiment.environment)?;
-        Ok(PlannedRun { index, name, preset: preset.clone(), changes, experiment, source })
+        let preset = preset.clone();
+        Ok(PlannedRun { index, name, preset, changes, experiment, source })
     }
 
     /// Changes of a combination. Later tables override earlier ones: [run], method, command line,
@@ -236,7 +241,6 @@ impl File {
     }
 }
 
-/// Sets a dotted key.
 fn set(table: &mut Table, key: &str, value: &Value) {
     let below = |inner, part: &str| Value::Table(Table::from_iter([(part.to_owned(), inner)]));
     if let Value::Table(change) = key.rsplit('.').fold(value.clone(), below) {
@@ -250,15 +254,20 @@ fn sentence(error: &anyhow::Error) -> String {
     for cause in error.chain() {
         let text = cause.to_string().trim().replace('\n', " ");
         if !sentence.contains(&text) {
-            sentence = if sentence.is_empty() { text } else { sentence + ": " + &text };
+            sentence += if sentence.is_empty() { "" } else { ": " };
+            sentence += &text;
         }
     }
     sentence
 }
 
 fn some_of(names: &[String]) -> String {
-    let first = names.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
-    if names.len() > 3 { format!("{first} and {} others", names.len() - 3) } else { first }
+    let others = names.len().saturating_sub(3);
+    let first = names[..names.len() - others].join(", ");
+    match others {
+        0 => first,
+        _ => format!("{first} and {others} others"),
+    }
 }
 
 #[cfg(test)]

@@ -11,8 +11,6 @@ use serde_json::{Value, json};
 
 use crate::{learner, printed, write_dataset};
 
-const STEPS: [u64; 2] = [5, 10];
-
 /// A run with two snapshots and without scores; gives the hash of both.
 fn train(folder: &Path) -> (RunDir, String) {
     let [data, run] = ["data.hdf5", "run"].map(|name| folder.join(name));
@@ -37,8 +35,8 @@ fn score(run: &RunDir, episodes: &[(u64, u64, f64, &str)]) {
                           "precision": "f32-avx512", "evaluator": "e"});
         format!("{line}\n")
     };
-    fs::write(run.path().join("scores.jsonl"), episodes.iter().map(line).collect::<String>())
-        .unwrap();
+    let lines = String::from_iter(episodes.iter().map(line));
+    fs::write(run.path().join("scores.jsonl"), lines).unwrap();
 }
 
 fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
@@ -81,12 +79,13 @@ fn a_file_has_the_score_and_judgment_of_its_own_step_and_weights() {
     let (run, weights) = train(folder.path());
     let episode = |step, seed| (step, seed, if step == 5 { 30.0 } else { 20.0 }, &*weights);
     score(&run, &[episode(5, 0), episode(5, 1), episode(10, 0), episode(10, 1)]);
-    STEPS.iter().for_each(|step| judge(&run, *step, *step as f64, &weights));
+    [5, 10].iter().for_each(|step| judge(&run, *step, *step as f64, &weights));
     for (asked, step, expected) in
         [("5", 5, 30.0), ("10", 10, 20.0), ("last", 10, 20.0), ("best", 5, 30.0)]
     {
         let (score, judgment, said) = export(&run, asked);
-        assert_eq!((&score["step"], &score["score"]["mean"]), (&json!(step), &json!(expected)));
+        assert_eq!(score["step"], step);
+        assert_eq!(score["score"]["mean"], expected);
         assert_eq!(score["complete"], true);
         assert_eq!(judgment["distance"], step as f64);
         assert!(!said.contains("WARN"), "{said}");
@@ -95,9 +94,13 @@ fn a_file_has_the_score_and_judgment_of_its_own_step_and_weights() {
     score(&run, &[episode(5, 0), episode(10, 0), (10, 1, 20.0, "00")]);
     judge(&run, 10, 1.0, "00");
     let (part, judgment, said) = export(&run, "5");
-    assert_eq!((&part["episodes"], &part["complete"]), (&json!(1), &json!(false)));
-    assert!(said.contains("the score is of 1 of 2 episodes") && !judgment.is_null(), "{said}");
-    let (none, judgment, said) = export(&run, "10");
-    assert!(none.is_null() && judgment.is_null(), "of other weights: {none} {judgment}");
+    assert_eq!(part["episodes"], 1);
+    assert_eq!(part["complete"], false);
+    assert!(said.contains("the score is of 1 of 2 episodes"), "{said}");
+    assert_ne!(judgment, Value::Null);
+    let of_other_weights = export(&run, "10");
+    assert_eq!(of_other_weights.0, Value::Null);
+    assert_eq!(of_other_weights.1, Value::Null);
+    let said = of_other_weights.2;
     assert!(said.contains("that of step 10 is of other weights"), "{said}");
 }

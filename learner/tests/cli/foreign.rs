@@ -1,13 +1,12 @@
-//! Run folders that another user made.
+//! Run folders that another user made: no command waits for a pipe or commands a terminal. What else
+//! they cannot do is in foreign.trycmd.
 
 use std::fs;
 use std::os::unix::fs::symlink;
 use std::process::{Command, Output};
 
-use serde_json::{Value, json};
-
+use crate::learner;
 use crate::run::Run;
-use crate::{learner, printed};
 
 /// Runs a command for at most ten minutes, and in memory that is a thousandth of what a list of a
 /// trillion evaluations would take.
@@ -16,55 +15,6 @@ fn bounded(words: &str) -> Output {
     let mut command = Command::new("sh");
     command.args(["-c", script, env!("CARGO_BIN_EXE_learner")]);
     command.args(words.split_whitespace()).output().unwrap()
-}
-
-#[test]
-fn a_report_contains_films_and_no_other_files() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = |name: &str| folder.path().join(name);
-    let secret = "a secret of the report's reader";
-    let film = [b"GIF89a", secret.as_bytes()].concat();
-    fs::write(path("secret.gif"), &film).unwrap();
-    for (run, film, is_shown) in [
-        ("link", None, false),
-        ("text", Some(secret.as_bytes()), false),
-        ("film", Some(&film[..]), true),
-    ] {
-        Run::new("hopper-demo", 0).write(path(run));
-        match film {
-            Some(bytes) => fs::write(path(run).join("film.gif"), bytes).unwrap(),
-            None => symlink(path("secret.gif"), path(run).join("film.gif")).unwrap(),
-        }
-        let page = path("page.html");
-        let output = learner(&format!("report {} --html {}", path(run).display(), page.display()));
-        let page = fs::read_to_string(page).unwrap();
-        assert_eq!(page.contains("data:image/gif"), is_shown, "{run}");
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(said.contains("film.gif is not in the report"), !is_shown, "{said}");
-    }
-}
-
-#[test]
-fn a_runs_name_leads_to_no_other_folder() {
-    let folder = tempfile::tempdir().unwrap();
-    let [run, figures, outside] =
-        ["run", "figures", "outside"].map(|name| folder.path().join(name));
-    for path in [&figures.join("curve-.."), &outside] {
-        fs::create_dir_all(path).unwrap();
-    }
-    let mut named = Run::new("hopper-demo", 0).set("run.preset", "../../outside/x");
-    named.score(1000, 0, 5.0, "00");
-    named.write(&run);
-    printed(&format!("report {} --figures {}", run.display(), figures.display()));
-    assert_eq!(fs::read_dir(&outside).unwrap().count(), 0);
-    assert!(figures.join("curve-..-..-outside-x.svg").exists());
-
-    for name in ["../../outside/evil", "..", ""] {
-        Run::new("hopper-demo", 0).set("run.name", name).write(&run);
-        let refused = learner(&format!("report {}", run.display()));
-        let said = String::from_utf8(refused.stderr).unwrap();
-        assert!(!refused.status.success() && said.contains("config.toml, line "), "{name}: {said}");
-    }
 }
 
 #[test]
@@ -99,40 +49,6 @@ fn pipes_and_devices_in_a_run_block_no_command() {
             }
         }
     }
-}
-
-#[test]
-fn a_run_that_plans_more_evaluations_than_fit_into_memory_is_read() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut run = Run::new("hopper-demo", 0).sizes(1_000_000_000_000_000, 1, 1000);
-    (0..1000).for_each(|seed| run.score(1, seed, 5.0, "00"));
-    run.write(folder.path());
-    let look = |command: &str| {
-        let output = bounded(&format!("{command} {}", folder.path().display()));
-        String::from_utf8(output.stdout).unwrap()
-    };
-    let report: Value = serde_json::from_str(&look("report --json")).unwrap();
-    assert_eq!(report["runs"][0]["episodes_missing"], json!(999_999_999_999_999_000i64));
-    assert!(look("report").contains("1 of 1000000000000000 evaluations are complete"));
-    assert!(look("list").contains("5.0 @1"));
-    assert!(look("verify").contains("without a score (1000000000000000000): step 1, seed "));
-}
-
-#[test]
-fn no_link_beside_a_report_is_written_through() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = |name: &str| folder.path().join(name);
-    fs::write(path("precious"), "precious").unwrap();
-    let mut run = Run::new("hopper-demo", 0);
-    run.score(1000, 0, 5.0, "00");
-    run.write(path("run"));
-    for name in ["page.html", "curve-hopper-demo.svg", "curve-hopper-demo.png"] {
-        symlink(path("precious"), path(&format!("{name}.partial"))).unwrap();
-    }
-    let dir = folder.path().display();
-    printed(&format!("report {dir}/run --html {dir}/page.html --figures {dir}"));
-    assert!(path("curve-hopper-demo.svg").exists());
-    assert_eq!(fs::read_to_string(path("precious")).unwrap(), "precious");
 }
 
 /// A terminal takes them for commands.

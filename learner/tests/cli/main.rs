@@ -5,7 +5,6 @@ mod export;
 mod foreign;
 #[path = "../../../tests/fixtures/hopper.rs"]
 mod hopper;
-mod presets;
 mod report;
 mod run;
 mod transcripts;
@@ -20,7 +19,8 @@ fn learner(words: &str) -> Output {
 
 fn printed(words: &str) -> String {
     let output = learner(words);
-    assert!(output.status.success(), "{words}: {}", String::from_utf8_lossy(&output.stderr));
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{words}: {said}");
     String::from_utf8(output.stdout).unwrap()
 }
 

@@ -29,8 +29,8 @@ impl Run {
 
     /// Makes a run by another algorithm.
     pub fn by(algorithm: &str, task: &str, seed: u64) -> Self {
-        let mut experiment: Table =
-            printed(&format!("presets {task} --algorithm {algorithm}")).parse().unwrap();
+        let preset = printed(&format!("presets {task} --algorithm {algorithm}"));
+        let mut experiment: Table = preset.parse().unwrap();
         experiment.insert("seed".into(), (seed as i64).into());
         let run = toml::toml! { name = "r" incarnation = 1 version = "0" };
         let dataset = toml::toml! {
@@ -42,21 +42,21 @@ impl Run {
             max_return = 30.0
             mean_score = 10.7
         };
-        let mut config = toml::toml! { run = {} };
-        config.extend(
-            [("run", run), ("dataset", dataset), ("experiment", experiment)]
-                .map(|(k, t)| (k.into(), t.into())),
-        );
-        config["run"].as_table_mut().unwrap().insert("preset".into(), task.into());
-        Self { config, scores: Vec::new() }
+        let mut config = Table::new();
+        for (name, table) in [("run", run), ("dataset", dataset), ("experiment", experiment)] {
+            config.insert(name.to_owned(), table.into());
+        }
+        let scores = Vec::new();
+        Self { config, scores }.set("run.preset", task)
     }
 
     /// Changes a value by its dotted key.
     pub fn set(mut self, key: &str, value: impl Into<toml::Value>) -> Self {
         let (tables, key) = key.rsplit_once('.').unwrap();
-        let table = tables
-            .split('.')
-            .fold(&mut self.config, |table, key| table[key].as_table_mut().unwrap());
+        let mut table = &mut self.config;
+        for key in tables.split('.') {
+            table = table[key].as_table_mut().unwrap();
+        }
         table.insert(key.to_owned(), value.into());
         self
     }
@@ -79,6 +79,14 @@ impl Run {
             "precision": "f32-avx512",
             "evaluator": "e",
         }));
+    }
+
+    /// As of a robot without reference returns.
+    pub fn scores_are_returns(mut self) -> Self {
+        for line in &mut self.scores {
+            line["return"] = line["score"].clone();
+        }
+        self
     }
 
     pub fn write(&self, path: impl AsRef<Path>) {
@@ -126,9 +134,8 @@ pub fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
 pub fn complete(run: Run, score: f64) -> Run {
     let mut run = run.sizes(5000, 1000, 2);
     for step in 1..=5 {
-        for episode in 0..2 {
-            run.score(1000 * step, episode, score + 2.0 * (step as f64 - 3.0), "00");
-        }
+        let score = score + 2.0 * (step as f64 - 3.0);
+        (0..2).for_each(|episode| run.score(1000 * step, episode, score, "00"));
     }
     run
 }

@@ -3,13 +3,14 @@
 
 use std::env;
 use std::fs::{self, File};
+use std::os::unix::fs::symlink;
 use std::path::Path;
 
 use quad_protocol::{Episode, EpisodeScore, Hash, Name, Record, episode_seeds};
 use quad_run::folder::RunDir;
 use serde_json::{Value, json};
 
-use crate::run::{HOPPER, Run, paper, small, write_all, write_study};
+use crate::run::{HOPPER, Run, TASKS, complete, paper, small, write_all, write_study};
 use crate::write_dataset;
 
 /// A study of which some runs cannot begin.
@@ -40,10 +41,11 @@ fn commands_print_what_their_transcripts_have() {
     fs::write("study.toml", STUDY).unwrap();
     write_reported();
     write_published();
-    write_study("study");
+    write_studies();
     let _at_work = write_listed();
     write_verified();
     write_practiced();
+    write_foreign();
     trycmd::TestCases::new()
         .register_bin("learner", Path::new(env!("CARGO_BIN_EXE_learner")))
         .register_bin("sh", Path::new("/bin/sh"))
@@ -75,10 +77,10 @@ fn write_reported() {
     (0..2).for_each(|episode| best.score(7000, episode, 10.0, "00"));
     best.write("report/best");
     let mut robot = small(0, 0.0).set("experiment.environment", "my-robot");
-    robot.config["dataset"].as_table_mut().unwrap().remove("mean_score");
+    let dataset = robot.config["dataset"].as_table_mut();
+    dataset.unwrap().remove("mean_score");
     robot.write("report/robot");
-    robot.scores.iter_mut().for_each(|line| line["return"] = line["score"].clone());
-    robot.write("report/returns");
+    robot.scores_are_returns().write("report/returns");
     small(0, 0.0).write("report/unlike/first");
     let unlike = |key: &str, value: toml::Value| {
         small(1, 0.0).set(key, value).write(format!("report/unlike/{key}"));
@@ -133,6 +135,52 @@ fn write_published() {
     Run::by("td3-bc", "hopper-medium-v2", 0).write("others/td3-bc");
     write_all("before/a", paper(HOPPER, 400_000, |_| 30.0));
     write_all("before/b", complete());
+}
+
+/// The studies of study.trycmd.
+fn write_studies() {
+    write_study("study");
+    // Task, environment and τ of each run; the τ of hopper-demo is 0.1.
+    let (own, walker) = ((TASKS[0], "hopper", 0.1), (TASKS[1], "walker2d", 0.5));
+    for (name, runs) in [
+        ("half-done", vec![own, walker]),
+        ("two-values", vec![own, (TASKS[0], "hopper", 0.5), walker]),
+        ("unknown", vec![("mine-a", "hopper", 0.1), ("mine-b", "walker2d", 0.5)]),
+        ("unknown-and-known", vec![own, ("mine", "walker2d", 0.5)]),
+        ("unknown-and-alike", vec![("mine-a", "hopper", 0.5), ("mine-b", "walker2d", 0.5)]),
+    ] {
+        let run = |(task, environment, tau): (&str, &str, f64)| {
+            let run = Run::new("hopper-demo", 0)
+                .set("run.preset", task)
+                .set("experiment.environment", environment)
+                .set("dataset.mean_return", if environment == "hopper" { 20.0 } else { tau })
+                .set("experiment.agent.tau", tau);
+            complete(run, 40.0)
+        };
+        write_all(format!("named/{name}"), runs.into_iter().map(run));
+    }
+    let guided =
+        |run: Run, guidance, score| complete(run.set("experiment.agent.guidance", guidance), score);
+    let pairs = [("quad", 0, 10.0), ("quad", 1, 20.0), ("quad", 2, 30.0)].into_iter().chain([
+        ("dac", 2, 31.0),
+        ("dac", 1, 22.0),
+        ("dac", 3, 5.0),
+    ]);
+    write_all(
+        "pairs",
+        pairs.map(|(guidance, seed, score)| guided(Run::new(TASKS[0], seed), guidance, score)),
+    );
+    let robot = Run::new(TASKS[0], 0)
+        .set("experiment.environment", "my-robot")
+        .set("run.preset", "my-robot");
+    write_all(
+        "robots",
+        [
+            guided(Run::new(TASKS[0], 0), "quad", 40.0),
+            guided(robot.clone(), "quad", 900.0),
+            guided(robot, "dac", 950.0),
+        ],
+    );
 }
 
 /// The runs of list.trycmd. The file is locked, as by a learner at work.
@@ -224,6 +272,30 @@ fn write_practiced() {
         log.append(&[Record { evaluator: name("e"), precision: name("f32-avx512"), episode }])
             .unwrap();
     }
+}
+
+/// The runs of foreign.trycmd.
+fn write_foreign() {
+    let scored = |task: &str| {
+        let mut run = Run::new("hopper-demo", 0).set("run.preset", task);
+        run.score(1000, 0, 5.0, "00");
+        run
+    };
+    scored("hopper-demo").write("foreign/linked");
+    scored("../../outside/x").write("foreign/named");
+    for (number, name) in ["../../outside/evil", "..", ""].into_iter().enumerate() {
+        scored("hopper-demo").set("run.name", name).write(format!("foreign/renamed/{number}"));
+    }
+    for run in ["link", "text", "film"] {
+        scored("hopper-demo").write(format!("foreign/{run}"));
+    }
+    fs::write("secret.gif", "GIF89a secret of the report's reader").unwrap();
+    fs::write("foreign/text/film.gif", "a secret").unwrap();
+    fs::copy("secret.gif", "foreign/film/film.gif").unwrap();
+    symlink("../../secret.gif", "foreign/link/film.gif").unwrap();
+    let mut huge = Run::new("hopper-demo", 0).sizes(1_000_000_000_000_000, 1, 1000);
+    (0..1000).for_each(|seed| huge.score(1, seed, 5.0, "00"));
+    huge.write("foreign/huge");
 }
 
 fn with(line: &Value, key: &str, value: Value) -> Value {

@@ -27,7 +27,7 @@ const EMBEDDING: usize = 16;
 pub struct NoiseLevels(Vec<f32>);
 
 impl NoiseLevels {
-    /// These noise levels.
+    /// Noise levels of a batch, one for each action.
     pub fn new(sigma: Vec<f32>) -> Self {
         Self(sigma)
     }
@@ -37,7 +37,8 @@ impl NoiseLevels {
         let below = |sigma: f64| 1.0 / (1.0 + (-(sigma / SIGMA_DATA).ln() / SPREAD).exp());
         let (least, most) = (below(SIGMA.0), below(SIGMA.1));
         let quantile = |p: f64| SIGMA_DATA * (p / (1.0 - p)).powf(SPREAD);
-        Self((0..count).map(|_| quantile(generator.random_range(least..most)) as f32).collect())
+        let mut draw = || quantile(generator.random_range(least..most)) as f32;
+        Self((0..count).map(|_| draw()).collect())
     }
 
     /// σ as a column, `[B, 1]`.
@@ -62,14 +63,14 @@ impl NoiseLevels {
 
     /// Sinusoids of c_noise = ln(σ)/4, `[B, 16]`.
     fn features(&self, device: &Device) -> Result<Tensor> {
-        let features: Vec<f32> =
-            self.0.iter().flat_map(|sigma| sinusoids(f64::from(*sigma).ln() / 4.0)).collect();
+        let features = |sigma: &f32| sinusoids(f64::from(*sigma).ln() / 4.0);
+        let features = self.0.iter().flat_map(features).collect();
         Tensor::from_vec(features, (self.0.len(), TIME_FEATURES), device)
     }
 
     fn column(&self, device: &Device, f: impl Fn(f64) -> f64) -> Result<Tensor> {
-        let numbers: Vec<f32> = self.0.iter().map(|sigma| f(f64::from(*sigma)) as f32).collect();
-        Tensor::from_vec(numbers, (self.0.len(), 1), device)
+        let numbers = self.0.iter().map(|sigma| f(f64::from(*sigma)) as f32);
+        Tensor::from_vec(numbers.collect(), (self.0.len(), 1), device)
     }
 }
 
@@ -86,17 +87,19 @@ pub struct DenoiserShape {
 
 impl DenoiserShape {
     fn time_layers(&self) -> Layers {
-        Layers::new(1, TIME_FEATURES, &self.layers.embedding(EMBEDDING_WIDTH), EMBEDDING, 0)
+        let hidden = self.layers.embedding(EMBEDDING_WIDTH);
+        Layers::new(1, (TIME_FEATURES, EMBEDDING), hidden, 0)
     }
 
     fn input_layers(&self) -> Layers {
-        let config = MlpConfig { initial: self.layers.initial, ..MlpConfig::default() };
         let inputs = self.observation_dim + self.action_dim + EMBEDDING;
-        Layers::new(1, inputs, &config, self.width(), self.time_layers().range().end)
+        let config = MlpConfig { hidden: Vec::new(), ..self.layers.clone() };
+        Layers::new(1, (inputs, self.width()), config, self.time_layers().range().end)
     }
 
     fn trunk_layers(&self) -> Layers {
-        Layers::new(1, self.width(), &self.layers, self.action_dim, self.input_layers().range().end)
+        let (sizes, start) = ((self.width(), self.action_dim), self.input_layers().range().end);
+        Layers::new(1, sizes, self.layers.clone(), start)
     }
 
     fn width(&self) -> usize {
@@ -130,13 +133,15 @@ impl Denoiser {
     pub fn new(shape: &DenoiserShape, weights: Weights) -> Self {
         let time = Mlp::new(shape.time_layers(), "time.");
         let input = Mlp::new(shape.input_layers(), "input.");
-        Self { time, input, trunk: Mlp::new(shape.trunk_layers(), "trunk."), weights }
+        let trunk = Mlp::new(shape.trunk_layers(), "trunk.");
+        Self { time, input, trunk, weights }
     }
 
     /// The same network with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
         let [time, input, trunk] = [&self.time, &self.input, &self.trunk].map(Mlp::clone);
-        Self { time, input, trunk, weights: self.weights.detach() }
+        let weights = self.weights.detach();
+        Self { time, input, trunk, weights }
     }
 
     /// D(a + σ·n; s, σ), the predicted clean actions within ±1 (Karras et al., Eq. 7):
@@ -149,21 +154,19 @@ impl Denoiser {
         levels: &NoiseLevels,
     ) -> Result<Tensor> {
         let device = noisy.device();
-        let embedding =
-            self.time.forward(&self.weights, &[&levels.features(device)?])?.squeeze(0)?;
+        let features = levels.features(device)?;
+        let embedding = self.time.forward(&self.weights, &[&features])?.squeeze(0)?;
         let scaled = noisy.broadcast_mul(&levels.input_scale(device)?)?;
+        let x = Tensor::cat(&[observations, &scaled, &embedding], 1)?;
         // The fast implementation has at least one hidden layer.
-        let x = self
-            .input
-            .plain_forward(&self.weights, &Tensor::cat(&[observations, &scaled, &embedding], 1)?)?;
-        let out = self.trunk.forward(&self.weights, &[&x.squeeze(0)?])?.squeeze(0)?;
+        let x = self.input.plain_forward(&self.weights, &x)?.squeeze(0)?;
+        let out = self.trunk.forward(&self.weights, &[&x])?.squeeze(0)?;
         let skipped = noisy.broadcast_mul(&levels.skip_scale(device)?)?;
         (out.broadcast_mul(&levels.output_scale(device)?)? + skipped)?.clamp(-1f32, 1f32)
     }
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use crate::gradients::gradient::Gradients;
@@ -195,10 +198,8 @@ mod tests {
             let levels = NoiseLevels::new(vec![sigma as f32]);
             let number =
                 |x: Tensor| Result::Ok(f64::from(x.flatten_all()?.get(0)?.to_scalar::<f32>()?));
-            let (skip, out) = (
-                number(levels.skip_scale(&Device::Cpu)?)?,
-                number(levels.output_scale(&Device::Cpu)?)?,
-            );
+            let skip = number(levels.skip_scale(&Device::Cpu)?)?;
+            let out = number(levels.output_scale(&Device::Cpu)?)?;
             let input = number(levels.input_scale(&Device::Cpu)?)?.powi(2) * (sigma.powi(2) + 0.25);
             let target = ((1.0 - skip).powi(2) * 0.25 + (skip * sigma).powi(2)) / out.powi(2);
             assert!((input - 1.0).abs() < 1e-5, "{sigma}: {input}");
@@ -210,8 +211,10 @@ mod tests {
     #[test]
     fn gradients_of_weights_and_actions_match_finite_differences() -> Result<()> {
         let generator = &mut ChaCha8Rng::seed_from_u64(2);
-        let layers = MlpConfig { initial: InitScheme::Torch, ..MlpConfig::mish(&[12, 9]) };
-        let shape = DenoiserShape { observation_dim: 3, action_dim: 2, layers };
+        let mut layers = MlpConfig::mish(&[12, 9]);
+        layers.initial = InitScheme::Torch;
+        let (observation_dim, action_dim) = (3, 2);
+        let shape = DenoiserShape { observation_dim, action_dim, layers };
         let denoiser = Denoiser::new(&shape, weights(shape.layout(), generator));
         let (s, levels) = (random((20, 3), 1), NoiseLevels::draw(20, generator));
         let a = Var::from_tensor(&(random((20, 2), 2) * 0.5)?)?;

@@ -44,10 +44,11 @@ impl NoisePredictor {
             features_tensor: OnceLock::new(),
             shape,
         };
-        Self { architecture: Arc::new(architecture), weights, packing: Packing::new(precision) }
+        let (architecture, packing) = (Arc::new(architecture), Packing::new(precision));
+        Self { architecture, weights, packing }
     }
 
-    /// The shape.
+    /// Sizes and hidden layers.
     pub fn shape(&self) -> &NoiseShape {
         &self.architecture.shape
     }
@@ -59,13 +60,13 @@ impl NoisePredictor {
 
     /// The sinusoids of all t, `[T, 16]`, on the weights' device.
     fn features(&self) -> Result<Tensor> {
-        let Architecture { features, features_tensor, .. } = &*self.architecture;
-        if let Some(tensor) = features_tensor.get() {
+        let made = &self.architecture.features_tensor;
+        if let Some(tensor) = made.get() {
             return Ok(tensor.clone());
         }
-        let device = self.weights.values().device();
+        let (features, device) = (&self.architecture.features, self.weights.values().device());
         let tensor = Tensor::from_slice(features, ((), TIME_FEATURES), device)?;
-        Ok(features_tensor.get_or_init(|| tensor).clone())
+        Ok(made.get_or_init(|| tensor).clone())
     }
 
     /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`.
@@ -73,15 +74,16 @@ impl NoisePredictor {
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
         let Architecture { time, trunk, .. } = &*self.architecture;
         let embedding = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
-        let embedding =
-            embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
+        let rows = (t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?;
+        let embedding = embedding.index_select(&rows, 0)?;
         trunk.forward(&self.weights, &[observations, actions, &embedding])?.squeeze(0)
     }
 
     /// The same network with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
         let (architecture, weights) = (self.architecture.clone(), self.weights.detach());
-        Self { architecture, weights, packing: Packing::new(self.packing.precision) }
+        let packing = Packing::new(self.packing.precision);
+        Self { architecture, weights, packing }
     }
 
     /// Draws actions `[rows, a]` by the reverse process (DDPM), without gradients.
@@ -118,9 +120,9 @@ impl NoisePredictor {
         let mut actions = noise.get(0)?;
         for t in (1..=steps).rev() {
             let embedding = embeddings.get(t - 1)?.broadcast_left(rows)?.contiguous()?;
-            let epsilon =
-                trunk.forward(&self.weights, &[&observations, &actions, &embedding])?.squeeze(0)?;
-            let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
+            let inputs = [&observations, &actions, &embedding];
+            let epsilon = trunk.forward(&self.weights, &inputs)?.squeeze(0)?;
+            let z = (t > 1).then(|| noise.get(steps - t + 1)).transpose()?;
             actions = self.schedule().constant_reverse(t, &actions, &epsilon, z.as_ref())?;
         }
         Ok(actions)
@@ -135,24 +137,20 @@ impl NoisePredictor {
         for t in (1..=steps).rev() {
             let all = Tensor::full(t as u32, rows, noise.device())?;
             let epsilon = self.predict(&observations, &actions, &all)?;
-            let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
+            let z = (t > 1).then(|| noise.get(steps - t + 1)).transpose()?;
             actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
         }
         Ok(actions)
     }
 
     fn check_noise(&self, observations: &Tensor, noise: &Tensor) -> Result<()> {
-        let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } =
-            self.architecture.shape;
+        let shape = &self.architecture.shape;
         let ((states, o), (steps, rows, a)) = (observations.dims2()?, noise.dims3()?);
-        let fits = states > 0
-            && rows > 0
-            && rows.is_multiple_of(states)
-            && (o, a) == (observation_dim, action_dim);
-        if !fits || steps != diffusion_steps {
+        let is_whole = states > 0 && rows > 0 && rows.is_multiple_of(states);
+        let wanted = (shape.observation_dim, shape.action_dim, shape.diffusion_steps);
+        if !is_whole || (o, a, steps) != wanted {
             bail!(
-                "a noise predictor of {:?} got {states} × {o} and noise {steps} × {rows} × {a}",
-                self.architecture.shape
+                "a noise predictor of {shape:?} got {states} × {o} and noise {steps} × {rows} × {a}"
             );
         }
         Ok(())

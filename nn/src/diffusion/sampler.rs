@@ -4,10 +4,11 @@
 use crate::diffusion::schedule::Schedule;
 use crate::layers::flat::TILE;
 use crate::layers::mlp::{Kernels, Mlp, of_member};
-use crate::layers::network::{Input, Network, rows_of};
+use crate::layers::network::{Network, rows_of};
 use crate::layers::workspace::with_workspace;
 use crate::shape::{NoiseShape, TIME_EMBEDDING};
 use candle_core::Tensor;
+use quad_kernels::narrow::FirstLayer;
 use quad_kernels::product::product;
 use rayon::prelude::*;
 use std::sync::OnceLock;
@@ -30,14 +31,15 @@ impl Architecture {
     /// The embedding's part of the trunk's first pre-activation plus bias, for t = 1..T: `T ×
     /// width`.
     fn shifts(&self, weights: &[f32]) -> Vec<f32> {
-        let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } = self.shape;
-        let mut embedding = vec![0.0; diffusion_steps * TIME_EMBEDDING];
+        let (network, shape) = (self.trunk.network(weights, 0), &self.shape);
+        let mut embedding = vec![0.0; shape.diffusion_steps * TIME_EMBEDDING];
         self.time.run(weights, None, &self.features, &mut embedding);
-        let network = self.trunk.network(weights, 0);
-        let mut shifts = vec![0.0; diffusion_steps * network.width()];
-        let kernel = network.first_kernel(observation_dim + action_dim, TIME_EMBEDDING);
-        product(&embedding, kernel, &mut shifts, TIME_EMBEDDING, network.width());
-        for row in shifts.chunks_exact_mut(network.width()) {
+        let width = network.width();
+        let mut shifts = vec![0.0; shape.diffusion_steps * width];
+        let before = shape.observation_dim + shape.action_dim;
+        let kernel = network.first_kernel(before, TIME_EMBEDDING);
+        product(&embedding, kernel, &mut shifts, TIME_EMBEDDING, width);
+        for row in shifts.chunks_exact_mut(width) {
             row.iter_mut().zip(network.bias(0)).for_each(|(x, b)| *x += b);
         }
         shifts
@@ -51,11 +53,12 @@ impl Architecture {
         (observations, states): (&[f32], usize),
         noise: &[f32],
     ) -> Vec<f32> {
-        let NoiseShape { observation_dim, action_dim: a, diffusion_steps: steps, .. } = self.shape;
+        let (o, a) = (self.shape.observation_dim, self.shape.action_dim);
+        let steps = self.shape.diffusion_steps;
         let packed = of_member(packed, 0);
         let network = Network { packed, ..self.trunk.network(weights, 0) };
         let (shifts, width) = (self.shifts(weights), network.width());
-        let kernel = network.first_kernel(observation_dim, a);
+        let kernel = network.first_kernel(o, a);
         let all = noise.len() / steps;
         let (rows, repeat) = (all / a, all / a / states);
         // A small batch is cut finer, so that every thread works.
@@ -64,19 +67,16 @@ impl Architecture {
         let tile = states * repeat * a;
         let mut actions = vec![0.0; all];
         actions.par_chunks_mut(tile).enumerate().for_each(|(i, actions)| {
-            let observations = rows_of(observations, i * states, states, observation_dim);
-            let len = observations.len() / observation_dim * width;
+            let observations = rows_of(observations, i * states, states, o);
+            let len = observations.len() / o * width;
             with_workspace(|work| {
                 work.with_base(len, actions.len(), |base, epsilon, work| {
-                    network.first_part(observations, observation_dim, base);
+                    network.first_part(observations, o, base);
                     actions.copy_from_slice(&noise[i * tile..][..actions.len()]);
                     for t in (1..=steps).rev() {
                         let shift = &shifts[(t - 1) * width..][..width];
-                        network.forward(
-                            Input { base, repeat, shift, actions, kernel },
-                            work,
-                            epsilon,
-                        );
+                        let first = FirstLayer { base, repeat, shift, actions, kernel };
+                        network.forward(first, work, epsilon);
                         let z = match t {
                             1 => &[],
                             _ => &noise[(steps - t + 1) * all + i * tile..][..actions.len()],

@@ -97,10 +97,10 @@ impl Schedule {
         clean: &Tensor,
         z: Option<&Tensor>,
     ) -> Result<Tensor> {
-        let Step { from_clean, from_noisy, noise, .. } = self.steps[t - 1];
-        let mean = ((clean * f64::from(from_clean))? + (x * f64::from(from_noisy))?)?;
+        let step = self.steps[t - 1];
+        let mean = ((clean * f64::from(step.from_clean))? + (x * f64::from(step.from_noisy))?)?;
         match z {
-            Some(z) if t > 1 => mean + (z * f64::from(noise))?,
+            Some(z) if t > 1 => mean + (z * f64::from(step.noise))?,
             _ => Ok(mean),
         }
     }
@@ -109,9 +109,8 @@ impl Schedule {
     /// is also the guidance weight w(t).
     pub fn noising(&self, t: &[u32], width: usize, device: &Device) -> Result<(Tensor, Tensor)> {
         let rows = |of: fn(&Step) -> f32| {
-            let numbers =
-                t.iter().flat_map(|t| std::iter::repeat_n(of(&self.steps[*t as usize - 1]), width));
-            Tensor::from_vec(numbers.collect(), (t.len(), width), device)
+            let row = |t: &u32| std::iter::repeat_n(of(&self.steps[*t as usize - 1]), width);
+            Tensor::from_vec(t.iter().flat_map(row).collect(), (t.len(), width), device)
         };
         Ok((rows(|step| step.signal)?, rows(|step| step.deviation)?))
     }
@@ -119,9 +118,12 @@ impl Schedule {
     /// x_0 = (x_t − √(1 − ᾱ_t)·ε)/√ᾱ_t for a predicted noise ε, clipped to ±1 unless samples are; all
     /// `[rows, a]`.
     pub fn clean(&self, t: usize, x: &Tensor, epsilon: &Tensor) -> Result<Tensor> {
-        let Step { signal, deviation, .. } = self.steps[t - 1];
-        let clean = ((x - (epsilon * f64::from(deviation))?)? * f64::from(1.0 / signal))?;
-        if self.reverse == Reverse::ClipSample { Ok(clean) } else { clean.clamp(-1f32, 1f32) }
+        let step = self.steps[t - 1];
+        let clean = ((x - (epsilon * f64::from(step.deviation))?)? * f64::from(1.0 / step.signal))?;
+        match self.reverse {
+            Reverse::ClipSample => Ok(clean),
+            Reverse::ClipClean | Reverse::Posterior => clean.clamp(-1f32, 1f32),
+        }
     }
 
     /// x_t → x_{t−1}: the posterior's mean, plus noise for t > 1. `epsilon` is the predicted noise,
@@ -134,7 +136,10 @@ impl Schedule {
         z: Option<&Tensor>,
     ) -> Result<Tensor> {
         let next = self.reverse_to_clean(t, x, &self.clean(t, x, epsilon)?, z)?;
-        if self.reverse == Reverse::ClipSample { next.clamp(-1f32, 1f32) } else { Ok(next) }
+        match self.reverse {
+            Reverse::ClipSample => next.clamp(-1f32, 1f32),
+            Reverse::ClipClean | Reverse::Posterior => Ok(next),
+        }
     }
 
     /// [`Self::reverse`] without gradients: one operation on a GPU.
@@ -199,13 +204,12 @@ impl Schedule {
 
     /// [`Self::reverse`] on slices; `z` is not read at t = 1.
     pub(crate) fn reverse_in_place(&self, t: usize, x: &mut [f32], epsilon: &[f32], z: &[f32]) {
-        let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
-        let scale = 1.0 / signal;
-        let (clean_bound, bound) = self.bounds();
+        let (step, (clean_bound, bound)) = (self.steps[t - 1], self.bounds());
+        let scale = 1.0 / step.signal;
         for (i, (x, epsilon)) in x.iter_mut().zip(epsilon).enumerate() {
-            let clean = ((*x - deviation * epsilon) * scale).clamp(-clean_bound, clean_bound);
-            let mean = from_clean * clean + from_noisy * *x;
-            let next = if t > 1 { mean + noise * z[i] } else { mean };
+            let clean = ((*x - step.deviation * epsilon) * scale).clamp(-clean_bound, clean_bound);
+            let mean = step.from_clean * clean + step.from_noisy * *x;
+            let next = if t > 1 { mean + step.noise * z[i] } else { mean };
             *x = next.clamp(-bound, bound);
         }
     }

@@ -1,11 +1,12 @@
 //! Memory into which fast implementations write the gradient of weights.
 
+use crate::pool::lock;
 use crate::slices::modify;
 use candle_core::{Result, Tensor, bail};
 use std::cell::Cell;
 use std::ops::Range;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
 
 /// Backward passes begun in this process; each gets the next number.
 static PASSES: AtomicU64 = AtomicU64::new(0);
@@ -45,7 +46,7 @@ impl GradientBuffer {
         if pass == 0 {
             bail!("the gradients of weights are taken by `Gradients::of`");
         }
-        let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut written = lock(&self.written);
         if written.0 != pass {
             *written = (pass, Vec::new());
         }
@@ -62,7 +63,7 @@ impl GradientBuffer {
 
     /// The gradient of this pass, 0 outside the written ranges; `None` if the pass wrote nothing.
     pub fn read(&self, pass: u64) -> Option<Tensor> {
-        let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut written = lock(&self.written);
         if written.0 != pass {
             return None;
         }

@@ -51,7 +51,7 @@ impl Pass {
             let (kernel, bias) = layers.views(&values, layer)?;
             let z = pass.out.matmul(&kernel)?;
             let last = layer + 1 == layers.count();
-            let f = (!last).then_some(layers.activation);
+            let f = (!last).then_some(layers.config.activation);
             let slope = differentiable && !last;
             let activated = z.apply_op2_no_bwd(&bias, &Activate { f, slope })?;
             let y = activated.get(0)?;

@@ -125,7 +125,6 @@ fn widths<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<usize>, D::E
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
 

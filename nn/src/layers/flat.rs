@@ -4,10 +4,9 @@
 //! contiguous: layer after layer the kernels of all members, then their biases, then scales and
 //! shifts of a norm.
 
-use crate::layers::config::{InitScheme, MlpConfig, NormEpsilon};
+use crate::layers::config::MlpConfig;
 use crate::weights::{Init, TensorSpec};
 use candle_core::{Result, Tensor};
-use quad_kernels::activation::Activation;
 use std::ops::Range;
 
 /// Rows of one task: weights and activations of a tile stay in a core's own cache.
@@ -18,12 +17,8 @@ pub(crate) const TILE: usize = 128;
 pub(crate) struct Layers {
     /// Number of networks, K.
     pub members: usize,
+    pub config: MlpConfig,
     widths: Vec<usize>,
-    pub norm: bool,
-    pub norm_after: bool,
-    pub norm_epsilon: NormEpsilon,
-    pub activation: Activation,
-    initial: InitScheme,
     /// Start of each layer, and the end of the last.
     offsets: Vec<usize>,
 }
@@ -42,17 +37,13 @@ impl Layers {
     /// Layers whose first kernel is at `start`.
     pub fn new(
         members: usize,
-        inputs: usize,
-        config: &MlpConfig,
-        outputs: usize,
+        (inputs, outputs): (usize, usize),
+        config: MlpConfig,
         start: usize,
     ) -> Self {
-        let widths: Vec<usize> =
-            [inputs].iter().chain(&config.hidden).chain(&[outputs]).copied().collect();
-        let MlpConfig { norm, norm_after, norm_epsilon, activation, initial, .. } = *config;
+        let widths = [&[inputs], &config.hidden[..], &[outputs]].concat();
         let offsets = vec![start];
-        let mut layers =
-            Self { members, widths, norm, norm_after, norm_epsilon, activation, initial, offsets };
+        let mut layers = Self { members, config, widths, offsets };
         for layer in 0..layers.count() {
             let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
             let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;
@@ -66,11 +57,11 @@ impl Layers {
     }
 
     fn is_normed(&self, layer: usize) -> bool {
-        self.norm && layer + 1 < self.count()
+        self.config.norm && layer + 1 < self.count()
     }
 
     pub fn epsilon(&self) -> f32 {
-        self.norm_epsilon.value() as f32
+        self.config.norm_epsilon.value() as f32
     }
 
     pub fn inputs(&self) -> usize {
@@ -79,11 +70,6 @@ impl Layers {
 
     pub fn outputs(&self) -> usize {
         self.widths[self.count()]
-    }
-
-    /// Widths of the hidden layers.
-    pub fn hidden(&self) -> &[usize] {
-        &self.widths[1..self.count()]
     }
 
     /// Range of the layers in the vector.
@@ -98,13 +84,11 @@ impl Layers {
 
     /// Kernels `[K, in, out]` and biases `[K, out]` of a layer, as views of the vector.
     pub fn views(&self, vector: &Tensor, layer: usize) -> Result<(Tensor, Tensor)> {
-        let ((inputs, outputs), start, members) =
-            (self.shape(layer), self.offsets[layer], self.members);
-        let kernels = vector
-            .narrow(0, start, members * inputs * outputs)?
-            .reshape((members, inputs, outputs))?;
-        let biases = vector.narrow(0, start + members * inputs * outputs, members * outputs)?;
-        Ok((kernels, biases.reshape((members, outputs))?))
+        let ((inputs, outputs), members) = (self.shape(layer), self.members);
+        let (start, count) = (self.offsets[layer], members * inputs * outputs);
+        let kernels = vector.narrow(0, start, count)?;
+        let biases = vector.narrow(0, start + count, members * outputs)?;
+        Ok((kernels.reshape((members, inputs, outputs))?, biases.reshape((members, outputs))?))
     }
 
     pub fn kernel<'a>(&self, weights: &'a [f32], layer: usize, member: usize) -> &'a [f32] {
@@ -126,8 +110,8 @@ impl Layers {
     ) -> Option<[&'a [f32]; 2]> {
         let (inputs, outputs) = self.shape(layer);
         let of = |kind| {
-            &weights[self.offsets[layer] + (self.members * (inputs + kind) + member) * outputs..]
-                [..outputs]
+            let before = (self.members * (inputs + kind) + member) * outputs;
+            &weights[self.offsets[layer] + before..][..outputs]
         };
         self.is_normed(layer).then(|| [of(1), of(2)])
     }
@@ -160,7 +144,8 @@ impl Layers {
         let mut specs = Vec::new();
         for layer in 0..self.count() {
             let (inputs, outputs) = self.shape(layer);
-            let (kernel, bias) = self.initial.layer(inputs, outputs, layer + 1 == self.count());
+            let (kernel, bias) =
+                self.config.initial.layer(inputs, outputs, layer + 1 == self.count());
             let mut push = |kind: &str, shape: &[usize], init| {
                 let members = leading.then_some(self.members);
                 let shape: Vec<usize> = members.into_iter().chain(shape.iter().copied()).collect();

@@ -7,7 +7,7 @@
 use crate::gradients::buffer::GradientBuffer;
 use crate::layers::composed::{Composed, Pass};
 use crate::layers::flat::{Layers, TILE};
-use crate::layers::network::{Input, Network, rows_of};
+use crate::layers::network::{Network, rows_of};
 use crate::layers::plain;
 use crate::layers::saved::SavedActivations;
 use crate::layers::workspace::with_workspace;
@@ -15,6 +15,7 @@ use crate::pool::{Pool, Pooled};
 use crate::slices::{has_fast_implementation, read_all, slice};
 use crate::weights::Weights;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use quad_kernels::narrow::FirstLayer;
 use quad_kernels::product::Packed;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -38,7 +39,8 @@ pub(crate) struct Mlp {
 
 impl Mlp {
     pub fn new(layers: Layers, prefix: &'static str) -> Self {
-        Self { layers: Arc::new(layers), prefix, saved: Arc::default() }
+        let (layers, saved) = (Arc::new(layers), Arc::default());
+        Self { layers, prefix, saved }
     }
 
     /// The outputs `[K, rows, out]` for `inputs [rows, …]`, which are concatenated.
@@ -56,26 +58,19 @@ impl Mlp {
         let x = if let [x] = inputs { (*x).clone() } else { Tensor::cat(inputs, 1)? };
         let (values, layers) = (weights.values(), &self.layers);
         if !matches!(*x.dims(), [rows, width] if rows > 0 && width == layers.inputs()) {
-            bail!(
-                "{} networks of {} numbers got inputs of shape {:?}",
-                layers.members,
-                layers.inputs(),
-                x.dims()
-            );
+            let (members, inputs) = (layers.members, layers.inputs());
+            bail!("{members} networks of {inputs} numbers got inputs of shape {:?}", x.dims());
         }
         if !self.is_fast(weights) {
-            return match layers.norm {
+            return match layers.config.norm {
                 true => self.plain_forward(weights, &x),
                 false => self.composed_forward(weights, &x),
             };
         }
         let buffer = if values.track_op() { weights.gradient_buffer().cloned() } else { None };
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
-        let constant = inputs
-            .iter()
-            .take_while(|input| !input.track_op())
-            .map(|input| input.dim(1))
-            .sum::<Result<_>>()?;
+        let constant = inputs.iter().take_while(|input| !input.track_op());
+        let constant = constant.map(|input| input.dim(1)).sum::<Result<_>>()?;
         let operation = Operation { mlp: self.clone(), buffer, saved, packed, constant };
         values.apply_op2(&x.contiguous()?, operation)
     }
@@ -114,9 +109,10 @@ impl Mlp {
                 with_workspace(|work| {
                     work.with_base(x.len() / inputs * network.width(), 0, |base, _, work| {
                         network.first_part(x, inputs, base);
-                        let shift = network.bias(0);
-                        let input = Input { base, repeat: 1, shift, actions: &[], kernel: &[] };
-                        network.forward(input, work, out);
+                        let (shift, none) = (network.bias(0), &[]);
+                        let first =
+                            FirstLayer { base, repeat: 1, shift, actions: none, kernel: none };
+                        network.forward(first, work, out);
                     });
                 });
             });

@@ -28,20 +28,6 @@ pub(crate) struct Network<'a> {
     pub packed: Option<&'a [Packed]>,
 }
 
-/// Inputs of a tile: `repeat` consecutive rows share a row of `base`.
-#[derive(Clone, Copy)]
-pub(crate) struct Input<'a> {
-    /// State part of the first pre-activation ([`Network::first_part`]).
-    pub base: &'a [f32],
-    pub repeat: usize,
-    /// Bias, and a time embedding's part, of each row.
-    pub shift: &'a [f32],
-    /// `rows × a`; a can be 0.
-    pub actions: &'a [f32],
-    /// The first kernel's rows for the actions, `a × width`.
-    pub kernel: &'a [f32],
-}
-
 impl<'a> Network<'a> {
     pub fn kernel(&self, layer: usize) -> &'a [f32] {
         self.layers.kernel(self.weights, layer, self.member)
@@ -106,8 +92,8 @@ impl<'a> Network<'a> {
         (1..self.last()).map(pack).collect()
     }
 
-    /// `out[rows × outputs]` of a tile.
-    pub fn forward(&self, input: Input<'_>, work: &mut Workspace, out: &mut [f32]) {
+    /// `out[rows × outputs]` of a tile, whose state part is from [`Self::first_part`].
+    pub fn forward(&self, input: FirstLayer<'_>, work: &mut Workspace, out: &mut [f32]) {
         let (outputs, width, last) = (self.layers.outputs(), self.width(), self.last());
         let action_dim = input.kernel.len() / width;
         let [x, y] = &mut work.pair;
@@ -121,18 +107,17 @@ impl<'a> Network<'a> {
         {
             let count = out.len() / outputs;
             let actions = &input.actions[i * rows * action_dim..][..count * action_dim];
-            let Input { repeat, shift, kernel, .. } = input;
-            let first = FirstLayer { base, repeat, shift, actions, kernel };
+            let first = FirstLayer { base, actions, ..input };
             let out_of_first = x.sized(count * width);
             match self.norm(0) {
-                Some([scale, shift]) if !self.layers.norm_after => {
+                Some([scale, shift]) if !self.layers.config.norm_after => {
                     first_layer(None, &first, out_of_first);
                     let saved = work.norm_scratch.sized(saved_len(count, width));
                     normalize(out_of_first, None, scale, self.layers.epsilon(), saved);
-                    activate(self.layers.activation, out_of_first, shift);
+                    activate(self.layers.config.activation, out_of_first, shift);
                 }
                 _ => {
-                    first_layer(Some(self.layers.activation), &first, out_of_first);
+                    first_layer(Some(self.layers.config.activation), &first, out_of_first);
                     self.normalize_after(0, out_of_first, || {
                         work.norm_scratch.sized(saved_len(count, width))
                     });
@@ -148,7 +133,7 @@ impl<'a> Network<'a> {
                 }
                 let bias =
                     self.normalize(layer, y, || work.norm_scratch.sized(saved_len(count, width)));
-                activate(self.layers.activation, y, bias);
+                activate(self.layers.config.activation, y, bias);
                 self.normalize_after(layer, y, || work.norm_scratch.sized(saved_len(count, width)));
             }
             let width = self.layers.shape(last).0;
@@ -173,7 +158,7 @@ impl<'a> Network<'a> {
             let x = before.last().map_or(input, |x| &**x);
             product(x, self.kernel(layer), here[0], inputs, width);
             let bias = self.normalize(layer, here[0], || saved.norm[layer]);
-            activate_with_slope(self.layers.activation, here[0], bias, saved.slope[layer]);
+            activate_with_slope(self.layers.config.activation, here[0], bias, saved.slope[layer]);
             self.normalize_after(layer, here[0], || saved.norm[layer]);
         }
         let (output, width) = (self.output_rows(&mut work.output), self.layers.shape(last).0);
@@ -190,7 +175,7 @@ impl<'a> Network<'a> {
     ) -> &'a [f32] {
         let bias = self.bias(layer);
         match self.norm(layer) {
-            Some([scale, shift]) if !self.layers.norm_after => {
+            Some([scale, shift]) if !self.layers.config.norm_after => {
                 normalize(x, Some(bias), scale, self.layers.epsilon(), saved());
                 shift
             }
@@ -205,7 +190,7 @@ impl<'a> Network<'a> {
         x: &mut [f32],
         saved: impl FnOnce() -> &'b mut [f32],
     ) {
-        if let Some([scale, shift]) = self.norm(layer).filter(|_| self.layers.norm_after) {
+        if let Some([scale, shift]) = self.norm(layer).filter(|_| self.layers.config.norm_after) {
             normalize(x, None, scale, self.layers.epsilon(), saved());
             shift_rows(x, shift);
         }
@@ -219,9 +204,8 @@ impl<'a> Network<'a> {
         saved: &mut Activations<'_>,
         work: &mut Workspace,
     ) {
-        let last = self.last();
+        let (last, after) = (self.last(), self.layers.config.norm_after);
         let Activations { slope, norm, .. } = saved;
-        let after = self.layers.norm_after;
         let mut through_norm = |layer: usize, here: bool, delta: &mut [f32]| {
             if let Some([scale, _]) = self.norm(layer).filter(|_| here) {
                 normalize_backward(delta, scale, norm[layer]);
@@ -229,7 +213,7 @@ impl<'a> Network<'a> {
         };
         let output = self.output_rows(&mut work.output);
         let (top, width) = (&mut *slope[last - 1], self.layers.shape(last).0);
-        if self.layers.norm && after {
+        if self.layers.config.norm && after {
             let temporary = work.pair[0].sized(top.len());
             temporary.fill(1.0);
             scale_by_combination(temporary, output_gradient, output, width);

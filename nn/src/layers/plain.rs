@@ -3,7 +3,7 @@
 
 use crate::layers::flat::Layers;
 use crate::weights::Tensors;
-use candle_core::{D, Result, Tensor};
+use candle_core::{D, Error, Result, Tensor};
 use quad_kernels::activation::Activation;
 
 /// x·tanh(softplus(x)) as x·n/(n + 2) with n = e^x (e^x + 2). From 20 on it is x to the last bit of
@@ -40,35 +40,35 @@ pub(crate) fn layer_norm(
     centered.broadcast_div(&deviation)?.broadcast_mul(scale)?.broadcast_add(shift)
 }
 
+/// A tensor by its name.
+pub(crate) fn named(weights: &Tensors, path: String) -> Result<&Tensor> {
+    weights.get(&path).ok_or_else(|| Error::CannotFindTensor { path }.bt())
+}
+
 /// Layers `{prefix}0 …`: `x [1 or K, rows, in]` → `[K, rows, out]`.
 pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, x: &Tensor) -> Result<Tensor> {
     // `[K, in, out]` or `[K, 1, out]`
     let get = |layer: usize, kind: &str| {
         let path = format!("{prefix}{layer}.{kind}");
-        let tensor =
-            weights.get(&path).ok_or_else(|| candle_core::Error::CannotFindTensor { path }.bt())?;
-        let rows = if kind == "kernel" { layers.shape(layer).0 } else { 1 };
-        tensor.reshape((layers.members, rows, layers.shape(layer).1))
+        let (inputs, outputs) = layers.shape(layer);
+        let rows = if kind == "kernel" { inputs } else { 1 };
+        named(weights, path)?.reshape((layers.members, rows, outputs))
     };
-    let mut x = x.clone();
+    let (mut x, config) = (x.clone(), &layers.config);
     for layer in 0..layers.count() {
-        x = x
-            .contiguous()?
-            .broadcast_matmul(&get(layer, "kernel")?)?
-            .broadcast_add(&get(layer, "bias")?)?;
+        x = x.contiguous()?.broadcast_matmul(&get(layer, "kernel")?)?;
+        x = x.broadcast_add(&get(layer, "bias")?)?;
         if layer + 1 == layers.count() {
             break;
         }
-        if !layers.norm {
-            x = activate(layers.activation, &x)?;
-            continue;
-        }
         let norm = |x: &Tensor| {
-            layer_norm(x, &get(layer, "scale")?, &get(layer, "shift")?, layers.norm_epsilon.value())
+            let (scale, shift) = (get(layer, "scale")?, get(layer, "shift")?);
+            layer_norm(x, &scale, &shift, config.norm_epsilon.value())
         };
-        x = match layers.norm_after {
-            false => activate(layers.activation, &norm(&x)?)?,
-            true => norm(&activate(layers.activation, &x)?)?,
+        x = match (config.norm, config.norm_after) {
+            (false, _) => activate(config.activation, &x)?,
+            (true, false) => activate(config.activation, &norm(&x)?)?,
+            (true, true) => norm(&activate(config.activation, &x)?)?,
         };
     }
     Ok(x)
@@ -96,8 +96,8 @@ mod tests {
         let one = |x: f32| Tensor::full(x, (1, 1, 2), &Device::Cpu);
         for (epsilon, expected) in [(1e-6, 0.5f32.sqrt()), (1e-5, (1.0 / 11f32).sqrt())] {
             let y = layer_norm(&x, &one(2.0)?, &one(0.5)?, epsilon)?;
-            let expected =
-                Tensor::new(&[[[0.5 + 2.0 * expected, 0.5 - 2.0 * expected]]], x.device())?;
+            let expected = [0.5 + 2.0 * expected, 0.5 - 2.0 * expected];
+            let expected = Tensor::new(&[[expected]], x.device())?;
             assert_within(2e-4, "norm", &y, &expected);
         }
         Ok(())

@@ -1,5 +1,6 @@
 //! Activations saved by a forward pass, and the weights' gradient computed from them.
 
+use crate::layers::config::MlpConfig;
 use crate::layers::flat::{LayerMut, Layers, TILE};
 use crate::layers::workspace::Activations;
 use quad_kernels::Buffer;
@@ -34,10 +35,12 @@ pub(crate) struct Tile<'a> {
 impl SavedActivations {
     /// Prepares for a forward pass of this many rows.
     pub fn resize(&mut self, layers: &Layers, rows: usize) {
-        (self.widths, self.members, self.rows) = (layers.hidden().to_vec(), layers.members, rows);
-        self.x.resize_with(self.widths.len(), Buffer::default);
-        self.slope.resize_with(self.widths.len(), Buffer::default);
-        self.norm.resize_with(if layers.norm { self.widths.len() } else { 0 }, Buffer::default);
+        let MlpConfig { hidden, norm, .. } = &layers.config;
+        (self.widths, self.members, self.rows) = (hidden.clone(), layers.members, rows);
+        let normed = if *norm { hidden.len() } else { 0 };
+        self.x.resize_with(hidden.len(), Buffer::default);
+        self.slope.resize_with(hidden.len(), Buffer::default);
+        self.norm.resize_with(normed, Buffer::default);
     }
 
     /// Splits the activations and `out`, `K × rows × outputs`, into tiles.
@@ -49,25 +52,22 @@ impl SavedActivations {
         };
         let each_member = rows.div_ceil(TILE);
         let tile = |(i, out)| {
-            let activations = Activations { x: Vec::new(), slope: Vec::new(), norm: Vec::new() };
-            Tile { member: i / each_member, index: i % each_member, activations, out }
+            let (member, index) = (i / each_member, i % each_member);
+            Tile { member, index, activations: Activations::default(), out }
         };
         let mut tiles: Vec<_> = cut(out).enumerate().map(tile).collect();
         for ((x, slope), width) in self.x.iter_mut().zip(&mut self.slope).zip(&self.widths) {
             let len = members * rows * width;
-            for ((tile, x), slope) in
-                tiles.iter_mut().zip(cut(x.sized(len))).zip(cut(slope.sized(len)))
-            {
+            let of_tiles = cut(x.sized(len)).zip(cut(slope.sized(len)));
+            for (tile, (x, slope)) in tiles.iter_mut().zip(of_tiles) {
                 tile.activations.x.push(x);
                 tile.activations.slope.push(slope);
             }
         }
         for (layer, (norm, width)) in self.norm.iter_mut().zip(&self.widths).enumerate() {
             let full = saved_len(TILE, *width);
-            for (tile, norm) in tiles
-                .iter_mut()
-                .zip(norm.sized(members * each_member * full).chunks_exact_mut(full))
-            {
+            let of_tiles = norm.sized(members * each_member * full).chunks_exact_mut(full);
+            for (tile, norm) in tiles.iter_mut().zip(of_tiles) {
                 let rows = tile.activations.x[layer].len() / width;
                 tile.activations.norm.push(&mut norm[..saved_len(rows, *width)]);
             }
@@ -118,8 +118,8 @@ impl SavedActivations {
 
     /// The gradient of a norm's scales (0) or shifts (1): the sum of the tiles' parts.
     fn sum_over_tiles(&self, layer: usize, member: usize, which: usize, out: &mut [f32]) {
-        let (tiles, full, width) =
-            (self.rows.div_ceil(TILE), saved_len(TILE, out.len()), out.len());
+        let (tiles, width) = (self.rows.div_ceil(TILE), out.len());
+        let full = saved_len(TILE, width);
         let saved = self.norm[layer].first(self.members * tiles * full);
         out.fill(0.0);
         for tile in saved[member * tiles * full..][..tiles * full].chunks_exact(full) {

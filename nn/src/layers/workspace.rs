@@ -7,6 +7,7 @@ use std::cell::RefCell;
 
 /// Activations and slopes of a tile's hidden layers; the backward pass replaces the slopes by the
 /// gradients before the activations.
+#[derive(Default)]
 pub(crate) struct Activations<'a> {
     pub x: Vec<&'a mut [f32]>,
     pub slope: Vec<&'a mut [f32]>,
@@ -49,8 +50,7 @@ impl Workspace {
         out: usize,
         work: impl FnOnce(&mut [f32], &mut [f32], &mut Self) -> R,
     ) -> R {
-        let (mut base, mut outputs) =
-            (std::mem::take(&mut self.base), std::mem::take(&mut self.out));
+        let [mut base, mut outputs] = [&mut self.base, &mut self.out].map(std::mem::take);
         let result = work(base.sized(len), outputs.sized(out), self);
         (self.base, self.out) = (base, outputs);
         result
@@ -70,18 +70,15 @@ impl Workspace {
             len: impl Fn(usize) -> usize,
         ) -> Vec<&'a mut [f32]> {
             buffers.resize_with(widths.len().max(buffers.len()), Buffer::default);
-            buffers
-                .iter_mut()
-                .zip(widths)
-                .map(|(buffer, width)| buffer.sized(len(*width)))
-                .collect()
+            let each = buffers.iter_mut().zip(widths);
+            each.map(|(buffer, width)| buffer.sized(len(*width))).collect()
         }
         let mut all = [&mut self.x, &mut self.slope, &mut self.norm].map(std::mem::take);
         let [x, slope, norm] = &mut all;
-        let widths = layers.hidden();
-        let normed = if layers.norm { widths } else { &[] };
-        let (x, slope) =
-            (sized(x, widths, |width| rows * width), sized(slope, widths, |width| rows * width));
+        let widths = &layers.config.hidden[..];
+        let normed = if layers.config.norm { widths } else { &[] };
+        let x = sized(x, widths, |width| rows * width);
+        let slope = sized(slope, widths, |width| rows * width);
         let norm = sized(norm, normed, |width| saved_len(rows, width));
         let result = work(&mut Activations { x, slope, norm }, self);
         [self.x, self.slope, self.norm] = all;

@@ -15,23 +15,14 @@ use std::ops::Range;
 /// A layer in a vector of weights: its kernel `[in, out]`, then its bias `[out]`.
 #[derive(Clone, Debug)]
 pub(crate) struct Dense {
-    start: usize,
+    pub start: usize,
     pub inputs: usize,
     pub outputs: usize,
     /// f; `None` is the identity.
-    activation: Option<Activation>,
+    pub activation: Option<Activation>,
 }
 
 impl Dense {
-    pub fn new(
-        start: usize,
-        inputs: usize,
-        outputs: usize,
-        activation: Option<Activation>,
-    ) -> Self {
-        Self { start, inputs, outputs, activation }
-    }
-
     /// Range in the vector.
     pub fn range(&self) -> Range<usize> {
         self.start..self.start + (self.inputs + 1) * self.outputs
@@ -39,10 +30,11 @@ impl Dense {
 
     /// The tensors `{name}.kernel` and `{name}.bias`.
     pub fn specs(&self, name: &str, initial: InitScheme) -> [TensorSpec; 2] {
-        let (kernel, bias) = initial.layer(self.inputs, self.outputs, false);
+        let (k, n) = (self.inputs, self.outputs);
+        let (kernel, bias) = initial.layer(k, n, false);
         [
-            TensorSpec::new(format!("{name}.kernel"), &[self.inputs, self.outputs], kernel),
-            TensorSpec::new(format!("{name}.bias"), &[self.outputs], bias),
+            TensorSpec::new(format!("{name}.kernel"), &[k, n], kernel),
+            TensorSpec::new(format!("{name}.bias"), &[n], bias),
         ]
     }
 
@@ -57,10 +49,8 @@ impl Dense {
         let of_added = added.map_or(Ok((rows, n)), Tensor::dims2)?;
         let fits = of_added.0 > 0 && rows > 0 && rows.is_multiple_of(of_added.0) && of_added.1 == n;
         if width != self.inputs || !fits {
-            bail!(
-                "a layer of {} and {n} numbers got {rows} × {width} and {of_added:?}",
-                self.inputs
-            );
+            let sizes = (self.inputs, n);
+            bail!("a layer of {sizes:?} numbers got {rows} × {width} and {of_added:?}");
         }
         if !has_fast_implementation(weights.device()) {
             return self.plain(weights, x, added);

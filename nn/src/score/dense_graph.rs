@@ -86,11 +86,9 @@ impl DenseGraph {
         let is_last = |i: usize, number: &usize| {
             !steps[i + 1..].iter().any(|step| step.values().any(|n| n == *number))
         };
-        let done = steps
-            .iter()
-            .enumerate()
-            .map(|(i, step)| step.values().filter(|n| is_last(i, n)).collect())
-            .collect();
+        let done = steps.iter().enumerate();
+        let done = done.map(|(i, step)| step.values().filter(|n| is_last(i, n)).collect());
+        let done = done.collect();
         Self { inputs: count, steps, widths, done, len, pool: Arc::default() }
     }
 
@@ -258,16 +256,16 @@ impl CustomOp2 for Operation {
         let mut chunks = self.chunks.lock();
         read_all([weights, &gradient.contiguous()?], |[weights, gradient]| {
             let tasks = chunks.par_iter_mut().zip(gradient.par_chunks(chunk_len(rows) * outputs));
-            tasks
-                .with_max_len(1)
-                .for_each(|(chunk, gradient)| self.graph.backward_chunk(weights, gradient, chunk));
+            tasks.with_max_len(1).for_each(|(chunk, gradient)| {
+                self.graph.backward_chunk(weights, gradient, chunk);
+            });
         })?;
         self.buffer.write(0..self.graph.len, |out| {
             out.par_chunks_mut(TOGETHER).enumerate().for_each(|(i, out)| {
                 out.fill(0.0);
-                chunks.iter().for_each(|chunk| {
-                    add(out, rows_of(&chunk.of_weights, i * TOGETHER, TOGETHER, 1))
-                });
+                for chunk in chunks.iter() {
+                    add(out, rows_of(&chunk.of_weights, i * TOGETHER, TOGETHER, 1));
+                }
             });
         })?;
         Ok((None, None))

@@ -40,7 +40,12 @@ struct GraphBuilder<'a> {
     steps: Vec<Step>,
 }
 
-impl GraphBuilder<'_> {
+impl<'a> GraphBuilder<'a> {
+    fn new(layers: &'a MlpConfig) -> Self {
+        let (specs, steps) = (Vec::new(), Vec::new());
+        Self { layers, specs, start: 0, steps }
+    }
+
     /// Adds a step. Returns the number of its value; 0 to 2 are the inputs.
     fn step(&mut self, step: Step) -> usize {
         self.steps.push(step);
@@ -49,17 +54,22 @@ impl GraphBuilder<'_> {
 
     /// The next layer in the vector of weights.
     fn dense(&mut self, name: &str, (inputs, outputs): (usize, usize), active: bool) -> Dense {
-        let layer =
-            Dense::new(self.start, inputs, outputs, active.then_some(self.layers.activation));
+        let activation = active.then_some(self.layers.activation);
+        let layer = Dense { start: self.start, inputs, outputs, activation };
         self.start = layer.range().end;
         self.specs.extend(layer.specs(name, self.layers.initial));
         layer
     }
 
+    /// Adds a step with a layer of value `x`, plus value `added`.
+    fn apply(&mut self, layer: Dense, x: usize, added: Option<usize>) -> usize {
+        self.step(Step::Dense { layer, x, added })
+    }
+
     /// A layer of value `x`.
     fn layer(&mut self, name: &str, x: usize, sizes: (usize, usize), active: bool) -> usize {
         let layer = self.dense(name, sizes, active);
-        self.step(Step::Dense { layer, x, added: None })
+        self.apply(layer, x, None)
     }
 
     /// A residual block: h = f(W₁·x) + W₂·c, then f(W₃·h) + x with a linear map of x to the
@@ -74,21 +84,20 @@ impl GraphBuilder<'_> {
         let first = self.dense(&format!("{name}.first"), (inputs, outputs), true);
         let condition = self.dense(&format!("{name}.condition"), (width, outputs), false);
         let second = self.dense(&format!("{name}.second"), (outputs, outputs), true);
-        let added = self.step(Step::Dense { layer: condition, x: c, added: None });
-        let h = self.step(Step::Dense { layer: first, x, added: Some(added) });
+        let added = self.apply(condition, c, None);
+        let h = self.apply(first, x, Some(added));
         let skip = match inputs == outputs {
             true => x,
             false => self.layer(&format!("{name}.skip"), x, (inputs, outputs), false),
         };
-        self.step(Step::Dense { layer: second, x: h, added: Some(skip) })
+        self.apply(second, h, Some(skip))
     }
 }
 
 /// The network of (state, features of time, actions) and the layout of its weights.
 fn build(shape: &ScoreShape) -> (DenseGraph, Layout) {
-    let (layers, a) = (&shape.layers, shape.action_dim);
-    let (specs, steps) = (Vec::new(), Vec::new());
-    let (widths, mut of) = (&layers.hidden, GraphBuilder { layers, specs, start: 0, steps });
+    let (widths, a) = (&shape.layers.hidden, shape.action_dim);
+    let mut of = GraphBuilder::new(&shape.layers);
     let narrowest = widths.last().copied().unwrap_or(1);
     let state = of.layer("state", 0, (shape.observation_dim, EMBEDDING), true);
     let time = of.layer("time", 1, (EMBEDDING, EMBEDDING), false);
@@ -108,9 +117,10 @@ fn build(shape: &ScoreShape) -> (DenseGraph, Layout) {
         x = of.block(&format!("up.{i}"), both, (2 * pair[1], pair[0]), condition);
     }
     let both = of.step(Step::Concat(skips.pop().unwrap_or(x), x));
-    of.layer("last", both, (2 * widths.first().copied().unwrap_or(1), a), false);
-    let graph = DenseGraph::new(vec![shape.observation_dim, EMBEDDING, a], of.steps, of.start);
-    (graph, Layout::new(of.specs))
+    let widest = widths.first().copied().unwrap_or(1);
+    of.layer("last", both, (2 * widest, a), false);
+    let inputs = vec![shape.observation_dim, EMBEDDING, a];
+    (DenseGraph::new(inputs, of.steps, of.start), Layout::new(of.specs))
 }
 
 /// A noise predictor in continuous time, and its weights.
@@ -153,10 +163,11 @@ impl ScoreShape {
 impl ScoreNetwork {
     /// A network with weights of the shape's layout and `frequencies` `[16]` on the CPU.
     pub fn new(shape: ScoreShape, weights: Weights, frequencies: Tensor) -> Self {
-        Self { graph: Arc::new(build(&shape).0), shape, weights, frequencies }
+        let graph = Arc::new(build(&shape).0);
+        Self { shape, graph, weights, frequencies }
     }
 
-    /// The shape.
+    /// Sizes and blocks.
     pub fn shape(&self) -> &ScoreShape {
         &self.shape
     }
@@ -168,9 +179,9 @@ impl ScoreNetwork {
 
     /// The same network with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
-        let (shape, graph, frequencies) =
-            (self.shape.clone(), self.graph.clone(), self.frequencies.clone());
-        Self { shape, graph, weights: self.weights.detach(), frequencies }
+        let (shape, frequencies) = (self.shape.clone(), self.frequencies.clone());
+        let (graph, weights) = (self.graph.clone(), self.weights.detach());
+        Self { shape, graph, weights, frequencies }
     }
 
     /// ε_θ(a_t, s, t), `[rows, a]`, for `observations [n, o]`, n times `t` and `actions [rows, a]`,
@@ -189,9 +200,9 @@ impl ScoreNetwork {
     fn time_features(&self, t: &[f64], device: &Device) -> Result<Tensor> {
         let frequencies = self.frequencies.to_vec1::<f32>()?;
         let row = |t: &f64| {
-            let angles: Vec<f64> =
-                frequencies.iter().map(|frequency| TAU * t * f64::from(*frequency)).collect();
-            angles.iter().map(|x| x.sin()).chain(angles.iter().map(|x| x.cos())).collect::<Vec<_>>()
+            let angles = frequencies.iter().map(|frequency| TAU * t * f64::from(*frequency));
+            let angles = Vec::from_iter(angles);
+            [f64::sin, f64::cos].map(|of| Vec::from_iter(angles.iter().map(|x| of(*x)))).concat()
         };
         let features: Vec<f32> = t.iter().flat_map(row).map(|x| x as f32).collect();
         Tensor::from_vec(features, (t.len(), EMBEDDING), device)
@@ -222,11 +233,13 @@ mod tests {
 
     fn network(hidden: &[usize]) -> Result<ScoreNetwork> {
         let generator = &mut ChaCha8Rng::seed_from_u64(0);
-        let (activation, initial) = (Activation::Silu, InitScheme::Torch);
-        let layers = MlpConfig { activation, initial, ..MlpConfig::mish(hidden) };
-        let shape = ScoreShape { observation_dim: 5, action_dim: 3, layers };
+        let mut layers = MlpConfig::mish(hidden);
+        (layers.activation, layers.initial) = (Activation::Silu, InitScheme::Torch);
+        let (observation_dim, action_dim) = (5, 3);
+        let shape = ScoreShape { observation_dim, action_dim, layers };
         let weights = weights(shape.layout(), generator);
-        Ok(ScoreNetwork::new(shape, weights, ScoreShape::frequencies(generator)?))
+        let frequencies = ScoreShape::frequencies(generator)?;
+        Ok(ScoreNetwork::new(shape, weights, frequencies))
     }
 
     /// Rows fill several tiles and chunks, or none.
@@ -255,9 +268,11 @@ mod tests {
         let (observations, noise) = (random((4, 5), 1), random((12, 3), 2));
         let shared = network.sample(&solver, &observations, &noise)?;
         let each = crate::layers::plain::repeat_rows(&observations, 3)?;
-        assert_within(1e-4, "samples", &shared, &network.sample(&solver, &each, &noise)?);
-        assert!(network.predict(&observations, &noise, &[0.5; 3]).is_err(), "3 times, 4 states");
-        assert!(network.predict(&observations, &random((5, 3), 3), &[0.5; 4]).is_err(), "5 rows");
+        let each = network.sample(&solver, &each, &noise)?;
+        assert_within(1e-4, "samples", &shared, &each);
+        let refused = |actions, t| network.predict(&observations, actions, t).is_err();
+        assert!(refused(&noise, &[0.5; 3]), "3 times, 4 states");
+        assert!(refused(&random((5, 3), 3), &[0.5; 4]), "5 rows");
         Ok(())
     }
 }

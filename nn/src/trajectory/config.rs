@@ -42,30 +42,29 @@ pub struct Attention {
 
 /// A number of the configuration that is out of range.
 #[derive(Debug, PartialEq, Eq)]
+#[allow(missing_docs)] // The names say it.
 pub struct TrajectoryError {
-    /// Name of the number.
     pub field: &'static str,
-    /// The number.
     pub value: usize,
-    /// Allowed range.
     pub range: &'static str,
 }
 
 impl TrajectoryConfig {
-    /// Checks all numbers.
-    ///
-    /// # Errors
-    /// The first number that is out of range.
+    /// Finds the first number that is out of range.
     pub fn check(&self) -> Result<(), TrajectoryError> {
-        let Self { horizon, channels, groups, .. } = *self;
+        let (horizon, channels, groups) = (self.horizon, self.channels, self.groups);
         let levels = self.multipliers.len();
-        let is = |field, value, holds: bool, range| {
-            if holds { Ok(()) } else { Err(TrajectoryError { field, value, range }) }
+        let is = |field, value, holds: bool, range| match holds {
+            true => Ok(()),
+            false => Err(TrajectoryError { field, value, range }),
         };
-        is("multipliers", levels, (1..=MOST_LEVELS).contains(&levels), "1 to 8 numbers")?;
-        is("groups", groups, (1..=MAX_DIM).contains(&groups), "from 1 to 65535")?;
+        let up_to =
+            |field, value, most, range| is(field, value, (1..=most).contains(&value), range);
+        up_to("multipliers", levels, MOST_LEVELS, "1 to 8 numbers")?;
+        up_to("groups", groups, MAX_DIM, "from 1 to 65535")?;
         let even = (4..=MAX_DIM).contains(&channels) && channels.is_multiple_of(2);
-        is("channels", channels, even, "an even number from 4 to 65535")?;
+        let range = "an even number from 4 to 65535";
+        is("channels", channels, even, range)?;
         let halves = horizon.is_multiple_of(1 << (levels - 1));
         let holds = (1..=MOST_STEPS).contains(&horizon) && halves;
         let range = "from 1 to 1000 and halved once for each further level";
@@ -79,10 +78,12 @@ impl TrajectoryConfig {
         let last = self.widths().last().copied().unwrap_or_default();
         let range = "such that a quarter of the last level's channels is divided by groups";
         is("multipliers", last, last.is_multiple_of(4 * groups), range)?;
-        let Some(Attention { heads, width }) = self.attention else { return Ok(()) };
-        is("heads", heads, (1..=MAX_DIM).contains(&heads), "from 1 to 65535")?;
-        let holds = (1..=MAX_DIM / heads).contains(&width);
-        is("width", width, holds, "at least 1, and with the heads at most 65535")
+        if let Some(Attention { heads, width }) = self.attention {
+            up_to("heads", heads, MAX_DIM, "from 1 to 65535")?;
+            let range = "at least 1, and with the heads at most 65535";
+            up_to("width", width, MAX_DIM / heads, range)?;
+        }
+        Ok(())
     }
 
     /// Channels of each level.
@@ -107,8 +108,8 @@ pub(crate) struct LayoutBuilder {
 impl LayoutBuilder {
     /// Begins with the embedding of a denoising step: `time.{0,1}`.
     pub fn new(config: &TrajectoryConfig) -> Self {
-        let embedding = config.channels;
-        let mut builder = Self { specs: Vec::new(), embedding, attention: config.attention };
+        let (specs, embedding, attention) = (Vec::new(), config.channels, config.attention);
+        let mut builder = Self { specs, embedding, attention };
         builder.linear("time.0", embedding, 4 * embedding);
         builder.linear("time.1", 4 * embedding, embedding);
         builder
@@ -178,7 +179,6 @@ impl LayoutBuilder {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
 
@@ -194,6 +194,7 @@ mod tests {
         config.check().unwrap();
         let refused = |field: &str, change: fn(&mut TrajectoryConfig)| {
             let mut config = config.clone();
+            config.attention = Some(Attention { heads: 2, width: 1 });
             change(&mut config);
             assert_eq!(config.check().unwrap_err().field, field);
         };
@@ -205,9 +206,7 @@ mod tests {
         refused("channels", |config| config.channels = 7);
         refused("horizon", |config| config.horizon = 18);
         refused("horizon", |config| config.horizon = 0);
-        refused("heads", |config| config.attention = Some(Attention { heads: 0, width: 1 }));
-        refused("width", |config| {
-            config.attention = Some(Attention { heads: 2, width: usize::MAX })
-        });
+        refused("heads", |config| config.attention.as_mut().unwrap().heads = 0);
+        refused("width", |config| config.attention.as_mut().unwrap().width = usize::MAX);
     }
 }

@@ -25,14 +25,13 @@ pub(crate) fn convolve(
     if has_fast_implementation(x.device()) {
         return x.apply_op3(&kernel.contiguous()?, &bias.contiguous()?, shape);
     }
-    let places =
-        (0..shape.steps()).flat_map(|step| (0..taps).map(move |tap| (step * stride + tap) as u32));
-    let places = Tensor::from_iter(places, x.device())?;
+    let of_step = |step| (0..taps).map(move |tap| (step * stride + tap) as u32);
+    let places = Tensor::from_iter((0..shape.steps()).flat_map(of_step), x.device())?;
     let rows = (batch * shape.steps(), taps * inputs);
-    let unfolded =
-        x.pad_with_zeros(1, taps / 2, taps / 2)?.index_select(&places, 1)?.reshape(rows)?;
-    let out = unfolded.matmul(&kernel.reshape((taps * inputs, outputs))?)?.broadcast_add(bias)?;
-    out.reshape((batch, shape.steps(), outputs))
+    let padded = x.pad_with_zeros(1, taps / 2, taps / 2)?;
+    let unfolded = padded.index_select(&places, 1)?.reshape(rows)?;
+    let out = unfolded.matmul(&kernel.reshape((taps * inputs, outputs))?)?;
+    out.broadcast_add(bias)?.reshape((batch, shape.steps(), outputs))
 }
 
 /// The transposed convolution with four taps and stride 2: `x [B, L, C]`, `kernel [C, 4, C']`,
@@ -102,32 +101,29 @@ impl Convolution {
     /// The gradient of [`Self::unfold`], added to `x`.
     fn fold(&self, unfolded: &[f32], x: &mut [f32]) {
         let (c, width) = (self.inputs, self.taps * self.inputs);
-        for (trajectory, rows) in
-            x.chunks_exact_mut(self.length * c).zip(unfolded.chunks_exact(self.steps() * width))
-        {
+        let rows = unfolded.chunks_exact(self.steps() * width);
+        for (trajectory, rows) in x.chunks_exact_mut(self.length * c).zip(rows) {
             self.places(0..self.taps, |step, tap, place| {
                 if let Some(place) = place {
                     let from = &rows[step * width + tap * c..][..c];
-                    trajectory[place * c..][..c]
-                        .iter_mut()
-                        .zip(from)
-                        .for_each(|(sum, x)| *sum += x);
+                    let to = trajectory[place * c..][..c].iter_mut();
+                    to.zip(from).for_each(|(sum, x)| *sum += x);
                 }
             });
         }
     }
 
     fn forward(&self, x: &[f32], kernel: &[f32], bias: &[f32]) -> Vec<f32> {
-        let (tile, width) = (self.tile(), self.taps * self.inputs);
-        let mut out =
-            vec![0.0; x.len() / (self.length * self.inputs) * self.steps() * self.outputs];
-        let tiles = out.par_chunks_mut(tile * self.steps() * self.outputs);
-        tiles.zip(x.par_chunks(tile * self.length * self.inputs)).for_each(|(out, x)| {
+        let (tile, width, outputs) = (self.tile(), self.taps * self.inputs, self.outputs);
+        let size = self.length * self.inputs;
+        let mut out = vec![0.0; x.len() / size * self.steps() * outputs];
+        let tiles = out.par_chunks_mut(tile * self.steps() * outputs);
+        tiles.zip(x.par_chunks(tile * size)).for_each(|(out, x)| {
             match self.taps {
-                1 => product(x, kernel, out, width, self.outputs),
-                _ => product(&self.unfold(x, 0..self.taps), kernel, out, width, self.outputs),
+                1 => product(x, kernel, out, width, outputs),
+                taps => product(&self.unfold(x, 0..taps), kernel, out, width, outputs),
             }
-            for row in out.chunks_exact_mut(self.outputs) {
+            for row in out.chunks_exact_mut(outputs) {
                 row.iter_mut().zip(bias).for_each(|(x, b)| *x += b);
             }
         });
@@ -135,20 +131,19 @@ impl Convolution {
     }
 
     fn input_gradient(&self, kernel: &[f32], gradient: &[f32]) -> Vec<f32> {
-        let (tile, width) = (self.tile(), self.taps * self.inputs);
-        let rows = gradient.len() / self.outputs;
+        let (tile, width, outputs) = (self.tile(), self.taps * self.inputs, self.outputs);
+        let rows = gradient.len() / outputs;
         let mut out = vec![0.0; rows / self.steps() * self.length * self.inputs];
         let tiles = out.par_chunks_mut(tile * self.length * self.inputs);
-        tiles.zip(gradient.par_chunks(tile * self.steps() * self.outputs)).for_each(
-            |(out, gradient)| {
-                if self.taps == 1 {
-                    return product_transposed(gradient, kernel, out, width, self.outputs);
-                }
-                let mut unfolded = vec![0.0; gradient.len() / self.outputs * width];
-                product_transposed(gradient, kernel, &mut unfolded, width, self.outputs);
-                self.fold(&unfolded, out);
-            },
-        );
+        let gradients = gradient.par_chunks(tile * self.steps() * outputs);
+        tiles.zip(gradients).for_each(|(out, gradient)| {
+            if self.taps == 1 {
+                return product_transposed(gradient, kernel, out, width, outputs);
+            }
+            let mut unfolded = vec![0.0; gradient.len() / outputs * width];
+            product_transposed(gradient, kernel, &mut unfolded, width, outputs);
+            self.fold(&unfolded, out);
+        });
         out
     }
 
@@ -177,11 +172,8 @@ impl CustomOp3 for Convolution {
         bias: &CpuStorage,
         bias_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let out = self.forward(
-            slice(x, x_layout)?,
-            slice(kernel, kernel_layout)?,
-            slice(bias, bias_layout)?,
-        );
+        let (kernel, bias) = (slice(kernel, kernel_layout)?, slice(bias, bias_layout)?);
+        let out = self.forward(slice(x, x_layout)?, kernel, bias);
         Ok((CpuStorage::F32(out), (x_layout.dims()[0], self.steps(), self.outputs).into()))
     }
 
@@ -195,7 +187,9 @@ impl CustomOp3 for Convolution {
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let (gradient, device) = (gradient.contiguous()?, gradient.device());
         read_all([x, kernel, &gradient], |[x_numbers, kernel_numbers, g]| {
-            let tensor = |numbers, of: &Tensor| Tensor::from_vec(numbers, of.shape(), device);
+            let tensor = |numbers: Option<Vec<f32>>, of: &Tensor| {
+                numbers.map(|numbers| Tensor::from_vec(numbers, of.shape(), device)).transpose()
+            };
             let of_x = x.track_op().then(|| self.input_gradient(kernel_numbers, g));
             let of_kernel = kernel.track_op().then(|| self.kernel_gradient(x_numbers, g));
             let of_bias = bias.track_op().then(|| {
@@ -203,11 +197,7 @@ impl CustomOp3 for Convolution {
                 column_sums(g, &mut sums);
                 sums
             });
-            Ok((
-                of_x.map(|numbers| tensor(numbers, x)).transpose()?,
-                of_kernel.map(|numbers| tensor(numbers, kernel)).transpose()?,
-                of_bias.map(|numbers| tensor(numbers, bias)).transpose()?,
-            ))
+            Ok((tensor(of_x, x)?, tensor(of_kernel, kernel)?, tensor(of_bias, bias)?))
         })?
     }
 }

@@ -22,7 +22,8 @@ pub(crate) fn normed_mish(
     let (batch, length, channels) = x.dims3()?;
     if has_fast_implementation(x.device()) {
         let operation = NormedMish { groups, channels, length };
-        return x.contiguous()?.apply_op3(&scale.contiguous()?, &shift.contiguous()?, operation);
+        let (scale, shift) = (scale.contiguous()?, shift.contiguous()?);
+        return x.contiguous()?.apply_op3(&scale, &shift, operation);
     }
     let grouped = x.reshape((batch, length, groups, channels / groups))?;
     let centered = grouped.broadcast_sub(&grouped.mean_keepdim((1, 3))?)?;
@@ -102,21 +103,22 @@ impl NormedMish {
         scale_rows(out, scale);
         activate_with_slope(Activation::Mish, out, shift, &mut slope);
         // The gradient before the activation.
-        out.iter_mut()
-            .zip(gradient.iter().zip(&slope))
-            .for_each(|(out, (g, slope))| *out = g * slope);
+        for (out, (g, slope)) in out.iter_mut().zip(gradient.iter().zip(&slope)) {
+            *out = g * slope;
+        }
         let (of_scale, of_shift) = sums.split_at_mut(self.channels);
         add_rows(of_scale, out, &normed, |delta, x| delta * x);
         add_rows(of_shift, out, &normed, |delta, _| delta);
         // The gradient before scale and shift, then through the moments.
-        let scaled =
-            |sums: &[f32]| sums.iter().zip(scale).map(|(sum, scale)| sum * scale).collect();
-        let (mut along, mut mean): (Vec<f32>, Vec<f32>) = (scaled(of_scale), scaled(of_shift));
-        self.spread(&mut along);
-        self.spread(&mut mean);
-        for (out, normed) in
-            out.chunks_exact_mut(self.channels).zip(normed.chunks_exact(self.channels))
-        {
+        let mean_of = |sums: &[f32]| {
+            let mut scaled = sums.to_vec();
+            scale_rows(&mut scaled, scale);
+            self.spread(&mut scaled);
+            scaled
+        };
+        let (along, mean) = (mean_of(of_scale), mean_of(of_shift));
+        let rows = normed.chunks_exact(self.channels);
+        for (out, normed) in out.chunks_exact_mut(self.channels).zip(rows) {
             for (i, (out, x)) in out.iter_mut().zip(normed).enumerate() {
                 *out = (*out * scale[i] - mean[i] - x * along[i]) * inverse[i];
             }
@@ -145,11 +147,8 @@ impl CustomOp3 for NormedMish {
         shift: &CpuStorage,
         shift_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let out = self.forward(
-            slice(x, x_layout)?,
-            slice(scale, scale_layout)?,
-            slice(shift, shift_layout)?,
-        );
+        let (scale, shift) = (slice(scale, scale_layout)?, slice(shift, shift_layout)?);
+        let out = self.forward(slice(x, x_layout)?, scale, shift);
         Ok((CpuStorage::F32(out), x_layout.shape().clone()))
     }
 
@@ -165,8 +164,8 @@ impl CustomOp3 for NormedMish {
         let mut sums = vec![0.0; x.elem_count() / self.size() * 2 * self.channels];
         let arguments = [x, scale, shift, &gradient.contiguous()?];
         read_all(arguments, |[x, scale, shift, gradient]| {
-            let results =
-                out.par_chunks_mut(self.size()).zip(sums.par_chunks_mut(2 * self.channels));
+            let sums = sums.par_chunks_mut(2 * self.channels);
+            let results = out.par_chunks_mut(self.size()).zip(sums);
             let given = x.par_chunks(self.size()).zip(gradient.par_chunks(self.size()));
             results.zip(given).for_each(|((out, sums), (x, gradient))| {
                 self.backward(x, [scale, shift], gradient, out, sums);

@@ -1,12 +1,12 @@
 //! The layers of Diffuser's networks over trajectories `[B, L, C]`, by the names of their tensors
 //! ([`LayoutBuilder`](crate::trajectory::config::LayoutBuilder)).
 
-use crate::layers::plain::{layer_norm, mish};
+use crate::layers::plain::{layer_norm, mish, named};
 use crate::trajectory::config::{Attention, TrajectoryConfig};
 use crate::trajectory::convolution::{convolve, double};
 use crate::trajectory::group_norm::normed_mish;
 use crate::weights::{Tensors, Weights};
-use candle_core::{Device, Error, Result, Tensor};
+use candle_core::{Device, Result, Tensor};
 
 /// Number added to the variance of attention's layer norm.
 const EPSILON: f64 = 1e-5;
@@ -30,8 +30,7 @@ impl<'a> Layers<'a> {
     }
 
     fn get(&self, name: &str, kind: &str) -> Result<&Tensor> {
-        let path = format!("{name}.{kind}");
-        self.tensors.get(&path).ok_or_else(|| Error::CannotFindTensor { path }.bt())
+        named(&self.tensors, format!("{name}.{kind}"))
     }
 
     /// The embedding of each t in 1..=T: sines, then cosines, of (t − 1)·f_k with f_k from 1 down to
@@ -42,10 +41,8 @@ impl<'a> Layers<'a> {
             f64::from(t - 1) * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp()
         };
         let row = |t: &u32| {
-            let t = *t;
-            (0..half)
-                .map(move |k| angle(t, k).sin())
-                .chain((0..half).map(move |k| angle(t, k).cos()))
+            let angles = Vec::from_iter((0..half).map(|k| angle(*t, k)));
+            [f64::sin, f64::cos].map(|of| Vec::from_iter(angles.iter().map(|x| of(*x)))).concat()
         };
         let features: Vec<f32> = t.iter().flat_map(row).map(|x| x as f32).collect();
         let features = Tensor::from_vec(features, (t.len(), 1, 2 * half), device)?;
@@ -55,13 +52,19 @@ impl<'a> Layers<'a> {
 
     /// x·kernel + bias of each step.
     pub fn linear(&self, name: &str, x: &Tensor) -> Result<Tensor> {
-        convolve(x, &self.get(name, "kernel")?.unsqueeze(0)?, self.get(name, "bias")?, 1)
+        let kernel = self.get(name, "kernel")?.unsqueeze(0)?;
+        convolve(x, &kernel, self.get(name, "bias")?, 1)
+    }
+
+    fn norm(&self, name: &str) -> Result<(&Tensor, &Tensor)> {
+        Ok((self.get(name, "scale")?, self.get(name, "shift")?))
     }
 
     /// A convolution, group norm, Mish.
     pub fn normed(&self, name: &str, x: &Tensor) -> Result<Tensor> {
         let x = convolve(x, self.get(name, "kernel")?, self.get(name, "bias")?, 1)?;
-        normed_mish(&x, self.get(name, "scale")?, self.get(name, "shift")?, self.config.groups)
+        let (scale, shift) = self.norm(name)?;
+        normed_mish(&x, scale, shift, self.config.groups)
     }
 
     /// A residual block.
@@ -70,10 +73,9 @@ impl<'a> Layers<'a> {
         let inside = self.normed(&format!("{name}.0"), x)?.broadcast_add(&of_time)?;
         let inside = self.normed(&format!("{name}.1"), &inside)?;
         let skip = format!("{name}.skip");
-        if self.tensors.contains_key(&format!("{skip}.kernel")) {
-            inside + self.linear(&skip, x)?
-        } else {
-            inside + x
+        match self.tensors.contains_key(&format!("{skip}.kernel")) {
+            true => inside + self.linear(&skip, x)?,
+            false => inside + x,
         }
     }
 
@@ -92,7 +94,8 @@ impl<'a> Layers<'a> {
     pub fn attend(&self, name: &str, x: &Tensor) -> Result<Tensor> {
         let Some(Attention { heads, width }) = self.config.attention else { return Ok(x.clone()) };
         let (batch, length, _) = x.dims3()?;
-        let normed = layer_norm(x, self.get(name, "scale")?, self.get(name, "shift")?, EPSILON)?;
+        let (scale, shift) = self.norm(name)?;
+        let normed = layer_norm(x, scale, shift, EPSILON)?;
         let kernel = self.get(name, "queries.kernel")?;
         let none = Tensor::zeros(kernel.dim(1)?, x.dtype(), x.device())?;
         let all = convolve(&normed, &kernel.unsqueeze(0)?, &none, 1)?

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::kinds::gaussian::Spread;
-use crate::testing::{file_of, load};
+use crate::testing::{initial, load};
 use quad_nn::MlpConfig;
 use std::fmt::Write;
 
@@ -19,17 +19,16 @@ fn empty_tensors(count: usize) -> Vec<u8> {
 
 #[test]
 fn a_header_that_is_too_long_is_not_read() {
-    let refused = |file: &[u8]| {
-        [read_tensors(file).map(drop), load(file).map(drop)].map(|result| {
-            matches!(result, Err(PolicyError::Unreadable(SafeTensorError::HeaderTooLarge)))
-        })
-    };
+    let is_too_long =
+        |result| matches!(result, Err(PolicyError::Unreadable(SafeTensorError::HeaderTooLarge)));
+    let refused =
+        |file: &[u8]| [read_tensors(file).map(drop), load(file).map(drop)].map(is_too_long);
     let many = empty_tensors(20_000);
     assert!(many.len() as u64 > MAX_HEADER && SafeTensors::deserialize(&many).is_ok());
     assert_eq!(refused(&many), [true; 2]);
     // Bytes that are not text would be another error.
-    let noise =
-        [&(MAX_HEADER + 1).to_le_bytes()[..], &vec![0xff; 2 * MAX_HEADER as usize]].concat();
+    let mut noise = vec![0xff; 2 * MAX_HEADER as usize];
+    noise[..8].copy_from_slice(&(MAX_HEADER + 1).to_le_bytes());
     assert_eq!(refused(&noise), [true; 2]);
 
     assert_eq!(read_tensors(&empty_tensors(10_000)).unwrap().len(), 10_000);
@@ -41,7 +40,7 @@ fn a_header_that_is_too_long_is_not_read() {
 fn gaussian() -> Vec<u8> {
     let actor = MlpConfig::mish(&[4]);
     let shape = GaussianShape { observation_dim: 3, action_dim: 1, actor, spread: Spread::None };
-    file_of(PolicyConfig::Gaussian { shape }, None, |layout| vec![0.0; layout.count()])
+    initial(PolicyConfig::Gaussian { shape })
 }
 
 #[test]
@@ -54,8 +53,9 @@ fn a_header_is_read_as_written() {
     let shape = format!(r#"{{"observation_dim":3,"action_dim":1,"actor":{actor}}}"#);
     assert_eq!(json, format!(r#"{{"kind":"gaussian","shape":{shape}}}"#));
     let newer = json.replace("hidden", "width");
-    assert!(serde_json::from_str::<PolicyConfig>(&newer).is_err(), "an unknown key");
-    assert!(matches!(Header::<u64>::read(&file), Err(PolicyError::Header(_))), "another origin");
+    assert!(serde_json::from_str::<PolicyConfig>(&newer).is_err());
+    let of_another_origin = Header::<u64>::read(&file);
+    assert!(matches!(of_another_origin, Err(PolicyError::Header(_))));
     let tensor = Tensor::zeros(1, DType::F32, &Device::Cpu).unwrap();
     let nameless = safetensors::serialize([("weights", tensor)], None).unwrap();
     assert!(matches!(load(&nameless), Err(PolicyError::NoHeader(_))));
@@ -80,8 +80,10 @@ fn a_header_of_another_version_is_read_or_the_error_names_the_version() {
 fn a_policy_without_candidates_says_so() {
     let policy = load_policy(&gaussian(), Precision::Bf16).unwrap();
     assert_eq!((policy.precision(), policy.choice()), (Precision::F32, None));
-    assert!(matches!(policy.with_choice(Choice::best_of(1)), Err(PolicyError::NoCandidates)));
+    let chosen = policy.with_choice(Choice::best_of(1));
+    assert!(matches!(chosen, Err(PolicyError::NoCandidates)));
     let samples = policy.sample(&[0.0; 3], &mut [policy.begin(0)]);
     assert!(matches!(samples, Err(PolicyError::NoCritics)));
-    assert!(matches!(policy.value(&[0.0; 3], &[0.0]), Err(PolicyError::NoCritics)));
+    let value = policy.value(&[0.0; 3], &[0.0]);
+    assert!(matches!(value, Err(PolicyError::NoCritics)));
 }

@@ -1,6 +1,6 @@
 //! Policies of an actor network that draws candidates, and critics.
 
-use crate::error::{PolicyError, check_range};
+use crate::error::{Result, check_dims, check_range};
 use crate::sampling::candidates::{Actor, CandidatePolicy, Networks};
 use crate::sampling::choice::Choice;
 use quad_nn::{Ensemble, EnsembleShape, MAX_DIM, MlpConfig, Precision, Tensors, Weighted};
@@ -35,13 +35,13 @@ impl ActorCriticShape {
 
     /// The shape of a policy of these networks.
     pub fn of(actor: &Ensemble, critics: &Ensemble) -> Self {
-        let EnsembleShape { members, observation_dim, action_dim, layers, .. } = critics.shape();
+        let shape = critics.shape();
         Self {
-            observation_dim: *observation_dim,
-            action_dim: *action_dim,
+            observation_dim: shape.observation_dim,
+            action_dim: shape.action_dim,
             actor: actor.shape().layers.clone(),
-            critic: layers.clone(),
-            critics: *members,
+            critic: shape.layers.clone(),
+            critics: shape.members,
         }
     }
 
@@ -60,12 +60,16 @@ impl ActorCriticShape {
         choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
-    ) -> Result<CandidatePolicy, PolicyError> {
-        check_range("observation_dim", self.observation_dim, MAX_DIM)?;
-        check_range("action_dim", self.action_dim, MAX_DIM)?;
+    ) -> Result<CandidatePolicy> {
+        check_dims(self.observation_dim, self.action_dim)?;
         check_range("critics", self.critics, MAX_DIM)?;
-        let actor = Box::new(actor(Ensemble::take(actor_shape, tensors, ACTOR, precision)?));
-        let critics = Ensemble::take(self.critics(), tensors, CRITIC, precision)?;
-        CandidatePolicy::new(Networks { actor, critics, value: None }, choice, precision)
+        let actor = actor(Ensemble::take(actor_shape, tensors, ACTOR, precision)?);
+        let networks = Networks {
+            actor: Box::new(actor),
+            critics: Ensemble::take(self.critics(), tensors, CRITIC, precision)?,
+            value: None,
+            precision,
+        };
+        CandidatePolicy::new(networks.into(), choice)
     }
 }

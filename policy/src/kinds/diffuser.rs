@@ -1,7 +1,7 @@
 //! Diffuser's policy: it plans from the current state and executes the first actions of the plan
 //! with the largest value (Janner et al. 2022, Algorithm 1).
 
-use crate::error::{PolicyError, check_numbers};
+use crate::error::{PolicyError, Result, check_numbers};
 use crate::kinds::planner::{CHUNK, DiffuserShape, Planner};
 use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Choice, Rule};
@@ -15,7 +15,6 @@ pub(crate) const VALUE: &str = "value.";
 
 /// Diffuser's policy.
 pub struct DiffuserPolicy {
-    shape: DiffuserShape,
     choice: Choice,
     /// Shared with copies that have another choice.
     planner: Arc<Planner>,
@@ -36,26 +35,26 @@ impl DiffuserPolicy {
         shape: DiffuserShape,
         choice: Choice,
         tensors: &mut Tensors,
-    ) -> Result<Self, PolicyError> {
+    ) -> Result<Self> {
         shape.check()?;
         let (config, width) = (&shape.network, shape.width());
         let model = Weights::take(TrajectoryModel::layout(config, width), tensors, MODEL)?;
         let value = Weights::take(TrajectoryValue::layout(config, width), tensors, VALUE)?;
-        let (model, value) = (
-            TrajectoryModel::new(config.clone(), model),
-            TrajectoryValue::new(config.clone(), value),
-        );
-        let planner = Arc::new(Planner::new(shape.clone(), model, value));
-        Self { shape, choice, planner }.choosing(choice)
+        let model = TrajectoryModel::new(config.clone(), model);
+        let value = TrajectoryValue::new(config.clone(), value);
+        Self::new(Arc::new(Planner::new(shape, model, value)), choice)
     }
 
-    /// The same networks with another choice.
-    fn choosing(&self, choice: Choice) -> Result<Self, PolicyError> {
+    fn new(planner: Arc<Planner>, choice: Choice) -> Result<Self> {
         choice.check()?;
         match choice.rule {
             Rule::Nearest => Err(PolicyError::NoValue),
-            _ => Ok(Self { shape: self.shape.clone(), choice, planner: self.planner.clone() }),
+            _ => Ok(Self { choice, planner }),
         }
+    }
+
+    fn shape(&self) -> &DiffuserShape {
+        &self.planner.shape
     }
 
     /// Plans in some states. Returns the first actions of all plans, `states × plans × replan_every ×
@@ -64,9 +63,10 @@ impl DiffuserPolicy {
         &self,
         observations: &[f32],
         states: &mut [&mut EpisodeState],
-    ) -> Result<(Vec<f32>, Vec<f32>), PolicyError> {
-        let (n, steps) = (states.len(), self.shape.diffusion_steps);
-        let row = self.choice.candidates as usize * self.shape.network.horizon * self.shape.width();
+    ) -> Result<(Vec<f32>, Vec<f32>)> {
+        let (n, steps) = (states.len(), self.shape().diffusion_steps);
+        let trajectory = self.shape().network.horizon * self.shape().width();
+        let row = self.choice.candidates as usize * trajectory;
         let mut noise = vec![0.0; steps * n * row];
         for (i, state) in states.iter_mut().enumerate() {
             for step in 0..steps {
@@ -81,7 +81,7 @@ impl DiffuserPolicy {
 
     /// Numbers in the executed actions of a plan.
     fn taken(&self) -> usize {
-        self.shape.replan_every * self.shape.action_dim
+        self.shape().replan_every * self.shape().action_dim
     }
 }
 
@@ -108,11 +108,11 @@ fn next_of_plan(state: &mut EpisodeState, action_dim: usize) -> (f32, Vec<f32>) 
 
 impl Policy for DiffuserPolicy {
     fn observation_dim(&self) -> usize {
-        self.shape.observation_dim
+        self.shape().observation_dim
     }
 
     fn action_dim(&self) -> usize {
-        self.shape.action_dim
+        self.shape().action_dim
     }
 
     fn precision(&self) -> Precision {
@@ -123,22 +123,23 @@ impl Policy for DiffuserPolicy {
         Some(self.choice)
     }
 
-    fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
-        Ok(Box::new(self.choosing(choice)?))
+    fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>> {
+        Ok(Box::new(Self::new(self.planner.clone(), choice)?))
     }
 
     fn memory(&self, states: usize) -> u64 {
         let rows = states as u128 * u128::from(self.choice.candidates);
-        let trajectory = (self.shape.network.horizon * self.shape.width()) as u128;
-        let noise = trajectory * self.shape.diffusion_steps as u128;
+        let trajectory = (self.shape().network.horizon * self.shape().width()) as u128;
+        let noise = trajectory * self.shape().diffusion_steps as u128;
         let drawn = rows * (noise + 2 * self.taken() as u128 + 2);
-        let observations = 2 * (states * self.shape.observation_dim) as u128;
-        bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape.floats())
+        let observations = 2 * (states * self.shape().observation_dim) as u128;
+        bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape().floats())
     }
 
     fn noise(&self) -> Vec<usize> {
         let plans = self.choice.candidates as usize;
-        vec![self.shape.diffusion_steps, plans, self.shape.network.horizon, self.shape.width()]
+        let shape = self.shape();
+        vec![shape.diffusion_steps, plans, shape.network.horizon, shape.width()]
     }
 
     /// Takes the next action of each state's plan, planning where it has none.
@@ -147,7 +148,7 @@ impl Policy for DiffuserPolicy {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> Result<(), PolicyError> {
+    ) -> Result<()> {
         let (plans, taken) = (self.choice.candidates as usize, self.taken());
         let (lacking, mut planning) = without_plan(observations, states);
         if !planning.is_empty() {
@@ -163,7 +164,7 @@ impl Policy for DiffuserPolicy {
                 state.memory.extend((0..taken).map(|i| mean(&|plan| planned[plan * taken + i])));
             }
         }
-        for (action, state) in actions.chunks_exact_mut(self.shape.action_dim).zip(states) {
+        for (action, state) in actions.chunks_exact_mut(self.shape().action_dim).zip(states) {
             action.copy_from_slice(&next_of_plan(state, action.len()).1);
         }
         Ok(())
@@ -171,38 +172,30 @@ impl Policy for DiffuserPolicy {
 
     /// The first action and the value of each new plan. A state with a plan repeats its next action
     /// and its value instead.
-    fn sample(
-        &self,
-        observations: &[f32],
-        states: &mut [EpisodeState],
-    ) -> Result<Samples, PolicyError> {
-        let (plans, action_dim) = (self.choice.candidates as usize, self.shape.action_dim);
+    fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Samples> {
+        let (plans, action_dim) = (self.choice.candidates as usize, self.shape().action_dim);
         let (lacking, mut planning) = without_plan(observations, states);
         let (planned, drawn) = match planning.is_empty() {
             true => (Vec::new(), Vec::new()),
             false => self.plan(&lacking, &mut planning)?,
         };
-        let mut new = planned.chunks_exact(plans * self.taken()).zip(drawn.chunks_exact(plans));
-        let mut sampled = Samples { actions: Vec::new(), values: Vec::new() };
+        let mut planned = planned.chunks_exact(self.taken());
+        let mut drawn = drawn.chunks_exact(plans);
+        let (mut actions, mut values) = (Vec::new(), Vec::new());
         for state in states {
-            match if state.memory.is_empty() { new.next() } else { None } {
-                Some((planned, values)) => {
-                    let firsts =
-                        planned.chunks_exact(self.taken()).flat_map(|plan| &plan[..action_dim]);
-                    sampled.actions.extend(firsts);
-                    sampled.values.extend_from_slice(values);
-                }
-                None => {
-                    let (value, action) = next_of_plan(state, action_dim);
-                    sampled.actions.extend(action.repeat(plans));
-                    sampled.values.extend(std::iter::repeat_n(value, plans));
-                }
+            if state.memory.is_empty() {
+                let firsts = planned.by_ref().take(plans);
+                actions.extend(firsts.flat_map(|plan| &plan[..action_dim]));
+                values.extend(drawn.next().into_iter().flatten());
+            } else {
+                let (value, action) = next_of_plan(state, action_dim);
+                actions.extend(action.repeat(plans));
+                values.extend(vec![value; plans]);
             }
         }
-        Ok(sampled)
+        Ok(Samples { actions, values })
     }
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests;

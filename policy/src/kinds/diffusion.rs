@@ -1,6 +1,6 @@
 //! The diffusion policy: candidates of the target actor, chosen by the target critics (Eq. 25).
 
-use crate::error::{PolicyError, check_range};
+use crate::error::{Result, check_dims, check_range};
 use crate::kinds::actor_critic::{ACTOR, CRITIC};
 use crate::sampling::candidates::{Actor, CandidatePolicy, Networks};
 use crate::sampling::choice::Choice;
@@ -42,32 +42,27 @@ pub struct DiffusionShape {
 
 impl DiffusionShape {
     /// QUAD's networks: actor and critics with the same hidden layers.
-    pub fn quad(
-        dims: (usize, usize),
-        layers: &MlpConfig,
-        critics: usize,
-        diffusion_steps: usize,
-    ) -> Self {
-        let (observation_dim, action_dim) = dims;
-        let (actor, critic, value) = (layers.clone(), layers.clone(), None);
-        let reverse = Reverse::default();
+    pub fn quad(dims: (usize, usize), layers: &MlpConfig, critics: usize, steps: usize) -> Self {
         Self {
-            observation_dim,
-            action_dim,
-            actor,
-            critic,
-            value,
+            observation_dim: dims.0,
+            action_dim: dims.1,
+            actor: layers.clone(),
+            critic: layers.clone(),
             critics,
-            diffusion_steps,
-            reverse,
+            diffusion_steps: steps,
+            ..Self::default()
         }
     }
 
     /// Shape of the noise predictor.
     pub fn actor(&self) -> NoiseShape {
-        let Self { observation_dim, action_dim, diffusion_steps, reverse, .. } = *self;
-        let layers = self.actor.clone();
-        NoiseShape { observation_dim, action_dim, layers, diffusion_steps, reverse }
+        NoiseShape {
+            observation_dim: self.observation_dim,
+            action_dim: self.action_dim,
+            layers: self.actor.clone(),
+            diffusion_steps: self.diffusion_steps,
+            reverse: self.reverse,
+        }
     }
 
     /// Shape of the critics.
@@ -78,14 +73,8 @@ impl DiffusionShape {
 
     /// Shape of the value function.
     pub fn value(&self) -> Option<EnsembleShape> {
-        Some(EnsembleShape::of_state(self.observation_dim, self.value.as_ref()?, 1))
-    }
-
-    fn check(&self) -> Result<(), PolicyError> {
-        check_range("observation_dim", self.observation_dim, MAX_DIM)?;
-        check_range("action_dim", self.action_dim, MAX_DIM)?;
-        check_range("critics", self.critics, MAX_DIM)?;
-        check_range("diffusion_steps", self.diffusion_steps, MOST_STEPS)
+        let layers = self.value.as_ref()?;
+        Some(EnsembleShape::of_state(self.observation_dim, layers, 1))
     }
 }
 
@@ -108,18 +97,22 @@ impl DiffusionPolicy {
     }
 
     pub(crate) fn load(
-        shape: DiffusionShape,
+        shape: &DiffusionShape,
         choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
-    ) -> Result<CandidatePolicy, PolicyError> {
-        shape.check()?;
+    ) -> Result<CandidatePolicy> {
+        check_dims(shape.observation_dim, shape.action_dim)?;
+        check_range("critics", shape.critics, MAX_DIM)?;
+        check_range("diffusion_steps", shape.diffusion_steps, MOST_STEPS)?;
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
         let actor = NoisePredictor::new(shape.actor(), weights, precision).packed()?;
         let critics = Ensemble::take(shape.critics(), tensors, CRITIC, precision)?;
         let value = |shape| Ensemble::take(shape, tensors, VALUE, precision);
         let value = shape.value().map(value).transpose()?;
-        CandidatePolicy::new(Networks { actor: Box::new(actor), critics, value }, choice, precision)
+        let actor = Box::new(actor);
+        let networks = Networks { actor, critics, value, precision };
+        CandidatePolicy::new(networks.into(), choice)
     }
 }
 
@@ -142,5 +135,4 @@ impl Actor for NoisePredictor {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests;

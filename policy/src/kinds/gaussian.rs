@@ -1,18 +1,17 @@
 //! The Gaussian policy, which acts by its mode, tanh of a network of the state. If it has a
 //! distribution, it explores by draws from it.
 
-use crate::error::{PolicyError, check_numbers, check_range};
+use crate::error::{Result, check_dims, check_numbers};
+use crate::kinds::actor_critic::ACTOR;
 use crate::policy::Policy;
 use crate::sampling::episode::EpisodeState;
-use candle_core::{Device, Result, Tensor};
+use candle_core::{Device, Tensor};
 use quad_nn::{
-    Ensemble, EnsembleShape, Init, Layout, MAX_DIM, MlpConfig, Precision, TensorSpec, Tensors,
-    Weighted, bytes, read, take,
+    Ensemble, EnsembleShape, Init, Layout, MlpConfig, Precision, TensorSpec, Tensors, Weighted,
+    bytes, read, take,
 };
 use serde::{Deserialize, Serialize};
 
-/// Prefix of the tensors' names.
-const ACTOR: &str = "actor.";
 /// Name of log σ, `[a]`, of [`Spread::Shared`].
 const LOG_STD: &str = "log_std";
 
@@ -74,7 +73,7 @@ pub struct GaussianPolicy {
 }
 
 /// The mean actions, `[n, a]` in (−1, 1), for `observations [n, o]`.
-pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> {
+pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> candle_core::Result<Tensor> {
     actor.state_outputs(observations)?.squeeze(0)?.tanh()
 }
 
@@ -83,21 +82,17 @@ impl GaussianPolicy {
     pub const LOG_STD: (f32, f32) = (-20.0, 2.0);
 
     /// The tensors of a policy's file; `log_std`, `[a]`, is of [`Spread::Shared`].
-    pub fn tensors(actor: &Ensemble, log_std: Option<Tensor>) -> Result<Tensors> {
+    pub fn tensors(actor: &Ensemble, log_std: Option<Tensor>) -> candle_core::Result<Tensors> {
         let mut tensors = actor.weights().tensors(ACTOR)?;
         tensors.extend(log_std.map(|log_std| (LOG_STD.to_owned(), log_std)));
         Ok(tensors)
     }
 
-    pub(crate) fn load(
-        shape: GaussianShape,
-        tensors: &mut Tensors,
-    ) -> std::result::Result<Self, PolicyError> {
-        check_range("observation_dim", shape.observation_dim, MAX_DIM)?;
-        check_range("action_dim", shape.action_dim, MAX_DIM)?;
+    pub(crate) fn load(shape: GaussianShape, tensors: &mut Tensors) -> Result<Self> {
+        check_dims(shape.observation_dim, shape.action_dim)?;
         let actor = Ensemble::take(shape.actor(), tensors, ACTOR, Precision::F32)?;
-        let log_std =
-            shape.log_std().map(|_| take(tensors, LOG_STD.to_owned(), &[shape.action_dim]));
+        let log_std = shape.log_std();
+        let log_std = log_std.map(|_| take(tensors, LOG_STD.to_owned(), &[shape.action_dim]));
         Ok(Self { log_std: log_std.transpose()?, shape, actor })
     }
 
@@ -105,7 +100,7 @@ impl GaussianPolicy {
     fn outputs(&self, observations: &[f32], n: usize) -> Result<Tensor> {
         let shape = (n, self.shape.observation_dim);
         let observations = Tensor::from_slice(observations, shape, &Device::Cpu)?;
-        self.actor.state_outputs(&observations)?.squeeze(0)
+        Ok(self.actor.state_outputs(&observations)?.squeeze(0)?)
     }
 
     /// Actions `[n, a]` from the distribution, by standard normal noise `[n, a]`.
@@ -115,13 +110,14 @@ impl GaussianPolicy {
         let mean = out.narrow(1, 0, a)?;
         if self.shape.spread == Spread::Squashed {
             let std = out.narrow(1, a, a)?.clamp(Self::LOG_STD.0, Self::LOG_STD.1)?.exp()?;
-            return (mean + (noise * std)?)?.tanh();
+            return Ok((mean + (noise * std)?)?.tanh()?);
         }
+        let mode = mean.tanh()?;
         match &self.log_std {
             Some(log_std) => {
-                (mean.tanh()? + noise.broadcast_mul(&log_std.exp()?)?)?.clamp(-1f32, 1f32)
+                Ok((mode + noise.broadcast_mul(&log_std.exp()?)?)?.clamp(-1f32, 1f32)?)
             }
-            None => mean.tanh(),
+            None => Ok(mode),
         }
     }
 }
@@ -140,10 +136,9 @@ impl Policy for GaussianPolicy {
     }
 
     fn memory(&self, states: usize) -> u64 {
-        let GaussianShape { observation_dim, action_dim, .. } = self.shape;
         let states = states as u128;
         // Actions, and what exploring draws: noise, σ and their product.
-        let numbers = states * (observation_dim + 6 * action_dim) as u128;
+        let numbers = states * (self.observation_dim() + 6 * self.action_dim()) as u128;
         bytes(self.shape.actor().floats(states, 1) + numbers)
     }
 
@@ -152,7 +147,7 @@ impl Policy for GaussianPolicy {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> std::result::Result<(), PolicyError> {
+    ) -> Result<()> {
         let out = self.outputs(observations, states.len())?;
         let modes = out.narrow(1, 0, self.shape.action_dim)?.tanh()?;
         read(&modes, |modes: &[f32]| actions.copy_from_slice(modes))?;
@@ -164,13 +159,12 @@ impl Policy for GaussianPolicy {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> std::result::Result<(), PolicyError> {
+    ) -> Result<()> {
         let a = self.shape.action_dim;
         let mut noise = vec![0.0; states.len() * a];
-        noise
-            .chunks_exact_mut(a)
-            .zip(states.iter_mut())
-            .for_each(|(x, state)| state.fill_normal(x));
+        for (noise, state) in noise.chunks_exact_mut(a).zip(&mut *states) {
+            state.fill_normal(noise);
+        }
         let noise = Tensor::from_vec(noise, (states.len(), a), &Device::Cpu)?;
         let drawn = self.draw(observations, &noise)?;
         read(&drawn, |drawn: &[f32]| actions.copy_from_slice(drawn))?;

@@ -18,7 +18,7 @@ impl OneStepActor {
     /// Shape of the network of state and noise, which is as long as an action.
     pub fn shape(policy: &ActorCriticShape) -> EnsembleShape {
         let dims = (policy.observation_dim, policy.action_dim);
-        EnsembleShape { outputs: dims.1, ..EnsembleShape::critics(1, dims, &policy.actor) }
+        EnsembleShape::critics(1, dims, &policy.actor).with_outputs(dims.1)
     }
 
     /// Actions `[rows, a]`, clipped to ±1, from standard normal `noise`, `[rows, a]`, for
@@ -33,10 +33,6 @@ impl Actor for OneStepActor {
         (self.0.shape().observation_dim, self.0.shape().action_dim)
     }
 
-    fn noise_vectors(&self) -> usize {
-        1
-    }
-
     fn draw(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.sample(observations, &noise.squeeze(0)?)
     }
@@ -48,27 +44,21 @@ impl Actor for OneStepActor {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
-    use super::*;
     use crate::file::PolicyConfig;
     use crate::policy::Samples;
     use crate::sampling::choice::Choice;
-    use crate::testing::{act, file_of, load, sample};
-    use quad_nn::{Activation, MlpConfig};
+    use crate::testing::{act, file_of, load, of_two_units, sample};
 
     #[test]
     fn actions_are_a_clipped_network_of_state_and_noise() {
-        let layers = MlpConfig { activation: Activation::Relu, ..MlpConfig::mish(&[2]) };
-        let (actor, critic) = (layers.clone(), layers);
-        let shape =
-            ActorCriticShape { observation_dim: 1, action_dim: 1, actor, critic, critics: 2 };
         // The actor is s + z; the critics are a and 2a. Kernels, then biases, layer after layer.
         let actor = vec![1.0, -1.0, 1.0, -1.0, 0.0, 0.0, 1.0, -1.0, 0.0];
         let first = [0.0, 0.0, 1.0, -1.0].repeat(2);
         let critics = [&first[..], &[0.0; 4], &[1.0, -1.0, 2.0, -2.0], &[0.0; 2]].concat();
         let mut weights = [actor, critics].into_iter();
-        let policy = PolicyConfig::OneStep { shape, choice: Choice::best_of(500) };
+        let (shape, choice) = (of_two_units(1), Choice::best_of(500));
+        let policy = PolicyConfig::OneStep { shape, choice };
         let policy = load(&file_of(policy, None, |_| weights.next().unwrap())).unwrap();
 
         let Samples { actions, values } = sample(&*policy, &[0.25], &[3]).unwrap();
@@ -79,6 +69,7 @@ mod tests {
             assert!((action - expected).abs() < 1e-6, "{action} for {expected}");
             assert!((value - 1.5 * expected).abs() < 1e-6, "{value}");
         }
-        assert_eq!(act(&*policy, &[0.25], &[3]).unwrap(), [1.0], "the best of many is clipped");
+        let best = act(&*policy, &[0.25], &[3]).unwrap();
+        assert_eq!(best, [1.0], "the best of many is clipped");
     }
 }

@@ -1,12 +1,10 @@
 //! Diffuser's planner: it denoises trajectories `[action, state] × H` from a given first state,
 //! guided by the gradient of their value.
 
-use crate::error::{PolicyError, check_range};
+use crate::error::{PolicyError, check_dims, check_range};
 use candle_core::{Device, Error, Result, Tensor, Var};
 use quad_kernels::scaling::Scaling;
-use quad_nn::{
-    MAX_DIM, Schedule, TrajectoryConfig, TrajectoryError, TrajectoryModel, TrajectoryValue, read,
-};
+use quad_nn::{Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, read};
 use serde::{Deserialize, Serialize};
 
 /// Bound of the denoising steps, and of the steps of guidance in each.
@@ -53,12 +51,10 @@ impl DiffuserShape {
         self.action_dim + self.observation_dim
     }
 
-    pub(crate) fn check(&self) -> std::result::Result<(), PolicyError> {
-        check_range("observation_dim", self.observation_dim, MAX_DIM)?;
-        check_range("action_dim", self.action_dim, MAX_DIM)?;
-        self.network
-            .check()
-            .map_err(|TrajectoryError { field, value, .. }| PolicyError::Range { field, value })?;
+    pub(crate) fn check(&self) -> crate::error::Result<()> {
+        check_dims(self.observation_dim, self.action_dim)?;
+        let checked = self.network.check();
+        checked.map_err(|of| PolicyError::Range { field: of.field, value: of.value })?;
         check_range("diffusion_steps", self.diffusion_steps, MOST_STEPS)?;
         check_range("guidance.steps", self.guidance.steps, MOST_STEPS)?;
         check_range("replan_every", self.replan_every, self.network.horizon)
@@ -67,18 +63,20 @@ impl DiffuserShape {
     /// Numbers held of a trajectory while a gradient is taken: all layers, some of them unfolded, and
     /// their gradients.
     pub(crate) fn floats(&self) -> u128 {
-        let TrajectoryConfig { horizon, attention, .. } = &self.network;
-        let levels = self.network.lengths().into_iter().zip(self.network.widths());
-        let of_blocks =
-            levels.map(|(steps, wide)| 100 * steps * wide.max(self.width())).sum::<usize>();
-        let inner = attention.map_or(0, |of| of.heads * of.width * (16 * horizon + 4 * of.width));
-        (of_blocks + inner * 2 * self.network.multipliers.len()) as u128
+        let network = &self.network;
+        let levels = network.lengths().into_iter().zip(network.widths());
+        let of_level = |(steps, wide): (usize, usize)| 100 * steps * wide.max(self.width());
+        let of_blocks: usize = levels.map(of_level).sum();
+        let inner = network
+            .attention
+            .map_or(0, |of| of.heads * of.width * (16 * network.horizon + 4 * of.width));
+        (of_blocks + inner * 2 * network.multipliers.len()) as u128
     }
 }
 
 /// Diffuser's networks and noise schedule.
 pub struct Planner {
-    shape: DiffuserShape,
+    pub(crate) shape: DiffuserShape,
     schedule: Schedule,
     model: TrajectoryModel,
     value: TrajectoryValue,
@@ -95,7 +93,8 @@ pub fn with_first_state(x: &Tensor, states: &Tensor) -> Result<Tensor> {
 impl Planner {
     /// A planner with networks of the shape.
     pub fn new(shape: DiffuserShape, model: TrajectoryModel, value: TrajectoryValue) -> Self {
-        Self { schedule: Schedule::cosine(shape.diffusion_steps), shape, model, value }
+        let schedule = Schedule::cosine(shape.diffusion_steps);
+        Self { shape, schedule, model, value }
     }
 
     /// Plans in n states with `observations`, `n × observation_dim`, in the networks' units.
@@ -107,13 +106,11 @@ impl Planner {
         &self,
         observations: &[f32],
         noise: &[f32],
-    ) -> std::result::Result<(Vec<f32>, Vec<f32>), PolicyError> {
-        let DiffuserShape {
-            observation_dim: o, action_dim: a, diffusion_steps, replan_every, ..
-        } = self.shape;
-        let (horizon, states) = (self.shape.network.horizon, observations.len() / o);
-        let size = horizon * self.shape.width();
-        let all = noise.len() / diffusion_steps;
+    ) -> crate::error::Result<(Vec<f32>, Vec<f32>)> {
+        let shape = &self.shape;
+        let (o, horizon) = (shape.observation_dim, shape.network.horizon);
+        let (states, size) = (observations.len() / o, horizon * shape.width());
+        let all = noise.len() / shape.diffusion_steps;
         let (rows, mut actions, mut values) = (all / size, Vec::new(), Vec::new());
         for from in (0..rows).step_by(CHUNK) {
             let count = CHUNK.min(rows - from);
@@ -122,10 +119,11 @@ impl Planner {
             let first = Tensor::from_vec(first, (count, o), &Device::Cpu)?;
             let noise = |step: usize| {
                 let numbers = &noise[step * all + from * size..][..count * size];
-                Tensor::from_slice(numbers, (count, horizon, self.shape.width()), &Device::Cpu)
+                Tensor::from_slice(numbers, (count, horizon, shape.width()), &Device::Cpu)
             };
             let (plans, of_plans) = self.denoise(&first, noise)?;
-            let taken = plans.narrow(1, 0, replan_every)?.narrow(2, 0, a)?.contiguous()?;
+            let taken = plans.narrow(1, 0, shape.replan_every)?;
+            let taken = taken.narrow(2, 0, shape.action_dim)?.contiguous()?;
             read(&taken, |taken: &[f32]| actions.extend_from_slice(taken))?;
             values.extend(of_plans);
         }
@@ -149,17 +147,18 @@ impl Planner {
                 values = self.value.values(&x, &all)?.to_vec1()?;
             } else if t > stop {
                 for _ in 0..steps {
-                    let along =
-                        (self.gradient(&x, &all)? * f64::from(scale * self.schedule.variance(t)))?;
+                    let scale = f64::from(scale * self.schedule.variance(t));
+                    let along = (self.gradient(&x, &all)? * scale)?;
                     x = with_first_state(&(x + along)?, first)?;
                 }
             }
-            let z = if t > 1 { Some(noise(self.shape.diffusion_steps - t + 1)?) } else { None };
+            let z = match t {
+                1 => None,
+                _ => Some(noise(self.shape.diffusion_steps - t + 1)?),
+            };
             let clean = self.model.clean(&x, &all)?;
-            x = with_first_state(
-                &self.schedule.reverse_to_clean(t, &x, &clean, z.as_ref())?,
-                first,
-            )?;
+            let next = self.schedule.reverse_to_clean(t, &x, &clean, z.as_ref())?;
+            x = with_first_state(&next, first)?;
         }
         Ok((x, values))
     }

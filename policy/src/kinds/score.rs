@@ -1,13 +1,13 @@
 //! SfBC's policy: candidates of a score network, chosen by a critic.
 
-use crate::error::{PolicyError, check_range};
+use crate::error::{Result, check_dims, check_range};
 use crate::kinds::actor_critic::{ACTOR, CRITIC};
 use crate::sampling::candidates::{Actor, CandidatePolicy, Networks};
 use crate::sampling::choice::Choice;
 use candle_core::Tensor;
 use quad_nn::{
-    DpmSolver, Ensemble, EnsembleShape, MAX_DIM, MlpConfig, Precision, ScoreNetwork, ScoreShape,
-    Tensors, Weighted, Weights, take,
+    DpmSolver, Ensemble, EnsembleShape, MlpConfig, Precision, ScoreNetwork, ScoreShape, Tensors,
+    Weighted, Weights, take,
 };
 use serde::{Deserialize, Serialize};
 
@@ -35,19 +35,16 @@ pub struct ScorePolicyShape {
 impl ScorePolicyShape {
     /// Shape of the score network.
     pub fn actor(&self) -> ScoreShape {
-        let Self { observation_dim, action_dim, .. } = *self;
-        ScoreShape { observation_dim, action_dim, layers: self.actor.clone() }
+        ScoreShape {
+            observation_dim: self.observation_dim,
+            action_dim: self.action_dim,
+            layers: self.actor.clone(),
+        }
     }
 
     /// Shape of the critic, an ensemble of one.
     pub fn critic(&self) -> EnsembleShape {
         EnsembleShape::critics(1, (self.observation_dim, self.action_dim), &self.critic)
-    }
-
-    fn check(&self) -> Result<(), PolicyError> {
-        check_range("observation_dim", self.observation_dim, MAX_DIM)?;
-        check_range("action_dim", self.action_dim, MAX_DIM)?;
-        check_range("evaluations", self.evaluations, MOST_EVALUATIONS)
     }
 }
 
@@ -64,18 +61,24 @@ impl ScorePolicy {
     }
 
     pub(crate) fn load(
-        shape: ScorePolicyShape,
+        shape: &ScorePolicyShape,
         choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
-    ) -> Result<CandidatePolicy, PolicyError> {
-        shape.check()?;
+    ) -> Result<CandidatePolicy> {
+        check_dims(shape.observation_dim, shape.action_dim)?;
+        check_range("evaluations", shape.evaluations, MOST_EVALUATIONS)?;
         let frequencies = take(tensors, FREQUENCIES.to_owned(), &[ScoreShape::FREQUENCIES])?;
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
         let network = ScoreNetwork::new(shape.actor(), weights, frequencies);
-        let actor = Box::new(ScoreActor { network, solver: DpmSolver::new(shape.evaluations) });
-        let critics = Ensemble::take(shape.critic(), tensors, CRITIC, precision)?;
-        CandidatePolicy::new(Networks { actor, critics, value: None }, choice, Precision::F32)
+        let solver = DpmSolver::new(shape.evaluations);
+        let networks = Networks {
+            actor: Box::new(ScoreActor { network, solver }),
+            critics: Ensemble::take(shape.critic(), tensors, CRITIC, precision)?,
+            value: None,
+            precision: Precision::F32,
+        };
+        CandidatePolicy::new(networks.into(), choice)
     }
 }
 
@@ -87,11 +90,8 @@ struct ScoreActor {
 
 impl Actor for ScoreActor {
     fn dims(&self) -> (usize, usize) {
-        (self.network.shape().observation_dim, self.network.shape().action_dim)
-    }
-
-    fn noise_vectors(&self) -> usize {
-        1
+        let shape = self.network.shape();
+        (shape.observation_dim, shape.action_dim)
     }
 
     fn draw(&self, observations: &Tensor, noise: &Tensor) -> candle_core::Result<Tensor> {
@@ -106,28 +106,31 @@ impl Actor for ScoreActor {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use crate::error::PolicyError;
     use crate::file::{PolicyConfig, load_policy};
     use crate::policy::Samples;
-    use crate::sampling::choice::Rule;
-    use crate::testing::{act, initial, sample};
+    use crate::sampling::choice::Aggregate;
+    use crate::testing::{act, initial, layers, sample};
     use quad_nn::Activation;
 
     fn file(evaluations: usize, choice: Choice) -> Vec<u8> {
-        let actor = MlpConfig { activation: Activation::Silu, ..MlpConfig::mish(&[16, 8]) };
-        let (critic, dims) = (actor.clone(), (3, 2));
-        let (observation_dim, action_dim) = dims;
-        let shape = ScorePolicyShape { observation_dim, action_dim, actor, critic, evaluations };
+        let shape = ScorePolicyShape {
+            observation_dim: 3,
+            action_dim: 2,
+            actor: layers(Activation::Silu, &[16, 8]),
+            critic: layers(Activation::Silu, &[16, 8]),
+            evaluations,
+        };
         initial(PolicyConfig::Score { shape, choice })
     }
 
     /// The temperature is so low that the best four are certain.
     #[test]
     fn the_action_is_the_mean_of_the_best_candidates() {
-        let rule = Rule::Average { temperature: 1e-7, actions: 4 };
-        let file = file(5, Choice { rule, ..Choice::best_of(6) });
+        let rule = "average:1e-7:4".parse().unwrap();
+        let file = file(5, Choice::new(6, Aggregate::Mean, rule));
         let policy = load_policy(&file, Precision::Bf16).unwrap();
         assert_eq!(policy.precision(), Precision::F32);
         let (observations, seeds) = ([0.5, -0.2, 0.1, 1.0, 0.0, -1.0], [7, 8]);
@@ -138,15 +141,14 @@ mod tests {
             let mut order: Vec<usize> = (0..6).collect();
             order.sort_by(|x, y| values[*y].total_cmp(&values[*x]));
             for (j, taken) in taken.iter().enumerate() {
-                let mean = order[..4].iter().map(|place| actions[place * 2 + j]).sum::<f32>() / 4.0;
+                let chosen = order[..4].iter().map(|place| actions[place * 2 + j]);
+                let mean = chosen.sum::<f32>() / 4.0;
                 let error = (taken - mean).abs() / mean.abs().max(1.0);
                 assert!(error < 1e-5, "state {i}: {taken} for {mean}");
             }
             let observations = observations[i * 3..][..3].repeat(6);
             assert_eq!(policy.value(&observations, actions).unwrap(), values);
         }
-        let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(2) };
-        assert!(matches!(policy.with_choice(nearest), Err(PolicyError::NoValue)));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Policies of an actor that draws candidates, and critics that choose among them.
 
-use crate::error::{PolicyError, check_numbers};
+use crate::error::{PolicyError, Result, check_numbers};
 use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Choice, Rule};
 use crate::sampling::episode::EpisodeState;
@@ -14,7 +14,9 @@ pub(crate) trait Actor: Send + Sync {
     fn dims(&self) -> (usize, usize);
 
     /// Number of noise vectors, each as long as an action, for one action.
-    fn noise_vectors(&self) -> usize;
+    fn noise_vectors(&self) -> usize {
+        1
+    }
 
     /// Draws actions `[rows, a]` for `observations`, `[n, o]`, from standard normal `noise`,
     /// `[noise vectors, rows, a]`. The first rows/n rows belong to the first observation, and so on.
@@ -30,6 +32,7 @@ pub(crate) struct Networks {
     pub critics: Ensemble,
     /// Value function of the rule `nearest`.
     pub value: Option<Ensemble>,
+    pub precision: Precision,
 }
 
 /// A policy that chooses among candidates.
@@ -37,25 +40,15 @@ pub(crate) struct CandidatePolicy {
     choice: Choice,
     /// Shared with copies that have another choice.
     networks: Arc<Networks>,
-    precision: Precision,
 }
 
 impl CandidatePolicy {
-    pub fn new(
-        networks: Networks,
-        choice: Choice,
-        precision: Precision,
-    ) -> Result<Self, PolicyError> {
-        Self { choice, networks: Arc::new(networks), precision }.choosing(choice)
-    }
-
-    /// The same networks with another choice.
-    fn choosing(&self, choice: Choice) -> Result<Self, PolicyError> {
+    pub fn new(networks: Arc<Networks>, choice: Choice) -> Result<Self> {
         choice.check()?;
-        if choice.rule == Rule::Nearest && self.networks.value.is_none() {
+        if choice.rule == Rule::Nearest && networks.value.is_none() {
             return Err(PolicyError::NoValue);
         }
-        Ok(Self { choice, networks: self.networks.clone(), precision: self.precision })
+        Ok(Self { choice, networks })
     }
 
     /// Draws the noise of all candidates, `noise vectors × states × candidates × action_dim`.
@@ -72,11 +65,7 @@ impl CandidatePolicy {
     }
 
     /// The observations, `[states, o]`, and their candidates, `[states·candidates, a]`, from noise.
-    fn candidates(
-        &self,
-        observations: &[f32],
-        noise: Vec<f32>,
-    ) -> Result<(Tensor, Tensor), PolicyError> {
+    fn candidates(&self, observations: &[f32], noise: Vec<f32>) -> Result<(Tensor, Tensor)> {
         let (observation_dim, action_dim) = self.networks.actor.dims();
         let states = observations.len() / observation_dim;
         let rows = states * self.choice.candidates as usize;
@@ -89,7 +78,7 @@ impl CandidatePolicy {
 
     /// The critics' values of actions, by the choice's
     /// [`Aggregate`](crate::sampling::choice::Aggregate).
-    fn values(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>, PolicyError> {
+    fn values(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>> {
         let rows = actions.dim(0)?;
         let values = self.networks.critics.values(observations, actions)?;
         Ok(read(&values, |values: &[f32]| self.choice.aggregate.reduce(values, rows))?)
@@ -97,11 +86,7 @@ impl CandidatePolicy {
 
     /// Draws candidates, `states × candidates × action_dim`, and their scores, `states × candidates`,
     /// which are 0 for a single candidate.
-    pub fn draw(
-        &self,
-        observations: &[f32],
-        noise: Vec<f32>,
-    ) -> Result<(Vec<f32>, Vec<f32>), PolicyError> {
+    pub fn draw(&self, observations: &[f32], noise: Vec<f32>) -> Result<(Vec<f32>, Vec<f32>)> {
         let (observations, drawn) = self.candidates(observations, noise)?;
         let scores = match self.choice.candidates {
             1 => vec![0.0; drawn.dim(0)?],
@@ -111,7 +96,7 @@ impl CandidatePolicy {
     }
 
     /// The numbers that the choice's rule compares: values Q, or −(Q − V)² for the rule `nearest`.
-    fn scores(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>, PolicyError> {
+    fn scores(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>> {
         let mut scores = self.values(observations, actions)?;
         if let (Rule::Nearest, Some(value)) = (self.choice.rule, &self.networks.value) {
             let of_states = read(&value.state_values(observations)?, <[f32]>::to_vec)?;
@@ -142,19 +127,19 @@ impl Policy for CandidatePolicy {
     }
 
     fn precision(&self) -> Precision {
-        self.precision.in_effect()
+        self.networks.precision.in_effect()
     }
 
     fn choice(&self) -> Option<Choice> {
         Some(self.choice)
     }
 
-    fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
-        Ok(Box::new(self.choosing(choice)?))
+    fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>> {
+        Ok(Box::new(Self::new(self.networks.clone(), choice)?))
     }
 
     fn memory(&self, states: usize) -> u64 {
-        let Networks { actor, critics, value } = &*self.networks;
+        let Networks { actor, critics, value, .. } = &*self.networks;
         let ((observation_dim, action_dim), noises) = (actor.dims(), actor.noise_vectors());
         let (states, candidates) = (states as u128, u128::from(self.choice.candidates));
         // The noise of all steps, the candidates and their copies, and their values.
@@ -165,11 +150,8 @@ impl Policy for CandidatePolicy {
     }
 
     fn noise(&self) -> Vec<usize> {
-        vec![
-            self.networks.actor.noise_vectors(),
-            self.choice.candidates as usize,
-            self.action_dim(),
-        ]
+        let noises = self.networks.actor.noise_vectors();
+        vec![noises, self.choice.candidates as usize, self.action_dim()]
     }
 
     fn act(
@@ -177,7 +159,7 @@ impl Policy for CandidatePolicy {
         observations: &[f32],
         states: &mut [EpisodeState],
         actions: &mut [f32],
-    ) -> Result<(), PolicyError> {
+    ) -> Result<()> {
         let (action_dim, candidates) = (self.action_dim(), self.choice.candidates as usize);
         let (drawn, scores) = self.draw(observations, self.draw_noise(states))?;
         let drawn = drawn.chunks_exact(candidates * action_dim);
@@ -190,11 +172,7 @@ impl Policy for CandidatePolicy {
         check_numbers("a sampled action", actions)
     }
 
-    fn sample(
-        &self,
-        observations: &[f32],
-        states: &mut [EpisodeState],
-    ) -> Result<Samples, PolicyError> {
+    fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Samples> {
         let (observations, drawn) = self.candidates(observations, self.draw_noise(states))?;
         let values = self.values(&observations, &drawn)?;
         let actions = read(&drawn, <[f32]>::to_vec)?;
@@ -203,7 +181,7 @@ impl Policy for CandidatePolicy {
         Ok(Samples { actions, values })
     }
 
-    fn value(&self, observations: &[f32], actions: &[f32]) -> Result<Vec<f32>, PolicyError> {
+    fn value(&self, observations: &[f32], actions: &[f32]) -> Result<Vec<f32>> {
         let (observation_dim, action_dim) = self.networks.actor.dims();
         let n = actions.len() / action_dim;
         let observations = Tensor::from_slice(observations, (n, observation_dim), &Device::Cpu)?;

@@ -1,6 +1,6 @@
 //! The choice among the candidates of a state.
 
-use crate::error::{PolicyError, check_range};
+use crate::error::{PolicyError, Result, check_range};
 use crate::sampling::episode::EpisodeState;
 use serde::de::{self, IntoDeserializer};
 use serde::{Deserialize, Serialize};
@@ -25,10 +25,9 @@ pub struct Choice {
 /// Aggregate of the values of an ensemble of critics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[allow(missing_docs)]
 pub enum Aggregate {
-    /// Mean.
     Mean,
-    /// Minimum.
     Min,
 }
 
@@ -65,11 +64,16 @@ impl Choice {
 
     /// The best of this many candidates by the mean of the critics (Eq. 25).
     pub fn best_of(candidates: u32) -> Self {
-        Self { candidates, aggregate: Aggregate::Mean, rule: Rule::Best }
+        Self::new(candidates, Aggregate::Mean, Rule::Best)
+    }
+
+    /// A choice of these values, which [`Self::check`] checks.
+    pub fn new(candidates: u32, aggregate: Aggregate, rule: Rule) -> Self {
+        Self { candidates, aggregate, rule }
     }
 
     /// Checks the numbers of candidates and the temperature.
-    pub fn check(&self) -> Result<(), PolicyError> {
+    pub fn check(&self) -> Result<()> {
         check_range("candidates", self.candidates as usize, Self::MOST_CANDIDATES as usize)?;
         if let Rule::Average { actions, .. } = self.rule {
             check_range("actions", actions as usize, Self::MOST_CANDIDATES as usize)?;
@@ -97,11 +101,7 @@ impl Choice {
 
     /// Indices of the chosen candidates, of which the mean is the action. `scores` are values, or
     /// −(Q − V)² for [`Rule::Nearest`].
-    pub(crate) fn pick(
-        &self,
-        scores: &[f32],
-        state: &mut EpisodeState,
-    ) -> Result<Vec<usize>, PolicyError> {
+    pub(crate) fn pick(&self, scores: &[f32], state: &mut EpisodeState) -> Result<Vec<usize>> {
         if scores.iter().any(|score| score.is_nan()) {
             return Err(PolicyError::NotANumber("the value of a candidate"));
         }
@@ -117,17 +117,26 @@ impl Choice {
     }
 }
 
+impl Rule {
+    /// [`Self::Softmax`] with this temperature.
+    pub fn softmax(temperature: f32) -> Self {
+        Self::Softmax { temperature }
+    }
+}
+
 impl Aggregate {
     /// The aggregate of each of `rows` actions, for `values` `critics × rows`. Keeps NaN.
     pub(crate) fn reduce(self, values: &[f32], rows: usize) -> Vec<f32> {
         let critics = (values.len() / rows) as f32;
+        let min = |min, q: f32| match q < min || q.is_nan() {
+            true => q,
+            false => min,
+        };
         let of_action = |row| {
             let values = values.iter().skip(row).step_by(rows).copied();
             match self {
                 Self::Mean => values.map(|q| q / critics).sum(),
-                Self::Min => {
-                    values.fold(f32::INFINITY, |min, q| if q < min || q.is_nan() { q } else { min })
-                }
+                Self::Min => values.fold(f32::INFINITY, min),
             }
         };
         (0..rows).map(of_action).collect()
@@ -196,7 +205,7 @@ impl FromStr for Rule {
         match text.split(':').collect::<Vec<_>>()[..] {
             ["best"] => Ok(Self::Best),
             ["nearest"] => Ok(Self::Nearest),
-            ["softmax", number] => Ok(Self::Softmax { temperature: temperature(number)? }),
+            ["softmax", number] => Ok(Self::softmax(temperature(number)?)),
             ["average", number, actions] => {
                 let actions = actions.parse().map_err(|_| expected)?;
                 Ok(Self::Average { temperature: temperature(number)?, actions })
@@ -229,10 +238,9 @@ impl fmt::Display for Choice {
         if *rule != Rule::Best {
             write!(f, ", {rule}")?;
         }
-        if *aggregate == Aggregate::Min { f.write_str(", min") } else { Ok(()) }
+        f.write_str(if *aggregate == Aggregate::Min { ", min" } else { "" })
     }
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests;

@@ -37,6 +37,16 @@ pub enum ConfigError {
 }
 
 impl ConfigError {
+    pub(super) fn out_of_range(field: &'static str, value: impl ToString, range: &str) -> Self {
+        let (value, range) = (value.to_string(), range.to_owned());
+        Self::OutOfRange { field, value, range }
+    }
+
+    pub(super) fn unknown(kind: &'static str, name: &str, hint: String) -> Self {
+        let name = name.to_owned();
+        Self::Unknown { kind, name, hint }
+    }
+
     /// Tells the user how to fix it.
     pub fn hint(&self) -> String {
         match self {
@@ -57,9 +67,7 @@ impl ConfigError {
             Self::Evaluations { most, .. } => {
                 format!("choose a larger eval_interval, for at most {most}")
             }
-            Self::Keys { .. } | Self::OutOfRange { .. } | Self::Hyperparameters { .. } => {
-                KEYS.to_owned()
-            }
+            _ => KEYS.to_owned(),
         }
     }
 }

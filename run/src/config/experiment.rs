@@ -1,6 +1,6 @@
 //! One experiment, every value of which is checked.
 
-use quad_algorithms::{Definition, Hyperparameters, Reporting, Variant};
+use quad_algorithms::{Definition, Hyperparameters};
 use quad_dataset::{Normalize, RewardRule};
 use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
@@ -89,13 +89,15 @@ impl Experiment {
 
     /// Name, variant and counts of the algorithm: `quad, guidance dac, 10 candidates`.
     pub fn method(&self) -> Result<String, ConfigError> {
-        let Reporting { variant, counts, .. } = self.definition()?.report;
+        let report = self.definition()?.report;
         let mut method = self.algorithm.clone();
-        if let Some(Variant { key, .. }) = variant {
-            method += &format!(", {key} {}", self.variant()?);
+        if let Some(variant) = report.variant {
+            method += &format!(", {} {}", variant.key, self.variant()?);
         }
-        for (count, key) in counts.iter().filter_map(|key| Some((self.agent.get(*key)?, key))) {
-            method += &format!(", {count} {key}");
+        for key in report.counts {
+            if let Some(count) = self.agent.get(*key) {
+                method += &format!(", {count} {key}");
+            }
         }
         Ok(method)
     }
@@ -113,13 +115,13 @@ impl Experiment {
 
     /// The values that distinguish runs, in one line.
     pub fn summary(&self) -> Result<String, ConfigError> {
-        let Self { steps, eval_interval, episodes, seed, batch_size, online, .. } = self;
-        let method = self.method()?;
-        let evaluations = match eval_interval {
+        let (method, seed, steps) = (self.method()?, self.seed, self.steps);
+        let batch_size = self.batch_size;
+        let evaluations = match self.eval_interval {
             0 => "no evaluations".to_owned(),
-            _ => format!("{episodes} episodes every {eval_interval}"),
+            interval => format!("{} episodes every {interval}", self.episodes),
         };
-        let online = online.as_ref().map_or(String::new(), |online| {
+        let online = self.online.as_ref().map_or(String::new(), |online| {
             let Online { steps, updates_per_step, .. } = online;
             format!(", then {steps} environment steps with {updates_per_step} each")
         });
@@ -138,19 +140,18 @@ impl Experiment {
             ("batch_size", self.batch_size.into(), 1, MOST_BATCH),
         ] {
             if !(least..=most).contains(&value) {
-                let (value, range) = (value.to_string(), format!("from {least} to {most}"));
-                return Err(ConfigError::OutOfRange { field, value, range });
+                let range = format!("from {least} to {most}");
+                return Err(ConfigError::out_of_range(field, value, &range));
             }
         }
         self.online.as_ref().map_or(Ok(()), Online::check_ranges)?;
         if self.total_steps() == 0 {
             return Err(ConfigError::NoSteps);
         }
-        if !(0.0..1.0).contains(&self.hold_out) {
-            let (value, range) = (self.hold_out.to_string(), "at least 0 and below 1".to_owned());
-            return Err(ConfigError::OutOfRange { field: "hold_out", value, range });
+        match self.hold_out {
+            0.0..1.0 => Ok(()),
+            share => Err(ConfigError::out_of_range("hold_out", share, "at least 0 and below 1")),
         }
-        Ok(())
     }
 
     pub(super) fn check(&mut self) -> Result<(), ConfigError> {
@@ -162,9 +163,10 @@ impl Experiment {
             let most = MOST_EVALUATIONS;
             return Err(ConfigError::Evaluations { steps, interval, evaluations, most });
         }
-        let algorithm = || self.algorithm.clone();
-        self.agent = Hyperparameters::new(&self.definition()?, self.agent.to_table())
-            .map_err(|source| ConfigError::Hyperparameters { algorithm: algorithm(), source })?;
+        let checked = Hyperparameters::new(&self.definition()?, self.agent.to_table());
+        let algorithm = self.algorithm.clone();
+        self.agent =
+            checked.map_err(|source| ConfigError::Hyperparameters { algorithm, source })?;
         Ok(())
     }
 }

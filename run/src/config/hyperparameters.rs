@@ -9,8 +9,9 @@ use super::tasks::Task;
 /// True if an algorithm's authors give no values for a benchmark's task. A task without a dataset
 /// of its own is no benchmark's.
 fn lacks(values: &Values, task: &Task) -> bool {
-    let given = task.benchmark.and_then(|benchmark| values.given.get(&benchmark.name));
-    let is_given = given.into_iter().flatten().any(|pattern| fits(pattern, &task.name));
+    let given = task.benchmark.and_then(|of| values.given.get(&of.name));
+    let mut given = given.into_iter().flatten();
+    let is_given = given.any(|pattern| fits(pattern, &task.name));
     task.text("dataset").is_some() && !is_given
 }
 
@@ -21,19 +22,20 @@ pub fn not_given(definition: &Definition, task: &Task) -> Option<String> {
         other => format!("those for {other} are used"),
     };
     let (algorithm, name) = (definition.name, &task.name);
-    lacks(&Values::of(definition), task)
-        .then(|| format!("{algorithm}'s authors give no values for {name}; {instead}"))
+    let warning = format!("{algorithm}'s authors give no values for {name}; {instead}");
+    lacks(&Values::of(definition), task).then_some(warning)
 }
 
 /// Finds an algorithm by name.
 pub fn algorithm(name: &str) -> Result<Definition, ConfigError> {
     let unknown = || {
         let names = Vec::from_iter(ALGORITHMS.iter().map(|known| known.name));
-        let hint =
-            format!("{}there are {}", did_you_mean(name, names.iter().copied()), names.join(", "));
-        ConfigError::Unknown { kind: "algorithm", name: name.to_owned(), hint }
+        let similar = did_you_mean(name, names.iter().copied());
+        let hint = format!("{similar}there are {}", names.join(", "));
+        ConfigError::unknown("algorithm", name, hint)
     };
-    ALGORITHMS.iter().find(|known| known.name == name).copied().ok_or_else(unknown)
+    let found = ALGORITHMS.iter().find(|known| known.name == name);
+    found.copied().ok_or_else(unknown)
 }
 
 #[cfg(test)]

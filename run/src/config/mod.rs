@@ -4,7 +4,6 @@
 //! or a file; `experiment`, all of that resolved; `run_config`, the contents of `config.toml`;
 //! `online`, practice; `schedule`, the evaluated steps; `settings`, which compares runs key by key.
 
-mod device;
 mod error;
 mod experiment;
 pub mod hyperparameters;
@@ -17,11 +16,10 @@ pub mod settings;
 pub mod tables;
 pub mod tasks;
 
-pub use device::Device;
 pub use error::ConfigError;
 pub use experiment::Experiment;
 pub use nearest::did_you_mean;
 pub use online::Online;
 pub use presets::{Preset, resolve};
-pub use run_config::{DatasetInfo, RunConfig, RunInfo};
+pub use run_config::{DatasetInfo, Device, RunConfig, RunInfo};
 pub use schedule::Schedule;

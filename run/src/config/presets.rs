@@ -7,6 +7,7 @@ use std::path::Path;
 
 use quad_algorithms::{ALGORITHMS, Definition, Values};
 use quad_dataset::environment;
+use serde::Deserialize;
 use toml::{Table, Value};
 
 use super::error::ConfigError;
@@ -34,7 +35,9 @@ impl Preset {
     pub fn read(preset: &str) -> Result<Self, ConfigError> {
         if !is_path(preset) {
             let task = tasks::named(preset)?;
-            return Ok(Self { label: task.name.clone(), task: Some(task), own: Table::new() });
+            let (label, own) = (task.name.clone(), Table::new());
+            let task = Some(task);
+            return Ok(Self { label, task, own });
         }
         let name = || preset.to_owned();
         let text = std::fs::read_to_string(preset)
@@ -65,10 +68,10 @@ impl Preset {
     /// Merges the algorithm's values for the task, the task's keys, the file's and `changes`, the
     /// later over the earlier, and checks them.
     pub fn resolve(&self, changes: &Table) -> Result<Experiment, ConfigError> {
-        let preset = &self.label;
         let definition = self.algorithm(changes)?;
         let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
-        for keys in self.task.map(|task| &task.keys).into_iter().chain([&self.own, changes]) {
+        let of_task = self.task.map(|task| &task.keys);
+        for keys in of_task.into_iter().chain([&self.own, changes]) {
             merge(&mut table, keys.clone());
         }
         table.insert("algorithm".to_owned(), definition.name.into());
@@ -76,24 +79,26 @@ impl Preset {
             return Err(ConfigError::NoPractice(definition.name));
         }
         let Some(environment) = table.get("environment") else {
-            return Err(ConfigError::NoEnvironment(preset.clone()));
+            return Err(ConfigError::NoEnvironment(self.label.clone()));
         };
         if !table.contains_key("reward")
             && let Ok(rule) = Value::try_from(environment::reward_rule(&text_of(environment)))
         {
             table.insert("reward".to_owned(), rule);
         }
-        let mut experiment: Experiment = table
-            .try_into()
-            .map_err(|source| ConfigError::Keys { preset: preset.clone(), source })?;
+        let preset = self.label.clone();
+        let parsed = Experiment::deserialize(table);
+        let mut experiment = parsed.map_err(|source| ConfigError::Keys { preset, source })?;
         experiment.check()?;
         Ok(experiment)
     }
 
     /// The algorithm of the changes, else of the file, else the first of all.
     fn algorithm(&self, changes: &Table) -> Result<Definition, ConfigError> {
-        let name = changes.get("algorithm").or_else(|| self.own.get("algorithm"));
-        name.map_or(Ok(ALGORITHMS[0]), |name| hyperparameters::algorithm(&text_of(name)))
+        match changes.get("algorithm").or(self.own.get("algorithm")) {
+            Some(name) => hyperparameters::algorithm(&text_of(name)),
+            None => Ok(ALGORITHMS[0]),
+        }
     }
 }
 

@@ -5,8 +5,28 @@ use std::path::PathBuf;
 use quad_protocol::Name;
 use serde::{Deserialize, Serialize};
 
-use super::device::Device;
 use super::experiment::Experiment;
+
+/// The device of training.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Device {
+    /// The processor.
+    #[default]
+    Cpu,
+    /// The first Nvidia GPU.
+    Cuda,
+}
+
+impl Device {
+    /// Name on the command line and in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Cpu => "cpu",
+            Self::Cuda => "cuda",
+        }
+    }
+}
 
 /// The configuration of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -73,14 +93,16 @@ pub struct DatasetInfo {
 impl DatasetInfo {
     /// Size and quality of the data, in one line.
     pub fn summary(&self) -> String {
-        let Self { transitions, episodes, held_out, mean_return, mean_score, .. } = self;
-        let score = mean_score.map_or(String::new(), |score| format!(", mean score {score:.2}"));
-        let held_out = match held_out.len() {
-            0 => String::new(),
-            count => format!("; {count} more are held out"),
-        };
-        format!(
-            "{transitions} transitions of {episodes} episodes, mean return {mean_return:.2}{score}{held_out}"
-        )
+        let (transitions, episodes) = (self.transitions, self.episodes);
+        let mean = self.mean_return;
+        let mut text =
+            format!("{transitions} transitions of {episodes} episodes, mean return {mean:.2}");
+        if let Some(score) = self.mean_score {
+            text += &format!(", mean score {score:.2}");
+        }
+        if !self.held_out.is_empty() {
+            text += &format!("; {} more are held out", self.held_out.len());
+        }
+        text
     }
 }

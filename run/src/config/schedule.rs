@@ -1,6 +1,6 @@
 //! Gradient steps and evaluations of a run.
 
-/// Gradient steps and evaluations of a run.
+/// The evaluated steps among all.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Schedule {
     /// The gradient step that the run begins after.
@@ -21,7 +21,10 @@ impl Schedule {
     /// Number of evaluated policies.
     pub fn evaluations(self) -> u64 {
         let Self { start, steps, eval_interval } = self;
-        if eval_interval == 0 { 0 } else { steps.div_ceil(eval_interval) - start / eval_interval }
+        match eval_interval {
+            0 => 0,
+            interval => steps.div_ceil(interval) - start / interval,
+        }
     }
 
     /// The evaluated steps, in ascending order.
@@ -41,12 +44,9 @@ mod tests {
 
     #[test]
     fn evaluations_of_a_run_without_end_are_counted() {
-        assert_eq!(
-            Schedule { start: 0, steps: u64::MAX, eval_interval: 1 }.evaluations(),
-            u64::MAX
-        );
-        let long = Schedule { start: 0, steps: 1_000_000_000_001, eval_interval: 1000 };
-        assert_eq!(long.evaluations(), 1_000_000_001);
+        let endless = |steps, eval_interval| Schedule { start: 0, steps, eval_interval };
+        assert_eq!(endless(u64::MAX, 1).evaluations(), u64::MAX);
+        assert_eq!(endless(1_000_000_000_001, 1000).evaluations(), 1_000_000_001);
     }
 
     #[test]
@@ -62,8 +62,9 @@ mod tests {
             (5, 10, 20, &[10]),
         ] {
             let schedule = Schedule { start, steps, eval_interval };
-            assert_eq!(Vec::from_iter(schedule.evaluated_steps()), expected, "{schedule:?}");
-            assert_eq!(schedule.evaluations(), expected.len() as u64, "{schedule:?}");
+            let listed = Vec::from_iter(schedule.evaluated_steps());
+            assert_eq!(listed, expected, "{schedule:?}");
+            assert_eq!(schedule.evaluations(), listed.len() as u64);
             let evaluated = (0..=2 * steps).filter(|step| schedule.is_evaluated(*step));
             assert_eq!(Vec::from_iter(evaluated), expected, "{schedule:?}");
         }

@@ -20,7 +20,9 @@ pub fn of_run(config: &RunConfig) -> Settings {
     if dataset.contains_key("sha256") {
         dataset.retain(|key, _| key == "sha256");
     }
-    settings.extend(dataset.into_iter().map(|(key, value)| (format!("dataset.{key}"), value)));
+    for (key, value) in dataset {
+        settings.insert(format!("dataset.{key}"), value);
+    }
     settings.insert("device".to_owned(), config.run.device.name().to_owned());
     settings
 }
@@ -40,7 +42,6 @@ fn flat(value: &impl Serialize) -> Settings {
 
 /// The keys at which two settings differ.
 pub fn differences<'a>(a: &'a Settings, b: &'a Settings) -> impl Iterator<Item = &'a String> {
-    a.keys()
-        .chain(b.keys().filter(|key| !a.contains_key(*key)))
-        .filter(|key| a.get(*key) != b.get(*key))
+    let keys = a.keys().chain(b.keys().filter(|key| !a.contains_key(*key)));
+    keys.filter(|key| a.get(*key) != b.get(*key))
 }

@@ -54,19 +54,18 @@ static TASKS: LazyLock<Vec<Task>> = LazyLock::new(|| {
 
 impl From<BenchmarkTask> for Task {
     fn from(task: BenchmarkTask) -> Self {
-        let BenchmarkTask { name, benchmark, environment, dataset, maze, is_default } = task;
-        let dataset = maze.map(|_| dataset);
-        let about = match dataset {
-            Some(_) => "the default of -task1 to -task5",
-            None => "likewise; its data needs quad-convert",
-        };
-        let mut keys = Table::from_iter([("environment".to_owned(), environment.into())]);
-        keys.extend(dataset.map(|dataset| ("dataset".to_owned(), dataset.into())));
+        let mut keys = Table::new();
+        keys.insert("environment".to_owned(), task.environment.into());
+        let mut about = "likewise; its data needs quad-convert";
+        if task.maze.is_some() {
+            keys.insert("dataset".to_owned(), task.dataset.into());
+            about = "the default of -task1 to -task5";
+        }
         Self {
-            name,
+            name: task.name,
             about: about.to_owned(),
-            benchmark: Some(benchmark),
-            is_listed: is_default,
+            benchmark: Some(task.benchmark),
+            is_listed: task.is_default,
             values: None,
             keys,
         }
@@ -92,9 +91,8 @@ pub fn all() -> &'static [Task] {
 
 /// Finds a task by name.
 pub fn named(name: &str) -> Result<&'static Task, ConfigError> {
-    let unknown =
-        || ConfigError::Unknown { kind: "task", name: name.to_owned(), hint: unknown_hint(name) };
-    all().iter().find(|task| task.name == name).ok_or_else(unknown)
+    let found = all().iter().find(|task| task.name == name);
+    found.ok_or_else(|| ConfigError::unknown("task", name, unknown_hint(name)))
 }
 
 /// The hint for an unknown task: similar names.

@@ -43,13 +43,12 @@ pub struct ScoreLine {
 impl ScoreLine {
     /// The line of an episode of a report.
     pub fn new(report: &ScoreReport, score: &EpisodeScore) -> Self {
-        let EpisodeScore { seed, episode_return, length, score } = *score;
         Self {
             step: report.step,
-            seed,
-            episode_return,
-            length,
-            score,
+            seed: score.seed,
+            episode_return: score.episode_return,
+            length: score.length,
+            score: score.score,
             weights: report.weights.to_string(),
             precision: report.precision.to_string(),
             evaluator: report.evaluator.to_string(),
@@ -58,8 +57,12 @@ impl ScoreLine {
 
     /// The episode of the line.
     pub fn episode(&self) -> EpisodeScore {
-        let Self { seed, episode_return, length, score, .. } = *self;
-        EpisodeScore { seed, episode_return, length, score }
+        EpisodeScore {
+            seed: self.seed,
+            episode_return: self.episode_return,
+            length: self.length,
+            score: self.score,
+        }
     }
 }
 
@@ -79,8 +82,8 @@ mod tests {
     #[test]
     fn scores_keep_every_bit() {
         for number in (1..5_000).map(f64::from) {
-            let score = number.ln() * 13.7;
-            let line = ScoreLine { episode_return: number.sqrt() * 37.0, ..line(1, 2, score) };
+            let mut line = line(1, 2, number.ln() * 13.7);
+            line.episode_return = number.sqrt() * 37.0;
             let text = serde_json::to_string(&line).unwrap();
             let read: ScoreLine = serde_json::from_str(&text).unwrap();
             let bits = |line: &ScoreLine| [line.episode_return.to_bits(), line.score.to_bits()];

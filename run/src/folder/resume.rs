@@ -51,7 +51,10 @@ impl ExistingRun {
         }
         let dir = RunDir::at(path);
         let scores = dir.score_log()?;
-        let config = if fresh { None } else { Some(dir.read_config()?) };
+        let config = match fresh {
+            true => None,
+            false => Some(dir.read_config()?),
+        };
         Ok(Some(Self { dir, config, scores }))
     }
 
@@ -96,7 +99,8 @@ impl ExistingRun {
         dir.clear_failure()?;
         dir.remove_partial_files();
         let point = ResumePoint::read(&dir, experiment)?;
-        let episodes: usize = point.scores.values().map(|scores| scores.episodes.len()).sum();
+        let scored = point.scores.values();
+        let episodes: usize = scored.map(|scores| scores.episodes.len()).sum();
         let (path, step) = (dir.path().display(), point.step());
         info!("the run in {path} continues after step {step}; {episodes} episodes are scored");
         Ok((dir, scores, point))
@@ -107,7 +111,8 @@ impl ResumePoint {
     fn read(dir: &RunDir, experiment: &Experiment) -> Result<Self, RunDirError> {
         let checkpoint = dir.newest_checkpoint()?;
         let scores = by_step(dir.read_scores()?).map_err(|reason| dir.broken_scores(reason))?;
-        let mut point = Self { checkpoint, snapshots: BTreeMap::new(), scores };
+        let snapshots = BTreeMap::new();
+        let mut point = Self { checkpoint, snapshots, scores };
         let (schedule, step) = (experiment.schedule(), point.step());
         let practice = |at| {
             let online = experiment.online.as_ref();

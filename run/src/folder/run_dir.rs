@@ -235,10 +235,11 @@ impl RunDir {
         let folder = self.path.join(SNAPSHOTS);
         let entries = files::optional(fs::read_dir(&folder)).map_err(io_error("read", &folder))?;
         let step = |entry: io::Result<DirEntry>| {
-            let entry =
-                entry.ok().filter(|entry| entry.file_type().is_ok_and(|it| it.is_file()))?;
+            let entry = entry.ok()?;
             let name = entry.file_name();
-            name.to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok()
+            let step = name.to_str()?.strip_prefix("step_")?;
+            let step = step.strip_suffix(".safetensors")?.parse().ok();
+            step.filter(|_| entry.file_type().is_ok_and(|it| it.is_file()))
         };
         let mut steps: Vec<u64> = entries.into_iter().flatten().filter_map(step).collect();
         steps.sort_unstable();

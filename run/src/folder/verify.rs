@@ -32,6 +32,10 @@ pub struct Findings {
 }
 
 impl Findings {
+    fn new(what: &'static str, expected: u64) -> Self {
+        Self { what, expected, ..Self::default() }
+    }
+
     /// True if there are no violations.
     pub fn all_held(&self) -> bool {
         self.wrong.is_empty()
@@ -50,8 +54,10 @@ impl fmt::Display for Findings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} of {} {}", self.found, self.expected, self.what)?;
         for (kind, (count, listed)) in &self.wrong {
-            let more = if *count > listed.len() as u64 { "; …" } else { "" };
-            write!(f, "\n{kind} ({count}): {}{more}", listed.join("; "))?;
+            write!(f, "\n{kind} ({count}): {}", listed.join("; "))?;
+            if *count > listed.len() as u64 {
+                f.write_str("; …")?;
+            }
         }
         Ok(())
     }
@@ -64,7 +70,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let experiment = &config.experiment;
     let schedule = experiment.schedule();
     let expected = schedule.evaluations().saturating_mul(experiment.episodes.into());
-    let mut found = Findings { what: "episodes are scored", expected, ..Findings::default() };
+    let mut found = Findings::new("episodes are scored", expected);
     let mut hashes: BTreeMap<u64, Option<String>> = BTreeMap::new();
     let planned = |step| match schedule.is_evaluated(step) {
         true => episode_seeds(experiment.seed, step, experiment.episodes),
@@ -72,17 +78,18 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     };
     let mut left: BTreeMap<u64, BTreeSet<u64>> = BTreeMap::new();
     let mut seen = BTreeSet::new();
-    for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
-        let name = format!("step {step}, seed {seed}");
+    for line in dir.read_scores()? {
+        let (step, seed) = (line.step, line.seed);
+        let name = named((step, seed));
         let read = || hash(&dir, step).ok().map(|hash| hash.to_string());
-        let kind = match hashes.entry(step).or_insert_with(read) {
-            None => Some("scored, but the snapshot is gone"),
-            Some(hash) => {
-                (*hash != weights).then_some("scored with other weights than are on disk")
+        match hashes.entry(step).or_insert_with(read) {
+            None => found.add("scored, but the snapshot is gone", name.clone()),
+            Some(hash) if *hash != line.weights => {
+                found.add("scored with other weights than are on disk", name.clone());
             }
-        };
-        kind.into_iter().for_each(|kind| found.add(kind, name.clone()));
-        if !(episode_return.is_finite() && score.is_finite()) {
+            Some(_) => {}
+        }
+        if !(line.episode_return.is_finite() && line.score.is_finite()) {
             found.add("not a number", name.clone());
         }
         let left = left.entry(step).or_insert_with(|| BTreeSet::from_iter(planned(step)));
@@ -99,11 +106,15 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
         // A run without end plans more episodes than memory holds.
         let unscored = |(step, seed): &(u64, u64)| !seen.contains(&(*step, *seed));
         let seeds = |step| planned(step).into_iter().map(move |seed| (step, seed));
-        let first = schedule.evaluated_steps().flat_map(seeds).filter(unscored).take(LISTED);
-        let first = first.map(|(step, seed)| format!("step {step}, seed {seed}"));
-        found.wrong.insert("without a score", (missing, first.collect()));
+        let first = schedule.evaluated_steps().flat_map(seeds).filter(unscored);
+        let first = first.take(LISTED).map(named).collect();
+        found.wrong.insert("without a score", (missing, first));
     }
     Ok(found)
+}
+
+fn named((step, seed): (u64, u64)) -> String {
+    format!("step {step}, seed {seed}")
 }
 
 fn hash(dir: &RunDir, step: u64) -> Result<Hash, RunDirError> {
@@ -113,18 +124,17 @@ fn hash(dir: &RunDir, step: u64) -> Result<Hash, RunDirError> {
 /// Compares the scores and the snapshots of a run with those of another run of the same
 /// configuration, bit for bit.
 pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> {
-    let mut found = Findings { what: "episodes are compared", ..Findings::default() };
     let [(dir, config), (other_dir, other_config)] = [RunDir::open(path)?, RunDir::open(other)?];
+    let with_key = |line: ScoreLine| ((line.step, line.seed), line);
+    let by_key = |lines: Vec<ScoreLine>| BTreeMap::from_iter(lines.into_iter().map(with_key));
+    let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
+    let mut found = Findings::new("episodes are compared", ours.len() as u64);
     let [a, b] = [&config, &other_config].map(settings::of_run);
     for key in settings::differences(&a, &b) {
         found.add("settings that differ", key.clone());
     }
-    let with_key = |line: ScoreLine| ((line.step, line.seed), line);
-    let by_key = |lines: Vec<ScoreLine>| BTreeMap::from_iter(lines.into_iter().map(with_key));
-    let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
-    found.expected = ours.len() as u64;
-    for (key @ (step, seed), line) in &ours {
-        let name = format!("step {step}, seed {seed}");
+    for (key, line) in &ours {
+        let name = named(*key);
         let Some(same) = theirs.get(key) else {
             found.add("not scored there", name);
             continue;
@@ -146,8 +156,7 @@ pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> 
 
 fn compare_snapshots(dir: &RunDir, other: &RunDir) -> Result<Findings, RunDirError> {
     let (ours, theirs) = (dir.snapshots()?, other.snapshots()?);
-    let (what, expected) = ("snapshots are compared", ours.len() as u64);
-    let mut found = Findings { what, expected, ..Findings::default() };
+    let mut found = Findings::new("snapshots are compared", ours.len() as u64);
     if ours.is_empty() {
         // A complete run has at least one.
         found.add("nothing to compare", format!("{} has no snapshot", dir.path().display()));

@@ -3,7 +3,6 @@
 
 use std::collections::BTreeSet;
 
-use quad_algorithms::Variant;
 use quad_dataset::catalog;
 
 use super::published;
@@ -24,8 +23,8 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     let mut departures = Vec::new();
     if select == Select::Best {
         let last = published::last(&run.task);
-        departures
-            .push(format!("the best evaluation of each run, not the mean of its last {last}"));
+        let best = format!("the best evaluation of each run, not the mean of its last {last}");
+        departures.push(best);
     }
     let definition = ours.definition().ok();
     departures.extend(definition.and_then(|known| hyperparameters::not_given(&known, task)));
@@ -37,17 +36,15 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     let keys: BTreeSet<&String> = differences(&ours, &paper).collect();
     for key in keys {
         let value =
-            |settings: &Settings| settings.get(key).cloned().unwrap_or_else(|| "absent".to_owned());
+            |settings: &'_ Settings| settings.get(key).map_or("absent", String::as_str).to_owned();
         departures.push(format!("{key} is {}, not {}", value(&ours), value(&paper)));
     }
     if scored_in != "f32" {
         departures.push(format!("scored in {scored_in}, not in f32"));
     }
-    if let Some(least) =
-        runs.iter().filter(|run| !run.is_complete()).min_by_key(|run| run.evaluations_complete())
-    {
-        departures.push(least.how_complete());
-    }
+    let incomplete = runs.iter().filter(|run| !run.is_complete());
+    let least = incomplete.min_by_key(|run| run.evaluations_complete());
+    departures.extend(least.map(|run| run.how_complete()));
     let seeds = published::seeds(&run.task);
     if runs.len() < seeds {
         departures.push(format!("{} of {seeds} seeds", runs.len()));
@@ -57,11 +54,11 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
 
 /// The authors' values of a run's task: of the run's variant, or of the algorithm's default.
 pub fn as_given(run: &RunReport, of_variant: bool) -> Result<Experiment, ConfigError> {
-    let mut asked =
-        toml::Table::from_iter([("algorithm".to_owned(), run.algorithm.as_str().into())]);
+    let of_key = |key: &str, value: toml::Value| toml::Table::from_iter([(key.to_owned(), value)]);
+    let mut asked = of_key("algorithm", run.algorithm.as_str().into());
     let variant = run.config.experiment.definition()?.report.variant;
-    if let Some(Variant { key, .. }) = variant.filter(|_| of_variant) {
-        let agent = toml::Table::from_iter([(key.to_owned(), run.variant.as_str().into())]);
+    if let Some(known) = variant.filter(|_| of_variant) {
+        let agent = of_key(known.key, run.variant.as_str().into());
         asked.insert("agent".to_owned(), agent.into());
     }
     config::resolve(&run.task, &asked)

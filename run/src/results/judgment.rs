@@ -48,6 +48,7 @@ impl Estimate {
 
 /// The judgment of one policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[allow(missing_docs)]
 pub struct Judgment {
     /// The folder of its run, as the reader calls it.
     #[serde(default)]
@@ -56,9 +57,7 @@ pub struct Judgment {
     pub step: u64,
     /// BLAKE3 of the snapshot's file.
     pub weights: String,
-    /// Conditions of the judgment.
     pub conditions: Conditions,
-    /// The policy's value.
     pub estimate: Estimate,
     /// Root mean square distance of its actions from the data's in the judged episodes, in standard
     /// deviations of the data's.
@@ -104,19 +103,16 @@ impl Judgment {
 
 /// Policies that were judged under equal conditions, the best first, unreliable ones last.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[allow(missing_docs)] // As in [`Judgment`].
 pub struct Ranking {
-    /// Conditions of the judgments.
     pub conditions: Conditions,
-    /// The behavior's estimated value.
     pub behavior: Estimate,
-    /// The behavior's recorded value.
     pub recorded: f64,
     /// True if the policies' values differ by more than the error of the behavior's estimate and the
     /// noise of seeds.
     pub can_rank: bool,
     /// The conclusion in words.
     pub verdict: String,
-    /// The policies.
     pub policies: Vec<Judgment>,
 }
 
@@ -138,38 +134,48 @@ impl Ranking {
         let value =
             |judgment: &Judgment| spread(judgment).map_or(f64::NEG_INFINITY, |spread| spread.mean);
         policies.sort_by(|one, other| value(other).total_cmp(&value(one)));
-        let Judgment { conditions, behavior, recorded, .. } = policies[0].clone();
+        let first = policies[0].clone();
         let reliable = Vec::from_iter(policies.iter().filter_map(spread));
-        let (can_rank, verdict) = verdict(&reliable, conditions.seeds, &behavior, recorded);
-        Self { conditions, behavior, recorded, can_rank, verdict, policies }
+        let (can_rank, verdict) = verdict(&reliable, &first);
+        Self {
+            conditions: first.conditions,
+            behavior: first.behavior,
+            recorded: first.recorded,
+            can_rank,
+            verdict,
+            policies,
+        }
     }
 
     /// A paragraph and a table.
     pub fn blocks(&self) -> [Block; 2] {
-        let Conditions { environment, episodes, gamma, steps, seeds, .. } = &self.conditions;
-        let mut table = Table::new(&[
-            ("rank", Right),
-            ("policy", Left),
-            ("value", Right),
-            ("distance", Right),
-            ("doubts", Left),
-        ]);
+        let left = ["policy", "doubts"];
+        let alignment = |name| (name, if left.contains(&name) { Left } else { Right });
+        let header = ["rank", "policy", "value", "distance", "doubts"];
+        let mut table = Table::new(&header.map(alignment));
         let mut push = |cells: [&str; 5]| table.push(cells.map(str::to_owned));
         let value = |of: &Estimate| of.spread().map_or_else(|| "-".to_owned(), Spread::text);
         for (judgment, rank) in self.policies.iter().zip(1..) {
-            let Judgment { run, step, estimate, distance, unseen, .. } = judgment;
-            let is_ranked = self.can_rank && estimate.doubts.is_empty();
-            let rank = if is_ranked { format!("{rank}") } else { "-".to_owned() };
+            let estimate = &judgment.estimate;
+            let rank = match self.can_rank && estimate.doubts.is_empty() {
+                true => rank.to_string(),
+                false => "-".to_owned(),
+            };
             let mut doubts = estimate.doubts.clone();
-            doubts.extend((!unseen).then(|| "has learned from some of these episodes".to_owned()));
-            let (name, distance) =
-                (format!("{} @ {step}", run.display()), format!("{distance:.2}"));
-            push([&rank, &name, &value(estimate), &distance, &doubts.join("; ")]);
+            if !judgment.unseen {
+                doubts.push("has learned from some of these episodes".to_owned());
+            }
+            let name = format!("{} @ {}", judgment.run.display(), judgment.step);
+            let (value, distance) = (value(estimate), format!("{:.2}", judgment.distance));
+            push([&rank, &name, &value, &distance, &doubts.join("; ")]);
         }
         let doubts = self.behavior.doubts.join("; ");
-        push(["-", "behavior, estimated", &value(&self.behavior), "", &doubts]);
-        push(["-", "behavior, as recorded", &format!("{:.2}", self.recorded), "", ""]);
-        let (verdict, count) = (&self.verdict, episodes.len());
+        let (estimated, recorded) = (value(&self.behavior), format!("{:.2}", self.recorded));
+        push(["-", "behavior, estimated", &estimated, "", &doubts]);
+        push(["-", "behavior, as recorded", &recorded, "", ""]);
+        let of = &self.conditions;
+        let (environment, gamma, steps, seeds) = (&of.environment, of.gamma, of.steps, of.seeds);
+        let (verdict, count) = (&self.verdict, of.episodes.len());
         let text = format!(
             "Judged without a simulator: a ranking, not a score.\n{verdict}\nValues are discounted returns (γ = {gamma}) in {environment} \
              from the first states of {count} episodes on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
@@ -180,19 +186,20 @@ impl Ranking {
 }
 
 /// Decides if policies of these values, in descending order, can be ranked; also returns the reason.
-fn verdict(values: &[Spread], seeds: u64, behavior: &Estimate, recorded: f64) -> (bool, String) {
+fn verdict(values: &[Spread], judged: &Judgment) -> (bool, String) {
     let (Some(most), Some(least)) = (values.first(), values.last()) else {
         return (false, "It cannot rank them: no estimate can be relied on.".to_owned());
     };
-    let Some(estimated) = behavior.spread() else {
+    let Some(estimated) = judged.behavior.spread() else {
         let doubtful = "It cannot rank them: the estimate of the behavior's own value is doubtful.";
         return (false, doubtful.to_owned());
     };
-    let (off, range) = ((estimated.mean - recorded).abs(), most.mean - least.mean);
+    let off = (estimated.mean - judged.recorded).abs();
+    let range = most.mean - least.mean;
     // Twice the standard error of a difference of two means over the seeds.
     let squares: f64 = values.iter().map(|value| value.std.unwrap_or(0.0).powi(2)).sum();
     let variance = squares / values.len() as f64;
-    let noise = 2.0 * (2.0 * variance / seeds as f64).sqrt();
+    let noise = 2.0 * (2.0 * variance / judged.conditions.seeds as f64).sqrt();
     let behind = format!(
         "the behavior's own value is estimated {off:.2} off, and by other seeds two policies differ by {noise:.2}"
     );

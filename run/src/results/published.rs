@@ -125,14 +125,16 @@ fn of_task(task: &str) -> impl Iterator<Item = &'static Tables> {
 /// The published scores of a task, the paper's own method first.
 pub fn scores(task: &str) -> Vec<Published> {
     let of_source = |source: &'static Tables| {
-        source.method.iter().filter_map(move |Method { name, source: cited, tables, .. }| {
+        source.method.iter().filter_map(move |method| {
+            let name = &method.name;
             let figures = source.scores[task].get(name)?;
+            let (mean, std) = (*figures.first()?, figures.get(1).copied());
             let remarks = source.remark.iter().filter_map(|known| known.on(name, task));
             Some(Published {
                 method: name,
-                score: Printed { mean: *figures.first()?, std: figures.get(1).copied() },
-                source: cited,
-                tables,
+                score: Printed { mean, std },
+                source: &method.source,
+                tables: &method.tables,
                 protocol: &source.protocol,
                 remarks: remarks.collect(),
             })
@@ -167,12 +169,16 @@ pub fn tables(task: &str, algorithm: &str) -> Vec<&'static str> {
         all_methods().any(|method| method.algorithm.as_deref() == Some(algorithm) && has(method))
     };
     let with_it = Vec::from_iter(all.iter().copied().filter(has_it));
-    if with_it.is_empty() { all.into_iter().take(1).collect() } else { with_it }
+    match with_it.is_empty() {
+        true => all.into_iter().take(1).collect(),
+        false => with_it,
+    }
 }
 
 /// All tables, in their order.
 pub fn all_tables() -> Vec<&'static str> {
-    once_each(all_methods().flat_map(|method| &method.tables).map(String::as_str))
+    let tables = all_methods().flat_map(|method| &method.tables);
+    once_each(tables.map(String::as_str))
 }
 
 /// The sources' names of a variant of an algorithm: one for each of its rows.

@@ -19,13 +19,12 @@ const FINAL_STEPS: u64 = 50_000;
 impl RunReport {
     /// Reads a run folder.
     pub fn read(path: &Path) -> Result<Self, RunDirError> {
-        let scored = Self::scored(path)?;
-        let definition = scored.config.experiment.definition().map_err(unusable(path))?;
-        let summary = match definition.report.summary {
-            Some(summary) => summary(&read_metrics(path)?, &scored.variant),
-            None => None,
-        };
-        Ok(Self { summary, ..scored })
+        let mut report = Self::scored(path)?;
+        let definition = report.config.experiment.definition();
+        if let Some(summary) = definition.map_err(unusable(path))?.report.summary {
+            report.summary = summary(&read_metrics(path)?, &report.variant);
+        }
+        Ok(report)
     }
 
     /// Reads a run folder without `metrics.jsonl`, so that the report has no summary.
@@ -37,8 +36,9 @@ impl RunReport {
     pub fn with_scores(path: &Path) -> Result<(Self, Vec<ScoreLine>), RunDirError> {
         let (dir, config) = RunDir::open(path)?;
         let (scores, judgments) = (dir.read_scores()?, Judgment::read_all(&dir)?);
-        let report = Self::new(path, config, &scores).map_err(unusable(path))?;
-        Ok((Self { judgments, ..report }, scores))
+        let mut report = Self::new(path, config, &scores).map_err(unusable(path))?;
+        report.judgments = judgments;
+        Ok((report, scores))
     }
 
     fn new(path: &Path, config: RunConfig, lines: &[ScoreLine]) -> Result<Self, ConfigError> {
@@ -110,7 +110,9 @@ fn precision(line: &ScoreLine) -> String {
 
 /// Lists precisions: `bf16 and f32`; without any, `-`.
 pub fn joined<'a>(precisions: impl IntoIterator<Item = &'a String>) -> String {
-    let precisions =
-        Vec::from_iter(BTreeSet::from_iter(precisions.into_iter().map(String::as_str)));
-    if precisions.is_empty() { "-".to_owned() } else { precisions.join(" and ") }
+    let precisions = BTreeSet::from_iter(precisions.into_iter().map(String::as_str));
+    match precisions.is_empty() {
+        true => "-".to_owned(),
+        false => Vec::from_iter(precisions).join(" and "),
+    }
 }

@@ -16,9 +16,7 @@ use crate::config::RunConfig;
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[allow(missing_docs)] // The names say it.
 pub struct RunReport {
-    /// The run's folder.
     pub dir: PathBuf,
-    /// The run's name.
     pub run: String,
     /// The task, or the name of a user's file that names no task.
     pub task: String,
@@ -29,7 +27,6 @@ pub struct RunReport {
     /// The most important hyper-parameters, as text.
     pub agent: String,
     pub seed: u64,
-    /// Gradient steps.
     pub steps: u64,
     /// True if scores are D4RL-normalized; else they are returns.
     pub normalized: bool,
@@ -37,7 +34,6 @@ pub struct RunReport {
     pub scored_in: String,
     /// Mean score of the dataset's trajectories.
     pub dataset_score: f64,
-    /// Evaluations by step.
     pub evaluations: Vec<EvaluationReport>,
     /// Episodes of planned evaluations without a score.
     pub episodes_missing: u64,
@@ -68,7 +64,10 @@ impl RunReport {
     /// Mean score of the last complete evaluations, as many as the task's published figures
     /// average; absent if there are fewer.
     pub fn score(&self) -> Option<f64> {
-        if published::last(&self.task) == 3 { self.mean_last_3 } else { self.mean_last_5 }
+        match published::last(&self.task) {
+            3 => self.mean_last_3,
+            _ => self.mean_last_5,
+        }
     }
 
     /// True if every episode of every evaluation has its score.
@@ -83,9 +82,8 @@ impl RunReport {
 
     /// The best complete evaluation of the steps for which `is_one` holds; the last of equal ones.
     pub fn best_of(&self, is_one: impl Fn(u64) -> bool) -> Option<&EvaluationReport> {
-        self.complete()
-            .filter(|evaluation| is_one(evaluation.step))
-            .max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
+        let chosen = self.complete().filter(|evaluation| is_one(evaluation.step));
+        chosen.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
     }
 
     /// The last complete evaluation.
@@ -121,7 +119,10 @@ impl RunReport {
 
     /// `score` or `return`, whichever the scores are.
     pub fn measure(&self) -> &'static str {
-        if self.normalized || self.own_score { "score" } else { "return" }
+        match self.normalized || self.own_score {
+            true => "score",
+            false => "return",
+        }
     }
 
     /// [`Self::measure`] with its unit; in a maze, the fraction of episodes that reach the goal.

@@ -94,7 +94,8 @@ pub fn fraction_above(scores: &Runs, threshold: f64) -> f64 {
 /// of another. Equal scores count half: it is the U of Mann and Whitney (1947) divided by the number
 /// of pairs. Both methods have the same tasks.
 pub fn probability_of_improvement(x: &Runs, y: &Runs) -> f64 {
-    let wins = |x: f64, y: f64| if x == y { 0.5 } else { f64::from(u8::from(x > y)) };
+    let half = |is_more| 0.5 * f64::from(u8::from(is_more));
+    let wins = |x: f64, y: f64| half(x > y) + half(x >= y);
     let of_task = |(x, y): (&Vec<f64>, &Vec<f64>)| {
         let all: f64 = x.iter().flat_map(|x| y.iter().map(|y| wins(*x, *y))).sum();
         all / (x.len() * y.len()) as f64
@@ -110,22 +111,28 @@ pub fn estimates<T: Copy>(
 ) -> Vec<Estimate> {
     let mut drawn: Vec<Runs<T>> = methods.iter().map(|runs| (*runs).clone()).collect();
     let values = statistics(&drawn);
-    if methods.iter().any(|runs| runs.iter().any(|task| task.len() < 2)) {
-        return values.into_iter().map(|value| Estimate { value, low: None, high: None }).collect();
+    let estimate = |value, low, high| Estimate { value, low, high };
+    if methods.iter().copied().flatten().any(|task| task.len() < 2) {
+        let alone = |value| estimate(value, None, None);
+        return values.into_iter().map(alone).collect();
     }
     let mut random = ChaCha8Rng::seed_from_u64(SEED);
     let mut resampled = vec![Vec::with_capacity(RESAMPLES); values.len()];
     for _ in 0..RESAMPLES {
-        for (drawn, runs) in drawn.iter_mut().flatten().zip(methods.iter().copied().flatten()) {
+        let tasks = methods.iter().copied().flatten();
+        for (drawn, runs) in drawn.iter_mut().flatten().zip(tasks) {
             drawn.fill_with(|| runs[random.random_range(0..runs.len())]);
         }
-        resampled.iter_mut().zip(statistics(&drawn)).for_each(|(all, value)| all.push(value));
+        for (all, value) in resampled.iter_mut().zip(statistics(&drawn)) {
+            all.push(value);
+        }
     }
-    let estimate = |(value, mut all): (f64, Vec<f64>)| {
+    let with_interval = |(value, mut all): (f64, Vec<f64>)| {
         all.sort_by(f64::total_cmp);
-        Estimate { value, low: Some(percentile(&all, 0.025)), high: Some(percentile(&all, 0.975)) }
+        let [low, high] = [0.025, 0.975].map(|share| Some(percentile(&all, share)));
+        estimate(value, low, high)
     };
-    values.into_iter().zip(resampled).map(estimate).collect()
+    values.into_iter().zip(resampled).map(with_interval).collect()
 }
 
 /// The percentile of sorted values, interpolated linearly.
@@ -143,8 +150,8 @@ pub fn sign_flip_test(differences: &[f64]) -> f64 {
     // Rounding depends on the order of a sum.
     let extreme = differences.iter().sum::<f64>().abs() * (1.0 - 1e-12);
     let is_as_far = |is_flipped: &mut dyn FnMut(usize) -> bool| {
-        let signed =
-            differences.iter().enumerate().map(|(pair, d)| if is_flipped(pair) { -d } else { *d });
+        let signed = differences.iter().enumerate();
+        let signed = signed.map(|(pair, d)| if is_flipped(pair) { -d } else { *d });
         signed.sum::<f64>().abs() >= extreme
     };
     if differences.len() <= EXACT_PAIRS {

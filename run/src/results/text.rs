@@ -25,11 +25,11 @@ impl RunReport {
             }
             table.push(row);
         }
-        let Self { run, task, agent, steps, seed, scored_in, .. } = self;
-        let unit = self.measure_with_unit();
-        let mut text = format!(
-            "{run}: task {task}, {agent}, {steps} steps, seed {seed}; {unit}, scored in {scored_in}\n\n"
-        ) + &table.render(Style::Text);
+        let (run, task, agent) = (&self.run, &self.task, &self.agent);
+        let (steps, seed, unit) = (self.steps, self.seed, self.measure_with_unit());
+        let mut text = format!("{run}: task {task}, {agent}, {steps} steps, seed {seed}; {unit}");
+        text += &format!(", scored in {}\n\n", self.scored_in);
+        text += &table.render(Style::Text);
         if self.evaluations.is_empty() {
             text += "(no evaluation has a score yet)\n";
         }

@@ -54,7 +54,8 @@ pub fn list(dirs: &[PathBuf]) -> Vec<Entry> {
             let below = below.filter(|below| dirs.len() == 1 && *below != Path::new(""));
             let name = below.unwrap_or(dir).display().to_string();
             let error = error.map(|error| one_line(error).replace('\n', " "));
-            entries.push(Entry { name, dir: dir.to_owned(), run, error });
+            let dir = dir.to_owned();
+            entries.push(Entry { name, dir, run, error });
         };
         let runs = walk(asked, &mut |dir, error| add(dir, None, Some(&error)));
         for dir in runs {
@@ -73,11 +74,13 @@ pub fn table(entries: &[Entry]) -> String {
     let mut table = Table::new(&[&texts[..], &[("last score", Right), ("size", Right)]].concat());
     for Entry { name, run, .. } in entries {
         let Some(run) = run else { continue };
-        let state = format!("{}{}", run.state, if run.at_work { ", at work" } else { "" });
+        let at_work = if run.at_work { ", at work" } else { "" };
+        let state = format!("{}{at_work}", run.state);
         let score = run.score.zip(run.score_step);
         let score = score.map_or("-".to_owned(), |(score, step)| format!("{score:.1} @{step}"));
         let size = HumanBytes(run.bytes).to_string();
-        table.push([name.clone(), run.task.clone(), run.method.clone(), state, score, size]);
+        let (task, method) = (run.task.clone(), run.method.clone());
+        table.push([name.clone(), task, method, state, score, size]);
     }
     table.render(Style::Text)
 }
@@ -93,10 +96,12 @@ impl Listed {
     fn read(dir: &Path) -> Result<Self, RunDirError> {
         let report = RunReport::scored(dir)?;
         let (state, newest) = (State::of(&report)?, report.newest());
-        let variant = Some(&report.variant).filter(|variant| **variant != report.algorithm);
+        let mut method = report.algorithm.clone();
+        if report.variant != method {
+            method += &format!(", {}", report.variant);
+        }
         Ok(Self {
-            method: report.algorithm.clone()
-                + &variant.map(|variant| format!(", {variant}")).unwrap_or_default(),
+            method,
             step: state.step(report.steps),
             steps: report.steps,
             state: state.text(report.steps),
@@ -115,5 +120,6 @@ fn size(dir: &Path) -> u64 {
         Ok(metadata) if metadata.is_dir() => size(&entry.path()),
         metadata => metadata.map_or(0, |metadata| metadata.len()),
     };
-    fs::read_dir(dir).into_iter().flatten().flatten().map(of).sum()
+    let entries = fs::read_dir(dir).into_iter().flatten();
+    entries.flatten().map(of).sum()
 }

@@ -88,7 +88,8 @@ impl Pace {
         let report = RunReport::scored(dir).ok();
         let newest = report.as_ref().and_then(RunReport::newest);
         let score = newest.map(|newest| (newest.step, newest.score.mean));
-        Self { step: rows.last().map_or(0, |row| row.step), rate, score }
+        let step = rows.last().map_or(0, |row| row.step);
+        Self { step, rate, score }
     }
 }
 
@@ -114,8 +115,6 @@ fn rows(dir: &Path) -> Vec<Row> {
         files::rest(&mut file, length.saturating_sub(TAIL))
     };
     let bytes = read().unwrap_or_default();
-    bytes
-        .split(|byte| *byte == b'\n')
-        .filter_map(|line| serde_json::from_slice(line).ok())
-        .collect()
+    let lines = bytes.split(|byte| *byte == b'\n');
+    lines.filter_map(|line| serde_json::from_slice(line).ok()).collect()
 }

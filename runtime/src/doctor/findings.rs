@@ -35,13 +35,17 @@ impl Findings {
     }
 
     fn add(&mut self, verdict: &'static str, check: &str, what: String, hint: Option<String>) {
-        self.0.push(Finding { verdict, check: check.to_owned(), what, hint });
+        let check = check.to_owned();
+        self.0.push(Finding { verdict, check, what, hint });
     }
 
     /// Fails if a check failed.
     pub fn verdict(&self) -> Result<(), ChecksFailed> {
-        let failed = self.0.iter().filter(|finding| finding.verdict == "fail").count();
-        if failed == 0 { Ok(()) } else { Err(ChecksFailed { failed, checks: self.0.len() }) }
+        let failed = self.0.iter().filter(|finding| finding.verdict == "fail");
+        match (failed.count(), self.0.len()) {
+            (0, _) => Ok(()),
+            (failed, checks) => Err(ChecksFailed { failed, checks }),
+        }
     }
 }
 
@@ -55,11 +59,15 @@ pub struct ChecksFailed {
 
 impl fmt::Display for Findings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let lines = self.0.iter().map(|Finding { verdict, check, what, hint }| {
-            let hint =
-                hint.as_ref().map(|hint| format!("\n      hint: {hint}")).unwrap_or_default();
-            format!("{:4}  {check:11}  {what}{hint}", verdict.replace("fail", "FAIL"))
-        });
-        f.write_str(&lines.collect::<Vec<_>>().join("\n"))
+        let mut end = "";
+        for finding in &self.0 {
+            let verdict = finding.verdict.replace("fail", "FAIL");
+            write!(f, "{end}{verdict:4}  {:11}  {}", finding.check, finding.what)?;
+            if let Some(hint) = &finding.hint {
+                write!(f, "\n      hint: {hint}")?;
+            }
+            end = "\n";
+        }
+        Ok(())
     }
 }

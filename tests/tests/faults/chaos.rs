@@ -8,7 +8,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use quad_tests::link::Trouble;
-use quad_tests::setting::Setting;
+use quad_tests::setting::{SHORT, Setting};
 use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually, number};
 use rand::seq::SliceRandom;
@@ -24,15 +24,8 @@ const STEPS_PER_FAULT: u64 = 12_000;
 /// without.
 fn endure(faults: &[Fault], count: u64, online_steps: u64) {
     let steps = if online_steps > 0 { 1000 } else { STEPS_PER_FAULT * count };
-    let setting = Setting {
-        steps,
-        eval_interval: STEPS_PER_FAULT / 2,
-        episodes: 4,
-        candidates: 20,
-        hidden: 64,
-        seed: 9,
-        online_steps,
-    };
+    let sizes = Setting { episodes: 4, candidates: 20, hidden: 64, ..SHORT };
+    let setting = Setting { steps, eval_interval: STEPS_PER_FAULT / 2, online_steps, ..sizes };
     let begin = Instant::now();
     let scratch = Scratch::new();
     let mut calm = scratch.learner("calm", setting);

@@ -9,37 +9,24 @@ use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::Scratch;
 
 /// A few seconds of training with evaluations all along.
-const LONG: Setting = Setting {
-    steps: 3000,
-    eval_interval: 300,
-    episodes: 4,
-    candidates: 2,
-    hidden: 64,
-    seed: 5,
-    online_steps: 0,
-};
+const LONG: Setting = Setting { steps: 3000, eval_interval: 300, episodes: 4, hidden: 64, ..SHORT };
+const LISTEN: [&str; 2] = ["--listen", "tcp/127.0.0.1:0"];
 
 #[test]
 fn a_stopped_learner_resumes_at_its_step() {
     let scratch = Scratch::new();
-    let learner = |arguments: &[&str]| {
-        scratch.learner_with(
-            "run",
-            ENDLESS,
-            &[&["--listen", "tcp/127.0.0.1:0"], arguments].concat(),
-        )
-    };
+    let learner = || scratch.learner("run", ENDLESS);
     let step_of = |learner: &Learner| -> u64 {
         let line = learner.process.wait_for_log("continues after step", PATIENCE);
         let step = line.split("continues after step ").nth(1).unwrap().split(';').next().unwrap();
         step.parse().unwrap()
     };
-    let mut first = learner(&[]);
+    let mut first = learner();
     first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     assert_eq!(first.process.terminate(PATIENCE).code(), Some(75));
     first.process.assert_said("the same command continues from there");
 
-    let mut second = learner(&[]);
+    let mut second = learner();
     let step = step_of(&second);
     assert!(step >= ENDLESS.eval_interval, "{step}");
     // A damaged checkpoint falls back to the one before, here to the very beginning.
@@ -47,7 +34,7 @@ fn a_stopped_learner_resumes_at_its_step() {
     let (name, mut bytes) = second.files("checkpoints").pop_last().unwrap();
     bytes.truncate(bytes.len() / 2);
     fs::write(second.run_dir.join("checkpoints").join(name), bytes).unwrap();
-    let mut third = learner(&[]);
+    let mut third = learner();
     assert!(step_of(&third) < step);
     third.process.assert_said("is damaged");
     third.process.terminate(PATIENCE);
@@ -56,27 +43,22 @@ fn a_stopped_learner_resumes_at_its_step() {
 #[test]
 fn a_folder_has_one_configuration_and_one_learner() {
     let scratch = Scratch::new();
-    let learner = |seed: &str, fresh: &[&str]| {
-        scratch.learner_with(
-            "run",
-            ENDLESS,
-            &[&["--listen", "tcp/127.0.0.1:0", "--seed", seed], fresh].concat(),
-        )
-    };
-    let mut first = learner("1", &[]);
+    let learner =
+        |flags: &[&str]| scratch.learner_with("run", ENDLESS, &[&LISTEN[..], flags].concat());
+    let mut first = learner(&["--seed", "1"]);
     first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     first.process.kill();
-    let mut other = learner("6", &[]);
+    let mut other = learner(&["--seed", "6"]);
     other.process.assert_ends(1, PATIENCE);
-    let log = other.process.log();
-    assert!(log.contains("seed: 1 there, 6 here") && log.contains("--fresh"), "{log}");
+    other.process.assert_said("seed: 1 there, 6 here");
+    other.process.assert_said("--fresh");
 
     // Begun anew, the old one is kept.
-    let fresh = learner("6", &["--fresh"]);
+    let fresh = learner(&["--seed", "6", "--fresh"]);
     fresh.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     assert!(scratch.path().join("run.old1/config.toml").exists());
-    assert!(!fresh.process.log().contains("continues after step"));
-    let mut twin = learner("6", &[]);
+    fresh.process.assert_not_said("continues after step");
+    let mut twin = learner(&["--seed", "6"]);
     twin.process.assert_ends(75, PATIENCE);
     twin.process.assert_said("another learner is at work");
 }
@@ -88,8 +70,8 @@ fn a_run_whose_folder_is_removed_ends() {
     learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     fs::rename(&learner.run_dir, scratch.path().join("elsewhere")).unwrap();
     learner.process.assert_ends(1, PATIENCE);
-    let log = learner.process.log();
-    assert!(log.contains("was removed or renamed") && log.contains("hint: put it back"), "{log}");
+    learner.process.assert_said("was removed or renamed");
+    learner.process.assert_said("hint: put it back");
 }
 
 /// As if the scores were of another machine's bits. Training has to come by the step again to find
@@ -112,9 +94,8 @@ fn other_weights_for_a_scored_step_end_the_run() {
     fs::write(&log, fs::read_to_string(&log).unwrap().replace(&first.weights, &weights)).unwrap();
     let mut learner = scratch.learner("run", LONG);
     learner.process.assert_ends(1, PATIENCE);
-    let said = learner.process.log();
-    assert!(said.contains(&format!("but {weights} were scored before")), "{said}");
-    assert!(said.contains("hint: another kind of processor"), "{said}");
+    learner.process.assert_said(&format!("but {weights} were scored before"));
+    learner.process.assert_said("hint: another kind of processor");
     assert!(fs::read(&snapshot).unwrap() == bytes, "what was scored is overwritten");
 }
 
@@ -139,11 +120,7 @@ fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
     fs::write(&log, lines.replace(&format!("{lost}\n"), "")).unwrap();
     let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
     learner.process.assert_ends(1, PATIENCE);
-    for said in [
-        &format!("without the snapshot of step {step}")[..],
-        "but 1 episodes have no score",
-        "hint: ",
-    ] {
-        assert!(learner.process.log().contains(said), "{}", learner.process.log());
-    }
+    learner.process.assert_said(&format!("without the snapshot of step {step}"));
+    learner.process.assert_said("but 1 episodes have no score");
+    learner.process.assert_said("hint: ");
 }

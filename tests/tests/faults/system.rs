@@ -43,14 +43,12 @@ pub enum Fault {
 
 /// All that can happen.
 pub fn all_faults() -> Vec<Fault> {
-    let of = |program| {
-        let links = Trouble::ALL.map(|trouble| Fault::Link(program, trouble));
-        [Fault::Kill(program), Fault::Stop(program), Fault::Freeze(program)]
-            .into_iter()
-            .chain(links)
-    };
-    let others = [Fault::RestartRouter, Fault::FillDisk, Fault::DeliverAgain];
-    of(Program::Learner).chain(of(Program::Evaluator)).chain(others).collect()
+    let mut all = vec![Fault::RestartRouter, Fault::FillDisk, Fault::DeliverAgain];
+    for program in [Program::Learner, Program::Evaluator] {
+        all.extend([Fault::Kill(program), Fault::Stop(program), Fault::Freeze(program)]);
+        all.extend(Trouble::ALL.map(|trouble| Fault::Link(program, trouble)));
+    }
+    all
 }
 
 /// Each program is at the end of a link of its own.
@@ -209,9 +207,6 @@ impl System {
 }
 
 fn learner(scratch: &Scratch, setting: Setting, link: &Link) -> Learner {
-    scratch.learner_with(
-        "run",
-        setting,
-        &["--connect", &link.endpoint, "--checkpoint-seconds", "1"],
-    )
+    let connect = ["--connect", &link.endpoint, "--checkpoint-seconds", "1"];
+    scratch.learner_with("run", setting, &connect)
 }

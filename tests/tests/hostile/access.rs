@@ -24,18 +24,10 @@ async fn a_run_completes_through_the_shipped_router() {
     let Some(certificates) = Certificates::make() else { return };
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let scratch = Scratch::new();
-    let connect = |role| {
-        [
-            "--connect".to_owned(),
-            endpoint.clone(),
-            "--certificates".to_owned(),
-            certificates.argument(role),
-        ]
-    };
-    let arguments = connect("evaluator");
-    let _evaluator = scratch.evaluator_with("trusted", &arguments.each_ref().map(String::as_str));
-    let arguments = connect("learner");
-    let mut learner = scratch.learner_with("run", SHORT, &arguments.each_ref().map(String::as_str));
+    let [ours, theirs] = ["learner", "evaluator"].map(|role| certificates.argument(role));
+    let connect = ["--connect", &endpoint, "--certificates"];
+    let _evaluator = scratch.evaluator_with("trusted", &[&connect[..], &[&theirs]].concat());
+    let mut learner = scratch.learner_with("run", SHORT, &[&connect[..], &[&ours]].concat());
     learner.assert_completes(PATIENCE);
 }
 
@@ -48,22 +40,15 @@ async fn a_router_with_a_certificate_for_another_host_is_refused() {
     let arguments = ["--connect", &endpoint, "--certificates", &folder];
     let evaluator = scratch.evaluator_through(&launcher, "careful", &arguments);
     evaluator.process.wait_for_log("certificate not valid for name", PATIENCE);
-    assert!(
-        !evaluator.process.log().contains("Successfully connected"),
-        "{}",
-        evaluator.process.log()
-    );
+    evaluator.process.assert_not_said("Successfully connected");
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_listening_learner_checks_certificates() {
     let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
-    let learner = scratch.learner_with(
-        "run",
-        ENDLESS,
-        &["--listen", "tls/127.0.0.1:0", "--certificates", &folder],
-    );
+    let listen = ["--listen", "tls/127.0.0.1:0", "--certificates", &folder];
+    let learner = scratch.learner_with("run", ENDLESS, &listen);
     let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
     assert!(endpoint.starts_with("tls/127.0.0.1:"), "{endpoint}");
 
@@ -71,10 +56,8 @@ async fn a_listening_learner_checks_certificates() {
         [(None, "peer sent no certificates"), (Some("expired"), "certificate expired")]
     {
         let folder = name.map(|name| certificates.of(name));
-        assert!(
-            connect(&endpoint, &authority, folder.as_deref()).await.is_err(),
-            "{name:?} came in"
-        );
+        let session = connect(&endpoint, &authority, folder.as_deref()).await;
+        assert!(session.is_err(), "{name:?} came in");
         learner.process.wait_for_log(reason, PATIENCE);
     }
 
@@ -104,29 +87,26 @@ async fn the_router_refuses_invalid_certificates() {
     come_in(&endpoint, &authority, &evaluator).await;
     let foreign = elsewhere.of("evaluator");
     let expired = certificates.of("expired");
-    for folder in [None, Some(&foreign), Some(&expired)] {
-        let session = connect(&endpoint, &authority, folder.map(PathBuf::as_path)).await;
-        assert!(session.is_err(), "{folder:?} came in");
-    }
-
     // The other way round: a router that is not of the evaluator's authority, or only an evaluator,
     // is not talked to.
-    assert!(
-        connect(&endpoint, &foreign, Some(&foreign)).await.is_err(),
-        "a foreign router was trusted"
-    );
-    let (_impostor, endpoint) = protected_router(HOST, &evaluator).await;
-    assert!(
-        connect(&endpoint, &authority, Some(&evaluator)).await.is_err(),
-        "an evaluator passed for a router"
-    );
+    let (_impostor, impostor) = protected_router(HOST, &evaluator).await;
+    for (endpoint, authority, folder) in [
+        (&endpoint, &authority, None),
+        (&endpoint, &authority, Some(&foreign)),
+        (&endpoint, &authority, Some(&expired)),
+        (&endpoint, &foreign, Some(&foreign)),
+        (&impostor, &authority, Some(&evaluator)),
+    ] {
+        let session = connect(endpoint, authority, folder.map(PathBuf::as_path)).await;
+        assert!(session.is_err(), "{folder:?} came in at {endpoint}");
+    }
 
     // And it says so, instead of waiting in silence.
     let (scratch, folder) = (Scratch::new(), elsewhere.argument("evaluator"));
-    let stray =
-        scratch.evaluator_with("stray", &["--connect", &endpoint, "--certificates", &folder]);
+    let connect = ["--connect", &impostor, "--certificates", &folder];
+    let stray = scratch.evaluator_with("stray", &connect);
     stray.process.wait_for_log("refuses the other's certificate", PATIENCE);
-    assert!(!stray.process.log().contains("connected"));
+    stray.process.assert_not_said("connected");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -134,26 +114,19 @@ async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_ba
     let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
-    let _learner =
-        scratch.learner_with("run", IDLE, &["--connect", &endpoint, "--certificates", &folder]);
+    let connect = ["--connect", &endpoint, "--certificates"];
+    let _learner = scratch.learner_with("run", IDLE, &[&connect[..], &[&folder]].concat());
     let monitor = come_in(&endpoint, &certificates.of("router"), &certificates.of("monitor")).await;
-    let tokens = monitor
-        .liveliness()
-        .declare_subscriber("quad/run/live/evaluator/*")
-        .history(true)
-        .await
-        .unwrap();
-    let next = async || {
-        timeout(PATIENCE, tokens.recv_async()).await.expect("it comes or goes").unwrap().kind()
-    };
+    let evaluators = "quad/run/live/evaluator/*";
+    let tokens = monitor.liveliness().declare_subscriber(evaluators).history(true).await.unwrap();
+    let next = async || timeout(PATIENCE, tokens.recv_async()).await.unwrap().unwrap().kind();
     certificates.short("brief", BRIEF);
     let folder = certificates.argument("brief");
-    let evaluator =
-        scratch.evaluator_with("brief", &["--connect", &endpoint, "--certificates", &folder]);
+    let evaluator = scratch.evaluator_with("brief", &[&connect[..], &[&folder]].concat());
     assert_eq!(next().await, SampleKind::Put);
     assert_eq!(next().await, SampleKind::Delete, "it stays after its certificate has expired");
 
     certificates.renew("brief");
     assert_eq!(next().await, SampleKind::Put);
-    assert!(evaluator.process.log().contains("make a new one soon"));
+    evaluator.process.assert_said("make a new one soon");
 }

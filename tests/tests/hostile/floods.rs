@@ -37,16 +37,6 @@ enum Flood {
     Downloads,
 }
 
-const FLOODS: [Flood; 7] = [
-    Flood::Progress,
-    Flood::Claims,
-    Flood::Reports,
-    Flood::Garbage,
-    Flood::Large,
-    Flood::Evaluators,
-    Flood::Downloads,
-];
-
 /// A client that sends without a pause.
 struct Client {
     session: Session,
@@ -56,13 +46,8 @@ struct Client {
 
 impl Client {
     async fn ask(&self, key: &str, question: Vec<u8>) {
-        self.session
-            .get(key)
-            .payload(question)
-            .timeout(Duration::from_secs(1))
-            .callback(drop)
-            .await
-            .unwrap();
+        let get = self.session.get(key).payload(question).timeout(Duration::from_secs(1));
+        get.callback(drop).await.unwrap();
     }
 
     async fn ask_much(&self, key: &str) {
@@ -138,7 +123,8 @@ async fn bear(each: Duration) {
     let evaluator = scratch.evaluator("steady", &endpoint);
     learner.wait_for_scores(0);
     let quiet = learner.process.peak_memory().unwrap();
-    for flood in FLOODS {
+    use Flood::{Claims, Downloads, Evaluators, Garbage, Large, Progress, Reports};
+    for flood in [Progress, Claims, Reports, Garbage, Large, Evaluators, Downloads] {
         let stop = Arc::new(AtomicBool::new(false));
         let flooding = start(flood, &endpoint, stop.clone()).await;
         let scores = learner.scores().len();
@@ -149,20 +135,15 @@ async fn bear(each: Duration) {
         stop.store(true, Relaxed);
         flooding.await.unwrap();
         let growth = learner.process.peak_memory().unwrap().saturating_sub(quiet) >> 20;
-        eprintln!(
-            "{flood:?}: memory has grown by {growth} MiB at most, {} scores",
-            learner.scores().len() - scores
-        );
+        let scores = learner.scores().len() - scores;
+        eprintln!("{flood:?}: memory has grown by {growth} MiB at most, {scores} scores");
         assert!(growth < MOST_GROWTH, "{flood:?} took {growth} MiB");
     }
-    learner.wait_for_metric("rejected_messages_total", "", |rejected| {
-        rejected >= LEAST_MESSAGES as f64
-    });
+    let least = LEAST_MESSAGES as f64;
+    learner.wait_for_metric("rejected_messages_total", "", |rejected| rejected >= least);
     learner.assert_scores_are_distinct();
-    assert!(
-        !learner.process.log().contains("panicked")
-            && !evaluator.process.log().contains("panicked")
-    );
+    learner.process.assert_not_said("panicked");
+    evaluator.process.assert_not_said("panicked");
     let lines = learner.process.log().lines().count();
     assert!(lines < 1000, "{lines} lines in the log");
 }

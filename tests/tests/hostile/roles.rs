@@ -36,8 +36,8 @@ async fn at_the_router<const N: usize>(roles: [&str; N]) -> Option<(impl Sized, 
 /// The key that arrives next.
 async fn next(samples: &Subscriber<FifoChannelHandler<Sample>>) -> String {
     loop {
-        let sample =
-            timeout(PATIENCE, samples.recv_async()).await.expect("nothing arrives").unwrap();
+        let sample = timeout(PATIENCE, samples.recv_async()).await;
+        let sample = sample.expect("nothing arrives").unwrap();
         if *sample.payload().to_bytes() != *PROBE.as_bytes() {
             return sample.key_expr().to_string();
         }
@@ -86,11 +86,8 @@ async fn answers(session: &Session, key: &str) -> usize {
 #[tokio::test(flavor = "multi_thread")]
 async fn only_learners_publish_weights_and_only_evaluators_report_progress() {
     let roles = ["learner", "evaluator", "monitor", "monitor", "evaluator"];
-    let Some((_router, [learner, evaluator, monitor, listener, receiver])) =
-        at_the_router(roles).await
-    else {
-        return;
-    };
+    let Some((_router, sessions)) = at_the_router(roles).await else { return };
+    let [learner, evaluator, monitor, listener, receiver] = sessions;
     let heard = listener.declare_subscriber("quad/run/**").await.unwrap();
     let weights = receiver.declare_subscriber("quad/run/weights").await.unwrap();
     let spied = receiver.declare_subscriber("quad/run/progress/*").await.unwrap();
@@ -113,10 +110,8 @@ async fn only_learners_publish_weights_and_only_evaluators_report_progress() {
         keys.extend(until(&heard, "quad/run/weights").await);
     }
     keys.sort();
-    assert_eq!(
-        keys,
-        ["progress/e", "progress/last", "weights"].map(|key| format!("quad/run/{key}"))
-    );
+    let expected = ["progress/e", "progress/last", "weights"];
+    assert_eq!(keys, expected.map(|key| format!("quad/run/{key}")));
     assert_eq!(until(&weights, "quad/run/weights").await.len(), 1);
     assert!(weights.try_recv().unwrap().is_none() && spied.try_recv().unwrap().is_none());
 }
@@ -124,12 +119,11 @@ async fn only_learners_publish_weights_and_only_evaluators_report_progress() {
 #[tokio::test(flavor = "multi_thread")]
 async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
     let roles = ["learner", "evaluator", "monitor", "evaluator"];
-    let Some((_router, [learner, evaluator, monitor, other])) = at_the_router(roles).await else {
-        return;
-    };
+    let Some((_router, sessions)) = at_the_router(roles).await else { return };
+    let [learner, evaluator, monitor, other] = sessions;
     for impostor in [&evaluator, &monitor] {
-        let _held =
-            (answer(impostor, "quad/run/**").await, answer(impostor, "quad/run/jobs").await);
+        let _all = answer(impostor, "quad/run/**").await;
+        let _jobs = answer(impostor, "quad/run/jobs").await;
         sleep(LULL).await;
         assert_eq!(answers(&other, "quad/run/jobs").await, 0, "{impostor:?}");
     }
@@ -137,17 +131,17 @@ async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
     for key in ["jobs", "scores", "weights/*"] {
         held.push(answer(&learner, &format!("quad/run/{key}")).await);
     }
-    for (key, for_evaluators, for_monitors) in
-        [("jobs", 1, 0), ("scores", 1, 0), ("weights/7", 1, 1)]
-    {
-        let (key, deadline) = (format!("quad/run/{key}"), Instant::now() + PATIENCE);
-        for (session, expected) in [(&evaluator, for_evaluators), (&monitor, for_monitors)] {
-            while answers(session, &key).await != expected {
-                assert!(
-                    Instant::now() < deadline,
-                    "{key} has not {expected} answers for {session:?}"
-                );
-            }
+    for (session, key, expected) in [
+        (&evaluator, "quad/run/jobs", 1),
+        (&evaluator, "quad/run/scores", 1),
+        (&evaluator, "quad/run/weights/7", 1),
+        (&monitor, "quad/run/jobs", 0),
+        (&monitor, "quad/run/scores", 0),
+        (&monitor, "quad/run/weights/7", 1),
+    ] {
+        let deadline = Instant::now() + PATIENCE;
+        while answers(session, key).await != expected {
+            assert!(Instant::now() < deadline, "{key} has not {expected} answers for {session:?}");
         }
     }
 }
@@ -155,10 +149,8 @@ async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
 #[tokio::test(flavor = "multi_thread")]
 async fn only_learners_and_evaluators_declare_tokens() {
     let roles = ["learner", "evaluator", "monitor", "monitor"];
-    let Some((_router, [learner, evaluator, monitor, listener])) = at_the_router(roles).await
-    else {
-        return;
-    };
+    let Some((_router, sessions)) = at_the_router(roles).await else { return };
+    let [learner, evaluator, monitor, listener] = sessions;
     let mut held = Vec::new();
     for (session, key) in [
         (&evaluator, "quad/forged/live/learner/1"),
@@ -182,11 +174,8 @@ async fn only_learners_and_evaluators_declare_tokens() {
 async fn at_a_learner_that_listens_only_evaluators_progress_passes() {
     let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
-    let learner = scratch.learner_with(
-        "run",
-        ENDLESS,
-        &["--listen", "tls/127.0.0.1:0", "--certificates", &folder],
-    );
+    let listen = ["--listen", "tls/127.0.0.1:0", "--certificates", &folder];
+    let learner = scratch.learner_with("run", ENDLESS, &listen);
     let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
     let connect = async |role| come_in(&endpoint, &authority, &certificates.of(role)).await;
     let (witness, asker) = (connect("monitor").await, connect("evaluator").await);

@@ -6,7 +6,7 @@ use std::{env, fs};
 
 use quad_protocol::keys;
 use quad_tests::made_up::{client, name};
-use quad_tests::process::Process;
+use quad_tests::process::{Process, signal};
 use quad_tests::setting::ENDLESS;
 use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually};
@@ -20,25 +20,17 @@ const KNOWN: &str = "known";
 async fn read_nothing(endpoint: &str) {
     let (session, run) = (client(endpoint).await, name("run"));
     let _all = session.declare_subscriber("quad/run/**").callback(drop).await.unwrap();
-    let _token = session
-        .liveliness()
-        .declare_token(keys::live_evaluator(&run, &name("stranger")))
-        .await
-        .unwrap();
+    let token = keys::live_evaluator(&run, &name("stranger"));
+    let _token = session.liveliness().declare_token(token).await.unwrap();
     // Without this, a busy machine might stop the process before it has sent the token.
     eventually("the learner knows the stranger", PATIENCE, || {
         Path::new(KNOWN).exists().then_some(())
     });
+    let weights = keys::weights_at(&run, ENDLESS.eval_interval);
     for _ in 0..150 {
-        session
-            .get(keys::weights_at(&run, ENDLESS.eval_interval))
-            .timeout(PATIENCE)
-            .callback(drop)
-            .await
-            .unwrap();
+        session.get(&weights).timeout(PATIENCE).callback(drop).await.unwrap();
     }
-    let stop = format!("kill -STOP {}", std::process::id());
-    Command::new("sh").args(["-c", &stop]).status().unwrap();
+    signal("STOP", std::process::id());
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -62,12 +54,7 @@ async fn a_peer_that_reads_nothing_blocks_neither_jobs_nor_snapshots() {
         fs::read_to_string(&stat).ok()?.contains(") T ").then(|| learner.scores().len())
     });
     // Until the learner has closed the connection; the stranger itself does nothing any more.
-    let meanwhile = eventually("the stranger is gone", PATIENCE, || {
-        learner
-            .process
-            .log()
-            .contains("evaluator stranger has left")
-            .then(|| learner.scores().len())
-    });
+    learner.process.wait_for_log("evaluator stranger has left", PATIENCE);
+    let meanwhile = learner.scores().len();
     assert!(meanwhile > scored, "no evaluator was served while the stranger read nothing");
 }

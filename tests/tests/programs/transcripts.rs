@@ -9,7 +9,7 @@ use std::path::Path;
 
 use quad_tests::PATIENCE;
 use quad_tests::certificates::Certificates;
-use quad_tests::process::{binary, succeeds};
+use quad_tests::process::{binary, built, succeeds};
 use quad_tests::setting::SHORT;
 use quad_tests::system::Scratch;
 
@@ -28,6 +28,7 @@ fn commands_print_what_their_transcripts_have() {
         .register_bins(["learner", "evaluator"].map(|name| (name, binary(name))))
         .register_bin("sh", Path::new("/bin/sh"))
         .env("PATH", format!("{programs}:{}", env::var("PATH").unwrap()))
+        .env("NO_LOCKS", built("examples/libno_locks.so").to_str().unwrap())
         .env("TAKEN", taken.local_addr().unwrap().to_string())
         // Nothing but this machine can be reached: the proxy for everything else is a closed port.
         .env("ALL_PROXY", "http://127.0.0.1:9")
@@ -35,7 +36,7 @@ fn commands_print_what_their_transcripts_have() {
         .env("QUAD_DATASETS_URL", "http://127.0.0.1:9")
         .env("D4RL_DATASET_DIR", "cache");
     let transcripts = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/programs"));
-    for name in ["usage", "data", "datasets", "policies", "judge"] {
+    for name in ["usage", "data", "datasets", "doctor", "policies", "judge"] {
         cases.case(transcripts.join(format!("{name}.trycmd")));
     }
     if let [Some(ours), Some(others)] = [(); 2].map(|()| Certificates::make()) {
@@ -80,6 +81,7 @@ fn write_run(scratch: &Scratch) {
     fs::write("moon.safetensors", [&snapshot[..at], b"onmoon", &snapshot[at + 6..]].concat())
         .unwrap();
 
+    write_log(Path::new("strong.hdf5"), 30.0);
     write_log(Path::new("robot.hdf5"), 1.0);
     for (run, flags) in [("quad", ""), ("iql", "--agent value.hidden=[32]")] {
         train("robot.hdf5", &format!("robots/{run}"), &format!("--algorithm {run} {flags}"));

@@ -6,7 +6,7 @@ use std::process::{Child, Command, Stdio};
 
 use quad_protocol::keys;
 use quad_tests::made_up::name;
-use quad_tests::process::binary;
+use quad_tests::process::{binary, signal};
 use quad_tests::router::{router, router_without_scores};
 use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
@@ -23,8 +23,7 @@ fn full_pipe() -> (OwnedFd, PipeReader) {
 
 /// The exit code of a program that is told to leave.
 fn leaves(child: Child) -> Option<i32> {
-    let signal = format!("kill -TERM {}", child.id());
-    assert!(Command::new("sh").args(["-c", &signal]).status().unwrap().success());
+    signal("TERM", child.id());
     ends(child)
 }
 
@@ -38,47 +37,23 @@ fn an_unread_stderr_blocks_neither_work_nor_exit() {
     let scratch = Scratch::new();
     let (unread, _reader) = full_pipe();
     let start = |command: &mut Command| {
-        command
-            .stdout(Stdio::null())
-            .stderr(unread.try_clone().unwrap())
-            .stdin(Stdio::null())
-            .spawn()
-            .unwrap()
+        let stderr = unread.try_clone().unwrap();
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(stderr).spawn().unwrap()
     };
     let learner = |name: &str, setting, arguments: &[&str]| {
-        let mut learner = Command::new(binary("learner"));
-        learner
-            .arg("train")
-            .arg("--preset")
-            .arg(scratch.preset(name, setting))
-            .arg("--dataset")
-            .arg(scratch.dataset());
-        learner
-            .arg("--run-dir")
-            .arg(scratch.path().join(name))
-            .args(["--http", "127.0.0.1:0"])
-            .args(arguments);
-        start(&mut learner)
+        start(scratch.train(&[], &scratch.path().join(name), setting).args(arguments))
     };
     // One that has to end itself is not a success.
-    assert_eq!(
-        ends(learner("short", SHORT, &["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"])),
-        Some(0)
-    );
+    let short = learner("short", SHORT, &["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"]);
+    assert_eq!(ends(short), Some(0));
     let (endpoint, run_dir) = (free_endpoint(), scratch.path().join("run"));
     let learner = learner("run", ENDLESS, &["--listen", &endpoint]);
-    let evaluator = start(Command::new(binary("evaluator")).args([
-        "serve",
-        "--name",
-        "mute",
-        "--connect",
-        &endpoint,
-    ]));
-    let scored = || {
-        std::fs::read_to_string(run_dir.join("scores.jsonl"))
-            .is_ok_and(|lines| lines.lines().count() > 20)
-    };
-    eventually("there are scores", PATIENCE, || scored().then_some(()));
+    let serve = ["serve", "--name", "mute", "--connect", &endpoint];
+    let evaluator = start(Command::new(binary("evaluator")).args(serve));
+    eventually("there are scores", PATIENCE, || {
+        let lines = std::fs::read_to_string(run_dir.join("scores.jsonl")).ok()?;
+        (lines.lines().count() > 20).then_some(())
+    });
     assert_eq!((leaves(evaluator), leaves(learner)), (Some(0), Some(75)));
     let checkpoints = std::fs::read_dir(run_dir.join("checkpoints")).unwrap().count();
     assert!(checkpoints > 0, "it has left without a checkpoint");
@@ -133,14 +108,8 @@ async fn a_learner_that_waits_for_another_reports_failures_and_stops() {
 async fn an_evaluator_that_leaves_in_the_middle_of_a_job_hands_it_back() {
     let scratch = Scratch::new();
     // It need not be finished, so it is as long as jobs can be.
-    let setting = Setting {
-        steps: 10_000_000,
-        eval_interval: 10,
-        episodes: 40,
-        candidates: 1000,
-        hidden: 256,
-        ..ENDLESS
-    };
+    let sizes = Setting { candidates: 1000, hidden: 256, ..ENDLESS };
+    let setting = Setting { steps: 10_000_000, eval_interval: 10, episodes: 40, ..sizes };
     let learner = scratch.learner("run", setting);
     let behind = free_endpoint();
     let _router = router_without_scores(&behind, Some(&learner.endpoint())).await;

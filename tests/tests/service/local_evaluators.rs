@@ -1,9 +1,9 @@
 //! `learner train --evaluators N`: one command that starts its own evaluators.
 
 use std::fs;
-use std::process::Command;
 
 use quad_tests::learner::Learner;
+use quad_tests::process::{children, signal};
 use quad_tests::router::router;
 use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
@@ -11,12 +11,6 @@ use quad_tests::{PATIENCE, eventually};
 
 fn learner(scratch: &Scratch, setting: Setting) -> Learner {
     scratch.learner_with("run", setting, &["--listen", "tcp/127.0.0.1:0", "--evaluators", "2"])
-}
-
-/// The processes that a process has started.
-fn children(of: u32) -> Vec<u32> {
-    let list = fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
-    list.split_whitespace().map(|id| id.parse().unwrap()).collect()
 }
 
 /// True if none of them runs. A killed process that was not waited for does not run.
@@ -44,8 +38,8 @@ fn two_runs_on_one_machine_need_no_ports() {
     by_default.assert_completes(PATIENCE);
     learner.assert_completes(PATIENCE);
     for number in [1, 2] {
-        let log =
-            fs::read_to_string(learner.run_dir.join(format!("evaluator-{number}.log"))).unwrap();
+        let log = learner.run_dir.join(format!("evaluator-{number}.log"));
+        let log = fs::read_to_string(log).unwrap();
         assert!(log.contains("ready to serve") && log.contains("leaving"), "{log}");
     }
 }
@@ -72,9 +66,7 @@ fn a_dead_evaluator_is_reported_and_replaced() {
     let scratch = Scratch::new();
     let learner = learner(&scratch, ENDLESS);
     let evaluators = at_work(&learner);
-    for evaluator in &evaluators {
-        Command::new("kill").args(["-KILL", &evaluator.to_string()]).status().unwrap();
-    }
+    evaluators.iter().for_each(|evaluator| signal("KILL", *evaluator));
     let line = learner.process.wait_for_log("an evaluator has ended", PATIENCE);
     assert!(line.contains("signal: 9") && line.contains("evaluator-"), "{line}");
     let others =
@@ -92,11 +84,7 @@ async fn evaluators_of_two_learners_have_different_names() {
         |run| scratch.learner_with(run, SHORT, &["--connect", &endpoint, "--evaluators", "1"]);
     for mut learner in ["one", "two"].map(start) {
         learner.assert_completes(PATIENCE);
-        assert!(
-            !learner.process.log().contains("two evaluators were started"),
-            "{}",
-            learner.process.log()
-        );
+        learner.process.assert_not_said("two evaluators were started");
     }
     let names = ["one", "two"].map(|run| {
         let log = fs::read_to_string(scratch.path().join(run).join("evaluator-1.log")).unwrap();

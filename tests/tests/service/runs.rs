@@ -11,6 +11,7 @@ use quad_tests::router::{router, router_without_scores};
 use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
 use quad_tests::{PATIENCE, eventually, http};
+use tokio::task::JoinSet;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn one_evaluator_serves_two_runs_in_turn_and_survives_the_routers_restart() {
@@ -61,15 +62,8 @@ fn an_evaluator_waits_for_its_learner_and_serves_the_next_one() {
 async fn scores_measured_offline_reach_the_next_incarnation() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
-    let setting = Setting {
-        steps: 10,
-        eval_interval: 10,
-        episodes: 20,
-        candidates: 1000,
-        hidden: 256,
-        seed: 1,
-        online_steps: 0,
-    };
+    let sizes = Setting { candidates: 1000, hidden: 256, ..SHORT };
+    let setting = Setting { steps: 10, eval_interval: 10, episodes: 20, ..sizes };
     let session = router_without_scores(&endpoint, None).await;
     let mut first = scratch.learner_with("run", setting, &["--connect", &endpoint]);
     let evaluator = scratch.evaluator("cut-off", &endpoint);
@@ -127,25 +121,22 @@ async fn a_report_that_is_delivered_many_times_at_once_counts_once() {
     let learner =
         scratch.learner_through(&slow.launcher(), "run", setting, &["--listen", "tcp/127.0.0.1:0"]);
     let (session, run) = (client(&learner.endpoint()).await, name("run"));
-    let (mut deliveries, mut episodes) = (Vec::new(), 0);
+    let (mut deliveries, mut episodes) = (JoinSet::new(), 0);
     let jobs = [
-        (claim_eventually(&session, &run, "a").await, 1),
-        (claim_eventually(&session, &run, "b").await, 20),
+        (claim_eventually(&session, &run, "a").await, "a", 1),
+        (claim_eventually(&session, &run, "b").await, "b", 20),
     ];
-    for ((job, times), evaluator) in jobs.iter().zip(["a", "b"]) {
+    for (job, evaluator, times) in &jobs {
         episodes += job.seeds.len();
         for _ in 0..*times {
-            let (session, key, report) =
-                (session.clone(), keys::scores(&run), scores(job, evaluator));
-            deliveries
-                .push(tokio::spawn(async move { ask::<ScoreReply>(&session, key, &report).await }));
+            let (session, key) = (session.clone(), keys::scores(&run));
+            let report = scores(job, evaluator);
+            deliveries.spawn(async move { ask::<ScoreReply>(&session, key, &report).await });
         }
     }
     let mut counted = 0;
-    for delivery in deliveries {
-        let Some(ScoreReply::Recorded { new, .. }) = delivery.await.unwrap() else {
-            panic!("refused")
-        };
+    for answer in deliveries.join_all().await {
+        let Some(ScoreReply::Recorded { new, .. }) = answer else { panic!("{answer:?}") };
         counted += new as usize;
     }
     assert_eq!((counted, learner.assert_scores_are_distinct().len()), (episodes, episodes));

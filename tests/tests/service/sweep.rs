@@ -1,11 +1,12 @@
 //! `learner sweep`: the runs of a study, and one pool of evaluators for all of them.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use quad_tests::hanging_disk::launcher;
-use quad_tests::process::{Process, binary};
+use quad_tests::learner::verify;
+use quad_tests::process::{Process, binary, children, signal, stdout};
 use quad_tests::setting::{SHORT, Setting};
 use quad_tests::system::{Scratch, free_port};
 use quad_tests::{PATIENCE, eventually};
@@ -50,57 +51,35 @@ impl Study {
 
     /// Waits until a run has begun to train.
     fn wait_for(&self, run: &str) {
-        let text = || {
-            fs::read_to_string(self.dir(run).join("metrics.jsonl"))
-                .ok()
-                .filter(|text| !text.is_empty())
-        };
-        eventually(&format!("{run} trains"), PATIENCE, text);
+        let metrics = self.dir(run).join("metrics.jsonl");
+        eventually(&format!("{run} trains"), PATIENCE, || {
+            metrics.metadata().is_ok_and(|file| file.len() > 0).then_some(())
+        });
     }
 
     /// The state of each run in `--list`.
     fn states(&self) -> Vec<String> {
-        let output = self.command(&["--list"]).output().unwrap();
-        let text = String::from_utf8(output.stdout).unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        text.lines()
-            .skip(1)
-            .zip(RUNS)
-            .map(|(line, run)| line.split_once(run).unwrap().1.trim().to_owned())
-            .collect()
+        let list = stdout(&self.command(&["--list"]).output().unwrap());
+        let states = list.lines().skip(1).zip(RUNS);
+        states.map(|(line, run)| line.split_once(run).unwrap().1.trim().to_owned()).collect()
     }
 
     /// Every episode of every run has one score, and the runs are those of another study.
     fn assert_same_as(&self, other: &Study) {
         for run in RUNS {
-            let mut verify = Command::new(binary("learner"));
-            let output = verify
-                .arg("verify")
-                .arg(self.dir(run))
-                .arg("--same-as")
-                .arg(other.dir(run))
-                .output()
-                .unwrap();
-            assert!(output.status.success(), "{run}: {}", String::from_utf8_lossy(&output.stdout));
+            verify(&self.dir(run), &[Path::new("--same-as"), &other.dir(run)]);
         }
     }
 }
 
-/// The learner that works on a run, among the processes that a sweep has started.
-fn learner_of(sweep: &Process, run: &str) -> Option<String> {
-    child_of(sweep, |word| word.ends_with(run))
-}
-
-/// The first process that a sweep has started by a command line with such a word.
-fn child_of(sweep: &Process, is_its: impl Fn(&str) -> bool) -> Option<String> {
-    let children = fs::read_to_string(format!("/proc/{0}/task/{0}/children", sweep.id())).ok()?;
-    let line = |id: &&str| fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
-    let fits = |id: &&str| String::from_utf8_lossy(&line(id)).split('\0').any(&is_its);
-    children.split_whitespace().find(fits).map(str::to_owned)
-}
-
-fn kill(signal: &str, process: &str) {
-    assert!(Command::new("kill").args([signal, process]).status().unwrap().success());
+/// The process that a sweep has started by a command line with a word that ends like this: a run's
+/// learner, or an evaluator, whose word is `serve`.
+fn child_of(sweep: &Process, end: &str) -> u32 {
+    let line = |id: &u32| fs::read_to_string(format!("/proc/{id}/cmdline")).unwrap_or_default();
+    eventually(&format!("{end} has started"), PATIENCE, || {
+        let mut children = children(sweep.id()).into_iter();
+        children.find(|id| line(id).split('\0').any(|word| word.ends_with(end)))
+    })
 }
 
 #[test]
@@ -122,10 +101,10 @@ fn a_sweep_resumes_and_a_failed_run_ends_no_other() {
     let mut sweep = study.sweep(&["--jobs", "2"]);
     let victim = RUNS[2];
     study.wait_for(victim);
-    let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, victim));
-    kill("-KILL", &learner);
+    signal("KILL", child_of(&sweep, victim));
     sweep.assert_ends(1, PATIENCE);
     sweep.assert_said("1 of 4 runs have failed");
+    sweep.assert_said(&format!("{victim}: the learner ended by signal: 9 (SIGKILL)"));
     sweep.assert_said(&format!("{victim}/learner.log"));
     let states = study.states();
     assert!(states[2].starts_with("failed after"), "{states:?}");
@@ -142,14 +121,12 @@ fn shards_and_indices_train_parts_of_a_study() {
     assert_eq!(study.states(), ["not begun", "complete", "not begun", "complete"]);
     let address = format!("127.0.0.1:{}", free_port());
     study.sweep(&["--index", "2", "--http", &address]).assert_succeeds(PATIENCE);
-    assert!(
-        fs::read_to_string(study.dir(RUNS[2]).join("endpoints.json")).unwrap().contains(&address)
-    );
+    let endpoints = fs::read_to_string(study.dir(RUNS[2]).join("endpoints.json")).unwrap();
+    assert!(endpoints.contains(&address), "{endpoints}");
     assert_eq!(study.states(), ["not begun", "complete", "complete", "complete"]);
-    let mut sweep = study.sweep(&["--index", "0"]);
+    let sweep = study.sweep(&["--index", "0"]);
     study.wait_for(RUNS[0]);
-    sweep.signal("TERM");
-    sweep.assert_ends(75, PATIENCE);
+    assert_stops(&study, sweep);
     assert!(study.states()[0].ends_with("of 3000 steps"), "{:?}", study.states());
 }
 
@@ -169,9 +146,7 @@ fn a_sweep_whose_only_evaluator_is_killed_gets_another() {
     let study = Study::new();
     let mut sweep = study.sweep(&["--jobs", "1", "--evaluators", "1"]);
     study.wait_for(RUNS[0]);
-    let evaluator =
-        eventually("there is an evaluator", PATIENCE, || child_of(&sweep, |word| word == "serve"));
-    kill("-KILL", &evaluator);
+    signal("KILL", child_of(&sweep, "serve"));
     sweep.assert_succeeds(PATIENCE);
     sweep.assert_said("an evaluator has ended (signal: 9");
 }
@@ -183,9 +158,8 @@ fn an_ignored_sigchld_and_zero_threads_change_nothing() {
     let command = study.command(&["--index", "0"]);
     // Not a shell's `trap`: some shells never ignore this signal.
     let mut env = Command::new("env");
-    env.args(["--ignore-signal=CHLD", "RAYON_NUM_THREADS=0"])
-        .arg(command.get_program())
-        .args(command.get_args());
+    env.args(["--ignore-signal=CHLD", "RAYON_NUM_THREADS=0"]);
+    env.arg(command.get_program()).args(command.get_args());
     Process::start("sweep", study.scratch.path(), env).assert_succeeds(PATIENCE);
     assert_eq!(study.states()[0], "complete");
 }
@@ -197,18 +171,21 @@ fn two_sweeps_of_one_study_do_not_disturb_each_other() {
         // Without evaluators a run is not complete before its sweep is told to end.
         let mut sweep = study.sweep(&[&flags[..], &["--evaluators", "0"]].concat());
         study.wait_for(RUNS[run]);
-        for others in [&[][..], &["--index", if run == 0 { "0" } else { "2" }]] {
+        for others in [&[][..], &["--index", &run.to_string()]] {
             let second = study.command(others).output().unwrap();
             let said = String::from_utf8_lossy(&second.stderr);
             assert_eq!(second.status.code(), Some(75), "{flags:?}, {others:?}: {said}");
-            assert!(
-                !study.states()[run].starts_with("failed"),
-                "{flags:?}, {others:?}: {:?}",
-                study.states()
-            );
+            let state = &study.states()[run];
+            assert!(!state.starts_with("failed"), "{flags:?}, {others:?}: {state}");
         }
         sweep.terminate(PATIENCE);
     }
+}
+
+fn assert_stops(study: &Study, mut sweep: Process) {
+    sweep.signal("TERM");
+    sweep.assert_ends(75, PATIENCE);
+    assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
 }
 
 /// Slurm queues a task again by this exit code, so neither a slow disk nor a learner that has only
@@ -217,35 +194,28 @@ fn two_sweeps_of_one_study_do_not_disturb_each_other() {
 fn a_stopped_sweep_exits_with_75_whatever_hangs() {
     let study = Study::new();
     // At once: the learner does not yet listen to signals.
-    let mut sweep = study.sweep(&["--index", "0"]);
-    eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[0]));
-    sweep.signal("TERM");
-    sweep.assert_ends(75, PATIENCE);
-    assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
+    let sweep = study.sweep(&["--index", "0"]);
+    child_of(&sweep, RUNS[0]);
+    assert_stops(&study, sweep);
 
     // A learner that is frozen, as by a disk that hangs.
-    let mut sweep = study.sweep(&["--index", "0"]);
-    let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[0]));
+    let sweep = study.sweep(&["--index", "0"]);
+    let learner = child_of(&sweep, RUNS[0]);
     study.wait_for(RUNS[0]);
-    kill("-STOP", &learner);
-    sweep.signal("TERM");
-    sweep.assert_ends(75, PATIENCE);
-    assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
+    signal("STOP", learner);
+    assert_stops(&study, sweep);
 
     // A disk that hangs when the sweep marks one of two runs as failed.
     let mut through = Command::new("env");
     through.args(&launcher("fsync", &study.dir(RUNS[1]).join("failed"))[1..]);
     through.arg(binary("learner")).args(study.command(&["--jobs", "2"]).get_args());
-    let mut sweep = Process::start("sweep", study.scratch.path(), through);
+    let sweep = Process::start("sweep", study.scratch.path(), through);
     study.wait_for(RUNS[1]);
-    let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[1]));
-    kill("-KILL", &learner);
+    signal("KILL", child_of(&sweep, RUNS[1]));
     study.wait_for(RUNS[2]);
-    sweep.signal("TERM");
-    sweep.assert_ends(75, PATIENCE);
+    assert_stops(&study, sweep);
     let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
-    assert!(
-        log.contains("received SIGTERM") && log.contains("the same command continues"),
-        "{log}"
-    );
+    for said in ["received SIGTERM", "the same command continues"] {
+        assert!(log.contains(said), "{log}");
+    }
 }

@@ -5,143 +5,127 @@ mod sound;
 
 use std::path::Path;
 
-use quad_dataset::inspect;
+use quad_dataset::{Arrays, Names, Normalize, ReadOptions, Transitions, inspect, write_own};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tempfile::tempdir;
 
-use crate::{put, try_read};
+use crate::{scratch, write};
 
 const O: usize = 4;
 
-#[derive(Default)]
-struct Cart {
-    observations: Vec<f32>,
-    next_observations: Vec<f32>,
-    actions: Vec<f32>,
-    rewards: Vec<f32>,
-    terminals: Vec<bool>,
-    timeouts: Vec<bool>,
-}
+type State = [f32; O];
 
 /// Action, next state, reward, and true if the task is over.
-type Step = ([f32; 2], [f32; O], f32, bool);
+type Step = ([f32; 2], State, f32, bool);
 
-fn made(
-    steps: usize,
-    reset: impl Fn(&mut ChaCha8Rng) -> [f32; O],
-    step: impl Fn(&mut ChaCha8Rng, [f32; O]) -> Step,
-) -> Cart {
-    let (mut random, mut cart) = (ChaCha8Rng::seed_from_u64(5), Cart::default());
+fn empty() -> Arrays {
+    Arrays { observation_dim: O, action_dim: 2, ..Arrays::default() }
+}
+
+/// Appends an episode of at most `length` steps, which starts in `state`.
+fn record(
+    arrays: &mut Arrays,
+    length: usize,
+    mut state: State,
+    mut step: impl FnMut(State) -> Step,
+) {
+    for number in 1..=length {
+        let (action, next, reward, terminal) = step(state);
+        arrays.observations.extend(state);
+        arrays.actions.extend(action);
+        arrays.next_observations.extend(next);
+        arrays.rewards.push(reward);
+        arrays.terminals.push(terminal);
+        arrays.timeouts.push(!terminal && number == length);
+        state = next;
+        if terminal {
+            break;
+        }
+    }
+}
+
+/// A point mass that is pushed to the origin, at `1 / seconds` steps a second.
+fn mass(length: usize, seconds: f32) -> Arrays {
+    let (mut random, mut arrays) = (ChaCha8Rng::seed_from_u64(5), empty());
     for _ in 0..30 {
-        let mut state = reset(&mut random);
-        for number in 1..=steps {
-            let (action, next, reward, terminal) = step(&mut random, state);
-            cart.observations.extend(state);
-            cart.actions.extend(action);
-            cart.next_observations.extend(next);
-            cart.rewards.push(reward);
-            cart.terminals.push(terminal);
-            cart.timeouts.push(!terminal && number == steps);
-            state = next;
-            if terminal {
-                break;
-            }
-        }
+        let state = [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0), 0.0, 0.0];
+        record(&mut arrays, length, state, |[x, y, vx, vy]| {
+            let noise = [0; 2].map(|_| random.random_range(-0.5_f32..0.5));
+            let push = [-x - 1.5 * vx + noise[0], -y - 1.5 * vy + noise[1]];
+            let action = push.map(|push| push.clamp(-1.0, 1.0));
+            let (x, y) = (x + seconds * vx, y + seconds * vy);
+            let (vx, vy) = (vx + seconds * action[0], vy + seconds * action[1]);
+            (action, [x, y, vx, vy], -x.hypot(y), x.hypot(y) < 0.03)
+        });
     }
-    cart
+    arrays
 }
 
-fn mass(steps: usize, seconds: f32) -> Cart {
-    let reset = |random: &mut ChaCha8Rng| {
-        [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0), 0.0, 0.0]
-    };
-    made(steps, reset, |random, [x, y, vx, vy]| {
-        let noise = [0; 2].map(|_| random.random_range(-0.5_f32..0.5));
-        let action =
-            [-x - 1.5 * vx + noise[0], -y - 1.5 * vy + noise[1]].map(|push| push.clamp(-1.0, 1.0));
-        let next = [
-            x + seconds * vx,
-            y + seconds * vy,
-            vx + seconds * action[0],
-            vy + seconds * action[1],
-        ];
-        let distance = next[0].hypot(next[1]);
-        (action, next, -distance, distance < 0.03)
-    })
+/// 30 episodes of a cart, every third of which terminates; `kept` omits the resets.
+fn cart(kept: bool) -> Arrays {
+    let mut random = ChaCha8Rng::seed_from_u64(3);
+    let mut draw = |scale: f32| scale * random.random_range(-1.0..1.0);
+    let (mut arrays, mut state) = (empty(), [0.0; O]);
+    for episode in 0..30 {
+        if !kept {
+            state.fill_with(|| draw(1.0));
+        }
+        let (length, mut number) = (40 + episode % 7, 0);
+        record(&mut arrays, length, state, |mut next| {
+            let action = [draw(1.0), draw(1.0)];
+            next.iter_mut().for_each(|x| *x = 0.99 * *x + draw(0.02));
+            next[0] += 0.02 * action[0];
+            (state, number) = (next, number + 1);
+            (action, next, -next[0].abs(), number == length && episode % 3 == 0)
+        });
+    }
+    arrays
 }
 
-impl Cart {
-    /// 30 episodes, every third of which terminates; `kept` omits the resets.
-    fn new(kept: bool) -> Self {
-        let mut random = ChaCha8Rng::seed_from_u64(3);
-        let mut draw = |scale: f32| scale * random.random_range(-1.0..1.0);
-        let mut cart = Self::default();
-        let mut state = [0.0; O];
-        for episode in 0..30 {
-            if !kept {
-                state.fill_with(|| draw(1.0));
-            }
-            let length = 40 + episode % 7;
-            for row in 1..=length {
-                let action = [draw(1.0), draw(1.0)];
-                cart.observations.extend(state);
-                state.iter_mut().for_each(|x| *x = 0.99 * *x + draw(0.02));
-                state[0] += 0.02 * action[0];
-                cart.next_observations.extend(state);
-                cart.actions.extend(action);
-                cart.rewards.push(-state[0].abs());
-                cart.terminals.push(row == length && episode % 3 == 0);
-                cart.timeouts.push(row == length && episode % 3 != 0);
-            }
-        }
-        cart
+fn observe(arrays: &mut Arrays, change: impl Fn(&mut [f32])) {
+    for values in [&mut arrays.observations, &mut arrays.next_observations] {
+        values.chunks_exact_mut(O).for_each(&change);
     }
+}
 
-    fn write(&self, path: &Path, own: bool) {
-        let (file, rows) = (hdf5::File::create(path).unwrap(), self.rewards.len());
-        if own {
-            let layout: hdf5::types::VarLenUnicode = "transitions".parse().unwrap();
-            file.new_attr::<hdf5::types::VarLenUnicode>()
-                .create("layout")
-                .unwrap()
-                .write_scalar(&layout)
-                .unwrap();
-            put(&file, "next_observations", &[rows, O], &self.next_observations);
-        }
-        put(&file, "observations", &[rows, O], &self.observations);
-        put(&file, "actions", &[rows, 2], &self.actions);
-        put(&file, "rewards", &[rows], &self.rewards);
-        put(&file, "terminals", &[rows], &self.terminals);
-        put(&file, "timeouts", &[rows], &self.timeouts);
+/// Writes the custom layout if `own`, else D4RL's.
+fn write_as(path: &Path, arrays: &Arrays, own: bool) {
+    match own {
+        true => write_own(path, arrays.clone(), Names::default()).unwrap(),
+        false => drop(write(path, arrays)),
     }
+}
 
-    fn observe(&mut self, change: impl Fn(&mut [f32])) {
-        for values in [&mut self.observations, &mut self.next_observations] {
-            values.chunks_exact_mut(O).for_each(&change);
-        }
-    }
+fn problems(arrays: &Arrays, own: bool) -> Vec<String> {
+    let (_folder, path) = scratch("cart.hdf5");
+    write_as(&path, arrays, own);
+    inspect(&path, None).unwrap().problems
+}
 
-    fn problems(&self, own: bool) -> Vec<String> {
-        let folder = tempdir().unwrap();
-        let path = folder.path().join("cart.hdf5");
-        self.write(&path, own);
-        inspect(&path, None).unwrap().problems
-    }
+/// Problems of data that training accepts, which says the same.
+fn warnings(arrays: &Arrays, own: bool) -> Vec<String> {
+    let problems = problems(arrays, own);
+    assert_eq!(training_warnings(arrays, own, Normalize::default()), problems);
+    problems
+}
 
-    fn warning(&self, own: bool) -> String {
-        let warnings = self.warnings(own);
-        assert_eq!(warnings.len(), 1, "{warnings:?}");
-        warnings[0].clone()
-    }
+fn training_warnings(arrays: &Arrays, own: bool, normalize: Normalize) -> Vec<String> {
+    let (_folder, path) = scratch("cart.hdf5");
+    write_as(&path, arrays, own);
+    let options = ReadOptions { normalize, ..ReadOptions::default() };
+    Transitions::read(&path, &options).unwrap().warnings().to_vec()
+}
 
-    fn warnings(&self, own: bool) -> Vec<String> {
-        let folder = tempdir().unwrap();
-        let path = folder.path().join("cart.hdf5");
-        self.write(&path, own);
-        let inspection = inspect(&path, None).unwrap();
-        assert!(!inspection.refused);
-        assert_eq!(try_read(&path, None).unwrap().warnings(), inspection.problems);
-        inspection.problems
+/// Checks the start of the only warning, and a part of it.
+fn assert_warned(arrays: &Arrays, own: bool, start: &str, part: &str) {
+    let warnings = warnings(arrays, own);
+    assert_eq!(warnings.len(), 1, "{warnings:?}");
+    let warning = &warnings[0];
+    assert!(warning.starts_with(start) && warning.contains(part), "{warning}, not {start}…{part}");
+}
+
+fn assert_sound(name: &str, arrays: &Arrays) {
+    for own in [false, true] {
+        assert_eq!(warnings(arrays, own), [""; 0], "{name}, own: {own}");
     }
 }

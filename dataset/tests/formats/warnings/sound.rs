@@ -1,88 +1,60 @@
 use quad_dataset::{environment, inspect};
-use rand::Rng;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
-use super::{Cart, O, made, mass};
+use super::{assert_sound, cart, empty, mass, record};
 use crate::shared;
-
-fn nothing_is_said(name: &str, cart: &Cart) {
-    for own in [false, true] {
-        assert_eq!(cart.warnings(own), [""; 0], "{name}, own: {own}");
-    }
-}
 
 #[test]
 fn a_cart_whose_state_is_kept_or_reset() {
-    nothing_is_said("kept", &Cart::new(true));
-    nothing_is_said("reset", &Cart::new(false));
+    assert_sound("kept", &cart(true));
+    assert_sound("reset", &cart(false));
 }
 
 #[test]
 fn a_robot_at_a_high_rate() {
-    nothing_is_said("a tenth of a second", &mass(60, 0.1));
-    nothing_is_said("a millisecond", &mass(3000, 0.001));
+    assert_sound("a tenth of a second", &mass(60, 0.1));
+    assert_sound("a millisecond", &mass(3000, 0.001));
 }
 
 #[test]
 fn constant_velocity() {
-    let cart = made(
-        100,
-        |random| [random.random_range(-1.0..1.0), 0.7, random.random_range(-1.0..1.0), -0.3],
-        |random, [x, vx, y, vy]| {
+    let (mut random, mut arrays) = (ChaCha8Rng::seed_from_u64(5), empty());
+    let mut draw = || random.random_range(-1.0_f32..1.0);
+    for _ in 0..30 {
+        let state = [draw(), 0.7, draw(), -0.3];
+        record(&mut arrays, 100, state, |[x, vx, y, vy]| {
             let next = [x + 0.01 * vx, vx, y + 0.01 * vy, vy];
-            (
-                [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0)],
-                next,
-                -next[0].abs(),
-                false,
-            )
-        },
-    );
-    nothing_is_said("constant velocity", &cart);
+            ([draw(), draw()], next, -next[0].abs(), false)
+        });
+    }
+    assert_sound("constant velocity", &arrays);
 }
 
 #[test]
 fn rewards_at_the_goal_alone() {
-    let mut cart = mass(60, 0.1);
+    let mut mass = mass(60, 0.1);
     for (goal, others) in [(1.0, 0.0), (0.0, -1.0), (100.0, -1.0)] {
-        let rewards = cart.terminals.iter().map(|terminal| if *terminal { goal } else { others });
-        cart.rewards = rewards.collect();
-        nothing_is_said("sparse", &cart);
+        let rewards = mass.terminals.iter().map(|terminal| if *terminal { goal } else { others });
+        mass.rewards = rewards.collect();
+        assert_sound("sparse", &mass);
     }
 }
 
 #[test]
 fn episodes_of_one_step() {
-    let context =
-        |random: &mut rand_chacha::ChaCha8Rng| [0; O].map(|_| random.random_range(-1.0_f32..1.0));
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let mut draw = || random.random_range(-1.0_f32..1.0);
     for stays in [false, true] {
-        let mut cart = Cart::default();
-        for seed in 0..20 {
-            let one = made(
-                1,
-                |random| {
-                    (0..seed).for_each(|_| {
-                        context(random);
-                    });
-                    context(random)
-                },
-                |random, state| {
-                    let action = [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0)];
-                    (
-                        action,
-                        if stays { state } else { context(random) },
-                        action[0] * state[0],
-                        true,
-                    )
-                },
-            );
-            cart.observations.extend(one.observations);
-            cart.next_observations.extend(one.next_observations);
-            cart.actions.extend(one.actions);
-            cart.rewards.extend(one.rewards);
-            cart.terminals.extend(one.terminals);
-            cart.timeouts.extend(one.timeouts);
+        let mut arrays = empty();
+        for _ in 0..600 {
+            let (context, next) = ([0; 4].map(|_| draw()), [0; 4].map(|_| draw()));
+            record(&mut arrays, 1, context, |state| {
+                let action = [draw(), draw()];
+                (action, if stays { state } else { next }, action[0] * state[0], true)
+            });
         }
-        nothing_is_said("one step", &cart);
+        assert_sound("one step", &arrays);
     }
 }
 
@@ -92,6 +64,7 @@ fn recordings_and_files_of_others() {
         ("data/hopper_medium_replay.hdf5", "hopper"),
         ("data/halfcheetah_medium_replay.hdf5", "halfcheetah"),
         ("data/walker2d_medium_replay.hdf5", "walker2d"),
+        ("data/antmaze_umaze.hdf5", "antmaze-umaze"),
         ("data/antmaze_umaze_direct.hdf5", "antmaze-umaze"),
         ("data/antmaze_medium_play.hdf5", "antmaze-medium"),
         ("fixtures/hopper_fixture-v2.hdf5", "hopper"),
@@ -108,17 +81,15 @@ fn recordings_and_files_of_others() {
 
 #[test]
 fn files_with_one_fault_each() {
+    let mask = "array `terminals`: says in 98.099 % of the rows";
+    let outside = "array `actions`, row 0: the action -11.667108 is outside";
+    let newtons =
+        ["array `rewards`: of size 221.4", "array `observations`: far from ±1 in columns 2, 3"];
     for (file, expected) in [
-        ("discount-as-done", &["array `terminals`: says in 98.099 % of the rows"][..]),
+        ("discount-as-done", &[mask][..]),
         ("frozen-observations", &["array `observations`: does not change in 9"]),
-        ("constant-columns", &["array `actions`, row 0: the action -11.667108 is outside"]),
-        (
-            "degrees-newtons",
-            &[
-                "array `rewards`: of size 221.4",
-                "array `observations`: far from ±1 in columns 2, 3",
-            ],
-        ),
+        ("constant-columns", &[outside]),
+        ("degrees-newtons", &newtons),
         ("rewards-all-one", &["array `rewards`: all are alike"]),
         ("timeouts-one-row-late", &["array `timeouts`: one row late"]),
         ("one-observation-near-a-million", &["array `observations`: far from ±1 in column 4"]),

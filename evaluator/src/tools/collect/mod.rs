@@ -44,10 +44,11 @@ pub struct Summary {
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let [p50, p90, p99, max] = self.score_percentiles;
-        write!(f, "{} transitions, {} episodes", self.transitions, self.episodes)?;
-        writeln!(f, " of {} policies, in {:.0} s", self.policies, self.seconds)?;
-        write!(f, "normalized score: mean {:.1}, median {p50:.1}", self.mean_score)?;
-        write!(f, ", p90 {p90:.1}, p99 {p99:.1}, max {max:.1}")
+        let (transitions, episodes, mean) = (self.transitions, self.episodes, self.mean_score);
+        write!(f, "{transitions} transitions, {episodes} episodes of {} ", self.policies)?;
+        writeln!(f, "policies, in {:.0} s", self.seconds)?;
+        write!(f, "normalized score: mean {mean:.1}, median {p50:.1}, ")?;
+        write!(f, "p90 {p90:.1}, p99 {p99:.1}, max {max:.1}")
     }
 }
 
@@ -81,7 +82,8 @@ pub fn collect(
     let rows = writer.rows();
     let algorithm = "augmented random search, all iterations, with action noise";
     let iteration = policies.len() as i64 - 1;
-    writer.finish(&Metadata { algorithm, iteration, seed }).hint(OUT)?;
+    let metadata = Metadata { algorithm, iteration, seed };
+    writer.finish(&metadata).hint(OUT)?;
 
     scores.sort_by(f64::total_cmp);
     let percentile = |percent: usize| scores[(scores.len() - 1) * percent / 100];

@@ -68,8 +68,15 @@ impl Stage {
         scene.flags_mut()[MjtRndFlag::mjRND_SHADOW as usize] = u8::from(camera.trackbodyid >= 0);
         let data = MjData::try_new(model)
             .map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
-        let reach = spec.maze.map_or(0.0, |maze| maze.reach);
-        Ok(Self { context, scene, data, camera, reach, layout, _gl: gl })
+        Ok(Self {
+            context,
+            scene,
+            data,
+            camera,
+            reach: spec.maze.map_or(0.0, |maze| maze.reach),
+            layout,
+            _gl: gl,
+        })
     }
 
     /// The picture of all episodes after `steps` steps.
@@ -166,12 +173,15 @@ mod tests {
     fn every_robot_has_a_stage_and_a_maze_is_seen_from_above() {
         for spec in quad_dataset::environment::all() {
             let model = model(spec, (320, 240)).unwrap();
-            assert_eq!(model.nq() as usize, spec.qpos_dim, "{}: poses fit the model", spec.name);
+            let name = &spec.name;
+            assert_eq!(model.nq() as usize, spec.qpos_dim, "{name}: poses fit the model");
             let floor = model.name_to_id(MjtObjBase::mjOBJ_GEOM, "floor").unwrap();
-            assert_eq!(model.geom_matid()[floor], 0, "{}: the floor is a checkerboard", spec.name);
+            let material = model.geom_matid()[floor];
+            assert_eq!(material, 0, "{name}: the floor is a checkerboard");
             let camera = camera(&model, 4.0 / 3.0);
             let (above, maze) = (camera.elevation < -45.0, spec.maze.is_some());
-            assert_eq!((above, camera.trackbodyid == 1), (maze, !maze), "{}", spec.name);
+            assert_eq!(above, maze, "{name}");
+            assert_eq!(camera.trackbodyid == 1, !maze, "{name}");
         }
     }
 }

@@ -36,20 +36,20 @@ pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
 /// Runs a policy's episodes. An episode's result depends on neither its batch nor the number of
 /// threads.
 fn measure(subject: &Subject) -> anyhow::Result<Scored> {
-    let Subject { path, weights, spec, seed, step, episodes, policy } = subject;
-    let seeds = episode_seeds(*seed, *step, *episodes);
-    let batches = seeds.par_chunks(BATCH).with_max_len(1).map(|seeds| subject.roll_out(seeds));
+    let seeds = episode_seeds(subject.seed, subject.step, subject.episodes);
+    let batches = seeds.par_chunks(BATCH).with_max_len(1);
+    let batches = batches.map(|seeds| subject.roll_out(seeds));
     let scored = Scored {
-        snapshot: path.clone(),
-        weights: weights.to_string(),
-        environment: spec.name.clone(),
-        step: *step,
-        seed: *seed,
-        choice: policy.choice(),
-        precision: policy.precision().arithmetic(),
+        snapshot: subject.path.clone(),
+        weights: subject.weights.to_string(),
+        environment: subject.spec.name.clone(),
+        step: subject.step,
+        seed: subject.seed,
+        choice: subject.policy.choice(),
+        precision: subject.policy.precision().arithmetic(),
         episodes: batches.collect::<anyhow::Result<Vec<_>>>()?.concat(),
     };
     let spread = scored.spread().map(Spread::text).unwrap_or_default();
-    info!("{}, {}: {spread}", path.display(), scored.title());
+    info!("{}, {}: {spread}", subject.path.display(), scored.title());
     Ok(scored)
 }

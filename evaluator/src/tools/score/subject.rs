@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::{self, EnvironmentSpec};
-use quad_policy::{Choice, Header, Policy, load_policy};
+use quad_policy::{Choice, Header, Policy, PolicyError, load_policy};
 use quad_protocol::{EpisodeScore, Hash, Origin};
 use quad_run::files;
 use quad_runtime::Hint;
@@ -12,9 +12,8 @@ use quad_runtime::Hint;
 use super::args::{MOST_EPISODES, ScoreArgs};
 use crate::sim::{Environments, Rollout, Simulations};
 
-const SNAPSHOT: &str = "pass a file like RUN/snapshots/step_000020000.safetensors, written by `learner train` of this version";
+const SNAPSHOT: &str = "pass a file like RUN/snapshots/step_000020000.safetensors";
 const OTHER_ENVIRONMENT: &str = "in your own environment, run it from Python (docs/python.md)";
-const OTHER_CHOICE: &str = "score it without --candidates, --rule and --aggregate";
 
 /// A saved policy, ready to act, with its episodes.
 pub struct Subject {
@@ -39,11 +38,11 @@ impl Subject {
             .with_context(|| format!("cannot read {name}"))
             .hint(SNAPSHOT)?;
         let policy = load_policy(&file, args.precision)
-            .with_context(|| format!("{name} is not a saved policy"))
-            .hint(SNAPSHOT)?;
+            .hint_of(PolicyError::hint)
+            .with_context(|| format!("{name} is not a saved policy"))?;
         let header = Header::read(&file)
-            .with_context(|| format!("{name} is not a snapshot of a run"))
-            .hint(SNAPSHOT)?;
+            .hint_of(PolicyError::hint)
+            .with_context(|| format!("{name} is not a snapshot of a run"))?;
         let origin: Origin = header.origin;
         let spec = args.env.map_or_else(|| environment::find(&origin.environment), Ok);
         let spec = spec
@@ -67,8 +66,9 @@ impl Subject {
         }
         let with_choice = |choice| {
             let policy = unchanged.policy.with_choice(choice);
-            let policy = policy.with_context(|| format!("{name} cannot choose actions this way"));
-            policy.hint(OTHER_CHOICE).map(subject)
+            let policy = policy.hint_of(PolicyError::hint);
+            let cannot = || format!("{name} cannot choose actions this way");
+            policy.with_context(cannot).map(subject)
         };
         choices.into_iter().map(with_choice).collect()
     }

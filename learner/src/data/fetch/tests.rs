@@ -16,7 +16,6 @@ fn content() -> Vec<u8> {
     Vec::from_iter(b"\x89HDF\r\n\x1a\n".iter().copied().chain(numbers))
 }
 
-/// `content` with one byte changed.
 fn garbage() -> Vec<u8> {
     let mut bytes = content();
     bytes[150_000] ^= 1;
@@ -32,7 +31,6 @@ fn page(bytes: Vec<u8>) -> Answer {
     Other(format!("200 OK\r\nContent-Length: {}", bytes.len()), bytes)
 }
 
-/// An answer without the file.
 fn status(status: &str) -> Answer {
     Other(format!("{status}\r\nContent-Length: 0"), Vec::new())
 }
@@ -95,8 +93,8 @@ fn a_broken_connection_is_continued_where_it_broke() {
     let fifth = Send(50_000);
     let fifths: &[usize] = &[0, 50_000, 100_000, 150_000, 200_000];
     for (answers, expected) in [
-        (vec![Send(70_000), fifth.clone(), WHOLE], &[0, 70_000, 120_000][..]),
-        (vec![fifth; 5], fifths),
+        (vec![fifth.clone(); 5], fifths),
+        (vec![Send(70_000), fifth, WHOLE], &[0, 70_000, 120_000]),
         (vec![redirect; 2], &[0, 70_000]),
         // Servers that cannot continue.
         (vec![Send(70_000), page(content())], &[0, 70_000]),
@@ -159,8 +157,8 @@ fn a_wrong_file_is_refused_and_deleted() {
         assert!(error.contains(words), "{words} is missing in {error}");
         assert!(!folder.path().join("file.hdf5").exists());
         let requests = server.requests().len();
-        let is_expected = if count == 1 { requests == 1 } else { requests >= count };
-        assert!(is_expected, "{requests} requests: {error}");
+        assert!(requests >= count, "{requests} requests: {error}");
+        assert!(requests == 1 || count > 1, "{requests} requests: {error}");
     }
 }
 

@@ -13,32 +13,27 @@ fn read(rest: &str) -> anyhow::Result<Study> {
 
 /// Reads a file with these axes and rules, and these values of --only and --set.
 fn read_with(rest: &str, only: &[&str], set: &[&str]) -> anyhow::Result<Study> {
-    let [only, set] = [only, set].map(|words| {
-        Vec::from_iter(words.iter().map(|word| tables::parse_assignment(word).unwrap()))
-    });
+    let parse = |word: &&str| tables::parse_assignment(word).unwrap();
+    let [only, set] = [only, set].map(|words| Vec::from_iter(words.iter().map(parse)));
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("mine.toml");
     std::fs::write(&path, HEAD.to_owned() + rest).unwrap();
     Study::read(&path, &only, &set)
 }
 
-fn names(rest: &str) -> Vec<String> {
-    read(rest).unwrap().runs.into_iter().map(|run| run.name).collect()
+/// Number and name of each run, as `--list` prints them.
+fn listed(study: &Study) -> String {
+    let runs = study.runs.iter();
+    Vec::from_iter(runs.map(|run| format!("{} {}", run.index, run.name))).join(", ")
 }
 
 #[test]
 fn every_combination_is_a_run_and_seeds_change_last() {
     let axes = "axes = { seed = [0, 3], task = ['hopper-demo'], method = ['none', 'iql'] }\n";
     let study = read(&format!("{axes}{METHODS}")).unwrap();
-    let names = study.runs.iter().map(|run| (run.index, &*run.name));
     assert_eq!(
-        Vec::from_iter(names),
-        [
-            (0, "hopper-demo-none-seed0"),
-            (1, "hopper-demo-iql-seed0"),
-            (2, "hopper-demo-none-seed3"),
-            (3, "hopper-demo-iql-seed3"),
-        ]
+        listed(&study),
+        "0 hopper-demo-none-seed0, 1 hopper-demo-iql-seed0, 2 hopper-demo-none-seed3, 3 hopper-demo-iql-seed3"
     );
     let last = &study.runs[3].experiment;
     assert_eq!((&*last.algorithm, last.seed, last.steps), ("iql", 3, 7));
@@ -58,20 +53,22 @@ fn changes_as_flags_give_the_same_experiment() {
     assert_eq!(quad_run::config::resolve(&run.preset, &changes).unwrap(), run.experiment);
     let axes =
         "[axes]\ntask = ['hopper-demo']\nagent.actor.hidden = [[8]]\nagent.critic.hidden = [[9]]\n";
-    assert_eq!(names(axes), ["hopper-demo-agent.actor.hidden8-agent.critic.hidden9"]);
+    let study = read(axes).unwrap();
+    assert_eq!(listed(&study), "0 hopper-demo-agent.actor.hidden8-agent.critic.hidden9");
 }
 
 #[test]
 fn rules_select_combinations() {
     let axes = "[axes]\ntask = ['hopper-demo', 'walker2d-demo']\nmethod = ['none', 'dac']\nagent.tau = [0.5, 1.0]\n";
-    let with = |rules: &str| names(&format!("{axes}{METHODS}{rules}"));
-    assert_eq!(with("").len(), 8);
+    let with = |rules: &str| read(&format!("{axes}{METHODS}{rules}")).unwrap();
+    assert_eq!(with("").runs.len(), 8);
+    let except = "[[except]]\nmethod = 'none'\nagent.tau = 1\n[[except]]\ntask = 'walker*'\n";
     assert_eq!(
-        with("[[except]]\nmethod = 'none'\nagent.tau = 1\n[[except]]\ntask = 'walker*'\n"),
-        ["hopper-demo-none-tau0.5", "hopper-demo-dac-tau0.5", "hopper-demo-dac-tau1.0"]
+        listed(&with(except)),
+        "0 hopper-demo-none-tau0.5, 1 hopper-demo-dac-tau0.5, 2 hopper-demo-dac-tau1.0"
     );
     let only = "[[only]]\ntask = 'w*-demo'\nmethod = ['dac', 'none']\nagent.tau = 0.5\n[[only]]\ntask = 'hopper-demo'\nagent.tau = 1\n";
-    assert_eq!(with(only).len(), 4);
+    assert_eq!(with(only).runs.len(), 4);
 }
 
 /// Tables and the words, separated by `|`, of the error that they cause.
@@ -111,10 +108,9 @@ fn the_command_line_selects_and_changes_runs() {
     let axes = format!("{axes}{METHODS}");
     let only = ["task=hopper-*", "seed=1", "seed=2"];
     let study = read_with(&axes, &only, &["steps=9", "agent.gamma=0.5"]).unwrap();
-    let runs = study.runs.iter().map(|run| (run.index, &*run.name, run.experiment.steps));
-    let expected = [(4, "hopper-demo-none-seed1", 9), (5, "hopper-demo-iql-seed1", 9)];
-    assert_eq!(Vec::from_iter(runs), expected);
-    assert_eq!(study.runs[1].experiment.agent["gamma"].as_float(), Some(0.5));
+    assert_eq!(listed(&study), "4 hopper-demo-none-seed1, 5 hopper-demo-iql-seed1");
+    let changed = &study.runs[1].experiment;
+    assert_eq!((changed.steps, changed.agent["gamma"].as_float()), (9, Some(0.5)));
     for (only, expected) in [
         (&["sede=1"][..], "--only names sede, which is no axis"),
         (&[], "seed is an axis, and --set has it, too"),

@@ -1,15 +1,24 @@
 //! Tests of acting by plans. Golden tests of the algorithm compare the numbers.
 
 use super::*;
-use crate::file::{Header, PolicyConfig};
+use crate::file::PolicyConfig;
 use crate::kinds::planner::ValueGuidance;
-use crate::testing::{argmax, initial, load, sample};
+use crate::sampling::choice::Aggregate;
+use crate::testing::{argmax, initial, load, sample, without_tensors};
 use quad_nn::{Affine, Scaling, TrajectoryConfig};
 
 const DIMS: (usize, usize) = (4, 2);
 
+fn guidance(scale: f32, stop: usize) -> ValueGuidance {
+    ValueGuidance { steps: 2, scale, stop }
+}
+
 fn shape(replan_every: usize) -> DiffuserShape {
-    let affine = |n| Some(Affine { offset: vec![0.5; n], scale: vec![2.0; n] });
+    let affine = |n| {
+        let (offset, scale) = (vec![0.5; n], vec![2.0; n]);
+        Some(Affine { offset, scale })
+    };
+    let (observations, actions) = (affine(DIMS.0), affine(DIMS.1));
     let multipliers = vec![1, 4];
     DiffuserShape {
         observation_dim: DIMS.0,
@@ -22,21 +31,26 @@ fn shape(replan_every: usize) -> DiffuserShape {
             attention: None,
         },
         diffusion_steps: 3,
-        guidance: ValueGuidance { steps: 2, scale: 0.5, stop: 1 },
+        guidance: guidance(0.5, 1),
         replan_every,
-        units: Scaling { observations: affine(DIMS.0), actions: affine(DIMS.1), rewards: None },
+        units: Scaling { observations, actions, rewards: None },
     }
 }
 
+fn config(shape: DiffuserShape, plans: u32) -> PolicyConfig {
+    let choice = Choice::best_of(plans);
+    PolicyConfig::Diffuser { shape, choice }
+}
+
 fn policy(shape: DiffuserShape, plans: u32) -> Box<dyn Policy> {
-    load(&initial(PolicyConfig::Diffuser { shape, choice: Choice::best_of(plans) })).unwrap()
+    load(&initial(config(shape, plans))).unwrap()
 }
 
 /// The actions at some steps of episodes, whose observations depend on their seeds.
 fn acts(policy: &dyn Policy, seeds: &[u64], steps: usize) -> Vec<Vec<f32>> {
     let mut states: Vec<_> = seeds.iter().map(|seed| policy.begin(*seed)).collect();
-    let observations: Vec<f32> =
-        seeds.iter().flat_map(|seed| [*seed as f32 / 10.0; DIMS.0]).collect();
+    let observation = |seed: &u64| [*seed as f32 / 10.0; DIMS.0];
+    let observations: Vec<f32> = seeds.iter().flat_map(observation).collect();
     let mut step = || {
         let mut actions = vec![0.0; seeds.len() * DIMS.1];
         policy.act(&observations, &mut states, &mut actions).unwrap();
@@ -90,12 +104,13 @@ fn the_sampled_plan_of_largest_value_is_taken() {
 #[test]
 fn guidance_raises_values_but_not_in_the_last_steps() {
     let values = |scale: f32, stop: usize| {
-        let guidance = ValueGuidance { steps: 2, scale, stop };
-        let policy = policy(DiffuserShape { guidance, ..shape(1) }, 20);
+        let mut shape = shape(1);
+        shape.guidance = guidance(scale, stop);
+        let policy = policy(shape, 20);
         sample(&*policy, &[0.3; DIMS.0], &[0]).unwrap().values
     };
-    let [low, unguided, high] =
-        [-5.0, 0.0, 5.0].map(|scale| values(scale, 1).iter().sum::<f32>() / 20.0);
+    let sum = |scale| values(scale, 1).iter().sum::<f32>();
+    let [low, unguided, high] = [-5.0, 0.0, 5.0].map(sum);
     assert!(low < unguided && unguided < high, "{low} {unguided} {high}");
     assert_eq!(values(5.0, 3), values(0.0, 0), "three of three steps");
     assert_ne!(values(5.0, 2), values(0.0, 0));
@@ -106,20 +121,19 @@ fn a_shape_out_of_range_is_refused() {
     let refused = |change: fn(&mut DiffuserShape)| {
         let mut shape = shape(2);
         change(&mut shape);
-        let policy = PolicyConfig::Diffuser { shape, choice: Choice::best_of(1) };
-        let file = Header::new(policy, ()).to_safetensors(&Tensors::new()).unwrap();
-        matches!(load(&file), Err(PolicyError::Range { .. }))
+        matches!(load(&without_tensors(config(shape, 1))), Err(PolicyError::Range { .. }))
     };
     assert!(refused(|shape| shape.replan_every = 5) && refused(|shape| shape.replan_every = 0));
     assert!(refused(|shape| shape.network.horizon = 3));
     assert!(refused(|shape| shape.diffusion_steps = usize::MAX));
     assert!(refused(|shape| shape.observation_dim = 0) && !refused(|_| ()));
-    let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(2) };
-    assert!(matches!(policy(shape(1), 2).with_choice(nearest), Err(PolicyError::NoValue)));
+    let nearest = Choice::new(2, Aggregate::Mean, Rule::Nearest);
+    let nearest = policy(shape(1), 2).with_choice(nearest);
+    assert!(matches!(nearest, Err(PolicyError::NoValue)));
 }
 
 #[test]
 fn files_call_the_kind_planner() {
-    let policy = PolicyConfig::Diffuser { shape: shape(1), choice: Choice::best_of(1) };
-    assert_eq!(serde_json::to_value(policy).unwrap()["kind"], "planner");
+    let json = serde_json::to_value(config(shape(1), 1)).unwrap();
+    assert_eq!(json["kind"], "planner");
 }

@@ -1,42 +1,44 @@
 //! Tests of the diffusion policy and of what all policies with candidates share.
 
 use super::*;
-use crate::file::{Header, PolicyConfig};
+use crate::error::PolicyError;
+use crate::file::PolicyConfig;
 use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Aggregate, Rule};
-use crate::testing::{act, argmax, diffusion_file, load, sample, small};
+use crate::testing::{act, argmax, diffusion_file, load, sample, small, without_tensors};
 
-fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>, PolicyError> {
+fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>> {
     load(&diffusion_file(choice, critic, v, None))
 }
 
 /// Finite weights so large that values overflow.
 #[test]
 fn a_nan_is_an_error() {
-    let [good, broken] =
-        [0.1, 1e38].map(|critic| policy(Choice::best_of(5), critic, None).unwrap());
+    let five = Choice::best_of(5);
+    let [good, broken] = [0.1, 1e38].map(|critic| policy(five, critic, None).unwrap());
     // Of both signs, so that infinities meet.
     let observation = [1.0, -1.0, 1.0, 1.0];
     let of_one = broken.with_choice(Choice::best_of(1)).unwrap();
-    assert!(act(&*good, &observation, &[3]).is_ok());
-    assert!(act(&*of_one, &observation, &[3]).is_ok(), "one candidate needs no critics");
+    // One candidate needs no critics.
+    assert!([&good, &of_one].iter().all(|policy| act(&***policy, &observation, &[3]).is_ok()));
     let errors = [
         act(&*broken, &observation, &[3]).unwrap_err(),
         sample(&*of_one, &observation, &[3]).unwrap_err(),
         of_one.value(&observation, &[0.5, -0.5]).unwrap_err(),
         act(&*good, &[f32::NAN, 0.0, 0.0, 0.0], &[3]).unwrap_err(),
     ];
+    let of_value = "the value of a candidate is not a number (NaN)";
     let what = errors.map(|error| error.to_string());
+    assert!(what[..2].iter().all(|what| what == of_value), "{what:?}");
     assert!(what.iter().all(|what| what.contains("not a number")), "{what:?}");
-    assert!(what[..2].iter().all(|what| what.contains("value of a candidate")), "{what:?}");
 }
 
 /// None may ask for unbounded memory, nor by numbers that wrap around.
 #[test]
 fn a_shape_out_of_range_is_refused() {
     let refused = |shape: DiffusionShape| {
-        let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(1) };
-        let file = Header::new(policy, ()).to_safetensors(&Tensors::new()).unwrap();
+        let choice = Choice::best_of(1);
+        let file = without_tensors(PolicyConfig::Diffusion { shape, choice });
         matches!(load(&file), Err(PolicyError::Range { .. }))
     };
     for diffusion_steps in [0, 1001, (1 << 58) + 1, usize::MAX] {
@@ -48,15 +50,14 @@ fn a_shape_out_of_range_is_refused() {
 
 #[test]
 fn the_rule_of_the_file_applies_unless_another_is_requested() {
-    let best = Choice { aggregate: Aggregate::Min, ..Choice::best_of(8) };
-    let nearest = Choice { rule: Rule::Nearest, ..best };
+    let [best, nearest, cold] = [Rule::Best, Rule::Nearest, Rule::softmax(1e-6)]
+        .map(|rule| Choice::new(8, Aggregate::Min, rule));
     let action = |policy: &dyn Policy| act(policy, &[0.5; 4], &[3]).unwrap();
     // The nearest to a V above all Q is the best, to one below all Q the worst.
     let [high, low] = [1e3, -1e3].map(|v| action(&*policy(nearest, 1.0, Some(v)).unwrap()));
     let of_best = policy(best, 1.0, None).unwrap();
     assert_eq!((of_best.choice(), action(&*of_best)), (Some(best), high.clone()));
     assert_ne!(high, low);
-    let cold = Choice { rule: Rule::Softmax { temperature: 1e-6 }, ..best };
     let other = of_best.with_choice(cold).unwrap();
     assert_eq!((other.choice(), action(&*other)), (Some(cold), high.clone()));
     assert!(matches!(of_best.with_choice(nearest), Err(PolicyError::NoValue)));
@@ -69,9 +70,9 @@ fn the_rule_of_the_file_applies_unless_another_is_requested() {
 #[test]
 fn the_sampled_candidate_of_largest_value_is_taken() {
     for aggregate in [Aggregate::Mean, Aggregate::Min] {
-        let policy = policy(Choice { aggregate, ..Choice::best_of(6) }, 1.0, None).unwrap();
-        let (observations, seeds): (Vec<f32>, _) =
-            ((0..12).map(|i| (i as f32).sin()).collect(), [7, 8, 9]);
+        let policy = policy(Choice::new(6, aggregate, Rule::Best), 1.0, None).unwrap();
+        let observations: Vec<f32> = (0..12).map(|i| (i as f32).sin()).collect();
+        let seeds = [7, 8, 9];
         let Samples { actions, values } = sample(&*policy, &observations, &seeds).unwrap();
         assert_eq!((actions.len(), values.len()), (3 * 6 * 2, 3 * 6));
         let taken = act(&*policy, &observations, &seeds).unwrap();
@@ -82,10 +83,12 @@ fn the_sampled_candidate_of_largest_value_is_taken() {
             let observations = observations[i * 4..][..4].repeat(6);
             assert_eq!(policy.value(&observations, actions).unwrap(), values, "state {i}");
         }
+        // A state by itself.
         let alone = sample(&*policy, &observations[4..8], &[8]).unwrap();
-        let expected = (&actions[12..24], &values[6..12]);
-        assert_eq!((&alone.actions[..], &alone.values[..]), expected, "a state by itself");
-        assert!(policy.value(&observations, &actions).is_err(), "3 observations, 18 actions");
+        assert_eq!(alone.actions, actions[12..24]);
+        assert_eq!(alone.values, values[6..12]);
+        // 3 observations, 18 actions.
+        assert!(policy.value(&observations, &actions).is_err());
     }
 }
 
@@ -93,6 +96,6 @@ fn the_sampled_candidate_of_largest_value_is_taken() {
 #[test]
 fn a_choice_may_call_the_aggregate_value() {
     let json = r#"{"candidates":5,"value":"min","rule":"best"}"#;
-    let expected = Choice { aggregate: Aggregate::Min, ..Choice::best_of(5) };
+    let expected = Choice::new(5, Aggregate::Min, Rule::Best);
     assert_eq!(serde_json::from_str::<Choice>(json).unwrap(), expected);
 }

@@ -5,35 +5,34 @@ use super::*;
 const DRAWS: usize = 20_000;
 
 fn softmax(candidates: u32, temperature: f32) -> Choice {
-    Choice { rule: Rule::Softmax { temperature }, ..Choice::best_of(candidates) }
+    Choice::new(candidates, Aggregate::Mean, Rule::softmax(temperature))
 }
 
 fn average(candidates: u32, temperature: f32, actions: u32) -> Choice {
-    Choice { rule: Rule::Average { temperature, actions }, ..Choice::best_of(candidates) }
+    let rule = Rule::Average { temperature, actions };
+    Choice::new(candidates, Aggregate::Mean, rule)
 }
 
 #[test]
 fn a_choice_has_its_text() {
+    let of_average = r#"{"average":{"temperature":0.01,"actions":4}}"#;
     for (rule, json, text) in [
         (Rule::Best, r#""best""#, "best"),
-        (softmax(1, 0.1).rule, r#"{"softmax":{"temperature":0.1}}"#, "softmax:0.1"),
+        (Rule::softmax(0.1), r#"{"softmax":{"temperature":0.1}}"#, "softmax:0.1"),
         (Rule::Nearest, r#""nearest""#, "nearest"),
-        (
-            average(1, 0.01, 4).rule,
-            r#"{"average":{"temperature":0.01,"actions":4}}"#,
-            "average:0.01:4",
-        ),
+        (average(1, 0.01, 4).rule, of_average, "average:0.01:4"),
     ] {
         assert_eq!(serde_json::to_string(&rule).unwrap(), json);
         assert_eq!(serde_json::from_str::<Rule>(json).unwrap(), rule);
-        assert_eq!((text.parse::<Rule>().unwrap(), rule.to_string()), (rule, text.to_owned()));
+        assert_eq!(text.parse::<Rule>().unwrap(), rule);
+        assert_eq!(rule.to_string(), text);
     }
     for wrong in ["average:0.1", "average:0.1:few", "softmax", "softmax:warm"] {
         assert!(wrong.parse::<Rule>().is_err(), "{wrong}");
     }
-    let choice = Choice { aggregate: Aggregate::Min, ..softmax(50, 0.1) };
-    assert_eq!(choice.to_string(), "50 candidates, softmax:0.1, min");
-    assert_eq!(Choice { candidates: 1, ..choice }.to_string(), "1 candidate");
+    let of_min = |candidates| Choice::new(candidates, Aggregate::Min, Rule::softmax(0.1));
+    assert_eq!(of_min(50).to_string(), "50 candidates, softmax:0.1, min");
+    assert_eq!(of_min(1).to_string(), "1 candidate");
 }
 
 #[test]
@@ -68,12 +67,14 @@ fn softmax_draws_by_its_probabilities() {
         for (count, weight) in counts.iter().zip(weights) {
             let expected = weight / weights.iter().sum::<f64>();
             let found = f64::from(*count) / DRAWS as f64;
-            assert!((found - expected).abs() < 0.02, "{found} for {expected} at {scale}");
+            let error = (found - expected).abs();
+            assert!(error < 0.02, "{found} for {expected} at {scale}");
         }
     }
     let cold = softmax(3, f32::MIN_POSITIVE);
-    assert_eq!(cold.pick(&[f32::MAX, f32::MIN, 0.0], &mut state).unwrap(), [0]);
-    assert_eq!(cold.pick(&[0.0, f32::INFINITY, f32::NEG_INFINITY], &mut state).unwrap(), [1]);
+    for values in [[f32::MIN, f32::MAX, 0.0], [0.0, f32::INFINITY, f32::NEG_INFINITY]] {
+        assert_eq!(cold.pick(&values, &mut state).unwrap(), [1]);
+    }
 }
 
 #[test]
@@ -94,7 +95,8 @@ fn several_are_drawn_without_replacement() {
             false => weights[first] / sum * weights[second] / (sum - weights[first]),
         };
         let found = f64::from(counts[first][second]) / DRAWS as f64;
-        assert!((found - expected).abs() < 0.02, "{first}, {second}: {found} for {expected}");
+        let error = (found - expected).abs();
+        assert!(error < 0.02, "{first}, {second}: {found} for {expected}");
     }
     let mut all = average(4, 2.0, 9).pick(&values, &mut state).unwrap();
     all.sort_unstable();
@@ -110,28 +112,38 @@ fn values_far_above_the_others_are_clipped() {
         let values = [1e6, 0.0, 1e3, -50.0, -1e9];
         let drawn = average(5, 1.0, 3).pick(&values, &mut state).unwrap();
         first[drawn[0]] += 1;
-        assert_eq!(drawn.iter().sum::<usize>(), 3, "{drawn:?}: the three largest");
+        // The three largest.
+        assert_eq!(drawn.iter().sum::<usize>(), 3, "{drawn:?}");
     }
-    assert!(first[1] == 0 && first[0].abs_diff(first[2]) < 200, "{first:?}");
+    assert_eq!(first[1], 0);
+    assert!(first[0].abs_diff(first[2]) < 200, "{first:?}");
 }
 
 #[test]
 fn a_choice_out_of_range_is_refused() {
     let out_of_range = [0, 10_001, u32::MAX].map(Choice::best_of);
     for choice in out_of_range.into_iter().chain([average(2, 1.0, 0)]) {
-        assert!(matches!(choice.check(), Err(PolicyError::Range { .. })), "{choice:?}");
+        let checked = choice.check();
+        assert!(matches!(checked, Err(PolicyError::Range { .. })), "{choice:?}");
     }
     for temperature in [0.0, -1.0, f32::NAN, f32::INFINITY] {
         for choice in [softmax(2, temperature), average(2, temperature, 1)] {
-            assert!(matches!(choice.check(), Err(PolicyError::Temperature(_))), "{choice:?}");
+            let checked = choice.check();
+            assert!(matches!(checked, Err(PolicyError::Temperature(_))), "{choice:?}");
         }
     }
 }
 
 #[test]
 fn a_choice_counts_its_uniform_numbers() {
-    let choices = [average(4, 1.0, 3), average(4, 1.0, 9), average(1, 1.0, 3)];
-    assert_eq!(choices.map(|choice| choice.uniforms()), [3, 4, 0]);
-    let choices = [softmax(4, 1.0), softmax(1, 1.0), Choice::best_of(4)];
-    assert_eq!(choices.map(|choice| choice.uniforms()), [1, 0, 0]);
+    for (choice, uniforms) in [
+        (average(4, 1.0, 3), 3),
+        (average(4, 1.0, 9), 4),
+        (average(1, 1.0, 3), 0),
+        (softmax(4, 1.0), 1),
+        (softmax(1, 1.0), 0),
+        (Choice::best_of(4), 0),
+    ] {
+        assert_eq!(choice.uniforms(), uniforms);
+    }
 }

@@ -3,7 +3,8 @@
 use super::*;
 
 fn checkpoint(step: u64) -> Checkpoint {
-    Checkpoint { step, state: vec![step as u8; 1000] }
+    let state = vec![step as u8; 1000];
+    Checkpoint { step, state }
 }
 
 #[test]
@@ -17,10 +18,8 @@ fn keeps_the_newest_and_skips_damaged_ones() {
         assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(step)));
     }
     let files = checkpoints.files().unwrap();
-    assert_eq!(
-        files.iter().map(|file| step(file).unwrap()).collect::<Vec<_>>(),
-        [1_000_000_000, 200, 10]
-    );
+    let steps = Vec::from_iter(files.iter().filter_map(|file| step(file)));
+    assert_eq!(steps, [1_000_000_000, 200, 10]);
 
     // Torn, then a flipped bit, then missing; and a partial file of a crash.
     fs::write(&files[0], &checkpoint(0).state[..500]).unwrap();
@@ -28,7 +27,8 @@ fn keeps_the_newest_and_skips_damaged_ones() {
     let mut bytes = fs::read(&files[1]).unwrap();
     bytes[700] ^= 1;
     fs::write(&files[1], bytes).unwrap();
-    fs::write(checkpoints.folder.join("step_000000300_00.safetensors.partial"), "half").unwrap();
+    let partial = "step_000000300_00.safetensors.partial";
+    fs::write(checkpoints.folder.join(partial), "half").unwrap();
     assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(10)));
     assert_eq!(checkpoints.files().unwrap(), files[2..]);
     fs::remove_file(&files[2]).unwrap();
@@ -43,11 +43,8 @@ fn an_unreadable_checkpoint_is_an_error_unless_an_older_one_is_good() {
     // A folder cannot be read as a file, not even by root.
     let unreadable = checkpoints.folder.join("step_000000300_00.safetensors");
     fs::create_dir_all(&unreadable).unwrap();
-    let error = checkpoints.newest().unwrap_err();
-    assert!(
-        matches!(error, RunDirError::Io { action: "read", ref path, .. } if *path == unreadable),
-        "{error}"
-    );
+    let error = checkpoints.newest().unwrap_err().to_string();
+    assert_eq!(error, format!("cannot read {}", unreadable.display()));
     checkpoints.save(&checkpoint(200)).unwrap();
     assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(200)));
     assert!(unreadable.exists());

@@ -32,8 +32,8 @@ fn columns_add_up_to_the_totals_of_the_paper() {
         let totals = [false, true].map(|maze| total(method, 0, maze));
         assert_eq!(totals, [locomotion, antmaze], "{method}");
     }
-    let table_2 =
-        [0, 1].map(|figure| total("DAC-Rep", figure, false) + total("DAC-Rep", figure, true));
+    let of_replication = |figure, maze| total("DAC-Rep", figure, maze);
+    let table_2 = [0, 1].map(|figure| of_replication(figure, false) + of_replication(figure, true));
     assert_eq!(table_2.map(|total| (total * 10.0).round() / 10.0), [511.8, 58.1]);
 }
 
@@ -48,8 +48,9 @@ fn columns_have_the_averages_of_corl() {
         (mazes, "IQL", 57.17),
         (mazes, "ReBRAC", 78.42),
     ] {
-        let sum = source.scores.values().map(|scores| scores[method][0]).sum::<f64>();
-        assert!((sum / source.scores.len() as f64 - average).abs() < 0.01, "{method}: {sum}");
+        let scores = source.scores.values().map(|scores| scores[method][0]);
+        let mean = scores.sum::<f64>() / source.scores.len() as f64;
+        assert!((mean - average).abs() < 0.01, "{method}: {mean}");
     }
 }
 
@@ -70,6 +71,7 @@ fn every_score_has_a_method() {
 #[test]
 fn tables_of_a_run() {
     let paper = &["Table 1 of the paper", "Table 2 of the paper"][..];
+    let (mazes, ogbench) = (&["D4RL's mazes of version 2"], &["OGBench's default tasks"]);
     for (task, algorithm, expected) in [
         ("hopper-medium-replay-v2", "quad", paper),
         ("hopper-medium-v2", "quad", &paper[..1]),
@@ -77,10 +79,10 @@ fn tables_of_a_run() {
         ("hopper-medium-v2", "td3-bc", &["Locomotion by CORL"]),
         // Without a row of its own, in the first table of the task.
         ("hopper-medium-v2", "idql", &paper[..1]),
-        ("antmaze-umaze-v2", "fql", &["D4RL's mazes of version 2"]),
-        ("antmaze-umaze-v2", "quad", &["D4RL's mazes of version 2"]),
-        ("cube-single-play-singletask-v0", "fql", &["OGBench's default tasks"]),
-        ("cube-single-play-singletask-v0", "quad", &["OGBench's default tasks"]),
+        ("antmaze-umaze-v2", "fql", mazes),
+        ("antmaze-umaze-v2", "quad", mazes),
+        ("cube-single-play-singletask-v0", "fql", ogbench),
+        ("cube-single-play-singletask-v0", "quad", ogbench),
         ("hopper-demo", "quad", &[]),
     ] {
         assert_eq!(tables(task, algorithm), expected, "{task}, {algorithm}");
