@@ -15,6 +15,16 @@ const MOST_ATTEMPTS: u32 = 20;
 const ATTEMPTS_AT_ONCE: u32 = 3;
 const LONGEST_REST: Duration = Duration::from_secs(60);
 
+/// Names episodes of one snapshot. Practice comes first, since the learner waits for it, and older
+/// steps before newer ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Key {
+    /// Number of the episode.
+    Practice(u64),
+    /// Gradient step.
+    Evaluation(u64),
+}
+
 #[derive(Debug)]
 pub(super) struct Evaluation {
     /// Gradient step of the snapshot.

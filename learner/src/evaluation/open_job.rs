@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::{Job, Progress};
 
+use super::episodes::Key;
 use super::refusal::{Refusal, require};
-use super::scoreboard::Key;
 
 /// Longest time until the first environment step, in which an evaluator fetches the weights.
 const PREPARATION: Duration = Duration::from_secs(60);

@@ -8,7 +8,7 @@ use quad_dataset::Task;
 use quad_protocol::{Episode, EpisodeScore, Hash, Job, Message, Name, Progress, ScoreReport};
 use quad_run::folder::SavedScores;
 
-use super::episodes::Evaluation;
+use super::episodes::{Evaluation, Key};
 use super::open_job::OpenJob;
 use super::outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, Practice, Recorded};
 use super::refusal::{Refusal, require};
@@ -29,16 +29,6 @@ const DOES_NOT_FIT: Duration = Duration::from_secs(10);
 /// After this time, an evaluator without work gets the practice episode that the learner waits for
 /// once more: the first answer counts.
 const STRAGGLER: Duration = Duration::from_secs(20);
-
-/// Names episodes of one snapshot. Practice comes first, since the learner waits for it, and older
-/// steps before newer ones.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Key {
-    /// Number of the episode.
-    Practice(u64),
-    /// Gradient step.
-    Evaluation(u64),
-}
 
 /// Constants of all evaluations of a run.
 #[derive(Clone, Debug)]

@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 
 use quad_protocol::{Episode, EpisodeScore, ScoreReport};
 
+use super::episodes::Key;
 use super::refusal::{Refusal, require};
-use super::scoreboard::{Key, Scoreboard};
+use super::scoreboard::Scoreboard;
 
 /// Largest relative difference between a score and the one computed from its return; it allows for
 /// rounding only.
