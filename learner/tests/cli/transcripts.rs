@@ -249,7 +249,9 @@ fn write_verified() {
 /// which a person acted twice.
 fn write_practiced() {
     let runs = ["practice/none", "practice/run"];
-    runs.map(|path| Run::new("hopper-demo", 5).write(path));
+    for path in runs {
+        Run::new("hopper-demo", 5).write(path);
+    }
     let (mut log, _) = RunDir::at(Path::new(runs[1])).experience_log().unwrap();
     for (number, (length, terminated)) in
         [(30, true), (60, false), (20, true)].into_iter().enumerate()

@@ -29,7 +29,7 @@ const ALLOWED: [(&str, &str); 13] = [
     ("dataset/src/formats/minari.rs", "fs::read(&path)"),
     ("dataset/src/formats/foreign.rs", "fs::read(folder"),
     // What it has just made.
-    ("dataset/src/formats/new_file.rs", "File::open(&partial)"),
+    ("dataset/src/formats/new_file.rs", "File::open(&self.partial)"),
 ];
 
 /// The lines before the tests of a source that have one of [`CALLS`], without comments.
