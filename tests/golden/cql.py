@@ -117,9 +117,8 @@ def other_actions(config, state, inputs):
     )
     current, density = fast_sampled(state["actor"], inputs["observations"], inputs["current_noise"], activation)
     flat = np.full(uniform.shape[:2], -uniform.shape[-1] * math.log(2))
-    bounds = np.full((uniform.shape[0], 3 * uniform.shape[1]), -np.inf)
-    if "online_steps" in config:
-        bounds[:, uniform.shape[1] :] = returns_of(config, inputs)[:, None]
+    returns = inputs["returns"] if "online_steps" in config else np.full(len(uniform), -np.inf)
+    bounds = np.concatenate([np.full(flat.shape, -np.inf), np.tile(returns[:, None], (1, 2 * uniform.shape[1]))], 1)
     return np.concatenate([uniform, following, current], 1), np.concatenate([flat, next_density, density], 1), bounds
 
 
@@ -210,6 +209,7 @@ def random_inputs(config, rng, size):
         batch["timeouts"][-1] = batch["masks"][-1]
         goes_on = (batch["masks"] == 1) & (batch["timeouts"] == 0)
         batch["next_observations"][goes_on] = batch["observations"][1:][goes_on[:-1]]
+        batch["returns"] = single(returns_of(config, batch))
     return batch | {
         "actions": single(actions),
         "policy_noise": single(rng.normal(size=(b, a))),

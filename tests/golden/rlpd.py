@@ -13,7 +13,7 @@ from networks import random_network, shape, single, values
 
 FOLDERS = {"rlpd": (60, "small"), "rlpd-critics": (61, "small")}
 LOG_STD = -20.0, 2.0
-AGENT = {"critics": 4, "gamma": 0.99, "temperature": 0.5, "learning_rate": 0.02, "ema_rate": 0.05}
+AGENT = {"critics": 4, "gamma": 0.99, "temperature": 0.5, "learning_rate": 0.02, "decay": False, "ema_rate": 0.05}
 # The policy's step, and one of the critics alone.
 VARIANTS = {
     "rlpd": (701, {"target_critics": 2, "entropy_backup": True, "actor_every": 2}),
@@ -95,11 +95,14 @@ def random_state(config, rng):
     return state | {"target_critic": near(rng, state["critic"])}
 
 
-def draw(config, variant, size, rng):
-    """A state, inputs and what comes out."""
+def random_inputs(config, rng, size):
     agent, b, a = config["agent"], config["batch_size"], config["action_dim"]
-    state = random_state(config, rng)
     inputs = random_batch(rng, config) | {name: single(rng.normal(size=(b, a))) for name in ("next_noise", "policy_noise")}
     inputs["target_critics"] = rng.permutation(agent["critics"])[: agent["target_critics"]]
-    inputs["select_observations"] = single(rng.normal(size=(SIZES[size]["select"], config["observation_dim"])))
+    return inputs | {"select_observations": single(rng.normal(size=(SIZES[size]["select"], config["observation_dim"])))}
+
+
+def draw(config, variant, size, rng):
+    """A state, inputs and what comes out."""
+    state, inputs = random_state(config, rng), random_inputs(config, rng, size)
     return state, inputs, update(config, state, inputs)[0] | act(config, state, inputs)

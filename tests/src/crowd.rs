@@ -1,5 +1,5 @@
 //! Evaluators that do everything on the wire and nothing else: they claim, report progress and
-//! deliver scores that they made up. Hundreds of them fit into one test.
+//! deliver scores, or rows of practice, that they made up. Hundreds of them fit into one test.
 
 use std::mem;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use quad_protocol::{
-    Job, JobReply, Message, Name, Progress, ScoreReply, ScoreReport, encode, keys,
+    Job, JobReply, Message, Name, PieceReply, Progress, ScoreReply, ScoreReport, encode, keys,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -99,8 +99,12 @@ impl Member {
             match self.ask(keys::jobs(&run), &claim, |measured| &mut measured.claims).await {
                 Some(JobReply::Job(job)) => {
                     self.shared.busy.fetch_add(1, Relaxed);
-                    self.act(&job).await;
-                    self.deliver(&made_up::scores(&job, self.name.as_str())).await;
+                    if job.practice.is_some() {
+                        self.deliver_episode(&job).await;
+                    } else {
+                        self.act(&job).await;
+                        self.deliver(&made_up::scores(&job, self.name.as_str())).await;
+                    }
                     self.shared.busy.fetch_sub(1, Relaxed);
                 }
                 Some(JobReply::Wait { milliseconds, .. }) => {
@@ -153,6 +157,25 @@ impl Member {
         match answer {
             ScoreReply::Recorded { .. } => measured.acknowledged.extend(scores),
             ScoreReply::Refused { .. } => measured.refused += 1,
+        }
+    }
+
+    /// Delivers an episode of practice, which takes no time to play.
+    async fn deliver_episode(&self, job: &Job) {
+        let frame = encode(&made_up::episode(job)).expect("it is small");
+        let mut offset = 0;
+        loop {
+            let piece = made_up::piece(job, self.name.as_str(), &frame, offset);
+            let key = keys::experience(&job.run);
+            match self.ask(key, &piece, |measured| &mut measured.reports).await {
+                Some(PieceReply::Continue { offset: next, .. }) => offset = next as usize,
+                Some(PieceReply::Recorded { .. }) => return,
+                Some(PieceReply::Refused { .. }) => {
+                    self.shared.measured.lock().unwrap().refused += 1;
+                    return;
+                }
+                None => sleep(PAUSE).await,
+            }
         }
     }
 

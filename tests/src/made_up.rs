@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReport, decode,
-    encode, keys,
+    Episode, EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Piece, Progress,
+    ScoreReport, decode, encode, keys,
 };
 use quad_runtime::{Endpoints, open_session};
 use tokio::time::sleep;
@@ -70,6 +70,41 @@ pub fn scores(job: &Job, evaluator: &str) -> ScoreReport {
         }
     });
     ScoreReport::new(job, name(evaluator), name("f32"), episodes.collect())
+}
+
+/// An episode of practice in Hopper, of 1,000 steps.
+pub fn episode(job: &Job) -> Episode {
+    let hopper = environment::find("hopper").expect("hopper is known");
+    let (steps, reward) = (1000, 2.0);
+    let episode_return = steps as f64 * f64::from(reward);
+    let score = hopper.normalized_score(episode_return);
+    Episode {
+        step: job.step,
+        weights: job.weights,
+        score: EpisodeScore { seed: job.seeds[0], episode_return, length: steps as u32, score },
+        terminated: false,
+        observations: vec![0.1; (steps + 1) * 11],
+        actions: vec![0.1; steps * 3],
+        rewards: vec![reward; steps],
+        interventions: Vec::new(),
+    }
+}
+
+/// The piece of an episode's frame from `offset` on.
+pub fn piece(job: &Job, evaluator: &str, frame: &[u8], offset: usize) -> Piece {
+    let end = frame.len().min(offset + Piece::MOST);
+    Piece {
+        evaluator: name(evaluator),
+        run: job.run.clone(),
+        incarnation: job.incarnation,
+        job: job.id,
+        precision: name("f32"),
+        seed: job.seeds[0],
+        hash: Hash::of(frame),
+        length: frame.len() as u32,
+        offset: offset as u32,
+        bytes: frame[offset..end].to_vec(),
+    }
 }
 
 pub async fn client(endpoint: &str) -> Session {

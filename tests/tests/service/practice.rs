@@ -1,13 +1,17 @@
 //! Practice: what evaluators live through comes back, and makes the same run for any number of
 //! them, whatever happens to them.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use quad_run::folder::read_experience;
+use quad_tests::crowd::Crowd;
 use quad_tests::learner::Learner;
+use quad_tests::made_up::name;
+use quad_tests::router::router;
 use quad_tests::setting::Setting;
-use quad_tests::system::Scratch;
+use quad_tests::system::{Scratch, free_endpoint};
 use quad_tests::{PATIENCE, eventually};
+use tokio::runtime::Runtime;
 
 const SETTING: Setting = Setting {
     steps: 100,
@@ -87,4 +91,32 @@ fn kills_of_learner_and_evaluators_lose_no_row_and_change_no_bit() {
     faulty.assert_completes(3 * PATIENCE);
     calm.process.assert_succeeds(3 * PATIENCE);
     faulty.assert_same_as(&calm);
+}
+
+/// Prints the environment steps per second that a learner takes in while it trains nothing.
+#[test]
+#[ignore = "measures"]
+fn experience_arrives_as_fast_as_it_is_written() {
+    let runtime = Runtime::new().unwrap();
+    for count in [1, 8, 64] {
+        let (scratch, endpoint) = (Scratch::new(), free_endpoint());
+        let arguments = [
+            ["--connect", &endpoint],
+            ["--online-steps", "100000000"],
+            ["--set", "online.warmup=90000000"],
+            ["--set", "online.lag=128"],
+        ];
+        let learner = scratch.learner_with("run", SETTING, arguments.as_flattened());
+        let _router = runtime.block_on(router(&endpoint));
+        let alone = learner.process.peak_memory().unwrap();
+        let run = name("run");
+        let crowd = runtime.block_on(Crowd::connect(count, Duration::ZERO, &run, &endpoint));
+        let first = learner.wait_for_metric("experience_rows", "", |rows| rows > 10_000.0);
+        let begin = Instant::now();
+        let last = learner.wait_for_metric("experience_rows", "", |rows| rows > first + 100_000.0);
+        let rate = (last - first) / begin.elapsed().as_secs_f64();
+        let bytes = (learner.process.peak_memory().unwrap() - alone) as f64 / last;
+        eprintln!("{count} evaluators: {rate:.0} steps/s, {bytes:.0} bytes of memory each");
+        assert_eq!(crowd.measured().refused, 0);
+    }
 }
