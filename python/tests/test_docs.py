@@ -1,7 +1,11 @@
 """Runs the examples of the documentation; test_trackers.py those of trackers, test_cube.py the cube."""
 
+import json
 import re
 import shutil
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -18,3 +22,26 @@ def test_the_examples_run(hopper_runs, tmp_path, monkeypatch):
             exec(compile(block.replace("steps=20_000", "steps=2"), "docs/python.md", "exec"), names)
             ran += 1
     assert ran >= 5 and len(names["table"]) >= 2 and set(names["table"].dir) == {"runs/mine", "runs/my-robot"}
+
+
+def test_the_cart_practices(tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+    example = (DOCS / "../examples/practice.py").read_text()
+    for usual, here in [
+        ("workers=2", f'workers=1, connect="{endpoint}"'),
+        ("run_dir", f'listen="{endpoint}", threads=1, run_dir'),
+        ("record(100)", "record(5)"),
+        ("2_000", "10"),
+        ("5_000", "120"),
+        ("1_000", "70"),
+    ]:
+        assert example.count(usual) == 1
+        example = example.replace(usual, here)
+    (tmp_path / "practice.py").write_text(example)
+    command = [sys.executable, "practice.py", "run"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stderr
+    scores = json.loads(ended.stdout.replace("(", "[").replace(")", "]"))
+    assert [score[:2] for score in scores] == [[70, 60], [130, 120]]

@@ -84,7 +84,8 @@ function showCharts(runs) {
   const scores = runs.map((run) => ({ label: labeled(run, "") || "mean", points: run.evaluations.filter((one) => one[4]) }));
   if (scores.some(({ points }) => points.length)) {
     const data = runs.length === 1 ? `; the data's own episodes have ${number(runs[0].dataset_score)}` : "";
-    const about = `Mean over an evaluation's episodes, ± their standard deviation${data}.`;
+    const begins = runs.length === 1 && runs[0].practice_begins !== null ? ` Practice begins after step ${runs[0].practice_begins}.` : "";
+    const about = `Mean over an evaluation's episodes, ± their standard deviation${data}.${begins}`;
     const measure = runs.every((run) => run.measure === "return") ? "Return" : "Score";
     kept.add(chart($("score"), "score", measure, about, scores));
   }
@@ -97,6 +98,7 @@ function showCharts(runs) {
   for (const run of runs) {
     for (const { name, help } of run.metrics) {
       const column = run.history.names.indexOf(name);
+      if (column < 0) continue;
       const points = run.history.rows.map((values) => [values[0], values[2 + column]]).filter(([, value]) => Number.isFinite(value));
       if (!points.length) continue;
       const [, stem, end] = /^(.*?)(?:_(\d+))?$/.exec(name);
@@ -151,14 +153,21 @@ function showLive(live) {
   [$("progress").value, $("progress").max] = [live.step, live.steps];
   $("figures").replaceChildren(...facts([
     ["gradient steps", `${live.step} of ${live.steps}`], ["steps per second", number(speed)], ["training", left],
-    ["episodes to score", String(live.episodes_pending)], ["evaluators", String(live.evaluators.length)],
+    ["episodes to score", String(live.episodes_pending)], ["evaluators", String(live.evaluators.length)], ...practice(live.practice),
   ]).children);
   $("health").textContent = live.problems.join("\n") || "all is well";
   $("health").className = live.problems.length ? "bad" : "good";
   $("evaluators").replaceChildren(...live.evaluators.map(({ name, job, seconds_ago: ago, fits }) => {
     const idle = fits ? "waits for a job" : "has not asked for a job of this environment";
-    return row(name, job ? `step ${job.step}: ${job.done} of ${job.episodes} episodes` : idle, right(ago === null ? "–" : `${Math.round(ago)} s ago`));
+    return row(name, job ? `${job.practice ? "practice" : "evaluation"}, step ${job.step}: ${job.done} of ${job.episodes} episodes` : idle, right(ago === null ? "–" : `${Math.round(ago)} s ago`));
   }));
+}
+
+// Figures of a run with practice.
+function practice(now) {
+  if (!now) return [];
+  const newest = now.steps > 0 ? number(now.return) : "–";
+  return [["environment steps", `${now.steps} of ${now.target}`], ["return in practice", newest], ["waited for practice", duration(now.wait_seconds)]];
 }
 
 async function refresh() {

@@ -16,9 +16,15 @@ pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> an
     let price = Price::measure(experiment, config.run.device, transitions)?;
     let milliseconds = price.step_seconds * 1e3;
     let hours = price.step_seconds * steps as f64 / 3600.0;
+    let (mut grows, mut kept) = (String::new(), "snapshots and checkpoints");
+    if experiment.online.is_some() {
+        let bytes = HumanBytes(price.experience_bytes(experiment));
+        (grows, kept) =
+            (format!("; experience adds {bytes}"), "snapshots, checkpoints and experience");
+    }
     print(&format!(
         "# folder: {}\n# data: {}\n# time: {milliseconds:.1} ms a gradient step, measured over a second; {hours:.2} hours for \
-         all {steps}\n# memory: {}, without evaluators\n# disk: {} for snapshots and checkpoints\n\n{}",
+         all {steps}\n# memory: {}, without evaluators{grows}\n# disk: {} for {kept}\n\n{}",
         path.display(),
         config.dataset.summary(),
         peak_memory().map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string()),

@@ -22,6 +22,10 @@ impl From {
     /// The run is not complete, or its algorithm cannot practice.
     pub fn read(run: &Path) -> anyhow::Result<(Self, Preset)> {
         let (dir, config) = RunDir::open(run)?;
+        if config.experiment.online.is_some() {
+            let error = anyhow!("the run in {} has practiced already", run.display());
+            return Err(hinted(error, "--from takes a run of the dataset alone"));
+        }
         let steps = config.experiment.steps;
         let checkpoint = dir.newest_checkpoint()?.filter(|checkpoint| checkpoint.step == steps);
         let checkpoint = checkpoint
@@ -29,10 +33,6 @@ impl From {
                 format!("the run in {} has not reached its last step, {steps}", run.display())
             })
             .hint("let it end first: `learner train` with its settings continues it")?;
-        if config.experiment.online.is_some() {
-            let error = anyhow!("the run in {} has practiced already", run.display());
-            return Err(hinted(error, "--from takes a run of the dataset alone"));
-        }
         let mut own = Table::try_from(&config.experiment)?;
         own.insert("from".to_owned(), Hash::of(&checkpoint.state).to_string().into());
         let preset = Preset::of_run(&config, own).hint_of(ConfigError::hint)?;

@@ -238,7 +238,7 @@ fn conclude(
     let kept = format!(
         "everything up to the newest checkpoint is kept in {folder}; the same command continues from there"
     );
-    let (steps, environment) = (config.experiment.steps, &config.experiment.environment);
+    let (steps, environment) = (config.experiment.total_steps(), &config.experiment.environment);
     let error = match ending {
         Ending::Complete => return all_scored(summarize(run_dir)?),
         Ending::Failed(error) => hinted(error, kept),

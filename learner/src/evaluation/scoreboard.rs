@@ -260,10 +260,9 @@ impl Scoreboard {
         (waiting / (2 * present.max(1))).clamp(least, most)
     }
 
-    /// Step, ended episodes and all episodes of the job that an evaluator has.
-    pub fn job_of(&self, evaluator: &Name) -> Option<(u64, u32, usize)> {
-        let open = self.jobs.get(evaluator)?;
-        Some((open.job.step, open.done.1, open.job.seeds.len()))
+    /// The job that an evaluator has, and the number of its episodes that have ended.
+    pub fn job_of(&self, evaluator: &Name) -> Option<(&Job, u32)> {
+        self.jobs.get(evaluator).map(|open| (&open.job, open.done.1))
     }
 
     /// Extends the lease of the evaluator's job, if the job is further than before. Returns whether

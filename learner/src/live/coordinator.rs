@@ -79,8 +79,13 @@ impl Coordinator {
     pub fn evaluators(&self) -> Vec<Value> {
         let state = self.lock();
         state.evaluators.to_json(|evaluator| {
-            let (step, done, episodes) = state.scoreboard.job_of(evaluator)?;
-            Some(json!({ "step": step, "done": done, "episodes": episodes }))
+            let (job, done) = state.scoreboard.job_of(evaluator)?;
+            Some(json!({
+                "step": job.step,
+                "practice": job.practice.is_some(),
+                "done": done,
+                "episodes": job.seeds.len(),
+            }))
         })
     }
 
@@ -105,6 +110,9 @@ impl Coordinator {
 
     /// Opens an episode of practice.
     pub fn open_practice(&self, opening: &Opening, weights: Hash) {
+        if opening.episode == 0 {
+            self.events.line(format!("step {}: practice begins", opening.step));
+        }
         self.lock().scoreboard.open_practice(opening, weights);
     }
 

@@ -1,5 +1,6 @@
 //! The main loop of a run: reports events, and decides when the run is over.
 
+use std::mem;
 use std::time::{Duration, Instant};
 
 use quad_run::folder::RunDir;
@@ -68,6 +69,8 @@ struct State {
     /// Threads whose disk hangs, as reported.
     hanging: Vec<Writer>,
     reported_behind: bool,
+    /// Seconds that training has waited for practice.
+    waited: f64,
     patience: Patience,
 }
 
@@ -131,7 +134,7 @@ impl MainLoop {
                     // The stop came during the last step; the run does not wait for scores.
                     Event::TrainingEnded(_) if state.interrupted => return Ending::Interrupted,
                     Event::TrainingEnded(Outcome::Completed) => {
-                        state.trained = true;
+                        (state.trained, state.patience) = (true, Patience::default());
                         self.display.line(&self.trained());
                     }
                     event => {
@@ -203,16 +206,16 @@ impl MainLoop {
         self.threads.coordinator().tick();
         self.watch_disk(&mut state.hanging);
         self.display.tick(Instant::now());
-        if !state.trained {
-            return Verdict::Wait;
-        }
+        let waited = self.metrics.practice.wait_seconds.get();
+        let waits = state.trained || mem::replace(&mut state.waited, waited) < waited;
         let any_may_fit = self.threads.coordinator().any_may_fit();
-        let verdict = state.patience.check(any_may_fit, Instant::now());
+        let verdict = state.patience.check(any_may_fit || !waits, Instant::now());
         if let Verdict::Advise = verdict {
             let advice = match state.reachable_at.first() {
                 None => format!(
-                    "no router has answered at {} yet; the scores wait for it",
-                    self.endpoints.connect.join(", ")
+                    "no router has answered at {} yet; {} for it",
+                    self.endpoints.connect.join(", "),
+                    if state.trained { "the scores wait" } else { "practice waits" }
                 ),
                 Some(endpoint) => {
                     let environment = self.threads.coordinator().environment();
@@ -221,7 +224,8 @@ impl MainLoop {
             };
             self.display.line(&advice);
         }
-        verdict
+        // Training waits for practice as long as it takes.
+        if state.trained { verdict } else { Verdict::Wait }
     }
 
     /// A thread that writes and has not reported for long waits for the disk.

@@ -22,11 +22,21 @@ pub(crate) struct PageState {
 
 impl PageState {
     pub fn to_json(&self) -> Value {
+        let practice = &self.metrics.practice;
+        let practice = (practice.target.get() > 0).then(|| {
+            json!({
+                "steps": practice.rows.get(),
+                "target": practice.target.get(),
+                "return": practice.episode_return.get(),
+                "wait_seconds": practice.wait_seconds.get(),
+            })
+        });
         json!({
             "run": self.run.as_str(),
             "step": self.metrics.training.gradient_steps.get(),
             "steps": self.steps,
             "episodes_pending": self.metrics.evaluation.episodes_pending.get(),
+            "practice": practice,
             "problems": self.health.problems(),
             "evaluators": self.coordinator.get().map(Coordinator::evaluators).unwrap_or_default(),
         })

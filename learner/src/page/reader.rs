@@ -12,6 +12,7 @@ use quad_run::status::list;
 use serde_json::{Value, json};
 
 use super::history::History;
+use crate::train::COLUMNS;
 
 const RUN_LIFETIME: Duration = Duration::from_secs(1);
 const LIST_LIFETIME: Duration = Duration::from_secs(5);
@@ -98,7 +99,9 @@ impl RunPage {
         }
         self.history.refresh()?;
         let metrics = config.experiment.definition()?.metrics;
-        let metrics = metrics.iter().map(|it| json!({ "name": it.name, "help": it.help }));
+        let practice = config.experiment.online.iter().flat_map(|_| COLUMNS);
+        let metrics = metrics.iter().map(|it| (it.name, it.help)).chain(practice);
+        let metrics = metrics.map(|(name, help)| json!({ "name": name, "help": help }));
         let evaluations = report
             .evaluations
             .iter()
@@ -109,6 +112,7 @@ impl RunPage {
             "agent": report.agent,
             "seed": report.seed,
             "steps": report.steps,
+            "practice_begins": config.experiment.practice_begins(),
             "measure": report.measure(),
             "dataset_score": report.dataset_score,
             "dataset": config.dataset.summary(),

@@ -1,6 +1,6 @@
 //! The figures of a report: learning curves, performance profiles, scores over a hyper-parameter.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
@@ -74,6 +74,7 @@ pub fn learning_curve(run: &RunReport) -> Plot {
         x: "gradient steps",
         y: measure,
         references: vec![dataset_mean(run)],
+        begins: begins([run]),
         lines: vec![line],
         ..Plot::default()
     }
@@ -82,6 +83,11 @@ pub fn learning_curve(run: &RunReport) -> Plot {
 fn dataset_mean(run: &RunReport) -> (String, f64) {
     let mean = run.dataset_score;
     (format!("dataset mean {mean:.1}"), mean)
+}
+
+/// Gradient steps after which practice begins.
+fn begins<'a>(runs: impl IntoIterator<Item = &'a RunReport>) -> BTreeSet<u64> {
+    runs.into_iter().filter_map(|run| run.config.experiment.practice_begins()).collect()
 }
 
 fn curves(task: &str, groups: &[&GroupReport]) -> Plot {
@@ -93,6 +99,7 @@ fn curves(task: &str, groups: &[&GroupReport]) -> Plot {
         x: "gradient steps",
         y: groups[0].measure(),
         references,
+        begins: begins(groups.iter().map(|group| &group.runs[0])),
         lines: groups.iter().map(|group| curve(group)).collect(),
         ..Plot::default()
     }

@@ -1,5 +1,6 @@
 //! Plots of lines with bands, as SVG and as PNG.
 
+use std::collections::BTreeSet;
 use std::error::Error;
 use std::ops::Range;
 use std::path::Path;
@@ -45,6 +46,8 @@ pub struct Plot {
     pub is_falling: bool,
     /// Dashed lines at some y, with labels.
     pub references: Vec<(String, f64)>,
+    /// Dashed lines at gradient steps after which practice begins.
+    pub begins: BTreeSet<u64>,
     pub lines: Vec<Line>,
     /// Plots side by side, in place of lines.
     pub panels: Vec<Self>,
@@ -145,7 +148,7 @@ impl Plot {
             .margin_right(36 * scale)
             .x_label_area_size(44 * scale)
             .y_label_area_size(56 * scale)
-            .build_cartesian_2d(x.clone(), y)?;
+            .build_cartesian_2d(x.clone(), y.clone())?;
         // A logarithmic axis has labels at whole powers of ten.
         let label = |x: &f64| match self.is_log {
             true if (x - x.round()).abs() > 1e-6 => String::new(),
@@ -161,12 +164,19 @@ impl Plot {
             .x_label_formatter(&label)
             .light_line_style(WHITE)
             .draw()?;
+        let dashed = |ends: [(f64, f64); 2], width| {
+            let style = REFERENCE.stroke_width(width * scale);
+            DashedLineSeries::new(ends, 6 * scale, 4 * scale, style)
+        };
         for (name, y) in &self.references {
-            let ends = [(x.start, *y), (x.end, *y)];
-            let style = REFERENCE.stroke_width(2 * scale);
-            let line = DashedLineSeries::new(ends, 6 * scale, 4 * scale, style);
+            let line = dashed([(x.start, *y), (x.end, *y)], 2);
             let drawn = chart.draw_series(line)?.label(name);
             drawn.legend(legend(REFERENCE, scale));
+        }
+        for step in self.begins.iter().map(|step| *step as f64) {
+            chart.draw_series(dashed([(step, y.start), (step, y.end)], 1))?;
+            let at = (step, y.start + 0.04 * (y.end - y.start));
+            chart.draw_series([Text::new(" practice", at, font(13).color(&REFERENCE))])?;
         }
         for (line, color) in self.lines.iter().zip(COLORS.iter().cycle()) {
             line.draw(&mut chart, *color, scale)?;

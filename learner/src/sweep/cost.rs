@@ -62,6 +62,7 @@ impl Cost {
             step_seconds: mean(|price| price.step_seconds),
             snapshot_bytes: mean(|price| price.snapshot_bytes as f64) as u64,
             checkpoint_bytes: mean(|price| price.checkpoint_bytes as f64) as u64,
+            row_bytes: mean(|price| price.row_bytes as f64) as u64,
         };
         let mut cost = Self { measured, ..Self::default() };
         for (run, state) in runs {

@@ -63,6 +63,7 @@ pub(crate) fn register<M: Collector + Clone + 'static>(
 metrics! {
     /// Metrics of experience that training has absorbed.
     PracticeMetrics {
+        target: IntGauge("experience_rows_target", "Environment steps of practice that this run will do"),
         rows: IntGauge("experience_rows", "Environment steps of practice that training has absorbed"),
         episodes: IntGauge("experience_episodes", "Episodes of practice that training has absorbed"),
         episode_return: Gauge("practice_return", "Return of the newest of them"),

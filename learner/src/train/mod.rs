@@ -25,7 +25,7 @@ pub(crate) use agent::{begin, origin, resume};
 pub(crate) use held_out::HeldOut;
 pub(crate) use metrics::{PracticeMetrics, TrainingMetrics, metrics, register};
 pub(crate) use output_queue::{Output, OutputQueue};
-pub(crate) use practice::{Inbox, Practice};
+pub(crate) use practice::{COLUMNS, Inbox, Practice};
 pub(crate) use price::Price;
 pub(crate) use results::{Outcome, TrainedPolicy};
 pub(crate) use training::Training;

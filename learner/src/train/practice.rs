@@ -19,6 +19,13 @@ use crate::evaluation::Opening;
 /// Interval at which training checks for a stop while it waits for an episode.
 const POLL: Duration = Duration::from_millis(100);
 
+/// Names of practice's numbers in `metrics.jsonl`, and what they are.
+pub(crate) const COLUMNS: [(&str, &str); 3] = [
+    ("environment_steps", "Environment steps of practice that training has absorbed"),
+    ("practice_return", "Return of the newest episode of practice"),
+    ("practice_wait_seconds", "Time that this learner has waited for practice"),
+];
+
 /// Recorded episodes that training has not absorbed yet, by number. Clones share them.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Inbox {
@@ -39,14 +46,14 @@ impl Inbox {
         self.lock().remove(&number)
     }
 
-    /// Waits for an episode; `None` if training is to `stop`.
-    fn wait(&self, number: u64, stop: &AtomicBool, beat: &Heartbeat) -> Option<Episode> {
+    /// Waits for an episode, and calls `alive` all the while; `None` if training is to `stop`.
+    fn wait(&self, number: u64, stop: &AtomicBool, mut alive: impl FnMut()) -> Option<Episode> {
         let mut episodes = self.lock();
         while !stop.load(Ordering::Relaxed) {
             if let Some(episode) = episodes.remove(&number) {
                 return Some(episode);
             }
-            beat.alive();
+            alive();
             let woken = self.shared.1.wait_timeout(episodes, POLL);
             episodes = woken.unwrap_or_else(PoisonError::into_inner).0;
         }
@@ -100,6 +107,7 @@ impl Practice {
         let (seed, begin) = (experiment.seed, experiment.steps);
         let sampler = OnlineSampler::new(experiment.batch_size as usize, online.share, seed);
         let lag = online.lag;
+        metrics.target.set(i64::try_from(online.steps).unwrap_or(i64::MAX));
         let mut practice = Self {
             online,
             begin,
@@ -153,9 +161,16 @@ impl Practice {
         stop: &AtomicBool,
         beat: &Heartbeat,
     ) -> Result<bool, PracticeError> {
-        let begin = Instant::now();
-        let episode = self.inbox.wait(self.episodes, stop, beat);
-        self.metrics.wait_seconds.inc_by(begin.elapsed().as_secs_f64());
+        let mut counted = Instant::now();
+        let mut count = || {
+            let seconds = mem::replace(&mut counted, Instant::now()).elapsed().as_secs_f64();
+            self.metrics.wait_seconds.inc_by(seconds);
+        };
+        let episode = self.inbox.wait(self.episodes, stop, || {
+            beat.alive();
+            count();
+        });
+        count();
         episode.map_or(Ok(false), |episode| self.absorb(&episode).map(|()| true))
     }
 
@@ -196,15 +211,11 @@ impl Practice {
         self.opened += 1;
     }
 
-    /// Numbers for a line of `metrics.jsonl`: environment steps, return of the newest episode, and
-    /// seconds that this process has waited for practice.
+    /// Numbers for a line of `metrics.jsonl`.
     pub fn row(&self) -> Vec<(&'static str, f64)> {
         let metrics = &self.metrics;
-        vec![
-            ("environment_steps", self.rows as f64),
-            ("practice_return", metrics.episode_return.get()),
-            ("practice_wait_seconds", metrics.wait_seconds.get()),
-        ]
+        let values = [self.rows as f64, metrics.episode_return.get(), metrics.wait_seconds.get()];
+        COLUMNS.iter().map(|(name, _)| *name).zip(values).collect()
     }
 
     /// The rows of gradient step `step`, the first of which is 1.

@@ -18,6 +18,8 @@ pub(crate) struct Price {
     pub step_seconds: f64,
     pub snapshot_bytes: u64,
     pub checkpoint_bytes: u64,
+    /// Bytes of an environment step of practice: observation, action and reward.
+    pub row_bytes: u64,
 }
 
 impl Price {
@@ -27,6 +29,7 @@ impl Price {
         device: Device,
         transitions: Transitions,
     ) -> anyhow::Result<Self> {
+        let numbers = transitions.observation_dim() + transitions.action_dim() + 1;
         let mut agent = begin(experiment, device, transitions)?;
         let mut sampler = BatchSampler::new(
             agent.dataset_len(),
@@ -38,13 +41,26 @@ impl Price {
             step_seconds: mean_step(&mut agent, &mut sampler, experiment.total_steps())?,
             snapshot_bytes: agent.policy(origin(experiment))?.len() as u64,
             checkpoint_bytes: agent.save()?.len() as u64,
+            row_bytes: (numbers * size_of::<f32>()) as u64,
         })
     }
 
-    /// Bytes on disk of a whole run: its snapshots, and the checkpoints that are kept.
+    /// Bytes of the experience of a whole run.
+    pub fn experience_bytes(&self, experiment: &Experiment) -> u64 {
+        experiment.online.as_ref().map_or(0, |online| online.steps * self.row_bytes)
+    }
+
+    /// Bytes on disk of a whole run: its snapshots, the checkpoints that are kept, and experience.
     pub fn bytes(&self, experiment: &Experiment) -> u64 {
-        let snapshots = experiment.schedule().evaluations().max(1);
-        snapshots * self.snapshot_bytes + Checkpoint::KEPT as u64 * self.checkpoint_bytes
+        let schedule = experiment.schedule();
+        let practice = experiment.online.as_ref().map_or(0, |online| {
+            let steps =
+                (experiment.steps..schedule.steps).step_by(online.snapshot_interval as usize);
+            steps.filter(|step| !schedule.is_evaluated(*step)).count() as u64
+        });
+        let snapshots = (schedule.evaluations() + practice).max(1);
+        let kept = Checkpoint::KEPT as u64 * self.checkpoint_bytes;
+        snapshots * self.snapshot_bytes + kept + self.experience_bytes(experiment)
     }
 }
 

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::printed;
-use crate::run::{Run, small, write_all, write_study};
+use crate::run::{Run, practiced, small, write_all, write_study};
 
 fn draw(folder: &Path) {
     printed(&format!("report {0} --figures {0}/figures", folder.display()));
@@ -55,6 +55,10 @@ fn curves_show_complete_evaluations_only() {
     complete.score(6000, 0, 12.0, "00");
     stopped.scores.truncate(4);
     assert!(curve(&[complete, stopped]).contains("quad (1 seed, not complete)"));
+
+    let begins = |runs: &[Run]| curve(runs).contains("\npractice\n");
+    assert!(begins(&[practiced()]) && begins(&[small(1, 0.0), practiced()]));
+    assert!(!begins(&[small(0, 0.0)]));
 
     let robot = small(0, 0.0).set("experiment.environment", "my-robot");
     assert!(!curve(&[robot.scores_are_returns()]).contains("normalized"));

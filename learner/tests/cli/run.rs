@@ -118,6 +118,20 @@ pub fn small(seed: u64, shift: f64) -> Run {
     run
 }
 
+/// The same with practice after 3,000 steps.
+pub fn practiced() -> Run {
+    let online = toml::toml! {
+        steps = 2000
+        updates_per_step = 2
+        warmup = 500
+        uniform_warmup = false
+        noise = 0.0
+        lag = 2
+        snapshot_interval = 1000
+    };
+    small(0, 0.0).set("experiment.steps", 3000).set("experiment.online", online)
+}
+
 /// Four runs of one of the paper's tasks, with a score of each evaluation up to `last`.
 pub fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
     let run = |seed| {

@@ -10,7 +10,7 @@ use quad_protocol::{Episode, EpisodeScore, Hash, Name, Record, episode_seeds};
 use quad_run::folder::RunDir;
 use serde_json::{Value, json};
 
-use crate::run::{HOPPER, Run, TASKS, complete, paper, small, write_all, write_study};
+use crate::run::{HOPPER, Run, TASKS, complete, paper, practiced, small, write_all, write_study};
 use crate::write_dataset;
 
 /// A study of which some runs cannot begin.
@@ -63,6 +63,7 @@ fn bin_path() -> String {
 /// The runs of report.trycmd.
 fn write_reported() {
     small(3, 0.0).write("report/one");
+    practiced().write("report/practiced");
     let (mut complete, mut stopped) = (small(0, 0.0), small(1, 0.0));
     complete.score(6000, 0, 12.0, "00");
     complete.write("report/stopped/a");

@@ -19,10 +19,10 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
 
     folders: a run folder, a pattern such as "runs/*", or several of them. Folders without a run are left out.
 
-    Each dictionary has, from `learner report --json`, the evaluation's `step`, `episodes`, `complete`, `score` (mean over the
-    episodes), `score_std`, `return` and `length`; the run's `run`, `dir`, `task`, `algorithm`, `variant`, `agent`, `seed`,
-    `steps`, `normalized`, `scored_in`, `dataset_score`, `mean_last_3`, `mean_last_5` and `mean_last_50000_steps`, the same in
-    all its rows; and each setting of its `config.toml`, like `experiment.batch_size`. A run without an evaluation has one
+    Each dictionary has, from `learner report --json`, the evaluation's `step`, `environment_steps` (of practice, else None),
+    `episodes`, `complete`, `score` (mean over the episodes), `score_std`, `return` and `length`; the run's `run`, `dir`,
+    `task`, `algorithm`, `variant`, `agent`, `seed`, `steps`, `normalized`, `scored_in`, `dataset_score`, `mean_last_3`,
+    `mean_last_5` and `mean_last_50000_steps`, the same in all its rows; and each setting of its `config.toml`, like `experiment.batch_size`. A run without an evaluation has one
     row, in which the evaluation's values are None.
 
     A learner may be writing the folders. A run that cannot be read is left out, with a warning that names it.
@@ -71,12 +71,13 @@ def rows_of(folder: str | PathLike[str]) -> list[dict[str, Any]]:
     evaluations = [
         {
             **{name: one[name] for name in ("step", "episodes", "complete")},
+            "environment_steps": one.get("environment_steps"),
             **{"score": one["score"]["mean"], "score_std": one["score"]["std"]},
             **{"return": one["mean_return"], "length": one["mean_length"]},
         }
         for one in run["evaluations"]
     ]
-    none = dict.fromkeys(("step", "episodes", "complete", "score", "score_std", "return", "length"))
+    none = dict.fromkeys(("step", "episodes", "complete", "environment_steps", "score", "score_std", "return", "length"))
     return [common | evaluation for evaluation in evaluations or [none]]
 
 

@@ -93,6 +93,7 @@ def train(
     run_dir: str | PathLike[str],
     algorithm: str | None = None,
     steps: int | None = None,
+    online_steps: int | None = None,
     normalize: str | None = None,
     task: str | None = "own-data",
     **options: Any,
@@ -101,14 +102,15 @@ def train(
 
     dataset: an argument of `--dataset`, or a Dataset, which is passed as a temporary file.
     run_dir: folder of the run. If it contains a run of the same configuration, that run continues.
-    algorithm, steps, normalize, task: as in `learner train --help`.
+    algorithm, steps, online_steps, normalize, task: as in `learner train --help`.
     options: any other option, with _ for -: `eval_interval=5000`, `fresh=True`. A dictionary repeats an option:
         `agent={"tau": 0.5}, set={"batch_size": 64}`.
 
     An interrupt (Ctrl-C) stops the learner after a checkpoint, and the same call continues the run; a second one stops it at
     once. The learner also stops with this process. Raises RuntimeError with the learner's error and hint.
     """
-    own = {"task": task, "algorithm": algorithm, "steps": steps, "normalize": normalize, "run_dir": os.fspath(run_dir)}
+    own = {"task": task, "algorithm": algorithm, "steps": steps, "online_steps": online_steps, "normalize": normalize}
+    own["run_dir"] = os.fspath(run_dir)
     with tempfile.TemporaryDirectory() as folder:
         if isinstance(dataset, Dataset):
             path = Path(folder, "dataset.hdf5")

@@ -107,6 +107,18 @@ impl Experiment {
         self.steps.saturating_add(self.online.as_ref().map_or(0, Online::updates))
     }
 
+    /// Environment steps of practice that the gradient steps up to `step` go with; `None` without
+    /// practice.
+    pub fn environment_steps(&self, step: u64) -> Option<u64> {
+        let online = self.online.as_ref()?;
+        Some(if step > self.steps { online.rows_at(step - self.steps) } else { 0 })
+    }
+
+    /// Gradient step after which practice begins, if others come before it.
+    pub fn practice_begins(&self) -> Option<u64> {
+        self.online.as_ref().map(|_| self.steps).filter(|steps| *steps > 0)
+    }
+
     /// The gradient steps and evaluations.
     pub fn schedule(&self) -> Schedule {
         let start = if self.from.is_some() { self.steps } else { 0 };

@@ -53,3 +53,6 @@ pub fn practiced(path: &Path) -> Result<Option<(Findings, &'static str)>, RunDir
     is_repeatable &= arithmetic.len() <= 1;
     Ok(Some((found, if is_repeatable { REPEATABLE } else { LOGGED })))
 }
+
+#[cfg(test)]
+mod tests;

@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use super::spread::Spread;
 use super::statistics::mean;
+use crate::config::Experiment;
 use crate::folder::ScoreLine;
 
 /// The episodes of one snapshot.
@@ -11,6 +12,9 @@ use crate::folder::ScoreLine;
 pub struct EvaluationReport {
     /// Gradient step of the snapshot.
     pub step: u64,
+    /// Environment steps of practice that training had learned from; absent in a run without any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub environment_steps: Option<u64>,
     /// Scored episodes.
     pub episodes: usize,
     /// True if all episodes are scored.
@@ -25,14 +29,14 @@ pub struct EvaluationReport {
 }
 
 impl EvaluationReport {
-    /// Summarizes the episodes of the snapshot at `step`, of which there should be `expected`;
-    /// `None` without episodes.
-    pub(super) fn new(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<Self> {
+    /// Summarizes the episodes of the snapshot at `step`; `None` without episodes.
+    pub(super) fn new(step: u64, episodes: &[&ScoreLine], experiment: &Experiment) -> Option<Self> {
         let values = |of: fn(&ScoreLine) -> f64| Vec::from_iter(episodes.iter().map(|it| of(it)));
         Some(Self {
             step,
+            environment_steps: experiment.environment_steps(step),
             episodes: episodes.len(),
-            complete: episodes.len() == expected as usize,
+            complete: episodes.len() == experiment.episodes as usize,
             score: Spread::of(&values(|line| line.score))?,
             mean_return: mean(&values(|line| line.episode_return)),
             mean_length: mean(&values(|line| line.length.into())),

@@ -53,7 +53,7 @@ impl RunReport {
         let expected = schedule.evaluations().saturating_mul(episodes);
         let evaluate = |(step, episodes): (u64, BTreeMap<u64, &ScoreLine>)| {
             let episodes = Vec::from_iter(episodes.into_values());
-            EvaluationReport::new(step, &episodes, experiment.episodes)
+            EvaluationReport::new(step, &episodes, experiment)
         };
         let evaluations: Vec<_> = by_step.into_iter().filter_map(evaluate).collect();
         let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).collect();

@@ -15,6 +15,9 @@ impl RunReport {
         if has_both {
             header.insert(3, "return");
         }
+        if self.config.experiment.online.is_some() {
+            header.insert(1, "practice");
+        }
         let mut table = Table::new(&Vec::from_iter(header.into_iter().map(|name| (name, Right))));
         for e in &self.evaluations {
             let episodes = e.episodes.to_string() + if e.complete { "" } else { " (part)" };
@@ -22,6 +25,9 @@ impl RunReport {
             let mut row = vec![e.step.to_string(), episodes, e.score.text(), length];
             if has_both {
                 row.insert(3, format!("{:.1}", e.mean_return));
+            }
+            if let Some(steps) = e.environment_steps {
+                row.insert(1, steps.to_string());
             }
             table.push(row);
         }
