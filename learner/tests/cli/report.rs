@@ -56,7 +56,7 @@ fn curves_show_complete_evaluations_only() {
     stopped.scores.truncate(4);
     assert!(curve(&[complete, stopped]).contains("quad (1 seed, not complete)"));
 
-    let begins = |runs: &[Run]| curve(runs).contains("\npractice\n");
+    let begins = |runs: &[Run]| curve(runs).contains("\n practice\n");
     assert!(begins(&[practiced()]) && begins(&[small(1, 0.0), practiced()]));
     assert!(!begins(&[small(0, 0.0)]));
 
