@@ -13,7 +13,7 @@ use super::networks::{Initializer, TrainState, WithTarget, networks};
 use super::squashed::Squashed;
 use super::state_dict::StateDict;
 use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors, Weights};
+use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors, Weights, cosine_decay};
 use quad_policy::{GaussianPolicy, PolicyConfig};
 use rand::seq::index::sample;
 use serde::Deserialize;
@@ -53,6 +53,8 @@ struct Config {
     temperature: Positive,
     /// Learning rate of actor, critics and α.
     learning_rate: Positive,
+    /// Let the learning rate fall to 0 along a cosine over the run.
+    decay: bool,
     /// EMA rate of the target critics.
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and α.
@@ -147,7 +149,10 @@ impl Algorithm for Rlpd {
     /// The policy learns from the last of each `actor_every` batches, after the critics.
     fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
         let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
-        let (rate, every) = (*self.config.learning_rate, *self.config.actor_every);
+        let (mut rate, every) = (*self.config.learning_rate, *self.config.actor_every);
+        if self.config.decay {
+            rate *= cosine_decay(step, self.context.total_steps + self.context.online_steps);
+        }
         let mut losses = vec![self.critic_loss(&batch, &noise)?];
         self.networks.critic.minimize(&losses[0].value, AdamStep::after(step, rate))?;
         self.networks.critic.soft_update(*self.config.ema_rate)?;

@@ -13,7 +13,7 @@ from networks import random_network, shape, single, values
 
 FOLDERS = {"rlpd": (60, "small"), "rlpd-critics": (61, "small")}
 LOG_STD = -20.0, 2.0
-AGENT = {"critics": 4, "gamma": 0.99, "temperature": 0.5, "learning_rate": 0.02, "ema_rate": 0.05}
+AGENT = {"critics": 4, "gamma": 0.99, "temperature": 0.5, "learning_rate": 0.02, "decay": False, "ema_rate": 0.05}
 # The policy's step, and one of the critics alone.
 VARIANTS = {
     "rlpd": (701, {"target_critics": 2, "entropy_backup": True, "actor_every": 2}),
