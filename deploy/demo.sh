@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh.
+# The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh; then
+# a policy that hops on and on, by RLPD, which learns from the same file and from what evaluators live through.
 #
 # Installs what is missing, builds, records the dataset, trains, and ends with the run's table, learning curve, a film of its
 # best snapshot (where OpenGL is installed) and an HTML report. Run again, it skips finished steps and resumes an interrupted
@@ -13,43 +14,53 @@ cd "$(dirname "$0")/.."
 TASK=hopper-demo
 DATASET=data/hopper-demo.hdf5
 RUN=runs/hopper-demo
+PRACTICE=runs/hopper-practice
 EVALUATORS=2
 BIN=target/release
 
-say "1 of 4: packages and libmujoco; next: build, data, training"
+say "1 of 5: packages and libmujoco; next: build, data, training, practice"
 deploy/setup.sh
-say "2 of 4: building learner and evaluator, 420 crates: 5 to 10 minutes the first time; next: data (one minute), training (three)"
+say "2 of 5: building learner and evaluator, 420 crates: 5 to 10 minutes the first time; next: data (one minute), training (three),
+  practice (ten)"
 cargo build --release --locked --package quad-learner --package quad-evaluator
 
 mkdir -p data
 if [ ! -e "$DATASET" ]; then
-  say "3 of 4: recording $DATASET"
+  say "3 of 5: recording $DATASET"
   $BIN/evaluator collect --env hopper --out "$DATASET"
 fi
 
-if [ -e "$RUN/complete" ] && [ $# -eq 0 ]; then
-  $BIN/learner report "$RUN" --html "$RUN/report.html"
-  echo "learning curve: $RUN/learning_curve.svg"
-  echo "run folder: $RUN"
-  say "this run is complete; for another one: deploy/demo.sh --fresh"
+if [ -e "$PRACTICE/complete" ] && [ $# -eq 0 ]; then
+  $BIN/learner report "$RUN" "$PRACTICE" --html "$RUN/report.html"
+  echo "learning curves: $RUN/learning_curve.svg $PRACTICE/learning_curve.svg"
+  echo "run folders: $RUN $PRACTICE"
+  say "these runs are complete; for others: deploy/demo.sh --fresh"
   exit
 fi
 
-say "4 of 4: training, then the table, a film and a report"
-status=0
-$BIN/learner train --task $TASK --dataset $DATASET --run-dir $RUN --evaluators $EVALUATORS "$@" || status=$?
-if [ "$status" -ne 0 ]; then
-  say "the learner ended with status $status; run this again to continue"
-  exit "$status"
-fi
-touch "$RUN/complete"
+# train RUN ARGS...: trains; a complete run only prints its table.
+train() {
+  local run=$1 status=0
+  shift
+  $BIN/learner train --task $TASK --dataset $DATASET --run-dir "$run" --evaluators $EVALUATORS "$@" || status=$?
+  if [ "$status" -ne 0 ]; then
+    say "the learner ended with status $status; run this again to continue"
+    exit "$status"
+  fi
+  touch "$run/complete"
+}
+
+say "4 of 5: training on the file alone"
+train $RUN "$@"
+say "5 of 5: practice, then the tables, a film and a report"
+train $PRACTICE --algorithm rlpd "$@"
 # Rendering needs packages, which the evaluator names.
-if told=$($BIN/evaluator film "$RUN" --out "$RUN/film.gif" 2>&1); then
+if told=$($BIN/evaluator film "$PRACTICE" --out "$PRACTICE/film.gif" 2>&1); then
   echo "$told"
 elif install=$(grep -o 'apt-get install .*egl.*' <<<"$told"); then
-  say "for a film of it: $install, then $BIN/evaluator film $RUN --out $RUN/film.gif"
+  say "for a film of it: $install, then $BIN/evaluator film $PRACTICE --out $PRACTICE/film.gif"
 else
   echo "$told" >&2
 fi
 # One HTML file with all results.
-$BIN/learner report "$RUN" --html "$RUN/report.html" >/dev/null
+$BIN/learner report "$RUN" "$PRACTICE" --html "$RUN/report.html" >/dev/null

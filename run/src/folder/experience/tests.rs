@@ -3,6 +3,7 @@
 use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::PathBuf;
+use std::slice;
 
 use quad_protocol::{Episode, EpisodeScore, Name};
 use tempfile::TempDir;
@@ -51,7 +52,7 @@ fn an_incomplete_record_at_the_end_is_cut_off() {
         assert_eq!(read_experience(run.path()).unwrap(), [one.clone(), two.clone()]);
         let (mut log, records) = run.experience_log().unwrap();
         assert_eq!(records, [one.clone(), two.clone()]);
-        log.append(&[three.clone()]).unwrap();
+        log.append(slice::from_ref(&three)).unwrap();
         assert_eq!(fs::read(&path).unwrap(), bytes, "{kept} bytes");
     }
 }
