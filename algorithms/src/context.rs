@@ -110,7 +110,7 @@ impl Context {
     pub(super) fn next_actions(&self, rows: &[u32]) -> Result<Tensor> {
         let a = self.action_dim();
         let none = vec![0.0; a];
-        let next = |row: &u32| self.transitions.next_action(*row).unwrap_or_else(|| none.clone());
+        let next = |row: &u32| self.transitions.next_action(*row).unwrap_or(&none).to_vec();
         let actions: Vec<f32> = rows.iter().flat_map(next).collect();
         Tensor::from_vec(actions, (rows.len(), a), &self.device)
     }

@@ -221,26 +221,15 @@ impl Transitions {
         self.experience.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Index of the next transition in the episode of `index`.
+    /// Index of the next transition in the episode of `index < len()`.
     pub fn next(&self, index: u32) -> Option<u32> {
-        match self.in_experience(index) {
-            None => self.dataset.next(index),
-            Some(place) => self.experience().next(place).map(|_| index + 1),
-        }
+        self.dataset.next(index)
     }
 
     /// Next action a', taken in s'. Unlike [`next`](Self::next), it includes steps without a
     /// transition.
-    pub fn next_action(&self, index: u32) -> Option<Vec<f32>> {
-        let action = |rows: &Rows, place| rows.next_action(place).map(<[f32]>::to_vec);
-        match self.in_experience(index) {
-            None => action(&self.dataset, index),
-            Some(place) => action(&self.experience(), place),
-        }
-    }
-
-    fn in_experience(&self, index: u32) -> Option<u32> {
-        index.checked_sub(self.len() as u32)
+    pub fn next_action(&self, index: u32) -> Option<&[f32]> {
+        self.dataset.next_action(index)
     }
 
     /// Index range of each of the dataset's episodes; together they cover all its transitions.
@@ -270,7 +259,7 @@ impl Transitions {
         batch.clear();
         batch.size = indices.len();
         for &index in indices {
-            match self.in_experience(index) {
+            match index.checked_sub(self.len() as u32) {
                 None => self.dataset.copy_to(batch, index),
                 Some(place) => experience.copy_to(batch, place),
             }

@@ -57,6 +57,8 @@ fn a_new_run_does_not_take_over_scores_of_unknown_origin() {
     drop(log);
     fs::remove_file(path.join("config.toml")).unwrap();
     assert!(matches!(create(&path, 1), Err(RunDirError::Occupied(_))));
+    fs::rename(path.join("scores.jsonl"), path.join("experience.log")).unwrap();
+    assert!(matches!(create(&path, 1), Err(RunDirError::Occupied(_))));
 }
 
 #[test]
@@ -121,12 +123,14 @@ fn does_not_write_through_links_to_files() {
     drop(log);
     let [precious, missing] = ["precious", "missing"].map(|name| folder.path().join(name));
     fs::write(&precious, "no line of a log").unwrap();
-    let names = "endpoints.json.partial metrics.jsonl scores.jsonl failed judgments.json";
+    let names =
+        "endpoints.json.partial metrics.jsonl scores.jsonl experience.log failed judgments.json";
     for name in names.split(' ') {
         fs::remove_file(path.join(name)).ok();
         symlink(&precious, path.join(name)).unwrap();
     }
     assert!(run.score_log().is_err() && run.metrics_log(0).is_err());
+    assert!(run.experience_log().is_err() && super::read_experience(&path).is_err());
     run.write_json("endpoints.json", &1).unwrap();
     run.write_json("judgments.json", &1).unwrap();
     run.mark_failed("").unwrap();
