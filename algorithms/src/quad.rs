@@ -13,12 +13,11 @@ use super::definition::Axis;
 use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler};
 use super::prelude::*;
 use super::state_dict::write;
-use candle_nn::loss::mse;
 use config::{Config, Guidance, TargetReduce};
 use guidance::{Averages, Guide};
 use metrics::METRICS;
 use noise::Noise;
-use quad_nn::{Reverse, mean_and_variance};
+use quad_nn::{Reverse, mean_and_variance, pulled_error, squared_error};
 use quad_policy::{DiffusionPolicy, DiffusionShape};
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -86,10 +85,11 @@ impl Quad {
         noise: &Noise,
     ) -> Result<(Loss, Option<Guide>)> {
         let (noisy, predicted) = networks.denoise(batch, &noise.denoising)?;
-        let error = (&predicted - &noise.denoising.epsilon)?;
-        let bc_loss = error.sqr()?.mean_all()?;
-        let loss = (&bc_loss * &self.eta)?;
+        let error = (predicted.detach() - &noise.denoising.epsilon)?;
+        let epsilon = &noise.denoising.epsilon;
         if self.config.guidance == Guidance::None {
+            let bc_loss = squared_error(&predicted, epsilon)?;
+            let loss = (&bc_loss * &self.eta)?;
             return Ok((Loss::new("actor_loss", loss).with("bc_loss", bc_loss), None));
         }
         let critics = &networks.critic.target;
@@ -97,7 +97,7 @@ impl Quad {
         let guide = self.averages.guide(&self.config, critics, batch, noise, at)?;
         let gradient = (&guide.gradient * &noise.denoising.deviation)?;
         let pull = gradient.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
-        let loss = (loss + (&predicted * pull)?.mean_all()?)?;
+        let (loss, bc_loss) = pulled_error(&predicted, epsilon, &self.eta, &pull)?;
         let others = lambda::inputs(&guide, error);
         let loss = Loss { others, ..Loss::new("actor_loss", loss).with("bc_loss", bc_loss) };
         Ok((loss.with("delta_share", guide.delta_share.clone()), Some(guide)))
@@ -149,7 +149,8 @@ impl DiffusionUpdate for Quad {
                 let (epsilon, t) = (&noise.denoising.epsilon, &noise.denoising.t);
                 let noisy = noise.denoising.noisy(&batch.actions)?;
                 let actor = networks.actor.detach();
-                let bc_loss = mse(&actor.predict(&batch.observations, &noisy, t)?, epsilon)?;
+                let predicted = actor.predict(&batch.observations, &noisy, t)?;
+                let bc_loss = squared_error(&predicted, epsilon)?;
                 write(&self.eta, &self.ascended_eta((bc_loss - f64::from(*threshold))?)?)?;
             }
         }

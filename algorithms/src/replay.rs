@@ -4,14 +4,16 @@
 
 use super::algorithm::Measured;
 use super::inputs::Inputs;
-use super::losses::{Computed, Loss};
-use candle_core::{Device, Result, Tensor};
+use super::losses::{Computed, Loss, joined};
+use candle_core::{DType, Device, Result, Tensor};
 use quad_nn::{CudaGraph, overwrite};
 use std::thread::{ThreadId, current};
 
 /// State between two updates.
 struct Kept<I> {
     inputs: I,
+    /// The vector of which the inputs are views on a GPU.
+    numbers: Tensor,
     computed: Computed,
     /// None before the second update.
     recording: Option<CudaGraph>,
@@ -41,20 +43,26 @@ impl<I: Inputs> Replay<I> {
         let work = |inputs: &I| Computed::new(&work(inputs)?);
         let thread = current().id();
         let Some(mut kept) = self.0.take().filter(|kept| kept.thread == thread) else {
-            let inputs = inputs.on(device)?;
+            let numbers = numbers(inputs)?.to_device(device)?;
+            let inputs = views(inputs, &numbers)?;
             let computed = CudaGraph::warm_up(device, || work(&inputs))?;
-            self.0 = Some(Kept { inputs, computed, recording: None, thread });
+            self.0 = Some(Kept { inputs, numbers, computed, recording: None, thread });
             return Ok(());
         };
-        for (tensor, new) in kept.inputs.tensors().into_iter().zip(inputs.clone().tensors()) {
-            renew(tensor, new)?;
-        }
-        let Kept { inputs, computed, recording, .. } = &mut kept;
         if !device.is_cuda() {
-            *computed = work(inputs)?;
+            kept.inputs = inputs.clone();
+            kept.computed = work(inputs)?;
             self.0 = Some(kept);
             return Ok(());
         }
+        // In place, where recorded work reads them.
+        overwrite(&kept.numbers, &numbers(inputs)?)?;
+        for (tensor, new) in kept.inputs.tensors().into_iter().zip(inputs.clone().tensors()) {
+            if new.dtype() != DType::F32 {
+                overwrite(tensor, new)?;
+            }
+        }
+        let Kept { inputs, computed, recording, .. } = &mut kept;
         let record = || computed.numbers.slice_set(&work(inputs)?.numbers, 0, 0);
         let mut recorded = match recording.take() {
             Some(recorded) => recorded,
@@ -72,12 +80,23 @@ impl<I: Inputs> Replay<I> {
     }
 }
 
-/// Gives a tensor of an earlier update the numbers of a new one: in place on a GPU, where recorded
-/// work reads it.
-fn renew(tensor: &mut Tensor, new: &Tensor) -> Result<()> {
-    if tensor.device().is_cuda() {
-        return overwrite(tensor, new);
+/// The inputs' numbers of f32 in one vector, which one copy takes to a GPU.
+fn numbers(inputs: &impl Inputs) -> Result<Tensor> {
+    let mut inputs = inputs.clone();
+    joined(inputs.tensors().into_iter().map(|x| &*x).filter(|x| x.dtype() == DType::F32))
+}
+
+/// The inputs as views of a vector of [`numbers`]; those of other types are copied to its device.
+fn views<I: Inputs>(inputs: &I, numbers: &Tensor) -> Result<I> {
+    let (mut views, mut start) = (inputs.clone(), 0);
+    for tensor in views.tensors() {
+        let count = tensor.elem_count();
+        if tensor.dtype() == DType::F32 {
+            *tensor = numbers.narrow(0, start, count)?.reshape(tensor.shape())?;
+            start += count;
+        } else {
+            *tensor = tensor.to_device(numbers.device())?;
+        }
     }
-    *tensor = new.clone();
-    Ok(())
+    Ok(views)
 }

@@ -1,84 +1,20 @@
-//! The loops of a gradient step on an Nvidia GPU, each one launch: activations, a reverse step,
-//! Adam and EMA. Products are cuBLAS's, through candle. `cuda.cu` has the kernels; the driver's
-//! compiler translates them for the GPU at hand when the first is launched.
+//! The loops of a gradient step on an Nvidia GPU, each one launch: Adam, EMA, a loss, and QUAD's
+//! guidance. `cuda.cu` has the kernels.
 //!
 //! Every function queues its work on a stream and returns before the GPU has done it.
 
-use crate::activation::Activation;
+use crate::cuda_kernels::{Result, kernels};
 use cudarc::driver::result::{device, mem_pool};
 use cudarc::driver::sys::CUmemPool_attribute;
 use cudarc::driver::{
-    CudaContext, CudaFunction, CudaSlice, CudaStream, CudaView, CudaViewMut, DriverError,
-    LaunchConfig, PushKernelArg,
+    CudaContext, CudaSlice, CudaStream, CudaView, CudaViewMut, LaunchConfig, PushKernelArg,
 };
-use cudarc::nvrtc::{CompileError, compile_ptx};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 /// Threads of a block; `cuda.cu` counts on it.
 const BLOCK: u32 = 256;
 /// Partial sums of a gradient's norm.
 const SUMS: usize = 256;
-
-/// A kernel that does not run.
-#[derive(Debug, thiserror::Error)]
-pub enum CudaError {
-    /// The driver fails.
-    #[error("the CUDA driver failed")]
-    Driver(#[from] DriverError),
-    /// The kernels cannot be compiled.
-    #[error("the CUDA kernels cannot be compiled for this GPU")]
-    Compile(#[from] CompileError),
-}
-
-/// Result of a kernel.
-pub type Result<T> = std::result::Result<T, CudaError>;
-
-/// Coefficients of a reverse step: `clean = clamp((x - deviation·ε)·scale)`, then
-/// `clamp(from_clean·clean + from_noisy·x + noise·z)`. Bounds can be infinite.
-#[derive(Clone, Copy, Debug)]
-pub struct ReverseStep {
-    /// Factor of the predicted noise ε.
-    pub deviation: f32,
-    /// Factor of the difference.
-    pub scale: f32,
-    /// Bound of `clean`.
-    pub clean_bound: f32,
-    /// Factor of `clean`.
-    pub from_clean: f32,
-    /// Factor of x.
-    pub from_noisy: f32,
-    /// Factor of the noise z; 0 without noise.
-    pub noise: f32,
-    /// Bound of the result.
-    pub bound: f32,
-}
-
-/// The compiled kernels.
-struct Kernels {
-    activate: CudaFunction,
-    reverse_step: CudaFunction,
-    squares: CudaFunction,
-    adam: CudaFunction,
-    ema: CudaFunction,
-}
-
-/// The kernels, compiled by the first call. A process trains on one GPU.
-fn kernels(stream: &CudaStream) -> Result<Arc<Kernels>> {
-    static KERNELS: Mutex<Option<Arc<Kernels>>> = Mutex::new(None);
-    let mut kernels = KERNELS.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some(kernels) = &*kernels {
-        return Ok(kernels.clone());
-    }
-    let module = stream.context().load_module(compile_ptx(include_str!("cuda.cu"))?)?;
-    let compiled = Kernels {
-        activate: module.load_function("activate")?,
-        reverse_step: module.load_function("reverse_step")?,
-        squares: module.load_function("squares")?,
-        adam: module.load_function("adam")?,
-        ema: module.load_function("ema")?,
-    };
-    Ok(kernels.insert(Arc::new(compiled)).clone())
-}
 
 /// Prepares a process that computes on one stream. The driver keeps free memory, which it would
 /// return whenever the host waits for the GPU, and arrays have no events, which would order streams.
@@ -96,61 +32,14 @@ pub fn prepare(context: &CudaContext) -> Result<()> {
     Ok(())
 }
 
+/// One block.
+const ONE: LaunchConfig =
+    LaunchConfig { grid_dim: (1, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 };
+
 /// One thread for each number.
 fn threads(count: usize) -> LaunchConfig {
     let blocks = u32::try_from(count).unwrap_or(u32::MAX).div_ceil(BLOCK);
     LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 }
-}
-
-/// `f(z + bias)` for z `members × rows × width` and bias `members × width`; without `f` the sum. With
-/// `slope`, the derivatives f'(z + bias) follow all values.
-pub fn activate(
-    stream: &Arc<CudaStream>,
-    f: Option<Activation>,
-    z: &CudaView<'_, f32>,
-    (bias, members): (&CudaView<'_, f32>, usize),
-    slope: bool,
-) -> Result<CudaSlice<f32>> {
-    let (count, width) = (z.len(), bias.len() / members);
-    assert!(count.is_multiple_of(members * width) && u32::try_from(count).is_ok(), "whole rows");
-    let number = f.map_or(u32::MAX, |f| f as u32);
-    let kernels = kernels(stream)?;
-    // SAFETY: the kernel writes every number.
-    let mut out = unsafe { stream.alloc::<f32>(if slope { 2 * count } else { count })? };
-    let (mut y, mut derivative) = out.split_at_mut(count);
-    let (all, member, width, none) = (count as u32, (count / members) as u32, width as u32, 0_u64);
-    let mut launch = stream.launch_builder(&kernels.activate);
-    launch.arg(z).arg(bias).arg(&mut y);
-    if slope {
-        launch.arg(&mut derivative)
-    } else {
-        launch.arg(&none)
-    };
-    launch.arg(&all).arg(&member).arg(&width).arg(&number);
-    // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
-    unsafe { launch.launch(threads(count))? };
-    Ok(out)
-}
-
-/// x_t → x_{t-1}; z is not read if `step.noise` is 0.
-pub fn reverse(
-    stream: &Arc<CudaStream>,
-    [x, epsilon, z]: [&CudaView<'_, f32>; 3],
-    step: ReverseStep,
-) -> Result<CudaSlice<f32>> {
-    let count = x.len();
-    assert!(epsilon.len() == count && z.len() == count, "equally many numbers");
-    let kernels = kernels(stream)?;
-    // SAFETY: the kernel writes every number.
-    let mut out = unsafe { stream.alloc::<f32>(count)? };
-    let all = count as u32;
-    let mut launch = stream.launch_builder(&kernels.reverse_step);
-    launch.arg(x).arg(epsilon).arg(z).arg(&mut out).arg(&all);
-    launch.arg(&step.deviation).arg(&step.scale).arg(&step.clean_bound).arg(&step.from_clean);
-    launch.arg(&step.from_noisy).arg(&step.noise).arg(&step.bound);
-    // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
-    unsafe { launch.launch(threads(count))? };
-    Ok(out)
 }
 
 /// [`crate::optimizer::adam`] with the gradient scaled down to norm `clip`. Returns its norm before
@@ -186,7 +75,7 @@ pub fn adam(
         .arg(&mut norm);
     launch.arg(&all).arg(&clip).arg(rates);
     // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
-    unsafe { launch.launch(threads(count))? };
+    unsafe { launch.launch(threads(count.min(1024 * BLOCK as usize)))? };
     Ok(norm)
 }
 
@@ -206,4 +95,58 @@ pub fn ema(
     // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
     unsafe { launch.launch(threads(count))? };
     Ok(())
+}
+
+/// The mean of (x - y)², one number; with a weight and a pull, weight·mean((x - y)²) + mean(x·pull).
+/// With the result's gradient: that of x. The numbers of x follow those of y, again and again.
+pub fn squared_error(
+    stream: &Arc<CudaStream>,
+    [x, y]: [&CudaView<'_, f32>; 2],
+    pulled: Option<[&CudaView<'_, f32>; 2]>,
+    gradient: Option<&CudaView<'_, f32>>,
+) -> Result<CudaSlice<f32>> {
+    assert!(x.len().is_multiple_of(y.len()), "whole repetitions");
+    let kernels = kernels(stream)?;
+    // SAFETY: the kernels write every number.
+    let mut out = unsafe { stream.alloc::<f32>(gradient.map_or(1, |_| x.len()))? };
+    let (all, count, none) = (x.len() as u32, y.len() as u32, 0_u64);
+    let (kernel, config) = match gradient {
+        Some(_) => (&kernels.squared_error_gradient, threads(x.len())),
+        None => (&kernels.squared_error, ONE),
+    };
+    let mut launch = stream.launch_builder(kernel);
+    launch.arg(x).arg(y);
+    match pulled {
+        Some([weight, pull]) => launch.arg(weight).arg(pull),
+        None => launch.arg(&none).arg(&none),
+    };
+    if let Some(gradient) = gradient {
+        launch.arg(gradient);
+    }
+    launch.arg(&mut out).arg(&all).arg(&count);
+    // SAFETY: the arguments are those of the kernel.
+    unsafe { launch.launch(config)? };
+    Ok(out)
+}
+
+/// QUAD's guidance by critics' values `members × rows` and gradients `members × rows × a`, the
+/// predicted noise `rows × a` and ν̂², with τ, δ and the EMA rate of ν̂²: the mean gradient `rows × a`,
+/// then σ² and λ of each row, the share of rows where δ decides λ, and the new ν̂².
+pub fn guide(
+    stream: &Arc<CudaStream>,
+    [values, gradients, predicted, nu_squared]: [&CudaView<'_, f32>; 4],
+    a: usize,
+    [tau, delta, rate]: [f32; 3],
+) -> Result<CudaSlice<f32>> {
+    let rows = predicted.len() / a;
+    let kernels = kernels(stream)?;
+    // SAFETY: the kernel writes every number.
+    let mut out = unsafe { stream.alloc::<f32>(rows * (a + 2) + 2)? };
+    let (members, rows, a) = ((values.len() / rows) as u32, rows as u32, a as u32);
+    let mut launch = stream.launch_builder(&kernels.guide);
+    launch.arg(values).arg(gradients).arg(predicted).arg(nu_squared).arg(&mut out);
+    launch.arg(&members).arg(&rows).arg(&a).arg(&tau).arg(&delta).arg(&rate);
+    // SAFETY: the arguments are those of the kernel, and the lengths follow from each other.
+    unsafe { launch.launch(ONE)? };
+    Ok(out)
 }

@@ -1,7 +1,7 @@
 //! Work of an Nvidia GPU captured as a CUDA graph, which one call of the driver starts instead of
 //! one for each kernel.
 
-use crate::cuda::{CudaError, Result};
+use crate::cuda_kernels::{CudaError, Result};
 use cudarc::driver::sys::{CUgraphInstantiate_flags, CUresult, CUstreamCaptureMode};
 use cudarc::driver::{CudaStream, DriverError};
 use std::sync::Arc;

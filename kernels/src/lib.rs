@@ -9,7 +9,8 @@
 //! - [`activation`]: activations and their derivatives; [`narrow`]: the first and last layer of a
 //!   network; [`norm`]: layer norm, forward and backward.
 //! - [`optimizer`]: Adam and EMA over whole parameter vectors.
-//! - `cuda`, `cuda_graph` (feature `cuda`): the same loops on a GPU, and many launches as one.
+//! - `cuda`, `cuda_mlp`, `cuda_graph` (feature `cuda`): loops on a GPU, whole networks, and many
+//!   launches as one; `cuda_kernels` translates their source.
 //! - [`scaling`]: conversion between a user's units and those of networks.
 //! - [`Level`] (`level`): the CPU's instructions in use; `vectorized`: a macro that compiles loops
 //!   for each level; [`Buffer`] (`buffer`): reused memory, aligned to cache lines.
@@ -26,6 +27,10 @@ mod buffer;
 pub mod cuda;
 #[cfg(feature = "cuda")]
 pub mod cuda_graph;
+#[cfg(feature = "cuda")]
+pub mod cuda_kernels;
+#[cfg(feature = "cuda")]
+pub mod cuda_mlp;
 mod level;
 pub mod narrow;
 pub mod norm;

@@ -2,13 +2,13 @@
 //! policy's mean over s.
 
 use crate::error::NetworkError;
-use crate::layers::composed::Pass;
 use crate::layers::mlp::Mlp;
 use crate::layers::packed::Packing;
 use crate::layers::plain;
 use crate::precision::Precision;
 use crate::shape::EnsembleShape;
-use crate::slices::{has_fast_implementation, read, read_all};
+use crate::slices::read_all;
+use crate::statistics::squared_error;
 use crate::weighted::weighted;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Error, Result, Tensor, Var, bail};
@@ -74,8 +74,7 @@ impl Ensemble {
         if differentiable == [false; 3] && networks.is_fast(weights) {
             packed = self.packing.kernels(networks, weights)?;
         }
-        let repeat = actions.dim(0)? / observations.dim(0)?;
-        let inputs = [&plain::repeat_rows(observations, repeat)?, actions];
+        let inputs = [observations, actions];
         let count = if self.shape.action_dim == 0 { 1 } else { 2 };
         networks.forward_by(packed, weights, &inputs[..count])
     }
@@ -105,7 +104,7 @@ impl Ensemble {
         actions: &Tensor,
         targets: &Tensor,
     ) -> Result<Tensor> {
-        self.values(observations, actions)?.broadcast_sub(&targets.detach())?.sqr()?.mean_all()
+        squared_error(&self.values(observations, actions)?, &targets.detach())
     }
 
     /// ∇_a Q_k(s, a) of each member, `[K, rows, a]`, as constants.
@@ -137,16 +136,13 @@ impl Ensemble {
     /// [`Self::action_gradients`] in candle's operations. One backward pass serves all members:
     /// each has its own copy of the actions.
     fn plain_action_gradients(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
-        let repeat = actions.dim(0)? / observations.dim(0)?;
-        let (action_dim, layers) = (self.shape.action_dim, &self.networks.layers);
-        let observations = plain::repeat_rows(observations, repeat)?;
-        if !layers.config.norm {
-            let x = Tensor::cat(&[&observations, actions], 1)?;
-            let pass = Pass::forward(layers, &self.weights, &x, true)?;
-            let (_, gradients) = pass.backward(&pass.out.ones_like()?, false, true)?;
-            let gradients = gradients.ok_or_else(|| Error::Msg("no gradient of inputs".into()))?;
-            return gradients.narrow(2, self.shape.observation_dim, action_dim)?.contiguous();
+        #[cfg(feature = "cuda")]
+        if let Some(dense) = crate::gpu::dense::dense(&self.networks.layers, &self.weights) {
+            let inputs = [observations, actions];
+            return crate::gpu::dense::input_gradients(dense, &self.weights, &inputs);
         }
+        let repeat = actions.dim(0)? / observations.dim(0)?;
+        let observations = plain::repeat_rows(observations, repeat)?;
         let observations = observations.broadcast_left(self.shape.members)?;
         let actions = Var::from_tensor(&actions.broadcast_left(self.shape.members)?)?;
         let inputs = Tensor::cat(&[&observations, actions.as_tensor()], 2)?;
@@ -154,31 +150,4 @@ impl Ensemble {
         let gradients = values.sum_all()?.backward()?.remove(&actions);
         gradients.ok_or_else(|| Error::Msg("no gradient reaches the actions".into()))
     }
-}
-
-/// Mean and population variance over the first dimension: `[K, …]` → twice `[…]`, as constants.
-pub fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
-    let x = x.detach();
-    if !has_fast_implementation(x.device()) {
-        let mean = x.mean_keepdim(0)?;
-        let variance = x.broadcast_sub(&mean)?.sqr()?.mean(0)?;
-        return Ok((mean.squeeze(0)?, variance));
-    }
-    // Candle's own sums over a leading dimension take ten times as long.
-    let (members, shape) = (x.dim(0)?, &x.dims()[1..]);
-    let (mean, variance) = read(&x.contiguous()?, |x: &[f32]| {
-        let share = 1.0 / members as f32;
-        let mut mean = vec![0.0; x.len() / members];
-        let mut variance = mean.clone();
-        for member in x.chunks_exact(mean.len()) {
-            mean.iter_mut().zip(member).for_each(|(mean, x)| *mean += x * share);
-        }
-        for member in x.chunks_exact(mean.len()) {
-            let squares = member.iter().zip(&mean).map(|(x, mean)| (x - mean) * (x - mean));
-            variance.iter_mut().zip(squares).for_each(|(sum, square)| *sum += square * share);
-        }
-        (mean, variance)
-    })?;
-    let tensor = |numbers| Tensor::from_vec(numbers, shape, x.device());
-    Ok((tensor(mean)?, tensor(variance)?))
 }

@@ -4,12 +4,13 @@
 use crate::adam::{Adam, AdamStep};
 use crate::diffusion::noise_predictor::NoisePredictor;
 use crate::diffusion::schedule::Reverse;
-use crate::ensemble::{Ensemble, mean_and_variance};
+use crate::ensemble::Ensemble;
 use crate::gradients::gradient::Gradients;
 use crate::layers::config::{InitScheme, MlpConfig, NormEpsilon};
 use crate::precision::Precision;
 use crate::shape::{EnsembleShape, NoiseShape};
 use crate::slices::{has_fast_implementation, modify, plainly};
+use crate::statistics::mean_and_variance;
 use crate::testing::{
     assert_close, check_gradient, gradient, loss, numbers, random, tensor, weights,
 };

@@ -10,6 +10,7 @@
 //! - `score/`: SfBC's [`ScoreNetwork`], sampled by [`DpmSolver`].
 //! - `trajectory/`: Diffuser's [`TrajectoryModel`] and [`TrajectoryValue`].
 //! - `gpu/`: opening a GPU, and capturing its work as a [`CudaGraph`].
+//! - `statistics`: statistics and losses.
 //! - `slices`, `pool`: tensors as slices and reused memory, for the fast implementations on the CPU.
 //!
 //! Random numbers are arguments or come from a seeded generator.
@@ -30,6 +31,7 @@ mod precision;
 mod score;
 mod shape;
 mod slices;
+mod statistics;
 #[cfg(test)]
 mod testing;
 mod trajectory;
@@ -40,10 +42,12 @@ pub use adam::{Adam, AdamStep, cosine_decay};
 pub use diffusion::edm::{Denoiser, DenoiserShape, NoiseLevels};
 pub use diffusion::noise_predictor::NoisePredictor;
 pub use diffusion::schedule::{Reverse, Schedule};
-pub use ensemble::{Ensemble, mean_and_variance};
+pub use ensemble::Ensemble;
 pub use error::{MAX_DIM, NetworkError};
 pub use gpu::cuda_graph::{CudaGraph, overwrite};
 pub use gpu::device::open_gpu;
+#[cfg(feature = "cuda")]
+pub use gpu::numbers::guide;
 pub use gradients::gradient::Gradients;
 pub use layers::config::{InitScheme, MlpConfig, NormEpsilon};
 pub use precision::Precision;
@@ -53,6 +57,7 @@ pub use score::dpm_solver::{ContinuousNoise, DpmSolver};
 pub use score::network::{ScoreNetwork, ScoreShape};
 pub use shape::{EnsembleShape, NoiseShape, bytes, tile_floats};
 pub use slices::read;
+pub use statistics::{mean_and_variance, pulled_error, squared_error};
 pub use trajectory::config::{Attention, TrajectoryConfig, TrajectoryError};
 pub use trajectory::networks::{TrajectoryModel, TrajectoryValue};
 pub use weighted::Weighted;

@@ -69,9 +69,14 @@ impl Averages {
         noise: &Noise,
         (noisy, predicted): (&Tensor, &Tensor),
     ) -> Result<Guide> {
-        let scale = (batch.values(critics)?.abs()?.mean_all()? + 1e-6)?;
-        let gradients =
-            critics.action_gradients(&batch.observations, noisy)?.broadcast_div(&scale)?;
+        let values = batch.values(critics)?;
+        let gradients = critics.action_gradients(&batch.observations, noisy)?;
+        #[cfg(feature = "cuda")]
+        if config.guidance == Guidance::Quad && noisy.device().is_cuda() {
+            return self.guide_on_gpu(config, [&values, &gradients, predicted]);
+        }
+        let scale = (values.abs()?.mean_all()? + 1e-6)?;
+        let gradients = gradients.broadcast_div(&scale)?;
 
         let size = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
         let direction = predicted.broadcast_div(&size)?; // u, Eq. 21
@@ -111,6 +116,25 @@ impl Averages {
             lambda: weight,
             delta_share,
             averages: Averages { nu_squared, lambda_means },
+        })
+    }
+}
+
+#[cfg(feature = "cuda")]
+impl Averages {
+    /// Guidance from the critics' values and gradients, in one kernel.
+    fn guide_on_gpu(&self, config: &Config, of: [&Tensor; 3]) -> Result<Guide> {
+        let [values, gradients, predicted] = of;
+        let (rows, a) = predicted.dims2()?;
+        let numbers = [config.tau, *config.delta, *config.nu_ema_rate];
+        let numbers = quad_nn::guide([values, gradients, predicted, &self.nu_squared], numbers)?;
+        let scalar = |place: usize| numbers.narrow(0, rows * (a + 2) + place, 1)?.reshape(());
+        Ok(Guide {
+            gradient: numbers.narrow(0, 0, rows * a)?.reshape((rows, a))?,
+            sigma_squared: numbers.narrow(0, rows * a, rows)?,
+            lambda: numbers.narrow(0, rows * (a + 1), rows)?,
+            delta_share: scalar(0)?,
+            averages: Averages { nu_squared: scalar(1)?, lambda_means: None },
         })
     }
 }

@@ -10,7 +10,7 @@ use crate::shape::{NoiseShape, TIME_FEATURES};
 use crate::slices::read_all;
 use crate::weighted::weighted;
 use crate::weights::Weights;
-use candle_core::{DType, Result, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 use std::sync::{Arc, OnceLock};
 
 /// A noise predictor and its weights.
@@ -40,8 +40,10 @@ impl NoisePredictor {
             time: Mlp::new(shape.time_layers(), "time."),
             trunk: Mlp::new(shape.trunk_layers(), "trunk."),
             schedule: Schedule::variance_preserving(shape.diffusion_steps, shape.reverse),
-            features: (1..=shape.diffusion_steps).flat_map(|t| sinusoids(t as f64)).collect(),
+            features: (0..=shape.diffusion_steps).flat_map(|t| sinusoids(t as f64)).collect(),
             features_tensor: OnceLock::new(),
+            #[cfg(feature = "cuda")]
+            steps_tensor: OnceLock::new(),
             shape,
         };
         let (architecture, packing) = (Arc::new(architecture), Packing::new(precision));
@@ -58,7 +60,7 @@ impl NoisePredictor {
         &self.architecture.schedule
     }
 
-    /// The sinusoids of all t, `[T, 16]`, on the weights' device.
+    /// The sinusoids of t = 0..T, `[1 + T, 16]`, on the weights' device.
     fn features(&self) -> Result<Tensor> {
         let made = &self.architecture.features_tensor;
         if let Some(tensor) = made.get() {
@@ -69,13 +71,36 @@ impl NoisePredictor {
         Ok(made.get_or_init(|| tensor).clone())
     }
 
+    fn embed(&self, features: &Tensor) -> Result<Tensor> {
+        self.architecture.time.forward(&self.weights, &[features])?.squeeze(0)
+    }
+
+    /// The embeddings of t = 1..T, `[T, 32]`.
+    fn embeddings(&self) -> Result<Tensor> {
+        self.embed(&self.features()?.narrow(0, 1, self.architecture.shape.diffusion_steps)?)
+    }
+
+    /// The coefficients of all reverse steps, `[T, 7]`, on the weights' device.
+    #[cfg(feature = "cuda")]
+    fn reverse_steps(&self) -> Result<Tensor> {
+        let Architecture { schedule, steps_tensor, .. } = &*self.architecture;
+        if let Some(tensor) = steps_tensor.get() {
+            return Ok(tensor.clone());
+        }
+        let tensor =
+            Tensor::from_vec(schedule.reverse_steps(), ((), 7), self.weights.values().device())?;
+        Ok(steps_tensor.get_or_init(|| tensor).clone())
+    }
+
     /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`.
     /// Differentiable in weights, observations and actions.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
-        let Architecture { time, trunk, .. } = &*self.architecture;
-        let embedding = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
-        let rows = (t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?;
-        let embedding = embedding.index_select(&rows, 0)?;
+        let trunk = &self.architecture.trunk;
+        // A GPU sooner embeds every row than it adds up the rows' gradients.
+        let embedding = match t.device().is_cuda() {
+            true => self.embed(&self.features()?.index_select(t, 0)?)?,
+            false => self.embeddings()?.index_select(&(t - t.ones_like()?)?, 0)?,
+        };
         trunk.forward(&self.weights, &[observations, actions, &embedding])?.squeeze(0)
     }
 
@@ -113,9 +138,14 @@ impl NoisePredictor {
     /// [`Self::sample`] in composed operations, with the embeddings of all t computed once.
     fn composed_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
-        let Architecture { time, trunk, .. } = &*self.architecture;
+        let trunk = &self.architecture.trunk;
         let (steps, rows, _) = noise.dims3()?;
-        let embeddings = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
+        let embeddings = self.embeddings()?;
+        #[cfg(feature = "cuda")]
+        if let Some(dense) = crate::gpu::dense::dense(&trunk.layers, &self.weights) {
+            let (parts, steps) = ([observations, &embeddings], self.reverse_steps()?);
+            return crate::gpu::dense::sample(dense, &self.weights, parts, noise, &steps);
+        }
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
         let mut actions = noise.get(0)?;
         for t in (1..=steps).rev() {
@@ -123,7 +153,7 @@ impl NoisePredictor {
             let inputs = [&observations, &actions, &embedding];
             let epsilon = trunk.forward(&self.weights, &inputs)?.squeeze(0)?;
             let z = (t > 1).then(|| noise.get(steps - t + 1)).transpose()?;
-            actions = self.schedule().constant_reverse(t, &actions, &epsilon, z.as_ref())?;
+            actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
         }
         Ok(actions)
     }

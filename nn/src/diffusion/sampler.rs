@@ -6,7 +6,7 @@ use crate::layers::flat::TILE;
 use crate::layers::mlp::{Kernels, Mlp, of_member};
 use crate::layers::network::{Network, rows_of};
 use crate::layers::workspace::with_workspace;
-use crate::shape::{NoiseShape, TIME_EMBEDDING};
+use crate::shape::{NoiseShape, TIME_EMBEDDING, TIME_FEATURES};
 use candle_core::Tensor;
 use quad_kernels::narrow::FirstLayer;
 use quad_kernels::product::product;
@@ -21,10 +21,13 @@ pub(crate) struct Architecture {
     /// Over [s, a^t, embedding].
     pub trunk: Mlp,
     pub schedule: Schedule,
-    /// Sinusoids of t = 1..T, `T × 16`.
+    /// Sinusoids of t = 0..T, `(1 + T) × 16`.
     pub features: Vec<f32>,
     /// The same as a tensor, made when first needed.
     pub features_tensor: OnceLock<Tensor>,
+    /// The coefficients of all reverse steps, made when first needed.
+    #[cfg(feature = "cuda")]
+    pub steps_tensor: OnceLock<Tensor>,
 }
 
 impl Architecture {
@@ -33,7 +36,7 @@ impl Architecture {
     fn shifts(&self, weights: &[f32]) -> Vec<f32> {
         let (network, shape) = (self.trunk.network(weights, 0), &self.shape);
         let mut embedding = vec![0.0; shape.diffusion_steps * TIME_EMBEDDING];
-        self.time.run(weights, None, &self.features, &mut embedding);
+        self.time.run(weights, None, &self.features[TIME_FEATURES..], &mut embedding);
         let width = network.width();
         let mut shifts = vec![0.0; shape.diffusion_steps * width];
         let before = shape.observation_dim + shape.action_dim;

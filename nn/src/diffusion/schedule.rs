@@ -1,8 +1,6 @@
 //! Noise schedules and one step of the reverse process.
 
 use candle_core::{Device, Result, Tensor};
-#[cfg(feature = "cuda")]
-use quad_kernels::cuda::{ReverseStep, reverse};
 use serde::{Deserialize, Serialize};
 
 /// Formula of a reverse step.
@@ -142,56 +140,16 @@ impl Schedule {
         }
     }
 
-    /// [`Self::reverse`] without gradients: one operation on a GPU.
-    pub(crate) fn constant_reverse(
-        &self,
-        t: usize,
-        x: &Tensor,
-        epsilon: &Tensor,
-        z: Option<&Tensor>,
-    ) -> Result<Tensor> {
-        #[cfg(feature = "cuda")]
-        if x.device().is_cuda() {
-            return self.reverse_on_gpu(t, x, epsilon, z);
-        }
-        self.reverse(t, x, epsilon, z)
-    }
-
+    /// The coefficients of the reverse steps of t = 1..T as a GPU takes them
+    /// (`quad_kernels::cuda_mlp`), seven each.
     #[cfg(feature = "cuda")]
-    fn reverse_on_gpu(
-        &self,
-        t: usize,
-        x: &Tensor,
-        epsilon: &Tensor,
-        z: Option<&Tensor>,
-    ) -> Result<Tensor> {
-        use crate::gpu::tensors::{read, tensor};
-        let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
-        let (clean_bound, bound) = self.bounds();
-        let noise = if z.is_some() { noise } else { 0.0 };
-        let step = ReverseStep {
-            deviation,
-            scale: 1.0 / signal,
-            clean_bound,
-            from_clean,
-            from_noisy,
-            noise,
-            bound,
+    pub(crate) fn reverse_steps(&self) -> Vec<f32> {
+        let (clean, sample) = self.bounds();
+        let of_one = |step: &Step| {
+            let Step { signal, deviation, from_clean, from_noisy, noise } = *step;
+            [deviation, 1.0 / signal, clean, from_clean, from_noisy, noise, sample]
         };
-        let candle_core::Device::Cuda(device) = x.device() else {
-            candle_core::bail!("a tensor is not on the GPU")
-        };
-        let stream = device.cuda_stream();
-        let (x, epsilon) = (x.contiguous()?, epsilon.contiguous()?);
-        let z = z.unwrap_or(&epsilon).contiguous()?;
-        let next = read(&x, |x| {
-            read(&epsilon, |epsilon| {
-                read(&z, |z| {
-                    reverse(&stream, [x, epsilon, z], step).map_err(candle_core::Error::wrap)
-                })
-            })
-        })?;
-        tensor(next, x.shape(), &x)
+        self.steps.iter().flat_map(of_one).collect()
     }
 
     /// Bounds of the predicted x_0 and of x_{t−1}.

@@ -8,7 +8,6 @@ use candle_core::{
     CpuStorage, CudaStorage, Device, Error, InplaceOp1, Layout, Result, Shape, Storage, Tensor,
     WithDType, bail,
 };
-use quad_kernels::cuda::CudaError;
 use std::cell::Cell;
 use std::marker::PhantomData;
 use std::sync::Arc;
@@ -31,14 +30,25 @@ pub(crate) fn view<'a>(storage: &'a CudaStorage, layout: &Layout) -> Result<Cuda
     Ok(storage.as_cuda_slice::<f32>()?.slice(range(layout)?))
 }
 
-/// Queues `work`, which makes new numbers, on the stream of `storage`.
-pub(crate) fn with_stream(
-    storage: &CudaStorage,
-    work: impl FnOnce(&Arc<CudaStream>) -> std::result::Result<CudaSlice<f32>, CudaError>,
-) -> Result<CudaStorage> {
-    let device = storage.device.clone();
-    let numbers = work(&device.cuda_stream()).map_err(Error::wrap)?;
-    Ok(CudaStorage::wrap_cuda_slice(numbers, device))
+/// The stream of a tensor's GPU.
+pub(crate) fn stream(tensor: &Tensor) -> Result<Arc<CudaStream>> {
+    match tensor.device() {
+        Device::Cuda(device) => Ok(device.cuda_stream()),
+        _ => bail!("a tensor is not on the GPU"),
+    }
+}
+
+/// Calls `work` with the numbers of contiguous tensors.
+pub(crate) fn with_views<R>(
+    tensors: &[Tensor],
+    work: impl FnOnce(&[CudaView<'_, f32>]) -> Result<R>,
+) -> Result<R> {
+    let held = Vec::from_iter(tensors.iter().map(Tensor::storage_and_layout));
+    let views = held.iter().map(|(storage, layout)| match &**storage {
+        Storage::Cuda(storage) => view(storage, layout),
+        _ => bail!("a tensor is not on the GPU"),
+    });
+    work(&views.collect::<Result<Vec<_>>>()?)
 }
 
 /// Calls `work` with the numbers of a contiguous tensor.

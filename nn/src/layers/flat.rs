@@ -6,7 +6,6 @@
 
 use crate::layers::config::MlpConfig;
 use crate::weights::{Init, TensorSpec};
-use candle_core::{Result, Tensor};
 use std::ops::Range;
 
 /// Rows of one task: weights and activations of a tile stay in a core's own cache.
@@ -80,15 +79,6 @@ impl Layers {
     /// (inputs, outputs) of a layer.
     pub fn shape(&self, layer: usize) -> (usize, usize) {
         (self.widths[layer], self.widths[layer + 1])
-    }
-
-    /// Kernels `[K, in, out]` and biases `[K, out]` of a layer, as views of the vector.
-    pub fn views(&self, vector: &Tensor, layer: usize) -> Result<(Tensor, Tensor)> {
-        let ((inputs, outputs), members) = (self.shape(layer), self.members);
-        let (start, count) = (self.offsets[layer], members * inputs * outputs);
-        let kernels = vector.narrow(0, start, count)?;
-        let biases = vector.narrow(0, start + count, members * outputs)?;
-        Ok((kernels.reshape((members, inputs, outputs))?, biases.reshape((members, outputs))?))
     }
 
     pub fn kernel<'a>(&self, weights: &'a [f32], layer: usize, member: usize) -> &'a [f32] {

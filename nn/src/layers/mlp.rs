@@ -1,11 +1,10 @@
 //! K networks of one shape side by side: layers act(x·W + b), differentiable in x, W and b.
 //!
 //! On the CPU one custom operation of candle's runs all layers, for tiles of one member's rows in
-//! parallel. The tiles do not depend on the number of threads, so neither do the results. Elsewhere
-//! `composed` runs them, or with a norm `plain`.
+//! parallel. The tiles do not depend on the number of threads, so neither do the results. On a GPU a
+//! kernel does (`gpu::dense`), or with a norm or wide layers `plain`.
 
 use crate::gradients::buffer::GradientBuffer;
-use crate::layers::composed::{Composed, Pass};
 use crate::layers::flat::{Layers, TILE};
 use crate::layers::network::{Network, rows_of};
 use crate::layers::plain;
@@ -43,7 +42,7 @@ impl Mlp {
         Self { layers, prefix, saved }
     }
 
-    /// The outputs `[K, rows, out]` for `inputs [rows, …]`, which are concatenated.
+    /// The outputs `[K, rows, out]` for inputs that [`plain::side_by_side`] concatenates.
     pub fn forward(&self, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
         self.forward_by(None, weights, inputs)
     }
@@ -55,17 +54,18 @@ impl Mlp {
         weights: &Weights,
         inputs: &[&Tensor],
     ) -> Result<Tensor> {
-        let x = if let [x] = inputs { (*x).clone() } else { Tensor::cat(inputs, 1)? };
+        #[cfg(feature = "cuda")]
+        if let Some(dense) = crate::gpu::dense::dense(&self.layers, weights) {
+            return crate::gpu::dense::forward(dense, weights, inputs);
+        }
+        let x = plain::side_by_side(inputs)?;
         let (values, layers) = (weights.values(), &self.layers);
         if !matches!(*x.dims(), [rows, width] if rows > 0 && width == layers.inputs()) {
             let (members, inputs) = (layers.members, layers.inputs());
             bail!("{members} networks of {inputs} numbers got inputs of shape {:?}", x.dims());
         }
         if !self.is_fast(weights) {
-            return match layers.config.norm {
-                true => self.plain_forward(weights, &x),
-                false => self.composed_forward(weights, &x),
-            };
+            return self.plain_forward(weights, &x);
         }
         let buffer = if values.track_op() { weights.gradient_buffer().cloned() } else { None };
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
@@ -78,12 +78,6 @@ impl Mlp {
     /// True if the fast implementation runs these weights.
     pub fn is_fast(&self, weights: &Weights) -> bool {
         has_fast_implementation(weights.values().device())
-    }
-
-    fn composed_forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
-        let differentiable = weights.values().track_op() || x.track_op();
-        let pass = Pass::forward(&self.layers, weights, x, differentiable)?;
-        if differentiable { weights.values().apply_op2(x, Composed(pass)) } else { Ok(pass.out) }
     }
 
     /// [`Self::forward`] in candle's operations, also for inputs of each member, `[K, rows, in]`.

@@ -1,5 +1,5 @@
-//! Networks in candle's own operations, which candle differentiates: those with a norm on a GPU,
-//! and the reference of all tests.
+//! Networks in candle's own operations, which candle differentiates: those with a norm or wide layers
+//! on a GPU, and the reference of all tests.
 
 use crate::layers::flat::Layers;
 use crate::weights::Tensors;
@@ -81,6 +81,15 @@ pub(crate) fn repeat_rows(x: &Tensor, times: usize) -> Result<Tensor> {
         return Ok(x.clone());
     }
     x.unsqueeze(1)?.broadcast_as((rows, times, width))?.reshape((rows * times, width))
+}
+
+/// Inputs `[n, width]` side by side, `[rows, …]`: the last has `rows`, and of others the first
+/// rows/n rows get the first row, and so on.
+pub(crate) fn side_by_side(inputs: &[&Tensor]) -> Result<Tensor> {
+    let rows = inputs.last().map_or(Ok(0), |last| last.dim(0))?;
+    let repeated = inputs.iter().map(|x| repeat_rows(x, rows / x.dim(0)?.max(1)));
+    let repeated = repeated.collect::<Result<Vec<_>>>()?;
+    if let [x] = &repeated[..] { Ok(x.clone()) } else { Tensor::cat(&repeated, 1) }
 }
 
 #[cfg(test)]
