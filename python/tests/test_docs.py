@@ -32,7 +32,7 @@ def test_the_cart_practices(tmp_path):
     for usual, here in [
         ("workers=2", f'workers=1, connect="{endpoint}"'),
         ("run_dir", f'listen="{endpoint}", threads=1, run_dir'),
-        ("record(100)", "record(5)"),
+        ("record(100)", "record(20)"),
         ("2_000", "10"),
         ("5_000", "120"),
         ("1_000", "70"),
