@@ -20,8 +20,8 @@ BIN=target/release
 
 say "1 of 5: packages and libmujoco; next: build, data, training, practice"
 deploy/setup.sh
-say "2 of 5: building learner and evaluator, 420 crates: 5 to 10 minutes the first time; next: data (one minute), training (three),
-  practice (ten)"
+say "2 of 5: building learner and evaluator, 420 crates: 5 to 10 minutes the first time; next: data (one minute), training (two),
+  practice (three)"
 cargo build --release --locked --package quad-learner --package quad-evaluator
 
 mkdir -p data
