@@ -125,14 +125,14 @@ impl Scoreboard {
         self.evaluations.insert(Key::Practice(opening.episode), episode);
     }
 
-    /// Ends practice: episodes that nobody plays yet are not handed out.
+    /// Ends practice: evaluators get no more of its episodes.
     pub fn end_practice(&mut self) {
         let evaluations = &mut self.evaluations;
         evaluations.retain(|_, it| it.practice.is_none() || it.waiting() == 0);
         self.practice.retain(|_, episode| evaluations.contains_key(&Key::Practice(*episode)));
     }
 
-    /// The practice episode with this seed, and the step and hash of its snapshot.
+    /// The practice episode with this seed, if the run has it.
     pub fn practice(&self, seed: u64) -> Option<Practice> {
         let recorded = self.practiced.get(&seed).map(|hash| Practice::Recorded(*hash));
         let open = || Some(Practice::Open { episode: *self.practice.get(&seed)? });

@@ -116,7 +116,7 @@ impl Coordinator {
         self.lock().scoreboard.open_practice(opening, weights);
     }
 
-    /// Ends practice: what nobody plays yet is not handed out.
+    /// Ends practice: evaluators get no more of its episodes.
     pub fn end_practice(&self) {
         self.lock().scoreboard.end_practice();
     }

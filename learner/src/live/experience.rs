@@ -4,7 +4,6 @@
 //! pieces as the run has open, and none is longer than the environment allows.
 
 use std::collections::BTreeMap;
-use std::mem;
 
 use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, Record, decode};
 use quad_run::folder::ExperienceLog;
@@ -20,9 +19,9 @@ use crate::train::Inbox;
 /// Practice episodes on their way to the disk, and then to training.
 pub(super) struct Experience {
     /// `experience.log`.
-    pub log: ExperienceLog,
-    pub inbox: Inbox,
-    pub coordinator: Coordinator,
+    log: ExperienceLog,
+    inbox: Inbox,
+    coordinator: Coordinator,
     /// The first bytes of frames, and the hashes of the whole, by seed.
     partial: BTreeMap<u64, (Hash, Vec<u8>)>,
 }
@@ -117,9 +116,11 @@ impl Experience {
             (*hash, *bytes) = none();
         }
         let end = piece.offset as usize + piece.bytes.len();
-        let follows = *hash == piece.hash && (piece.offset as usize) <= bytes.len();
-        if !follows {
-            return at(if *hash == piece.hash { bytes.len() } else { 0 });
+        if *hash != piece.hash {
+            return at(0);
+        }
+        if piece.offset as usize > bytes.len() {
+            return at(bytes.len());
         }
         if end > bytes.len() {
             bytes.truncate(piece.offset as usize);
@@ -130,7 +131,7 @@ impl Experience {
         }
         let found = Hash::of(bytes);
         if found != piece.hash {
-            mem::take(bytes);
+            bytes.clear();
             return Err(CodecError::Hash { claimed: piece.hash, found }.into());
         }
         let episode: Episode = decode(bytes)?;

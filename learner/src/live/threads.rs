@@ -182,18 +182,16 @@ fn open_experience(
     coordinator: &Coordinator,
 ) -> anyhow::Result<Experience> {
     let (log, records) = dir.experience_log()?;
-    let mut frames = HashMap::new();
-    for Record { episode, .. } in records {
-        frames.insert(episode.score.seed, episode);
-    }
+    let by_seed = |Record { episode, .. }| (episode.score.seed, episode);
+    let mut episodes: HashMap<u64, _> = records.into_iter().map(by_seed).collect();
     // Seeds are those of the first episodes: more were never open.
-    let most = frames.len() as u64 + Online::MOST_LAG;
+    let most = episodes.len() as u64 + Online::MOST_LAG;
     for number in 0..most {
-        if let Some(episode) = frames.remove(&practice_seed(seed, number)) {
+        if let Some(episode) = episodes.remove(&practice_seed(seed, number)) {
             coordinator.record_practice(episode.score.seed, Hash::of(&encode(&episode)?));
             inbox.add(number, episode);
         }
     }
-    anyhow::ensure!(frames.is_empty(), "experience.log has episodes of another run");
+    anyhow::ensure!(episodes.is_empty(), "experience.log has episodes of another run");
     Ok(Experience::new(log, inbox.clone(), coordinator.clone()))
 }
