@@ -5,6 +5,7 @@
 use crate::diffusion::noise_predictor::NoisePredictor;
 use crate::ensemble::Ensemble;
 use crate::layers::plain::repeat_rows;
+use crate::shape::TIME_EMBEDDING;
 use crate::statistics::mean_and_variance;
 use candle_core::{Result, Tensor};
 
@@ -61,5 +62,13 @@ impl NoisePredictor {
             actions = schedule.reverse(t, &actions, &epsilon, z.as_ref())?;
         }
         Ok(actions)
+    }
+
+    /// Numbers held by [`Self::sample_guided`] beside its arguments and the networks' tiles.
+    pub fn guided_floats(&self, rows: u128, critics: &Ensemble) -> u128 {
+        let (o, a) = (self.shape().observation_dim, self.shape().action_dim);
+        // Observations and embeddings, alone and side by side; gradients; and those of a step.
+        let each = 2 * (o + TIME_EMBEDDING) + (critics.shape().members + 16) * a;
+        rows * each as u128
     }
 }
