@@ -79,7 +79,7 @@ def test_every_choice(snapshots, rule, tmp_path):
 
 @pytest.mark.parametrize("name", ["quad", "norm", "align-iql", "dql"])
 def test_models_are_guided_like_the_policy(snapshots, name, tmp_path):
-    compare(Policy.load(snapshots[name]), tmp_path / "policy.onnx", candidates=4, guidance=0.3)
+    compare(Policy.load(snapshots[name]), tmp_path / "policy.onnx", candidates=4, guidance=3.0)
 
 
 @pytest.mark.parametrize("name", ["mish", "relu", "silu", "tanh", "gelu"])

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from quad_rl.onnx.file import Array, File
-from quad_rl.onnx.graph import Graph, Value
+from quad_rl.onnx.graph import Value
 
 _TWICE = 2 * np.sqrt(2 / np.pi)
 
@@ -61,6 +62,15 @@ def layer_norm_gradient(x: Value, scale: Array, epsilon: float, gradient: Value)
     return (gradient - gradient.mean(-1) - normal * (gradient * normal).mean(-1)) / deviation
 
 
+def activation_gradient(name: str, x: Value, gradient: Value) -> Value:
+    return gradient * slope(name, x)
+
+
+def product_gradient(kernel: Array, gradient: Value) -> Value:
+    """The gradient with respect to x of x @ kernel [K, in, out]."""
+    return gradient @ gradient.graph.constant(kernel).transpose(0, 2, 1)
+
+
 def layers(
     file: File, prefix: str, config: dict[str, Any], x: Value, backward: list[Callable[[Value], Value]] | None = None
 ) -> Value:
@@ -79,18 +89,14 @@ def layers(
                 return x
             epsilon = 1e-5 if config.get("norm_epsilon") == "torch" else 1e-6
             scale = tensor(i, "scale")
-            backward.append(lambda gradient: layer_norm_gradient(x, scale, epsilon, gradient))
+            backward.append(partial(layer_norm_gradient, x, scale, epsilon))
             return layer_norm(x, scale, tensor(i, "shift"), epsilon)
 
         before, kernel = normed(x, False), tensor(i + 1, "kernel")
-        backward.append(lambda gradient, before=before: gradient * slope(config["activation"], before))
+        backward.append(partial(activation_gradient, config["activation"], before))
         x = normed(activate(config["activation"], before), True) @ kernel + tensor(i + 1, "bias")
-        backward.append(lambda gradient, kernel=kernel: gradient @ transposed(gradient.graph, kernel))
+        backward.append(partial(product_gradient, kernel))
     return x
-
-
-def transposed(graph: Graph, kernel: Array) -> Value:
-    return graph.constant(kernel).transpose(0, 2, 1)
 
 
 def of_states(file: File, prefix: str, config: dict[str, Any], observations: Value) -> Value:
@@ -126,5 +132,4 @@ def action_gradient(
     gradient = actions.graph.constant(np.ones((1, 1, 1)))
     for step in reversed(backward):
         gradient = step(gradient)
-    gradient = gradient @ transposed(actions.graph, kernel[:, -a:])
-    return gradient.mean(0).reshape(-1, each, a)
+    return product_gradient(kernel[:, -a:], gradient).mean(0).reshape(-1, each, a)
