@@ -35,4 +35,10 @@ impl Denoising {
     pub fn noisy(&self, actions: &Tensor) -> Result<Tensor> {
         (actions * &self.signal)? + (&self.epsilon * &self.deviation)?
     }
+
+    /// The estimate of the clean actions in noisy ones, given a predicted noise ε: (a^t − √(1 −
+    /// ᾱ_t)·ε)/√ᾱ_t, clipped to ±1, all `[B, a]`.
+    pub fn clean(&self, noisy: &Tensor, predicted: &Tensor) -> Result<Tensor> {
+        ((noisy - (predicted * &self.deviation)?)? / &self.signal)?.clamp(-1f32, 1f32)
+    }
 }

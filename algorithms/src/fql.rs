@@ -104,6 +104,7 @@ impl Fql {
         let q = match self.config.target {
             Aggregate::Mean => values.mean(0)?,
             Aggregate::Min => smallest(&values)?,
+            Aggregate::MeanMinusStd(kappa) => lower_bound(&values, kappa)?,
         };
         batch.target(*self.config.gamma, &q)
     }

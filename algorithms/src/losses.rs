@@ -1,6 +1,7 @@
 //! Losses with the scalars that are measured along with them, and reductions that keep NaN.
 
 use candle_core::{Result, Tensor};
+use quad_nn::mean_and_variance;
 
 use super::algorithm::Measured;
 
@@ -14,6 +15,13 @@ pub(super) fn smallest(values: &Tensor) -> Result<Tensor> {
 /// it.)
 pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
     values.max(dimension)? + (values.sum(dimension)? * 0.0)?
+}
+
+/// The mean − κ·standard deviation over the critics of constant values, `[K, B]` → `[B]`; divided by
+/// K, as in [`Aggregate::MeanMinusStd`](quad_policy::Aggregate::MeanMinusStd).
+pub(super) fn lower_bound(values: &Tensor, kappa: f32) -> Result<Tensor> {
+    let (mean, variance) = mean_and_variance(values)?;
+    mean - (variance.sqrt()? * f64::from(kappa))?
 }
 
 /// A loss `[]`, and the scalars `[]` that are measured with it.

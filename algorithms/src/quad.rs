@@ -17,7 +17,7 @@ use config::{Config, Guidance, TargetReduce};
 use guidance::{Averages, Guide};
 use metrics::METRICS;
 use noise::Noise;
-use quad_nn::{Reverse, mean_and_variance, pulled_error, squared_error};
+use quad_nn::{Reverse, pulled_error, squared_error};
 use quad_policy::{DiffusionPolicy, DiffusionShape};
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -66,9 +66,7 @@ impl Quad {
             TargetReduce::Mean => q.mean(2)?,
             TargetReduce::Max => largest(&q, 2)?,
         };
-        let (mean, variance) = mean_and_variance(&value)?;
-        let bound = (mean - (variance.sqrt()? * f64::from(*self.config.rho))?)?;
-        batch.target(*self.config.gamma, &bound)
+        batch.target(*self.config.gamma, &lower_bound(&value, *self.config.rho)?)
     }
 
     /// Every critic toward the lower confidence bound (Eq. 20).

@@ -116,6 +116,7 @@ fn actions_take_no_more_memory_than_the_policy_says() {
     let best_of = Choice::best_of;
     let mut nearest = best_of(1000);
     nearest.rule = Rule::Nearest;
+    let guided = |candidates| Choice { guidance: 1.0, ..best_of(candidates) };
     let halfcheetah = Some([4, 32]);
     let cases = [
         ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
@@ -123,6 +124,8 @@ fn actions_take_no_more_memory_than_the_policy_says() {
         ("many steps", diffusion(4, 1, 1000, best_of(8)), 256),
         ("many candidates", diffusion(8, 2, 5, best_of(1000)), 64),
         ("a value function", diffusion(8, 2, 5, nearest), 256),
+        ("with guidance", diffusion(64, 10, 2, guided(10)), 64),
+        ("many candidates with guidance", diffusion(8, 2, 2, guided(1000)), 64),
         ("a Gaussian", gaussian(256), 256),
         ("a squashed Gaussian", squashed(4, false), 64),
         ("critics with a norm", squashed(64, true), 10),

@@ -39,6 +39,7 @@ mod weighted;
 mod weights;
 
 pub use adam::{Adam, AdamStep, cosine_decay};
+pub use diffusion::denoised::Denoised;
 pub use diffusion::edm::{Denoiser, DenoiserShape, NoiseLevels};
 pub use diffusion::noise_predictor::NoisePredictor;
 pub use diffusion::schedule::{Reverse, Schedule};

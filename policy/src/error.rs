@@ -29,6 +29,10 @@ pub enum PolicyError {
     Scaling { what: &'static str, columns: usize },
     #[error("the softmax's temperature is {0}, but must be above 0")]
     Temperature(f32),
+    #[error("the strength of guidance is {0}, but must be a number of at least 0")]
+    Guidance(f32),
+    #[error("guidance takes a diffusion policy with critics, which this is not")]
+    NoGuidance,
     #[error("this policy draws no candidates, so there is nothing to choose among")]
     NoCandidates,
     #[error("this policy has no critics, which would value a single action")]
@@ -52,10 +56,10 @@ impl PolicyError {
             Self::Network(error) => error.hint(),
             Self::Version { .. } => "read it with that version, or train again",
             Self::NotANumber(_) => "its training has diverged: take an earlier snapshot",
-            Self::NoCandidates | Self::NoCritics | Self::NoValue => {
-                "score it without --candidates, --rule and --aggregate"
+            Self::NoCandidates | Self::NoCritics | Self::NoValue | Self::NoGuidance => {
+                "score it without --candidates, --rule, --aggregate and --guidance"
             }
-            Self::Range { .. } | Self::Temperature(_) => {
+            Self::Range { .. } | Self::Temperature(_) | Self::Guidance(_) => {
                 "give a smaller number above 0; a file with such a number is damaged"
             }
             _ => {

@@ -58,9 +58,11 @@ fn golden_choices() -> Result<()> {
         let network = |(name, tensor): (&String, &Tensor)| {
             Some((name.strip_prefix("target_")?.to_owned(), tensor.clone()))
         };
-        let mut tensors = golden.state.iter().filter_map(network).collect();
-        let policy = DiffusionPolicy::load(&shape(&golden), choice, &mut tensors, Precision::F32);
-        let policy = policy.unwrap();
+        let load = |choice| {
+            let mut tensors = golden.state.iter().filter_map(network).collect();
+            DiffusionPolicy::load(&shape(&golden), choice, &mut tensors, Precision::F32).unwrap()
+        };
+        let policy = load(choice);
         let numbers = |name: &str| golden.input(name, &Device::Cpu).flatten_all()?.to_vec1::<f32>();
         let observations = numbers("select_observations")?;
         let (drawn, values) = policy.draw(&observations, numbers("select_noise")?).unwrap();
@@ -73,6 +75,12 @@ fn golden_choices() -> Result<()> {
         golden.close("select.actions", &Tensor::new(actions, &Device::Cpu)?);
         let index: Vec<i64> = golden.expected["select.index"].to_vec1()?;
         assert_eq!(chosen.iter().map(|chosen| *chosen as i64).collect::<Vec<_>>(), index);
+        if golden.inputs.contains_key("select_guidance") {
+            let guidance = numbers("select_guidance")?[0];
+            let guided = load(Choice { guidance, ..choice });
+            let (drawn, _) = guided.draw(&observations, numbers("select_noise")?).unwrap();
+            golden.close("select.guided", &Tensor::new(drawn, &Device::Cpu)?);
+        }
     }
     Ok(())
 }

@@ -74,7 +74,9 @@ impl PyPolicy {
     ///     keys are ignored.
     /// candidates: the number of actions drawn in each state. rule: the choice among them, "best",
     ///     "softmax:TEMPERATURE", "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest".
-    ///     aggregate: the "mean" or "min" of the critics. None: the file's `choice`.
+    ///     aggregate: the "mean" or "min" of the critics, or "mean-minus-std:KAPPA". guidance: the
+    ///     strength at which their gradients guide a diffusion policy, per unit of their values; 0 for
+    ///     none. None: the file's `choice`.
     /// seed: an int: row i draws from seed + i, as an evaluator does in the first step of the episode
     ///     of that seed. A sequence of n ints: a seed for each row. None: fresh random numbers.
     ///
@@ -82,7 +84,8 @@ impl PyPolicy {
     ///
     /// Raises ValueError for another shape, NaN or infinite numbers, or a choice that this policy
     /// cannot make; RuntimeError if its networks give no number.
-    #[pyo3(signature = (observations, *, candidates = None, rule = None, aggregate = None, seed = None))]
+    #[pyo3(signature = (observations, *, candidates = None, rule = None, aggregate = None, guidance = None, seed = None))]
+    #[expect(clippy::too_many_arguments, reason = "they are Python's")]
     fn act<'py>(
         &self,
         py: Python<'py>,
@@ -90,16 +93,18 @@ impl PyPolicy {
         candidates: Option<i64>,
         rule: Option<String>,
         aggregate: Option<String>,
+        guidance: Option<f32>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Array<'py>> {
         let rows = self.rows(&observations)?;
-        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate })?;
+        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate, guidance })?;
         let mut states = begin(&*policy, &seeds(seed, rows.count)?);
         act(py, &*policy, &rows, &mut states)
     }
 
     /// `act`, by the name that d3rlpy has for it.
-    #[pyo3(signature = (observations, *, candidates = None, rule = None, aggregate = None, seed = None))]
+    #[pyo3(signature = (observations, *, candidates = None, rule = None, aggregate = None, guidance = None, seed = None))]
+    #[expect(clippy::too_many_arguments, reason = "they are Python's")]
     fn predict<'py>(
         &self,
         py: Python<'py>,
@@ -107,26 +112,28 @@ impl PyPolicy {
         candidates: Option<i64>,
         rule: Option<String>,
         aggregate: Option<String>,
+        guidance: Option<f32>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Array<'py>> {
-        self.act(py, observations, candidates, rule, aggregate, seed)
+        self.act(py, observations, candidates, rule, aggregate, guidance, seed)
     }
 
     /// Draws candidates of `act`: (actions [n, candidates, action_size], values [n, candidates]),
     /// float32; for one state, without the first axis. With the same seed, `act` chooses among these.
     /// Raises as `act`, and ValueError if the policy has no critics.
-    #[pyo3(signature = (observations, *, candidates = None, aggregate = None, seed = None))]
+    #[pyo3(signature = (observations, *, candidates = None, aggregate = None, guidance = None, seed = None))]
     fn sample<'py>(
         &self,
         py: Python<'py>,
         observations: ArrayLike<'py>,
         candidates: Option<i64>,
         aggregate: Option<String>,
+        guidance: Option<f32>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<(Array<'py>, Array<'py>)> {
         let rows = self.rows(&observations)?;
-        let policy =
-            choosing(&self.policy, Changes { candidates, aggregate, ..Changes::default() })?;
+        let changes = Changes { candidates, aggregate, guidance, rule: None };
+        let policy = choosing(&self.policy, changes)?;
         let mut states = begin(&*policy, &seeds(seed, rows.count)?);
         let (actions, values) = compute(py, || {
             let (mut actions, mut values) = (Vec::new(), Vec::new());
@@ -146,8 +153,7 @@ impl PyPolicy {
     /// observation_size], actions [n, action_size] -> [n], float32. For one state and action, an array
     /// without axes.
     ///
-    /// aggregate: the "mean" or "min" of the critics. Raises as `act`, and ValueError if the policy has no
-    /// critics.
+    /// aggregate: as in `act`. Raises as `act`, and ValueError if the policy has no critics.
     #[pyo3(signature = (observations, actions, *, aggregate = None))]
     fn value<'py>(
         &self,
@@ -175,7 +181,8 @@ impl PyPolicy {
     /// `export_onnx`: a dictionary of "noise", standard normal numbers [n, ...], and "uniform", numbers
     /// within [0, 1), [n, draws], float32, without those that the policy does not draw. Raises as
     /// `act`.
-    #[pyo3(signature = (n, *, candidates = None, rule = None, aggregate = None, seed = None))]
+    #[pyo3(signature = (n, *, candidates = None, rule = None, aggregate = None, guidance = None, seed = None))]
+    #[expect(clippy::too_many_arguments, reason = "they are Python's")]
     fn noise<'py>(
         &self,
         py: Python<'py>,
@@ -183,9 +190,10 @@ impl PyPolicy {
         candidates: Option<i64>,
         rule: Option<String>,
         aggregate: Option<String>,
+        guidance: Option<f32>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Bound<'py, PyDict>> {
-        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate })?;
+        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate, guidance })?;
         noise(py, &*policy, &mut begin(&*policy, &seeds(seed, n)?))
     }
 
@@ -194,15 +202,16 @@ impl PyPolicy {
     ///
     ///     episodes = policy.begin([0, 1, 2])
     ///     actions = episodes.act(observations)  # [3, observation_size] -> [3, action_size]
-    #[pyo3(signature = (seeds, *, candidates = None, rule = None, aggregate = None))]
+    #[pyo3(signature = (seeds, *, candidates = None, rule = None, aggregate = None, guidance = None))]
     fn begin(
         &self,
         seeds: &Bound<'_, PyAny>,
         candidates: Option<i64>,
         rule: Option<String>,
         aggregate: Option<String>,
+        guidance: Option<f32>,
     ) -> PyResult<Episodes> {
-        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate })?;
+        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate, guidance })?;
         let seeds = match seeds.extract::<u64>() {
             Ok(seed) => vec![seed],
             Err(_) => seeds.extract().map_err(|_| not_seeds("a sequence of them"))?,
@@ -275,8 +284,8 @@ impl PyPolicy {
         self.policy.precision().name()
     }
 
-    /// The choice among candidates: a dictionary of `act`'s arguments candidates, rule and aggregate; None
-    /// if the policy draws nothing.
+    /// The choice among candidates: a dictionary of `act`'s arguments candidates, rule, aggregate and
+    /// guidance; None if the policy draws nothing.
     #[getter]
     fn choice<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
         self.policy.choice().map(|choice| as_dictionary(py, choice)).transpose()

@@ -110,7 +110,8 @@ class Reference:
     def values(self, observations, actions, reduce=None):
         """Scales observations to the network's units."""
         q = self.mlp("critic.", self.shape["critic"], np.concatenate([observations, actions], -1))[..., 0]
-        return q.mean(0) if (reduce or self.choice["aggregate"]) == "mean" else q.min(0)
+        name, *kappa = (reduce or self.choice["aggregate"]).split(":")
+        return q.min(0) if name == "min" else q.mean(0) - float(kappa[0]) * q.std(0) if kappa else q.mean(0)
 
     def to_network(self, name, x):
         scale = self.maps[name]["scale"]

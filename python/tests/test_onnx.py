@@ -14,6 +14,7 @@ import quad_rl
 from quad_rl import Policy, export_onnx
 from quad_rl.onnx.choosing import choose
 from quad_rl.onnx.graph import Graph
+from quad_rl.onnx.mlp import activate, slope
 
 PRESETS = Path(__file__).parents[2] / "presets"
 ALGORITHMS = sorted(preset.stem for preset in PRESETS.glob("*.toml") if preset.stem != "tasks")
@@ -51,7 +52,7 @@ def compare(policy, path, **choice):
         assert {given.name for given in session.get_inputs()} == set(inputs)
         found = dict(zip((out.name for out in session.get_outputs()), session.run(None, inputs)))
         if policy.choice:
-            asked = {name: choice[name] for name in ("candidates", "aggregate") if name in choice}
+            asked = {name: choice[name] for name in ("candidates", "aggregate", "guidance") if name in choice}
             close(found["values"], policy.sample(states, seed=seed, **asked)[1], by)
         episodes = policy.begin(range(seed, seed + len(states)), **choice)
         close(found["actions"], episodes.act(states), by)
@@ -72,8 +73,23 @@ def test_networks_units_and_processes_of_all_kinds(snapshots, name, tmp_path):
 @pytest.mark.parametrize("rule", RULES)
 def test_every_choice(snapshots, rule, tmp_path):
     policy = Policy.load(snapshots["align-iql"])
-    for candidates, aggregate in [(1, "mean"), (6, "min"), (30, "mean")]:
+    for candidates, aggregate in [(1, "mean"), (6, "min"), (30, "mean-minus-std:0.5")]:
         compare(policy, tmp_path / "policy.onnx", candidates=candidates, rule=rule, aggregate=aggregate)
+
+
+@pytest.mark.parametrize("name", ["quad", "norm", "align-iql", "dql"])
+def test_models_are_guided_like_the_policy(snapshots, name, tmp_path):
+    compare(Policy.load(snapshots[name]), tmp_path / "policy.onnx", candidates=4, guidance=3.0)
+
+
+@pytest.mark.parametrize("name", ["mish", "relu", "silu", "tanh", "gelu"])
+def test_slopes_of_activations(name):
+    graph, x = Graph(), np.linspace(-9, 9, 400, dtype=np.float32)[:, None]
+    given = graph.input("x", (1,))
+    outputs = {"y": (activate(name, given), (1,)), "slope": (slope(name, given), (1,))}
+    session = onnxruntime.InferenceSession(graph.model(outputs, "").SerializeToString(), providers=["CPUExecutionProvider"])
+    above, below = (session.run(["y"], {"x": x + step})[0] for step in (1e-2, -1e-2))
+    np.testing.assert_allclose(session.run(["slope"], {"x": x})[0], (above - below) / 2e-2, atol=3e-4)
 
 
 BELOW_ONE = np.nextafter(np.float32(1), np.float32(0))

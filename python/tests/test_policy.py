@@ -54,7 +54,7 @@ def test_a_call_may_change_the_choice(snapshots):
     policy, reference = Policy.load(snapshots["align-iql"]), Reference(snapshots["align-iql"])
     state = observations(1)[0]
     for rule, of_file in [("best", "best"), ("nearest", "nearest"), ("softmax:0.05", {"softmax": {"temperature": 0.05}})]:
-        for aggregate in ("min", "mean"):
+        for aggregate in ("min", "mean", "mean-minus-std:0.5"):
             expected, _, _ = reference.act(state, Random(7, POLICY_STREAM), candidates=9, rule=of_file, aggregate=aggregate)
             close(policy.act(state, candidates=9, rule=rule, aggregate=aggregate, seed=7), expected)
     assert np.array_equal(policy.act(state, seed=7), policy.act(state, **policy.choice, seed=7))
@@ -167,7 +167,9 @@ def test_refuses_invalid_arguments(snapshots, tmp_path):
         'rule is "worst", not one of best': lambda: policy.act(states, rule="worst"),
         "temperature is -1": lambda: policy.act(states, rule="softmax:-1"),
         "`nearest` takes a value function": lambda: policy.act(states, rule="nearest"),
-        'aggregate is "max", not mean or min': lambda: policy.act(states, aggregate="max"),
+        'aggregate is "max", not one of mean, min and mean-minus-std:KAPPA': lambda: policy.act(states, aggregate="max"),
+        "guidance is -1": lambda: policy.act(states, guidance=-1),
+        "guidance takes a diffusion policy": lambda: Policy.load(snapshots["dtql"]).act(states, guidance=1),
         "no critics": lambda: Policy.load(snapshots["iql"]).value(states, np.zeros((3, ACTION))),
         "no candidates": lambda: Policy.load(snapshots["iql"]).act(states, candidates=2),
         "2 rows of observations for 3 episodes": lambda: episodes.act(states[:2]),

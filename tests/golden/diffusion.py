@@ -34,12 +34,21 @@ def schedule(steps):
     return beta, np.cumprod(1 - beta)
 
 
-def denoise(actor, states, noisy_actions, t, steps, activation):
-    """x0 and the mean of one reverse step at the whole number t, without its noise."""
+def clean(noisy_actions, epsilon, alpha_bar):
+    """x0 by the predicted noise, clipped."""
+    return np.clip((noisy_actions - np.sqrt(1 - alpha_bar) * epsilon) / np.sqrt(alpha_bar), -1, 1)
+
+
+def denoise(actor, states, noisy_actions, t, steps, activation, pull=None):
+    """x0 and the mean of one reverse step at the whole number t, without its noise. A pull, of states and x0, is added to
+    the score.
+    """
     beta, alpha_bar = schedule(steps)
     epsilon = fast_noise(actor, states, noisy_actions, np.full(states.shape[:-1], t), activation)
-    x0 = (noisy_actions - math.sqrt(1 - alpha_bar[t]) * epsilon) / math.sqrt(alpha_bar[t])
-    x0 = np.clip(x0, -1, 1)
+    x0 = clean(noisy_actions, epsilon, alpha_bar[t])
+    if pull:
+        score = -epsilon / math.sqrt(1 - alpha_bar[t]) + pull(states, x0)
+        x0 = clean(noisy_actions, -score * math.sqrt(1 - alpha_bar[t]), alpha_bar[t])
     of_x0 = math.sqrt(alpha_bar[t - 1]) * beta[t]
     of_noisy = math.sqrt(1 - beta[t]) * (1 - alpha_bar[t - 1])
     return x0, (of_x0 * x0 + of_noisy * noisy_actions) / (1 - alpha_bar[t])
@@ -50,14 +59,14 @@ def repeated(states, noise):
     return np.broadcast_to(states[:, None], noise.shape[1:-1] + states.shape[-1:])
 
 
-def sample(actor, states, noise, activation):
+def sample(actor, states, noise, activation, pull=None):
     """Actions for states [n, o] with noise [T, n, samples, a]; also the states, once for each action."""
     steps = len(noise)
     beta, _ = schedule(steps)
     states = repeated(states, noise)
     actions = noise[0]
     for t in range(steps, 0, -1):
-        _, actions = denoise(actor, states, actions, t, steps, activation)
+        _, actions = denoise(actor, states, actions, t, steps, activation, pull)
         if t > 1:
             actions = actions + math.sqrt(beta[t]) * noise[steps - t + 1]
     return actions, states

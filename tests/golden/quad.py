@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import guidance
-from diffusion import denoise, fast_noise, predict_noise, random_predictor, sample, schedule
+from diffusion import clean, denoise, fast_noise, predict_noise, random_predictor, sample, schedule
 from networks import (
     adam_step,
     clip_by_norm,
@@ -70,6 +70,8 @@ FOLDERS = {
     "mean": (25, "small"),
     "shuffled": (26, "small"),
     "quad-online": (63, "small"),
+    "denoised": (64, "small"),
+    "denoised-dac": (65, "small"),
 }
 VARIANTS = {
     "quad": Variant(1235, {}),
@@ -86,6 +88,8 @@ VARIANTS = {
     "mean": Variant(1237, {"guidance": "mean", "diffusion_steps": 7}),
     "shuffled": Variant(1238, {"guidance": "shuffled", "diffusion_steps": 3}),
     "quad-online": Variant(2300, {}),
+    "denoised": Variant(1239, {"guidance_at": "denoised"}),
+    "denoised-dac": Variant(1240, {"guidance": "dac", "guidance_at": "denoised"}),
 }
 
 
@@ -150,10 +154,13 @@ def guide(config, state, inputs, noisy, target_critic):
         nothing = {"nu_squared": state["nu_squared"], "lambda_mean": 0.0, "delta_share": 0.0}
         return np.zeros(len(s)), np.zeros_like(a), nothing, np.zeros(len(s))
     activation = agent["critic"]["activation"]
-    gradients = action_gradients(target_critic, s, noisy, activation)
+    predicted = fast_noise(state["actor"], s, noisy, inputs["t"], agent["actor"]["activation"])
+    at = noisy
+    if agent.get("guidance_at") == "denoised":  # QGF, with the identity as x0's Jacobian
+        at = clean(noisy, predicted, schedule(agent["diffusion_steps"])[1][inputs["t"], None])
+    gradients = action_gradients(target_critic, s, at, activation)
     q_scale = np.abs(fast_values(target_critic, s, a, activation)).mean() + 1e-6
     g = gradients / q_scale
-    predicted = fast_noise(state["actor"], s, noisy, inputs["t"], agent["actor"]["activation"])
     u = predicted / (np.linalg.norm(predicted, axis=-1, keepdims=True) + 1e-8)
     alignment = (u * g).sum(-1)  # [K, B]
     sigma_squared = alignment.var(0)
@@ -224,7 +231,14 @@ def act(config, state, inputs):
         denoise(actor, inputs["observations"], inputs["denoise_actions"][t - 1], t, steps, actors)
         for t in range(1, steps + 1)
     ]
-    return {
+    out = {}
+    if "select_guidance" in inputs:
+
+        def pull(states, x0):
+            return inputs["select_guidance"] * action_gradients(state["target_critic"], states, x0, critics).mean(0)
+
+        out["select.guided"] = sample(actor, inputs["select_observations"], noise, actors, pull)[0]
+    return out | {
         "denoise.x0": np.stack([x0 for x0, _ in reverse]),
         "denoise.mean": np.stack([mean for _, mean in reverse]),
         "select.q": q,
@@ -261,6 +275,8 @@ def random_inputs(config, rng, size, state):
         "select_observations": single(rng.normal(size=(n, o))),
     }
     inputs |= guidance.random_inputs(agent, inputs["t"], rng)
+    if "guidance_at" in agent:
+        inputs["select_guidance"] = single([0.7])
     # A choice between candidates of nearly equal value would depend on rounding: draw such states' noise again.
     noise = np.zeros((steps, n, agent["candidates"], a))
     close = np.full(n, True)

@@ -26,6 +26,17 @@ pub(super) enum Guidance {
     Shuffled,
 }
 
+/// The action at which the critics' gradients are taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum GuidanceAt {
+    /// The noisy action a^t (Eq. 8, 19).
+    #[default]
+    Noisy,
+    /// Its denoised estimate â_0, whose Jacobian is taken as the identity (QGF).
+    Denoised,
+}
+
 /// Reduction of a critic's values of several sampled next actions: the maximum in AntMaze.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -60,6 +71,8 @@ pub(super) struct Config {
     /// Pessimism ρ of the lower confidence bound (Eq. 20).
     pub rho: NotNegative,
     pub guidance: Guidance,
+    #[serde(default)]
+    pub guidance_at: GuidanceAt,
     /// Temperature τ of the uncertainty weight (Eq. 24); `inf` gives λ = ν̂²/(ν̂² + δ).
     pub tau: f32,
     /// Stabilizer δ of Eq. 24, on the scale of squared normalized Q-gradients.

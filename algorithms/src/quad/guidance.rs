@@ -1,7 +1,7 @@
-//! The critics' gradients at noisy actions, and their weight: λ of Eq. 24, or a control in its
-//! place.
+//! The critics' gradients at noisy actions, or at what these denoise to, and their weight: λ of
+//! Eq. 24, or a control in its place.
 
-use super::config::{Config, Guidance};
+use super::config::{Config, Guidance, GuidanceAt};
 use super::noise::Noise;
 use crate::context::Minibatch;
 use crate::state_dict::{StateDict, write};
@@ -18,7 +18,7 @@ fn lambda(nu_squared: &Tensor, sigma_squared: &Tensor, config: &Config) -> Resul
 /// Guidance at noisy actions; constants.
 pub(super) struct Guide {
     /// ḡ: the mean over critics of ∇_a Q̂_k(s, a^t), over the mean of |Q̂_k(s, a)| (Eq. 10), `[B,
-    /// a]`.
+    /// a]`; with `guidance_at` `denoised` of ∇_a Q̂_k(s, â_0).
     pub gradient: Tensor,
     /// σ² (Eq. 22), `[B]`.
     pub sigma_squared: Tensor,
@@ -70,7 +70,11 @@ impl Averages {
         (noisy, predicted): (&Tensor, &Tensor),
     ) -> Result<Guide> {
         let values = batch.values(critics)?;
-        let gradients = critics.action_gradients(&batch.observations, noisy)?;
+        let at = match config.guidance_at {
+            GuidanceAt::Noisy => noisy.clone(),
+            GuidanceAt::Denoised => noise.denoising.clean(noisy, predicted)?,
+        };
+        let gradients = critics.action_gradients(&batch.observations, &at)?;
         #[cfg(feature = "cuda")]
         if config.guidance == Guidance::Quad && noisy.device().is_cuda() {
             return self.guide_on_gpu(config, [&values, &gradients, predicted]);

@@ -173,7 +173,7 @@ impl NoisePredictor {
         Ok(actions)
     }
 
-    fn check_noise(&self, observations: &Tensor, noise: &Tensor) -> Result<()> {
+    pub(super) fn check_noise(&self, observations: &Tensor, noise: &Tensor) -> Result<()> {
         let shape = &self.architecture.shape;
         let ((states, o), (steps, rows, a)) = (observations.dims2()?, noise.dims3()?);
         let is_whole = states > 0 && rows > 0 && rows.is_multiple_of(states);

@@ -86,6 +86,11 @@ impl Schedule {
         self.steps[t - 1].noise.powi(2)
     }
 
+    /// √(1 − ᾱ_t).
+    pub fn deviation(&self, t: usize) -> f32 {
+        self.steps[t - 1].deviation
+    }
+
     /// x_t → x_{t−1}, given the predicted x_0: the posterior's mean, plus noise `z` for t > 1. All of
     /// one shape.
     pub fn reverse_to_clean(

@@ -49,6 +49,7 @@ impl DiffuserPolicy {
         choice.check()?;
         match choice.rule {
             Rule::Nearest => Err(PolicyError::NoValue),
+            _ if choice.guidance != 0.0 => Err(PolicyError::NoGuidance),
             _ => Ok(Self { choice, planner }),
         }
     }

@@ -129,6 +129,10 @@ impl Actor for NoisePredictor {
         self.sample(observations, noise)
     }
 
+    fn noise_predictor(&self) -> Option<&NoisePredictor> {
+        Some(self)
+    }
+
     fn floats(&self, _: u128, candidates: u128) -> u128 {
         tile_floats(candidates, &self.shape().layers)
     }

@@ -65,6 +65,7 @@ mod tests {
         candidates: 3000,
         aggregate: Aggregate::Min,
         rule: Rule::Softmax { temperature: f32::MIN_POSITIVE },
+        guidance: 0.0,
     };
 
     /// A policy with the mean (s/2, −1) and log σ (−1, 10·s), whose critics' values are a_0.
@@ -129,6 +130,8 @@ mod tests {
         assert_eq!(act(&*of_one, &[0.0], &[5]).unwrap(), drawn.actions);
         let nearest = policy.with_choice(Choice::new(2, Aggregate::Min, Rule::Nearest));
         assert!(matches!(nearest, Err(PolicyError::NoValue)));
+        let guided = policy.with_choice(Choice { guidance: 1.0, ..CHOICE });
+        assert!(matches!(guided, Err(PolicyError::NoGuidance)));
         assert!(act(&*policy, &[f32::NAN], &[5]).is_err());
     }
 }

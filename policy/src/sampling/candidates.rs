@@ -5,7 +5,7 @@ use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Choice, Rule};
 use crate::sampling::episode::EpisodeState;
 use candle_core::{Device, Tensor};
-use quad_nn::{Ensemble, Precision, bytes, read};
+use quad_nn::{Ensemble, NoisePredictor, Precision, bytes, read};
 use std::sync::Arc;
 
 /// Networks that draw candidates.
@@ -21,6 +21,11 @@ pub(crate) trait Actor: Send + Sync {
     /// Draws actions `[rows, a]` for `observations`, `[n, o]`, from standard normal `noise`,
     /// `[noise vectors, rows, a]`. The first rows/n rows belong to the first observation, and so on.
     fn draw(&self, observations: &Tensor, noise: &Tensor) -> candle_core::Result<Tensor>;
+
+    /// The noise predictor, if critics can guide it.
+    fn noise_predictor(&self) -> Option<&NoisePredictor> {
+        None
+    }
 
     /// Numbers held while drawing this many candidates in each state, beside noise and candidates.
     fn floats(&self, states: u128, candidates: u128) -> u128;
@@ -48,7 +53,15 @@ impl CandidatePolicy {
         if choice.rule == Rule::Nearest && networks.value.is_none() {
             return Err(PolicyError::NoValue);
         }
+        if choice.guidance != 0.0 && networks.actor.noise_predictor().is_none() {
+            return Err(PolicyError::NoGuidance);
+        }
         Ok(Self { choice, networks })
+    }
+
+    /// The noise predictor, if the choice guides it.
+    fn guided(&self) -> Option<&NoisePredictor> {
+        self.networks.actor.noise_predictor().filter(|_| self.choice.guidance != 0.0)
     }
 
     /// Draws the noise of all candidates, `noise vectors × states × candidates × action_dim`.
@@ -72,7 +85,13 @@ impl CandidatePolicy {
         let observations =
             Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
         let noise = Tensor::from_vec(noise, ((), rows, action_dim), &Device::Cpu)?;
-        let drawn = self.networks.actor.draw(&observations, &noise)?;
+        let Networks { actor, critics, .. } = &*self.networks;
+        let drawn = match self.guided() {
+            Some(actor) => {
+                actor.sample_guided(&observations, &noise, critics, self.choice.guidance)?
+            }
+            None => actor.draw(&observations, &noise)?,
+        };
         Ok((observations, drawn))
     }
 
@@ -146,7 +165,9 @@ impl Policy for CandidatePolicy {
         let drawn = states * candidates * (action_dim * (noises + 3) + 1) as u128;
         let sampling = drawn + states * observation_dim as u128 + actor.floats(states, candidates);
         let of_states = value.as_ref().map_or(0, |value| value.shape().floats(states, 1));
-        bytes(sampling + critics.shape().floats(states, candidates) + of_states)
+        let of_critics = critics.shape().floats(states, candidates);
+        let of_guided = |actor: &NoisePredictor| actor.guided_floats(states * candidates, critics);
+        bytes(sampling + of_critics + of_states + self.guided().map_or(0, of_guided))
     }
 
     fn noise(&self) -> Vec<usize> {

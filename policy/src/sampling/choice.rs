@@ -2,13 +2,12 @@
 
 use crate::error::{PolicyError, Result, check_range};
 use crate::sampling::episode::EpisodeState;
-use serde::de::{self, IntoDeserializer};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// The number of candidates, and the choice among them. A policy's file has one; users can ask for
-/// another.
+/// The number of candidates, the choice among them, and guidance as they are drawn. A policy's file
+/// has one; users can ask for another.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Choice {
@@ -20,15 +19,25 @@ pub struct Choice {
     pub aggregate: Aggregate,
     /// Rule of the choice.
     pub rule: Rule,
+    /// Strength of the critics' guidance as a diffusion policy draws candidates, 1/β of QGF, per unit
+    /// of value; 0 for none ([`NoisePredictor::sample_guided`](quad_nn::NoisePredictor::sample_guided)).
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub guidance: f32,
+}
+
+fn is_zero(strength: &f32) -> bool {
+    *strength == 0.0
 }
 
 /// Aggregate of the values of an ensemble of critics.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
 #[allow(missing_docs)]
 pub enum Aggregate {
     Mean,
     Min,
+    /// Mean − κ·√variance, a lower confidence bound. The variance is divided by the number of critics.
+    MeanMinusStd(f32),
 }
 
 /// Rule of the choice among candidates.
@@ -69,14 +78,17 @@ impl Choice {
 
     /// A choice of these values, which [`Self::check`] checks.
     pub fn new(candidates: u32, aggregate: Aggregate, rule: Rule) -> Self {
-        Self { candidates, aggregate, rule }
+        Self { candidates, aggregate, rule, guidance: 0.0 }
     }
 
-    /// Checks the numbers of candidates and the temperature.
+    /// Checks the numbers of candidates, the temperature and the strength of guidance.
     pub fn check(&self) -> Result<()> {
         check_range("candidates", self.candidates as usize, Self::MOST_CANDIDATES as usize)?;
         if let Rule::Average { actions, .. } = self.rule {
             check_range("actions", actions as usize, Self::MOST_CANDIDATES as usize)?;
+        }
+        if !(self.guidance >= 0.0 && self.guidance.is_finite()) {
+            return Err(PolicyError::Guidance(self.guidance));
         }
         match self.rule {
             Rule::Softmax { temperature } | Rule::Average { temperature, .. }
@@ -137,6 +149,11 @@ impl Aggregate {
             match self {
                 Self::Mean => values.map(|q| q / critics).sum(),
                 Self::Min => values.fold(f32::INFINITY, min),
+                Self::MeanMinusStd(kappa) => {
+                    let mean = values.clone().map(|q| q / critics).sum::<f32>();
+                    let variance = values.map(|q| (q - mean).powi(2) / critics).sum::<f32>();
+                    mean - kappa * variance.sqrt()
+                }
             }
         };
         (0..rows).map(of_action).collect()
@@ -188,10 +205,45 @@ fn draw_several(
 }
 
 impl FromStr for Aggregate {
-    type Err = de::value::Error;
+    type Err = &'static str;
 
-    fn from_str(name: &str) -> Result<Self, Self::Err> {
-        Self::deserialize(name.into_deserializer())
+    /// Parses the form of [`Display`](fmt::Display).
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let expected = "one of mean, min and mean-minus-std:KAPPA";
+        match text.split_once(':') {
+            None if text == "mean" => Ok(Self::Mean),
+            None if text == "min" => Ok(Self::Min),
+            Some(("mean-minus-std", kappa)) => match kappa.parse() {
+                Ok(kappa) if (0.0..=f32::MAX).contains(&kappa) => Ok(Self::MeanMinusStd(kappa)),
+                _ => Err("mean-minus-std:KAPPA with a number KAPPA of at least 0"),
+            },
+            _ => Err(expected),
+        }
+    }
+}
+
+impl TryFrom<String> for Aggregate {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse().map_err(|expected| format!("{text:?} is not {expected}"))
+    }
+}
+
+impl From<Aggregate> for String {
+    fn from(aggregate: Aggregate) -> Self {
+        aggregate.to_string()
+    }
+}
+
+/// `mean`, `min` or `mean-minus-std:1`.
+impl fmt::Display for Aggregate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Mean => f.write_str("mean"),
+            Self::Min => f.write_str("min"),
+            Self::MeanMinusStd(kappa) => write!(f, "mean-minus-std:{kappa}"),
+        }
     }
 }
 
@@ -227,18 +279,21 @@ impl fmt::Display for Rule {
     }
 }
 
-/// `10 candidates`, then rule and aggregate where they are not the best by the mean.
+/// `10 candidates`, then rule and aggregate where they are not the best by the mean, and guidance.
 impl fmt::Display for Choice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { candidates, aggregate, rule } = self;
-        if *candidates == 1 {
-            return f.write_str("1 candidate");
-        }
-        write!(f, "{candidates} candidates")?;
-        if *rule != Rule::Best {
+        let Self { candidates, aggregate, rule, guidance } = self;
+        write!(f, "{candidates} candidate{}", if *candidates == 1 { "" } else { "s" })?;
+        if *candidates > 1 && *rule != Rule::Best {
             write!(f, ", {rule}")?;
         }
-        f.write_str(if *aggregate == Aggregate::Min { ", min" } else { "" })
+        if *candidates > 1 && *aggregate != Aggregate::Mean {
+            write!(f, ", {aggregate}")?;
+        }
+        match *guidance {
+            0.0 => Ok(()),
+            strength => write!(f, ", guidance {strength}"),
+        }
     }
 }
 

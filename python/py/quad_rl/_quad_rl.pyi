@@ -18,6 +18,7 @@ class Policy:
         candidates: int | None = None,
         rule: str | None = None,
         aggregate: str | None = None,
+        guidance: float | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> NDArray[np.float32]: ...
     def predict(
@@ -27,6 +28,7 @@ class Policy:
         candidates: int | None = None,
         rule: str | None = None,
         aggregate: str | None = None,
+        guidance: float | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> NDArray[np.float32]: ...
     def sample(
@@ -35,6 +37,7 @@ class Policy:
         *,
         candidates: int | None = None,
         aggregate: str | None = None,
+        guidance: float | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
     def value(
@@ -47,6 +50,7 @@ class Policy:
         candidates: int | None = None,
         rule: str | None = None,
         aggregate: str | None = None,
+        guidance: float | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> dict[str, NDArray[np.float32]]: ...
     def begin(
@@ -56,6 +60,7 @@ class Policy:
         candidates: int | None = None,
         rule: str | None = None,
         aggregate: str | None = None,
+        guidance: float | None = None,
     ) -> Episodes: ...
     def to_bytes(self) -> bytes: ...
     @property

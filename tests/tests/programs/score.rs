@@ -93,13 +93,17 @@ fn candidates_rules_and_values_are_chosen_at_scoring() {
     learner.process.assert_succeeds(PATIENCE);
     let snapshot = learner.snapshot(SETTING.steps);
     let flags = "--candidates 1,3 --rule softmax:0.5 --aggregate min";
-    let [softmax, best] =
-        [flags, ""].map(|flags| score(&[&snapshot], &format!("--episodes 2 {flags}")));
+    let guided = "--aggregate mean-minus-std:1 --guidance 0.5";
+    let [softmax, best, guided] =
+        [flags, "", guided].map(|flags| score(&[&snapshot], &format!("--episodes 2 {flags}")));
     let rule = json!({ "softmax": { "temperature": 0.5 } });
     for (scored, candidates) in softmax.iter().zip([1, 3]) {
         let choice = json!({ "candidates": candidates, "aggregate": "min", "rule": rule });
         assert_eq!(scored["choice"], choice);
     }
-    let all = [&softmax[0], &softmax[1], &best[0]].map(episodes);
-    assert!(all[0] != all[1] && all[1] != all[2], "each chooses in its own way: {all:?}");
+    let choice = json!({ "candidates": SETTING.candidates, "aggregate": "mean-minus-std:1", "rule": "best", "guidance": 0.5 });
+    assert_eq!(guided[0]["choice"], choice);
+    let all = [&softmax[0], &softmax[1], &best[0], &guided[0]].map(episodes);
+    let own_way = all.windows(2).all(|two| two[0] != two[1]);
+    assert!(own_way, "each chooses in its own way: {all:?}");
 }

@@ -22,6 +22,9 @@ Examples:
   # Draw one of fifty actions, with the softmax of the critics' smallest value.
   evaluator score runs/mine/snapshots/step_000020000.safetensors --candidates 50 --rule softmax:1 --aggregate min
 
+  # Guide the draws by the critics' gradients, too.
+  evaluator score runs/mine/snapshots/step_000020000.safetensors --guidance 0.01
+
 RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
 /// Score saved policies (snapshots of any run) on this machine
@@ -47,9 +50,14 @@ pub struct ScoreArgs {
     /// [default: the snapshot's]
     #[arg(long, value_name = "RULE")]
     pub rule: Option<Rule>,
-    /// Combination of the critics' values of an action: mean or min [default: the snapshot's]
+    /// Combination of the critics' values of an action: mean, min or mean-minus-std:KAPPA (the mean
+    /// less KAPPA standard deviations) [default: the snapshot's]
     #[arg(long, value_name = "NAME")]
     pub aggregate: Option<Aggregate>,
+    /// Strength at which the critics' gradients guide a diffusion policy as it draws an action, per
+    /// unit of their values; 0 is none [default: the snapshot's]
+    #[arg(long, value_name = "W")]
+    pub guidance: Option<f32>,
     /// Seed from which, with the snapshot's step, the episodes' seeds follow [default: the run's]
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,

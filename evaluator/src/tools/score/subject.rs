@@ -112,9 +112,11 @@ fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
     let own = own.unwrap_or(Choice::best_of(1));
     let rule = args.rule.unwrap_or(own.rule);
     let aggregate = args.aggregate.unwrap_or(own.aggregate);
-    let with = |candidates| Choice { candidates, rule, aggregate };
+    let guidance = args.guidance.unwrap_or(own.guidance);
+    let with = |candidates| Choice { candidates, rule, aggregate, guidance };
+    let asked = args.rule.is_some() || args.aggregate.is_some() || args.guidance.is_some();
     match args.candidates.as_slice() {
-        [] if args.rule.is_none() && args.aggregate.is_none() => Vec::new(),
+        [] if !asked => Vec::new(),
         [] => vec![with(own.candidates)],
         several => several.iter().copied().map(with).collect(),
     }
@@ -137,5 +139,7 @@ mod tests {
         own.rule = Rule::Softmax { temperature: 0.5 };
         (args.candidates, args.rule) = (Vec::new(), Some(own.rule));
         assert_eq!(choices(&args, Some(own)), [own]);
+        (own.guidance, args.rule, args.guidance) = (0.5, None, Some(2.0));
+        assert_eq!(choices(&args, Some(own)), [Choice { guidance: 2.0, ..own }]);
     }
 }

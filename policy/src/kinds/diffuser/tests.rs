@@ -130,6 +130,9 @@ fn a_shape_out_of_range_is_refused() {
     let nearest = Choice::new(2, Aggregate::Mean, Rule::Nearest);
     let nearest = policy(shape(1), 2).with_choice(nearest);
     assert!(matches!(nearest, Err(PolicyError::NoValue)));
+    let guided = Choice { guidance: 1.0, ..Choice::best_of(2) };
+    let guided = policy(shape(1), 2).with_choice(guided);
+    assert!(matches!(guided, Err(PolicyError::NoGuidance)));
 }
 
 #[test]

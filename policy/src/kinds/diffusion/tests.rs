@@ -69,7 +69,7 @@ fn the_rule_of_the_file_applies_unless_another_is_requested() {
 
 #[test]
 fn the_sampled_candidate_of_largest_value_is_taken() {
-    for aggregate in [Aggregate::Mean, Aggregate::Min] {
+    for aggregate in [Aggregate::Mean, Aggregate::Min, Aggregate::MeanMinusStd(1.0)] {
         let policy = policy(Choice::new(6, aggregate, Rule::Best), 1.0, None).unwrap();
         let observations: Vec<f32> = (0..12).map(|i| (i as f32).sin()).collect();
         let seeds = [7, 8, 9];
@@ -90,6 +90,26 @@ fn the_sampled_candidate_of_largest_value_is_taken() {
         // 3 observations, 18 actions.
         assert!(policy.value(&observations, &actions).is_err());
     }
+}
+
+#[test]
+fn guidance_raises_the_values_of_what_is_drawn() {
+    let of_file = policy(Choice::best_of(6), 0.5, None).unwrap();
+    let observations: Vec<f32> = (0..12).map(|i| (i as f32).sin()).collect();
+    let drawn = |guidance| {
+        let choice = Choice { guidance, ..Choice::best_of(6) };
+        sample(&*of_file.with_choice(choice).unwrap(), &observations, &[7, 8, 9]).unwrap()
+    };
+    let [none, weak, strong] = [0.0, 0.1, 10.0].map(drawn);
+    assert_eq!(none, sample(&*of_file, &observations, &[7, 8, 9]).unwrap(), "off");
+    for (less, more) in [(&none, &weak), (&weak, &strong)] {
+        let mean = |samples: &Samples| samples.values.iter().sum::<f32>() / 18.0;
+        assert!(mean(less) < mean(more), "{less:?} {more:?}");
+    }
+    // A state by itself.
+    let choice = Choice { guidance: 10.0, ..Choice::best_of(6) };
+    let alone = sample(&*of_file.with_choice(choice).unwrap(), &observations[4..8], &[8]).unwrap();
+    assert_eq!(alone.actions, strong.actions[12..24]);
 }
 
 /// The name in files before it was `aggregate`.

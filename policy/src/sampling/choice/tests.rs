@@ -30,9 +30,22 @@ fn a_choice_has_its_text() {
     for wrong in ["average:0.1", "average:0.1:few", "softmax", "softmax:warm"] {
         assert!(wrong.parse::<Rule>().is_err(), "{wrong}");
     }
+    let bound = Aggregate::MeanMinusStd(0.5);
+    for (aggregate, text) in
+        [(Aggregate::Mean, "mean"), (Aggregate::Min, "min"), (bound, "mean-minus-std:0.5")]
+    {
+        assert_eq!((text.parse(), aggregate.to_string()), (Ok(aggregate), text.to_owned()));
+        assert_eq!(serde_json::to_value(aggregate).unwrap(), text);
+    }
+    for wrong in ["max", "mean:1", "mean-minus-std", "mean-minus-std:-1", "mean-minus-std:inf"] {
+        assert!(wrong.parse::<Aggregate>().is_err(), "{wrong}");
+    }
     let of_min = |candidates| Choice::new(candidates, Aggregate::Min, Rule::softmax(0.1));
     assert_eq!(of_min(50).to_string(), "50 candidates, softmax:0.1, min");
     assert_eq!(of_min(1).to_string(), "1 candidate");
+    let guided = Choice { guidance: 0.5, ..Choice::new(3, bound, Rule::Best) };
+    assert_eq!(guided.to_string(), "3 candidates, mean-minus-std:0.5, guidance 0.5");
+    assert_eq!(Choice { candidates: 1, ..guided }.to_string(), "1 candidate, guidance 0.5");
 }
 
 #[test]
@@ -40,7 +53,8 @@ fn an_aggregate_keeps_nan() {
     let values = [1.0, 5.0, 3.0, 4.0];
     assert_eq!(Aggregate::Mean.reduce(&values, 2), [2.0, 4.5]);
     assert_eq!(Aggregate::Min.reduce(&values, 2), [1.0, 4.0]);
-    for aggregate in [Aggregate::Mean, Aggregate::Min] {
+    assert_eq!(Aggregate::MeanMinusStd(2.0).reduce(&values, 2), [0.0, 3.5]);
+    for aggregate in [Aggregate::Mean, Aggregate::Min, Aggregate::MeanMinusStd(0.0)] {
         for values in [[f32::NAN, 0.0], [0.0, f32::NAN]] {
             assert!(aggregate.reduce(&values, 1)[0].is_nan());
         }
@@ -131,6 +145,10 @@ fn a_choice_out_of_range_is_refused() {
             let checked = choice.check();
             assert!(matches!(checked, Err(PolicyError::Temperature(_))), "{choice:?}");
         }
+    }
+    for guidance in [-1.0, f32::NAN, f32::INFINITY] {
+        let checked = Choice { guidance, ..Choice::best_of(2) }.check();
+        assert!(matches!(checked, Err(PolicyError::Guidance(_))), "{guidance}");
     }
 }
 

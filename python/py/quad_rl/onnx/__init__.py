@@ -17,11 +17,12 @@ def export_onnx(
     candidates: int | None = None,
     rule: str | None = None,
     aggregate: str | None = None,
+    guidance: float | None = None,
 ) -> None:
     """Writes a policy, or that of a snapshot's file, as an ONNX model of opset 17, in float32.
 
-    It acts as `Policy.act` does with the same `candidates`, `rule` and `aggregate`, which are fixed in the model. The number of
-    states, n, is free.
+    It acts as `Policy.act` does with the same `candidates`, `rule`, `aggregate` and `guidance`, which are fixed in the model. The
+    number of states, n, is free.
 
     Inputs: `observations` [n, observation_size] and the arrays of `policy.noise(n, ...)`: `noise`, standard normal numbers, and
     `uniform`, numbers within [0, 1); 1 itself takes the best action. Draw them anew for each action.
@@ -38,7 +39,7 @@ def export_onnx(
 
     if not isinstance(policy, Policy):
         policy = Policy.load(policy)
-    written = model(policy, candidates=candidates, rule=rule, aggregate=aggregate).SerializeToString()
+    written = model(policy, candidates=candidates, rule=rule, aggregate=aggregate, guidance=guidance).SerializeToString()
     whole = Path(path)
     partial = whole.with_name(f"{whole.name}.{token_hex(4)}.partial")  # An existing file stays until the new one is complete.
     try:

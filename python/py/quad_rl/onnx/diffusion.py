@@ -6,7 +6,7 @@ import numpy as np
 
 from quad_rl.onnx.file import Array, File
 from quad_rl.onnx.graph import Value
-from quad_rl.onnx.mlp import layers, mish
+from quad_rl.onnx.mlp import action_gradient, layers, mish
 
 
 def embeddings(file: File, steps: int) -> Array:
@@ -17,7 +17,7 @@ def embeddings(file: File, steps: int) -> Array:
     return mish(features @ kernels[0] + biases[0]) @ kernels[1] + biases[1]
 
 
-def draw(file: File, observations: Value, noise: Value, candidates: int) -> Value:
+def draw(file: File, observations: Value, noise: Value, candidates: int, guidance: float = 0.0) -> Value:
     o, a, steps, reverse = (file.shape[name] for name in ("observation_dim", "action_dim", "diffusion_steps", "reverse"))
     kernel, bias = file["actor.trunk.0.kernel"], file["actor.trunk.0.bias"]
     shifts = embeddings(file, steps) @ kernel[o + a :] + bias
@@ -29,6 +29,9 @@ def draw(file: File, observations: Value, noise: Value, candidates: int) -> Valu
         first = (x.reshape(-1, a) @ kernel[o : o + a]).reshape(-1, candidates, kernel.shape[1]) + of_state + shifts[t - 1]
         epsilon = layers(file, "actor.trunk.", file.shape["actor"], first)
         clean = (x - epsilon * math.sqrt(1 - bar[t])) * (1 / math.sqrt(bar[t]))
+        if guidance:
+            pull = action_gradient(file, "critic.", file.shape["critic"], observations, clean.clip(-1.0, 1.0), candidates)
+            clean = clean + pull * (guidance * (1 - bar[t]) / math.sqrt(bar[t]))
         clean = clean if reverse == "clip-sample" else clean.clip(-1.0, 1.0)
         ahead, beta = bar[t - 1], 1 - alpha[t - 1]
         x = clean * (math.sqrt(ahead) * beta / (1 - bar[t])) + x * (math.sqrt(1 - beta) * (1 - ahead) / (1 - bar[t]))

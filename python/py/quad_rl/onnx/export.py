@@ -38,6 +38,9 @@ def critics(file: File, choice: dict[str, Any], observations: Value, drawn: Valu
     graph, candidates = drawn.graph, choice["candidates"]
     of_members = of_actions(file, "critic.", file.shape["critic"], observations, drawn, candidates)
     values = graph("ReduceMin" if choice["aggregate"] == "min" else "ReduceMean", of_members, axes=[0], keepdims=0)
+    if choice["aggregate"].startswith("mean-minus-std:"):
+        away = of_members - values
+        values = values - graph("Sqrt", (away * away).mean(0)).at(0, 0) * float(choice["aggregate"].split(":")[1])
     if choice["rule"] != "nearest":
         return values, values
     difference = values - of_states(file, "value.", file.shape["value"], observations).reshape(-1, 1)
@@ -61,7 +64,8 @@ def model(policy: Policy, **changes: Any) -> ModelProto:
         plan = to_user(file, taken)
         first = {"actions": (plan.at(1, 0), (a,)), "values": (values, (candidates,))}
         return graph.model({**first, "plan": (plan, (steps, a))} if steps > 1 else {**first}, repr(policy))
-    actions = DRAW[file.kind](file, observations, inputs["noise"], candidates)
+    guidance = {"guidance": choice["guidance"]} if choice["guidance"] else {}
+    actions = DRAW[file.kind](file, observations, inputs["noise"], candidates, **guidance)
     values, scores = critics(file, choice, observations, actions)
     taken = to_user(file, choose(actions, scores, rule, candidates, inputs.get("uniform")))
     return graph.model({"actions": (taken, (a,)), "values": (values, (candidates,))}, repr(policy))

@@ -51,6 +51,7 @@ fn errors_name_the_problem() {
         ("agent.rate = 1.0", "unknown field `rate`, expected one of `actor`, `critic`"),
         ("agent.eta.treshold = 1.0", "`threshold`"),
         ("agent.guidance = 'sac'", "`quad`, `dac`, `none`"),
+        ("agent.guidance_at = 'clean'", "`noisy`, `denoised`"),
         ("agent.guidance = 'constant'", "agent.lambda is absent, but must be given where"),
         ("agent.lambda = 0.5", "agent.lambda is 0.5, but must be absent unless"),
         ("agent = { guidance = 'constant', lambda = 2 }", "2 is not in [0, 1]"),
