@@ -1,7 +1,7 @@
 """Rows per second that a Reverb server takes in from 1 and 8 writers, each row of Hopper's size: 11 observed numbers, 3 of an action.
 
     pip install dm-reverb==0.14.0 tensorflow-cpu==2.14.1 'numpy<2' 'setuptools<81'    # Python 3.11 at most
-    python deploy/bench/reverb.py
+    python deploy/bench/experience.py
 
 The learner's rows per second, in the same setting:
 
