@@ -7,7 +7,7 @@ use quad_dataset::environment::find;
 use quad_evaluator::sim::{
     Environment, EnvironmentError, Environments, Rollout, Simulations, Step, make,
 };
-use quad_protocol::{EpisodeScore, Hash};
+use quad_protocol::{EpisodeScore, Hash, Name};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -197,7 +197,7 @@ fn a_recorded_episode_is_what_was_observed_and_done() {
     let play = |seeds: &[u64]| {
         let make = || Ok(Box::new(Scripted::default()) as Box<dyn Environment>);
         let rollout = Rollout::new(make, (2, 1), seeds, |_| ()).unwrap();
-        let mut rollout = rollout.recording(70, weights);
+        let mut rollout = rollout.recording(70, weights, &Name::new("f32").unwrap());
         while !rollout.is_done() {
             // A policy that fails leaves no trace.
             assert!(rollout.step(|_, _, _| Err(anyhow::anyhow!("no action"))).is_err());

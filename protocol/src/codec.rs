@@ -17,7 +17,7 @@ use bincode::{Decode, Encode};
 use crate::hash::Hash;
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
-pub const PROTOCOL_VERSION: u16 = 9;
+pub const PROTOCOL_VERSION: u16 = 10;
 
 const MAGIC: &[u8; 4] = b"QUAD";
 const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
@@ -99,6 +99,14 @@ pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
 /// Decodes a message and verifies version, kind, length, every field, and a snapshot's hash.
 pub fn decode<M: Message>(frame: &[u8]) -> Result<M, CodecError> {
     decode_from(frame.len(), frame)
+}
+
+/// [`decode`] of a frame from the disk, which a program of another version may have written: the
+/// layout of what is kept never changes, a new one is a new kind of message.
+pub fn decode_kept<M: Message>(frame: &[u8]) -> Result<M, CodecError> {
+    let begin = [&MAGIC[..], &PROTOCOL_VERSION.to_le_bytes()].concat();
+    let rest = frame.get(begin.len()..).unwrap_or_default();
+    decode_from(frame.len(), Read::chain(&begin[..], rest))
 }
 
 /// [`decode`] of a frame of `length` bytes, which may lie in several pieces.

@@ -18,6 +18,8 @@ pub struct Episode {
     pub step: u64,
     /// Hash of the snapshot's file.
     pub weights: Hash,
+    /// Arithmetic of the policy, as in a [`ScoreReport`](crate::ScoreReport).
+    pub precision: Name,
     /// Seed, length n, return and score.
     pub score: EpisodeScore,
     /// True if the last step terminated the task; else it was cut off, and its next state has a
@@ -38,6 +40,21 @@ impl Episode {
     /// Most steps of an episode.
     pub const LONGEST: usize = 100_000;
 
+    /// The episode of a seed before its first step.
+    pub fn new(step: u64, weights: Hash, precision: Name, seed: u64) -> Self {
+        Self {
+            step,
+            weights,
+            precision,
+            score: EpisodeScore { seed, episode_return: 0.0, length: 0, score: 0.0 },
+            terminated: false,
+            observations: Vec::new(),
+            actions: Vec::new(),
+            rewards: Vec::new(),
+            interventions: Vec::new(),
+        }
+    }
+
     /// Sizes of an observation and of an action.
     pub fn dims(&self) -> (usize, usize) {
         let n = self.rewards.len().max(1);
@@ -45,12 +62,9 @@ impl Episode {
     }
 }
 
-/// Bytes of a record's two names, each after its length.
-const NAMES: usize = 2 * (size_of::<u64>() + Name::MAX_LENGTH);
-
 impl Message for Episode {
     const KIND: u8 = 7;
-    const LIMIT: usize = LARGE - NAMES;
+    const LIMIT: usize = LARGE;
 
     fn verify(&self) -> Result<(), CodecError> {
         let Self { score, observations, actions, rewards, interventions, .. } = self;
@@ -74,25 +88,6 @@ impl Message for Episode {
     }
 }
 
-/// An episode and who has played it, as the learner keeps it on disk.
-#[derive(Clone, Debug, PartialEq, Encode, Decode)]
-#[allow(missing_docs)] // The names say it.
-pub struct Record {
-    pub evaluator: Name,
-    /// Arithmetic of the policy, as in a [`ScoreReport`](crate::ScoreReport).
-    pub precision: Name,
-    pub episode: Episode,
-}
-
-impl Message for Record {
-    const KIND: u8 = 10;
-    const LIMIT: usize = LARGE;
-
-    fn verify(&self) -> Result<(), CodecError> {
-        self.episode.verify()
-    }
-}
-
 /// A piece of an episode's frame.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[allow(missing_docs)] // The names say it.
@@ -103,8 +98,6 @@ pub struct Piece {
     pub incarnation: u64,
     /// [`Job::id`](crate::Job::id).
     pub job: u64,
-    /// Arithmetic of the policy, as in a [`ScoreReport`](crate::ScoreReport).
-    pub precision: Name,
     /// Seed of the episode.
     pub seed: u64,
     /// Hash of the frame.
@@ -167,14 +160,12 @@ mod tests {
 
     fn episode() -> Episode {
         Episode {
-            step: 3,
-            weights: Hash::of(b"weights"),
             score: EpisodeScore { seed: 7, episode_return: 3.0, length: 2, score: 3.0 },
-            terminated: true,
             observations: vec![0.0, 0.1, 1.0, 1.1, 2.0, 2.1],
             actions: vec![0.5, -0.5],
             rewards: vec![1.0, 2.0],
             interventions: vec![1],
+            ..Episode::new(3, Hash::of(b"weights"), Name::new("f32").unwrap(), 7)
         }
     }
 

@@ -22,8 +22,8 @@ mod score;
 mod seeds;
 mod snapshot;
 
-pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, encode};
-pub use experience::{Episode, Piece, PieceReply, Record};
+pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, decode_kept, encode};
+pub use experience::{Episode, Piece, PieceReply};
 pub use hash::Hash;
 pub use job::{Exploration, Job, JobReply, JobRequest};
 pub use name::{InvalidName, Name};

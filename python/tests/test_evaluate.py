@@ -37,10 +37,10 @@ class Walk:
 class Learner:
     """A learner at work, and the folder of its run."""
 
-    def __init__(self, folder, data, *arguments, environment="walk", steps=60, interval=20, episodes=8):
+    def __init__(self, folder, data, *arguments, environment="walk", listen="tcp/127.0.0.1:0", steps=60, interval=20, episodes=8):
         self.folder = folder
         command = ["learner", "train", "--task", "own-data", "--env", environment, "--dataset", str(data)]
-        command += ["--run-dir", str(folder), "--listen", "tcp/127.0.0.1:0", *SMALL]
+        command += ["--run-dir", str(folder), "--listen", listen, *SMALL]
         command += ["--steps", str(steps), "--eval-interval", str(interval), "--episodes", str(episodes)]
         command += arguments
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)

@@ -78,15 +78,13 @@ pub fn episode(job: &Job) -> Episode {
     let (steps, reward) = (1000, 2.0);
     let episode_return = steps as f64 * f64::from(reward);
     let score = hopper.normalized_score(episode_return);
+    let seed = job.seeds[0];
     Episode {
-        step: job.step,
-        weights: job.weights,
-        score: EpisodeScore { seed: job.seeds[0], episode_return, length: steps as u32, score },
-        terminated: false,
+        score: EpisodeScore { seed, episode_return, length: steps as u32, score },
         observations: vec![0.1; (steps + 1) * 11],
         actions: vec![0.1; steps * 3],
         rewards: vec![reward; steps],
-        interventions: Vec::new(),
+        ..Episode::new(job.step, job.weights, name("f32"), seed)
     }
 }
 
@@ -98,7 +96,6 @@ pub fn piece(job: &Job, evaluator: &str, frame: &[u8], offset: usize) -> Piece {
         run: job.run.clone(),
         incarnation: job.incarnation,
         job: job.id,
-        precision: name("f32"),
         seed: job.seeds[0],
         hash: Hash::of(frame),
         length: frame.len() as u32,

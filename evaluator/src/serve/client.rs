@@ -1,6 +1,6 @@
 //! An evaluator's side of one run: jobs claimed, results owed, the learner process followed.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -203,7 +203,7 @@ impl RunClient {
         let (run, step) = (&connection.run, *step);
         let refused = match owed {
             Owed::Scores(report) => deliver_scores(connection, report, timeout).await?,
-            Owed::Episodes(parcels) => deliver_episodes(connection, step, parcels, timeout).await?,
+            Owed::Episode(parcel) => deliver_episode(connection, step, parcel, timeout).await?,
         };
         let Some(refused) = refused else {
             self.claimed = None;
@@ -309,34 +309,31 @@ async fn deliver_scores(
     })
 }
 
-/// Delivers episodes, each in pieces, and drops those that the learner has acknowledged. Returns the
-/// refusal of a learner that refuses one.
-async fn deliver_episodes(
+/// Delivers an episode in pieces. Returns the refusal of a learner that refuses it.
+async fn deliver_episode(
     connection: &Connection,
     step: u64,
-    parcels: &mut VecDeque<Parcel>,
+    parcel: &mut Parcel,
     timeout: Duration,
 ) -> Result<Option<String>, QueryError> {
-    let Connection { run, metrics, .. } = connection;
-    while let Some(parcel) = parcels.front_mut() {
+    let (Connection { run, metrics, .. }, seed) = (connection, parcel.seed());
+    loop {
         match connection.deliver_piece(&parcel.piece(), timeout).await? {
             PieceReply::Continue { offset, .. } => {
                 let unusable = |reason| QueryError::Unusable { key: keys::experience(run), reason };
                 parcel.continue_at(offset).map_err(unusable)?;
             }
             PieceReply::Recorded { duplicate, .. } => {
-                let (seed, rows) = (parcel.seed(), parcel.rows);
+                let rows = parcel.rows;
                 info!(%run, step, seed, rows, duplicate, "an episode of practice delivered");
                 metrics.practice_episodes.inc();
                 metrics.practice_rows.inc_by(rows);
-                parcels.pop_front();
+                metrics.job_practiced();
+                return Ok(None);
             }
             PieceReply::Refused { reason, .. } => {
-                let seed = parcel.seed();
                 return Ok(Some(format!("refused the episode with seed {seed}: {reason}")));
             }
         }
     }
-    metrics.job_practiced();
-    Ok(None)
 }

@@ -1,7 +1,5 @@
 //! Results of a job, which the evaluator owes to the learner until they are acknowledged.
 
-use std::collections::VecDeque;
-
 use quad_protocol::{
     CodecError, Episode, EpisodeScore, Hash, Job, Message, Name, Piece, ScoreReport, encode,
 };
@@ -9,8 +7,7 @@ use quad_protocol::{
 /// The results of a job.
 pub enum Owed {
     Scores(ScoreReport),
-    /// Practice episodes that are not acknowledged, in the order of their delivery.
-    Episodes(VecDeque<Parcel>),
+    Episode(Parcel),
 }
 
 /// A practice episode on its way to the learner.
@@ -31,32 +28,26 @@ impl Owed {
         job: &Job,
         evaluator: Name,
         precision: Name,
-        played: Vec<(EpisodeScore, Option<Episode>)>,
+        mut played: Vec<(EpisodeScore, Option<Episode>)>,
     ) -> Result<Owed, CodecError> {
-        if job.practice.is_none() {
+        let Some(episode) = played.first_mut().and_then(|(_, episode)| episode.take()) else {
             let scores = played.into_iter().map(|(score, _)| score).collect();
             return Ok(Owed::Scores(ScoreReport::new(job, evaluator, precision, scores)));
-        }
-        let parcel = |episode: Episode| {
-            episode.verify()?;
-            let frame = encode(&episode)?;
-            let EpisodeScore { seed, length, .. } = episode.score;
-            let next = Piece {
-                evaluator: evaluator.clone(),
-                run: job.run.clone(),
-                incarnation: job.incarnation,
-                job: job.id,
-                precision: precision.clone(),
-                seed,
-                hash: Hash::of(&frame),
-                length: frame.len() as u32,
-                offset: 0,
-                bytes: Vec::new(),
-            };
-            Ok(Parcel { rows: length.into(), frame, next })
         };
-        let episodes = played.into_iter().filter_map(|(_, episode)| episode);
-        Ok(Owed::Episodes(episodes.map(parcel).collect::<Result<_, _>>()?))
+        episode.verify()?;
+        let frame = encode(&episode)?;
+        let next = Piece {
+            evaluator,
+            run: job.run.clone(),
+            incarnation: job.incarnation,
+            job: job.id,
+            seed: episode.score.seed,
+            hash: Hash::of(&frame),
+            length: frame.len() as u32,
+            offset: 0,
+            bytes: Vec::new(),
+        };
+        Ok(Owed::Episode(Parcel { rows: episode.score.length.into(), frame, next }))
     }
 }
 

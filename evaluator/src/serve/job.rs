@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_policy::{Policy, PolicyError};
-use quad_protocol::{Episode, EpisodeScore, Job};
+use quad_protocol::{Episode, EpisodeScore, Job, Name};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
@@ -23,7 +23,7 @@ const MAX_BYTES: u64 = 256 << 20;
 /// Reason not to run a job.
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
-    #[error("it has {0} episodes, but must have from 1 to {MAX_EPISODES}")]
+    #[error("it has {0} episodes, but must have from 1 to {MAX_EPISODES}, or one of practice")]
     Size(usize),
     #[error("each of its steps takes {0} bytes of memory, more than {MAX_BYTES}")]
     Memory(u64),
@@ -57,7 +57,8 @@ impl JobError {
 /// Checks the episodes and the environment of a learner's job.
 pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError> {
     let episodes = job.seeds.len();
-    if !(1..=MAX_EPISODES).contains(&episodes) {
+    let most = if job.practice.is_some() { 1 } else { MAX_EPISODES };
+    if !(1..=most).contains(&episodes) {
         return Err(JobError::Size(episodes));
     }
     match environments.names().contains(&job.environment) {
@@ -116,7 +117,8 @@ fn run(
     let sizes = (policy.observation_dim(), policy.action_dim());
     let mut rollout = Rollout::new(make, sizes, &job.seeds, |seed| policy.begin(seed))?;
     if job.practice.is_some() {
-        rollout = rollout.recording(job.step, job.weights);
+        let precision = Name::new(policy.precision().arithmetic())?;
+        rollout = rollout.recording(job.step, job.weights, &precision);
     }
     let row = size_of::<f32>() * (sizes.0 + sizes.1 + 1);
     let (mut step, mut rows) = (0, 0);
@@ -163,7 +165,7 @@ mod tests {
     use quad_policy::{DiffusionShape, MlpConfig, Precision, load_policy};
     use quad_protocol::{Exploration, Name, decode};
 
-    use super::super::delivery::{Owed, Parcel};
+    use super::super::delivery::Owed;
     use super::super::fixtures::{self, file};
     use super::*;
     use crate::sim::{Environment, EnvironmentError, Simulations};
@@ -236,26 +238,24 @@ mod tests {
     }
 
     #[test]
-    fn an_episode_of_practice_has_the_same_bytes_whoever_plays_it_and_with_which_others() {
-        let practice = |seeds: &[u64], noise, by: &str| {
+    fn an_episode_of_practice_has_the_same_bytes_whoever_plays_it() {
+        let practice = |noise, by: &str| {
             let practice = Some(Exploration::Policy { noise });
-            let job = Job { seeds: seeds.to_vec(), practice, ..job(0) };
+            let job = Job { practice, ..job(1) };
             let played = run_for(&Simulations, &job, Job::LONGEST).unwrap();
             let [by, precision] = [by, "f32"].map(|name| Name::new(name).unwrap());
-            let Owed::Episodes(parcels) = Owed::new(&job, by, precision, played).unwrap() else {
-                panic!("it is practice")
-            };
-            let pieces = parcels.iter().map(Parcel::piece);
-            Vec::from_iter(pieces.map(|piece| (piece.seed, piece.hash, piece.bytes)))
+            match Owed::new(&job, by, precision, played).unwrap() {
+                Owed::Episode(parcel) => parcel.piece(),
+                Owed::Scores(_) => panic!("it is practice"),
+            }
         };
-        let together = practice(&[5, 6, 7], 0.3, "one");
-        for (i, seed) in [(2, 7), (0, 5)] {
-            assert_eq!(practice(&[seed], 0.3, "other"), together[i..=i]);
-        }
-        assert_ne!(practice(&[5], 0.2, "one")[0].1, together[0].1);
+        let [one, other, quieter] =
+            [(0.3, "one"), (0.3, "other"), (0.2, "one")].map(|(noise, by)| practice(noise, by));
+        assert_eq!((one.hash, &one.bytes), (other.hash, &other.bytes));
+        assert_ne!(one.hash, quieter.hash);
 
-        let Episode { step, weights, score, .. } = decode(&together[1].2).unwrap();
-        assert_eq!((step, weights, score.seed), (job(0).step, job(0).weights, 6));
+        let Episode { step, weights, score, .. } = decode(&one.bytes).unwrap();
+        assert_eq!((step, weights, score.seed), (job(0).step, job(0).weights, 0));
     }
 
     /// A file of some megabytes asks for 66 GB: one value from each of 65,535 tiny critics for each

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_protocol::{Episode, EpisodeScore, Hash};
+use quad_protocol::{Episode, EpisodeScore, Hash, Name};
 use rayon::prelude::*;
 
 use super::environment::{Environment, EnvironmentError};
@@ -74,19 +74,11 @@ impl<S> Rollout<S> {
     }
 
     /// Records the episodes, which have just started, as experience with the snapshot of this step
-    /// and hash.
-    pub fn recording(mut self, step: u64, weights: Hash) -> Self {
+    /// and hash, by a policy with this arithmetic.
+    pub fn recording(mut self, step: u64, weights: Hash, precision: &Name) -> Self {
         for live in &mut self.live {
-            live.record = Some(Episode {
-                step,
-                weights,
-                score: live.score,
-                terminated: false,
-                observations: Vec::new(),
-                actions: Vec::new(),
-                rewards: Vec::new(),
-                interventions: Vec::new(),
-            });
+            let seed = live.score.seed;
+            live.record = Some(Episode::new(step, weights, precision.clone(), seed));
         }
         self
     }

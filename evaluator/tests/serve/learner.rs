@@ -1,6 +1,5 @@
 //! A learner that has one job and records an evaluator's messages; and the evaluator's process.
 
-use std::collections::BTreeMap;
 use std::process::{Child, Command, ExitStatus};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
@@ -64,9 +63,9 @@ pub enum Behavior {
     Refuses,
     /// Leaves the first job that is handed back without an answer.
     LosesHandBack,
-    /// Loses the beginning of the first episode when it gets the third piece.
+    /// Loses the beginning of an episode when it gets the third piece, once.
     Forgets,
-    /// Leaves the last piece of the first episode without an answer.
+    /// Leaves the last piece of an episode without an answer, once.
     LosesAnswer,
 }
 
@@ -76,8 +75,8 @@ pub struct State {
     pub incarnation: u64,
     /// Given out until it is done or handed back.
     pub job: Option<Job>,
-    /// The frames of episodes by their seeds, as far as they have come.
-    pub frames: BTreeMap<u64, Vec<u8>>,
+    /// The frame of an episode, as far as it has come.
+    pub frame: Vec<u8>,
 }
 
 pub struct Learner {
@@ -204,8 +203,8 @@ impl Learner {
         let listen = Endpoints { listen: any_port, ..Endpoints::default() };
         let session = open_session(&listen).await.unwrap();
         let endpoint = reachable_at(&session, &listen).await.unwrap().remove(0);
-        let (events, frames, incarnation) = (Vec::new(), BTreeMap::new(), INCARNATION);
-        let state = State { events, behavior, incarnation, job: None, frames };
+        let (events, frame, incarnation) = (Vec::new(), Vec::new(), INCARNATION);
+        let state = State { events, behavior, incarnation, job: None, frame };
         let state = Arc::new(Mutex::new(state));
         let snapshot = snapshot(file);
         let (shared, weights) = (state.clone(), snapshot.clone());

@@ -9,14 +9,13 @@ use crate::cli::ExportDataArgs;
 
 pub fn export(args: &ExportDataArgs) -> anyhow::Result<()> {
     let (folder, config) = RunDir::open(&args.run)?;
-    let records = read_experience(folder.path())?;
-    let Some(last) = records.last() else {
+    let played = read_experience(folder.path())?;
+    let Some(last) = played.last() else {
         return Err(anyhow!("{} has no experience", args.run.display())).hint(
             "`learner train --online-steps N` lets evaluators practice; the learner keeps their episodes",
         );
     };
-    let episodes = Vec::from_iter(records.iter().map(|record| {
-        let episode = &record.episode;
+    let episodes = Vec::from_iter(played.iter().map(|episode| {
         let rows = PracticeRows {
             observations: &episode.observations,
             actions: &episode.actions,
@@ -28,10 +27,10 @@ pub fn export(args: &ExportDataArgs) -> anyhow::Result<()> {
     let experiment = &config.experiment;
     let metadata = Metadata {
         algorithm: &experiment.algorithm,
-        iteration: last.episode.step as i64,
+        iteration: last.step as i64,
         seed: experiment.seed,
     };
-    let (environment, dims) = (&experiment.environment, last.episode.dims());
+    let (environment, dims) = (&experiment.environment, last.dims());
     write_practice(&args.out, environment, dims, &metadata, &episodes)
         .hint_of(DatasetError::hint)?;
     let rows: usize = episodes.iter().map(|(rows, _)| rows.rewards.len()).sum();

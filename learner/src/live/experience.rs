@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, Record, decode};
+use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode};
 use quad_run::folder::ExperienceLog;
 use quad_runtime::Heartbeat;
 use tracing::warn;
@@ -26,11 +26,11 @@ pub(super) struct Experience {
     partial: BTreeMap<u64, (Hash, Vec<u8>)>,
 }
 
-/// A whole episode with its last piece.
+/// A whole episode, which its last piece has completed.
 struct Whole {
     request: Request,
     number: u64,
-    hash: Hash,
+    episode: Episode,
 }
 
 impl Experience {
@@ -45,15 +45,13 @@ impl Experience {
         disk: &mut DiskStatus,
         beat: &Heartbeat,
     ) {
-        let (mut whole, mut records) = (Vec::new(), Vec::new());
+        let mut whole = Vec::new();
         for (request, piece) in pieces {
             self.coordinator.extend_lease(&piece.evaluator, piece.incarnation, piece.job);
             match self.add(&piece, &whole) {
                 Ok(Added::Reply(reply)) => request.reply(&reply),
-                Ok(Added::Whole { number, episode }) => {
-                    let Piece { evaluator, precision, hash, .. } = piece;
-                    records.push(Record { evaluator, precision, episode });
-                    whole.push(Whole { request, number, hash });
+                Ok(Added::Whole(number, episode)) => {
+                    whole.push(Whole { request, number, episode });
                 }
                 Err(why) => {
                     self.coordinator.metrics.reject(why.label());
@@ -65,13 +63,14 @@ impl Experience {
         if whole.is_empty() {
             return;
         }
-        match self.log.append(&records) {
+        let frames = whole.iter().filter_map(|it| self.partial.get(&it.episode.score.seed));
+        match self.log.append(frames) {
             Ok(()) => {
                 disk.accepted(beat);
-                for (Whole { request, number, hash }, record) in whole.into_iter().zip(records) {
-                    let seed = record.episode.score.seed;
-                    self.partial.remove(&seed);
-                    self.inbox.add(number, record.episode);
+                for Whole { request, number, episode } in whole {
+                    let seed = episode.score.seed;
+                    let Some((hash, _)) = self.partial.remove(&seed) else { continue };
+                    self.inbox.add(number, episode);
                     request.reply(&self.coordinator.record_practice(seed, hash));
                 }
             }
@@ -112,18 +111,18 @@ impl Experience {
         }
         let none = || (piece.hash, Vec::new());
         let (hash, bytes) = self.partial.entry(seed).or_insert_with(none);
-        if *hash != piece.hash && piece.offset == 0 {
+        let offset = piece.offset as usize;
+        if *hash != piece.hash {
+            if offset > 0 {
+                return at(0);
+            }
             (*hash, *bytes) = none();
         }
-        let end = piece.offset as usize + piece.bytes.len();
-        if *hash != piece.hash {
-            return at(0);
-        }
-        if piece.offset as usize > bytes.len() {
+        if offset > bytes.len() {
             return at(bytes.len());
         }
-        if end > bytes.len() {
-            bytes.truncate(piece.offset as usize);
+        if offset + piece.bytes.len() > bytes.len() {
+            bytes.truncate(offset);
             bytes.extend_from_slice(&piece.bytes);
         }
         if bytes.len() < piece.length as usize {
@@ -139,11 +138,11 @@ impl Experience {
             return Err(Refusal::Practice(seed).into());
         }
         self.coordinator.validate_practice(&episode)?;
-        Ok(Added::Whole { number, episode })
+        Ok(Added::Whole(number, episode))
     }
 }
 
 enum Added {
     Reply(PieceReply),
-    Whole { number: u64, episode: Episode },
+    Whole(u64, Episode),
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use quad_algorithms::Agent;
 use quad_dataset::{BatchSampler, Task};
-use quad_protocol::{Hash, Record, encode, practice_seed};
+use quad_protocol::{Episode, Hash, practice_seed};
 use quad_run::config::{Online, RunConfig};
 use quad_run::folder::{Log, ResumePoint, RunDir};
 use quad_runtime::{Health, Hint};
@@ -182,13 +182,14 @@ fn open_experience(
     coordinator: &Coordinator,
 ) -> anyhow::Result<Experience> {
     let (log, records) = dir.experience_log()?;
-    let by_seed = |Record { episode, .. }| (episode.score.seed, episode);
+    let by_seed = |(hash, episode): (Hash, Episode)| (episode.score.seed, (hash, episode));
     let mut episodes: HashMap<u64, _> = records.into_iter().map(by_seed).collect();
     // Seeds are those of the first episodes: more were never open.
     let most = episodes.len() as u64 + Online::MOST_LAG;
     for number in 0..most {
-        if let Some(episode) = episodes.remove(&practice_seed(seed, number)) {
-            coordinator.record_practice(episode.score.seed, Hash::of(&encode(&episode)?));
+        let seed = practice_seed(seed, number);
+        if let Some((hash, episode)) = episodes.remove(&seed) {
+            coordinator.record_practice(seed, hash);
             inbox.add(number, episode);
         }
     }

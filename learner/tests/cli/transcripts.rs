@@ -6,7 +6,7 @@ use std::fs::{self, File};
 use std::os::unix::fs::symlink;
 use std::path::Path;
 
-use quad_protocol::{Episode, EpisodeScore, Hash, Name, Record, episode_seeds};
+use quad_protocol::{Episode, EpisodeScore, Hash, Name, encode, episode_seeds};
 use quad_run::folder::RunDir;
 use serde_json::{Value, json};
 
@@ -261,19 +261,18 @@ fn write_practiced() {
             Vec::from_iter((0..count).map(|i| ((i + 40 * number) as f32 * each).sin()))
         };
         let seed = number as u64;
-        let name = |text: &str| Name::new(text).unwrap();
+        let precision = Name::new("f32-avx512").unwrap();
         let episode = Episode {
-            step: 20_000,
-            weights: Hash::of(b"weights"),
             score: EpisodeScore { seed, episode_return: length as f64, length, score: 1.0 },
             terminated,
             observations: smooth((length as usize + 1) * 11, 0.37),
             actions: smooth(length as usize * 3, 1.3),
             rewards: smooth(length as usize, 0.1),
             interventions: if number == 0 { vec![3, 4] } else { Vec::new() },
+            ..Episode::new(20_000, Hash::of(b"weights"), precision, seed)
         };
-        log.append(&[Record { evaluator: name("e"), precision: name("f32-avx512"), episode }])
-            .unwrap();
+        let frame = encode(&episode).unwrap();
+        log.append(&[(Hash::of(&frame), frame)]).unwrap();
     }
 }
 

@@ -90,21 +90,19 @@ pub fn each(test: &mut impl Check) {
     let uniform = Job { practice: Some(Exploration::Uniform), ..job };
     test.check(&JobReply::Job(uniform));
     test.check(&Episode {
-        step: 3,
-        weights: snapshot.hash,
         score: EpisodeScore { length: 1, ..score(1, 4.0) },
         terminated: true,
         observations: vec![0.0, 1.0],
         actions: vec![0.5],
         rewards: vec![2.0],
         interventions: vec![0],
+        ..Episode::new(3, snapshot.hash, name(), 1)
     });
     test.check(&Piece {
         evaluator: name(),
         run: name(),
         incarnation: 2,
         job: 1,
-        precision: name(),
         seed: 1,
         hash: snapshot.hash,
         length: 100,

@@ -1,11 +1,13 @@
 //! Experience on disk: `experience.log`.
 //!
-//! A record is the length of its frame (u32, little-endian), the frame's BLAKE3 hash and the frame,
-//! a [`Record`].
+//! A record is the length of a frame (u32, little-endian), its BLAKE3 hash and the frame: an
+//! [`Episode`] as its evaluator has delivered it.
 
+use std::fs::File;
+use std::io::{self, BufReader, ErrorKind, Read};
 use std::path::Path;
 
-use quad_protocol::{Hash, Record, decode, encode};
+use quad_protocol::{Episode, Hash, decode_kept};
 
 use super::error::{RunDirError, content, io_error};
 use super::log::Log;
@@ -14,19 +16,23 @@ use crate::files;
 
 /// Bytes of a record before its frame.
 const HEADER: usize = 4 + 32;
+/// Every frame begins so.
+const BEGIN: &[u8; 4] = b"QUAD";
 
 /// `experience.log`, opened for appending.
 #[derive(Debug)]
 pub struct ExperienceLog(Log);
 
 impl ExperienceLog {
-    /// Appends records, durably: all of them, or none if it fails.
-    pub fn append(&mut self, records: &[Record]) -> Result<(), RunDirError> {
+    /// Appends frames with their hashes, durably: all of them, or none if it fails.
+    pub fn append<'a>(
+        &mut self,
+        frames: impl IntoIterator<Item = &'a (Hash, Vec<u8>)>,
+    ) -> Result<(), RunDirError> {
         let mut bytes = Vec::new();
-        for record in records {
-            let frame = encode(record).map_err(|error| content(self.0.path(), None, error))?;
+        for (hash, frame) in frames {
             bytes.extend((frame.len() as u32).to_le_bytes());
-            bytes.extend(Hash::of(&frame).bytes());
+            bytes.extend(hash.bytes());
             bytes.extend(frame);
         }
         self.0.append_bytes(&bytes)
@@ -35,37 +41,42 @@ impl ExperienceLog {
 
 impl RunDir {
     /// Opens or creates `experience.log` and cuts off an incomplete record at its end. Also returns
-    /// the records. The lock on `scores.jsonl` keeps other writers out.
-    pub fn experience_log(&self) -> Result<(ExperienceLog, Vec<Record>), RunDirError> {
-        let (path, mut records) = (self.path().join(EXPERIENCE), Vec::new());
-        let log = Log::of_records(path.clone(), true, |bytes| {
-            let length;
-            (records, length) = complete_records(&path, bytes)?;
-            Ok(length)
-        })?;
-        Ok((ExperienceLog(log), records))
+    /// the episodes and the hashes of their frames. The lock on `scores.jsonl` keeps other writers
+    /// out.
+    pub fn experience_log(&self) -> Result<(ExperienceLog, Vec<(Hash, Episode)>), RunDirError> {
+        let path = self.path().join(EXPERIENCE);
+        let mut file = files::append(&path).map_err(io_error("open", &path))?;
+        let (records, length) = complete_records(&path, &mut file)?;
+        Ok((ExperienceLog(Log::cut(path, file, length, true)?), records))
     }
 }
 
-/// Reads the complete records of `experience.log` in a run folder; a missing file has none.
-pub fn read_experience(folder: &Path) -> Result<Vec<Record>, RunDirError> {
+/// Reads the episodes of the complete records of `experience.log` in a run folder; a missing file
+/// has none.
+pub fn read_experience(folder: &Path) -> Result<Vec<Episode>, RunDirError> {
     let path = folder.join(EXPERIENCE);
-    let bytes = files::optional(files::read(&path)).map_err(io_error("read", &path))?;
-    Ok(complete_records(&path, &bytes.unwrap_or_default())?.0)
+    let file = files::optional(files::open(&path)).map_err(io_error("read", &path))?;
+    let Some(mut file) = file else { return Ok(Vec::new()) };
+    let (records, _) = complete_records(&path, &mut file)?;
+    Ok(records.into_iter().map(|(_, episode)| episode).collect())
 }
 
 /// The complete records, and their length in bytes. A damaged one is an error, unless it may be an
 /// incomplete one at the end.
-fn complete_records(path: &Path, bytes: &[u8]) -> Result<(Vec<Record>, usize), RunDirError> {
-    let (mut records, mut rest) = (Vec::new(), bytes);
-    while let Some(frame) = first_frame(rest) {
-        let number = records.len() + 1;
-        let broken = |error| content(path, None, format!("record {number}: {error}"));
-        records.push(decode(frame).map_err(broken)?);
-        rest = &rest[HEADER + frame.len()..];
+fn complete_records(
+    path: &Path,
+    file: &mut File,
+) -> Result<(Vec<(Hash, Episode)>, u64), RunDirError> {
+    let (mut records, mut length) = (Vec::new(), 0);
+    let mut reader = BufReader::new(&*file);
+    while let Some((hash, frame)) = next(&mut reader).map_err(io_error("read", path))? {
+        let broken = |error| content(path, None, format!("record {}: {error}", records.len() + 1));
+        records.push((hash, decode_kept(&frame).map_err(broken)?));
+        length += (HEADER + frame.len()) as u64;
     }
-    let length = bytes.len() - rest.len();
-    if (1..rest.len()).any(|start| first_frame(&rest[start..]).is_some()) {
+    let rest = files::rest(file, length).map_err(io_error("read", path))?;
+    let is_record = |start: usize| next(&mut &rest[start..]).is_ok_and(|found| found.is_some());
+    if (1..rest.len()).any(is_record) {
         let number = records.len() + 1;
         let reason =
             format!("record {number}, at byte {length}, is damaged, but one after it is complete");
@@ -74,14 +85,24 @@ fn complete_records(path: &Path, bytes: &[u8]) -> Result<(Vec<Record>, usize), R
     Ok((records, length))
 }
 
-/// The frame of the record that the bytes begin with, if it is complete.
-fn first_frame(bytes: &[u8]) -> Option<&[u8]> {
-    let (length, bytes) = bytes.split_first_chunk()?;
-    let (hash, bytes) = bytes.split_first_chunk::<32>()?;
-    let frame = bytes.get(..u32::from_le_bytes(*length) as usize)?;
-    // Every frame begins so; else the search for a later one would hash each part of a damaged one.
-    let is_complete = frame.starts_with(b"QUAD") && Hash::of(frame).bytes() == hash;
-    is_complete.then_some(frame)
+/// The next frame and its hash, if its record is complete.
+fn next(reader: &mut impl Read) -> io::Result<Option<(Hash, Vec<u8>)>> {
+    let mut begin = [0; HEADER + BEGIN.len()];
+    match reader.read_exact(&mut begin) {
+        Err(error) if error.kind() == ErrorKind::UnexpectedEof => return Ok(None),
+        read => read?,
+    }
+    let mut frame = begin[HEADER..].to_vec();
+    // Else the search for a later one would hash each part of a damaged one.
+    if frame != BEGIN {
+        return Ok(None);
+    }
+    let [a, b, c, d, ..] = begin;
+    let length = u32::from_le_bytes([a, b, c, d]) as usize;
+    reader.take(length.saturating_sub(BEGIN.len()) as u64).read_to_end(&mut frame)?;
+    let hash = Hash::of(&frame);
+    let is_complete = frame.len() == length && hash.bytes()[..] == begin[4..HEADER];
+    Ok(is_complete.then_some((hash, frame)))
 }
 
 #[cfg(test)]

@@ -29,30 +29,26 @@ impl Log {
     /// Opens or creates a file of lines and cuts off an incomplete line at its end. A log with a
     /// lock is durable.
     pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
-        let durable = lock.is_some();
-        let log = Self::of_records(path, durable, |bytes| Ok(complete_lines(bytes)))?;
+        let mut file = files::append(&path).map_err(io_error("open", &path))?;
+        let text = files::rest(&mut file, 0).map_err(io_error("read", &path))?;
+        let log = Self::cut(path, file, complete_lines(&text) as u64, lock.is_some())?;
         Ok(Self { _lock: lock, ..log })
     }
 
-    /// Opens or creates a file and cuts off all but the first bytes, as many as `complete` counts.
-    pub(super) fn of_records(
+    /// A log of the first `length` bytes of a file, whose rest is cut off.
+    pub(super) fn cut(
         path: PathBuf,
+        file: File,
+        length: u64,
         durable: bool,
-        complete: impl FnOnce(&[u8]) -> Result<usize, RunDirError>,
     ) -> Result<Self, RunDirError> {
-        let file = files::append(&path).map_err(io_error("open", &path))?;
-        let mut log = Self { path, file, length: 0, torn: true, durable, _lock: None };
-        log.length = complete(&log.bytes()?)? as u64;
+        let mut log = Self { path, file, length, torn: true, durable, _lock: None };
         // Lines that a killed process did not synchronize count from now on.
         log.mend()
             .and_then(|()| log.synchronize())
             .and_then(|()| files::synchronize_folder(&log.path))
             .map_err(io_error("open", &log.path))?;
         Ok(log)
-    }
-
-    pub(super) fn path(&self) -> &Path {
-        &self.path
     }
 
     /// True if it has no complete line.
@@ -110,16 +106,12 @@ impl Log {
         mut keep: impl FnMut(&str) -> bool,
     ) -> Result<(), RunDirError> {
         // After a power cut, a file that was not synchronized may contain anything.
-        let bytes = self.bytes()?;
+        let bytes = files::rest(&mut self.file, 0).map_err(io_error("read", &self.path))?;
         let lines = bytes.split_inclusive(|&byte| byte == b'\n');
         let kept = lines.take_while(|line| std::str::from_utf8(line).is_ok_and(&mut keep));
         self.length = kept.map(|line| line.len() as u64).sum();
         self.torn = true;
         self.mend().map_err(io_error("write", &self.path))
-    }
-
-    fn bytes(&mut self) -> Result<Vec<u8>, RunDirError> {
-        files::rest(&mut self.file, 0).map_err(io_error("read", &self.path))
     }
 }
 
@@ -151,7 +143,7 @@ mod tests {
     fn what_a_full_disk_has_torn_off_is_cut_off_by_the_next_write() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
-        let mut log = Log::of_records(path.clone(), true, |bytes| Ok(bytes.len())).unwrap();
+        let mut log = Log::cut(path.clone(), files::append(&path).unwrap(), 0, true).unwrap();
         log.append_bytes(b"first,").unwrap();
         let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
         let file = std::mem::replace(&mut log.file, full);

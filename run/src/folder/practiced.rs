@@ -22,35 +22,35 @@ pub fn practiced(path: &Path) -> Result<Option<(Findings, &'static str)>, RunDir
     let (dir, config) = RunDir::open(path)?;
     let experiment = &config.experiment;
     let Some(online) = &experiment.online else { return Ok(None) };
-    let records = read_experience(path)?;
-    let lengths = records.iter().map(|record| record.episode.rewards.len() as u64);
+    let episodes = read_experience(path)?;
+    let lengths = episodes.iter().map(|episode| episode.rewards.len() as u64);
     let rows: u64 = lengths.sum();
     let mut found = Findings { what: "environment steps are recorded", ..Findings::default() };
     (found.found, found.expected) = (rows.min(online.steps), online.steps);
     if rows < online.steps {
         found.add("not recorded yet", format!("{} steps", online.steps - rows));
     }
-    let most = records.len() as u64 + u64::from(online.lag);
+    let most = episodes.len() as u64 + u64::from(online.lag);
     let seeds = BTreeSet::from_iter((0..most).map(|j| practice_seed(experiment.seed, j)));
-    let (mut seen, mut arithmetic) = (BTreeSet::new(), BTreeSet::new());
-    let mut is_repeatable = true;
-    for record in &records {
-        let episode = &record.episode;
-        let name = format!("step {}, seed {}", episode.step, episode.score.seed);
-        if !seeds.contains(&episode.score.seed) {
-            found.add("no episode of this run", name.clone());
+    let mut seen = BTreeSet::new();
+    for episode in &episodes {
+        let seed = episode.score.seed;
+        let name = || format!("step {}, seed {seed}", episode.step);
+        if !seeds.contains(&seed) {
+            found.add("no episode of this run", name());
         }
-        if !seen.insert(episode.score.seed) {
-            found.add("recorded twice", name.clone());
+        if !seen.insert(seed) {
+            found.add("recorded twice", name());
         }
-        let hash = dir.read_snapshot(episode.step).map(|file| Hash::of(&file));
-        if hash.is_ok_and(|hash| hash != episode.weights) {
-            is_repeatable = false;
-        }
-        arithmetic.insert(&record.precision);
-        is_repeatable &= episode.interventions.is_empty();
     }
-    is_repeatable &= arithmetic.len() <= 1;
+    let arithmetic = BTreeSet::from_iter(episodes.iter().map(|it| &it.precision));
+    let acted = BTreeSet::from_iter(episodes.iter().map(|it| (it.step, it.weights)));
+    let is_same = |(step, weights): &(u64, Hash)| {
+        dir.read_snapshot(*step).map_or(true, |file| Hash::of(&file) == *weights)
+    };
+    let is_repeatable = arithmetic.len() <= 1
+        && episodes.iter().all(|it| it.interventions.is_empty())
+        && acted.iter().all(is_same);
     Ok(Some((found, if is_repeatable { REPEATABLE } else { LOGGED })))
 }
 

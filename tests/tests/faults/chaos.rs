@@ -67,12 +67,13 @@ fn a_few_faults_change_no_bit_of_a_run() {
     endure(&faults, faults.len() as u64, 0);
 }
 
+/// Five kills of each program, a cut link and a full disk.
 #[test]
 fn a_few_faults_lose_no_row_of_practice_and_change_no_bit() {
-    let kinds = [Program::Learner, Program::Evaluator].map(Fault::Kill);
-    let faults =
-        [&kinds[..], &[Fault::Link(Program::Evaluator, Trouble::Cut), Fault::FillDisk]].concat();
-    endure(&faults, 6, 20_000);
+    let kills = [Program::Learner, Program::Evaluator].map(Fault::Kill).repeat(5);
+    let others = [Fault::Link(Program::Evaluator, Trouble::Cut), Fault::FillDisk];
+    let faults = [&kills[..], &others].concat();
+    endure(&faults, faults.len() as u64, 30_000);
 }
 
 #[test]

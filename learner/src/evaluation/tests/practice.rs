@@ -20,14 +20,11 @@ fn bench() -> Bench {
 
 fn episode(seed: u64) -> Episode {
     Episode {
-        step: 500,
-        weights: hash(500),
         score: EpisodeScore { length: 2, ..score(seed, 3.0) },
-        terminated: false,
         observations: vec![0.0; 3 * 11],
         actions: vec![0.0; 2 * 3],
         rewards: vec![1.0, 2.0],
-        interventions: Vec::new(),
+        ..Episode::new(500, hash(500), name("f32"), seed)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::AtomicBool;
 
-use quad_protocol::{Episode, EpisodeScore, Exploration, Hash, practice_seed};
+use quad_protocol::{Episode, Exploration, Hash, Name, practice_seed};
 use quad_run::config::{Experiment, Online};
 
 use super::*;
@@ -31,16 +31,12 @@ fn experiment() -> Experiment {
 }
 
 fn episode(rows: usize) -> Episode {
-    let score = EpisodeScore { seed: 0, episode_return: 0.0, length: rows as u32, score: 0.0 };
     Episode {
-        step: 0,
-        weights: Hash::of(b""),
-        score,
         terminated: true,
         observations: vec![rows as f32; (rows + 1) * 11],
         actions: vec![0.5; rows * 3],
         rewards: vec![1.0; rows],
-        interventions: Vec::new(),
+        ..Episode::new(0, Hash::of(b""), Name::new("f32").unwrap(), 0)
     }
 }
 

@@ -3,27 +3,26 @@
 use std::fs;
 use std::path::PathBuf;
 
-use quad_protocol::{Episode, EpisodeScore, Name};
+use quad_protocol::{EpisodeScore, Name, encode};
 use tempfile::TempDir;
 
 use super::*;
 use crate::fixtures::config;
 
-/// A record of a practice episode of two steps.
-fn record(seed: u64) -> Record {
-    let score = EpisodeScore { seed, episode_return: 3.0, length: 2, score: 3.0 };
-    let episode = Episode {
-        step: 10,
-        weights: Hash::of(b"weights"),
-        score,
-        terminated: true,
+/// A practice episode of two steps.
+fn episode(seed: u64) -> Episode {
+    Episode {
+        score: EpisodeScore { seed, episode_return: 3.0, length: 2, score: 3.0 },
         observations: vec![0.0, 1.0, 2.0],
         actions: vec![0.5, -0.5],
         rewards: vec![1.0, 2.0],
-        interventions: Vec::new(),
-    };
-    let name = |text: &str| Name::new(text).unwrap();
-    Record { evaluator: name("e"), precision: name("f32"), episode }
+        ..Episode::new(10, Hash::of(b"weights"), Name::new("f32").unwrap(), seed)
+    }
+}
+
+fn framed(seed: u64) -> (Hash, Vec<u8>) {
+    let frame = encode(&episode(seed)).unwrap();
+    (Hash::of(&frame), frame)
 }
 
 /// A run with the records of seeds 1, 2 and 3, the path of their file, and its contents.
@@ -33,8 +32,8 @@ fn recorded() -> (TempDir, RunDir, PathBuf, Vec<u8>) {
     assert_eq!(read_experience(run.path()).unwrap(), []);
     let (mut log, records) = run.experience_log().unwrap();
     assert_eq!(records, []);
-    log.append(&[record(1)]).unwrap();
-    log.append(&[record(2), record(3)]).unwrap();
+    log.append(&[framed(1)]).unwrap();
+    log.append(&[framed(2), framed(3)]).unwrap();
     let path = run.path().join("experience.log");
     let bytes = fs::read(&path).unwrap();
     (folder, run, path, bytes)
@@ -44,13 +43,12 @@ fn recorded() -> (TempDir, RunDir, PathBuf, Vec<u8>) {
 fn an_incomplete_record_at_the_end_is_cut_off() {
     let (_folder, run, path, bytes) = recorded();
     let record_length = bytes.len() / 3;
-    let two = [1, 2].map(record);
-    for kept in [0, 1, 35, 36, record_length - 1] {
+    for kept in [0, 1, 35, 36, 40, record_length - 1] {
         fs::write(&path, &bytes[..2 * record_length + kept]).unwrap();
-        assert_eq!(read_experience(run.path()).unwrap(), two);
+        assert_eq!(read_experience(run.path()).unwrap(), [1, 2].map(episode));
         let (mut log, records) = run.experience_log().unwrap();
-        assert_eq!(records, two);
-        log.append(&[record(3)]).unwrap();
+        assert_eq!(records, [1, 2].map(|seed| (framed(seed).0, episode(seed))));
+        log.append(&[framed(3)]).unwrap();
         assert_eq!(fs::read(&path).unwrap(), bytes, "{kept} bytes");
     }
 }
@@ -75,12 +73,20 @@ fn a_damaged_record_before_another_one_is_an_error() {
 }
 
 #[test]
-fn a_record_of_another_version_is_an_error() {
+fn the_log_of_a_program_of_another_version_is_read_but_no_other_message() {
     let (_folder, run, path, _) = recorded();
-    let mut frame = encode(&record(4)).unwrap();
-    frame[4] += 1;
-    let length = (frame.len() as u32).to_le_bytes();
-    fs::write(&path, [&length[..], Hash::of(&frame).bytes(), &frame].concat()).unwrap();
-    let error = run.experience_log().unwrap_err().to_string();
-    assert!(error.contains("record 1: the message has protocol version"), "{error}");
+    let (_, frame) = framed(4);
+    // A byte of the version, and the kind.
+    for (at, expected) in [(4, Ok(vec![episode(4)])), (6, Err("is of kind 6, kind 7 belongs here"))]
+    {
+        let mut frame = frame.clone();
+        frame[at] ^= 1;
+        let length = (frame.len() as u32).to_le_bytes();
+        fs::write(&path, [&length[..], Hash::of(&frame).bytes(), &frame].concat()).unwrap();
+        let read = read_experience(run.path()).map_err(|error| error.to_string());
+        match expected {
+            Ok(episodes) => assert_eq!(read.unwrap(), episodes),
+            Err(words) => assert!(read.unwrap_err().contains(words)),
+        }
+    }
 }

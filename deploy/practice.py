@@ -1,0 +1,44 @@
+#!/usr/bin/env python3
+"""Prints the table of studies/practice.toml, as Markdown: python3 deploy/practice.py runs/practice
+
+For each dataset the score before practice (mean of the last three evaluations), after it and on the dataset alone (of the last five),
+mean ± sample standard deviation over the seeds. Runs that are not complete are left out.
+"""
+
+import json
+import re
+import statistics
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+COLUMNS = "before", "after", "alone"
+
+
+def spread(values):
+    """Mean ± sample standard deviation; nothing of nothing."""
+    if not values:
+        return ""
+    mean = f"{statistics.fmean(values):.1f}"
+    return f"{mean} ± {statistics.stdev(values):.1f}" if len(values) > 1 else mean
+
+
+def row(*cells):
+    print("|", " | ".join(cells), "|")
+
+
+scores = defaultdict(list)  # by method, environment and column: a number for each seed
+for file in sorted(Path(sys.argv[1]).glob("*/report.json")):
+    environment, method = re.fullmatch(r"(\w+)-demo-\w+-(.+)-seed\d+", file.parent.name).groups()
+    report = json.loads(file.read_text())
+    before = [it["score"]["mean"] for it in report["evaluations"] if it.get("environment_steps") == 0]
+    if before:
+        scores[method, environment, "before"].append(statistics.fmean(before[-3:]))
+    column = "alone" if method.endswith("-alone") else "after"
+    scores[method.removesuffix("-alone"), environment, column].append(report["mean_last_5"])
+
+environments = sorted({environment for _, environment, _ in scores})
+row("method", *(f"{environment}, {column}" for environment in environments for column in COLUMNS))
+row(*["---"] * (1 + len(COLUMNS) * len(environments)))
+for method in dict.fromkeys(method for method, *_ in scores):
+    row(method, *(spread(scores[method, environment, column]) for environment in environments for column in COLUMNS))

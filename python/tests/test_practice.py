@@ -1,0 +1,80 @@
+"""Practice in a Python environment: the same run for any number of evaluators, whatever is killed."""
+
+import subprocess
+
+import h5py
+import numpy as np
+
+import quad_rl
+from test_evaluate import Learner, Walk, wait
+
+ROWS = 2_000
+
+
+class Fall(Walk):
+    """Ends where it falls, so that the policy decides how long an episode is."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, bool(abs(self.state[1]) > 1.5), truncated, info
+
+
+def learner(folder, data, **arguments):
+    practice = ["--online-steps", str(ROWS), "--checkpoint-seconds", "0"]
+    for value in "warmup=100", "lag=3", "snapshot_interval=50":
+        practice += ["--set", f"online.{value}"]
+    return Learner(folder, data, *practice, interval=500, episodes=2, **arguments)
+
+
+def evaluators(learner, workers):
+    return quad_rl.Evaluators("walk", lambda seed: Fall(), connect=learner.endpoint, workers=workers)
+
+
+def checkpoint(folder):
+    return max((folder / "checkpoints").glob("step_*")).read_bytes()
+
+
+def experience(folder):
+    """The rows of each episode, by its first."""
+    file = folder / "practice.hdf5"
+    subprocess.run(["learner", "export-data", str(folder), "--out", str(file)], check=True, capture_output=True, timeout=600)
+    with h5py.File(file) as data:
+        ends = np.flatnonzero(data["terminals"][:] | data["timeouts"][:]) + 1
+        rows = np.hstack([data["observations"][:], data["actions"][:], data["rewards"][:, None]])
+    episodes = np.split(rows, ends[:-1])
+    assert len(rows) >= ROWS and len({len(episode) for episode in episodes}) > 5
+    by_first = {episode[0].tobytes(): episode.tobytes() for episode in episodes}
+    assert len(by_first) == len(episodes), "an episode is there twice"
+    return by_first
+
+
+def test_any_number_of_evaluators_and_any_kill_make_the_same_run(tmp_path, data):
+    folders = [tmp_path / name for name in ("of-1", "of-2", "of-4", "killed")]
+    for workers, folder in zip((1, 2, 4), folders):
+        whole = learner(folder, data)
+        with evaluators(whole, workers):
+            code, said = whole.end()
+        assert code == 0, said
+    killed = learner(folders[-1], data)
+    log = folders[-1] / "experience.log"
+    with evaluators(killed, 2) as pool:
+        for kill in range(4):
+            before = log.stat().st_size if log.exists() else 0
+            wait(lambda: log.exists() and log.stat().st_size > before)
+            pool._workers[kill % 2].process.kill()
+            assert killed.process.poll() is None, "it has ended before"
+            killed.process.kill()
+            killed.end()
+            killed = learner(folders[-1], data, listen=killed.endpoint)
+        code, said = killed.end()
+    assert code == 0, said
+
+    first, *others = [(checkpoint(folder), experience(folder)) for folder in folders]
+    for weights, episodes in others:
+        assert weights == first[0]
+        # At the end, one run may have an episode more than it needs.
+        common = first[1].keys() & episodes.keys()
+        assert len(common) >= max(len(first[1]), len(episodes)) - 3
+        assert all(first[1][key] == episodes[key] for key in common)
+    verified = subprocess.run(["learner", "verify", str(folders[-1])], capture_output=True, text=True, timeout=600)
+    assert verified.returncode == 0 and "bit for bit by evaluators with the same arithmetic" in verified.stdout, verified
