@@ -30,7 +30,7 @@ if [ ! -e "$DATASET" ]; then
   $BIN/evaluator collect --env hopper --out "$DATASET"
 fi
 
-if [ -e "$PRACTICE/complete" ] && [ $# -eq 0 ]; then
+if [ -e "$RUN/complete" ] && [ -e "$PRACTICE/complete" ] && [ $# -eq 0 ]; then
   $BIN/learner report "$RUN" "$PRACTICE" --html "$RUN/report.html"
   echo "learning curves: $RUN/learning_curve.svg $PRACTICE/learning_curve.svg"
   echo "run folders: $RUN $PRACTICE"

@@ -2,13 +2,13 @@
 # Trains algorithms on datasets in the demonstration's setting, scores the last five snapshots of each run on the same
 # episodes, and prints one Markdown table of all runs under runs/results.
 #
-#   deploy/results.sh [--seeds "0 1 2"] [--methods "bc quad iql"] [--candidates 1,10] FILE...
+#   deploy/results.sh [--seeds "0 1 2"] [--methods "bc quad iql"] [--agent KEY=VALUE] [--candidates 1,10] FILE...
 #
 #   deploy/results.sh data/hopper-demo.hdf5          the demonstration's own file, which is recorded if it is not there
 #   deploy/results.sh --methods "bc dac quad" --candidates 1,10 walker2d*.hdf5
 #
 # A method is the name of an algorithm, or of one of QUAD's variants: bc (behavior cloning) and dac. --candidates sets how
-# many actions a policy that draws several draws; the default is the algorithm's.
+# many actions a policy that draws several draws; the default is the algorithm's. --agent changes a hyper-parameter of all.
 # A file's name begins with its environment: hopper, halfcheetah, walker2d, antmaze_umaze or antmaze_medium. Runs go to
 # runs/results. Finished runs are skipped, so the script can be interrupted. One run per core at a time, each on one thread.
 set -euo pipefail
@@ -16,6 +16,7 @@ cd "$(dirname "$0")/.."
 . deploy/common.sh
 
 BIN=target/release
+AGENT=
 EVALUATIONS=5
 EPISODES=20
 CANDIDATES=
@@ -29,6 +30,7 @@ while [ $# -gt 1 ]; do
   case $1 in
     --seeds) seeds=$2 ;;
     --methods) methods=$2 ;;
+    --agent) AGENT=$2 ;;
     --candidates) CANDIDATES=$2 ;;
     *) break ;;
   esac
@@ -68,8 +70,8 @@ run() {
     rm -rf "$run"
     mkdir -p "$run"
     # shellcheck disable=SC2046 # Several words.
-    start_learner "$run" --task "$task" --dataset "$file" $(flags "$method") --episodes 1 --seed "$seed" \
-      >"$run/learner.log" 2>&1 || { cat "$run/learner.log" >&2; return 1; }
+    start_learner "$run" --task "$task" --dataset "$file" $(flags "$method") ${AGENT:+--agent "$AGENT"} \
+      --episodes 1 --seed "$seed" >"$run/learner.log" 2>&1 || { cat "$run/learner.log" >&2; return 1; }
     $BIN/evaluator serve --connect "$endpoint" --http 127.0.0.1:0 >"$run/evaluator.log" 2>&1 &
     evaluator=$!
     wait "$learner" || { tail -n 5 "$run/learner.log" >&2; kill $evaluator; return 1; }
@@ -85,7 +87,7 @@ run() {
 }
 # xargs runs it in other shells.
 export -f run task flags start_learner say die
-export NAME BIN EVALUATIONS EPISODES CANDIDATES RAYON_NUM_THREADS=1
+export NAME BIN AGENT EVALUATIONS EPISODES CANDIDATES RAYON_NUM_THREADS=1
 
 for file; do
   task "$file" >/dev/null

@@ -25,7 +25,7 @@ impl DatasetError {
     }
 }
 
-/// Problem with a dataset.
+/// Reason why a dataset cannot be read, trained on or written.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // The messages say what each is.
 pub enum Problem {
@@ -75,7 +75,7 @@ pub enum Problem {
     Write(#[source] hdf5::Error),
 }
 
-/// Problem with an array.
+/// Reason why an array cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // The messages say what each is.
 pub enum ArrayProblem {
@@ -89,7 +89,7 @@ pub enum ArrayProblem {
     DiscreteActions,
     #[error("has shape {0:?}, but must have rows, or rows of numbers")]
     Axes(Vec<usize>),
-    #[error("has shape {0:?}, but must have {1:?}")]
+    #[error("has shape {0:?}, but must have {shape}", shape = shape(*.1))]
     Shape(Vec<usize>, [usize; 2]),
     #[error("claims the shape {0:?}, more than a file of {1} bytes can hold")]
     Oversized(Vec<usize>, u64),
@@ -139,6 +139,14 @@ pub enum Load {
     Convert(&'static str),
     /// Advice on loading it in Python.
     Python(&'static str),
+}
+
+/// The shape of an array; that of one number a row has no second axis.
+fn shape([rows, width]: [usize; 2]) -> String {
+    match width {
+        1 => format!("[{rows}]"),
+        _ => format!("[{rows}, {width}]"),
+    }
 }
 
 fn such_rows(rows: usize) -> String {

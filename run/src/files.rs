@@ -41,8 +41,10 @@ fn open_as(options: &mut OpenOptions, link: OFlags, path: &Path) -> io::Result<F
         Some(Errno::LOOP | Errno::NXIO) => no_file(),
         _ => error,
     })?;
-    match file.metadata()?.is_file() {
+    let metadata = file.metadata()?;
+    match metadata.is_file() {
         true => Ok(file),
+        false if metadata.is_dir() => Err(io::Error::other("it is a folder, not a file")),
         false => Err(no_file()),
     }
 }

@@ -32,7 +32,7 @@ pub use exit::{
 };
 pub use health::{Health, Heartbeat};
 pub use logging::{Logging, init_logging};
-pub use metrics_server::{ListenError, MetricsServer, serve_metrics};
+pub use metrics_server::{ListenError, MetricsServer, parse_address, serve_metrics};
 pub use progress_bar::ProgressBar;
 pub use router::open_router;
 pub use session::{open_session, reachable_at};

@@ -51,6 +51,11 @@ impl ListenError {
     }
 }
 
+/// Parses a server's address from the command line: a `value_parser`.
+pub fn parse_address(text: &str) -> Result<SocketAddr, &'static str> {
+    text.parse().map_err(|_| "write ADDR:PORT, such as 127.0.0.1:9600")
+}
+
 /// A server, which ends when this is dropped.
 #[derive(Debug)]
 pub struct MetricsServer {

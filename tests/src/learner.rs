@@ -90,7 +90,7 @@ impl Learner {
     }
 }
 
-/// What `learner verify` says of a run; it must be content.
+/// Runs `learner verify`, which must succeed, and returns its output.
 pub fn verify(run_dir: &Path, flags: &[&Path]) -> String {
     let mut verify = Command::new(binary("learner"));
     stdout(&verify.arg("verify").arg(run_dir).args(flags).output().unwrap())

@@ -13,7 +13,7 @@ use super::simulator::{Robot, Simulator};
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Benchmark {
-    /// Display name.
+    /// Name in tables and messages, such as `OGBench`.
     pub name: String,
     /// Format of the files.
     pub format: Format,
@@ -51,7 +51,7 @@ impl Format {
         }
     }
 
-    /// Display name.
+    /// Name in messages, such as `npz archive`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Hdf5 => "HDF5 file",
@@ -254,13 +254,13 @@ fn fill(template: &str, place: &str, data: &str, task: &str) -> String {
 
 /// Task with its environment and dataset.
 pub struct BenchmarkTask {
-    /// Task name.
+    /// Name after `--task`.
     pub name: String,
     /// Benchmark of the task.
     pub benchmark: &'static Benchmark,
-    /// Environment name.
+    /// Name after `--env`.
     pub environment: String,
-    /// Dataset name.
+    /// Name after `--dataset`.
     pub dataset: String,
     /// Task that labels the dataset with rewards, if it has none.
     pub maze: Option<MazeTask>,

@@ -133,6 +133,14 @@ impl EnvironmentSpec {
         self.simulation.as_deref().unwrap_or(&self.name)
     }
 
+    /// Another simulation with observations and actions of the same sizes.
+    pub fn of_same_sizes(&self) -> Option<&'static Self> {
+        let sizes = |spec: &Self| (spec.observation_dim, spec.action_dim);
+        let is_alike =
+            |spec: &&Self| sizes(spec) == sizes(self) && spec.simulation() != self.simulation();
+        all().iter().find(is_alike)
+    }
+
     /// D4RL's normalized score of an undiscounted return: `100 · (R - min) / (max - min)`.
     pub fn normalized_score(&self, episode_return: f64) -> f64 {
         let (min, max) = self.reference_returns;

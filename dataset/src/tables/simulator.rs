@@ -27,11 +27,11 @@ pub struct Robot {
     pub frame_skip: usize,
     /// Noise on the initial state.
     pub noise: Noise,
-    /// Effect of an action.
+    /// Motors, or displacement of a point.
     pub drive: Drive,
 }
 
-/// Effect of an action.
+/// Map from an action to the simulator.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Drive {

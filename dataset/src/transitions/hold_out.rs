@@ -11,7 +11,7 @@ use crate::recording::{Recording, RowKind};
 /// Distinguishes this random stream from others of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"hold out");
 
-/// Choice of validation episodes.
+/// Episodes that are kept out of training.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum HoldOut<'a> {
     /// Random fraction of the episodes.

@@ -35,7 +35,7 @@ pub struct ReadOptions {
     pub environment: Option<&'static EnvironmentSpec>,
     /// Maze task that replaces the source's rewards and masks.
     pub task: Option<MazeTask>,
-    /// Reward rule.
+    /// Map from the source's rewards to those that are trained on.
     pub reward: RewardRule,
     /// Columns to normalize. Actions that are not normalized must be within [-1, 1].
     pub normalize: Normalize,

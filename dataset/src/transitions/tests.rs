@@ -144,8 +144,8 @@ fn experience_that_a_dataset_would_be_refused_for_is_refused() {
     };
     for (problem, expected) in [
         (problem(&[0.0], &[], &[]), "0 rows, of which none"),
-        (problem(&[0.0], &[0.0], &[0.0]), "`observations` has shape [1], but must have [2, 1]"),
-        (problem(&[0.0; 2], &[0.0; 2], &[0.0]), "`actions` has shape [2], but must have [1, 1]"),
+        (problem(&[0.0], &[0.0], &[0.0]), "`observations` has shape [1], but must have [2]"),
+        (problem(&[0.0; 2], &[0.0; 2], &[0.0]), "`actions` has shape [2], but must have [1]"),
         (problem(&[0.0, f32::NAN], &[0.0], &[0.0]), "`observations`, row 1: NaN is not"),
         (problem(&[0.0; 2], &[0.0], &[f32::INFINITY]), "`rewards`, row 0: inf is not"),
         (problem(&[0.0; 2], &[1.1], &[0.0]), "`actions`, row 0: the action 1.1 is outside"),

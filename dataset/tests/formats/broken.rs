@@ -109,9 +109,9 @@ fn an_array_that_is_not_what_it_must_be() {
     spoiled("observations", &[ROWS, 17], &half, message);
     let message = "`actions` has 6 numbers a row, but `hopper` has 3";
     spoiled("actions", &[ROWS, 6], &half[..ROWS * 6], message);
-    let message = "array `rewards` has shape [19], but must have [20, 1]";
+    let message = "array `rewards` has shape [19], but must have [20]";
     spoiled("rewards", &[ROWS - 1], &half[..ROWS - 1], message);
-    let message = "array `terminals` has shape [20, 2], but must have [20, 1]";
+    let message = "array `terminals` has shape [20, 2], but must have [20]";
     spoiled("terminals", &[ROWS, 2], &[false; ROWS * 2], message);
     let message = "has shape [20, 1, 11], but must have rows, or rows of numbers";
     spoiled("observations", &[ROWS, 1, 11], &half[..ROWS * 11], message);

@@ -45,7 +45,7 @@ use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_runtime::{
     Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, ListenError, Role,
-    SessionError, default_endpoint, parse_endpoint, serve_metrics,
+    SessionError, default_endpoint, parse_address, parse_endpoint, serve_metrics,
 };
 use tracing::{info, warn};
 
@@ -80,7 +80,7 @@ pub struct ServeArgs {
     #[arg(long, value_name = "DIR")]
     pub certificates: Option<PathBuf>,
     /// Address of /metrics and /healthz; port 0 takes a free one
-    #[arg(long, value_name = "ADDR:PORT")]
+    #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address)]
     pub http: Option<SocketAddr>,
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]

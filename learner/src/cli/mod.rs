@@ -5,17 +5,18 @@ mod judge;
 mod sweep;
 mod train;
 
+use std::ffi::OsStr;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use clap::builder::PossibleValuesParser;
-use clap::{Args, Parser, Subcommand};
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use clap::{Arg, Args, Parser, Subcommand};
 use clap_complete::Shell;
 use quad_algorithms::ALGORITHMS;
 use quad_dataset::{EnvironmentSpec, environment};
 use quad_run::config::{presets, tasks};
 use quad_run::results::Select;
-use quad_runtime::parse_endpoint;
+use quad_runtime::{parse_address, parse_endpoint};
 
 pub use export::{At, ExportArgs, ExportDataArgs};
 pub use judge::JudgeArgs;
@@ -171,7 +172,7 @@ pub struct PageArgs {
     #[arg(value_name = "DIR", default_value = "runs")]
     pub runs: PathBuf,
     /// Address of the page; port 0 takes a free one
-    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:8080")]
+    #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address, default_value = "127.0.0.1:8080")]
     pub http: SocketAddr,
 }
 
@@ -189,7 +190,7 @@ pub struct ReportArgs {
     /// Print the tables as LaTeX, which needs the package booktabs
     #[arg(long, group = "style")]
     pub latex: bool,
-    /// Which evaluations make a run's score
+    /// Evaluations whose mean is a run's score
     #[arg(long, value_enum, default_value = "last")]
     pub select: Select,
     /// Also write one HTML file to send or to print: tables, figures, settings, data, films in the
@@ -202,8 +203,29 @@ pub struct ReportArgs {
     pub figures: Option<PathBuf>,
 }
 
-fn task_names() -> PossibleValuesParser {
-    tasks::all().iter().map(|task| &*task.name).into()
+/// Parses the name of a task. Shells complete it; an error has similar names, not all.
+#[derive(Clone)]
+struct TaskName;
+
+impl TypedValueParser for TaskName {
+    type Value = String;
+
+    fn parse_ref(
+        &self,
+        command: &clap::Command,
+        argument: Option<&Arg>,
+        value: &OsStr,
+    ) -> Result<String, clap::Error> {
+        let named = |text: &str| match tasks::named(text) {
+            Ok(task) => Ok(task.name.clone()),
+            Err(error) => Err(error.hint()),
+        };
+        named.parse_ref(command, argument, value)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        Some(Box::new(tasks::all().iter().map(|task| PossibleValue::new(&*task.name))))
+    }
 }
 
 fn algorithm_names() -> PossibleValuesParser {

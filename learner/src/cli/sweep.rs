@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, value_parser};
 use quad_run::config::tables::parse_assignment;
-use quad_runtime::parse_endpoint;
+use quad_runtime::{parse_address, parse_endpoint};
 use toml::Table;
 
 pub(super) const EXAMPLES: &str = "\
@@ -30,8 +30,8 @@ Examples:
 
 Each run is a `learner train` of one thread (RAYON_NUM_THREADS changes that) and logs to runs/STUDY/RUN/learner.log. A run that
 fails does not end the others. The same command continues the runs that are not complete. The exit code is 0 if all runs are
-complete, 1 if a run has failed, 75 if runs are left for the same command. At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learners save checkpoints, and
-the sweep ends within 18 s.";
+complete, 1 if a run has failed, 75 if runs are left for the same command. At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learners
+save checkpoints, and the sweep ends within 18 s.";
 
 #[derive(Debug, Args)]
 pub struct SweepArgs {
@@ -45,7 +45,7 @@ pub struct SweepArgs {
     /// Print number, name and state of each run, and start none
     #[arg(long)]
     pub list: bool,
-    /// Train only runs with this value of an axis: task=hopper-*, seed=0; repeatable: one of an
+    /// Train only runs with this value of an axis: 'task=hopper-*', seed=0; repeatable: one of an
     /// axis's values, and for all axes
     #[arg(long, value_name = "AXIS=VALUE", value_parser = parse_assignment)]
     pub only: Vec<Table>,
@@ -60,7 +60,7 @@ pub struct SweepArgs {
     pub shard: Option<Shard>,
     /// Address of the page, /metrics and /healthz of the run that --index names [default: a free
     /// port]
-    #[arg(long, value_name = "ADDR:PORT", requires = "index")]
+    #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address, requires = "index")]
     pub http: Option<SocketAddr>,
     /// Runs at a time [default: uses three of four cores, and leaves the fourth for evaluators]
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]

@@ -8,10 +8,10 @@ use clap::{Args, value_parser};
 use quad_policy::Precision;
 use quad_run::config::Device;
 use quad_run::config::tables::{self, parse_assignment};
-use quad_runtime::parse_endpoint;
+use quad_runtime::{parse_address, parse_endpoint};
 use toml::{Table, Value};
 
-use super::{algorithm_names, parse_preset, task_names};
+use super::{TaskName, algorithm_names, parse_preset};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
@@ -29,15 +29,15 @@ Examples:
 
   # Continue after a crash or Ctrl-C: the same command again.
 
-At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learner saves a checkpoint and ends with exit code 75; at a second signal it ends at once. The same
-command continues from the newest checkpoint in the run's folder. On the same machine an interrupted run ends with the same
-weights, bit for bit, as a run without interruption.";
+At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learner saves a checkpoint and ends with exit code 75; at a second signal it ends at
+once. The same command continues from the newest checkpoint in the run's folder. On the same machine an interrupted run ends with
+the same weights, bit for bit, as a run without interruption.";
 
 #[derive(Debug, Args)]
 pub struct TrainArgs {
     /// The task: an environment, a dataset, and the algorithm's values for them (`learner presets`
-    /// lists tasks)
-    #[arg(long, value_name = "NAME", value_parser = task_names(), hide_possible_values = true, required_unless_present_any = ["preset", "from"])]
+    /// lists tasks; own-data trains on any file, without evaluations)
+    #[arg(long, value_name = "NAME", value_parser = TaskName, hide_possible_values = true, required_unless_present_any = ["preset", "from"])]
     task: Option<String>,
     /// The algorithm (`learner presets` lists algorithms) [default: quad]
     #[arg(long, value_name = "NAME", value_parser = algorithm_names(), hide_possible_values = true)]
@@ -105,14 +105,14 @@ pub struct TrainArgs {
     #[arg(long, value_name = "DIR")]
     pub certificates: Option<PathBuf>,
     /// Address of the page, /metrics and /healthz; port 0 takes a free one (see DIR/endpoints.json)
-    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
+    #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address, default_value = "127.0.0.1:0")]
     pub http: SocketAddr,
     /// Train on the CPU, or on the first Nvidia GPU (with a learner that deploy/cuda.sh has built)
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
     /// Change a hyper-parameter of the algorithm, in TOML's notation: guidance=dac, tau=0.5;
     /// repeatable
-    #[arg(long, value_name = "KEY=VALUE", value_parser = |text: &str| parse_assignment(&format!("agent.{text}")))]
+    #[arg(long, value_name = "KEY=VALUE", value_parser = parse_hyperparameter)]
     agent: Vec<Table>,
     /// Change any other key: batch_size=64; repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = parse_assignment)]
@@ -125,19 +125,19 @@ pub struct TrainArgs {
 #[command(next_help_heading = "Instead of the algorithm's value for the task")]
 struct OverrideArgs {
     /// Gradient steps on the dataset; 0 with --online-steps
-    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
+    #[arg(long, value_name = "N", value_parser = parse_count)]
     steps: Option<i64>,
     /// Environment steps of practice, from which the learner goes on learning [default: 0]
-    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
+    #[arg(long, value_name = "N", value_parser = parse_count)]
     online_steps: Option<i64>,
     /// Gradient steps between two evaluations; 0 trains without any evaluation
-    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
+    #[arg(long, value_name = "N", value_parser = parse_count)]
     eval_interval: Option<i64>,
     /// Episodes per evaluation
-    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
+    #[arg(long, value_name = "N", value_parser = parse_count)]
     episodes: Option<i64>,
     /// Seed of initial weights, batches, noise and the episodes of evaluations
-    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
+    #[arg(long, value_name = "N", value_parser = parse_count)]
     seed: Option<i64>,
     /// Precision of forward passes without gradient: f32, or bf16, which rounds and is faster on
     /// CPUs with AMX or AVX512-BF16
@@ -185,4 +185,16 @@ impl TrainArgs {
         set("precision", precision.map(Value::from));
         changes
     }
+}
+
+/// Parses `tau=0.5` as a key below `[agent]`.
+fn parse_hyperparameter(text: &str) -> Result<Table, String> {
+    let agent = parse_assignment(text)?;
+    Ok(Table::from_iter([("agent".to_owned(), agent.into())]))
+}
+
+/// Parses a number of steps or episodes, or a seed.
+fn parse_count(text: &str) -> Result<i64, &'static str> {
+    let count = text.parse().ok().filter(|count| *count >= 0);
+    count.ok_or("write a whole number such as 1000000, below 2⁶³")
 }

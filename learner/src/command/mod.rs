@@ -199,9 +199,12 @@ fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
     let entries = list::list(&args.dirs);
     show(args.json, &entries, || list::table(&entries))?;
     let unreadable = Vec::from_iter(entries.iter().filter_map(list::Entry::unreadable));
+    if unreadable.is_empty() {
+        return Ok(());
+    }
     let text = unreadable.join("\n  ");
-    anyhow::ensure!(text.is_empty(), "some runs cannot be read:\n  {text}");
-    Ok(())
+    Err(anyhow!("some runs cannot be read:\n  {text}"))
+        .hint("`learner list DIR` lists the runs below another folder")
 }
 
 fn rank(args: &JudgeArgs) -> anyhow::Result<()> {
@@ -250,10 +253,13 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
 fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let source = Source::parse(&args.dataset)?;
     let environment = args.env.or_else(|| environment::find(&source.entry()?.environment).ok());
-    let path = match source {
-        Source::Path(path) => path,
+    let path = match &source {
+        Source::Path(path) => path.clone(),
         source => source.obtain()?.path,
     };
+    if let Some(doubt) = environment.and_then(|spec| source.doubt(&path, &spec.name)) {
+        warn!("{doubt}");
+    }
     let inspection = quad_dataset::inspect(&path, environment).hint_of(DatasetError::hint)?;
     show(args.json, &inspection, || inspection.to_string())?;
     let (problems, path) = (inspection.problems.len(), inspection.path.display());

@@ -16,6 +16,7 @@ use tokio::task::LocalSet;
 use tracing::{info, warn};
 
 use super::all_readable;
+use super::train::record_hint;
 use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
 use crate::sweep::{Cost, LearnerOptions, Outcome, PlannedRun, Study, Sweep};
@@ -112,14 +113,24 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     let mut evaluators = LocalEvaluators::new(count, cores)?;
     // Fetched once, not by each learner.
     let mut datasets = BTreeMap::<Option<String>, Option<PathBuf>>::new();
+    let mut refusal = None;
     for (run, _) in &left {
         let fetch = || {
-            let refused = |error| warn!("no run on the data of {} can begin: {error:#}", run.name);
-            let dataset = run.source.obtain().map_err(refused);
-            dataset.ok().map(|dataset| dataset.path)
+            let dataset = run.source.obtain().hint(record_hint(&run.experiment));
+            let refused = |error| {
+                warn!("no run on the data of {} can begin: {error:#}", run.name);
+                refusal = Some(error);
+            };
+            dataset.map_err(refused).ok().map(|dataset| dataset.path)
         };
         let dataset = run.experiment.dataset.clone();
         datasets.entry(dataset).or_insert_with(fetch);
+    }
+    if let Some(refusal) = refusal
+        && args.index.is_none()
+        && datasets.values().all(Option::is_none)
+    {
+        return Err(refusal.context("no run can begin"));
     }
     let mut step_seconds = BTreeMap::new();
     // A single run, such as a task of an array job, starts at once and prints its own forecast.

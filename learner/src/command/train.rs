@@ -43,7 +43,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let experiment = preset.resolve(&args.changes()).hint_of(ConfigError::hint)?;
     let label = &preset.label;
     let Some(dataset) = &experiment.dataset else {
-        return Err(anyhow!("preset {label} names no dataset"))
+        return Err(anyhow!("{label} has no dataset of its own"))
             .hint(convert_hint(&preset).unwrap_or_else(|| record_hint(&experiment)));
     };
     let source = Source::parse(dataset)?;
@@ -83,6 +83,9 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
             experiment.environment
         );
     }
+    if let Some(doubt) = source.doubt(&config.dataset.path, &experiment.environment) {
+        warn!("{doubt}");
+    }
     if !experiment.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
@@ -121,15 +124,22 @@ fn convert_hint(preset: &Preset) -> Option<String> {
     ))
 }
 
-/// A hint for any other run without a dataset.
-fn record_hint(experiment: &Experiment) -> String {
-    let name = &experiment.environment;
+/// A hint for any other run whose dataset is not named, or not there.
+pub(super) fn record_hint(experiment: &Experiment) -> String {
+    let (name, file) = (&experiment.environment, experiment.dataset.as_deref());
+    let advice = match file {
+        None => "name a file by --dataset FILE",
+        Some(_) => "check the path",
+    };
     let can_record = environment::find(name).is_ok_and(|spec| spec.maze.is_none());
     let other = match can_record {
-        true => format!("`evaluator collect --env {name} --out FILE` records one"),
+        true => {
+            let file = file.unwrap_or("FILE");
+            format!("`evaluator collect --env {name} --out {file}` records one")
+        }
         false => "docs/data.md says what it may be".to_owned(),
     };
-    format!("name a file as `dataset`, on the command line by --dataset FILE; {other}")
+    format!("{advice}; {other}")
 }
 
 async fn run_to_end(

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::environment::simulation_of;
+use quad_dataset::environment::{self, simulation_of};
 use quad_dataset::{DatasetError, NamedDataset, catalog};
-use quad_run::config::did_you_mean;
+use quad_run::config::{did_you_mean, tasks};
 use quad_runtime::Hint;
 
 use super::cache;
@@ -44,9 +44,15 @@ impl Source {
         const LIST: &str =
             "`learner datasets list` prints all names; to train on a file, give its path";
         let known = catalog::all().iter().map(|dataset| dataset.name.as_str());
-        let nearest = did_you_mean(name, known);
+        let hint = match tasks::named(name).map(|task| task.text("dataset")) {
+            Ok(Some(dataset)) => format!("it is a task, whose dataset is {dataset}"),
+            Ok(None) => {
+                format!("it is a task: `learner train --task {name}` says how to make its data")
+            }
+            Err(_) => did_you_mean(name, known) + LIST,
+        };
         let found = catalog::find(name).with_context(|| format!("unknown dataset `{name}`"));
-        Ok(Self::Named(found.hint(nearest + LIST)?))
+        Ok(Self::Named(found.hint(hint)?))
     }
 
     /// The entry of the catalog, for a path by the file's name.
@@ -68,6 +74,17 @@ impl Source {
         }
         Err(anyhow!("{name} is a dataset of {other}, but the policy is for {environment}"))
             .hint("choose a task in the dataset's environment, or another --dataset")
+    }
+
+    /// A warning if neither catalog nor file names the environment, and another one has its sizes.
+    pub fn doubt(&self, path: &Path, environment: &str) -> Option<String> {
+        let spec = environment::find(environment).ok().filter(|_| self.entry().is_none())?;
+        let named = quad_dataset::recorded_environment(path).ok()?;
+        let other = &spec.of_same_sizes().filter(|_| named.is_none())?.name;
+        let path = path.display();
+        Some(format!(
+            "{path} names no environment: it is taken for {environment}'s, but {other} has the same sizes"
+        ))
     }
 
     /// Finds the data on this machine, or fetches it, and computes its checksum.

@@ -26,6 +26,12 @@ pub enum ConfigError {
     NoEnvironment(String),
     #[error("{field} is {value}, but must be {range}")]
     OutOfRange { field: &'static str, value: String, range: String },
+    #[error("{0} is a hyper-parameter")]
+    Hyperparameter(String),
+    #[error("{0} is no hyper-parameter")]
+    NoHyperparameter(String),
+    #[error("practice of {steps} environment steps ends within its warm-up of {warmup}")]
+    Warmup { steps: u64, warmup: u64 },
     #[error("a run of 0 steps without practice learns nothing")]
     NoSteps,
     #[error("{0} learns from a dataset alone, not from practice")]
@@ -55,6 +61,17 @@ impl ConfigError {
             Self::Preset { source, .. } => source.hint(),
             Self::NoEnvironment(_) => {
                 "begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks".to_owned()
+            }
+            Self::Hyperparameter(key) => {
+                format!("--agent {key}=VALUE changes it; in a file it is below [agent]")
+            }
+            Self::NoHyperparameter(key) => {
+                format!("--set {key}=VALUE changes it; in a file it is above [agent]")
+            }
+            Self::Warmup { .. } => {
+                "the learner learns from practice after the warm-up: give more --online-steps, or a shorter one by \
+                 --set online.warmup=N"
+                    .to_owned()
             }
             Self::NoSteps => {
                 "--steps N learns from the dataset alone, --online-steps N from practice too".to_owned()

@@ -68,7 +68,7 @@ fn is_zero(share: &f64) -> bool {
 }
 
 impl Experiment {
-    /// The algorithm.
+    /// Looks up the algorithm by its name.
     pub fn definition(&self) -> Result<Definition, ConfigError> {
         hyperparameters::algorithm(&self.algorithm)
     }

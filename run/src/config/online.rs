@@ -64,7 +64,6 @@ impl Online {
         for (field, value, least, most) in [
             ("online.steps", self.steps, 0, MOST),
             ("online.updates_per_step", self.updates_per_step.into(), 1, 1000),
-            ("online.warmup", self.warmup, 0, self.steps.saturating_sub(1)),
             ("online.lag", self.lag.into(), 1, Self::MOST_LAG),
             ("online.snapshot_interval", self.snapshot_interval, 1, MOST),
         ] {
@@ -72,6 +71,10 @@ impl Online {
                 let (value, range) = (value.to_string(), format!("from {least} to {most}"));
                 return Err(ConfigError::OutOfRange { field, value, range });
             }
+        }
+        if self.warmup >= self.steps {
+            let Self { steps, warmup, .. } = *self;
+            return Err(ConfigError::Warmup { steps, warmup });
         }
         for (field, value) in
             [("online.share", self.share.unwrap_or(1.0)), ("online.noise", self.noise.into())]

@@ -71,9 +71,11 @@ impl Preset {
         let definition = self.algorithm(changes)?;
         let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
         let of_task = self.task.map(|task| &task.keys);
-        for keys in of_task.into_iter().chain([&self.own, changes]) {
+        for keys in of_task.into_iter().chain([&self.own]) {
             merge(&mut table, keys.clone());
         }
+        check_places(&table, changes)?;
+        merge(&mut table, changes.clone());
         table.insert("algorithm".to_owned(), definition.name.into());
         if table.get("online").is_some_and(|online| online.get(REQUIRED).is_none()) {
             return Err(ConfigError::NoPractice(definition.name));
@@ -100,6 +102,22 @@ impl Preset {
             None => Ok(ALGORITHMS[0]),
         }
     }
+}
+
+/// Refuses a change above `[agent]` to a key that `table` has below it, and the reverse.
+fn check_places(table: &Table, changes: &Table) -> Result<(), ConfigError> {
+    let agent = |table: &Table| table.get("agent").and_then(Value::as_table).cloned();
+    let (below, below_changes) =
+        (agent(table).unwrap_or_default(), agent(changes).unwrap_or_default());
+    let misplaced = |changes: &Table, here: &Table, there: &Table| {
+        let is_misplaced = |key: &&String| !here.contains_key(*key) && there.contains_key(*key);
+        changes.keys().find(is_misplaced).cloned()
+    };
+    if let Some(key) = misplaced(changes, table, &below) {
+        return Err(ConfigError::Hyperparameter(key));
+    }
+    let key = misplaced(&below_changes, &below, table);
+    key.map_or(Ok(()), |key| Err(ConfigError::NoHyperparameter(key)))
 }
 
 /// True if a preset is the path of a file, not the name of a task.

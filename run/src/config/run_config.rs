@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 
 use super::experiment::Experiment;
 
-/// The device of training.
+/// Device on which a run trains; evaluators use the CPU.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Device {
-    /// The processor.
+    /// The CPU.
     #[default]
     Cpu,
     /// The first Nvidia GPU.
@@ -28,7 +28,7 @@ impl Device {
     }
 }
 
-/// The configuration of a run.
+/// Contents of `config.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)] // The types say what each is.
@@ -38,7 +38,7 @@ pub struct RunConfig {
     pub experiment: Experiment,
 }
 
-/// Identity of a run.
+/// Name, task, program and machine of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunInfo {
@@ -62,28 +62,28 @@ pub struct RunInfo {
     pub device: Device,
 }
 
-/// Contents of the dataset.
+/// File, checksum and statistics of the dataset.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetInfo {
-    /// The file.
+    /// Path of the file or folder.
     pub path: PathBuf,
     /// SHA-256 of the file in hexadecimal, of a folder of Minari's that of its `main_data.hdf5`;
     /// absent in older runs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sha256: Option<String>,
-    /// Transitions of training.
+    /// Number of transitions that are trained on.
     pub transitions: u64,
-    /// Trajectories of training.
+    /// Number of trajectories that are trained on.
     pub episodes: u64,
     /// Indices of the episodes that are kept out of training, in the file's order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub held_out: Vec<usize>,
     /// Smallest return of a trajectory, unscaled.
     pub min_return: f64,
-    /// Mean return.
+    /// Mean return of a trajectory, unscaled.
     pub mean_return: f64,
-    /// Largest return.
+    /// Largest return of a trajectory, unscaled.
     pub max_return: f64,
     /// Mean D4RL-normalized score, where the environment has reference returns.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -5,11 +5,9 @@ use toml::{Table, Value};
 
 /// Parses `agent.tau=0.5`: a dotted key and a TOML value, in which text needs no quotes.
 pub fn parse_assignment(text: &str) -> Result<Table, String> {
-    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE, for example agent.tau=0.5")?;
+    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE")?;
     let quoted = || format!("{key} = {}", Value::String(value.trim().to_owned()));
-    text.parse()
-        .or_else(|_| quoted().parse())
-        .map_err(|_| format!("{key:?} is no key like agent.tau"))
+    text.parse().or_else(|_| quoted().parse()).map_err(|_| format!("{key:?} is no key"))
 }
 
 /// The values of a table and its inner tables, with dotted keys.

@@ -130,7 +130,7 @@ impl RunDir {
         Ok(aside)
     }
 
-    /// Reads the configuration.
+    /// Reads and checks `config.toml`.
     pub fn read_config(&self) -> Result<RunConfig, RunDirError> {
         let path = self.path.join(CONFIG);
         let text = files::read_text(&path).map_err(io_error("read", &path))?;

@@ -15,7 +15,7 @@ pub struct Published {
     pub method: &'static str,
     /// D4RL-normalized score, or rate of success in percent.
     pub score: Printed,
-    /// Citation.
+    /// Paper or repository that has the score.
     pub source: &'static str,
     /// Tables that contain the method.
     #[serde(skip)]
@@ -30,7 +30,7 @@ pub struct Published {
 /// A known error or peculiarity of a score.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Remark {
-    /// Explanation.
+    /// Text of the footnote.
     pub reason: &'static str,
     /// The figure at the end of the explanation, if it ends with one.
     pub instead: Option<f64>,

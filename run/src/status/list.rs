@@ -19,7 +19,7 @@ use crate::table::{Style, Table};
 pub struct Entry {
     /// Path below the listed folder; the whole path if several folders are listed.
     pub name: String,
-    /// The folder.
+    /// Path of the folder.
     pub dir: PathBuf,
     #[serde(flatten)]
     run: Option<Listed>,

@@ -49,7 +49,7 @@ impl Findings {
     }
 }
 
-/// Checks failed.
+/// Some checks of a machine failed.
 #[derive(Debug, thiserror::Error)]
 #[error("{failed} of {checks} checks failed")]
 pub struct ChecksFailed {

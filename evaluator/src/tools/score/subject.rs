@@ -12,7 +12,8 @@ use quad_runtime::Hint;
 use super::args::{MOST_EPISODES, ScoreArgs};
 use crate::sim::{Environments, Rollout, Simulations};
 
-const SNAPSHOT: &str = "pass a file like RUN/snapshots/step_000020000.safetensors";
+const SNAPSHOT: &str = "pass files like RUN/snapshots/step_000020000.safetensors; \
+                        RUN/snapshots/*.safetensors are all of a run";
 const OTHER_ENVIRONMENT: &str = "in your own environment, run it from Python (docs/python.md)";
 
 /// A saved policy, ready to act, with its episodes.

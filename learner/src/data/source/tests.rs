@@ -1,6 +1,7 @@
 //! Tests of the values of `--dataset`.
 
-use quad_run::config::{resolve, tasks};
+use quad_dataset::{Arrays, Names, write_own};
+use quad_run::config::resolve;
 
 use super::*;
 
@@ -55,6 +56,29 @@ fn data_of_another_simulation_is_refused() {
         let words = Vec::from_iter(pair.split_whitespace());
         let checked = Source::parse(words[1]).unwrap().check_environment(words[2]);
         assert_eq!(checked.is_ok(), words[0] == "fits", "{pair}: {checked:?}");
+    }
+}
+
+#[test]
+fn data_that_names_no_environment_may_be_another_s() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("mine.hdf5");
+    let rows = |width| vec![0.5; 4 * width];
+    let arrays = Arrays {
+        observation_dim: 17,
+        action_dim: 6,
+        observations: rows(17),
+        actions: rows(6),
+        rewards: rows(1),
+        next_observations: rows(17),
+        terminals: vec![true; 4],
+        timeouts: vec![false; 4],
+    };
+    write_own(&path, arrays, Names::default()).unwrap();
+    let doubt = |environment| Source::Path(path.clone()).doubt(&path, environment);
+    assert!(doubt("walker2d").unwrap().ends_with("but halfcheetah has the same sizes"));
+    for only_of_its_sizes in ["hopper", "my-robot"] {
+        assert_eq!(doubt(only_of_its_sizes), None);
     }
 }
 
