@@ -85,19 +85,6 @@ fn a_score_equals_that_of_stepping_the_environment() {
     }
 }
 
-#[test]
-fn a_policy_that_fails_advances_no_episode() {
-    let (mut failing, mut other) = (hopper(&[1, 2]), hopper(&[1, 2]));
-    let failed = failing.step(|_, _, _| Err(anyhow::anyhow!("no action")));
-    assert_eq!(failed.unwrap_err().to_string(), "no action");
-    for rollout in [&mut failing, &mut other] {
-        while !rollout.is_done() {
-            rollout.step(select).unwrap();
-        }
-    }
-    assert_eq!(failing.into_scores(), other.into_scores());
-}
-
 /// Observes and rewards its number of steps, of which there are four.
 #[derive(Clone, Copy, Default)]
 struct Counter {

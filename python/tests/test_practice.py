@@ -8,7 +8,7 @@ import numpy as np
 import quad_rl
 from test_evaluate import Learner, Walk, wait
 
-ROWS = 2_000
+ROWS = 1_000
 
 
 class Fall(Walk):
@@ -40,7 +40,7 @@ def experience(folder):
     subprocess.run(["learner", "export-data", str(folder), "--out", str(file)], check=True, capture_output=True, timeout=600)
     with h5py.File(file) as data:
         ends = np.flatnonzero(data["terminals"][:] | data["timeouts"][:]) + 1
-        rows = np.hstack([data["observations"][:], data["actions"][:], data["rewards"][:, None]])
+        rows = np.hstack([data["observations"][:], data["actions"][:], data["rewards"][:][:, None]])
     episodes = np.split(rows, ends[:-1])
     assert len(rows) >= ROWS and len({len(episode) for episode in episodes}) > 5
     by_first = {episode[0].tobytes(): episode.tobytes() for episode in episodes}

@@ -83,14 +83,14 @@ fn practice_slows_no_gradient_step() {
     let setting = Setting { steps: STEPS, online_steps, ..sizes };
     for run in ["run-1", "run-2", "run-3", "run-4", "run-5"] {
         let endpoint = free_endpoint();
-        let changes = ["online.warmup=0", "online.updates_per_step=1", "batch_size=256"];
-        let changes = changes.map(|change| ["--set", change]);
-        let arguments = [&[["--connect", &endpoint]][..], &changes].concat();
-        let mut learner =
-            scratch.learner_through(&launcher, run, setting, arguments.as_flattened());
+        let mut arguments = vec!["--connect", &endpoint];
+        for change in ["online.warmup=0", "online.updates_per_step=1", "batch_size=256"] {
+            arguments.extend(["--set", change]);
+        }
+        let mut learner = scratch.learner_through(&launcher, run, setting, &arguments);
         let _router = runtime.block_on(router(&endpoint));
-        let crowd = Crowd::connect(1, Duration::ZERO, &name(run), &endpoint);
-        let _crowd = runtime.block_on(crowd);
+        let named = name(run);
+        let _crowd = runtime.block_on(Crowd::connect(1, Duration::ZERO, &named, &endpoint));
         learner.process.assert_succeeds(3 * PATIENCE);
         let lines = read_metrics(&learner.run_dir).unwrap();
         let trained = |step: u64| {
