@@ -24,6 +24,9 @@ pub(super) const RETRY: Duration = Duration::from_secs(2);
 const OTHER_WEIGHTS: &str = "another kind of processor, another number of threads or another version computes other bits: \
                              continue where the run was before, or begin anew with --fresh";
 
+const NO_SNAPSHOT: &str = "put the file back into snapshots/; or remove checkpoints/ of later steps, and training makes it \
+                           again";
+
 pub(super) struct Snapshots {
     pub queue: OutputQueue,
     /// `metrics.jsonl`.
@@ -110,7 +113,7 @@ impl Snapshots {
         let step = opening.step;
         let Some(hash) = self.known.get(&step) else {
             let error = anyhow!("the snapshot of step {step}, which is to practice, is missing");
-            return Err(hinted(error, "begin anew with --fresh"));
+            return Err(hinted(error, NO_SNAPSHOT));
         };
         self.coordinator().open_practice(opening, *hash);
         Ok(())
