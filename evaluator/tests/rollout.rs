@@ -7,7 +7,7 @@ use quad_dataset::environment::find;
 use quad_evaluator::sim::{
     Environment, EnvironmentError, Environments, Rollout, Simulations, Step, make,
 };
-use quad_protocol::{EpisodeScore, Hash, Name};
+use quad_protocol::{Episode, EpisodeScore, Hash, Name};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -213,6 +213,8 @@ fn a_recorded_episode_is_what_was_observed_and_done() {
         assert_eq!(episode.score, score);
         assert_eq!(play(&[seed])[0], *episode);
     }
+    let endless = &play(&[u64::MAX])[0];
+    assert_eq!((endless.rewards.len(), endless.terminated), (Episode::LONGEST, false));
 }
 
 /// A learner would refuse them.
