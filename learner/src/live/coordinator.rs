@@ -116,6 +116,11 @@ impl Coordinator {
         self.lock().scoreboard.open_practice(opening, weights);
     }
 
+    /// Expects an episode of practice that an earlier incarnation may have opened.
+    pub fn expect_practice(&self, seed: u64) {
+        self.lock().scoreboard.expect_practice(seed);
+    }
+
     /// Ends practice: evaluators get no more of its episodes.
     pub fn end_practice(&self) {
         self.lock().scoreboard.end_practice();

@@ -16,7 +16,7 @@ use super::events::Event;
 use super::metrics::unix_time;
 use super::weights::Weights;
 use crate::evaluation::{Opening, OtherWeights};
-use crate::train::{Output, OutputQueue, TrainedPolicy};
+use crate::train::{Outcome, Output, OutputQueue, TrainedPolicy};
 
 /// Pause after the disk has refused a write.
 pub(super) const RETRY: Duration = Duration::from_secs(2);
@@ -73,7 +73,9 @@ impl Snapshots {
             Output::Checkpoint(checkpoint) => self.checkpoint(checkpoint)?,
             Output::Rows(rows) => self.rows.append(rows)?,
             Output::Ended(outcome) => {
-                self.coordinator().end_practice();
+                if *outcome == Outcome::Completed {
+                    self.coordinator().end_practice();
+                }
                 self.coordinator().events.send(Event::TrainingEnded(*outcome));
             }
         }
