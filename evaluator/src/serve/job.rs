@@ -107,7 +107,13 @@ fn run(
     longest: Duration,
 ) -> anyhow::Result<Played> {
     let started = Instant::now();
-    let make = || environments.make(&job.environment, job.environment_seed);
+    let make = || {
+        let mut made = environments.make(&job.environment, job.environment_seed);
+        if let (Ok(environment), Some(_)) = (&mut made, job.practice) {
+            environment.allow_interventions();
+        }
+        made
+    };
     let sizes = (policy.observation_dim(), policy.action_dim());
     let mut rollout = Rollout::new(make, sizes, &job.seeds, |seed| policy.begin(seed))?;
     if job.practice.is_some() {

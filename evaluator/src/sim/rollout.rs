@@ -183,6 +183,8 @@ impl Live {
             record.actions.extend(step.intervention.as_deref().unwrap_or(action));
             record.rewards.push(step.reward as f32);
             record.terminated = step.terminated;
+        } else if step.intervention.is_some() {
+            return Err(EnvironmentError::Intervention(self.score.seed));
         }
         self.score.episode_return += step.reward;
         self.score.length += 1;
