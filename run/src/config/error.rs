@@ -59,6 +59,9 @@ impl ConfigError {
             Self::NoSteps => {
                 "--steps N learns from the dataset alone, --online-steps N from practice too".to_owned()
             }
+            Self::OutOfRange { field: "online.warmup", .. } => {
+                "ask for more --online-steps, or for less by --set online.warmup=N".to_owned()
+            }
             Self::NoPractice(_) => {
                 let can = |known: &&Definition| Values::of(known).for_task(None).contains_key("online");
                 let names = Vec::from_iter(ALGORITHMS.iter().filter(can).map(|known| known.name));
