@@ -95,7 +95,7 @@ pub(super) enum NotAccepted {
     Unreadable(anyhow::Error),
     #[error("training has not come to the episode again since the learner's start, try again")]
     NotYet,
-    #[error("the scores could not be saved, try again: {0}")]
+    #[error("it could not be saved, try again: {0}")]
     NotSaved(String),
 }
 

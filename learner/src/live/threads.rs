@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use anyhow::Context;
 use quad_algorithms::Agent;
 use quad_dataset::{BatchSampler, Task};
 use quad_protocol::{Episode, Hash, practice_seed};
@@ -196,6 +197,7 @@ fn open_experience(
             coordinator.expect_practice(seed);
         }
     }
-    anyhow::ensure!(episodes.is_empty(), "experience.log has episodes of another run");
+    let error = "experience.log has episodes of another run";
+    episodes.is_empty().then_some(()).context(error).hint(OTHER_FOLDER)?;
     Ok(Experience::new(log, inbox.clone(), coordinator.clone()))
 }
