@@ -7,7 +7,7 @@ use quad_dataset::environment::find;
 use quad_evaluator::sim::{
     Environment, EnvironmentError, Environments, Rollout, Simulations, Step, make,
 };
-use quad_protocol::{EpisodeScore, Hash, Name};
+use quad_protocol::{Episode, EpisodeScore, Hash, Name};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -213,6 +213,14 @@ fn a_recorded_episode_is_what_was_observed_and_done() {
         assert_eq!(episode.score, score);
         assert_eq!(play(&[seed])[0], *episode);
     }
+    // A score is the policy's alone.
+    let make = || Ok(Box::new(Scripted::default()) as Box<dyn Environment>);
+    let mut scored = Rollout::new(make, (2, 1), &[3], |_| ()).unwrap();
+    let mut step = || scored.step(|_, _, _| Ok::<_, EnvironmentError>(()));
+    step().unwrap();
+    assert!(matches!(step(), Err(EnvironmentError::Intervention(3))));
+    let endless = &play(&[u64::MAX])[0];
+    assert_eq!((endless.rewards.len(), endless.terminated), (Episode::LONGEST, false));
 }
 
 /// A learner would refuse them.

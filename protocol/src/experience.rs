@@ -55,6 +55,13 @@ impl Episode {
         }
     }
 
+    /// Most steps of an episode with these sizes of an observation and an action, so that its frame
+    /// is not too long.
+    pub fn most_steps((o, a): (usize, usize)) -> usize {
+        let row = size_of::<f32>() * (o + a + 2);
+        ((Self::LIMIT - (1 << 10)) / row).saturating_sub(1).min(Self::LONGEST)
+    }
+
     /// Sizes of an observation and of an action.
     pub fn dims(&self) -> (usize, usize) {
         let n = self.rewards.len().max(1);
@@ -167,6 +174,21 @@ mod tests {
             interventions: vec![1],
             ..Episode::new(3, Hash::of(b"weights"), Name::new("f32").unwrap(), 7)
         }
+    }
+
+    #[test]
+    fn the_longest_episode_fits_into_a_frame() {
+        let (o, a) = (5000, 100);
+        let n = Episode::most_steps((o, a));
+        let longest = Episode {
+            observations: vec![0.5; (n + 1) * o],
+            actions: vec![0.5; n * a],
+            rewards: vec![0.5; n],
+            interventions: Vec::from_iter(0..n as u32),
+            ..episode()
+        };
+        assert!(encode(&longest).unwrap().len() > Episode::LIMIT - 64 * (o + a));
+        assert_eq!(Episode::most_steps((11, 3)), Episode::LONGEST);
     }
 
     #[test]

@@ -25,6 +25,7 @@ struct PythonEnvironment {
     environment: Py<PyAny>,
     factory: Arc<Py<PyAny>>,
     observation: Vec<f64>,
+    practice: bool,
 }
 
 impl Environments for PythonEnvironments {
@@ -47,6 +48,7 @@ impl Environments for PythonEnvironments {
             environment: made.map_err(|error| failed(name, &error))?,
             factory: self.factory.clone(),
             observation: Vec::new(),
+            practice: false,
         }))
     }
 }
@@ -70,8 +72,13 @@ impl PythonEnvironment {
 }
 
 impl Environment for PythonEnvironment {
+    fn allow_interventions(&mut self) {
+        self.practice = true;
+    }
+
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
-        self.observe(|environment| Ok((environment.call_method1("reset", (seed,))?.unbind(), ())))
+        let arguments = (seed, self.practice);
+        self.observe(|environment| Ok((environment.call_method1("reset", arguments)?.unbind(), ())))
     }
 
     fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
@@ -110,7 +117,7 @@ fn failed(name: &str, error: &PyErr) -> EnvironmentError {
 }
 
 /// Serves learners with `factory`'s environments until SIGTERM. `factory` has `make(seed)` and
-/// `release(environment)`, an environment `reset(seed)`, `step(action)` and `score(return)`.
+/// `release(environment)`, an environment `reset(seed, practice)`, `step(action)` and `score(return)`.
 #[pyfunction]
 #[pyo3(signature = (name, factory, *, sizes, connect, certificates, precision))]
 pub fn serve_environment(

@@ -178,6 +178,19 @@ def test_an_intervention_replaces_the_action():
             made.step(np.zeros(ACTION, np.float32))
 
 
+def test_reset_says_which_episodes_are_practice():
+    class Told(Walk):
+        def reset(self, seed=None, options=None):
+            self.options = options
+            return super().reset(seed)
+
+    made = _worker.WrappedEnvironment(Told(), "return")
+    for practice, options in (True, {"practice": True}), (False, None):
+        made.reset(1, practice)
+        assert made.environment.options == options
+    _worker.WrappedEnvironment(Walk(), "return").reset(1, True)
+
+
 def test_killed_workers_restart_and_lose_no_score(tmp_path, data):
     # One pool for two runs: Python's workers have one environment, the programs' evaluators the other.
     ours = Learner(tmp_path / "ours", data, steps=3000)

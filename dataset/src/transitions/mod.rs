@@ -195,11 +195,12 @@ impl Transitions {
         &self.warnings
     }
 
-    /// Adds an episode of practice. Its rewards and numbers are transformed as the dataset's were;
-    /// what a dataset would be refused for is an error.
+    /// Adds an episode of practice. Its rewards and numbers are transformed as the dataset's were,
+    /// and actions beyond its range clipped; anything else that a dataset would be refused for is an
+    /// error.
     pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<(), Problem> {
         let recording = episode.recording(self.observation_dim(), self.action_dim())?;
-        checks::accept(&recording, None, self.scaling.actions.is_some())?;
+        checks::accept(&recording, None, true)?;
         let rows = Rows::new(recording, self.reward, &self.scaling);
         self.experience.write().unwrap_or_else(PoisonError::into_inner).extend(&rows);
         Ok(())

@@ -148,9 +148,18 @@ fn experience_that_a_dataset_would_be_refused_for_is_refused() {
         (problem(&[0.0; 2], &[0.0; 2], &[0.0]), "`actions` has shape [2], but must have [1]"),
         (problem(&[0.0, f32::NAN], &[0.0], &[0.0]), "`observations`, row 1: NaN is not"),
         (problem(&[0.0; 2], &[0.0], &[f32::INFINITY]), "`rewards`, row 0: inf is not"),
-        (problem(&[0.0; 2], &[1.1], &[0.0]), "`actions`, row 0: the action 1.1 is outside"),
     ] {
         assert!(problem.contains(expected), "{problem}");
     }
     assert_eq!(transitions.experience_len(), 0);
+}
+
+#[test]
+fn an_action_of_experience_beyond_the_range_is_clipped() {
+    let (transitions, mut batch) = (transitions(d4rl()), Batch::default());
+    let (observations, actions, rewards) = (&[0.0; 2][..], &[-1.5][..], &[0.0][..]);
+    let episode = PracticeRows { observations, actions, rewards, terminated: true };
+    transitions.add_episode(episode).unwrap();
+    transitions.gather(&[transitions.len() as u32], &mut batch);
+    assert_eq!(batch.actions, [-(1.0 - 1e-5)]);
 }

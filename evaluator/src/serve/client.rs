@@ -22,8 +22,10 @@ use crate::metrics::Metrics;
 
 /// Shortest and longest pause that a learner without work may ask for.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
-/// Time that a leaving evaluator has to deliver its results; half of it to hand a job back.
+/// Time that a leaving evaluator has to deliver its scores; half of it to hand a job back.
 const LEAVE: Duration = Duration::from_secs(2);
+/// The same for an episode of practice, which has many pieces.
+const LEAVE_EPISODE: Duration = Duration::from_secs(6);
 /// Pause of a leaving evaluator after a learner's error.
 const RETRY: Duration = Duration::from_millis(100);
 /// Most characters of a reason that the evaluator sends; the learner accepts no large messages.
@@ -229,10 +231,10 @@ impl RunClient {
 
     /// Delivers the results, or hands the job back, before this evaluator ends.
     pub async fn leave(mut self) {
-        let until = Instant::now() + LEAVE;
+        let is_episode = matches!(self.owed(), Some(Owed::Episode(_)));
+        let until = Instant::now() + if is_episode { LEAVE_EPISODE } else { LEAVE };
         let mut answered = false;
-        while let Some(owed) = self.owed() {
-            let is_whole = matches!(owed, Owed::Scores(_));
+        while self.owed().is_some() {
             let delivered = timeout_at(until.into(), self.deliver(LEAVE / 2)).await;
             let run = &self.connection.run;
             let late = |_| Err(QueryError::NoAnswer(keys::experience(run)));
@@ -240,7 +242,7 @@ impl RunClient {
             // A learner that answers with an error has received the scores and may still save them.
             // If the job went back now, others would run it again.
             let retry = matches!(error, QueryError::Unusable { .. });
-            answered |= retry && is_whole;
+            answered |= retry && !is_episode;
             if !retry || Instant::now() + RETRY > until {
                 warn!(%run, "the learner has not acknowledged the results: {error}");
                 break;

@@ -15,9 +15,8 @@ use crate::sim::{Environments, Rollout};
 
 /// Most episodes of a job: each is a simulation. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
-/// Most bytes of one network call, and of a practice job's rows: far more than the paper's few
-/// megabytes, far less than an evaluator's container has (1 GiB in docker-compose.yml) beside
-/// snapshots and the policy.
+/// Most bytes of one network call: far more than the paper's few megabytes, far less than an
+/// evaluator's container has (1 GiB in docker-compose.yml) beside snapshots and the policy.
 const MAX_BYTES: u64 = 256 << 20;
 
 /// Reason not to run a job.
@@ -27,11 +26,6 @@ pub enum JobError {
     Size(usize),
     #[error("each of its steps takes {0} bytes of memory, more than {MAX_BYTES}")]
     Memory(u64),
-    #[error(
-        "its practice has an episode of more than {} steps, or takes more than {MAX_BYTES} bytes of memory",
-        Episode::LONGEST
-    )]
-    Rows,
     #[error("its episodes did not end within {} s", Job::LONGEST.as_secs())]
     TooLong,
     #[error("this evaluator has no environment \"{0}\"")]
@@ -46,7 +40,7 @@ impl JobError {
     /// The reason as a metric's label.
     pub fn label(&self) -> &'static str {
         match self {
-            JobError::Size(_) | JobError::Memory(_) | JobError::Rows => "job_size",
+            JobError::Size(_) | JobError::Memory(_) => "job_size",
             JobError::TooLong => "too_long",
             JobError::Environment(_) | JobError::OtherEnvironment { .. } => "environment",
             JobError::Policy(_) => "tensors",
@@ -113,15 +107,19 @@ fn run(
     longest: Duration,
 ) -> anyhow::Result<Played> {
     let started = Instant::now();
-    let make = || environments.make(&job.environment, job.environment_seed);
+    let make = || {
+        let mut made = environments.make(&job.environment, job.environment_seed);
+        if let (Ok(environment), Some(_)) = (&mut made, job.practice) {
+            environment.allow_interventions();
+        }
+        made
+    };
     let sizes = (policy.observation_dim(), policy.action_dim());
     let mut rollout = Rollout::new(make, sizes, &job.seeds, |seed| policy.begin(seed))?;
     if job.practice.is_some() {
         let precision = Name::new(policy.precision().arithmetic())?;
         rollout = rollout.recording(job.step, job.weights, &precision);
     }
-    let row = size_of::<f32>() * (sizes.0 + sizes.1 + 1);
-    let (mut step, mut rows) = (0, 0);
     while !rollout.is_done() {
         if tx.is_closed() {
             metrics.job_abandoned();
@@ -131,10 +129,6 @@ fn run(
             metrics.rejected(JobError::TooLong.label());
             return Err(JobError::TooLong.into());
         }
-        if job.practice.is_some() && (step == Episode::LONGEST || rows * row as u64 > MAX_BYTES) {
-            metrics.rejected(JobError::Rows.label());
-            return Err(JobError::Rows.into());
-        }
         let stepped = rollout.step(|observations, states, actions| {
             let acted = match job.practice {
                 None => policy.act(observations, states, actions),
@@ -142,7 +136,6 @@ fn run(
             };
             acted.context("the policy cannot act")
         })?;
-        (step, rows) = (step + 1, rows + stepped.steps);
         let seconds = [stepped.select, stepped.physics].map(|time| time.as_secs_f64());
         metrics.environment_steps.inc_by(stepped.steps);
         metrics.episodes.inc_by(stepped.ended.into());

@@ -16,6 +16,9 @@ pub struct Step {
 }
 
 pub trait Environment: Send {
+    /// Says before [`reset`](Self::reset) that the episode is practice, in which a person may act.
+    fn allow_interventions(&mut self) {}
+
     /// Starts an episode, which is a function of its seed and its actions only.
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError>;
 
@@ -54,6 +57,11 @@ pub enum EnvironmentError {
     Observation { found: usize, wanted: usize },
     #[error("the environment \"{name}\" failed: {reason}")]
     Failed { name: String, reason: String },
+    #[error(
+        "a person took an action in the evaluation episode with seed {0}, whose score is to be the policy's: in practice alone, \
+         `reset` gets options={{\"practice\": True}}"
+    )]
+    Intervention(u64),
     /// No learner would count the episode.
     #[error(
         "the {what} of the episode with seed {seed} is {value} after {length} steps, not a finite number up to {:e}",

@@ -183,12 +183,18 @@ impl Live {
             record.actions.extend(step.intervention.as_deref().unwrap_or(action));
             record.rewards.push(step.reward as f32);
             record.terminated = step.terminated;
+        } else if step.intervention.is_some() {
+            return Err(EnvironmentError::Intervention(self.score.seed));
         }
         self.score.episode_return += step.reward;
         self.score.length += 1;
         // A sum that is not finite stays so.
         let is_finite = self.score.episode_return.is_finite();
-        self.ended = step.terminated || step.truncated || !is_finite;
+        // A longer one could not be delivered.
+        let sizes = (self.environment.observation().len(), action.len());
+        let is_full =
+            self.record.is_some() && self.score.length as usize >= Episode::most_steps(sizes);
+        self.ended = step.terminated || step.truncated || !is_finite || is_full;
         Ok(())
     }
 

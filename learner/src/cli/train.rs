@@ -48,7 +48,7 @@ pub struct TrainArgs {
     preset: Option<String>,
     /// Go on with practice where a complete run has ended: with its settings and its last checkpoint,
     /// in a folder of its own
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["task", "preset", "algorithm", "dataset", "steps"], requires = "online_steps")]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["task", "preset", "algorithm", "steps"], requires = "online_steps")]
     pub from: Option<PathBuf>,
     /// The environment in which the policy acts; one that no evaluator simulates can be any name
     /// (docs/python.md) [default: the task's]

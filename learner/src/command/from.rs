@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, anyhow};
 use quad_protocol::Hash;
-use quad_run::config::{ConfigError, Preset};
+use quad_run::config::{ConfigError, Experiment, Preset};
 use quad_run::folder::{Checkpoint, RunDir};
 use quad_runtime::{Hint, hinted};
 use toml::Table;
@@ -12,6 +12,7 @@ use toml::Table;
 /// The end of a complete run.
 pub(super) struct From {
     checkpoint: Checkpoint,
+    experiment: Experiment,
     dataset_sha256: Option<String>,
 }
 
@@ -35,14 +36,29 @@ impl From {
             .hint("let it end first: `learner train` with its settings continues it")?;
         let mut own = Table::try_from(&config.experiment)?;
         own.insert("from".to_owned(), Hash::of(&checkpoint.state).to_string().into());
+        // A share of 0 is not in the table, but the task may have another.
+        own.insert("hold_out".to_owned(), config.experiment.hold_out.into());
         let preset = Preset::of_run(&config, own).hint_of(ConfigError::hint)?;
-        Ok((Self { checkpoint, dataset_sha256: config.dataset.sha256 }, preset))
+        let (experiment, dataset_sha256) = (config.experiment, config.dataset.sha256);
+        Ok((Self { checkpoint, experiment, dataset_sha256 }, preset))
     }
 
-    /// Checks that the dataset is the run's.
-    pub fn check_dataset(&self, sha256: &str) -> anyhow::Result<()> {
-        let is_same = self.dataset_sha256.as_ref().is_none_or(|known| known == sha256);
-        is_same.then_some(()).context("the dataset is not the one that the run has learned from")
+    /// Checks that the dataset is the run's, and that the checkpoint's numbers still mean the same.
+    pub fn check(&self, here: &Experiment, sha256: &str) -> anyhow::Result<()> {
+        let there = &self.experiment;
+        let known = self.dataset_sha256.as_deref().unwrap_or(sha256);
+        let kept = [
+            ("dataset", known == sha256),
+            ("steps", there.steps == here.steps),
+            ("reward", there.reward == here.reward),
+            ("normalize", there.normalize == here.normalize),
+            ("hold_out", there.hold_out == here.hold_out),
+            // It draws the episodes that are held out.
+            ("seed", there.seed == here.seed || here.hold_out == 0.0),
+        ];
+        let Some((key, _)) = kept.iter().find(|(_, is_kept)| !is_kept) else { return Ok(()) };
+        let error = anyhow!("the run of --from has learned with another value of {key}");
+        Err(hinted(error, "leave it as it was there: what has been learned depends on it"))
     }
 
     /// The checkpoint to begin with.

@@ -60,7 +60,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     device::check(args.device, experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
-    from.as_ref().map_or(Ok(()), |from| from.check_dataset(&dataset.sha256))?;
+    from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &dataset.sha256))?;
 
     start_pool(args.threads)?;
     let data = load(&dataset.path, &experiment)?;
@@ -170,6 +170,11 @@ async fn run_to_end(
     let (o, a) = (data.training.observation_dim(), data.training.action_dim());
     let task = Task::new(&experiment.environment, o, a);
     let mut agent = begin(experiment, device, data.training)?;
+    if let Some(Checkpoint { state, .. }) = &first {
+        let loaded =
+            agent.load(state).hint("networks stay as they are: leave out what changes them");
+        loaded.context("the last checkpoint of --from does not fit")?;
+    }
     let held_out = data.held_out;
     let held_out = held_out.and_then(|data| HeldOut::new(experiment, device, data, &mut agent));
     let opening = outside.open().await?;

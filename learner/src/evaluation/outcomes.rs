@@ -41,6 +41,8 @@ pub(crate) enum Practice {
     Open { episode: u64 },
     /// It was recorded, with a frame of this hash.
     Recorded(Hash),
+    /// It may be one of an earlier incarnation, which training opens again when it comes there.
+    NotYet,
 }
 
 /// A request for a job.

@@ -1,6 +1,6 @@
 //! All evaluations of a run.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -72,6 +72,9 @@ pub(crate) struct Scoreboard {
     pub(super) practice: HashMap<u64, u64>,
     /// Hashes of the recorded practice episodes' frames, by seed.
     practiced: HashMap<u64, Hash>,
+    /// Seeds of episodes that an earlier incarnation may have opened.
+    opened_before: HashSet<u64>,
+    practice_ended: bool,
 }
 
 impl Scoreboard {
@@ -86,6 +89,8 @@ impl Scoreboard {
             earlier,
             practice: HashMap::new(),
             practiced: HashMap::new(),
+            opened_before: HashSet::new(),
+            practice_ended: false,
         }
     }
 
@@ -125,8 +130,15 @@ impl Scoreboard {
         self.evaluations.insert(Key::Practice(opening.episode), episode);
     }
 
+    /// Expects an episode of practice that an earlier incarnation may have opened.
+    pub fn expect_practice(&mut self, seed: u64) {
+        self.opened_before.insert(seed);
+    }
+
     /// Ends practice: evaluators get no more of its episodes.
     pub fn end_practice(&mut self) {
+        self.practice_ended = true;
+        self.opened_before.clear();
         let evaluations = &mut self.evaluations;
         evaluations.retain(|_, it| it.practice.is_none() || it.waiting() == 0);
         self.practice.retain(|_, episode| evaluations.contains_key(&Key::Practice(*episode)));
@@ -136,7 +148,8 @@ impl Scoreboard {
     pub fn practice(&self, seed: u64) -> Option<Practice> {
         let recorded = self.practiced.get(&seed).map(|hash| Practice::Recorded(*hash));
         let open = || Some(Practice::Open { episode: *self.practice.get(&seed)? });
-        recorded.or_else(open)
+        let before = || self.opened_before.contains(&seed).then_some(Practice::NotYet);
+        recorded.or_else(open).or_else(before)
     }
 
     /// Records a practice episode, whose frame has this hash, as delivered. Returns the number of
@@ -343,6 +356,9 @@ impl Scoreboard {
             Some(evaluation) => evaluation.take_back(id, &seeds, lost),
             None => Vec::new(),
         };
+        if self.practice_ended {
+            self.end_practice();
+        }
         Some(given_up.into_iter().map(|seed| (step, seed)).collect())
     }
 }

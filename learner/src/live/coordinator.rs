@@ -17,7 +17,7 @@ use tracing::{debug, warn};
 
 use super::evaluators::Evaluators;
 use super::events::{Event, Events};
-use super::metrics::Metrics;
+use super::metrics::{Metrics, unix_time};
 use super::requests::NotAccepted;
 use crate::evaluation::{
     Claim, Claimed, Lost, Opening, OtherWeights, Practice, Refusal, Rules, Scoreboard, Validated,
@@ -41,8 +41,8 @@ pub(crate) struct Coordinator {
 struct State {
     scoreboard: Scoreboard,
     evaluators: Evaluators,
-    /// Steps for which a failed job was reported.
-    failed_steps: BTreeSet<u64>,
+    /// Steps for which a failed job was reported; of practice also the minutes, since 1970.
+    failed_steps: BTreeSet<(u64, Option<u64>)>,
     /// Names for which it was reported that two evaluators use them.
     shared_names: BTreeSet<Name>,
 }
@@ -114,6 +114,11 @@ impl Coordinator {
             self.events.line(format!("step {}: practice begins", opening.step));
         }
         self.lock().scoreboard.open_practice(opening, weights);
+    }
+
+    /// Expects an episode of practice that an earlier incarnation may have opened.
+    pub fn expect_practice(&self, seed: u64) {
+        self.lock().scoreboard.expect_practice(seed);
     }
 
     /// Ends practice: evaluators get no more of its episodes.
@@ -189,11 +194,15 @@ impl Coordinator {
             }
             JobRequest::HandBack { evaluator, job, failed } => {
                 let when = failed.is_some().then_some(now);
+                let at = state.scoreboard.job_of(evaluator);
+                let practice = at.is_some_and(|(job, _)| job.practice.is_some());
                 let handed_back = state.scoreboard.hand_back(evaluator, *job, when);
                 let accepted = handed_back.is_some();
                 if let Some((step, given_up)) = handed_back {
                     match failed {
-                        Some(reason) => self.failed(&mut state, step, evaluator, reason),
+                        Some(reason) => {
+                            self.failed(&mut state, (step, practice), evaluator, reason)
+                        }
                         None => self.metrics.jobs("handed_back", 1),
                     }
                     self.given_up(&state, &given_up);
@@ -274,15 +283,20 @@ impl Coordinator {
         self.metrics.evaluation.episodes_missing.set(state.scoreboard.missing().len() as i64);
     }
 
-    /// Reports a job that an evaluator could not run, once for each step.
-    fn failed(&self, state: &mut State, step: u64, evaluator: &Name, reason: &str) {
+    /// Reports a job that an evaluator could not run, once for each step and, of practice, each
+    /// minute.
+    fn failed(&self, state: &mut State, of: (u64, bool), evaluator: &Name, reason: &str) {
+        let (step, practice) = of;
         self.metrics.jobs("failed", 1);
         let printable = reason.chars().filter(|c| !c.is_control());
         let reason = String::from_iter(printable.take(LONGEST_REASON));
         debug!(step, %evaluator, reason, "a job failed");
-        if state.failed_steps.insert(step) {
+        // Training waits for practice, so its failures are told again.
+        let minute = practice.then(|| unix_time() as u64 / 60);
+        if state.failed_steps.insert((step, minute)) {
+            let what = if practice { "play practice" } else { "do a job" };
             self.events.line(format!(
-                "evaluator {evaluator} could not do a job of step {step}, which goes to others: {reason}"
+                "evaluator {evaluator} could not {what} of step {step}, which goes to others: {reason}"
             ));
         }
     }

@@ -68,9 +68,7 @@ impl DiskStatus {
         self.gauge.set(1);
         let now = Instant::now();
         let (since, logged) = self.trouble.get_or_insert_with(|| {
-            self.events.line(format!(
-                "{problem}; training continues, and it is tried again until the disk takes it"
-            ));
+            self.events.line(format!("{problem}; it is tried again until the disk takes it"));
             (now, now)
         });
         if now - *logged >= REMIND {

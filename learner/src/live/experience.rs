@@ -53,6 +53,7 @@ impl Experience {
                 Ok(Added::Whole(number, episode)) => {
                     whole.push(Whole { request, number, episode });
                 }
+                Err(why @ NotAccepted::NotYet) => request.reject(&why, &self.coordinator.metrics),
                 Err(why) => {
                     self.coordinator.metrics.reject(why.label());
                     let (incarnation, reason) = (self.coordinator.incarnation(), why.to_string());
@@ -91,6 +92,7 @@ impl Experience {
         let seed = piece.seed;
         let number = match self.coordinator.practice(piece)? {
             Practice::Open { episode } => episode,
+            Practice::NotYet => return Err(NotAccepted::NotYet),
             Practice::Recorded(hash) => {
                 if hash != piece.hash {
                     warn!(

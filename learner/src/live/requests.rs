@@ -93,7 +93,9 @@ pub(super) enum NotAccepted {
     NoSnapshot,
     #[error("the snapshot cannot be read: {0:#}")]
     Unreadable(anyhow::Error),
-    #[error("the scores could not be saved, try again: {0}")]
+    #[error("training has not come to the episode again since the learner's start, try again")]
+    NotYet,
+    #[error("it could not be saved, try again: {0}")]
     NotSaved(String),
 }
 
@@ -108,6 +110,7 @@ impl NotAccepted {
             Self::Crowd => "too_many_evaluators",
             Self::NoSnapshot => "unknown_step",
             Self::Unreadable(_) => "unreadable_snapshot",
+            Self::NotYet => "not_open_yet",
             Self::NotSaved(_) => "not_saved",
         }
     }

@@ -16,13 +16,16 @@ use super::events::Event;
 use super::metrics::unix_time;
 use super::weights::Weights;
 use crate::evaluation::{Opening, OtherWeights};
-use crate::train::{Output, OutputQueue, TrainedPolicy};
+use crate::train::{Outcome, Output, OutputQueue, TrainedPolicy};
 
 /// Pause after the disk has refused a write.
 pub(super) const RETRY: Duration = Duration::from_secs(2);
 
 const OTHER_WEIGHTS: &str = "another kind of processor, another number of threads or another version computes other bits: \
                              continue where the run was before, or begin anew with --fresh";
+
+const NO_SNAPSHOT: &str = "put the file back into snapshots/; or remove checkpoints/ of later steps, and training makes it \
+                           again";
 
 pub(super) struct Snapshots {
     pub queue: OutputQueue,
@@ -70,7 +73,9 @@ impl Snapshots {
             Output::Checkpoint(checkpoint) => self.checkpoint(checkpoint)?,
             Output::Rows(rows) => self.rows.append(rows)?,
             Output::Ended(outcome) => {
-                self.coordinator().end_practice();
+                if *outcome == Outcome::Completed {
+                    self.coordinator().end_practice();
+                }
                 self.coordinator().events.send(Event::TrainingEnded(*outcome));
             }
         }
@@ -110,7 +115,7 @@ impl Snapshots {
         let step = opening.step;
         let Some(hash) = self.known.get(&step) else {
             let error = anyhow!("the snapshot of step {step}, which is to practice, is missing");
-            return Err(hinted(error, "begin anew with --fresh"));
+            return Err(hinted(error, NO_SNAPSHOT));
         };
         self.coordinator().open_practice(opening, *hash);
         Ok(())

@@ -6,10 +6,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use anyhow::Context;
 use quad_algorithms::Agent;
 use quad_dataset::{BatchSampler, Task};
 use quad_protocol::{Episode, Hash, practice_seed};
-use quad_run::config::{Online, RunConfig};
+use quad_run::config::{Experiment, RunConfig};
 use quad_run::folder::{Log, ResumePoint, RunDir};
 use quad_runtime::{Health, Hint};
 
@@ -106,7 +107,7 @@ impl Threads {
         let mut practice =
             Practice::new(experiment, transitions, inbox.clone(), metrics.practice.clone());
         let experience = match &practice {
-            Some(_) => Some(open_experience(dir, experiment.seed, &inbox, &coordinator)?),
+            Some(_) => Some(open_experience(dir, experiment, &inbox, &coordinator)?),
             None => None,
         };
         if let Some(practice) = &mut practice {
@@ -177,22 +178,26 @@ impl Threads {
 /// Opens the run's log of experience, and puts what it has into the inbox.
 fn open_experience(
     dir: &RunDir,
-    seed: u64,
+    experiment: &Experiment,
     inbox: &Inbox,
     coordinator: &Coordinator,
 ) -> anyhow::Result<Experience> {
     let (log, records) = dir.experience_log()?;
     let by_seed = |(hash, episode): (Hash, Episode)| (episode.score.seed, (hash, episode));
     let mut episodes: HashMap<u64, _> = records.into_iter().map(by_seed).collect();
+    let recorded = episodes.len() as u64;
+    let lag = experiment.online.as_ref().map_or(0, |online| online.lag);
     // Seeds are those of the first episodes: more were never open.
-    let most = episodes.len() as u64 + Online::MOST_LAG;
-    for number in 0..most {
-        let seed = practice_seed(seed, number);
+    for number in 0..recorded + u64::from(lag) {
+        let seed = practice_seed(experiment.seed, number);
         if let Some((hash, episode)) = episodes.remove(&seed) {
             coordinator.record_practice(seed, hash);
             inbox.add(number, episode);
+        } else if recorded > 0 {
+            coordinator.expect_practice(seed);
         }
     }
-    anyhow::ensure!(episodes.is_empty(), "experience.log has episodes of another run");
+    let error = "experience.log has episodes of another run";
+    episodes.is_empty().then_some(()).context(error).hint(OTHER_FOLDER)?;
     Ok(Experience::new(log, inbox.clone(), coordinator.clone()))
 }

@@ -12,8 +12,8 @@ use quad_runtime::{Hint, hinted};
 
 use super::device;
 
-const TOO_LARGE: &str = "take smaller networks or fewer critics; or train without evaluations (--eval-interval 0) and score the \
-                         last snapshot by `evaluator score`";
+const TOO_LARGE: &str = "take smaller networks or fewer critics; or train without practice and evaluations (--eval-interval 0), and \
+                         score the last snapshot by `evaluator score`";
 const OTHER_VERSION: &str =
     "begin anew with --fresh, or continue with the version of the learner that wrote it";
 
@@ -28,7 +28,7 @@ pub(crate) fn begin(
     transitions: Transitions,
 ) -> anyhow::Result<Agent> {
     let agent = new_agent(experiment, device, transitions, experiment.batch_size as usize)?;
-    if experiment.eval_interval > 0 {
+    if experiment.eval_interval > 0 || experiment.online.is_some() {
         let (bytes, most) = (agent.policy(origin(experiment))?.len(), Snapshot::MOST_FILE);
         if bytes > most {
             let error = anyhow!(

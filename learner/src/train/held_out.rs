@@ -43,7 +43,7 @@ impl HeldOut {
             Ok(agent)
         });
         match loaded {
-            Ok(agent) => Some(Self::of(agent, size, experiment.seed, experiment.steps)),
+            Ok(agent) => Some(Self::of(agent, size, experiment.seed, experiment.total_steps())),
             Err(error) => {
                 info!("nothing is measured on held-out episodes: {error:#}");
                 None

@@ -6,6 +6,7 @@ answers with one line of JSON: the sizes of the environment, or an error.
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import signal
@@ -64,6 +65,8 @@ class WrappedEnvironment:
         self.info: dict[str, Any] = {}
         self.broken = False
         self.space = getattr(environment, "observation_space", None)
+        parameters = inspect.signature(environment.reset).parameters.values()
+        self.takes_options = any(it.name == "options" or it.kind is it.VAR_KEYWORD for it in parameters)
         action_space = getattr(environment, "action_space", None)
         self.action_shape = getattr(action_space, "shape", None)
         if action_space is not None and not self.action_shape:
@@ -97,14 +100,15 @@ class WrappedEnvironment:
         self.broken = False
         return result
 
-    def reset(self, seed: int) -> NDArray[np.float64]:
+    def reset(self, seed: int, practice: bool = False) -> NDArray[np.float64]:
         # Many simulators take seeds of 32 bits at most.
         seed %= 2**31
         # Some draw from NumPy's global generator or from the action space, which Gymnasium's reset does not seed.
         _draw_from(self.generator, seed)
         for space in _action_spaces(self.environment):
             space.seed(seed)
-        observation, _ = self._run(self.environment.reset, seed=seed)
+        options = {"options": {"practice": True}} if practice and self.takes_options else {}
+        observation, _ = self._run(self.environment.reset, seed=seed, **options)
         return self._row(observation)
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool, list[float] | None]:

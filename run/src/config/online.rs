@@ -30,9 +30,6 @@ pub struct Online {
 }
 
 impl Online {
-    /// Largest lag, episodes.
-    pub const MOST_LAG: u64 = 1000;
-
     /// Gradient steps online.
     pub fn updates(&self) -> u64 {
         self.updates_after(self.steps)
@@ -64,7 +61,7 @@ impl Online {
         for (field, value, least, most) in [
             ("online.steps", self.steps, 0, MOST),
             ("online.updates_per_step", self.updates_per_step.into(), 1, 1000),
-            ("online.lag", self.lag.into(), 1, Self::MOST_LAG),
+            ("online.lag", self.lag.into(), 1, 1000),
             ("online.snapshot_interval", self.snapshot_interval, 1, MOST),
         ] {
             if !(least..=most).contains(&value) {

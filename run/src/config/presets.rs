@@ -70,8 +70,12 @@ impl Preset {
     pub fn resolve(&self, changes: &Table) -> Result<Experiment, ConfigError> {
         let definition = self.algorithm(changes)?;
         let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
-        let of_task = self.task.map(|task| &task.keys);
-        for keys in of_task.into_iter().chain([&self.own]) {
+        let mut of_task = self.task.map_or_else(Table::new, |task| task.keys.clone());
+        // An algorithm that learns from practice alone does so in each task.
+        if table.get("steps") == Some(&Value::Integer(0)) {
+            of_task.remove("steps");
+        }
+        for keys in [&of_task, &self.own] {
             merge(&mut table, keys.clone());
         }
         check_places(&table, changes)?;

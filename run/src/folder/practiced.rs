@@ -1,8 +1,9 @@
 //! `learner verify` on a run with practice: what its experience promises.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use quad_dataset::environment;
 use quad_protocol::{Hash, practice_seed};
 
 use super::error::RunDirError;
@@ -13,6 +14,9 @@ use super::verify::Findings;
 /// Another evaluator plays these episodes with the same bits.
 const REPEATABLE: &str =
     "the run can be repeated bit for bit by evaluators with the same arithmetic";
+/// The same, of an environment that QUAD does not simulate.
+const IF_REPEATABLE: &str = "the run can be repeated bit for bit by evaluators with the same arithmetic, if \
+                             its environment repeats itself";
 /// Some episodes depend on more than weights and seed.
 const LOGGED: &str = "the run can be repeated bit for bit from experience.log alone";
 
@@ -23,25 +27,31 @@ pub fn practiced(path: &Path) -> Result<Option<(Findings, &'static str)>, RunDir
     let experiment = &config.experiment;
     let Some(online) = &experiment.online else { return Ok(None) };
     let episodes = read_experience(path)?;
-    let lengths = episodes.iter().map(|episode| episode.rewards.len() as u64);
-    let rows: u64 = lengths.sum();
     let mut found = Findings { what: "environment steps are recorded", ..Findings::default() };
-    (found.found, found.expected) = (rows.min(online.steps), online.steps);
-    if rows < online.steps {
-        found.add("not recorded yet", format!("{} steps", online.steps - rows));
-    }
     let most = episodes.len() as u64 + u64::from(online.lag);
-    let seeds = BTreeSet::from_iter((0..most).map(|j| practice_seed(experiment.seed, j)));
-    let mut seen = BTreeSet::new();
+    let numbers: BTreeMap<_, _> =
+        (0..most).map(|j| (practice_seed(experiment.seed, j), j)).collect();
+    let mut lengths = BTreeMap::new();
     for episode in &episodes {
         let seed = episode.score.seed;
-        let name = || format!("step {}, seed {seed}", episode.step);
-        if !seeds.contains(&seed) {
-            found.add("no episode of this run", name());
+        let name = format!("step {}, seed {seed}", episode.step);
+        match numbers.get(&seed) {
+            None => found.add("no episode of this run", name),
+            Some(j) if lengths.insert(*j, episode.rewards.len() as u64).is_some() => {
+                found.add("recorded twice", name);
+            }
+            Some(_) => {}
         }
-        if !seen.insert(seed) {
-            found.add("recorded twice", name());
-        }
+    }
+    // Training takes episodes in their order, up to the first that is not there.
+    let (mut next, mut rows) = (0, 0);
+    while let Some(length) = lengths.get(&next).filter(|_| rows < online.steps) {
+        (next, rows) = (next + 1, rows + length);
+    }
+    (found.found, found.expected) = (rows.min(online.steps), online.steps);
+    if rows < online.steps {
+        let missing = online.steps - rows;
+        found.add("not recorded yet", format!("{missing} steps, from episode {next} on"));
     }
     let arithmetic = BTreeSet::from_iter(episodes.iter().map(|it| &it.precision));
     let acted = BTreeSet::from_iter(episodes.iter().map(|it| (it.step, it.weights)));
@@ -51,7 +61,12 @@ pub fn practiced(path: &Path) -> Result<Option<(Findings, &'static str)>, RunDir
     let is_repeatable = arithmetic.len() <= 1
         && episodes.iter().all(|it| it.interventions.is_empty())
         && acted.iter().all(is_same);
-    Ok(Some((found, if is_repeatable { REPEATABLE } else { LOGGED })))
+    let promise = match environment::find(&experiment.environment) {
+        _ if !is_repeatable => LOGGED,
+        Ok(_) => REPEATABLE,
+        Err(_) => IF_REPEATABLE,
+    };
+    Ok(Some((found, promise)))
 }
 
 #[cfg(test)]

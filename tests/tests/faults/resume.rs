@@ -1,12 +1,14 @@
 //! A learner continues from what its run's folder holds, whatever has become of that.
 
 use std::fs;
+use std::time::Duration;
 
-use quad_protocol::Hash;
+use quad_protocol::{Hash, PieceReply, encode, keys};
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
+use quad_tests::made_up::{self, name};
 use quad_tests::setting::{ENDLESS, SHORT, Setting};
-use quad_tests::system::Scratch;
+use quad_tests::system::{Scratch, free_endpoint};
 
 /// A few seconds of training with evaluations all along.
 const LONG: Setting = Setting { steps: 3000, eval_interval: 300, episodes: 4, hidden: 64, ..SHORT };
@@ -123,4 +125,32 @@ fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
     learner.process.assert_said(&format!("without the snapshot of step {step}"));
     learner.process.assert_said("but 1 episodes have no score");
     learner.process.assert_said("hint: ");
+}
+
+/// A robot cannot play it again. Without a checkpoint, training takes seconds to come to it.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_episode_that_was_played_before_a_crash_is_recorded_after_it() {
+    let (scratch, endpoint, run) = (Scratch::new(), free_endpoint(), name("run"));
+    let setting = Setting { eval_interval: 1_000_000, online_steps: 3000, ..LONG };
+    let flags = ["--listen", &endpoint, "--checkpoint-seconds", "3600"];
+    let start = || scratch.learner_with("run", setting, &flags);
+    let mut learner = start();
+    let mut session = made_up::client(&learner.endpoint()).await;
+    let recorded = made_up::claim_eventually(&session, &run, "one").await;
+    let kept = made_up::claim_eventually(&session, &run, "two").await;
+    for job in [recorded, kept] {
+        let (frame, mut offset) = (encode(&made_up::episode(&job)).unwrap(), 0);
+        loop {
+            let piece = made_up::piece(&job, "one", &frame, offset);
+            match made_up::ask(&session, keys::experience(&run), &piece).await {
+                Some(PieceReply::Continue { offset: next, .. }) => offset = next as usize,
+                Some(PieceReply::Recorded { .. }) => break,
+                Some(PieceReply::Refused { reason, .. }) => panic!("{reason}"),
+                None => tokio::time::sleep(Duration::from_millis(50)).await,
+            }
+        }
+        learner.process.kill();
+        learner = start();
+        session = made_up::client(&learner.endpoint()).await;
+    }
 }

@@ -104,4 +104,18 @@ fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
     assert_eq!(bench.job("b", 0).practice, None);
     assert_eq!(bench.board.validate_practice(&episode(100)), Ok(()));
     assert_eq!(bench.board.validate_practice(&episode(101)), Err(Refusal::Practice(101)));
+    bench.leave("a", 1);
+    assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "nobody waits for it");
+}
+
+#[test]
+fn an_episode_of_an_earlier_incarnation_is_kept_by_its_evaluator_until_it_is_open_again() {
+    let mut bench = Bench::new();
+    bench.board.expect_practice(100);
+    assert_eq!(bench.board.practice(100), Some(Practice::NotYet));
+    bench.board.open_practice(&opening(0), hash(500));
+    assert_eq!(bench.board.practice(100), Some(Practice::Open { episode: 0 }));
+    bench.board.expect_practice(101);
+    bench.board.end_practice();
+    assert_eq!(bench.board.practice(101), None, "training ends without it");
 }

@@ -15,6 +15,12 @@ fn changes_override_the_values_of_the_task() {
 }
 
 #[test]
+fn an_algorithm_of_practice_alone_trains_no_steps_before_it() {
+    let changes = toml! { algorithm = "rlpd" online.steps = 50000 };
+    assert_eq!(resolve("own-data", &changes).unwrap().steps, 0);
+}
+
+#[test]
 fn demonstrations_are_short() {
     for task in crate::config::tasks::all().iter().filter(|task| task.name.ends_with("-demo")) {
         for algorithm in quad_algorithms::ALGORITHMS {
