@@ -209,15 +209,12 @@ impl FromStr for Aggregate {
 
     /// Parses the form of [`Display`](fmt::Display).
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let expected = "one of mean, min and mean-minus-std:KAPPA";
-        match text.split_once(':') {
-            None if text == "mean" => Ok(Self::Mean),
-            None if text == "min" => Ok(Self::Min),
-            Some(("mean-minus-std", kappa)) => match kappa.parse() {
-                Ok(kappa) if (0.0..=f32::MAX).contains(&kappa) => Ok(Self::MeanMinusStd(kappa)),
-                _ => Err("mean-minus-std:KAPPA with a number KAPPA of at least 0"),
-            },
-            _ => Err(expected),
+        let kappa = text.strip_prefix("mean-minus-std:").and_then(|kappa| kappa.parse().ok());
+        match (text, kappa) {
+            ("mean", _) => Ok(Self::Mean),
+            ("min", _) => Ok(Self::Min),
+            (_, Some(kappa)) if (0.0..=f32::MAX).contains(&kappa) => Ok(Self::MeanMinusStd(kappa)),
+            _ => Err("one of mean, min and mean-minus-std:KAPPA, where KAPPA is at least 0"),
         }
     }
 }
