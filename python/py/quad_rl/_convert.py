@@ -68,7 +68,7 @@ def _read(source: str, given: dict[str, Any]) -> Dataset:
         given["success"] = _success(given["success"])
     known = inspect.signature(read).parameters
     for name in given.keys() - known.keys():
-        options = ", ".join(f"--{name}" for name in [*known][1:])
+        options = ", ".join(f"--{name}" for name in [*known][1:] if name != "features")  # Functions are Python's.
         raise ValueError(f"--{name} does not apply to this source; its options: {options or 'none'}")
     missing = [name for name, parameter in known.items() if parameter.kind is parameter.KEYWORD_ONLY
                and parameter.default is parameter.empty and name not in given]

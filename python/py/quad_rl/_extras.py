@@ -16,6 +16,7 @@ EXTRAS = {
     "onnx": ["onnx"],
     "robomimic": ["h5py"],
     "table": ["pyarrow"],
+    "video": ["av"],
 }
 
 

@@ -19,6 +19,7 @@ from quad_rl._extras import library
 from quad_rl._rows import Source
 from quad_rl.readers.arrow import array_of
 from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
+from quad_rl.readers.video import Encoder, column, encoded
 
 Columns = dict[str, NDArray[Any]]
 _REWARD, _SUCCESS, _DONE = "next.reward", "next.success", "next.done"
@@ -37,11 +38,15 @@ def from_lerobot(
     terminate: Rule = None,
     task: str | None = None,
     continuous: bool = False,
+    features: Mapping[str, Encoder] | None = None,
 ) -> Source:
     """A LeRobot dataset, v3.0 or v2.x: the folder with `meta/info.json`. Needs pyarrow.
 
     observations: its features that are seen, in this order, such as ["observation.state"]; no images or videos. Their numbers
         keep their units, and their names in the file and in the policy. action: the feature that is done.
+    features: videos that are seen after the observations, each with the function that makes numbers of its frames, such as
+        {"observation.images.top": encoder}: uint8 [n, h, w, 3] to [n, k]. Columns have the function's name, such as
+        "observation.images.top.encoder[0]". Needs av.
     reward, success: as in `from_frame`, columns being features, or numbers in `meta/episodes`, and names `episode_index`.
         By default `next.reward` and `next.success`, where these were recorded.
     terminate: as `terminal` in `from_frame`. By default `next.terminated`, or `next.done` without `next.truncated`, where these
@@ -58,18 +63,19 @@ def from_lerobot(
     if not (root / "meta/info.json").is_file():
         raise ValueError(f"{root} is no LeRobot dataset: there is no meta/info.json")
     info = json.loads((root / "meta/info.json").read_text())
-    version, features = str(info.get("codebase_version")), info["features"]
+    version, streams = str(info.get("codebase_version")), info["features"]
     if not version.startswith(("v2.", "v3.")):
         raise ValueError(f"{root}: a LeRobot dataset of {version}, but v2.x and v3.x are read\nhint: LeRobot converts it")
-    images = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
-    for name in {*observations, action} & {*images}:
-        raise ValueError(f"{root}: {name} is {features[name]['dtype']}, but only rows of numbers are learned from")
-    notes = [f"left out: {len(images)} streams of images ({', '.join(images)})"] if images else []
+    features = features or {}
+    seen = [*observations, *(column(name, encoder) for name, encoder in features.items())] if features else observations
+    notes = _check_images(root, {name: stream["dtype"] for name, stream in streams.items()}, {*observations, action}, features)
     words = columns_of(observations, action, reward, success, terminate)
-    plain = [name for name in features if name not in images and features[name]["dtype"] not in ("string", "language")]
+    plain = [name for name, stream in streams.items() if stream["dtype"] not in ("image", "video", "string", "language")]
     wanted = {_REWARD, _SUCCESS, _DONE, _TERMINATED, _TRUNCATED, "task_index", *_INDEX, *(plain if words is None else words)}
     columns, unreadable = _frames(root, [name for name in plain if name in wanted])
     parts = _of_task(root, _whole(root, columns, info, unreadable, notes), task, notes)
+    if features:
+        _encode(root, parts, info, features)
     ends = [name for name in (_DONE, _TERMINATED, _TRUNCATED) if name in columns]
     if ends == [_DONE, _TRUNCATED]:
         for part in parts.values():
@@ -79,9 +85,21 @@ def from_lerobot(
     episodes = _cut(parts, ends, notes)
     if rewarded and won and reward in (None, _REWARD):
         _suspect_shift(episodes, notes)
-    names = {name: _names(feature.get("names")) for name, feature in features.items()}
+    names = {name: names_of(stream.get("names")) for name, stream in streams.items()}
     log = Log(episodes, notes, plain, names, rewarded, won, done, terminated, continuous=continuous)
-    return dataset(log, observations, [action], reward, success, terminate)
+    return dataset(log, seen, [action], reward, success, terminate)
+
+
+def _check_images(root: Path, kinds: Mapping[str, str], rows: set[str], features: Mapping[str, Encoder]) -> list[str]:
+    """Raises ValueError for images as rows and for features that are no videos. Notes what is left out."""
+    for name in [name for name in kinds if name in rows and kinds[name] in ("image", "video")]:
+        hint = "hint: features= takes a function that makes numbers of a video"
+        raise ValueError(f"{root}: {name} is {kinds[name]}, but only rows of numbers are learned from\n{hint}")
+    for name in [name for name in features if kinds.get(name) != "video"]:
+        videos = ", ".join(name for name, kind in kinds.items() if kind == "video")
+        raise ValueError(f"{root}: {name} is no video\nhint: there are {videos or 'none'}")
+    unseen = [name for name, kind in kinds.items() if kind in ("image", "video") and name not in features]
+    return [f"left out: {len(unseen)} streams of images ({', '.join(unseen)})"] if unseen else []
 
 
 def _frames(root: Path, wanted: list[str]) -> tuple[Columns, list[str]]:
@@ -102,6 +120,22 @@ def _frames(root: Path, wanted: list[str]) -> tuple[Columns, list[str]]:
     return {name: np.concatenate([part[name] for part in parts]) for name in there}, unreadable
 
 
+def _encode(root: Path, parts: Mapping[int, Columns], info: Mapping[str, Any], features: Mapping[str, Encoder]) -> None:
+    """Adds the numbers of videos. In v3 a file may have many episodes; `meta/episodes` says where each begins."""
+    rows = {row["episode_index"]: row for row in _meta(root, "episodes")}
+    for name, encoder in features.items():
+        begins, full = f"videos/{name}/from_timestamp", column(name, encoder)
+        for number, part in parts.items():
+            row = rows.get(number, {})
+            if begins not in row and "chunk_index" in info["video_path"]:
+                raise ValueError(f"{root}: meta/episodes does not say where {name} of episode {number} is")
+            at = {key: row.get(f"videos/{name}/{key}", 0) for key in ("chunk_index", "file_index")}
+            at |= {"episode_index": number, "episode_chunk": number // info.get("chunks_size", 1000)}
+            path = root / info["video_path"].format(video_key=name, **at)
+            times = row.get(begins, 0.0) + part["frame_index"].reshape(-1) / info["fps"]
+            part[full] = encoded(full, encoder, path, times, 1 / info["fps"])
+
+
 def _meta(root: Path, name: str) -> list[dict[str, Any]]:
     """Rows of meta/NAME: lines of JSON in v2, Parquet in v3."""
     lines = root / f"meta/{name}.jsonl"
@@ -110,7 +144,7 @@ def _meta(root: Path, name: str) -> list[dict[str, Any]]:
     parquet, rows = library("pyarrow.parquet", "lerobot"), []
     for file in sorted((root / "meta").glob(f"{name}*/**/*.parquet")) + sorted((root / "meta").glob(f"{name}.parquet")):
         opened = parquet.ParquetFile(file)
-        rows += opened.read([column for column in opened.schema_arrow.names if "/" not in column]).to_pylist()
+        rows += opened.read([key for key in opened.schema_arrow.names if not key.startswith("stats/")]).to_pylist()
     return rows
 
 
@@ -130,7 +164,8 @@ def _whole(
     kept, longer, total = {}, [], max(int(info.get("total_episodes", 0)), len(there))
     for number, part in there.items():
         frames, row = part["frame_index"].reshape(-1), rows.get(number, {})
-        of_all = {name: value for name, value in row.items() if name not in part and isinstance(value, (bool, int, float))}
+        of_all = {name: value for name, value in row.items()
+                  if name not in part and "/" not in name and isinstance(value, (bool, int, float))}
         steps, said = len(frames), row.get("length", len(frames))
         if steps >= said and np.array_equal(frames, np.arange(steps)):
             kept[number] = part | {name: np.full(steps, value) for name, value in of_all.items()}
@@ -171,12 +206,12 @@ def _of_task(root: Path, parts: dict[int, Columns], task: str | None, notes: lis
     return {number: parts[number] for number in chosen}
 
 
-def _names(names: Any) -> list[str]:
+def names_of(names: Any) -> list[str]:
     """LeRobot has a list, a list in a dictionary, the place of each name, or nothing."""
     if isinstance(names, Mapping):
         if all(isinstance(place, int) for place in names.values()):
             return sorted(names, key=lambda name: int(names[name]))
-        return [name for part in names.values() for name in _names(part)]
+        return [name for part in names.values() for name in names_of(part)]
     return [str(name) for name in names or ()]
 
 
