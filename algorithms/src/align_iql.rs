@@ -16,6 +16,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/align-iql.toml"),
     metrics: METRICS,
     report: Reporting::CANDIDATES,
+    chunks: false,
     read: |table| {
         Ok(start(read::<Config>(table)?, |config, context| config.start(Rule::Nearest, context)))
     },

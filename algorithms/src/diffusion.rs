@@ -28,11 +28,12 @@ impl Networks {
         self.actor.target.sample(&batch.next_observations, noise)
     }
 
-    /// The batch's actions made noisy, and the noise that the actor predicts in them, `[B, a]`.
+    /// The batch's actions made noisy, and the noise that the actor predicts in them, `[B, a]`; in
+    /// those beyond the end of their episode, the noise itself.
     pub fn denoise(&self, batch: &Minibatch, noise: &Denoising) -> Result<(Tensor, Tensor)> {
         let noisy = noise.noisy(&batch.actions)?;
         let predicted = self.actor.predict(&batch.observations, &noisy, &noise.t)?;
-        Ok((noisy, predicted))
+        Ok((noisy, batch.within_episodes(predicted, &noise.epsilon)?))
     }
 }
 

@@ -18,6 +18,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/dql.toml"),
     metrics: METRICS,
     report: Reporting::CANDIDATES,
+    chunks: false,
     read: |table| Ok(start(read(table)?, Config::start)),
 };
 

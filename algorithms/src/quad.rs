@@ -31,6 +31,7 @@ pub(super) const DEFINITION: Definition = Definition {
         summary: Some(summary::of),
         ..Reporting::CANDIDATES
     },
+    chunks: true,
     read: |table| Ok(start(Config::read(table)?, Quad::start)),
 };
 
@@ -148,6 +149,7 @@ impl DiffusionUpdate for Quad {
                 let noisy = noise.denoising.noisy(&batch.actions)?;
                 let actor = networks.actor.detach();
                 let predicted = actor.predict(&batch.observations, &noisy, t)?;
+                let predicted = batch.within_episodes(predicted, epsilon)?;
                 let bc_loss = squared_error(&predicted, epsilon)?;
                 write(&self.eta, &self.ascended_eta((bc_loss - f64::from(*threshold))?)?)?;
             }

@@ -255,8 +255,8 @@ impl PyPolicy {
         self.origin.step
     }
 
-    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's) or "score" (SfBC's),
-    /// which draw actions and choose; "planner", which draws plans and chooses one; or "gaussian",
+    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's), "flow" (QC's) or "score"
+    /// (SfBC's), which draw actions and choose; "planner", which draws plans and chooses one; or "gaussian",
     /// which acts by its mean.
     #[getter]
     fn kind(&self) -> &'static str {
@@ -264,6 +264,7 @@ impl PyPolicy {
             PolicyConfig::Diffusion { .. } => "diffusion",
             PolicyConfig::Squashed { .. } => "squashed",
             PolicyConfig::OneStep { .. } => "one-step",
+            PolicyConfig::Flow { .. } => "flow",
             PolicyConfig::Gaussian { .. } => "gaussian",
             PolicyConfig::Score { .. } => "score",
             PolicyConfig::Diffuser { .. } => "planner",

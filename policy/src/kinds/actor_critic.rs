@@ -56,7 +56,7 @@ impl ActorCriticShape {
     pub(crate) fn load<A: Actor + 'static>(
         &self,
         actor_shape: EnsembleShape,
-        actor: fn(Ensemble) -> A,
+        actor: impl FnOnce(Ensemble) -> A,
         choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
