@@ -13,13 +13,19 @@ use rand::Rng;
 networks! {
     pub(super) struct Networks(shape: &DiffusionShape, init) {
         /// ε_θ.
-        actor: WithTarget<NoisePredictor> = {
-            let (layout, precision) = (shape.actor().layout(), init.context.precision);
-            let network = |weights| NoisePredictor::new(shape.actor(), weights, precision);
-            init.network(&layout, network)?.with_target(|online| Ok(network(online.weights().copy()?)))
-        },
+        actor: WithTarget<NoisePredictor> = noise_predictor(shape, init),
         critic: WithTarget<Ensemble> = init.critics(shape.critics, &shape.critic),
     }
+}
+
+/// ε_θ with its target network.
+pub(super) fn noise_predictor(
+    shape: &DiffusionShape,
+    init: &mut Initializer<'_>,
+) -> Result<WithTarget<NoisePredictor>> {
+    let (layout, precision) = (shape.actor().layout(), init.context.precision);
+    let network = |weights| NoisePredictor::new(shape.actor(), weights, precision);
+    init.network(&layout, network)?.with_target(|online| Ok(network(online.weights().copy()?)))
 }
 
 impl Networks {
@@ -40,9 +46,9 @@ impl Networks {
 /// Draws the random numbers of a diffusion policy, on the CPU.
 pub(super) struct Sampler<'a> {
     pub random: Random,
-    batch_size: usize,
-    shape: &'a DiffusionShape,
-    actor: &'a NoisePredictor,
+    pub batch_size: usize,
+    pub shape: &'a DiffusionShape,
+    pub actor: &'a NoisePredictor,
 }
 
 impl Sampler<'_> {

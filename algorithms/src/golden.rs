@@ -164,7 +164,7 @@ fn check_policy(golden: &Golden, algorithm: &dyn Algorithm) {
     let mut policy = load_policy(&file, Precision::F32).unwrap();
     let observations = numbers(golden, "select_observations");
     let n = observations.len() / policy.observation_dim();
-    let noise = policy.choice().map(|_| {
+    let noise = (!policy.noise().is_empty()).then(|| {
         let noise = golden.inputs["select_noise"].reshape((policy.noise()[0], n, ())).unwrap();
         noise.transpose(0, 1).unwrap().flatten_from(1).unwrap().to_vec2::<f32>().unwrap()
     });

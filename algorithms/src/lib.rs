@@ -9,7 +9,7 @@
 //!   the data and settings of a run; `chunk`: several steps at a time. `prelude` has the names of these for an algorithm's file.
 //! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
 //!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`. `fql` is the one to read first; `qc` shares
-//!   its flow.
+//!   its flow, and `diffusion_policy` QUAD's noise predictor.
 //!
 //! A new algorithm is a file here, a line in [`ALGORITHMS`], `presets/NAME.toml`, and a script with
 //! golden folders in `tests/golden`.
@@ -27,6 +27,7 @@ mod definition;
 mod denoising;
 mod diffuser;
 mod diffusion;
+mod diffusion_policy;
 mod dql;
 mod dtql;
 mod error;
@@ -78,6 +79,7 @@ pub const ALGORITHMS: &[Definition] = &[
     align_iql::DEFINITION,
     cql::DEFINITION,
     diffuser::DEFINITION,
+    diffusion_policy::DEFINITION,
     dql::DEFINITION,
     dtql::DEFINITION,
     fql::DEFINITION,

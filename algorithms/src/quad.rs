@@ -187,7 +187,7 @@ impl DiffusionUpdate for Quad {
 
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
         let Networks { actor, critic } = networks;
-        let tensors = DiffusionPolicy::tensors(&actor.target, &critic.target, None)?;
+        let tensors = DiffusionPolicy::tensors(&actor.target, Some(&critic.target), None)?;
         Ok((Choice::best_of(*self.config.candidates), tensors)) // Eq. 25
     }
 

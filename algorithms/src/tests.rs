@@ -226,7 +226,7 @@ fn a_nan_reaches_a_metric() {
             let values = train(&mut agent, STEPS);
             // Target networks by which the policy acts, but from which nothing is learned.
             let unread = match definition.name {
-                "align-iql" | "idql" => name == "target_actor",
+                "align-iql" | "diffusion-policy" | "idql" => name == "target_actor",
                 "diffuser" => name.starts_with("target"),
                 "dtql" => name == "target_critic",
                 _ => false,

@@ -71,7 +71,9 @@ impl PolicyConfig {
         match self {
             Self::Diffusion { shape, .. } => {
                 add(ACTOR, shape.actor().layout())?;
-                add(CRITIC, shape.critics().layout())?;
+                if shape.critics > 0 {
+                    add(CRITIC, shape.critics().layout())?;
+                }
                 shape.value().map(|value| add(VALUE, value.layout())).transpose()?;
             }
             Self::Squashed { shape, .. } => {

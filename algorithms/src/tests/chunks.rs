@@ -4,8 +4,14 @@ use super::*;
 use quad_policy::{Precision, load_policy};
 
 /// A network that clones the data in each algorithm that learns chunks.
-const CLONING: [(&str, &str); 5] =
-    [("quad", "actor"), ("dtql", "diffusion"), ("fql", "flow"), ("idql", "actor"), ("qc", "flow")];
+const CLONING: [(&str, &str); 6] = [
+    ("quad", "actor"),
+    ("diffusion-policy", "actor"),
+    ("dtql", "diffusion"),
+    ("fql", "flow"),
+    ("idql", "actor"),
+    ("qc", "flow"),
+];
 
 fn chunked(mut table: toml::Table, chunk: i64) -> toml::Table {
     table.insert("chunk".to_owned(), chunk.into());
