@@ -7,7 +7,7 @@ use candle_core::{Device, Result, Tensor};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group};
 use quad_algorithms::{ALGORITHMS, Agent, Context, Definition, Values};
-use quad_dataset::{Arrays, Transitions};
+use quad_dataset::{Arrays, Transitions, Window};
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_kernels::product::{Matrix::RowMajor, by_gemm};
 use quad_nn::{
@@ -65,6 +65,7 @@ fn context(experiment: &Experiment, precision: Precision, device: &Device) -> Co
         batch_size: experiment.batch_size,
         total_steps: experiment.total_steps,
         online_steps: 0,
+        window: Window::ONE,
         seed: 0,
         precision,
         device: device.clone(),

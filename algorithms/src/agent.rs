@@ -9,7 +9,7 @@ use crate::pool::run_awake;
 use candle_core::Device;
 use quad_dataset::{Names, Transitions};
 use quad_nn::Scaling;
-use quad_policy::{Header, PolicyError, read_header, read_tensors, write_tensors};
+use quad_policy::{Chunk, Header, PolicyError, read_header, read_tensors, write_tensors};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -22,6 +22,8 @@ pub struct Agent {
     pub(super) algorithm: Box<dyn Algorithm>,
     device: Device,
     transitions: Arc<Transitions>,
+    /// The chunk that the policy knows as one action.
+    chunk: Chunk,
     /// The maps between the data's units and the algorithm's, unless they are the same.
     scaling: Option<Scaling>,
     /// The dataset's names of observations and actions.
@@ -62,10 +64,10 @@ impl Agent {
         let scaling = Some(transitions.scaling().clone());
         let scaling = scaling.filter(|scaling| *scaling != Scaling::default());
         let names = transitions.names().clone();
-        let algorithm = hyperparameters.start(&definition, context)?;
+        let (chunk, algorithm) = hyperparameters.start(&definition, context)?;
         // Each thread has its own queue on a GPU: what this one made must be there for the next.
         device.synchronize()?;
-        Ok(Self { definition, algorithm, device, transitions, scaling, names, step: 0 })
+        Ok(Self { definition, algorithm, device, transitions, chunk, scaling, names, step: 0 })
     }
 
     /// The number of examples that batches are drawn from.
@@ -130,6 +132,7 @@ impl Agent {
     pub fn policy(&self, origin: impl Serialize) -> Result<Vec<u8>, AlgorithmError> {
         let (policy, tensors) = self.algorithm.policy()?;
         let mut header = Header::new(policy, origin);
+        header.chunk = self.chunk;
         header.scaling = self.scaling.clone();
         header.observation_names = self.names.observations.clone();
         header.action_names = self.names.actions.clone();

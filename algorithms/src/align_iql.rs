@@ -16,6 +16,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/align-iql.toml"),
     metrics: METRICS,
     report: Reporting::CANDIDATES,
+    chunks: false,
     read: |table| {
         Ok(start(read::<Config>(table)?, |config, context| config.start(Rule::Nearest, context)))
     },
@@ -166,7 +167,7 @@ impl DiffusionUpdate for AlignIql {
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
         let Networks { actor, critic } = networks;
         let value = (self.rule == Rule::Nearest).then_some(&*self.value);
-        let tensors = DiffusionPolicy::tensors(&actor.target, &critic.target, value)?;
+        let tensors = DiffusionPolicy::tensors(&actor.target, Some(&critic.target), value)?;
         Ok((Choice::new(*self.config.candidates, Aggregate::Min, self.rule), tensors))
     }
 

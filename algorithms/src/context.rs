@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
-use quad_dataset::{Batch, Transitions};
+use quad_dataset::{Batch, Transitions, Window};
 use quad_nn::{Ensemble, Precision, cosine_decay};
 
 use super::error::AlgorithmError;
@@ -22,6 +22,8 @@ pub struct Context {
     pub total_steps: u64,
     /// Updates with experience that follow.
     pub online_steps: u64,
+    /// The steps of an example, which are those of a chunk of actions.
+    pub window: Window,
     /// Seed of initial weights and noise.
     pub seed: u64,
     /// Precision of forward passes without a gradient.
@@ -39,9 +41,9 @@ impl Context {
         self.transitions.observation_dim()
     }
 
-    /// Size of an action, a.
+    /// Size of an action as the networks know it, a: of a whole chunk.
     pub fn action_dim(&self) -> usize {
-        self.transitions.action_dim()
+        self.transitions.action_dim() * self.window.length
     }
 
     /// The share of the updates with experience that come before update number `step`; `None` in
@@ -72,7 +74,7 @@ impl Context {
         }
     }
 
-    /// The transitions with these indices as tensors.
+    /// The windows that begin with these transitions as tensors.
     pub fn batch(&self, indices: &[u32]) -> Result<Minibatch> {
         self.batch_on(indices, &self.device)
     }
@@ -80,7 +82,7 @@ impl Context {
     /// [`Self::batch`] on another device.
     pub(super) fn batch_on(&self, indices: &[u32], device: &Device) -> Result<Minibatch> {
         let mut batch = Batch::default();
-        self.transitions.gather(indices, &mut batch);
+        self.transitions.gather_windows(indices, self.window, &mut batch);
         let rows = |numbers: &[f32]| {
             Tensor::from_slice(numbers, (indices.len(), numbers.len() / indices.len()), device)
         };
@@ -91,7 +93,18 @@ impl Context {
             rewards: column(&batch.rewards)?,
             next_observations: rows(&batch.next_observations)?,
             masks: column(&batch.masks)?,
+            within: self.within(&batch.steps, device)?,
         })
+    }
+
+    fn within(&self, steps: &[usize], device: &Device) -> Result<Option<Tensor>> {
+        if self.window.length == 1 {
+            return Ok(None);
+        }
+        let (a, width) = (self.transitions.action_dim(), self.action_dim());
+        let of_example = |n: usize| (0..width).map(move |i| f32::from(u8::from(i < n * a)));
+        let within = Vec::from_iter(steps.iter().copied().flat_map(of_example));
+        Tensor::from_vec(within, (steps.len(), width), device).map(Some)
     }
 
     /// The transitions that have a next action, or need none because the episode terminates.
@@ -121,25 +134,31 @@ pub(super) fn select(of: &[u32], indices: &[u32]) -> Vec<u32> {
     indices.iter().map(|index| of[*index as usize]).collect()
 }
 
-/// A batch of B transitions.
+/// A batch of B transitions, or of B windows of up to h of them.
 #[derive(Clone, Debug)]
 pub struct Minibatch {
     /// s, `[B, o]`.
     pub observations: Tensor,
-    /// a, `[B, a]`.
+    /// a, `[B, a]`: the actions of a chunk, the last of which is repeated where the episode ends
+    /// before.
     pub actions: Tensor,
-    /// r, `[B]`.
+    /// r, `[B]`: the discounted sum over a window.
     pub rewards: Tensor,
-    /// s', `[B, o]`.
+    /// s', `[B, o]`: the state after a window.
     pub next_observations: Tensor,
-    /// 0 where the episode terminated, else 1; `[B]`.
+    /// 0 where the episode terminated, else 1, times γ for each step of a window after the first;
+    /// `[B]`.
     pub masks: Tensor,
+    /// With chunks: 1 for actions within the episode, else 0; `[B, a]`.
+    pub within: Option<Tensor>,
 }
 
 impl Inputs for Minibatch {
     fn tensors(&mut self) -> Vec<&mut Tensor> {
-        let Self { observations, actions, rewards, next_observations, masks } = self;
-        vec![observations, actions, rewards, next_observations, masks]
+        let Self { observations, actions, rewards, next_observations, masks, within } = self;
+        let mut tensors = vec![observations, actions, rewards, next_observations, masks];
+        tensors.extend(within);
+        tensors
     }
 }
 
@@ -147,6 +166,15 @@ impl Minibatch {
     /// y = r + γ·mask·v for values v of s', `[B]`, as constants.
     pub fn target(&self, gamma: f32, next: &Tensor) -> Result<Tensor> {
         Ok((&self.rewards + ((next * &self.masks)? * f64::from(gamma))?)?.detach())
+    }
+
+    /// A prediction about the batch's actions, with the truth in place of what it says of those beyond
+    /// the end of their episode, which are not learned; all `[B, a]`.
+    pub(super) fn within_episodes(&self, predicted: Tensor, truth: &Tensor) -> Result<Tensor> {
+        match &self.within {
+            Some(within) => (predicted * within)? + (truth * within.affine(-1.0, 1.0)?)?,
+            None => Ok(predicted),
+        }
     }
 
     /// Q_k(s, a), `[K, B]`.

@@ -15,6 +15,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/cql.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
+    chunks: false,
     read: |table| Ok(start(read(table)?, Cql::new)),
 };
 

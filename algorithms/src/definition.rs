@@ -6,11 +6,13 @@ use std::fmt;
 use std::ops::Deref;
 use std::sync::Arc;
 
+use quad_policy::Chunk;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize, Serializer};
 use toml::Table;
 
 use super::algorithm::Algorithm;
+use super::chunk;
 use super::context::Context;
 use super::error::{AgentError, AlgorithmError};
 
@@ -25,7 +27,10 @@ pub struct Definition {
     pub metrics: &'static [Metric],
     /// Texts of reports about its runs, beside scores.
     pub report: Reporting,
-    /// Reads an `[agent]` table into the type of its hyper-parameters.
+    /// True if it can learn chunks of actions (`agent.chunk`).
+    pub chunks: bool,
+    /// Reads an `[agent]` table, without `chunk` and `replan`, into the type of its
+    /// hyper-parameters.
     pub read: fn(&Table) -> Result<Start, AgentError>,
 }
 
@@ -66,7 +71,7 @@ pub(super) fn read_with<C: DeserializeOwned, T: DeserializeOwned>(
 pub struct Hyperparameters {
     table: Table,
     #[serde(skip)]
-    start: Option<Start>,
+    start: Option<(Chunk, Start)>,
 }
 
 impl Hyperparameters {
@@ -75,7 +80,7 @@ impl Hyperparameters {
     /// # Errors
     /// A key is missing, unknown, of the wrong type or out of range.
     pub fn new(definition: &Definition, table: Table) -> Result<Self, AgentError> {
-        Ok(Self { start: Some((definition.read)(&table)?), table })
+        Ok(Self { start: Some(chunk::read(definition, &table)?), table })
     }
 
     /// A copy of the table.
@@ -83,7 +88,8 @@ impl Hyperparameters {
         self.table.clone()
     }
 
-    /// The algorithm at step 0. A table that comes from a run's folder is read here.
+    /// The algorithm at step 0, and the chunk that its policy knows as one action. A table that comes
+    /// from a run's folder is read here.
     ///
     /// # Errors
     /// The table cannot be used, the data has no examples for the algorithm, or candle fails.
@@ -91,11 +97,12 @@ impl Hyperparameters {
         &self,
         definition: &Definition,
         context: Context,
-    ) -> Result<Box<dyn Algorithm>, AlgorithmError> {
-        match &self.start {
-            Some(start) => start(context),
-            None => (definition.read)(&self.table)?(context),
-        }
+    ) -> Result<(Chunk, Box<dyn Algorithm>), AlgorithmError> {
+        let (chunk, start) = match &self.start {
+            Some(start) => start.clone(),
+            None => chunk::read(definition, &self.table)?,
+        };
+        Ok((chunk, start(context)?))
     }
 }
 

@@ -18,6 +18,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/diffuser.toml"),
     metrics: METRICS,
     report: Reporting::CANDIDATES,
+    chunks: false,
     read: |table| Ok(start(Config::read(table)?, Diffuser::new)),
 };
 

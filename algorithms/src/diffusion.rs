@@ -13,13 +13,19 @@ use rand::Rng;
 networks! {
     pub(super) struct Networks(shape: &DiffusionShape, init) {
         /// ε_θ.
-        actor: WithTarget<NoisePredictor> = {
-            let (layout, precision) = (shape.actor().layout(), init.context.precision);
-            let network = |weights| NoisePredictor::new(shape.actor(), weights, precision);
-            init.network(&layout, network)?.with_target(|online| Ok(network(online.weights().copy()?)))
-        },
+        actor: WithTarget<NoisePredictor> = noise_predictor(shape, init),
         critic: WithTarget<Ensemble> = init.critics(shape.critics, &shape.critic),
     }
+}
+
+/// ε_θ with its target network.
+pub(super) fn noise_predictor(
+    shape: &DiffusionShape,
+    init: &mut Initializer<'_>,
+) -> Result<WithTarget<NoisePredictor>> {
+    let (layout, precision) = (shape.actor().layout(), init.context.precision);
+    let network = |weights| NoisePredictor::new(shape.actor(), weights, precision);
+    init.network(&layout, network)?.with_target(|online| Ok(network(online.weights().copy()?)))
 }
 
 impl Networks {
@@ -28,20 +34,21 @@ impl Networks {
         self.actor.target.sample(&batch.next_observations, noise)
     }
 
-    /// The batch's actions made noisy, and the noise that the actor predicts in them, `[B, a]`.
+    /// The batch's actions made noisy, and the noise that the actor predicts in them, `[B, a]`; in
+    /// those beyond the end of their episode, the noise itself.
     pub fn denoise(&self, batch: &Minibatch, noise: &Denoising) -> Result<(Tensor, Tensor)> {
         let noisy = noise.noisy(&batch.actions)?;
         let predicted = self.actor.predict(&batch.observations, &noisy, &noise.t)?;
-        Ok((noisy, predicted))
+        Ok((noisy, batch.within_episodes(predicted, &noise.epsilon)?))
     }
 }
 
 /// Draws the random numbers of a diffusion policy, on the CPU.
 pub(super) struct Sampler<'a> {
     pub random: Random,
-    batch_size: usize,
-    shape: &'a DiffusionShape,
-    actor: &'a NoisePredictor,
+    pub batch_size: usize,
+    pub shape: &'a DiffusionShape,
+    pub actor: &'a NoisePredictor,
 }
 
 impl Sampler<'_> {

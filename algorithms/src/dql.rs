@@ -18,6 +18,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/dql.toml"),
     metrics: METRICS,
     report: Reporting::CANDIDATES,
+    chunks: false,
     read: |table| Ok(start(read(table)?, Config::start)),
 };
 
@@ -182,7 +183,7 @@ impl DiffusionUpdate for Config {
     /// The actor itself, not its EMA, which draws one of its candidates by the target critics' values.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
         let Networks { actor, critic } = networks;
-        let tensors = DiffusionPolicy::tensors(actor, &critic.target, None)?;
+        let tensors = DiffusionPolicy::tensors(actor, Some(&critic.target), None)?;
         let rule = Rule::softmax(*self.temperature);
         Ok((Choice::new(*self.candidates, Aggregate::Min, rule), tensors))
     }

@@ -17,6 +17,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/dtql.toml"),
     metrics: METRICS,
     report: Reporting::CANDIDATES,
+    chunks: true,
     read: |table| Ok(start(read(table)?, Dtql::new)),
 };
 
@@ -166,7 +167,9 @@ impl Dtql {
     /// μ_φ toward the data's actions.
     fn bc_loss(&self, batch: &Minibatch, noising: &Noising) -> Result<Loss> {
         let diffusion = &self.networks.diffusion;
-        let loss = denoising_loss(diffusion, &batch.observations, &batch.actions, noising)?;
+        let actions = &batch.actions;
+        let learned = |clean| batch.within_episodes(clean, actions);
+        let loss = denoising_loss(diffusion, &batch.observations, actions, noising, learned)?;
         Ok(Loss::new("bc_loss", loss))
     }
 
@@ -176,13 +179,14 @@ impl Dtql {
         let distribution = actor.distribution(&batch.observations)?;
         let drawn = distribution.draw(&noise.policy)?;
         let (actions, diffusion) = (drawn.actions.squeeze(1)?, diffusion.detach());
-        let trust_loss = denoising_loss(&diffusion, &batch.observations, &actions, &noise.trust)?;
+        let trust_loss =
+            denoising_loss(&diffusion, &batch.observations, &actions, &noise.trust, Ok)?;
         let q = batch.values_at(&critic.detach(), &actions)?;
         let q_loss = smallest(&q)?.mean_all()?.neg()?;
         let mut loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         let (weight, mut likelihood) = (*self.config.likelihood, None);
         if weight > 0.0 {
-            let of_data = likelihood_loss(&distribution, &batch.actions)?;
+            let of_data = likelihood_loss(&distribution, batch)?;
             loss = (loss + (&of_data * f64::from(weight))?)?;
             likelihood = Some(of_data);
         }
@@ -192,26 +196,30 @@ impl Dtql {
 }
 
 /// Mean of ((D_φ(a + σn; s, σ) − a)/c_out)², `[]`, of actions `[B, a]`, through which the gradient
-/// flows twice: the noisy ones and the clean ones.
+/// flows twice: the noisy ones and the clean ones. `learned` is what counts of the denoised ones.
 fn denoising_loss(
     diffusion: &Denoiser,
     observations: &Tensor,
     actions: &Tensor,
     noising: &Noising,
+    learned: impl FnOnce(Tensor) -> Result<Tensor>,
 ) -> Result<Tensor> {
     let device = actions.device();
     let Noising { levels, noise } = noising;
     let noisy = (actions + noise.broadcast_mul(&levels.sigma(device)?)?)?;
-    let error = (diffusion.denoise(observations, &noisy, levels)? - actions)?;
+    let error = (learned(diffusion.denoise(observations, &noisy, levels)?)? - actions)?;
     error.broadcast_div(&levels.output_scale(device)?)?.sqr()?.mean_all()
 }
 
 /// −E[log N(atanh(a/1.001))] of the data's actions, `[]`: not of a, whose density would also have
 /// the tanh's Jacobian, which does not depend on θ.
-fn likelihood_loss(distribution: &Normal, actions: &Tensor) -> Result<Tensor> {
-    let scaled = (actions / ROOM)?;
+fn likelihood_loss(distribution: &Normal, batch: &Minibatch) -> Result<Tensor> {
+    let scaled = (&batch.actions / ROOM)?;
     let u = (((1.0 + &scaled)?.log()? - (1.0 - &scaled)?.log()?)? * 0.5)?;
-    log_density(&u, &distribution.mean, &distribution.log_std)?.mean_all()?.neg()
+    let Normal { mean, log_std } = distribution;
+    let mean = batch.within_episodes(mean.clone(), &u)?;
+    let log_std = batch.within_episodes(log_std.clone(), &log_std.zeros_like()?)?;
+    log_density(&u, &mean, &log_std)?.mean_all()?.neg()
 }
 
 impl Algorithm for Dtql {

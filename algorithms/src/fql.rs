@@ -4,7 +4,7 @@
 
 use super::prelude::*;
 use candle_nn::loss::mse;
-use quad_policy::{ActorCriticShape, OneStepActor};
+use quad_policy::{ActorCriticShape, FlowActor, OneStepActor, flow_velocity};
 use rand::Rng;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -12,6 +12,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/fql.toml"),
     metrics: METRICS,
     report: Reporting::CANDIDATES,
+    chunks: true,
     read: |table| Ok(start(read(table)?, Fql::new)),
 };
 
@@ -87,7 +88,7 @@ impl Fql {
         let times = random.tensor("times", (b, 1), |generator| generator.random::<f32>())?;
         let targets = self.targets(&batch, &next_noise)?;
         let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
-        let bc_loss = self.flow_loss(&batch, &start, &times)?;
+        let bc_loss = flow_loss(&self.networks.flow, &batch, &start, &times)?;
         let [distill_loss, q_loss] = self.actor_losses(&batch, &policy_noise)?;
         let with_practice = self.config.online_alpha.filter(|_| self.context.online_steps > 0);
         let alpha = f64::from(*with_practice.unwrap_or(self.config.alpha));
@@ -101,33 +102,7 @@ impl Fql {
         let actions = OneStepActor::new(self.networks.actor.detach())
             .sample(&batch.next_observations, noise)?;
         let values = batch.next_values(&self.networks.critic.target, &actions)?;
-        let q = match self.config.target {
-            Aggregate::Mean => values.mean(0)?,
-            Aggregate::Min => smallest(&values)?,
-            Aggregate::MeanMinusStd(kappa) => lower_bound(&values, kappa)?,
-        };
-        batch.target(*self.config.gamma, &q)
-    }
-
-    /// Mean of (v(s, x_t, t) − (a − x_0))², `[]`, with x_t = x_0 + t·(a − x_0).
-    fn flow_loss(&self, batch: &Minibatch, start: &Tensor, times: &Tensor) -> Result<Tensor> {
-        let velocity = (&batch.actions - start)?;
-        let x = (start + velocity.broadcast_mul(times)?)?;
-        let predicted = velocity_of(&self.networks.flow, &batch.observations, &x, times)?;
-        mse(&predicted, &velocity)
-    }
-
-    /// The flow's actions, `[B, a]`, by Euler steps from this noise; constants.
-    fn flow_actions(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
-        let (flow, steps) = (self.networks.flow.detach(), *self.config.flow_steps);
-        let mut x = noise.clone();
-        for step in 0..steps {
-            let (t, rows) = (step as f32 / steps as f32, noise.dim(0)?);
-            let t = Tensor::full(t, (rows, 1), noise.device())?;
-            let velocity = velocity_of(&flow, observations, &x, &t)?;
-            x = (x + (velocity / steps as f64)?)?;
-        }
-        x.clamp(-1f32, 1f32)
+        batch.target(*self.config.gamma, &reduced(&values, self.config.target)?)
     }
 
     /// The squared distance of the one-step policy's actions to the flow's, and −Q of these actions,
@@ -135,7 +110,8 @@ impl Fql {
     fn actor_losses(&self, batch: &Minibatch, noise: &Tensor) -> Result<[Tensor; 2]> {
         let observations = &batch.observations;
         let actions = self.networks.actor.outputs(observations, noise)?.squeeze(0)?;
-        let distill_loss = mse(&actions, &self.flow_actions(observations, noise)?)?;
+        let flow = FlowActor::new(self.networks.flow.detach(), *self.config.flow_steps);
+        let distill_loss = mse(&actions, &flow.sample(observations, noise)?)?;
         let actions = actions.clamp(-1f32, 1f32)?;
         let q = batch.values_at(&self.networks.critic.detach(), &actions)?.mean(0)?;
         let mut q_loss = q.mean_all()?.neg()?;
@@ -146,9 +122,17 @@ impl Fql {
     }
 }
 
-/// v(s, x, t), `[B, a]`.
-fn velocity_of(flow: &Ensemble, observations: &Tensor, x: &Tensor, t: &Tensor) -> Result<Tensor> {
-    flow.outputs(observations, &Tensor::cat(&[x, t], 1)?)?.squeeze(0)
+/// Mean of (v(s, x_t, t) − (a − x_0))², `[]`, with x_t = x_0 + t·(a − x_0) (FQL's Eq. 4).
+pub(super) fn flow_loss(
+    flow: &Ensemble,
+    batch: &Minibatch,
+    start: &Tensor,
+    times: &Tensor,
+) -> Result<Tensor> {
+    let velocity = (&batch.actions - start)?;
+    let x = (start + velocity.broadcast_mul(times)?)?;
+    let predicted = flow_velocity(flow, &batch.observations, &x, times)?;
+    mse(&batch.within_episodes(predicted, &velocity)?, &velocity)
 }
 
 impl Algorithm for Fql {

@@ -12,7 +12,7 @@ use super::definition::{Definition, Metric};
 use super::state_dict::StateDict;
 use super::{ALGORITHMS, Hyperparameters};
 use candle_core::{D, DType, Device, Tensor};
-use quad_dataset::{Arrays, Transitions};
+use quad_dataset::{Arrays, Transitions, Window};
 use quad_nn::{Precision, Scaling, Tensors, open_gpu};
 use quad_policy::{
     Aggregate, Choice, EpisodeState, Header, PolicyConfig, Rule, Samples, load_policy,
@@ -130,6 +130,7 @@ pub(super) fn context(golden: &Golden, device: &Device) -> Context {
         batch_size: golden.count("/batch_size"),
         total_steps: golden.count("/total_steps") as u64,
         online_steps: golden.config["online_steps"].as_u64().unwrap_or(0),
+        window: Window::ONE,
         seed: 0,
         precision: Precision::F32,
         device: device.clone(),
@@ -144,7 +145,7 @@ pub(super) fn table(golden: &Golden) -> toml::Table {
 
 fn check(definition: &Definition, golden: &Golden, device: &Device) {
     let hyperparameters = Hyperparameters::new(definition, table(golden)).unwrap();
-    let mut algorithm = hyperparameters.start(definition, context(golden, device)).unwrap();
+    let (_, mut algorithm) = hyperparameters.start(definition, context(golden, device)).unwrap();
     load(golden, algorithm.state_dict());
     check_policy(golden, &*algorithm);
     let indices = Vec::from_iter(0..golden.count("/batch_size") as u32);
@@ -163,7 +164,7 @@ fn check_policy(golden: &Golden, algorithm: &dyn Algorithm) {
     let mut policy = load_policy(&file, Precision::F32).unwrap();
     let observations = numbers(golden, "select_observations");
     let n = observations.len() / policy.observation_dim();
-    let noise = policy.choice().map(|_| {
+    let noise = (!policy.noise().is_empty()).then(|| {
         let noise = golden.inputs["select_noise"].reshape((policy.noise()[0], n, ())).unwrap();
         noise.transpose(0, 1).unwrap().flatten_from(1).unwrap().to_vec2::<f32>().unwrap()
     });

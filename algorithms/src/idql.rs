@@ -11,6 +11,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/idql.toml"),
     metrics: METRICS,
     report: Reporting::CANDIDATES,
+    chunks: true,
     read: |table| {
         Ok(start(read::<Config>(table)?, |config, context| config.start(Rule::Best, context)))
     },

@@ -18,6 +18,7 @@ pub(super) const DEFINITION: Definition = Definition {
         }),
         ..Reporting::PLAIN
     },
+    chunks: false,
     read: |table| Ok(start(read::<Config>(table)?, InSample::new)),
 };
 

@@ -6,9 +6,10 @@
 //! - [`Algorithm`]: the interface to the learner; [`Agent`]: an algorithm in training.
 //! - `networks`: networks with optimizers and targets, which an algorithm declares once;
 //!   `state_dict`; `losses`; `hyperparameters`: types that check themselves; `random`; `context`:
-//!   the data and settings of a run. `prelude` has the names of these for an algorithm's file.
+//!   the data and settings of a run; `chunk`: several steps at a time. `prelude` has the names of these for an algorithm's file.
 //! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
-//!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`. `fql` stands alone and is the one to read first.
+//!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`. `fql` is the one to read first; `qc` shares
+//!   its flow, and `diffusion_policy` QUAD's noise predictor.
 //!
 //! A new algorithm is a file here, a line in [`ALGORITHMS`], `presets/NAME.toml`, and a script with
 //! golden folders in `tests/golden`.
@@ -19,12 +20,14 @@ mod agent;
 mod algorithm;
 mod align_iql;
 mod calibration;
+mod chunk;
 mod context;
 mod cql;
 mod definition;
 mod denoising;
 mod diffuser;
 mod diffusion;
+mod diffusion_policy;
 mod dql;
 mod dtql;
 mod error;
@@ -43,6 +46,7 @@ mod onestep;
 mod phases;
 mod pool;
 mod prelude;
+mod qc;
 mod quad;
 mod random;
 mod rebrac;
@@ -75,12 +79,14 @@ pub const ALGORITHMS: &[Definition] = &[
     align_iql::DEFINITION,
     cql::DEFINITION,
     diffuser::DEFINITION,
+    diffusion_policy::DEFINITION,
     dql::DEFINITION,
     dtql::DEFINITION,
     fql::DEFINITION,
     idql::DEFINITION,
     ivr::DEFINITION,
     onestep::DEFINITION,
+    qc::DEFINITION,
     rebrac::DEFINITION,
     rlpd::DEFINITION,
     sfbc::DEFINITION,

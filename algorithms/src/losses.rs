@@ -2,6 +2,7 @@
 
 use candle_core::{Result, Tensor};
 use quad_nn::mean_and_variance;
+use quad_policy::Aggregate;
 
 use super::algorithm::Measured;
 
@@ -22,6 +23,15 @@ pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
 pub(super) fn lower_bound(values: &Tensor, kappa: f32) -> Result<Tensor> {
     let (mean, variance) = mean_and_variance(values)?;
     mean - (variance.sqrt()? * f64::from(kappa))?
+}
+
+/// One value of the critics' constant ones, `[K, B]` → `[B]`.
+pub(super) fn reduced(values: &Tensor, aggregate: Aggregate) -> Result<Tensor> {
+    match aggregate {
+        Aggregate::Mean => values.mean(0),
+        Aggregate::Min => smallest(values),
+        Aggregate::MeanMinusStd(kappa) => lower_bound(values, kappa),
+    }
 }
 
 /// A loss `[]`, and the scalars `[]` that are measured with it.

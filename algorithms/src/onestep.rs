@@ -12,6 +12,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/onestep.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
+    chunks: false,
     read: |table| Ok(start(read(table)?, Onestep::new)),
 };
 

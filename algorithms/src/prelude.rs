@@ -7,7 +7,7 @@ pub(super) use super::error::{AgentError, AlgorithmError, check};
 pub(super) use super::hyperparameters::{
     Candidates, Count, Finite, NotNegative, OpenUnit, Positive, Rate, Steps, UnitInterval,
 };
-pub(super) use super::losses::{Loss, largest, lower_bound, measured, smallest};
+pub(super) use super::losses::{Loss, largest, lower_bound, measured, reduced, smallest};
 pub(super) use super::networks::{
     Initializer, TWIN, TrainState, WithTarget, networks, state_value,
 };

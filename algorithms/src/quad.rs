@@ -31,6 +31,7 @@ pub(super) const DEFINITION: Definition = Definition {
         summary: Some(summary::of),
         ..Reporting::CANDIDATES
     },
+    chunks: true,
     read: |table| Ok(start(Config::read(table)?, Quad::start)),
 };
 
@@ -148,6 +149,7 @@ impl DiffusionUpdate for Quad {
                 let noisy = noise.denoising.noisy(&batch.actions)?;
                 let actor = networks.actor.detach();
                 let predicted = actor.predict(&batch.observations, &noisy, t)?;
+                let predicted = batch.within_episodes(predicted, epsilon)?;
                 let bc_loss = squared_error(&predicted, epsilon)?;
                 write(&self.eta, &self.ascended_eta((bc_loss - f64::from(*threshold))?)?)?;
             }
@@ -185,7 +187,7 @@ impl DiffusionUpdate for Quad {
 
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
         let Networks { actor, critic } = networks;
-        let tensors = DiffusionPolicy::tensors(&actor.target, &critic.target, None)?;
+        let tensors = DiffusionPolicy::tensors(&actor.target, Some(&critic.target), None)?;
         Ok((Choice::best_of(*self.config.candidates), tensors)) // Eq. 25
     }
 

@@ -24,6 +24,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/rlpd.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
+    chunks: false,
     read: |table| Ok(start(Config::read(table)?, Rlpd::new)),
 };
 

@@ -10,6 +10,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/td3-bc.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
+    chunks: false,
     read: |table| Ok(start(read::<Config>(table)?, Td3::new)),
 };
 

@@ -6,11 +6,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use candle_core::Device;
-use quad_dataset::{Arrays, Transitions};
+use quad_dataset::{Arrays, Transitions, Window};
 use quad_nn::Precision;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+mod chunks;
 mod evaluation;
 
 const DIMS: (usize, usize) = (11, 3);
@@ -45,6 +46,7 @@ fn context(seed: u64, device: &Device) -> Context {
         batch_size: BATCH,
         total_steps: STEPS,
         online_steps: 0,
+        window: Window::ONE,
         seed,
         precision: Precision::F32,
         device: device.clone(),
@@ -224,7 +226,7 @@ fn a_nan_reaches_a_metric() {
             let values = train(&mut agent, STEPS);
             // Target networks by which the policy acts, but from which nothing is learned.
             let unread = match definition.name {
-                "align-iql" | "idql" => name == "target_actor",
+                "align-iql" | "diffusion-policy" | "idql" => name == "target_actor",
                 "diffuser" => name.starts_with("target"),
                 "dtql" => name == "target_critic",
                 _ => false,
@@ -239,6 +241,11 @@ fn a_nan_reaches_a_metric() {
     }
 }
 
+/// The error of hyper-parameters that cannot be used.
+fn refusal(definition: &Definition, table: &toml::Table) -> String {
+    Hyperparameters::new(definition, table.clone()).unwrap_err().to_string()
+}
+
 #[test]
 fn an_error_names_the_hyper_parameter() {
     for definition in ALGORITHMS {
@@ -249,10 +256,10 @@ fn an_error_names_the_hyper_parameter() {
         for key in agent.keys().filter(|key| agent[*key].is_float()) {
             let mut changed = agent.clone();
             changed.insert(key.clone(), "much".into());
-            let error = (definition.read)(&changed).err().unwrap().to_string();
+            let error = refusal(definition, &changed);
             assert!(error.contains(&format!("in `{key}`")), "{} {key}: {error}", definition.name);
             changed.remove(key);
-            let error = (definition.read)(&changed).err().unwrap().to_string();
+            let error = refusal(definition, &changed);
             assert!(
                 error.contains(&format!("missing field `{key}`")),
                 "{} {key}: {error}",
@@ -358,10 +365,14 @@ fn contradictory_hyper_parameters_are_refused() {
         ("diffuser", toml::toml! { replan_every = 1000 }, "at most the horizon"),
         ("quad", toml::toml! { eta.maximum = -1.0 }, "at least 0"),
         ("quad", toml::toml! { eta.initial = 1e9 }, "between eta.minimum and eta.maximum"),
+        ("quad", toml::toml! { chunk = 0 }, "a whole number from 1"),
+        ("idql", toml::toml! { chunk = 3 replan = 4 }, "agent.replan is 4, but must be at most"),
+        ("fql", toml::toml! { replan = 2 }, "at most agent.chunk"),
+        ("iql", toml::toml! { chunk = 2 }, "iql learns single actions, so agent.chunk must be 1"),
     ] {
         let (definition, mut table) = variant(name);
         merge(&mut table, change);
-        let error = (definition.read)(&table).err().unwrap().to_string();
+        let error = refusal(&definition, &table);
         assert!(error.contains(words), "{name}: {error}");
     }
 }

@@ -11,6 +11,7 @@ pub(super) const DEFINITION: Definition = Definition {
     presets: include_str!("../../presets/xql.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
+    chunks: false,
     read: |table| Ok(start(read::<Config>(table)?, InSample::new)),
 };
 

@@ -42,4 +42,4 @@ pub use tables::{benchmarks, catalog, environment};
 pub use transitions::hold_out::HoldOut;
 pub use transitions::sampler::{BatchSampler, OnlineSampler};
 pub use transitions::statistics::Statistics;
-pub use transitions::{Batch, ReadOptions, Split, Transitions};
+pub use transitions::{Batch, ReadOptions, Split, Transitions, Window};

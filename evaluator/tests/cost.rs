@@ -56,19 +56,21 @@ fn gaussian(hidden: usize) -> PolicyConfig {
     PolicyConfig::Gaussian { shape }
 }
 
-fn squashed(hidden: usize, norm: bool) -> PolicyConfig {
+fn of_actor(hidden: usize, norm: bool) -> ActorCriticShape {
     let actor = MlpConfig::mish(&[hidden; 3]);
     let mut critic = actor.clone();
     critic.norm = norm;
-    let shape = ActorCriticShape {
-        observation_dim: SIZES.0,
-        action_dim: SIZES.1,
-        actor,
-        critic,
-        critics: 2,
-    };
+    ActorCriticShape { observation_dim: SIZES.0, action_dim: SIZES.1, actor, critic, critics: 2 }
+}
+
+fn squashed(hidden: usize, norm: bool) -> PolicyConfig {
     let choice = Choice::best_of(1024);
-    PolicyConfig::Squashed { shape, choice }
+    PolicyConfig::Squashed { shape: of_actor(hidden, norm), choice }
+}
+
+fn flow(hidden: usize, candidates: u32) -> PolicyConfig {
+    let (shape, choice) = (of_actor(hidden, false), Choice::best_of(candidates));
+    PolicyConfig::Flow { shape, flow_steps: 10, choice }
 }
 
 fn score(widths: &[usize], candidates: u32) -> PolicyConfig {
@@ -129,6 +131,8 @@ fn actions_take_no_more_memory_than_the_policy_says() {
         ("a Gaussian", gaussian(256), 256),
         ("a squashed Gaussian", squashed(4, false), 64),
         ("critics with a norm", squashed(64, true), 10),
+        ("a flow", flow(64, 32), 64),
+        ("a flow to many candidates", flow(8, 1024), 64),
         ("a score network", score(&[512, 256, 128], 32), 10),
         ("a score network of one block", score(&[64], 1000), 64),
         ("Hopper's planner", diffuser((32, 32), &[1, 2, 4, 8], None, 64), 1),

@@ -23,7 +23,8 @@ use rand_chacha::ChaCha8Rng;
 
 const ACTIVATIONS: [Activation; 5] =
     [Activation::Mish, Activation::Relu, Activation::Silu, Activation::Tanh, Activation::Gelu];
-const REVERSES: [Reverse; 3] = [Reverse::ClipClean, Reverse::Posterior, Reverse::ClipSample];
+const REVERSES: [Reverse; 4] =
+    [Reverse::ClipClean, Reverse::Posterior, Reverse::ClipSample, Reverse::Cosine];
 
 fn one_of<T: Copy>(generator: &mut ChaCha8Rng, values: &[T]) -> T {
     values[generator.random_range(0..values.len())]

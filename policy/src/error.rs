@@ -37,6 +37,8 @@ pub enum PolicyError {
     NoCandidates,
     #[error("this policy has no critics, which would value a single action")]
     NoCritics,
+    #[error("the critics of this policy value chunks of {0} actions, not a single one")]
+    ValuesChunks(usize),
     #[error("the rule `nearest` takes a value function, which this policy does not have")]
     NoValue,
     #[error(transparent)]
@@ -59,6 +61,7 @@ impl PolicyError {
             Self::NoCandidates | Self::NoCritics | Self::NoValue | Self::NoGuidance => {
                 "score it without --candidates, --rule, --aggregate and --guidance"
             }
+            Self::ValuesChunks(_) => "the samples of a policy come with the values of their chunks",
             Self::Range { .. } | Self::Temperature(_) | Self::Guidance(_) => {
                 "give a smaller number above 0; a file with such a number is damaged"
             }

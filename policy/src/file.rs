@@ -1,9 +1,11 @@
 //! The file of a policy: tensors and a header.
 
-use crate::error::{PolicyError, Result, VERSION};
+use crate::chunk::{Chunk, chunked};
+use crate::error::{PolicyError, Result, VERSION, check_range};
 use crate::kinds::actor_critic::{ACTOR, ActorCriticShape, CRITIC};
 use crate::kinds::diffuser::{self, DiffuserPolicy};
 use crate::kinds::diffusion::{DiffusionPolicy, DiffusionShape, VALUE};
+use crate::kinds::flow::FlowActor;
 use crate::kinds::gaussian::{GaussianPolicy, GaussianShape};
 use crate::kinds::one_step::OneStepActor;
 use crate::kinds::planner::DiffuserShape;
@@ -42,6 +44,8 @@ pub enum PolicyConfig {
     /// A choice among actions of a network of state and noise.
     #[serde(rename = "one-step")]
     OneStep { shape: ActorCriticShape, choice: Choice },
+    /// A choice among the ends of a flow, which this many Euler steps follow.
+    Flow { shape: ActorCriticShape, flow_steps: usize, choice: Choice },
     /// The mode of a Gaussian.
     Gaussian { shape: GaussianShape },
     /// A choice among samples of a score network.
@@ -67,7 +71,9 @@ impl PolicyConfig {
         match self {
             Self::Diffusion { shape, .. } => {
                 add(ACTOR, shape.actor().layout())?;
-                add(CRITIC, shape.critics().layout())?;
+                if shape.critics > 0 {
+                    add(CRITIC, shape.critics().layout())?;
+                }
                 shape.value().map(|value| add(VALUE, value.layout())).transpose()?;
             }
             Self::Squashed { shape, .. } => {
@@ -76,6 +82,10 @@ impl PolicyConfig {
             }
             Self::OneStep { shape, .. } => {
                 add(ACTOR, OneStepActor::shape(shape).layout())?;
+                add(CRITIC, shape.critics().layout())?;
+            }
+            Self::Flow { shape, .. } => {
+                add(ACTOR, FlowActor::shape(shape).layout())?;
                 add(CRITIC, shape.critics().layout())?;
             }
             Self::Gaussian { shape } => {
@@ -104,6 +114,9 @@ impl PolicyConfig {
 pub struct Header<O> {
     /// Kind, shapes and choice.
     pub policy: PolicyConfig,
+    /// The chunk that the networks know as one action; a single step in older files.
+    #[serde(default, skip_serializing_if = "Chunk::is_single")]
+    pub chunk: Chunk,
     /// Conversion between the networks' units and the user's, unless they are the same.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scaling: Option<Scaling>,
@@ -130,10 +143,11 @@ struct Written {
 }
 
 impl<O> Header<O> {
-    /// A header without scaling and names.
+    /// A header without chunks, scaling and names.
     pub fn new(policy: PolicyConfig, origin: O) -> Self {
         Self {
             policy,
+            chunk: Chunk::default(),
             scaling: None,
             observation_names: Vec::new(),
             action_names: Vec::new(),
@@ -188,6 +202,11 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>>
             let actor = OneStepActor::shape(&shape);
             Box::new(shape.load(actor, OneStepActor::new, choice, tensors, precision)?)
         }
+        PolicyConfig::Flow { shape, flow_steps, choice } => {
+            check_range("flow_steps", flow_steps, FlowActor::MOST_STEPS)?;
+            let (flow, new) = (FlowActor::shape(&shape), |flow| FlowActor::new(flow, flow_steps));
+            Box::new(shape.load(flow, new, choice, tensors, precision)?)
+        }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, tensors)?),
         PolicyConfig::Score { shape, choice } => {
             Box::new(ScorePolicy::load(&shape, choice, tensors, precision)?)
@@ -200,6 +219,7 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>>
     if let Some(name) = tensors.keys().next() {
         return Err(PolicyError::Unexpected(name.clone()));
     }
+    let policy = chunked(policy, header.chunk)?;
     match header.scaling {
         Some(scaling) => scaled(policy, scaling),
         None => Ok(policy),

@@ -33,13 +33,15 @@ pub fn read(
 
 /// The header of a file with the additions of `learner export`, as JSON.
 pub fn all_about(header: &Header<Origin>) -> String {
-    let Header { scaling, observation_names, action_names, origin, about, version, .. } = header;
+    let Header { chunk, scaling, observation_names, action_names, origin, about, version, .. } =
+        header;
     let of_any = json!({
         "version": version,
         "environment": origin.environment,
         "step": origin.step,
         "observation_names": observation_names,
         "action_names": action_names,
+        "chunk": chunk,
         "scaling": scaling,
     });
     let mut all = about.as_object().cloned().unwrap_or_default();

@@ -255,8 +255,8 @@ impl PyPolicy {
         self.origin.step
     }
 
-    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's) or "score" (SfBC's),
-    /// which draw actions and choose; "planner", which draws plans and chooses one; or "gaussian",
+    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's), "flow" (QC's) or "score"
+    /// (SfBC's), which draw actions and choose; "planner", which draws plans and chooses one; or "gaussian",
     /// which acts by its mean.
     #[getter]
     fn kind(&self) -> &'static str {
@@ -264,6 +264,7 @@ impl PyPolicy {
             PolicyConfig::Diffusion { .. } => "diffusion",
             PolicyConfig::Squashed { .. } => "squashed",
             PolicyConfig::OneStep { .. } => "one-step",
+            PolicyConfig::Flow { .. } => "flow",
             PolicyConfig::Gaussian { .. } => "gaussian",
             PolicyConfig::Score { .. } => "score",
             PolicyConfig::Diffuser { .. } => "planner",
@@ -271,8 +272,9 @@ impl PyPolicy {
     }
 
     /// The file's header, a dictionary: version of the learner, environment, step, names of the
-    /// numbers in observations and actions, scaling (data's = offset + scale · network's, or None); and
-    /// from `learner export` run, task, algorithm, data with its license, score, and judgment.
+    /// numbers in observations and actions, chunk (its length, and the steps of it that are executed),
+    /// scaling (data's = offset + scale · network's, or None); and from `learner export` run, task,
+    /// algorithm, data with its license, score, and judgment.
     #[getter]
     fn about<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         py.import("json")?.call_method1("loads", (&self.about,))

@@ -25,7 +25,7 @@ use hold_out::HoldOut;
 use rows::Rows;
 use statistics::Statistics;
 
-pub use rows::Batch;
+pub use rows::{Batch, Window};
 
 /// Options of [`Transitions::read`].
 #[derive(Clone, Copy, Debug, Default)]
@@ -256,13 +256,18 @@ impl Transitions {
 
     /// Copies the transitions at `indices` into `batch`.
     pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
+        self.gather_windows(indices, Window::ONE, batch);
+    }
+
+    /// Copies the windows that begin with the transitions at `indices` into `batch`.
+    pub fn gather_windows(&self, indices: &[u32], window: Window, batch: &mut Batch) {
         let experience = self.experience();
         batch.clear();
         batch.size = indices.len();
         for &index in indices {
             match index.checked_sub(self.len() as u32) {
-                None => self.dataset.copy_to(batch, index),
-                Some(place) => experience.copy_to(batch, place),
+                None => self.dataset.copy_to(batch, index, window),
+                Some(place) => experience.copy_to(batch, place, window),
             }
         }
     }

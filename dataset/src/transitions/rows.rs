@@ -1,4 +1,4 @@
-//! Rows in recorded order, and batches of the transitions that start in them.
+//! Rows in recorded order, and batches of the transitions or windows that start in them.
 
 use std::ops::Range;
 
@@ -11,20 +11,36 @@ use crate::tables::reward::RewardScaling;
 /// Bound at which actions are clipped, within the range of tanh policies.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
 
-/// Mini-batch of B transitions.
+/// The steps that an example covers: h in a row, fewer where the episode ends before.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Window {
+    /// h ≥ 1.
+    pub length: usize,
+    /// Discount γ of a step.
+    pub gamma: f32,
+}
+
+impl Window {
+    /// A single transition.
+    pub const ONE: Self = Self { length: 1, gamma: 1.0 };
+}
+
+/// Mini-batch of B transitions, or of B windows of n ≤ h transitions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Batch {
-    /// s, B × o.
+    /// s_t, B × o.
     pub observations: Vec<f32>,
-    /// a, B × a.
+    /// a_t … a_{t+h−1}, B × h·a. After the n-th, which is the episode's last, it is repeated.
     pub actions: Vec<f32>,
-    /// r, B.
+    /// Σ γ^i·r_{t+i} over the n steps, B.
     pub rewards: Vec<f32>,
-    /// s', B × o.
+    /// s_{t+n}, B × o.
     pub next_observations: Vec<f32>,
-    /// 0 where the episode terminated, else 1; B.
+    /// 0 where the episode terminated, else γ^(n−1), which is 1 for a transition; B.
     pub masks: Vec<f32>,
-    /// Number of transitions, B.
+    /// n, B.
+    pub steps: Vec<usize>,
+    /// Number of examples, B.
     pub size: usize,
 }
 
@@ -39,6 +55,7 @@ impl Batch {
         ] {
             array.clear();
         }
+        self.steps.clear();
     }
 }
 
@@ -109,12 +126,24 @@ impl Rows {
         episodes
     }
 
-    pub fn copy_to(&self, batch: &mut Batch, index: u32) {
-        let (all, row) = (&self.recording, self.starts[index as usize] as usize);
-        batch.observations.extend_from_slice(all.observation(row));
-        batch.actions.extend_from_slice(all.action(row));
-        batch.rewards.push(all.rewards[row]);
-        batch.next_observations.extend_from_slice(all.next_observation(row));
-        batch.masks.push(f32::from(u8::from(!all.terminals[row])));
+    /// Adds the window that begins with the transition at `index`.
+    pub fn copy_to(&self, batch: &mut Batch, index: u32, window: Window) {
+        let (all, row) = (&self.recording, |index: u32| self.starts[index as usize] as usize);
+        batch.observations.extend_from_slice(all.observation(row(index)));
+        batch.actions.extend_from_slice(all.action(row(index)));
+        let (mut last, mut reward, mut discount, mut steps) =
+            (index, all.rewards[row(index)], 1.0, 1);
+        for _ in 1..window.length {
+            if let Some(next) = self.next(last) {
+                discount *= window.gamma;
+                reward += discount * all.rewards[row(next)];
+                (last, steps) = (next, steps + 1);
+            }
+            batch.actions.extend_from_slice(all.action(row(last)));
+        }
+        batch.rewards.push(reward);
+        batch.next_observations.extend_from_slice(all.next_observation(row(last)));
+        batch.masks.push(if all.terminals[row(last)] { 0.0 } else { discount });
+        batch.steps.push(steps);
     }
 }

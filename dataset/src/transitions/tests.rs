@@ -91,6 +91,36 @@ fn windows_lie_within_episodes() {
     assert_eq!((batch.observations, batch.next_observations), (vec![3.0, 4.0], vec![4.0, 5.0]));
 }
 
+/// Rewards and observations are row numbers, actions a hundredth of them.
+#[test]
+fn windows_of_steps_end_with_their_episode() {
+    let transitions = transitions(d4rl());
+    let (observations, terminated) = (&[10.0, 11.0, 12.0, 13.0, 14.0], false);
+    let (actions, rewards) = (&[0.1, 0.2, 0.3, 0.4], &[1.0, 2.0, 4.0, 8.0]);
+    transitions.add_episode(PracticeRows { observations, actions, rewards, terminated }).unwrap();
+    let mut batch = Batch::default();
+    let window = Window { length: 3, gamma: 0.5 };
+    transitions.gather_windows(&[5, 0, 2, 4, 7], window, &mut batch);
+    let expected = Batch {
+        observations: vec![10.0, 0.0, 3.0, 5.0, 12.0],
+        actions: [
+            [0.1, 0.2, 0.3],
+            [0.0, 0.01, 0.01],
+            [0.03, 0.04, 0.04],
+            [0.05; 3],
+            [0.3, 0.4, 0.4],
+        ]
+        .concat(),
+        rewards: vec![3.0, 0.5, 5.0, 5.0, 8.0],
+        next_observations: vec![13.0, 2.0, 5.0, 6.0, 14.0],
+        // The third one's episode terminates, the others go on or are cut off.
+        masks: vec![0.25, 0.5, 0.0, 1.0, 0.5],
+        steps: vec![3, 2, 2, 1, 2],
+        size: 5,
+    };
+    assert_eq!(batch, expected);
+}
+
 #[test]
 fn standard_units_are_of_the_rows_that_are_learned_from() {
     let units = transitions(d4rl()).standard_units();
@@ -128,6 +158,7 @@ fn experience_follows_the_dataset_and_is_scaled_as_it_was() {
         rewards: vec![0.0, 0.0, 2.0, 1.0],
         next_observations: vec![21.0, 2.0, 12.0, 11.0],
         masks: vec![0.0, 1.0, 1.0, 1.0],
+        steps: vec![1; 4],
         size: 4,
     };
     let apart = batch.actions.iter().zip(&expected.actions).map(|(a, b)| (a - b).abs());

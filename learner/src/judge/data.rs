@@ -7,7 +7,7 @@ use anyhow::{Context as _, anyhow};
 use candle_core::Device;
 use quad_algorithms::{Context, Fqe};
 use quad_dataset::{
-    Batch, DatasetError, HoldOut, Normalize, ReadOptions, RewardRule, Split, Transitions,
+    Batch, DatasetError, HoldOut, Normalize, ReadOptions, RewardRule, Split, Transitions, Window,
     benchmarks, environment,
 };
 use quad_policy::Precision;
@@ -109,6 +109,7 @@ impl Data {
             batch_size: BATCH_SIZE.min(self.training.len()),
             total_steps: 0,
             online_steps: 0,
+            window: Window::ONE,
             seed,
             precision: Precision::F32,
             device: Device::Cpu,

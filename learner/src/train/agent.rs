@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow};
 use quad_algorithms::{Agent, AlgorithmError, Context};
-use quad_dataset::Transitions;
+use quad_dataset::{Transitions, Window};
 use quad_protocol::{Origin, Snapshot};
 use quad_run::config::{Device, Experiment};
 use quad_run::folder::Checkpoint;
@@ -52,6 +52,7 @@ pub(super) fn new_agent(
         batch_size,
         total_steps: experiment.steps,
         online_steps: experiment.total_steps() - experiment.steps,
+        window: Window::ONE,
         seed: experiment.seed,
         precision: experiment.precision,
         device: device::open(device)?,

@@ -10,7 +10,7 @@ use quad_algorithms::{
     Agent, Algorithm, Context, Definition, Measured, Metric, Reporting, StateDict,
 };
 use quad_dataset::{
-    Arrays, BatchSampler, Normalize, ReadOptions, RewardRule, Transitions, environment,
+    Arrays, BatchSampler, Normalize, ReadOptions, RewardRule, Transitions, Window, environment,
 };
 use quad_nn::Tensors;
 use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision, Spread};
@@ -81,6 +81,7 @@ fn context(total_steps: u64) -> Context {
         batch_size: 4,
         total_steps,
         online_steps: 0,
+        window: Window::ONE,
         seed: 0,
         precision: Precision::F32,
         device: Device::Cpu,
@@ -258,6 +259,7 @@ fn in_phases() -> Agent {
         presets: "",
         metrics: const { &[metric("first"), metric("second")] },
         report: Reporting::PLAIN,
+        chunks: false,
         read: |_| Ok(Arc::new(|_| Ok(Box::new(InPhases)))),
     };
     Agent::new(definition, &toml::Table::new().into(), context(100)).unwrap()

@@ -15,6 +15,8 @@ pub enum Reverse {
     Posterior,
     /// x_{t−1} is clipped instead, after adding noise; the variance is 1 − α_t (IDQL, AlignIQL).
     ClipSample,
+    /// As `Posterior`, on the cosine schedule (Diffusion Policy).
+    Cosine,
 }
 
 /// Constants of the diffusion over t = 1..T (Eq. 3–5).
@@ -55,7 +57,15 @@ impl Schedule {
         let f = |t: usize| {
             ((t as f64 / steps as f64 + 0.008) / 1.008 * std::f64::consts::FRAC_PI_2).cos().powi(2)
         };
-        Self::of(steps, Reverse::Posterior, |t| (f(t) / f(t - 1)).max(0.001))
+        Self::of(steps, Reverse::Cosine, |t| (f(t) / f(t - 1)).max(0.001))
+    }
+
+    /// The schedule that goes with a formula.
+    pub fn with(steps: usize, reverse: Reverse) -> Self {
+        match reverse {
+            Reverse::Cosine => Self::cosine(steps),
+            _ => Self::variance_preserving(steps, reverse),
+        }
     }
 
     /// The schedule with these α_t for t = 1..T.
@@ -65,7 +75,7 @@ impl Schedule {
             let alpha = alpha(t);
             let alpha_bar = before * alpha;
             let posterior = match reverse {
-                Reverse::Posterior => (1.0 - before) / (1.0 - alpha_bar),
+                Reverse::Posterior | Reverse::Cosine => (1.0 - before) / (1.0 - alpha_bar),
                 Reverse::ClipClean | Reverse::ClipSample => 1.0,
             };
             let step = Step {
@@ -125,7 +135,7 @@ impl Schedule {
         let clean = ((x - (epsilon * f64::from(step.deviation))?)? * f64::from(1.0 / step.signal))?;
         match self.reverse {
             Reverse::ClipSample => Ok(clean),
-            Reverse::ClipClean | Reverse::Posterior => clean.clamp(-1f32, 1f32),
+            _ => clean.clamp(-1f32, 1f32),
         }
     }
 
@@ -141,7 +151,7 @@ impl Schedule {
         let next = self.reverse_to_clean(t, x, &self.clean(t, x, epsilon)?, z)?;
         match self.reverse {
             Reverse::ClipSample => next.clamp(-1f32, 1f32),
-            Reverse::ClipClean | Reverse::Posterior => Ok(next),
+            _ => Ok(next),
         }
     }
 
@@ -161,7 +171,7 @@ impl Schedule {
     fn bounds(&self) -> (f32, f32) {
         match self.reverse {
             Reverse::ClipSample => (f32::INFINITY, 1.0),
-            Reverse::ClipClean | Reverse::Posterior => (1.0, f32::INFINITY),
+            _ => (1.0, f32::INFINITY),
         }
     }
 

@@ -56,7 +56,7 @@ impl ActorCriticShape {
     pub(crate) fn load<A: Actor + 'static>(
         &self,
         actor_shape: EnsembleShape,
-        actor: fn(Ensemble) -> A,
+        actor: impl FnOnce(Ensemble) -> A,
         choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
@@ -66,7 +66,7 @@ impl ActorCriticShape {
         let actor = actor(Ensemble::take(actor_shape, tensors, ACTOR, precision)?);
         let networks = Networks {
             actor: Box::new(actor),
-            critics: Ensemble::take(self.critics(), tensors, CRITIC, precision)?,
+            critics: Some(Ensemble::take(self.critics(), tensors, CRITIC, precision)?),
             value: None,
             precision,
         };

@@ -31,7 +31,7 @@ pub struct DiffusionShape {
     /// The value function's hidden layers, for the rule `nearest`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub value: Option<MlpConfig>,
-    /// Number of critics, K.
+    /// Number of critics, K; 0 for a policy that takes what it draws.
     pub critics: usize,
     /// Denoising steps T.
     pub diffusion_steps: usize,
@@ -85,11 +85,13 @@ impl DiffusionPolicy {
     /// The tensors of a policy's file.
     pub fn tensors(
         actor: &NoisePredictor,
-        critics: &Ensemble,
+        critics: Option<&Ensemble>,
         value: Option<&Ensemble>,
     ) -> candle_core::Result<Tensors> {
         let mut tensors = actor.weights().tensors(ACTOR)?;
-        tensors.extend(critics.weights().tensors(CRITIC)?);
+        if let Some(critics) = critics {
+            tensors.extend(critics.weights().tensors(CRITIC)?);
+        }
         if let Some(value) = value {
             tensors.extend(value.weights().tensors(VALUE)?);
         }
@@ -103,11 +105,12 @@ impl DiffusionPolicy {
         precision: Precision,
     ) -> Result<CandidatePolicy> {
         check_dims(shape.observation_dim, shape.action_dim)?;
-        check_range("critics", shape.critics, MAX_DIM)?;
+        check_range("critics", shape.critics.max(1), MAX_DIM)?;
         check_range("diffusion_steps", shape.diffusion_steps, MOST_STEPS)?;
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
         let actor = NoisePredictor::new(shape.actor(), weights, precision).packed()?;
-        let critics = Ensemble::take(shape.critics(), tensors, CRITIC, precision)?;
+        let critics = || Ensemble::take(shape.critics(), tensors, CRITIC, precision);
+        let critics = (shape.critics > 0).then(critics).transpose()?;
         let value = |shape| Ensemble::take(shape, tensors, VALUE, precision);
         let value = shape.value().map(value).transpose()?;
         let actor = Box::new(actor);

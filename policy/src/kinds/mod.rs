@@ -3,6 +3,7 @@
 pub(crate) mod actor_critic;
 pub(crate) mod diffuser;
 pub(crate) mod diffusion;
+pub(crate) mod flow;
 pub(crate) mod gaussian;
 pub(crate) mod one_step;
 pub(crate) mod planner;

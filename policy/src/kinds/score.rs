@@ -74,7 +74,7 @@ impl ScorePolicy {
         let solver = DpmSolver::new(shape.evaluations);
         let networks = Networks {
             actor: Box::new(ScoreActor { network, solver }),
-            critics: Ensemble::take(shape.critic(), tensors, CRITIC, precision)?,
+            critics: Some(Ensemble::take(shape.critic(), tensors, CRITIC, precision)?),
             value: None,
             precision: Precision::F32,
         };

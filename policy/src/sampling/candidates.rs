@@ -34,7 +34,8 @@ pub(crate) trait Actor: Send + Sync {
 /// The networks of a policy.
 pub(crate) struct Networks {
     pub actor: Box<dyn Actor>,
-    pub critics: Ensemble,
+    /// Without them a single candidate is drawn.
+    pub critics: Option<Ensemble>,
     /// Value function of the rule `nearest`.
     pub value: Option<Ensemble>,
     pub precision: Precision,
@@ -53,15 +54,21 @@ impl CandidatePolicy {
         if choice.rule == Rule::Nearest && networks.value.is_none() {
             return Err(PolicyError::NoValue);
         }
-        if choice.guidance != 0.0 && networks.actor.noise_predictor().is_none() {
+        if choice.candidates > 1 && networks.critics.is_none() {
+            return Err(PolicyError::NoCritics);
+        }
+        let policy = Self { choice, networks };
+        if choice.guidance != 0.0 && policy.guided().is_none() {
             return Err(PolicyError::NoGuidance);
         }
-        Ok(Self { choice, networks })
+        Ok(policy)
     }
 
-    /// The noise predictor, if the choice guides it.
-    fn guided(&self) -> Option<&NoisePredictor> {
-        self.networks.actor.noise_predictor().filter(|_| self.choice.guidance != 0.0)
+    /// The noise predictor and the critics that guide it, if the choice wants it.
+    fn guided(&self) -> Option<(&NoisePredictor, &Ensemble)> {
+        let Networks { actor, critics, .. } = &*self.networks;
+        let guided = actor.noise_predictor().zip(critics.as_ref());
+        guided.filter(|_| self.choice.guidance != 0.0)
     }
 
     /// Draws the noise of all candidates, `noise vectors × states × candidates × action_dim`.
@@ -85,12 +92,11 @@ impl CandidatePolicy {
         let observations =
             Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
         let noise = Tensor::from_vec(noise, ((), rows, action_dim), &Device::Cpu)?;
-        let Networks { actor, critics, .. } = &*self.networks;
         let drawn = match self.guided() {
-            Some(actor) => {
+            Some((actor, critics)) => {
                 actor.sample_guided(&observations, &noise, critics, self.choice.guidance)?
             }
-            None => actor.draw(&observations, &noise)?,
+            None => self.networks.actor.draw(&observations, &noise)?,
         };
         Ok((observations, drawn))
     }
@@ -99,7 +105,8 @@ impl CandidatePolicy {
     /// [`Aggregate`](crate::sampling::choice::Aggregate).
     fn values(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>> {
         let rows = actions.dim(0)?;
-        let values = self.networks.critics.values(observations, actions)?;
+        let critics = self.networks.critics.as_ref().ok_or(PolicyError::NoCritics)?;
+        let values = critics.values(observations, actions)?;
         Ok(read(&values, |values: &[f32]| self.choice.aggregate.reduce(values, rows))?)
     }
 
@@ -150,7 +157,7 @@ impl Policy for CandidatePolicy {
     }
 
     fn choice(&self) -> Option<Choice> {
-        Some(self.choice)
+        self.networks.critics.as_ref().map(|_| self.choice)
     }
 
     fn with_choice(&self, choice: Choice) -> Result<Box<dyn Policy>> {
@@ -165,8 +172,11 @@ impl Policy for CandidatePolicy {
         let drawn = states * candidates * (action_dim * (noises + 3) + 1) as u128;
         let sampling = drawn + states * observation_dim as u128 + actor.floats(states, candidates);
         let of_states = value.as_ref().map_or(0, |value| value.shape().floats(states, 1));
-        let of_critics = critics.shape().floats(states, candidates);
-        let of_guided = |actor: &NoisePredictor| actor.guided_floats(states * candidates, critics);
+        let of_critics = |critics: &Ensemble| critics.shape().floats(states, candidates);
+        let of_critics = critics.as_ref().map_or(0, of_critics);
+        let of_guided = |(actor, critics): (&NoisePredictor, &Ensemble)| {
+            actor.guided_floats(states * candidates, critics)
+        };
         bytes(sampling + of_critics + of_states + self.guided().map_or(0, of_guided))
     }
 

@@ -77,9 +77,11 @@ impl ConfigError {
                 "--steps N learns from the dataset alone, --online-steps N from practice too".to_owned()
             }
             Self::NoPractice(_) => {
-                let can = |known: &&Definition| Values::of(known).for_task(None).contains_key("online");
-                let names = Vec::from_iter(ALGORITHMS.iter().filter(can).map(|known| known.name));
-                format!("leave out --online-steps, or choose one of {}", names.join(", "))
+                let can = |known: &Definition| Values::of(known).for_task(None).contains_key("online");
+                format!("leave out --online-steps, or choose one of {}", those_that(can))
+            }
+            Self::Hyperparameters { source: AgentError::NoChunks(_), .. } => {
+                format!("leave it out, or choose one of {}", those_that(|known| known.chunks))
             }
             Self::Evaluations { most, .. } => {
                 format!("choose a larger eval_interval, for at most {most}")
@@ -87,4 +89,10 @@ impl ConfigError {
             _ => KEYS.to_owned(),
         }
     }
+}
+
+/// Names of some algorithms.
+fn those_that(can: impl Fn(&Definition) -> bool) -> String {
+    let names = ALGORITHMS.iter().filter(|known| can(known)).map(|known| known.name);
+    Vec::from_iter(names).join(", ")
 }

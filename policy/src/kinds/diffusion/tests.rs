@@ -5,7 +5,7 @@ use crate::error::PolicyError;
 use crate::file::PolicyConfig;
 use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Aggregate, Rule};
-use crate::testing::{act, argmax, diffusion_file, load, sample, small, without_tensors};
+use crate::testing::{act, argmax, diffusion_file, initial, load, sample, small, without_tensors};
 
 fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>> {
     load(&diffusion_file(choice, critic, v, None))
@@ -44,8 +44,25 @@ fn a_shape_out_of_range_is_refused() {
     for diffusion_steps in [0, 1001, (1 << 58) + 1, usize::MAX] {
         assert!(refused(DiffusionShape { diffusion_steps, ..small() }), "{diffusion_steps}");
     }
-    assert!(refused(DiffusionShape { critics: 0, ..small() }));
+    assert!(refused(DiffusionShape { critics: MAX_DIM + 1, ..small() }));
     assert!(!refused(small()), "a good shape without tensors");
+}
+
+#[test]
+fn a_policy_without_critics_takes_what_it_draws() {
+    let file = |critics, candidates| {
+        let (shape, choice) = (DiffusionShape { critics, ..small() }, Choice::best_of(candidates));
+        load(&initial(PolicyConfig::Diffusion { shape, choice }))
+    };
+    let [without, with] = [0, 2].map(|critics| file(critics, 1).unwrap());
+    let action = |policy: &dyn Policy| act(policy, &[0.5; 4], &[3]).unwrap();
+    assert_eq!(action(&*without), action(&*with));
+    assert_eq!((without.choice(), without.noise()), (None, vec![2, 1, 2]));
+    assert!(without.memory(5) < with.memory(5));
+    let lacks_critics = |error| matches!(error, Some(PolicyError::NoCritics));
+    assert!(lacks_critics(file(0, 2).err()));
+    assert!(lacks_critics(without.with_choice(Choice::best_of(2)).err()));
+    assert!(lacks_critics(without.value(&[0.5; 4], &[0.0; 2]).err()));
 }
 
 #[test]

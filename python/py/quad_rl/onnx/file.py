@@ -18,7 +18,11 @@ class File:
         start = 8 + int.from_bytes(data[:8], "little")
         listed = json.loads(data[8:start])
         header = json.loads(listed.pop("__metadata__")["quad"])
+        if chunk := header.get("chunk"):
+            raise ValueError(f"a policy that acts in chunks of {chunk['length']} steps cannot be written as a model of ONNX yet")
         self.kind: str = header["policy"]["kind"]
+        if self.kind == "flow" or header["policy"]["shape"].get("critics") == 0:
+            raise ValueError("a policy that follows a flow, or has no critics, cannot be written as a model of ONNX yet")
         self.shape: dict[str, Any] = header["policy"]["shape"]
         # From the user's units to the networks', map by map.
         self.units = [units for units in (header.get("scaling"), self.shape.get("units")) if units]

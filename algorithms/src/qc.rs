@@ -1,0 +1,127 @@
+//! QC (Li, Zhou and Levine 2025, "Reinforcement Learning with Action Chunking"): a flow clones chunks
+//! of the data's actions, and of what it draws the critics choose, in their targets as when the
+//! policy acts. Its update is its authors' code's, but for windows that reach beyond the end of an
+//! episode. QC-FQL is FQL with chunks.
+
+use super::fql::flow_loss;
+use super::prelude::*;
+use quad_policy::{ActorCriticShape, FlowActor};
+use rand::Rng;
+
+pub(super) const DEFINITION: Definition = Definition {
+    name: "qc",
+    presets: include_str!("../../presets/qc.toml"),
+    metrics: METRICS,
+    report: Reporting::CANDIDATES,
+    chunks: true,
+    read: |table| Ok(start(read(table)?, Qc::new)),
+};
+
+const METRICS: &[Metric] = &metrics! {
+    target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = Σ_i γ^i·r_i + γ^h·mask·(mean or smaller of Q̂_k(s', a')), where a' is the best by Q of the chunks that the flow draws in s', h steps later.";
+    critic_loss ["critic loss"] held_out: "Mean over batch and critics of (Q_k(s, a) − y)², where a is a chunk.";
+    bc_loss ["BC loss"] held_out: "The flow's loss: mean over batch and numbers of a chunk of (v(s, x_t, t) − (a − x_0))², 0 for actions beyond the end of an episode.";
+};
+
+#[derive(Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Config {
+    /// The hidden layers of the flow's velocity.
+    actor: MlpConfig,
+    critic: MlpConfig,
+    gamma: UnitInterval,
+    /// Reduction of the two critics' values, in their target and for the choice.
+    target: Aggregate,
+    /// Euler steps of the flow.
+    flow_steps: Count,
+    learning_rate: Positive,
+    /// EMA rate of the target critics.
+    ema_rate: Rate,
+    /// Chunks drawn to choose from, N, in targets too.
+    candidates: Candidates,
+}
+
+networks! {
+    struct Networks(config: &Config, init) {
+        critic: WithTarget<Ensemble> = init.critics(TWIN, &config.critic),
+        /// The velocity v(s, x, t), a network of s and [x, t].
+        flow: TrainState<Ensemble> = init.ensemble(EnsembleShape {
+            action_dim: init.context.action_dim() + 1,
+            outputs: init.context.action_dim(),
+            ..init.shape(&config.actor)
+        }),
+    }
+}
+
+struct Qc {
+    config: Config,
+    context: Context,
+    networks: Networks,
+}
+
+impl Qc {
+    fn new(config: Config, context: Context) -> Result<Self> {
+        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
+        Ok(Self { config, context, networks })
+    }
+
+    /// The losses of critics and flow.
+    fn losses(&self, step: u64, indices: &[u32]) -> Result<[Loss; 2]> {
+        let (batch, random) = (self.context.batch(indices)?, &mut self.context.random(step));
+        let (b, a) = batch.actions.dims2()?;
+        let start = random.normal("start_noise", (b, a))?; // x_0
+        let next_noise = random.normal("next_noise", (b * *self.config.candidates as usize, a))?;
+        let times = random.tensor("times", (b, 1), |generator| generator.random::<f32>())?;
+        let targets = self.targets(&batch, &next_noise)?;
+        let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
+        let bc_loss = flow_loss(&self.networks.flow, &batch, &start, &times)?;
+        Ok([critic_loss, Loss::new("bc_loss", bc_loss)])
+    }
+
+    /// y = r + γ·mask·Q̂(s', a'), `[B]`, with the best a' by Q of those from this noise, `[B·N, a]`.
+    fn targets(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
+        let Networks { critic, flow } = &self.networks;
+        let flow = FlowActor::new(flow.detach(), *self.config.flow_steps);
+        let drawn = flow.sample(&batch.next_observations, noise)?;
+        let target = self.config.target;
+        let q = reduced(&batch.next_values(&critic.detach(), &drawn)?, target)?;
+        let (n, b) = (*self.config.candidates, batch.rewards.dim(0)? as u32);
+        let best = q.reshape((b as usize, n as usize))?.argmax(1)?;
+        let firsts = Tensor::arange_step(0, b * n, n, noise.device())?;
+        let best = drawn.index_select(&(best + firsts)?, 0)?;
+        let next = reduced(&batch.next_values(&critic.target, &best)?, target)?;
+        batch.target(*self.config.gamma, &next)
+    }
+}
+
+impl Algorithm for Qc {
+    /// Both losses are those of the networks before the update, and so are the critics that the
+    /// targets follow.
+    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+        let adam = AdamStep::after(step, *self.config.learning_rate);
+        let losses = self.losses(step, indices)?;
+        let [critic_loss, bc_loss] = &losses;
+        let Networks { critic, flow } = &mut self.networks;
+        critic.soft_update(*self.config.ema_rate)?;
+        critic.minimize(&critic_loss.value, adam)?;
+        flow.minimize(&bc_loss.value, adam)?;
+        measured(&losses)
+    }
+
+    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
+        measured(&self.losses(step, indices)?)
+    }
+
+    /// The flow, which chooses by the critics themselves.
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
+        let (flow, critics) = (&self.networks.flow, &self.networks.critic);
+        let shape = ActorCriticShape::of(flow, critics);
+        let tensors = ActorCriticShape::tensors(flow, critics)?;
+        Ok((PolicyConfig::Flow { shape, flow_steps: *self.config.flow_steps, choice }, tensors))
+    }
+
+    fn state_dict(&mut self) -> StateDict<'_> {
+        self.networks.state_dict()
+    }
+}

@@ -1,0 +1,95 @@
+//! Tests of chunks of actions. The golden folder `fql-chunks` compares the numbers of an update.
+
+use super::*;
+use quad_policy::{Precision, load_policy};
+
+/// A network that clones the data in each algorithm that learns chunks.
+const CLONING: [(&str, &str); 6] = [
+    ("quad", "actor"),
+    ("diffusion-policy", "actor"),
+    ("dtql", "diffusion"),
+    ("fql", "flow"),
+    ("idql", "actor"),
+    ("qc", "flow"),
+];
+
+fn chunked(mut table: toml::Table, chunk: i64) -> toml::Table {
+    table.insert("chunk".to_owned(), chunk.into());
+    table
+}
+
+/// Rows 0 to 9 of each twenty terminate, and 10 to 19 are cut off.
+#[test]
+fn windows_beyond_the_end_of_an_episode_are_masked() {
+    let mut context = context(0, &Device::Cpu);
+    context.window = Window { length: 3, gamma: 0.5 };
+    let data = arrays();
+    let batch = context.batch(&[0, 8, 18]).unwrap();
+    let (r, a) = (&data.rewards, |row: usize| &data.actions[row * DIMS.1..][..DIMS.1]);
+    let numbers = |tensor: &candle_core::Tensor| tensor.to_vec1::<f32>().unwrap();
+    let rows = |tensor: &candle_core::Tensor| tensor.to_vec2::<f32>().unwrap();
+    let next = candle_core::Tensor::new(&[8f32, 8.0, 8.0], &Device::Cpu).unwrap();
+    let targets = numbers(&batch.target(0.5, &next).unwrap());
+    let expected =
+        [r[0] + 0.5 * r[1] + 0.25 * r[2] + 1.0, r[8] + 0.5 * r[9], r[18] + 0.5 * r[19] + 2.0];
+    let apart = targets.iter().zip(expected).map(|(x, y)| (x - y).abs());
+    assert!(apart.fold(0.0, f32::max) < 1e-6, "{targets:?} for {expected:?}");
+    assert_eq!(rows(&batch.actions)[1], [a(8), a(9), a(9)].concat());
+    let beyond = [[1.0; 6].as_slice(), &[0.0; 3]].concat();
+    assert_eq!(rows(&batch.within.clone().unwrap()), [vec![1.0; 9], beyond.clone(), beyond]);
+    let (zeros, ones) = (batch.actions.zeros_like().unwrap(), batch.actions.ones_like().unwrap());
+    let learned = batch.within_episodes(zeros, &ones).unwrap();
+    assert_eq!(rows(&learned)[2], [[0.0; 6].as_slice(), &[1.0; 3]].concat());
+}
+
+#[test]
+fn a_policy_of_chunks_acts_step_by_step() {
+    let names = ALGORITHMS.iter().filter(|known| known.chunks).map(|known| known.name);
+    assert_eq!(Vec::from_iter(names), CLONING.map(|(name, _)| name));
+    for (definition, table) in variants().into_iter().filter(|(known, _)| known.chunks) {
+        let mut agent = agent(definition, &chunked(table, 4), &context(0, &Device::Cpu));
+        for values in train(&mut agent, STEPS) {
+            assert!(values.iter().flatten().all(|value| value.is_finite()), "{values:?}");
+        }
+        let file = agent.policy("here").unwrap();
+        let policy = load_policy(&file, Precision::F32).unwrap();
+        assert_eq!((policy.observation_dim(), policy.action_dim()), DIMS, "{}", definition.name);
+        let mut states = [policy.begin(1)];
+        let mut act = |observation: f32| {
+            let mut action = [0.0; DIMS.1];
+            policy.act(&[observation; DIMS.0], &mut states, &mut action).unwrap();
+            action
+        };
+        let first = act(0.5);
+        assert!((1..4).any(|_| act(0.5) != first), "{}", definition.name);
+    }
+}
+
+/// In episodes of one step the second half of a chunk of two is never seen.
+#[test]
+fn actions_beyond_the_end_of_an_episode_are_not_cloned() {
+    let mut arrays = arrays();
+    (arrays.terminals, arrays.timeouts) = (vec![true; 10 * BATCH], vec![false; 10 * BATCH]);
+    let transitions = Arc::new(Transitions::of(arrays).unwrap());
+    let context = Context { transitions, ..context(0, &Device::Cpu) };
+    for (name, network) in CLONING {
+        let of_algorithm = variants().into_iter().filter(|(known, _)| known.name == name);
+        for (definition, table) in of_algorithm {
+            let mut agent = agent(definition, &chunked(table, 2), &context);
+            train(&mut agent, 3);
+            let state = agent.algorithm.state_dict().save().unwrap();
+            // The last layer's bias, one for each number of a chunk.
+            let prefix = format!("adam_v.{network}.");
+            let is_last = |(known, x): &(&String, &candle_core::Tensor)| {
+                known.starts_with(&prefix)
+                    && known.ends_with("bias")
+                    && x.elem_count() == 2 * DIMS.1
+            };
+            let last = Vec::from_iter(state.iter().filter(is_last));
+            assert_eq!(last.len(), 1, "{name}: {last:?}");
+            let moments: Vec<f32> = last[0].1.flatten_all().unwrap().to_vec1().unwrap();
+            let (learned, beyond) = moments.split_at(DIMS.1);
+            assert!(learned.iter().all(|x| *x > 0.0) && beyond.iter().all(|x| *x == 0.0), "{name}");
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Tests of acting by chunks, against the policy that draws them.
+
+use super::*;
+use crate::file::{Header, PolicyConfig};
+use crate::kinds::actor_critic::ActorCriticShape;
+use crate::scaled::scaled;
+use crate::testing::{act, initial, layers, load, sample};
+use quad_kernels::scaling::{Affine, Scaling};
+use quad_nn::{Activation, Layout, Weights};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+const A: usize = 2;
+
+/// A policy of chunks of three steps, and what draws them.
+fn config(candidates: u32) -> PolicyConfig {
+    let (actor, critic) = (layers(Activation::Relu, &[8]), layers(Activation::Relu, &[8]));
+    let shape =
+        ActorCriticShape { observation_dim: 1, action_dim: 3 * A, actor, critic, critics: 2 };
+    PolicyConfig::OneStep { shape, choice: Choice::best_of(candidates) }
+}
+
+fn drawing(candidates: u32) -> Box<dyn Policy> {
+    load(&initial(config(candidates))).unwrap()
+}
+
+fn policy(candidates: u32, replan: usize) -> Box<dyn Policy> {
+    chunked(drawing(candidates), Chunk { length: 3, replan }).unwrap()
+}
+
+/// The actions of one more step in these states.
+fn step(policy: &dyn Policy, observations: &[f32], states: &mut [EpisodeState]) -> Vec<f32> {
+    let mut actions = vec![0.0; states.len() * policy.action_dim()];
+    policy.act(observations, states, &mut actions).unwrap();
+    actions
+}
+
+#[test]
+fn the_first_actions_of_a_chunk_are_executed_before_the_next_is_drawn() {
+    let drawing = drawing(4);
+    for replan in 1..=3 {
+        let (policy, mut state) = (policy(4, replan), [drawing.begin(7)]);
+        assert_eq!((policy.action_dim(), policy.noise()), (A, vec![1, 4, 3 * A]));
+        let mut expected = [drawing.begin(7)];
+        let mut chunk = Vec::new();
+        for number in 0..7 {
+            let observation = [number as f32 / 5.0];
+            if number % replan == 0 {
+                chunk = step(&*drawing, &observation, &mut expected);
+            }
+            let action = step(&*policy, &observation, &mut state);
+            assert_eq!(action, chunk[number % replan * A..][..A], "step {number} of {replan}");
+        }
+    }
+}
+
+/// The second episode begins a step later, so that no two draw at the same time.
+#[test]
+fn an_episode_does_not_depend_on_others() {
+    let policy = policy(3, 2);
+    let mut together = [1, 2].map(|seed| policy.begin(seed));
+    let first = step(&*policy, &[0.1], &mut together[..1]);
+    let mut actions = [first, Vec::new()];
+    for _ in 0..4 {
+        let both = step(&*policy, &[0.1, 0.2], &mut together);
+        actions.iter_mut().zip(both.chunks(A)).for_each(|(all, action)| all.extend(action));
+    }
+    for (seed, actions) in [1, 2].into_iter().zip(actions) {
+        let mut alone = [policy.begin(seed)];
+        for action in actions.chunks(A) {
+            assert_eq!(step(&*policy, &[seed as f32 / 10.0], &mut alone), action);
+        }
+    }
+}
+
+#[test]
+fn samples_are_the_first_actions_of_chunks() {
+    let (policy, drawing) = (policy(5, 3), drawing(5));
+    let Samples { actions, values } = sample(&*policy, &[0.3], &[9]).unwrap();
+    let of_chunks = sample(&*drawing, &[0.3], &[9]).unwrap();
+    let firsts = of_chunks.actions.chunks(3 * A).flat_map(|chunk| &chunk[..A]);
+    assert!(actions.iter().eq(firsts) && values == of_chunks.values);
+    assert!(actions.chunks(A).any(|action| action == act(&*policy, &[0.3], &[9]).unwrap()));
+    let of_one = policy.with_choice(Choice::best_of(1)).unwrap();
+    assert_eq!(of_one.noise(), [1, 1, 3 * A]);
+    let error = policy.value(&[0.3], &[0.0; A]).unwrap_err();
+    assert!(error.to_string().contains("chunks of 3"), "{error}");
+}
+
+#[test]
+fn a_file_says_the_chunk_and_scales_each_action() {
+    let generator = &mut ChaCha8Rng::seed_from_u64(5);
+    let policy = config(2);
+    let weights = |layout: &Layout| Weights::initial(layout, generator, &candle_core::Device::Cpu);
+    let tensors = policy.tensors(weights).unwrap();
+    let actions = Affine { offset: vec![4.0, -1.0], scale: vec![2.0, 0.5] };
+    let scaling = Scaling { actions: Some(actions), ..Scaling::default() };
+    let file = |chunk| {
+        let header = Header::new(policy.clone(), ());
+        let header = Header { chunk, scaling: Some(scaling.clone()), ..header };
+        header.to_safetensors(&tensors).unwrap()
+    };
+    let chunk = Chunk { length: 3, replan: 2 };
+    let found = load(&file(chunk)).unwrap();
+    let expected = scaled(self::policy(2, 2), scaling.clone()).unwrap();
+    let mut states = [[found.begin(3)], [found.begin(3)]];
+    for _ in 0..3 {
+        let [one, other] = &mut states;
+        assert_eq!(step(&*found, &[0.2], one), step(&*expected, &[0.2], other));
+    }
+    assert_eq!(Header::<()>::read(&file(chunk)).unwrap().chunk, chunk);
+
+    let refused = |length, replan| {
+        let chunked = chunked(drawing(1), Chunk { length, replan });
+        matches!(chunked, Err(PolicyError::Range { .. }))
+    };
+    assert!(refused(0, 0) && refused(4, 1) && refused(12, 1) && refused(3, 4) && refused(3, 0));
+    assert!(!refused(6, 6) && !refused(2, 1));
+}
