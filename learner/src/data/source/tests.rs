@@ -63,7 +63,7 @@ fn data_of_another_simulation_is_refused() {
 fn data_that_names_no_environment_may_be_another_s() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("mine.hdf5");
-    let rows = |width| vec![0.5; 4 * width];
+    let rows = |width: usize| vec![0.5; 4 * width];
     let arrays = Arrays {
         observation_dim: 17,
         action_dim: 6,
