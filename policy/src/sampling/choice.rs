@@ -209,7 +209,8 @@ impl FromStr for Aggregate {
 
     /// Parses the form of [`Display`](fmt::Display).
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let kappa = text.strip_prefix("mean-minus-std:").and_then(|kappa| kappa.parse().ok());
+        let kappa =
+            text.strip_prefix("mean-minus-std:").and_then(|kappa| kappa.parse::<f32>().ok());
         match (text, kappa) {
             ("mean", _) => Ok(Self::Mean),
             ("min", _) => Ok(Self::Min),

@@ -23,7 +23,7 @@ Examples:
   evaluator score runs/mine/snapshots/step_000020000.safetensors --candidates 50 --rule softmax:1 --aggregate min
 
   # Guide the draws by the critics' gradients, too.
-  evaluator score runs/mine/snapshots/step_000020000.safetensors --guidance 0.01
+  evaluator score runs/mine/snapshots/step_000020000.safetensors --guidance 0.1
 
 RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
