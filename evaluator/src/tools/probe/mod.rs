@@ -1,7 +1,7 @@
 //! `evaluator probe`: compares a run's critics with true values, on this machine alone.
 //!
 //! `args`: the arguments; `subject`: the snapshot's networks; `states`: states that its policy visits;
-//! `oracle`: true values. `points`: noisy actions, with the critics' gradients; `slopes`: true slopes
+//! `oracle`: true values. `noisy`: noisy actions, with the critics' gradients; `slopes`: true slopes
 //! beside them; `mechanism`: statistics of these. `choosing`: statistics of candidates; `recorded`:
 //! the data near them. `grid`: tables of estimates; `ranks`: rank correlation.
 
@@ -9,8 +9,8 @@ mod args;
 mod choosing;
 mod grid;
 mod mechanism;
+mod noisy;
 mod oracle;
-mod points;
 mod ranks;
 mod recorded;
 mod slopes;
@@ -26,15 +26,14 @@ use quad_run::results::statistics::mean;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
-use serde_json::json;
 use tracing::{info, warn};
 
 pub(crate) use args::ProbeArgs;
 use choosing::{CANDIDATES, Candidates, choosing, rules};
 use grid::Grid;
 use mechanism::mechanism;
+use noisy::{Noisy, normal};
 use oracle::{Oracle, Query};
-use points::{Points, normal};
 use recorded::Recorded;
 use slopes::measure;
 use states::State;
@@ -47,12 +46,7 @@ pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
     if !args.json {
         return Ok(Vec::from_iter(tables.iter().map(Grid::to_string)).join("\n"));
     }
-    let ProbeArgs { step, states, rollouts, length, h, kappa, seed, .. } = *args;
-    let environment = &probe.probed.subject.spec.name;
-    Ok(quad_runtime::json(&json!({
-        "environment": environment, "step": step, "states": states, "rollouts": rollouts,
-        "length": length, "h": h, "kappa": kappa, "seed": seed, "tables": tables,
-    }))?)
+    Ok(quad_runtime::json(&tables)?)
 }
 
 struct Probe<'a> {
@@ -92,12 +86,12 @@ impl<'a> Probe<'a> {
 
     fn mechanism(&mut self) -> anyhow::Result<[Grid; 3]> {
         let (Probed { actor, critics, tau, delta, .. }, h) = (&self.probed, self.args.h);
-        let drawn = Points::draw((actor, critics), &self.observations, h, &mut self.random)?;
-        let Points { points, outside, scale } = drawn;
+        let drawn = Noisy::draw((actor, critics), &self.observations, h, &mut self.random)?;
+        let (noisy, outside, scale) = drawn;
         let returns = |queries| self.returns(queries);
-        let samples = measure(&points, &self.states, &self.seeds, h, returns)?;
+        let samples = measure(&noisy, &self.states, &self.seeds, h, returns)?;
         let weighting = (*tau, delta * scale * scale);
-        Ok(mechanism(&samples, self.states.len(), &outside, weighting))
+        Ok(mechanism(samples, self.states.len(), &outside, weighting))
     }
 
     fn choosing(&mut self) -> anyhow::Result<[Grid; 2]> {

@@ -2,8 +2,10 @@
 
 use std::sync::Arc;
 
+use candle_core::{Device, Tensor};
+
+use super::super::noisy::Noisy;
 use super::super::oracle::Query;
-use super::super::points::Point;
 use super::super::slopes::measure;
 use super::super::states::State;
 use super::*;
@@ -13,33 +15,39 @@ use super::*;
 /// first dimension, and each of them by ±t more.
 fn samples(noise: f64) -> Vec<Sample> {
     let observations = [0.5f32, -1.0, 2.0, 0.75];
-    let of_state = |state: usize| {
-        let point = move |t: usize, action: [f32; 2], direction: [f64; 2]| {
-            let gradient = [observations[state] - action[0], 1.0 - action[1]].map(f64::from);
-            let wrong = |by: f64| vec![gradient[0] + t as f64 / 2.0 + by, gradient[1]];
-            Point {
-                state,
-                t,
-                action: action.into(),
-                direction: direction.into(),
-                gradients: [t as f64, -(t as f64)].map(wrong).into(),
-                denoised: gradient.into(),
-            }
-        };
-        [point(1, [0.25, -0.5], [1.0, 0.0]), point(2, [-0.5, 0.5], [0.6, 0.8])]
+    let of = Vec::from_iter((0..4).flat_map(|state| [(state, 1), (state, 2)]));
+    let action = |t: usize| [[0.25, -0.5], [-0.5, 0.5]][t - 1];
+    let gradient = |state: usize, t: usize| {
+        let [x, y] = action(t);
+        [f64::from(observations[state]) - x, 1.0 - y]
     };
-    let points = Vec::from_iter((0..4).flat_map(of_state));
+    let of_critic = |(state, t): (usize, usize), sign: f64| {
+        let [x, y] = gradient(state, t);
+        [x + t as f64 * (0.5 + sign), y]
+    };
+    let rows = |row: &dyn Fn(usize, usize) -> [f64; 2]| {
+        let numbers = Vec::from_iter(of.iter().map(|(state, t)| row(*state, *t).to_vec()));
+        Tensor::new(numbers, &Device::Cpu).unwrap()
+    };
+    let critics = [1.0, -1.0].map(|sign| rows(&|state, t| of_critic((state, t), sign)));
+    let noisy = Noisy {
+        actions: rows(&|_, t| action(t)),
+        directions: rows(&|_, t| [[1.0, 0.0], [0.6, 0.8]][t - 1]),
+        gradients: Tensor::stack(&critics, 1).unwrap(),
+        denoised: rows(&gradient),
+        of: of.clone(),
+    };
     let state = |s| Arc::new(State { observation: vec![s, 1.0], ..State::default() });
     // The four ways to draw two signs.
     let seeds = [[1, 1], [1, 3], [3, 1], [3, 3]].map(Vec::from);
     let value = |Query { state, action, seed }: &Query| {
+        let signed = (*seed as f64 - 2.0) * noise;
         let pairs = state.observation.iter().zip(action);
         let pairs = pairs.map(|(s, a)| (f64::from(*s), f64::from(*a)));
-        let signed = (*seed as f64 - 2.0) * noise;
         pairs.map(|(s, a)| s * a - a * a / 2.0 + signed * a).sum::<f64>() + 9.0 * *seed as f64
     };
     let returns = |queries: Vec<Query>| Ok(queries.iter().map(value).collect());
-    measure(&points, &observations.map(state), &seeds, 0.125, returns).unwrap()
+    measure(&noisy, &observations.map(state), &seeds, 0.125, returns).unwrap()
 }
 
 fn close(found: f64, expected: f64, what: &str) {
@@ -69,7 +77,7 @@ fn slopes_are_those_of_value_and_critics() {
 #[test]
 fn risks_are_those_of_the_known_errors() {
     let samples = samples(0.0);
-    let [weights, _, steps] = mechanism(&samples, 4, &[0.25, 0.5], (0.5, 0.0));
+    let [weights, _, steps] = mechanism(samples.clone(), 4, &[0.25, 0.5], (0.5, 0.0));
     let mean_of = |of: &dyn Fn(&Sample) -> f64| mean(&Vec::from_iter(samples.iter().map(of)));
     let square = mean_of(&|of| of.estimate.powi(2));
     let center = mean_of(&|of| of.estimate);
@@ -114,20 +122,10 @@ fn noise_of_rollouts_is_subtracted() {
 
 #[test]
 fn shuffled_weights_are_drawn_within_their_t() {
-    let sample = |t, estimate| Sample {
-        state: 0,
-        t,
-        estimate,
-        variance: 0.0,
-        denoised: 0.0,
-        truth: 1.0,
-        noise: 0.0,
-        along: [[1.0, 1.0]; 3],
-    };
-    let samples = [sample(1, 1.0), sample(1, 3.0), sample(2, -2.0)];
-    let weigh = |(sample, lambda)| Weighted { sample, lambda };
-    let items = Vec::from_iter(samples.iter().zip([1.0, 0.5, 0.25]).map(weigh));
-    let found = weights(&Vec::from_iter(&items), 2);
+    let sample =
+        |t, estimate, lambda| Sample { t, estimate, lambda, truth: 1.0, ..Sample::default() };
+    let samples = [sample(1, 1.0, 1.0), sample(1, 3.0, 0.5), sample(2, -2.0, 0.25)];
+    let found = weights(&Vec::from_iter(&samples), 2);
     let square = 14.0 / 3.0;
     // The two of t = 1 with their mean λ, ¾, and in all four pairs of slope and λ.
     let by_step = (0.25f64.powi(2) + 1.25f64.powi(2) + 1.5f64.powi(2)) / 3.0;
