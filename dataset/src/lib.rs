@@ -35,7 +35,7 @@ pub use recording::Names;
 pub use tables::catalog::NamedDataset;
 pub use tables::environment::{EnvironmentSpec, UnknownEnvironment};
 pub use tables::maze::{CELL, GoalDraw, Judged, MazeTask};
-pub use tables::reward::RewardRule;
+pub use tables::reward::{RewardRule, RewardScaling};
 pub use tables::simulator::{Drive, Healthy, Noise, Planar, Recipe, Robot, Simulator};
 pub use tables::task::Task;
 pub use tables::{benchmarks, catalog, environment};

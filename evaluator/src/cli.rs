@@ -14,6 +14,7 @@ use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
 use crate::sim::Simulations;
 use crate::tools::film::{self, FilmArgs};
+use crate::tools::probe::{self, ProbeArgs};
 use crate::tools::score::{self, ScoreArgs};
 use crate::tools::{collect, verify};
 
@@ -30,6 +31,7 @@ enum Command {
     Serve(ServeArgs),
     Score(ScoreArgs),
     Film(FilmArgs),
+    Probe(ProbeArgs),
     Collect(CollectArgs),
     VerifyDataset(VerifyArgs),
     Doctor(DoctorArgs),
@@ -95,6 +97,7 @@ impl Cli {
             }
             Command::Score(args) => print(&score::score(&args)?),
             Command::Film(args) => print(&film::film(&args)?),
+            Command::Probe(args) => print(&probe::probe(&args)?),
             Command::Collect(args) => {
                 let (out, transitions) = (&args.out, args.transitions.get());
                 let summary = collect::collect(args.env, out, transitions, args.seed)?;

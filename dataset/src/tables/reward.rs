@@ -32,7 +32,7 @@ pub enum RewardRule {
 
 /// Affine map `(r - subtract) · times`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct RewardScaling {
+pub struct RewardScaling {
     subtract: f64,
     times: f64,
 }
@@ -51,14 +51,15 @@ impl RewardScaling {
         Figures::of(&Vec::from_iter(rewards.filter(|reward| reward.is_finite()))).size
     }
 
-    pub(crate) fn apply(self, reward: f32) -> f32 {
+    /// The training reward.
+    pub fn apply(self, reward: f32) -> f32 {
         ((f64::from(reward) - self.subtract) * self.times) as f32
     }
 }
 
 impl RewardRule {
     /// The rule's map, given the trajectory returns; `None` if a division by their range is by 0.
-    pub(crate) fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
+    pub fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
         let (subtract, times) = match self {
             Self::Locomotion => {
                 let Figures { min, max, .. } = Figures::of(returns);

@@ -98,12 +98,15 @@ impl DiffusionPolicy {
         Ok(tensors)
     }
 
-    pub(crate) fn load(
+    /// Loads noise predictor and, if there are any, critics, removing their tensors from `tensors`.
+    ///
+    /// # Errors
+    /// A size is out of range, or tensors are missing or not finite.
+    pub fn networks(
         shape: &DiffusionShape,
-        choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
-    ) -> Result<CandidatePolicy> {
+    ) -> Result<(NoisePredictor, Option<Ensemble>)> {
         check_dims(shape.observation_dim, shape.action_dim)?;
         check_range("critics", shape.critics.max(1), MAX_DIM)?;
         check_range("diffusion_steps", shape.diffusion_steps, MOST_STEPS)?;
@@ -111,6 +114,16 @@ impl DiffusionPolicy {
         let actor = NoisePredictor::new(shape.actor(), weights, precision).packed()?;
         let critics = || Ensemble::take(shape.critics(), tensors, CRITIC, precision);
         let critics = (shape.critics > 0).then(critics).transpose()?;
+        Ok((actor, critics))
+    }
+
+    pub(crate) fn load(
+        shape: &DiffusionShape,
+        choice: Choice,
+        tensors: &mut Tensors,
+        precision: Precision,
+    ) -> Result<CandidatePolicy> {
+        let (actor, critics) = Self::networks(shape, tensors, precision)?;
         let value = |shape| Ensemble::take(shape, tensors, VALUE, precision);
         let value = shape.value().map(value).transpose()?;
         let actor = Box::new(actor);

@@ -28,6 +28,7 @@ pub(crate) use args::FilmArgs;
 use episode::Episode;
 pub(crate) use gl::{Gl, INSTALL};
 use output::{Layout, steps, stride};
+pub(crate) use run_folder::snapshot;
 use stage::Stage;
 
 /// Makes the film. Returns the text to print.
@@ -72,7 +73,7 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
 }
 
 fn subject(path: &Path, step: Option<u64>) -> anyhow::Result<Subject> {
-    let snapshot = run_folder::snapshot(path, step)?;
+    let snapshot = snapshot(path, step)?;
     let mut subjects = Subject::read(&snapshot, &ScoreArgs::default())?;
     Ok(subjects.remove(0))
 }

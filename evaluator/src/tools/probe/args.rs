@@ -1,0 +1,51 @@
+//! The arguments of `evaluator probe`.
+
+use std::path::PathBuf;
+
+use clap::{Args, value_parser};
+
+/// Compare a run's critics with true values, which the simulator gives
+///
+/// States are drawn from new episodes of the run's policy, one from each. An action's true value is
+/// the mean of rollouts in the critics' units: from the state the action comes first, then one sample
+/// of the policy in each state, as the critics' targets have it. Rollouts of other actions have the
+/// same noise. docs/operations.md explains the tables.
+#[derive(Args, Debug)]
+pub struct ProbeArgs {
+    /// Folder of a run of QUAD or one of its variants
+    #[arg(value_name = "RUN")]
+    pub run: PathBuf,
+    /// Gradient step of the snapshot
+    #[arg(long, value_name = "N")]
+    pub step: u64,
+    /// Number of states
+    #[arg(long, value_name = "N", default_value = "64", value_parser = value_parser!(u32).range(2..))]
+    pub states: u32,
+    /// Rollouts of each action
+    #[arg(long, value_name = "N", default_value = "16", value_parser = value_parser!(u32).range(2..))]
+    pub rollouts: u32,
+    /// Most steps of a rollout
+    #[arg(long, value_name = "N", default_value = "50", value_parser = value_parser!(u32).range(1..))]
+    pub length: u32,
+    /// Change of an action to either side, of which slopes are central differences
+    #[arg(long, value_name = "X", default_value = "0.1", value_parser = change)]
+    pub h: f32,
+    /// κ of the lower confidence bound mean − κ·std
+    #[arg(long, value_name = "X", default_value = "1")]
+    pub kappa: f64,
+    /// Dataset to which the distance of chosen actions is measured [default: the run's, if it is
+    /// there]
+    #[arg(long, value_name = "PATH")]
+    pub dataset: Option<PathBuf>,
+    /// Seed of states and noise
+    #[arg(long, value_name = "N", default_value = "0")]
+    pub seed: u64,
+    /// Print the tables as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+fn change(text: &str) -> Result<f32, &'static str> {
+    let number = text.parse().ok().filter(|h: &f32| *h > 0.0 && *h < 1.0);
+    number.ok_or("a number between 0 and 1")
+}

@@ -1,0 +1,147 @@
+//! `evaluator probe`: compares a run's critics with true values, on this machine alone.
+//!
+//! `args`: the arguments; `subject`: the snapshot's networks; `states`: states that its policy visits;
+//! `oracle`: true values. `noisy`: noisy actions, with the critics' gradients; `slopes`: true slopes
+//! beside them; `mechanism`: statistics of these. `choosing`: statistics of candidates; `recorded`:
+//! the data near them. `grid`: tables of estimates; `ranks`: rank correlation.
+
+mod args;
+mod choosing;
+mod grid;
+mod mechanism;
+mod noisy;
+mod oracle;
+mod ranks;
+mod recorded;
+mod slopes;
+mod states;
+mod subject;
+
+use std::sync::Arc;
+
+use anyhow::Context;
+use candle_core::{DType, Device, Tensor};
+use quad_protocol::episode_seeds;
+use quad_run::results::statistics::mean;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+use tracing::{info, warn};
+
+pub(crate) use args::ProbeArgs;
+use choosing::{CANDIDATES, Candidates, choosing, rules};
+use grid::Grid;
+use mechanism::mechanism;
+use noisy::{Noisy, normal};
+use oracle::{Oracle, Query};
+use recorded::Recorded;
+use slopes::measure;
+use states::State;
+use subject::Probed;
+
+/// Probes the snapshot of the command line. Returns the text to print.
+pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
+    let mut probe = Probe::new(args)?;
+    let tables = Vec::from_iter(probe.mechanism()?.into_iter().chain(probe.choosing()?));
+    if !args.json {
+        return Ok(Vec::from_iter(tables.iter().map(Grid::to_string)).join("\n"));
+    }
+    Ok(quad_runtime::json(&tables)?)
+}
+
+struct Probe<'a> {
+    args: &'a ProbeArgs,
+    probed: Probed,
+    states: Vec<Arc<State>>,
+    /// `[n, o]`.
+    observations: Tensor,
+    /// Seeds of the rollouts in each state.
+    seeds: Vec<Vec<u64>>,
+    random: ChaCha8Rng,
+}
+
+impl<'a> Probe<'a> {
+    fn new(args: &'a ProbeArgs) -> anyhow::Result<Self> {
+        let probed = Probed::read(args)?;
+        info!("visiting {} states", args.states);
+        let seeds = episode_seeds(args.seed, args.step, args.states);
+        let visit = |seed: &u64| State::visit(&probed.subject, *seed).map(Arc::new);
+        let states = seeds.par_iter().with_max_len(1).map(visit);
+        let states = states.collect::<anyhow::Result<Vec<_>>>()?;
+        let observations = states.iter().flat_map(|state| state.observation.clone()).collect();
+        let shape = (states.len(), probed.subject.spec.observation_dim);
+        let observations = Tensor::from_vec(observations, shape, &Device::Cpu)?;
+        let mut random = ChaCha8Rng::seed_from_u64(args.seed);
+        let of_state = |_| Vec::from_iter((0..args.rollouts).map(|_| random.random()));
+        let seeds = (0..states.len()).map(of_state).collect();
+        Ok(Self { args, probed, states, observations, seeds, random })
+    }
+
+    fn returns(&self, queries: Vec<Query>) -> anyhow::Result<Vec<f64>> {
+        info!("{} rollouts", queries.len());
+        let Probed { subject, sampler, rewards, gamma, .. } = &self.probed;
+        let (rewards, gamma, length) = (*rewards, *gamma, self.args.length);
+        Oracle { spec: subject.spec, policy: &**sampler, rewards, gamma, length }.returns(queries)
+    }
+
+    fn mechanism(&mut self) -> anyhow::Result<[Grid; 3]> {
+        let (Probed { actor, critics, tau, delta, .. }, h) = (&self.probed, self.args.h);
+        let drawn = Noisy::draw((actor, critics), &self.observations, h, &mut self.random)?;
+        let (noisy, outside, scale) = drawn;
+        let returns = |queries| self.returns(queries);
+        let samples = measure(&noisy, &self.states, &self.seeds, h, returns)?;
+        let weighting = (*tau, delta * scale * scale);
+        Ok(mechanism(samples, self.states.len(), &outside, weighting))
+    }
+
+    fn choosing(&mut self) -> anyhow::Result<[Grid; 2]> {
+        let Probed { actor, critics, .. } = &self.probed;
+        let shape = actor.shape();
+        let shape = (shape.diffusion_steps, self.states.len() * CANDIDATES, shape.action_dim);
+        let noise = normal(shape, &mut self.random)?;
+        let actions = actor.sample(&self.observations, &noise)?;
+        let values = critics.values(&self.observations, &actions)?.to_dtype(DType::F64)?;
+        let (actions, values) = (actions.to_vec2::<f32>()?, values.to_vec2::<f64>()?);
+
+        let of_states = self.states.iter().zip(&self.seeds).zip(actions.chunks_exact(CANDIDATES));
+        let queries = of_states.flat_map(|((state, seeds), actions)| {
+            actions.iter().flat_map(move |action| {
+                let (state, action) = (state.clone(), action.clone());
+                seeds.iter().map(move |&seed| Query {
+                    state: state.clone(),
+                    action: action.clone(),
+                    seed,
+                })
+            })
+        });
+        let returns = self.returns(queries.collect())?;
+        let half = self.args.rollouts as usize / 2;
+        let returns = returns.chunks_exact(self.args.rollouts as usize);
+        let halves = Vec::from_iter(returns.map(|all| [mean(&all[..half]), mean(&all[half..])]));
+        let recorded = self.recorded()?;
+        let of_state = |(index, state): (usize, &Arc<State>)| {
+            let rows = index * CANDIDATES..(index + 1) * CANDIDATES;
+            let values = Vec::from_iter(values.iter().map(|values| values[rows.clone()].to_vec()));
+            let (halves, actions) = (&halves[rows.clone()], &actions[rows]);
+            Candidates {
+                values: rules(&values, self.args.kappa),
+                halves: [0, 1].map(|which| halves.iter().map(|of| of[which]).collect()),
+                distances: recorded.as_ref().map(|of| of.distances(&state.observation, actions)),
+            }
+        };
+        let candidates = Vec::from_iter(self.states.iter().enumerate().map(of_state));
+        Ok(choosing(&candidates, self.args.kappa))
+    }
+
+    /// The data, if it is there.
+    fn recorded(&self) -> anyhow::Result<Option<Recorded>> {
+        let path = self.args.dataset.as_ref().unwrap_or(&self.probed.dataset);
+        let name = path.display();
+        if self.args.dataset.is_none() && !path.exists() {
+            warn!("{name} is not there, so no distance from the data is measured");
+            return Ok(None);
+        }
+        let recorded = Recorded::read(path, self.probed.subject.spec);
+        recorded.map(Some).with_context(|| format!("cannot use {name}"))
+    }
+}

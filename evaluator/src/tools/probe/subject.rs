@@ -1,0 +1,81 @@
+//! The networks of a snapshot, and what its run's settings say about values.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, anyhow};
+use quad_dataset::{Normalize, RewardScaling};
+use quad_nn::{Ensemble, NoisePredictor};
+use quad_policy::{
+    Choice, DiffusionPolicy, Header, Policy, PolicyConfig, PolicyError, Precision, read_tensors,
+};
+use quad_protocol::Origin;
+use quad_run::files;
+use quad_run::folder::RunDir;
+use quad_runtime::Hint;
+
+use super::args::ProbeArgs;
+use crate::tools::film;
+use crate::tools::score::{ScoreArgs, Subject};
+
+const OTHERS: &str = "probe a run of `--algorithm quad`, with any guidance, without --normalize and chunks";
+
+pub struct Probed {
+    /// The policy as it is evaluated, which visits the states.
+    pub subject: Subject,
+    /// The policy that the critics' targets evaluate: it takes its first sample.
+    pub sampler: Box<dyn Policy>,
+    pub actor: NoisePredictor,
+    pub critics: Ensemble,
+    pub gamma: f64,
+    /// τ and δ of Eq. 24.
+    pub tau: f64,
+    pub delta: f64,
+    pub rewards: RewardScaling,
+    pub dataset: PathBuf,
+}
+
+impl Probed {
+    pub fn read(args: &ProbeArgs) -> anyhow::Result<Self> {
+        let name = args.run.display();
+        let (_, config) = RunDir::open(&args.run).hint("pass the folder of a run")?;
+        let path = film::snapshot(&args.run, Some(args.step))?;
+        let subject = Subject::read(&path, &ScoreArgs::default())?.pop();
+        let subject = subject.context("a snapshot has a policy")?;
+
+        let (experiment, data) = (config.experiment, config.dataset);
+        let number = |key: &str| {
+            let value = experiment.agent.get(key).and_then(|value| {
+                value.as_float().or(value.as_integer().map(|number| number as f64))
+            });
+            value.with_context(|| format!("{name} has no agent.{key}")).hint(OTHERS)
+        };
+        if experiment.normalize != Normalize::default() {
+            return Err(anyhow!("{name} has normalized data")).hint(OTHERS);
+        }
+        let rewards = experiment.reward.scaling(&[data.min_return, data.max_return]);
+        let rewards = rewards.with_context(|| format!("all returns of {name} are the same"))?;
+
+        let file = files::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let header = Header::<Origin>::read(&file).hint_of(PolicyError::hint)?;
+        let PolicyConfig::Diffusion { shape, .. } = header.policy else {
+            return Err(anyhow!("{name} has no diffusion policy")).hint(OTHERS);
+        };
+        if header.chunk.length > 1 {
+            return Err(anyhow!("{name} acts for several steps at a time")).hint(OTHERS);
+        }
+        let tensors = &mut read_tensors(&file)?;
+        let (actor, critics) = DiffusionPolicy::networks(&shape, tensors, Precision::F32)?;
+        let critics = critics.with_context(|| format!("{name} has no critics")).hint(OTHERS)?;
+        Ok(Self {
+            sampler: subject.policy.with_choice(Choice::best_of(1))?,
+            subject,
+            actor,
+            critics,
+            gamma: number("gamma")?,
+            tau: number("tau")?,
+            delta: number("delta")?,
+            rewards,
+            dataset: data.path,
+        })
+    }
+}
