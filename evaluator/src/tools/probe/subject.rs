@@ -17,7 +17,8 @@ use super::args::ProbeArgs;
 use crate::tools::film;
 use crate::tools::score::{ScoreArgs, Subject};
 
-const OTHERS: &str = "probe a run of `--algorithm quad`, with any guidance, without --normalize and chunks";
+const OTHERS: &str =
+    "probe a run of `--algorithm quad`, with any guidance, without --normalize and chunks";
 
 pub struct Probed {
     /// The policy as it is evaluated, which visits the states.
