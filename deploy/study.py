@@ -56,11 +56,12 @@ class Study:
         self.call("learner", "sweep", self.given.study, "--index", str(index), "--jobs", "1", "--evaluators", "1")
         run = self.home / name
         snapshots = sorted((run / "snapshots").iterdir())[-SNAPSHOTS:]
-        options = ["--episodes", str(self.given.episodes), "--candidates", self.given.candidates, "--json"]
-        scores = {}  # by candidates: for each snapshot the scores of its episodes
-        for scored in json.loads(self.call("evaluator", "score", *options, *snapshots)):
-            of_snapshots = scores.setdefault(str(scored["choice"]["candidates"]), [])
-            of_snapshots.append([round(episode["score"], 3) for episode in scored["episodes"]])
+        scores = {}  # by choice: for each snapshot the scores of its episodes
+        for strength in self.given.guidance:
+            options = ["--episodes", str(self.given.episodes), "--candidates", self.given.candidates, "--guidance", str(strength)]
+            for scored in json.loads(self.call("evaluator", "score", "--json", *options, *snapshots)):
+                of_snapshots = scores.setdefault(choice(scored["choice"]["candidates"], strength), [])
+                of_snapshots.append([round(episode["score"], 3) for episode in scored["episodes"]])
         metrics = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
         with self.lock:
             self.scores[name] = {"scores": scores, "lambda": last_mean(metrics, "lambda_mean")}
@@ -68,19 +69,19 @@ class Study:
             partial.write_bytes(gzip.compress(json.dumps(self.scores).encode(), mtime=0))
             partial.replace(self.scores_file)
 
-    def of_method(self, method, candidates):
-        """The score of each run of a method, by what it is a run of (task and dataset) and seed: the mean over its snapshots' episodes."""
+    def of_method(self, method, choice):
+        """The score of each run of a method, by task and dataset, and by seed: the mean over its snapshots' episodes."""
         name = re.compile(f"(.+)-{re.escape(method)}-seed([0-9]+)")
         scored = ((name.fullmatch(run), values["scores"]) for run, values in self.scores.items())
         return {
-            found.groups(): statistics.fmean(map(statistics.fmean, scores[candidates])) for found, scores in scored if found
+            found.groups(): statistics.fmean(map(statistics.fmean, scores[choice])) for found, scores in scored if found
         }
 
-    def print_scores(self, candidates):
-        print("| task | method | mean λ |", " | ".join(f"N = {n}" for n in candidates), "|")
-        print("|---|---|---:|" + "---:|" * len(candidates))
+    def print_scores(self, choices):
+        print("| task | method | mean λ |", " | ".join(choices), "|")
+        print("|---|---|---:|" + "---:|" * len(choices))
         for method in self.axes["method"]:
-            columns = [self.of_method(method, n) for n in candidates]
+            columns = [self.of_method(method, choice) for choice in choices]
             for task in dict.fromkeys(task for task, _ in columns[0]):
                 keys = [key for key in columns[0] if key[0] == task]
                 weights = [self.scores[f"{task}-{method}-seed{seed}"]["lambda"] for _, seed in keys]
@@ -88,15 +89,20 @@ class Study:
                 cells = (spread([column[key] for key in keys]) for column in columns)
                 print(f"| {task} | {method} | {weight} |", " | ".join(cells), "|")
 
-    def print_pairs(self, candidates):
-        print("\n| N | pair | pairs | mean difference | 95 % interval | p |\n|---:|---|---:|---:|---|---:|")
-        for n, pair in itertools.product(candidates, self.given.pairs):
-            ours, theirs = (self.of_method(method, n) for method in pair.split(":"))
+    def print_pairs(self, choices):
+        print("\n| choice | methods | pairs | mean difference | 95 % interval | p |\n|---|---|---:|---:|---|---:|")
+        for choice, pair in itertools.product(choices, self.given.pairs):
+            ours, theirs = (self.of_method(method, choice) for method in pair.split(":"))
             differences = [ours[key] - theirs[key] for key in ours if key in theirs]
             if len(differences) > 1:
                 mean, (low, high) = statistics.fmean(differences), interval(differences)
                 cells = f"{len(differences)} | {mean:.2f} | [{low:.2f}, {high:.2f}] | {sign_flips(differences):.4f}"
-                print(f"| {n} | {pair.replace(':', ' − ')} | {cells} |")
+                print(f"| {choice} | {pair.replace(':', ' − ')} | {cells} |")
+
+
+def choice(candidates, strength):
+    """The best of several candidates, which guidance of some strength has drawn."""
+    return f"best of {candidates}" + (f", guided by {strength:g}" if strength else "")
 
 
 def spread(values):
@@ -126,6 +132,7 @@ def main():
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs at a time")
     parser.add_argument("--episodes", type=int, default=40, help="of each snapshot")
     parser.add_argument("--candidates", default="1,2,5,10")
+    parser.add_argument("--guidance", nargs="+", type=float, default=[0.0, 0.3], metavar="W", help="strengths when acting")
     parser.add_argument("--pairs", nargs="+", default=["quad:dac"], metavar="METHOD:METHOD")
     parser.add_argument("--programs", type=Path, default=Path("target/release"))
     parser.add_argument("--table", action="store_true", help="print the tables of what is there")
@@ -135,9 +142,9 @@ def main():
         left = [(index, name) for index, name in enumerate(study.runs()) if name not in study.scores]
         with ThreadPoolExecutor(given.jobs) as pool:
             list(pool.map(lambda run: study.train(*run), left))
-    candidates = given.candidates.split(",")
-    study.print_scores(candidates)
-    study.print_pairs(candidates)
+    choices = [choice(n, strength) for strength, n in itertools.product(given.guidance, given.candidates.split(","))]
+    study.print_scores(choices)
+    study.print_pairs(choices)
 
 
 main()

@@ -59,6 +59,7 @@ impl Cloning {
             observation_dim: context.observation_dim(),
             action_dim: context.action_dim(),
             actor: config.actor.clone(),
+            critic: config.actor.clone(), // of no critics
             diffusion_steps: *config.diffusion_steps,
             reverse: Reverse::Cosine,
             ..DiffusionShape::default()

@@ -12,7 +12,7 @@ use crate::shape::{EnsembleShape, NoiseShape};
 use crate::slices::{has_fast_implementation, modify, plainly};
 use crate::statistics::mean_and_variance;
 use crate::testing::{
-    assert_close, check_gradient, gradient, loss, numbers, random, tensor, weights,
+    assert_close, assert_within, check_gradient, gradient, loss, numbers, random, tensor, weights,
 };
 use crate::weighted::Weighted;
 use crate::weights::Weights;
@@ -186,8 +186,9 @@ fn noise_predictors_match_plain_operations() -> Result<()> {
         let repeat = generator.random_range(1..12);
         let noise = tensor(generator, (steps, rows * repeat, action_dim));
         let fast = actor.sample(&s, &noise)?;
-        assert_close("samples", &fast, &plainly(|| actor.sample(&s, &noise))?);
-        assert_close("samples", &fast, &actor.sample_with_gradient(&s, &noise)?);
+        // Each denoising step magnifies rounding.
+        assert_within(1e-4, "samples", &fast, &plainly(|| actor.sample(&s, &noise))?);
+        assert_within(1e-4, "samples", &fast, &actor.sample_with_gradient(&s, &noise)?);
     }
     Ok(())
 }

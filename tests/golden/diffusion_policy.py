@@ -28,7 +28,7 @@ def make_config(variant, size):
 def schedule(steps):
     """β_t and ᾱ_t of t = 0 … T."""
     signal = [math.cos((t / steps + 0.008) / 1.008 * math.pi / 2) ** 2 for t in range(steps + 1)]
-    beta = np.array([0.0] + [min(1 - after / before, 0.999) for before, after in zip(signal, signal[1:], strict=False)])
+    beta = np.array([0.0] + [np.minimum(1 - after / before, 0.999) for before, after in zip(signal, signal[1:], strict=False)])
     return beta, np.cumprod(1 - beta)
 
 

@@ -1,6 +1,6 @@
 //! Tests of the algorithms' values.
 
-use super::super::{resolve, tasks};
+use super::super::{ConfigError, resolve, tasks};
 use super::*;
 
 #[test]
@@ -27,7 +27,15 @@ fn every_algorithm_has_values_for_every_task() {
     for definition in ALGORITHMS {
         let changes = toml::Table::from_iter([("algorithm".to_owned(), definition.name.into())]);
         for task in tasks::all() {
-            let resolved = resolve(&task.name, &changes).unwrap();
+            let resolved = match resolve(&task.name, &changes) {
+                // It learns from practice alone, of which this task has none.
+                Err(ConfigError::NoSteps)
+                    if definition.name == "rlpd" && task.name == "own-data" =>
+                {
+                    continue;
+                }
+                resolved => resolved.unwrap(),
+            };
             assert_eq!(resolved.algorithm, definition.name);
             assert_eq!(Some(&*resolved.environment), task.text("environment"));
         }
