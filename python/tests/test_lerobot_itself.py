@@ -1,12 +1,19 @@
-"""The same frames as LeRobot's own class gives, on a folder that it has written. It needs torch and is skipped without it:
-pip install lerobot==0.4.4 (v3.0), or 0.3.3 with datasets==3.6.0 (v2.1)."""
+"""The same frames as LeRobot's own class gives, on a folder that it has written; policies that act in LeRobot. It needs torch and
+is skipped without it: pip install lerobot==0.4.4 (v3.0), or 0.3.3 with datasets==3.6.0 (v2.1); for policies, lerobot>=0.4.4,
+gym-pusht and python/lerobot_policy_quad."""
 
 import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import train
 
-from quad_rl import Dataset
+from quad_rl import Dataset, Policy, export_lerobot
 
 FEATURES = {
     "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
@@ -43,3 +50,61 @@ def test_its_own_class_sees_the_same_frames(tmp_path):
     assert np.array_equal(rows.observations, seen[kept]) and np.array_equal(rows.actions, columns["action"][kept])
     assert np.array_equal(rows.rewards, columns["next.reward"][kept, 0]) and np.array_equal(rows.terminals, success[kept])
     assert np.array_equal(rows.next_observations[~rows.terminals], np.roll(seen, -1, 0)[kept][~rows.terminals]) and len(rows.rewards) == 41
+
+
+def exported(folder, dataset):
+    """A policy's folder, and its snapshot."""
+    dataset.save(folder / "data.hdf5")
+    options = ["--task", "own-data", "--env", "mine", "--steps", "2", "--normalize", "actions,observations"]
+    snapshot = train(folder / "run", folder / "data.hdf5", *options)
+    export_lerobot(snapshot, folder / "policy")
+    return folder / "policy", snapshot
+
+
+def test_a_policy_acts_by_the_names_of_columns(tmp_path):
+    quad, torch = pytest.importorskip("lerobot_policy_quad"), pytest.importorskip("torch")
+    from lerobot.policies.factory import make_pre_post_processors
+    from test_video import RULE, TOP, gray, recorded
+
+    folder, snapshot = exported(tmp_path, Dataset.from_lerobot(recorded(tmp_path / "data"), **RULE, features={TOP: gray}))
+
+    def loaded(state=("roll", "grip", "pan", "lift"), action=("lift", "pan"), encoder="test_video:gray"):
+        config = quad.PreTrainedConfig.from_pretrained(folder, cli_overrides=[f"--encoders={json.dumps({TOP: encoder})}"])
+        meta = SimpleNamespace(features={"observation.state": {"names": [*state]}, "action": {"names": [*action]}})
+        return quad.QuadPolicy.from_pretrained(folder, config=config, dataset_meta=meta)
+
+    policy, rng = loaded(), np.random.default_rng(0)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(folder))
+    state, frames = rng.normal(size=(2, 4)).astype(np.float32), rng.integers(0, 256, (2, 48, 64, 3)).astype(np.uint8)
+    batch = {"observation.state": torch.from_numpy(state), TOP: torch.from_numpy(frames).permute(0, 3, 1, 2) / 255}
+    torch.manual_seed(0)
+    found = [after(policy.select_action(before(batch))).numpy() for _ in range(2)]
+    torch.manual_seed(0)
+    seed = int(torch.randint(2**31, ()))
+    episodes, rows = Policy.load(snapshot).begin([seed, seed + 1]), np.concatenate([state[:, [2, 3, 0]], gray(frames)], axis=1)
+    assert all(np.array_equal(actions, episodes.act(rows)[:, ::-1]) for actions in found)
+    policy.save_pretrained(tmp_path / "again")
+    assert (tmp_path / "again/model.safetensors").read_bytes() == snapshot.read_bytes()
+
+    for message, call in {
+        "there is no column observation.state.lift\nhint: there are": lambda: loaded(state=["roll", "pan"]),
+        "there is no column action.lift": lambda: loaded(action=["pan"]),
+        r"sees observation.images.top.gray\[0\], by a function that is not given": lambda: loaded(encoder="test_video:film"),
+        "there is no observation.state\nhint: there are": lambda: policy.select_action({TOP: batch[TOP]}),
+        "observation.state has 2 numbers, not 4": lambda: policy.select_action({**batch, "observation.state": torch.zeros(2, 2)}),
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+def test_lerobot_eval_takes_the_path_of_a_policy(tmp_path):
+    pytest.importorskip("lerobot_policy_quad"), pytest.importorskip("gym_pusht")
+    rng, done = np.random.default_rng(0), ["action[0]", "action[1]"]
+    seen = [*(f"observation.environment_state[{i}]" for i in range(16)), "observation.state[0]", "observation.state[1]"]
+    table = {name: rng.uniform(0, 512, 200) for name in [*seen, *done]} | {"run": np.arange(200) // 50}
+    folder, _ = exported(tmp_path, Dataset.from_frame(table, observations=seen, actions=done, reward="run", episode="run"))
+    command = [Path(sys.executable).parent / "lerobot-eval", f"--policy.path={folder}", "--env.type=pusht", "--eval.n_episodes=2",
+               "--env.obs_type=environment_state_agent_pos", "--env.episode_length=4", "--eval.batch_size=1", f"--output_dir={tmp_path}"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stderr
+    assert len(json.loads((tmp_path / "eval_info.json").read_text())["per_task"][0]["metrics"]["sum_rewards"]) == 2

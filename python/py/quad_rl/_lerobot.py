@@ -1,0 +1,64 @@
+"""Policies as folders for LeRobot and its plugin in python/lerobot_policy_quad."""
+
+from __future__ import annotations
+
+import json
+import re
+from os import PathLike
+from pathlib import Path
+
+from quad_rl._quad_rl import Policy
+
+_FEATURE = re.compile(r"observation\.(images\.)?[^.\[]+")
+# LeRobot's programs set values of steps by these names. Nothing is normalized, as the policy itself scales.
+_DEVICE = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
+_RENAME = {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}}
+_BATCH = {"registry_name": "to_batch_processor", "config": {}}
+_STEPS = {"policy_preprocessor": [_RENAME, _BATCH, _DEVICE], "policy_postprocessor": [_DEVICE]}
+_CARD = """---
+library_name: lerobot
+pipeline_tag: robotics
+tags: [robotics, lerobot, quad]
+---
+
+# {policy}
+
+A policy of QUAD, for LeRobot with the plugin `lerobot_policy_quad`. It sees {seen}, in the units of its data:
+
+```json
+{about}
+```
+"""
+
+
+def inputs(policy: Policy) -> dict[str, list[int]]:
+    """The features of LeRobot's that a policy sees, with the places of their numbers in an observation.
+
+    Where names are others than `Dataset.from_lerobot` gives, or none, all are the robot's state.
+    """
+    found = [match.group() for match in map(_FEATURE.match, policy.observation_names) if match]
+    if len(found) < policy.observation_size:
+        found = ["observation.state"] * policy.observation_size
+    return {name: [place for place, other in enumerate(found) if other == name] for name in dict.fromkeys(found)}
+
+
+def export_lerobot(policy: Policy | str | PathLike[str], folder: str | PathLike[str]) -> None:
+    """Writes a policy, or that of a snapshot's file, as a folder for LeRobot's `--policy.path`: config.json, model.safetensors,
+    the processors and a card, README.md. LeRobot needs the plugin lerobot_policy_quad. Raises OSError if it cannot be written.
+    """
+    if not isinstance(policy, Policy):
+        policy = Policy.load(policy)
+    seen = {}
+    for name, places in inputs(policy).items():
+        kind = "VISUAL" if "image" in name else "ENV" if name == "observation.environment_state" else "STATE"
+        seen[name] = {"type": kind, "shape": [3, -1, -1] if kind == "VISUAL" else [len(places)]}  # Images of any size.
+    done = {"action": {"type": "ACTION", "shape": [policy.action_size]}}
+    config = {"type": "quad", "device": "cpu", "input_features": seen, "output_features": done}
+    root = Path(folder)
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "model.safetensors").write_bytes(policy.to_bytes())
+    for name, steps in _STEPS.items():
+        (root / f"{name}.json").write_text(json.dumps({"name": name, "steps": steps}, indent=2))
+    card = _CARD.format(policy=policy, seen=", ".join(f"`{name}`" for name in seen), about=json.dumps(policy.about, indent=2))
+    (root / "README.md").write_text(card)
+    (root / "config.json").write_text(json.dumps(config, indent=2))
