@@ -104,7 +104,7 @@ def test_lerobot_eval_takes_the_path_of_a_policy(tmp_path):
     table = {name: rng.uniform(0, 512, 200) for name in [*seen, *done]} | {"run": np.arange(200) // 50}
     folder, _ = exported(tmp_path, Dataset.from_frame(table, observations=seen, actions=done, reward="run", episode="run"))
     command = [Path(sys.executable).parent / "lerobot-eval", f"--policy.path={folder}", "--env.type=pusht", "--eval.n_episodes=2",
-               "--env.obs_type=environment_state_agent_pos", "--env.episode_length=4", "--eval.batch_size=2", f"--output_dir={tmp_path}"]
+               "--env.obs_type=environment_state_agent_pos", "--env.episode_length=4", "--eval.batch_size=1", f"--output_dir={tmp_path}"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
     assert len(json.loads((tmp_path / "eval_info.json").read_text())["per_task"][0]["metrics"]["sum_rewards"]) == 2

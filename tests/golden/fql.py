@@ -101,6 +101,9 @@ def windows(config, inputs):
     is over; where they are within the episode; its discounted rewards; the state after it; and what that is discounted by.
     """
     agent, chunks = config["agent"], []
+    if agent.get("chunk", 1) == 1:
+        within = np.ones_like(inputs["actions"])
+        return inputs["actions"], within, inputs["rewards"], inputs["next_observations"], agent["gamma"] * inputs["masks"]
     for row in range(config["batch_size"]):
         rows = [row]
         while len(rows) < agent.get("chunk", 1) and inputs["masks"][rows[-1]] > 0.5 and inputs["timeouts"][rows[-1]] < 0.5:
