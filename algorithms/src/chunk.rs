@@ -6,15 +6,11 @@
 //! steps in it, and what it predicts for actions beyond the end of an episode is not learned
 //! ([`Minibatch`](super::Minibatch)).
 
-use std::sync::Arc;
-
 use quad_dataset::Window;
 use quad_policy::Chunk;
 use serde::Deserialize;
 use toml::{Table, Value};
 
-use super::context::Context;
-use super::definition::{self, Definition, Start};
 use super::error::{AgentError, check};
 use super::hyperparameters::Count;
 
@@ -27,21 +23,14 @@ struct Keys {
     replan: Option<Count>,
 }
 
-/// Reads an `[agent]` table: its chunk, and all else as the algorithm does, which will learn chunks.
-pub(super) fn read(definition: &Definition, table: &Table) -> Result<(Chunk, Start), AgentError> {
-    let Keys { chunk, replan } = definition::read(table)?;
+/// Takes these keys from an `[agent]` table: the chunk, and the windows of steps to learn it from.
+pub(super) fn take(table: &mut Table) -> Result<(Chunk, Window), AgentError> {
+    let Keys { chunk, replan } = Keys::deserialize(table.clone())?;
     let length = chunk.map_or(1, |length| *length);
     let replan = replan.map_or(length, |replan| *replan);
-    if length > 1 && !definition.chunks {
-        return Err(AgentError::NoChunks(definition.name));
-    }
     check("replan", replan, replan <= length, "at most agent.chunk")?;
-    let mut own = table.clone();
-    own.remove("chunk");
-    own.remove("replan");
-    let start = (definition.read)(&own)?;
-    let gamma = own.get("gamma").and_then(Value::as_float).unwrap_or(1.0) as f32;
-    let window = Window { length, gamma };
-    let start = move |context: Context| start(Context { window, ..context });
-    Ok((Chunk { length, replan }, Arc::new(start)))
+    table.remove("chunk");
+    table.remove("replan");
+    let gamma = table.get("gamma").and_then(Value::as_float).unwrap_or(1.0) as f32;
+    Ok((Chunk { length, replan }, Window { length, gamma }))
 }

@@ -34,6 +34,19 @@ pub struct Definition {
     pub read: fn(&Table) -> Result<Start, AgentError>,
 }
 
+impl Definition {
+    /// Reads an `[agent]` table: the chunk, and all else as the algorithm does.
+    fn start(&self, table: &Table) -> Result<(Chunk, Start), AgentError> {
+        let mut own = table.clone();
+        let (chunk, window) = chunk::take(&mut own)?;
+        if chunk.length > 1 && !self.chunks {
+            return Err(AgentError::NoChunks(self.name));
+        }
+        let start = (self.read)(&own)?;
+        Ok((chunk, Arc::new(move |context| start(Context { window, ..context }))))
+    }
+}
+
 /// Makes an algorithm at step 0 with hyper-parameters that were read before.
 pub type Start = Arc<dyn Fn(Context) -> Result<Box<dyn Algorithm>, AlgorithmError> + Send + Sync>;
 
@@ -80,7 +93,7 @@ impl Hyperparameters {
     /// # Errors
     /// A key is missing, unknown, of the wrong type or out of range.
     pub fn new(definition: &Definition, table: Table) -> Result<Self, AgentError> {
-        Ok(Self { start: Some(chunk::read(definition, &table)?), table })
+        Ok(Self { start: Some(definition.start(&table)?), table })
     }
 
     /// A copy of the table.
@@ -100,7 +113,7 @@ impl Hyperparameters {
     ) -> Result<(Chunk, Box<dyn Algorithm>), AlgorithmError> {
         let (chunk, start) = match &self.start {
             Some(start) => start.clone(),
-            None => chunk::read(definition, &self.table)?,
+            None => definition.start(&self.table)?,
         };
         Ok((chunk, start(context)?))
     }
