@@ -18,6 +18,7 @@ from quad_rl.onnx.mlp import activate, slope
 
 PRESETS = Path(__file__).parents[2] / "presets"
 ALGORITHMS = sorted(preset.stem for preset in PRESETS.glob("*.toml") if preset.stem != "tasks")
+OF_CHUNKS = ["diffusion-policy", "qc"]
 OWN = ["--task", "own-data", "--env", "my-robot", "--steps", "2", "--set", "batch_size=8"]
 RULES = ["best", "nearest", "softmax:0.1", "average:0.1:4", "average:0.01:20"]
 
@@ -60,9 +61,22 @@ def compare(policy, path, **choice):
             close(found["plan"][:, later], episodes.act(states), by)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", [name for name in ALGORITHMS if name not in OF_CHUNKS])
 def test_models_of_each_algorithm_act_like_the_policy(algorithm, data, tmp_path):
     compare(Policy.load(train(tmp_path / "run", data, *OWN, "--algorithm", algorithm, layers=False)), tmp_path / "policy.onnx")
+
+
+@pytest.mark.parametrize("algorithm", OF_CHUNKS)
+def test_a_policy_of_chunks_executes_them_and_is_no_model(algorithm, data, tmp_path):
+    policy = Policy.load(train(tmp_path / "run", data, *OWN, "--algorithm", algorithm, layers=False))
+    (states, *_), episodes = batches(), policy.begin([0])
+    executed = [episodes.act(states * step) for step in (1, 2)]
+    np.testing.assert_array_equal(executed[0], policy.act(states, seed=0))
+    # The second action is the first chunk's, whatever is seen by then.
+    again = policy.begin([0])
+    np.testing.assert_array_equal([again.act(states) for _ in range(2)], executed)
+    with pytest.raises(ValueError, match="chunks"):
+        export_onnx(policy, tmp_path / "policy.onnx")
 
 
 @pytest.mark.parametrize("name", ["norm", "scaled", "dql", "dtql"])
