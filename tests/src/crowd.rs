@@ -121,7 +121,7 @@ impl Member {
     /// Sleeps as long as a job takes, and reports progress.
     async fn act(&mut self, job: &Job) {
         let longest = self.shared.episode * job.seeds.len() as u32;
-        let mut left = self.random.random_range(longest / 2..longest);
+        let mut left = self.random.random_range(longest / 2..=longest);
         let every = Duration::from_millis(job.progress_milliseconds);
         let mut steps_done = 0;
         while !left.is_zero() {
