@@ -3,8 +3,9 @@
 
     python3 deploy/study.py studies/lambda.toml [--jobs 2]
 
-Scores of finished runs go to one file beside the study, lambda.scores.json.gz. Runs in that file are not trained again, so the
-same command continues after an interruption, and on another machine that has the file. `--table` trains nothing.
+For methods that draw candidates. Scores of finished runs go to one file beside the study, lambda.scores.json.gz. Runs in that
+file are not trained again, so the same command continues after an interruption, and on another machine that has the file.
+`--table` trains nothing.
 """
 
 import argparse
@@ -72,9 +73,9 @@ class Study:
     def of_method(self, method, choice):
         """The score of each run of a method, by task and dataset, and by seed: the mean over its snapshots' episodes."""
         name = re.compile(f"(.+)-{re.escape(method)}-seed([0-9]+)")
-        scored = ((name.fullmatch(run), values["scores"]) for run, values in self.scores.items())
+        scored = ((name.fullmatch(run), values["scores"].get(choice)) for run, values in self.scores.items())
         return {
-            found.groups(): statistics.fmean(map(statistics.fmean, scores[choice])) for found, scores in scored if found
+            found.groups(): statistics.fmean(map(statistics.fmean, scores)) for found, scores in scored if found and scores
         }
 
     def print_scores(self, choices):
@@ -86,7 +87,7 @@ class Study:
                 keys = [key for key in columns[0] if key[0] == task]
                 weights = [self.scores[f"{task}-{method}-seed{seed}"]["lambda"] for _, seed in keys]
                 weight = "" if None in weights else f"{statistics.fmean(weights):.2f}"
-                cells = (spread([column[key] for key in keys]) for column in columns)
+                cells = (spread([column[key] for key in keys if key in column]) for column in columns)
                 print(f"| {task} | {method} | {weight} |", " | ".join(cells), "|")
 
     def print_pairs(self, choices):
@@ -107,6 +108,8 @@ def choice(candidates, strength):
 
 def spread(values):
     """Mean ± sample standard deviation, and how many values."""
+    if not values:
+        return ""
     deviation = f" ± {statistics.stdev(values):.1f}" if len(values) > 1 else ""
     return f"{statistics.fmean(values):.1f}{deviation} ({len(values)})"
 

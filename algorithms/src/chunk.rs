@@ -28,9 +28,10 @@ pub(super) fn take(table: &mut Table) -> Result<(Chunk, Window), AgentError> {
     let Keys { chunk, replan } = Keys::deserialize(table.clone())?;
     let length = chunk.map_or(1, |length| *length);
     let replan = replan.map_or(length, |replan| *replan);
-    check("replan", replan, replan <= length, "at most agent.chunk")?;
+    check("replan", replan, replan <= length, "at most agent.chunk (--agent replan=K changes it)")?;
     table.remove("chunk");
     table.remove("replan");
-    let gamma = table.get("gamma").and_then(Value::as_float).unwrap_or(1.0) as f32;
+    let number = |value: &Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
+    let gamma = table.get("gamma").and_then(number).unwrap_or(1.0) as f32;
     Ok((Chunk { length, replan }, Window { length, gamma }))
 }

@@ -107,7 +107,7 @@ impl Threads {
         let mut practice =
             Practice::new(experiment, transitions, inbox.clone(), metrics.practice.clone());
         let experience = match &practice {
-            Some(_) => Some(open_experience(dir, experiment, &inbox, &coordinator)?),
+            Some(_) => Some(open_experience(dir, experiment, step > 0, &inbox, &coordinator)?),
             None => None,
         };
         if let Some(practice) = &mut practice {
@@ -179,6 +179,7 @@ impl Threads {
 fn open_experience(
     dir: &RunDir,
     experiment: &Experiment,
+    resumed: bool,
     inbox: &Inbox,
     coordinator: &Coordinator,
 ) -> anyhow::Result<Experience> {
@@ -193,7 +194,7 @@ fn open_experience(
         if let Some((hash, episode)) = episodes.remove(&seed) {
             coordinator.record_practice(seed, hash);
             inbox.add(number, episode);
-        } else if recorded > 0 {
+        } else if resumed || recorded > 0 {
             coordinator.expect_practice(seed);
         }
     }

@@ -65,7 +65,10 @@ class WrappedEnvironment:
         self.info: dict[str, Any] = {}
         self.broken = False
         self.space = getattr(environment, "observation_space", None)
-        parameters = inspect.signature(environment.reset).parameters.values()
+        try:
+            parameters = list(inspect.signature(environment.reset).parameters.values())
+        except ValueError:  # Of a C extension.
+            parameters = []
         self.takes_options = any(it.name == "options" or it.kind is it.VAR_KEYWORD for it in parameters)
         action_space = getattr(environment, "action_space", None)
         self.action_shape = getattr(action_space, "shape", None)

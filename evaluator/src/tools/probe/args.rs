@@ -8,8 +8,8 @@ use clap::{Args, value_parser};
 ///
 /// States are drawn from new episodes of the run's policy, one from each. An action's true value is
 /// the mean of rollouts in the critics' units: from the state the action comes first, then one sample
-/// of the policy in each state, as the critics' targets have it. Rollouts of other actions have the
-/// same noise. docs/operations.md explains the tables.
+/// of the policy in each state, as the critics' targets have it but for ρ and `target_reduce = "max"`.
+/// Rollouts of other actions have the same noise. docs/operations.md explains the tables.
 #[derive(Args, Debug)]
 pub struct ProbeArgs {
     /// Folder of a run of QUAD or one of its variants

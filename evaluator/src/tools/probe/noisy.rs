@@ -61,6 +61,9 @@ impl Noisy {
             noisy = actor.schedule().reverse(t, &noisy, &epsilon, z.as_ref())?;
         }
         outside.reverse();
+        if parts.is_empty() {
+            candle_core::bail!("no noisy action is within ±(1 − h): take a smaller --h");
+        }
         let all = |which: usize| {
             let of_steps = Vec::from_iter(parts.iter().map(|part| &part[which]));
             Tensor::cat(&of_steps, 0)?.to_dtype(DType::F64)

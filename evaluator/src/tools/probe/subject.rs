@@ -53,7 +53,12 @@ impl Probed {
         if experiment.normalize != Normalize::default() {
             return Err(anyhow!("{name} has normalized data")).hint(OTHERS);
         }
-        let rewards = experiment.reward.scaling(&[data.min_return, data.max_return]);
+        // After a goal a new trajectory begins, so a maze has returns of 0, too.
+        let returns = match subject.spec.maze {
+            Some(_) => [0.0, 1.0],
+            None => [data.min_return, data.max_return],
+        };
+        let rewards = experiment.reward.scaling(&returns);
         let rewards = rewards.with_context(|| format!("all returns of {name} are the same"))?;
 
         let file = files::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
