@@ -1,8 +1,10 @@
-"""The ROS 2 node of docs/deploying.md, with a fake of rclpy, which pip cannot install."""
+"""The ROS 2 node of docs/deploying.md, with a fake of rclpy, which pip cannot install, and chunks that are computed ahead."""
 
 import re
+import runpy
 import sys
 from pathlib import Path
+from threading import Semaphore
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -71,3 +73,62 @@ def test_the_node_maps_joints_by_name(snapshot, tmp_path, monkeypatch):
     assert len(node.published) == 2, "no command without a whole state"
     assert [re.search("position.elbow|velocity.shoulder", error).group() for error in node.errors] == ["position.elbow", "velocity.shoulder", "position.elbow"]
     assert "NaN" in node.errors[0] and "lacks" in node.errors[1]
+
+
+CHUNKS = runpy.run_path(str(Path(__file__).parents[2] / "examples/chunks.py"))
+
+
+class Slow:
+    """A policy whose chunks, ten times what it sees and three more, take until they are released."""
+
+    def __init__(self):
+        self.about, self.left, self.released = {"chunk": {"length": 6, "replan": 4}}, [], Semaphore(0)
+
+    def begin(self, seed):
+        return self
+
+    def act(self, seen):
+        if not self.left:
+            assert self.released.acquire(timeout=60)
+            if seen is None:
+                raise ValueError("nothing seen")
+            self.left = [10 * seen + i for i in range(4)]
+        return self.left.pop(0)
+
+
+def test_a_late_chunk_loses_the_actions_whose_time_has_passed():
+    policy = Slow()
+    ahead = CHUNKS["Ahead"](policy)
+
+    def computed():
+        policy.released.release()
+        ahead.coming.result(60)
+
+    with pytest.raises(ValueError, match="late"):
+        ahead.act(None)
+    with pytest.raises(ValueError, match="nothing seen"):
+        computed()
+    for error in ("nothing seen", "late"):
+        with pytest.raises(ValueError, match=error):
+            ahead.act(0)
+    computed()
+    assert [ahead.act(seen) for seen in (1, 2, 3, 4)] == [0, 1, 2, 3], "nothing was executed before"
+    with pytest.raises(ValueError, match="late"):
+        ahead.act(5)
+    computed()  # Of what was seen two actions ago.
+    assert (ahead.act(6), ahead.dropped) == (32, 2)
+    assert ahead.act(7) == 33
+    computed()
+    assert [ahead.act(seen) for seen in (8, 9)] == [71, 72]
+    computed()
+    assert ahead.act(10) == 91, "a chunk that is there takes the place of the last one"
+
+
+def test_chunks_are_executed_at_30_hertz(snapshot, tmp_path):
+    given = ["--task", "own-data", "--env", "mine", "--steps", "2", "--normalize", "actions", "--algorithm", "qc"]
+    policy = Policy.load(train(tmp_path / "run", snapshot.parents[2] / "log.hdf5", *given))
+    ahead = CHUNKS["Ahead"](policy)
+    took, missed = CHUNKS["loop"](ahead.act, policy.observation_size, steps=60)
+    assert len(took) == 60 and missed < 30, missed
+    seen = dict.fromkeys(SEEN, 0.5)
+    np.testing.assert_array_equal(CHUNKS["Ahead"](policy).chunk(seen)[0], policy.begin(0).act(seen))

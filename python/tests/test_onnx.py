@@ -18,7 +18,6 @@ from quad_rl.onnx.mlp import activate, slope
 
 PRESETS = Path(__file__).parents[2] / "presets"
 ALGORITHMS = sorted(preset.stem for preset in PRESETS.glob("*.toml") if preset.stem != "tasks")
-OF_CHUNKS = ["diffusion-policy", "qc"]
 OWN = ["--task", "own-data", "--env", "my-robot", "--steps", "2", "--set", "batch_size=8"]
 RULES = ["best", "nearest", "softmax:0.1", "average:0.1:4", "average:0.01:20"]
 
@@ -52,31 +51,51 @@ def compare(policy, path, **choice):
         inputs = {"observations": states, **policy.noise(len(states), seed=seed, **choice)}
         assert {given.name for given in session.get_inputs()} == set(inputs)
         found = dict(zip((out.name for out in session.get_outputs()), session.run(None, inputs)))
-        if policy.choice:
+        if "values" in found:
             asked = {name: choice[name] for name in ("candidates", "aggregate", "guidance") if name in choice}
             close(found["values"], policy.sample(states, seed=seed, **asked)[1], by)
         episodes = policy.begin(range(seed, seed + len(states)), **choice)
+        if (chunk := policy.about["chunk"])["length"] > 1:
+            assert found["actions"].shape == (len(states), chunk["length"], policy.action_size)
+            assert session.get_modelmeta().custom_metadata_map == {"chunk": str(chunk["length"]), "replan": str(chunk["replan"])}
+            for i in range(chunk["replan"]):
+                close(found["actions"][:, i], episodes.act(states * (i + 1)), by)
+            continue
         close(found["actions"], episodes.act(states), by)
         for later in range(1, found.get("plan", states[:, None]).shape[1]):
             close(found["plan"][:, later], episodes.act(states), by)
 
 
-@pytest.mark.parametrize("algorithm", [name for name in ALGORITHMS if name not in OF_CHUNKS])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_models_of_each_algorithm_act_like_the_policy(algorithm, data, tmp_path):
     compare(Policy.load(train(tmp_path / "run", data, *OWN, "--algorithm", algorithm, layers=False)), tmp_path / "policy.onnx")
 
 
-@pytest.mark.parametrize("algorithm", OF_CHUNKS)
-def test_a_policy_of_chunks_executes_them_and_is_no_model(algorithm, data, tmp_path):
-    policy = Policy.load(train(tmp_path / "run", data, *OWN, "--algorithm", algorithm, layers=False))
+SMALLER = "actor={hidden=[24], activation=\"gelu\", norm=true}"
+
+
+@pytest.mark.parametrize("flags, choice", [
+    (["qc", "--agent", "replan=2", "--normalize", "actions,observations", "--agent", SMALLER], {"rule": "softmax:0.1"}),
+    (["quad", "--agent", "chunk=3", "--normalize", "actions"], {"candidates": 4, "guidance": 3.0}),
+    (["quad", "--agent", "chunk=3", "--agent", "guidance=none"], {"candidates": 1}),
+    (["fql", "--agent", "chunk=4", "--agent", "replan=3"], {}),
+    (["idql", "--agent", "chunk=2"], {"rule": "average:0.1:4"}),
+    (["diffusion-policy", "--agent", "replan=16", "--normalize", "actions"], {}),
+])
+def test_models_of_chunks(flags, choice, data, tmp_path):
+    algorithm, *given = flags
+    run = train(tmp_path / "run", data, *OWN, "--algorithm", algorithm, *given, layers=False)
+    compare(Policy.load(run), tmp_path / "policy.onnx", **choice)
+
+
+def test_a_policy_of_chunks_executes_them(data, tmp_path):
+    policy = Policy.load(train(tmp_path / "run", data, *OWN, "--algorithm", "qc", layers=False))
     (states, *_), episodes = batches(), policy.begin([0])
     executed = [episodes.act(states * step) for step in (1, 2)]
     np.testing.assert_array_equal(executed[0], policy.act(states, seed=0))
     # The second action is the first chunk's, whatever is seen by then.
     again = policy.begin([0])
     np.testing.assert_array_equal([again.act(states) for _ in range(2)], executed)
-    with pytest.raises(ValueError, match="chunks"):
-        export_onnx(policy, tmp_path / "policy.onnx")
 
 
 @pytest.mark.parametrize("name", ["norm", "scaled", "dql", "dtql"])

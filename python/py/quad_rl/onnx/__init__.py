@@ -27,9 +27,10 @@ def export_onnx(
     Inputs: `observations` [n, observation_size] and the arrays of `policy.noise(n, ...)`: `noise`, standard normal numbers, and
     `uniform`, numbers within [0, 1); 1 itself takes the best action. Draw them anew for each action.
 
-    Outputs: `actions` [n, action_size]; `values` [n, candidates], as of `Policy.sample`, if the policy samples; and, for a
-    planner that follows a plan for several steps, `plan` [n, steps, action_size], which begins with `actions`: run the model
-    again after the last.
+    Outputs: `actions` [n, action_size], or [n, chunk, action_size] of a policy of chunks, whose `chunk` and `replan`, the
+    number of actions to execute before the next run, are in the model's metadata; `values` [n, candidates], as of
+    `Policy.sample`, if the policy has critics; and, for a planner that follows a plan for several steps, `plan`
+    [n, steps, action_size], which begins with `actions`: run the model again after the last.
 
     Raises ImportError without the package onnx, ValueError for a choice that the policy cannot make, OSError if the file
     cannot be written.

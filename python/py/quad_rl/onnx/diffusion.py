@@ -17,12 +17,19 @@ def embeddings(file: File, steps: int) -> Array:
     return mish(features @ kernels[0] + biases[0]) @ kernels[1] + biases[1]
 
 
+def cosine(steps: int) -> Array:
+    """α_t of the cosine schedule for t = 1..T."""
+    falls = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
+    return np.maximum(falls[1:] / falls[:-1], 0.001)
+
+
 def draw(file: File, observations: Value, noise: Value, candidates: int, guidance: float = 0.0) -> Value:
     o, a, steps, reverse = (file.shape[name] for name in ("observation_dim", "action_dim", "diffusion_steps", "reverse"))
     kernel, bias = file["actor.trunk.0.kernel"], file["actor.trunk.0.bias"]
     shifts = embeddings(file, steps) @ kernel[o + a :] + bias
     of_state = (observations @ kernel[:o]).reshape(-1, 1, kernel.shape[1])
-    alpha = np.exp(-0.1 / steps - 0.5 * 9.9 * (2 * np.arange(1, steps + 1) - 1) / steps**2)
+    exponent = -0.1 / steps - 0.5 * 9.9 * (2 * np.arange(1, steps + 1) - 1) / steps**2
+    alpha = cosine(steps) if reverse == "cosine" else np.exp(exponent)
     bar = np.cumprod(np.concatenate([[1.0], alpha]))
     x = noise.at(1, 0)
     for t in range(steps, 0, -1):
@@ -36,7 +43,7 @@ def draw(file: File, observations: Value, noise: Value, candidates: int, guidanc
         ahead, beta = bar[t - 1], 1 - alpha[t - 1]
         x = clean * (math.sqrt(ahead) * beta / (1 - bar[t])) + x * (math.sqrt(1 - beta) * (1 - ahead) / (1 - bar[t]))
         if t > 1:
-            shrink = (1 - ahead) / (1 - bar[t]) if reverse == "posterior" else 1.0
+            shrink = (1 - ahead) / (1 - bar[t]) if reverse in ("posterior", "cosine") else 1.0
             x = x + noise.at(1, steps - t + 1) * math.sqrt(beta * shrink)
         x = x.clip(-1.0, 1.0) if reverse == "clip-sample" else x
     return x

@@ -8,13 +8,13 @@ import numpy as np
 from onnx import ModelProto
 
 from quad_rl._quad_rl import Policy
-from quad_rl.onnx import diffusion, gaussian, one_step, planner, score, squashed
+from quad_rl.onnx import diffusion, flow, gaussian, one_step, planner, score, squashed
 from quad_rl.onnx.choosing import choose
 from quad_rl.onnx.file import File
 from quad_rl.onnx.graph import Graph, Value
 from quad_rl.onnx.mlp import of_actions, of_states
 
-DRAW = {"diffusion": diffusion.draw, "one-step": one_step.draw, "score": score.draw, "squashed": squashed.draw}
+DRAW = {"diffusion": diffusion.draw, "flow": flow.draw, "one-step": one_step.draw, "score": score.draw, "squashed": squashed.draw}
 
 
 def to_network(file: File, observations: Value) -> Value:
@@ -50,7 +50,8 @@ def critics(file: File, choice: dict[str, Any], observations: Value, drawn: Valu
 def model(policy: Policy, **changes: Any) -> ModelProto:
     # The noise for one state; refuses choices that `act` refuses.
     drawn = policy.noise(1, **changes, seed=0)
-    choice = {**(policy.choice or {}), **{name: change for name, change in changes.items() if change is not None}}
+    single = {"candidates": 1, "rule": "best", "guidance": 0.0}  # Of a policy without critics.
+    choice = {**(policy.choice or single), **{name: change for name, change in changes.items() if change is not None}}
     file, graph, a = File(policy.to_bytes()), Graph(), policy.action_size
     observations = to_network(file, graph.input("observations", (policy.observation_size,)))
     inputs = {name: graph.input(name, array.shape[1:]) for name, array in drawn.items()}
@@ -66,6 +67,12 @@ def model(policy: Policy, **changes: Any) -> ModelProto:
         return graph.model({**first, "plan": (plan, (steps, a))} if steps > 1 else {**first}, repr(policy))
     guidance = {"guidance": choice["guidance"]} if choice["guidance"] else {}
     actions = DRAW[file.kind](file, observations, inputs["noise"], candidates, **guidance)
-    values, scores = critics(file, choice, observations, actions)
-    taken = to_user(file, choose(actions, scores, rule, candidates, inputs.get("uniform")))
-    return graph.model({"actions": (taken, (a,)), "values": (values, (candidates,))}, repr(policy))
+    beside: dict[str, tuple[Value, tuple[int, ...]]] = {}
+    if file.shape.get("critics") != 0:
+        values, scores = critics(file, choice, observations, actions)
+        beside["values"] = values, (candidates,)
+        actions = choose(actions, scores, rule, candidates, inputs.get("uniform"))
+    shape = (file.chunk["length"], a) if file.chunk else (a,)
+    metadata = {"chunk": file.chunk["length"], "replan": file.chunk["replan"]} if file.chunk else {}
+    taken = to_user(file, actions.reshape(-1, *shape))
+    return graph.model({"actions": (taken, shape), **beside}, repr(policy), **metadata)

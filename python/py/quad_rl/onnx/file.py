@@ -12,18 +12,16 @@ Array = NDArray[Any]
 
 
 class File:
-    """The file of a policy: `kind`, `shape`, `units`, and tensors as `file[name]`."""
+    """The file of a policy: `kind`, `shape`, `units`, `chunk` (None for single actions), and tensors as `file[name]`."""
 
     def __init__(self, data: bytes) -> None:
         start = 8 + int.from_bytes(data[:8], "little")
         listed = json.loads(data[8:start])
         header = json.loads(listed.pop("__metadata__")["quad"])
-        if chunk := header.get("chunk"):
-            raise ValueError(f"a policy that acts in chunks of {chunk['length']} steps cannot be written as a model of ONNX yet")
         self.kind: str = header["policy"]["kind"]
-        if self.kind == "flow" or header["policy"]["shape"].get("critics") == 0:
-            raise ValueError("a policy that follows a flow, or has no critics, cannot be written as a model of ONNX yet")
         self.shape: dict[str, Any] = header["policy"]["shape"]
+        self.flow_steps: int = header["policy"].get("flow_steps", 0)
+        self.chunk: dict[str, int] | None = header.get("chunk")
         # From the user's units to the networks', map by map.
         self.units = [units for units in (header.get("scaling"), self.shape.get("units")) if units]
         self.tensors: dict[str, Array] = {}

@@ -105,11 +105,13 @@ class Graph:
         left = [info(unchanged, TensorProto.BOOL, []), info(after, TensorProto.FLOAT, None)]
         return self("Loop", np.array(times), np.array(True), x, body=helper.make_graph(inside, "body", given, left))
 
-    def model(self, outputs: dict[str, tuple[Value, tuple[int, ...]]], about: str) -> ModelProto:
-        """The model with these outputs, each with its shape after n."""
+    def model(self, outputs: dict[str, tuple[Value, tuple[int, ...]]], about: str, **metadata: object) -> ModelProto:
+        """The model with these outputs, each with its shape after n, and its metadata."""
         for name, (value, _) in outputs.items():
             self.nodes.append(helper.make_node("Identity", [value.name], [name]))
         infos = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", *shape]) for name, (_, shape) in outputs.items()]
         graph = helper.make_graph(self.nodes, "policy", self.inputs, infos, list(self.constants.values()))
         opsets = [helper.make_opsetid("", OPSET)]
-        return helper.make_model(graph, opset_imports=opsets, ir_version=IR, producer_name="quad_rl", doc_string=about)
+        made = helper.make_model(graph, opset_imports=opsets, ir_version=IR, producer_name="quad_rl", doc_string=about)
+        helper.set_model_props(made, {name: str(value) for name, value in metadata.items()})
+        return made

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from quad_rl.onnx.diffusion import cosine
 from quad_rl.onnx.file import Array, File
 from quad_rl.onnx.graph import Value
 from quad_rl.onnx.window import Model, ValueFunction
@@ -12,8 +13,7 @@ from quad_rl.onnx.window import Model, ValueFunction
 
 def schedule(steps: int) -> tuple[Array, Array, Array]:
     """For t = 0..T: factors of the clean and of the noisy window, and the noise's variance."""
-    falls = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
-    alpha = np.concatenate([[1.0], np.maximum(falls[1:] / falls[:-1], 0.001)])
+    alpha = np.concatenate([[1.0], cosine(steps)])
     bar = np.cumprod(alpha)
     before, left = np.concatenate([[1.0], bar[:-1]]), np.maximum(1 - bar, 1e-300)
     from_clean, from_noisy = np.sqrt(before) * (1 - alpha) / left, np.sqrt(alpha) * (1 - before) / left
