@@ -2,7 +2,7 @@
 """Prints the table of studies/practice.toml, as Markdown: python3 deploy/practice.py runs/practice
 
 For each dataset the score before practice (mean of the last three evaluations), after it and on the dataset alone (of the last five),
-mean ± sample standard deviation over the seeds. Runs that are not complete are left out.
+mean ± sample standard deviation over the seeds, and how many these are where there are not three. Runs that are not complete are left out.
 """
 
 import json
@@ -12,20 +12,9 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 
+from results import row, spread
+
 COLUMNS = "before", "after", "alone"
-
-
-def spread(values):
-    """Mean ± sample standard deviation; nothing of nothing."""
-    if not values:
-        return ""
-    mean = f"{statistics.fmean(values):.1f}"
-    return f"{mean} ± {statistics.stdev(values):.1f}" if len(values) > 1 else mean
-
-
-def row(*cells):
-    print("|", " | ".join(cells), "|")
-
 
 scores = defaultdict(list)  # by method, environment and column: a number for each seed
 for file in sorted(Path(sys.argv[1]).glob("*/report.json")):

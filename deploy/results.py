@@ -56,4 +56,5 @@ def main(runs):
     print("\nNormalized score: mean of a run's last snapshots,", " or ".join(sorted(settings)) + "; ± over the seeds.")
 
 
-main(sys.argv[1:])
+if __name__ == "__main__":
+    main(sys.argv[1:])

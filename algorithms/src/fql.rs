@@ -57,12 +57,8 @@ networks! {
             ..init.shape(&config.actor)
         }),
         critic: WithTarget<Ensemble> = init.critics(TWIN, &config.critic),
-        /// The velocity v(s, x, t), a network of s and [x, t].
-        flow: TrainState<Ensemble> = init.ensemble(EnsembleShape {
-            action_dim: init.context.action_dim() + 1,
-            outputs: init.context.action_dim(),
-            ..init.shape(&config.actor)
-        }),
+        /// The velocity v(s, x, t).
+        flow: TrainState<Ensemble> = flow(&config.actor, init),
     }
 }
 
@@ -120,6 +116,12 @@ impl Fql {
         }
         Ok([distill_loss, q_loss])
     }
+}
+
+/// A flow's velocity, a network of s and [x, t].
+pub(super) fn flow(layers: &MlpConfig, init: &mut Initializer) -> Result<TrainState<Ensemble>> {
+    let a = init.context.action_dim();
+    init.ensemble(EnsembleShape { action_dim: a + 1, outputs: a, ..init.shape(layers) })
 }
 
 /// Mean of (v(s, x_t, t) − (a − x_0))², `[]`, with x_t = x_0 + t·(a − x_0) (FQL's Eq. 4).

@@ -3,7 +3,7 @@
 //! policy acts. Its update is its authors' code's, but for windows that reach beyond the end of an
 //! episode. QC-FQL is FQL with chunks.
 
-use super::fql::flow_loss;
+use super::fql::{flow, flow_loss};
 use super::prelude::*;
 use quad_policy::{ActorCriticShape, FlowActor};
 use rand::Rng;
@@ -44,12 +44,8 @@ struct Config {
 networks! {
     struct Networks(config: &Config, init) {
         critic: WithTarget<Ensemble> = init.critics(TWIN, &config.critic),
-        /// The velocity v(s, x, t), a network of s and [x, t].
-        flow: TrainState<Ensemble> = init.ensemble(EnsembleShape {
-            action_dim: init.context.action_dim() + 1,
-            outputs: init.context.action_dim(),
-            ..init.shape(&config.actor)
-        }),
+        /// The velocity v(s, x, t).
+        flow: TrainState<Ensemble> = flow(&config.actor, init),
     }
 }
 

@@ -105,7 +105,7 @@ fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
     assert_eq!(bench.board.validate_practice(&episode(100)), Ok(()));
     assert_eq!(bench.board.validate_practice(&episode(101)), Err(Refusal::Practice(101)));
     bench.leave("a", 1);
-    assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "nobody waits for it");
+    assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }
 
 #[test]
