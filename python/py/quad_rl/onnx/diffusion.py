@@ -14,7 +14,8 @@ def embeddings(file: File, steps: int) -> Array:
     angles = np.arange(1, steps + 1)[:, None] * np.exp(-np.arange(8) * math.log(10_000) / 7)
     features = np.concatenate([np.cos(angles), np.sin(angles)], 1)
     kernels, biases = ([file[f"actor.time.{i}.{kind}"] for i in range(2)] for kind in ("kernel", "bias"))
-    return mish(features @ kernels[0] + biases[0]) @ kernels[1] + biases[1]
+    embedded: Array = mish(features @ kernels[0] + biases[0]) @ kernels[1] + biases[1]
+    return embedded
 
 
 def cosine(steps: int) -> Array:
