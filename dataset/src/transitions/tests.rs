@@ -99,7 +99,7 @@ fn windows_of_steps_end_with_their_episode() {
     let (actions, rewards) = (&[0.1, 0.2, 0.3, 0.4], &[1.0, 2.0, 4.0, 8.0]);
     transitions.add_episode(PracticeRows { observations, actions, rewards, terminated }).unwrap();
     let mut batch = Batch::default();
-    let window = Window { length: 3, gamma: 0.5 };
+    let window = Window { length: 3, gamma: 0.5, ..Window::ONE };
     transitions.gather_windows(&[5, 0, 2, 4, 7], window, &mut batch);
     let expected = Batch {
         observations: vec![10.0, 0.0, 3.0, 5.0, 12.0],
@@ -119,6 +119,12 @@ fn windows_of_steps_end_with_their_episode() {
         size: 5,
     };
     assert_eq!(batch, expected);
+
+    transitions.gather_windows(&[5, 3, 7], Window { history: 3, ..window }, &mut batch);
+    let of_three = [[10.0, 10.0, 10.0], [3.0, 3.0, 4.0], [10.0, 11.0, 12.0]].concat();
+    let next = [[11.0, 12.0, 13.0], [3.0, 4.0, 5.0], [12.0, 13.0, 14.0]].concat();
+    assert_eq!((batch.observations, batch.next_observations), (of_three, next));
+    assert_eq!(batch.rewards, [3.0, 4.0, 8.0]);
 }
 
 #[test]
