@@ -151,7 +151,8 @@ fn experience_follows_the_dataset_and_is_scaled_as_it_was() {
         transitions.add_episode(PracticeRows { observations, actions, rewards, terminated })
     };
     episode(&[10.0, 11.0, 12.0], &[0.045, 0.09], &[3.0, 5.0], false).unwrap();
-    episode(&[20.0, 21.0], &[0.0], &[1.0], true).unwrap();
+    // Beyond the range of a dataset's actions.
+    episode(&[20.0, 21.0], &[-1.5], &[1.0], true).unwrap();
     assert_eq!((transitions.len(), transitions.experience_len()), (5, 3));
     assert_eq!(transitions.episodes(), [0..2, 2..4, 4..5]);
     assert_eq!(transitions.experience_episodes(), [5..7, 7..8]);
@@ -189,14 +190,4 @@ fn experience_that_a_dataset_would_be_refused_for_is_refused() {
         assert!(problem.contains(expected), "{problem}");
     }
     assert_eq!(transitions.experience_len(), 0);
-}
-
-#[test]
-fn an_action_of_experience_beyond_the_range_is_clipped() {
-    let (transitions, mut batch) = (transitions(d4rl()), Batch::default());
-    let (observations, actions, rewards) = (&[0.0; 2][..], &[-1.5][..], &[0.0][..]);
-    let episode = PracticeRows { observations, actions, rewards, terminated: true };
-    transitions.add_episode(episode).unwrap();
-    transitions.gather(&[transitions.len() as u32], &mut batch);
-    assert_eq!(batch.actions, [-(1.0 - 1e-5)]);
 }
