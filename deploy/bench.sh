@@ -2,8 +2,8 @@
 # Benchmarks training and evaluation on this machine against its peak rates and JAX, and each kernel against a library's.
 # Prints the tables of docs/performance.md and kernels/benches/README.md.
 #
-#   deploy/bench.sh [ROUNDS]              [default: 5] rounds of two or three minutes each, on an idle machine
-#   deploy/bench.sh ROUNDS algorithms     only the gradient steps of all algorithms
+#   deploy/bench.sh [ROUNDS]                       [default: 5] rounds of two or three minutes each, on an idle machine
+#   deploy/bench.sh ROUNDS algorithms [NAME ...]   only the gradient steps of all algorithms, or of these
 #
 # QUAD_INSTRUCTIONS=avx2 disables AVX-512 in everything but JAX's products.
 # Criterion's own reports are in target/criterion afterwards, every figure in target/bench.json.

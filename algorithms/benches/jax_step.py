@@ -5,7 +5,8 @@
     jax_step.py --check [FOLDER ...]
 
 A step is an algorithm's whole `update` in tests/golden, with JAX in NumPy's place, compiled as one function in float32;
-it is called from Python, and run by `lax.scan`. Sizes and values are those of presets/, noise is among the inputs.
+it is called from Python, and run by `lax.scan`. Sizes and values are those of presets/; noise and chunks, as long actions, are
+among the inputs.
 Tuned means: Mish with a single exponential instead of softplus and tanh, and an allocator that keeps its memory.
 Prints a line of JSON for each NAME: {way: seconds per step}, medians. With --serve it waits for names on standard
 input, a line each, so that others can be timed in between. --names prints those of all algorithms. --check compares one
@@ -53,14 +54,15 @@ import make
 
 MODULES = [m for m in list(sys.modules.values()) if Path(getattr(m, "__file__", None) or "").parent == GOLDEN]
 ALGORITHMS = {m.make_config(variant, "small")["algorithm"]: m for variant, m in make.ALGORITHMS.items()}
-# As in algorithms/benches/update.rs: Hopper, and QUAD's configurations.
-DIMS = {"observation_dim": 11, "action_dim": 3}
+# As in algorithms/benches/update.rs: Hopper, and what is measured beside each algorithm with its values for TASK.
+OBSERVATION, ACTION = 11, 3
 TASK = "hopper-medium-v2"
 CONFIGURATIONS = {
     "paper, 10 samples": ("quad", "hopper-medium-replay-v2", {"samples": 10}),
     "paper, 1 sample": ("quad", "hopper-medium-replay-v2", {"samples": 1}),
     "demo": ("quad", "hopper-demo", {"samples": 1}),
     "demo, IQL": ("iql", "hopper-demo", {}),
+    "qc-fql": ("fql", TASK, {"chunk": 5}),
 }
 
 
@@ -149,7 +151,9 @@ def configure(algorithm, task, changes, phase):
     preset, shares = values(algorithm, task), phases(algorithm)
     middle = (sum(shares[:phase]) + shares[phase] / 2) / sum(shares)
     given = {"algorithm": algorithm, "batch_size": preset["batch_size"], "total_steps": preset["steps"], "adam": networks.ADAM}
-    return DIMS | given | {"step": int(middle * preset["steps"]) + 1, "agent": preset["agent"] | changes}
+    agent = preset["agent"] | changes
+    dims = {"observation_dim": OBSERVATION * agent.pop("history", 1), "action_dim": ACTION * agent.pop("chunk", 1)}
+    return dims | given | {"step": int(middle * preset["steps"]) + 1, "agent": agent}
 
 
 def prepare(name):
@@ -157,7 +161,8 @@ def prepare(name):
     config = configure(*names()[name])
     count = config["agent"].get("actor_every", 1)
     module, rng = ALGORITHMS[config["algorithm"]], np.random.default_rng(0)
-    given = {"config": config | {"agent": config["agent"] | {"candidates": 2}}, "rng": rng, "size": "hopper", "spread": 1.0}
+    few = {} if config["algorithm"] == "qc" else {"candidates": 2}  # of others an update draws none
+    given = {"config": config | {"agent": config["agent"] | few}, "rng": rng, "size": "hopper", "spread": 1.0}
 
     def drawn(function):
         function = getattr(module, function, None) or getattr(implicit, function)

@@ -28,14 +28,15 @@ const DIMS: (usize, usize) = (11, 3);
 /// The task whose values all algorithms but QUAD are measured with.
 const TASK: &str = "hopper-medium-v2";
 
-/// Other configurations that are measured: task, algorithm, and next actions sampled per state.
+/// Other configurations that are measured: task, algorithm, and a value in place of the task's.
 /// deploy/bench/bench.py knows QUAD's shapes; algorithms/benches/jax_step.py names all as they are
 /// named here.
-const CONFIGURATIONS: [(&str, [&str; 2], Option<u32>); 4] = [
-    ("paper, 10 samples", ["hopper-medium-replay-v2", "quad"], Some(10)),
-    ("paper, 1 sample", ["hopper-medium-replay-v2", "quad"], Some(1)),
-    ("demo", ["hopper-demo", "quad"], Some(1)),
+const CONFIGURATIONS: [(&str, [&str; 2], Option<(&str, u32)>); 5] = [
+    ("paper, 10 samples", ["hopper-medium-replay-v2", "quad"], Some(("samples", 10))),
+    ("paper, 1 sample", ["hopper-medium-replay-v2", "quad"], Some(("samples", 1))),
+    ("demo", ["hopper-demo", "quad"], Some(("samples", 1))),
     ("demo, IQL", ["hopper-demo", "iql"], None),
+    ("qc-fql", [TASK, "fql"], Some(("chunk", 5))),
 ];
 
 /// An algorithm with its values for a task.
@@ -46,14 +47,14 @@ struct Experiment {
     total_steps: u64,
 }
 
-fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment {
+fn experiment([task, algorithm]: [&str; 2], change: Option<(&str, u32)>) -> Experiment {
     let definition =
         *ALGORITHMS.iter().find(|known| known.name == algorithm).expect("an algorithm");
     let mut values = Values::of(&definition).for_task(Some(task));
     let Some(toml::Value::Table(mut agent)) = values.remove("agent") else {
         panic!("no values for {task}")
     };
-    agent.extend(samples.map(|samples| ("samples".to_owned(), samples.into())));
+    agent.extend(change.map(|(key, value)| (key.to_owned(), value.into())));
     let number = |name: &str| values[name].as_integer().expect("a whole number");
     let (batch_size, total_steps) = (number("batch_size") as usize, number("steps") as u64);
     Experiment { definition, agent, batch_size, total_steps }
@@ -114,8 +115,8 @@ fn updates(criterion: &mut Criterion) {
             .iter()
             .filter(|known| known.name != "quad")
             .map(|known| (known.name, [TASK, known.name], None));
-        for (name, which, samples) in CONFIGURATIONS.into_iter().chain(others) {
-            let experiment = experiment(which, samples);
+        for (name, which, change) in CONFIGURATIONS.into_iter().chain(others) {
+            let experiment = experiment(which, change);
             let context = context(&experiment, precision, &device);
             let hyperparameters = experiment.agent.clone().into();
             let mut agent = Agent::new(experiment.definition, &hyperparameters, context)
@@ -179,15 +180,14 @@ fn peaks(criterion: &mut Criterion) {
 
 /// The parts of QUAD's update, each by itself.
 fn parts(criterion: &mut Criterion) {
-    for (name, which, samples) in CONFIGURATIONS {
-        let Some(samples) = samples else { continue };
+    for (name, which, change) in CONFIGURATIONS {
+        let Some(("samples", samples)) = change else { continue };
         let mut group = criterion.benchmark_group(name);
         group
             .sample_size(20)
             .measurement_time(Duration::from_secs(2))
             .warm_up_time(Duration::from_millis(500));
-        parts_of(&mut group, &experiment(which, Some(samples)), samples as usize)
-            .expect("candle works");
+        parts_of(&mut group, &experiment(which, change), samples as usize).expect("candle works");
         group.finish();
     }
 }

@@ -1,11 +1,11 @@
 """Runs the benchmarks of learner, evaluator and kernels and of their peers in turns, and prints what
 docs/performance.md shows. To be started by deploy/bench.sh.
 
-    bench.py ROUNDS [algorithms]
+    bench.py ROUNDS [algorithms [NAME ...]]
 
-With `algorithms` only their gradient steps beside JAX's. A round visits each configuration for some seconds, in which JAX, the learner and the machine's peaks are measured one
-after the other: machines may be shared, and change their speed. Figures are medians over the rounds; a ratio is the
-median of the rounds' ratios.
+With `algorithms` only their gradient steps beside JAX's, or those of some (`jax_step.py --names`). A round visits each
+configuration for some seconds, in which JAX, the learner and the machine's peaks are measured one after the other: machines
+may be shared, and change their speed. Figures are medians over the rounds; a ratio is the median of the rounds' ratios.
 """
 
 import json
@@ -135,11 +135,11 @@ def moment(jax, *benches):
     return {"jax": jax, "seconds": seconds, "peak": peak, "threads": threads}
 
 
-def measure_algorithms(count):
+def measure_algorithms(count, some):
     """{algorithm, or its phase: its rounds}"""
     peer = Peer(JAX_STEP, "--tuned")
     names = subprocess.run([PYTHON, "-W", "ignore", JAX_STEP, "--names"], check=True, capture_output=True, text=True).stdout
-    rounds = {name: [] for name in names.splitlines() if name not in CONFIGURATIONS}
+    rounds = {name: [] for name in some or names.splitlines() if name not in CONFIGURATIONS}
     for _ in range(count):
         for name, moments in rounds.items():
             moments.append({"jax": min(peer.measure(name).values()), "ours": criterion("update", f"^update/{name}$")})
@@ -275,8 +275,8 @@ def kernel_rates(rounds):
 
 
 def main():
-    count, only_algorithms = int(sys.argv[1]), sys.argv[2:] == ["algorithms"]
-    algorithms(measure_algorithms(count))
+    count, only_algorithms = int(sys.argv[1]), sys.argv[2:3] == ["algorithms"]
+    algorithms(measure_algorithms(count, sys.argv[3:]))
     if only_algorithms:
         return
     rounds = measure(count)

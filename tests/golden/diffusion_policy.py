@@ -68,16 +68,23 @@ def act(config, state, inputs):
     return {"select.actions": x[:, 0]}
 
 
-def draw(config, variant, size, rng):
-    """A state, inputs and what comes out."""
-    agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]
-    steps, b, n = agent["diffusion_steps"], config["batch_size"], SIZES[size]["select"]
-    state = {"actor": random_predictor(rng, o, a, agent["actor"])}
-    state |= {"target_actor": near(rng, state["actor"])} | random_moments(rng, "actor", state["actor"])
-    inputs = random_batch(rng, config) | {
+def random_state(config, rng):
+    actor = random_predictor(rng, config["observation_dim"], config["action_dim"], config["agent"]["actor"])
+    return {"actor": actor, "target_actor": near(rng, actor)} | random_moments(rng, "actor", actor)
+
+
+def random_inputs(config, rng, size):
+    o, a, b, n = config["observation_dim"], config["action_dim"], config["batch_size"], SIZES[size]["select"]
+    steps = config["agent"]["diffusion_steps"]
+    return random_batch(rng, config) | {
         "t": rng.permutation(np.arange(b) % steps + 1),
         "epsilon": single(rng.normal(size=(b, a))),
         "select_observations": single(rng.normal(size=(n, o))),
         "select_noise": single(rng.normal(size=(steps, n, 1, a))),
     }
+
+
+def draw(config, variant, size, rng):
+    """A state, inputs and what comes out."""
+    state, inputs = random_state(config, rng), random_inputs(config, rng, size)
     return state, inputs, update(config, state, inputs)[0] | act(config, state, inputs)

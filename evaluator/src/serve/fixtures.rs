@@ -1,4 +1,4 @@
-//! Data for the tests of this module.
+//! Data for the tests of this module and the tools.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -26,7 +26,7 @@ mod discovery;
 mod evaluate;
 mod exploration;
 #[cfg(test)]
-mod fixtures;
+pub(crate) mod fixtures;
 mod job;
 mod policy;
 mod query;

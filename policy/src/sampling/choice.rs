@@ -138,7 +138,7 @@ impl Rule {
 
 impl Aggregate {
     /// The aggregate of each of `rows` actions, for `values` `critics × rows`. Keeps NaN.
-    pub(crate) fn reduce(self, values: &[f32], rows: usize) -> Vec<f32> {
+    pub fn reduce(self, values: &[f32], rows: usize) -> Vec<f32> {
         let critics = (values.len() / rows) as f32;
         let min = |min, q: f32| match q < min || q.is_nan() {
             true => q,

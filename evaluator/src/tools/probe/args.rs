@@ -32,7 +32,7 @@ pub struct ProbeArgs {
     pub h: f32,
     /// κ of the lower confidence bound mean − κ·std
     #[arg(long, value_name = "X", default_value = "1")]
-    pub kappa: f64,
+    pub kappa: f32,
     /// Dataset to which the distance of chosen actions is measured [default: the run's, if it is
     /// there]
     #[arg(long, value_name = "PATH")]

@@ -10,27 +10,12 @@ pub const CANDIDATES: usize = 32;
 
 /// The candidates of one state.
 pub struct Candidates {
-    /// Values by the three [`rules`].
+    /// Values by the mean, the minimum and the mean − κ·std over critics.
     pub values: [Vec<f64>; 3],
     /// True values, each a mean over one half of the rollouts.
     pub halves: [Vec<f64>; 2],
     /// Distances to the nearest action that was recorded in similar states.
     pub distances: Option<Vec<f64>>,
-}
-
-/// The mean, the minimum and the mean − κ·std over critics of `values`, `[K, n]`.
-pub fn rules(values: &[Vec<f64>], kappa: f64) -> [Vec<f64>; 3] {
-    let of_candidates = |of: &dyn Fn(&[f64]) -> f64| {
-        let critics = |at: usize| Vec::from_iter(values.iter().map(|values| values[at]));
-        Vec::from_iter((0..values[0].len()).map(|at| of(&critics(at))))
-    };
-    let bound = |q: &[f64]| {
-        let center = mean(q);
-        let squares = q.iter().map(|q| (q - center).powi(2));
-        center - kappa * mean(&Vec::from_iter(squares)).sqrt()
-    };
-    let least = |q: &[f64]| q.iter().copied().fold(f64::INFINITY, f64::min);
-    [of_candidates(&mean), of_candidates(&least), of_candidates(&bound)]
 }
 
 /// Index of the largest number, the first of equals.
@@ -66,7 +51,7 @@ impl Candidates {
 }
 
 /// Tables of rank correlations and of choices.
-pub fn choosing(states: &[Candidates], kappa: f64) -> [Grid; 2] {
+pub fn choosing(states: &[Candidates], kappa: f32) -> [Grid; 2] {
     let rules = ["mean".to_owned(), "minimum".to_owned(), format!("mean − {kappa}·std")];
     let correlations = |state: &Candidates| {
         let halves = rank_correlation(&state.halves[0], &state.halves[1]);
@@ -87,23 +72,18 @@ pub fn choosing(states: &[Candidates], kappa: f64) -> [Grid; 2] {
         1 => "one candidate".to_owned(),
         _ => format!("largest {} of {count}", rules[*rule]),
     });
+    let correlation = ["rank correlation with the truth"];
     [
-        means(
-            "Values of 32 candidates",
-            &["rank correlation with the truth"],
-            names.collect(),
-            states,
-            correlations,
-        ),
-        means("Choices among candidates", &columns, of_choice.collect(), states, chosen),
+        means("Values of 32 candidates", &correlation, names, states, correlations),
+        means("Choices among candidates", &columns, of_choice, states, chosen),
     ]
 }
 
 /// A table of means over states.
 fn means(
-    title: &str,
+    title: &'static str,
     columns: &[&'static str],
-    names: Vec<String>,
+    names: impl IntoIterator<Item = String>,
     states: &[Candidates],
     numbers: impl Fn(&Candidates) -> Vec<f64>,
 ) -> Grid {
@@ -118,12 +98,6 @@ fn means(
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn values_are_those_of_the_rules() {
-        let values = [[1.0, 0.0], [3.0, -6.0]].map(Vec::from);
-        assert_eq!(rules(&values, 2.0), [vec![2.0, -3.0], vec![1.0, -6.0], vec![0.0, -9.0]]);
-    }
 
     /// One half of the rollouts says 0, 1, 2, …, 31, the other the double, and so do the critics, but
     /// that their mean takes 0, 10, 20 and 30 for the best, in this order.

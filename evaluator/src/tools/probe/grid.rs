@@ -10,7 +10,7 @@ use serde::Serialize;
 /// Estimates, with 95 % bootstrap intervals over states.
 #[derive(Serialize)]
 pub struct Grid {
-    pub title: String,
+    pub title: &'static str,
     pub columns: Vec<&'static str>,
     /// A name, and an estimate for each column.
     pub rows: Vec<(String, Vec<Estimate>)>,
@@ -20,7 +20,7 @@ impl Grid {
     /// `statistics` computes the numbers of all rows, one after the other, from the states with these
     /// indices.
     pub fn of(
-        title: impl Into<String>,
+        title: &'static str,
         columns: &[&'static str],
         names: impl IntoIterator<Item = String>,
         states: usize,
@@ -29,7 +29,7 @@ impl Grid {
         let all = vec![Vec::from_iter(0..states)];
         let found = estimates(&[&all], |drawn| statistics(&drawn[0][0]));
         let rows = names.into_iter().zip(found.chunks(columns.len()).map(<[_]>::to_vec));
-        Self { title: title.into(), columns: columns.to_vec(), rows: rows.collect() }
+        Self { title, columns: columns.to_vec(), rows: rows.collect() }
     }
 }
 

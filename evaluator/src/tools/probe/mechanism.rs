@@ -36,12 +36,11 @@ pub fn mechanism(
     }
     by_state.retain(|state| !state.is_empty());
     let steps = outside.len();
-    let table = |title: &str, columns: &[_], names, numbers: &dyn Fn(&[&Sample]) -> Vec<f64>| {
+    let table = |title, columns: &[_], names, numbers: &dyn Fn(&[&Sample]) -> Vec<f64>| {
         Grid::of(title, columns, names, by_state.len(), |drawn| {
             numbers(&Vec::from_iter(drawn.iter().flat_map(|state| by_state[*state].clone())))
         })
     };
-    let names = |names: &[&str]| Vec::from_iter(names.iter().map(|name| name.to_string()));
     let of_steps = outside.iter().zip(1..).map(|(outside, t)| {
         let actions = by_state.iter().flatten().filter(|sample| sample.t == t).count();
         format!("t = {t}: {actions} actions, {:.0} % left out", 100.0 * outside)
@@ -50,13 +49,13 @@ pub fn mechanism(
         table(
             "Risk of weights (Eq. 14), over the mean square of l̄",
             &["mean weight", "risk", "above QUAD's λ", "each at its best scale"],
-            names(&WEIGHTS),
+            Vec::from(WEIGHTS.map(str::to_owned)),
             &|samples| weights(samples, steps),
         ),
         table(
             "Slopes along gradients",
             &["claimed", "true", "true / claimed"],
-            names(&DIRECTIONS),
+            Vec::from(DIRECTIONS.map(str::to_owned)),
             &directions,
         ),
         table(

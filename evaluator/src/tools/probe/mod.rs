@@ -20,7 +20,8 @@ mod subject;
 use std::sync::Arc;
 
 use anyhow::Context;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{Device, Tensor};
+use quad_policy::Aggregate;
 use quad_protocol::episode_seeds;
 use quad_run::results::statistics::mean;
 use rand::{Rng, SeedableRng};
@@ -29,11 +30,11 @@ use rayon::prelude::*;
 use tracing::{info, warn};
 
 pub(crate) use args::ProbeArgs;
-use choosing::{CANDIDATES, Candidates, choosing, rules};
+use choosing::{CANDIDATES, Candidates, choosing};
 use grid::Grid;
 use mechanism::mechanism;
 use noisy::{Noisy, normal};
-use oracle::{Oracle, Query};
+use oracle::Query;
 use recorded::Recorded;
 use slopes::measure;
 use states::State;
@@ -77,55 +78,51 @@ impl<'a> Probe<'a> {
         Ok(Self { args, probed, states, observations, seeds, random })
     }
 
-    fn returns(&self, queries: Vec<Query>) -> anyhow::Result<Vec<f64>> {
-        info!("{} rollouts", queries.len());
-        let Probed { subject, sampler, rewards, gamma, .. } = &self.probed;
-        let (rewards, gamma, length) = (*rewards, *gamma, self.args.length);
-        Oracle { spec: subject.spec, policy: &**sampler, rewards, gamma, length }.returns(queries)
-    }
-
     fn mechanism(&mut self) -> anyhow::Result<[Grid; 3]> {
-        let (Probed { actor, critics, tau, delta, .. }, h) = (&self.probed, self.args.h);
+        let (Probed { oracle, actor, critics, tau, delta, .. }, h) = (&self.probed, self.args.h);
         let drawn = Noisy::draw((actor, critics), &self.observations, h, &mut self.random)?;
         let (noisy, outside, scale) = drawn;
-        let returns = |queries| self.returns(queries);
+        let returns = |queries| oracle.returns(queries);
         let samples = measure(&noisy, &self.states, &self.seeds, h, returns)?;
         let weighting = (*tau, delta * scale * scale);
         Ok(mechanism(samples, self.states.len(), &outside, weighting))
     }
 
     fn choosing(&mut self) -> anyhow::Result<[Grid; 2]> {
-        let Probed { actor, critics, .. } = &self.probed;
+        let Probed { oracle, actor, critics, .. } = &self.probed;
         let shape = actor.shape();
         let shape = (shape.diffusion_steps, self.states.len() * CANDIDATES, shape.action_dim);
         let noise = normal(shape, &mut self.random)?;
         let actions = actor.sample(&self.observations, &noise)?;
-        let values = critics.values(&self.observations, &actions)?.to_dtype(DType::F64)?;
-        let (actions, values) = (actions.to_vec2::<f32>()?, values.to_vec2::<f64>()?);
+        let values = critics.values(&self.observations, &actions)?;
+        let values = values.flatten_all()?.to_vec1::<f32>()?;
+        let actions = actions.to_vec2::<f32>()?;
+        let rules = [Aggregate::Mean, Aggregate::Min, Aggregate::MeanMinusStd(self.args.kappa)];
+        let values = rules.map(|rule| {
+            Vec::from_iter(rule.reduce(&values, actions.len()).into_iter().map(f64::from))
+        });
 
         let of_states = self.states.iter().zip(&self.seeds).zip(actions.chunks_exact(CANDIDATES));
-        let queries = of_states.flat_map(|((state, seeds), actions)| {
-            actions.iter().flat_map(move |action| {
-                let (state, action) = (state.clone(), action.clone());
-                seeds.iter().map(move |&seed| Query {
-                    state: state.clone(),
-                    action: action.clone(),
-                    seed,
-                })
-            })
+        let mut queries = Vec::new();
+        for ((state, seeds), actions) in of_states {
+            for action in actions {
+                let query = |&seed| Query { state: state.clone(), action: action.clone(), seed };
+                queries.extend(seeds.iter().map(query));
+            }
+        }
+        let (returns, rollouts) = (oracle.returns(queries)?, self.args.rollouts as usize);
+        let halves = [0..rollouts / 2, rollouts / 2..rollouts].map(|half| {
+            let of_actions = returns.chunks_exact(rollouts);
+            Vec::from_iter(of_actions.map(|returns| mean(&returns[half.clone()])))
         });
-        let returns = self.returns(queries.collect())?;
-        let half = self.args.rollouts as usize / 2;
-        let returns = returns.chunks_exact(self.args.rollouts as usize);
-        let halves = Vec::from_iter(returns.map(|all| [mean(&all[..half]), mean(&all[half..])]));
         let recorded = self.recorded()?;
         let of_state = |(index, state): (usize, &Arc<State>)| {
             let rows = index * CANDIDATES..(index + 1) * CANDIDATES;
-            let values = Vec::from_iter(values.iter().map(|values| values[rows.clone()].to_vec()));
-            let (halves, actions) = (&halves[rows.clone()], &actions[rows]);
+            let of_rows = |all: &Vec<f64>| all[rows.clone()].to_vec();
+            let actions = &actions[rows.clone()];
             Candidates {
-                values: rules(&values, self.args.kappa),
-                halves: [0, 1].map(|which| halves.iter().map(|of| of[which]).collect()),
+                values: values.each_ref().map(of_rows),
+                halves: halves.each_ref().map(of_rows),
                 distances: recorded.as_ref().map(|of| of.distances(&state.observation, actions)),
             }
         };

@@ -6,6 +6,7 @@ use anyhow::Context;
 use quad_dataset::{EnvironmentSpec, RewardScaling};
 use quad_policy::Policy;
 use rayon::prelude::*;
+use tracing::info;
 
 use super::states::State;
 use crate::sim::{self, Environment, EnvironmentError, Rollout, Simulation, Step};
@@ -23,19 +24,20 @@ pub struct Query {
     pub seed: u64,
 }
 
-pub struct Oracle<'a> {
+pub struct Oracle {
     pub spec: &'static EnvironmentSpec,
     /// Acts after the first action.
-    pub policy: &'a dyn Policy,
+    pub policy: Box<dyn Policy>,
     pub rewards: RewardScaling,
     pub gamma: f64,
     /// Most steps of a rollout.
     pub length: u32,
 }
 
-impl Oracle<'_> {
+impl Oracle {
     /// The discounted return of each rollout, in the critics' units.
     pub fn returns(&self, queries: Vec<Query>) -> anyhow::Result<Vec<f64>> {
+        info!("{} rollouts", queries.len());
         let indices = Vec::from_iter(0..queries.len() as u64);
         let queries: Arc<[Query]> = queries.into();
         let batches = indices.par_chunks(BATCH).with_max_len(1);
@@ -44,8 +46,8 @@ impl Oracle<'_> {
     }
 
     fn roll_out(&self, queries: &Arc<[Query]>, indices: &[u64]) -> anyhow::Result<Vec<f64>> {
-        let (policy, sizes) =
-            (self.policy, (self.policy.observation_dim(), self.policy.action_dim()));
+        let policy = &*self.policy;
+        let sizes = (policy.observation_dim(), policy.action_dim());
         let make = || -> Result<Box<dyn Environment>, EnvironmentError> {
             Ok(Box::new(Continuation {
                 simulation: sim::make(self.spec, 0)?,
@@ -111,26 +113,17 @@ impl Environment for Continuation {
 
 #[cfg(test)]
 mod tests {
-    use candle_core::{DType, Device, Tensor};
     use quad_dataset::{RewardRule, environment};
-    use quad_nn::Layout;
-    use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Precision};
+    use quad_policy::{Precision, load_policy};
 
     use super::*;
-
-    /// Random actions, as all weights are 0.
-    fn policy() -> Box<dyn Policy> {
-        let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[1]), 1, 1);
-        let config = PolicyConfig::Diffusion { shape, choice: Choice::best_of(1) };
-        let zeros = |layout: &Layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu);
-        let tensors = config.tensors(zeros).unwrap();
-        let file = Header::new(config, ()).to_safetensors(&tensors).unwrap();
-        quad_policy::load_policy(&file, Precision::F32).unwrap()
-    }
+    use crate::serve::fixtures::{file, smallest};
 
     #[test]
     fn a_return_is_that_of_stepping_from_the_state() {
-        let (spec, policy) = (environment::find("hopper").unwrap(), policy());
+        let spec = environment::find("hopper").unwrap();
+        // Its actions are random, as all weights are 0.
+        let policy = load_policy(&file("hopper", smallest(), 1), Precision::F32).unwrap();
         let mut hopper = sim::make(spec, 0).unwrap();
         hopper.reset(3);
         hopper.step(&[0.3, -0.2, 0.1]);
@@ -139,18 +132,19 @@ mod tests {
         let query = |first, seed| Query { state: state.clone(), action: vec![first; 3], seed };
         let queries = [query(0.5, 1), query(-0.5, 1), query(0.5, 2)];
         let rewards = RewardRule::Subtract1.scaling(&[]).unwrap();
+        let mut oracle = Oracle { spec, policy, rewards, gamma: 0.9, length: 0 };
         let mut lengths = Vec::new();
         // The robot falls within the longer one.
         for length in [3, 2000] {
-            let oracle = Oracle { spec, policy: &*policy, rewards, gamma: 0.9, length };
+            oracle.length = length;
             let returns = oracle.returns(queries.to_vec()).unwrap();
             for (Query { action, seed, .. }, found) in queries.iter().zip(&returns) {
                 hopper.set_state(&state.qpos, &state.qvel);
-                let (mut memory, mut expected, mut n) = ([policy.begin(*seed)], 0.0, 0);
+                let (mut memory, mut expected, mut n) = ([oracle.policy.begin(*seed)], 0.0, 0);
                 loop {
                     let observation = hopper.observation().iter().map(|x| *x as f32);
-                    let mut own = vec![0.0; 3];
-                    policy.act(&Vec::from_iter(observation), &mut memory, &mut own).unwrap();
+                    let (observation, mut own) = (Vec::from_iter(observation), vec![0.0; 3]);
+                    oracle.policy.act(&observation, &mut memory, &mut own).unwrap();
                     let step = hopper.step(if n == 0 { action } else { &own });
                     expected += 0.9f64.powi(n) * (step.reward - 1.0);
                     n += 1;

@@ -31,7 +31,7 @@ pub struct Sample {
 pub const DIRECTIONS: [&str; 3] =
     ["each critic's gradient", "the critics' mean gradient", "at the denoised estimate"];
 
-/// Mean and population variance over a dimension.
+/// Mean and population variance over a dimension, in `f64`; `quad_nn::mean_and_variance` has `f32`.
 fn moments(x: &Tensor, dim: usize) -> Result<[Tensor; 2]> {
     let mean = x.mean_keepdim(dim)?;
     let variance = x.broadcast_sub(&mean)?.sqr()?.mean(dim)?;

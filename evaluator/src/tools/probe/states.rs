@@ -4,7 +4,7 @@ use anyhow::Context;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::sim::{self, Simulation};
+use crate::sim;
 use crate::tools::score::Subject;
 
 /// Random stream of an episode's seed by which one of its states is chosen.
@@ -20,15 +20,6 @@ pub struct State {
 }
 
 impl State {
-    fn of(simulation: &Simulation) -> Self {
-        Self {
-            qpos: simulation.qpos().to_vec(),
-            qvel: simulation.qvel().to_vec(),
-            goal: simulation.goal().map(<[f64]>::to_vec),
-            observation: simulation.observation().iter().map(|x| *x as f32).collect(),
-        }
-    }
-
     /// Plays the episode of a seed. Each of the states in which the policy acts is kept with the same
     /// probability.
     pub fn visit(subject: &Subject, seed: u64) -> anyhow::Result<Self> {
@@ -40,7 +31,12 @@ impl State {
         let (mut memory, mut action) = ([policy.begin(seed)], vec![0.0; policy.action_dim()]);
         let (mut kept, mut visited) = (Self::default(), 1);
         loop {
-            let state = Self::of(&simulation);
+            let state = Self {
+                qpos: simulation.qpos().to_vec(),
+                qvel: simulation.qvel().to_vec(),
+                goal: simulation.goal().map(<[f64]>::to_vec),
+                observation: simulation.observation().iter().map(|x| *x as f32).collect(),
+            };
             let acted = policy.act(&state.observation, &mut memory, &mut action);
             acted.with_context(|| format!("{}: the policy cannot act", subject.path.display()))?;
             if random.random_range(0..visited) == 0 {

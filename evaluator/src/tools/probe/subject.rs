@@ -3,11 +3,10 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{Normalize, RewardScaling};
+use quad_dataset::Normalize;
 use quad_nn::{Ensemble, NoisePredictor};
 use quad_policy::{
-    Choice, Chunk, DiffusionPolicy, Header, Policy, PolicyConfig, PolicyError, Precision,
-    read_tensors,
+    Choice, Chunk, DiffusionPolicy, Header, PolicyConfig, PolicyError, Precision, read_tensors,
 };
 use quad_protocol::Origin;
 use quad_run::files;
@@ -15,6 +14,7 @@ use quad_run::folder::RunDir;
 use quad_runtime::Hint;
 
 use super::args::ProbeArgs;
+use super::oracle::Oracle;
 use crate::tools::film;
 use crate::tools::score::{ScoreArgs, Subject};
 
@@ -24,15 +24,13 @@ const OTHERS: &str =
 pub struct Probed {
     /// The policy as it is evaluated, which visits the states.
     pub subject: Subject,
-    /// The policy that the critics' targets evaluate: it takes its first sample.
-    pub sampler: Box<dyn Policy>,
+    /// Values of the policy that the critics' targets evaluate, which takes its first sample.
+    pub oracle: Oracle,
     pub actor: NoisePredictor,
     pub critics: Ensemble,
-    pub gamma: f64,
     /// τ and δ of Eq. 24.
     pub tau: f64,
     pub delta: f64,
-    pub rewards: RewardScaling,
     pub dataset: PathBuf,
 }
 
@@ -73,15 +71,20 @@ impl Probed {
         let tensors = &mut read_tensors(&file)?;
         let (actor, critics) = DiffusionPolicy::networks(&shape, tensors, Precision::F32)?;
         let critics = critics.with_context(|| format!("{name} has no critics")).hint(OTHERS)?;
+        let oracle = Oracle {
+            spec: subject.spec,
+            policy: subject.policy.with_choice(Choice::best_of(1))?,
+            rewards,
+            gamma: number("gamma")?,
+            length: args.length,
+        };
         Ok(Self {
-            sampler: subject.policy.with_choice(Choice::best_of(1))?,
             subject,
+            oracle,
             actor,
             critics,
-            gamma: number("gamma")?,
             tau: number("tau")?,
             delta: number("delta")?,
-            rewards,
             dataset: data.path,
         })
     }

@@ -98,11 +98,9 @@ fn risks_are_those_of_the_known_errors() {
     }
     close(weights.rows[2].1[0].value, best, "best constant");
     close(weights.rows[1].1[3].value, weights.rows[2].1[3].value, "risk at the best scale");
-    for (row, lambda) in
-        steps.rows.iter().zip([1.0, 1.44].map(|v| nu_squared / (nu_squared + 2.0 * v)))
-    {
+    for (row, variance) in steps.rows.iter().zip([1.0, 1.44]) {
         let found = Vec::from_iter(row.1.iter().map(|number| number.value));
-        close(found[0], lambda, "λ");
+        close(found[0], nu_squared / (nu_squared + 2.0 * variance), "λ");
         close(found[1], 1.0, "l̄ with truth");
         assert_eq!(found[3], 1.0);
         close(found[4], 1.0, "no noise");
@@ -114,10 +112,9 @@ fn risks_are_those_of_the_known_errors() {
 fn noise_of_rollouts_is_subtracted() {
     let (exact, noisy) = (samples(0.0), samples(0.5));
     assert!(noisy.iter().any(|of| of.noise > 0.1));
-    let pairs = Vec::from_iter(exact.iter().zip(&noisy));
-    let left =
-        |(exact, noisy): &(&Sample, &Sample)| (noisy.truth - exact.truth).powi(2) - noisy.noise;
-    close(mean(&Vec::from_iter(pairs.iter().map(left))), 0.0, "noise");
+    let pairs = exact.iter().zip(&noisy);
+    let left = pairs.map(|(exact, noisy)| (noisy.truth - exact.truth).powi(2) - noisy.noise);
+    close(mean(&Vec::from_iter(left)), 0.0, "noise");
 }
 
 #[test]
