@@ -22,7 +22,7 @@ pub struct Context {
     pub total_steps: u64,
     /// Updates with experience that follow.
     pub online_steps: u64,
-    /// The steps of an example, which are those of a chunk of actions.
+    /// The steps of an example: those that are seen, and those of a chunk of actions.
     pub window: Window,
     /// Seed of initial weights and noise.
     pub seed: u64,
@@ -36,9 +36,9 @@ pub struct Context {
 }
 
 impl Context {
-    /// Size of an observation, o.
+    /// Size of an observation as the networks know it, o: of all that are seen at a time.
     pub fn observation_dim(&self) -> usize {
-        self.transitions.observation_dim()
+        self.transitions.observation_dim() * self.window.history
     }
 
     /// Size of an action as the networks know it, a: of a whole chunk.

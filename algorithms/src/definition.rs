@@ -27,9 +27,10 @@ pub struct Definition {
     pub metrics: &'static [Metric],
     /// Texts of reports about its runs, beside scores.
     pub report: Reporting,
-    /// True if it can learn chunks of actions (`agent.chunk`).
+    /// True if it can learn chunks of actions (`agent.chunk`) from several observations
+    /// (`agent.history`).
     pub chunks: bool,
-    /// Reads an `[agent]` table, without `chunk` and `replan`, into the type of its
+    /// Reads an `[agent]` table, without `chunk`, `replan` and `history`, into the type of its
     /// hyper-parameters.
     pub read: fn(&Table) -> Result<Start, AgentError>,
 }
@@ -39,7 +40,7 @@ impl Definition {
     fn start(&self, table: &Table) -> Result<(Chunk, Start), AgentError> {
         let mut own = table.clone();
         let (chunk, window) = chunk::take(&mut own)?;
-        if chunk.length > 1 && !self.chunks {
+        if (chunk.length > 1 || chunk.history > 1) && !self.chunks {
             return Err(AgentError::NoChunks(self.name));
         }
         let start = (self.read)(&own)?;

@@ -51,7 +51,9 @@ pub enum AgentError {
     Parse(#[from] toml::de::Error),
     #[error("agent.{field} is {value}, but must be {range}")]
     Range { field: &'static str, value: String, range: &'static str },
-    #[error("{0} learns single actions, so agent.chunk must be 1")]
+    #[error(
+        "{0} learns single actions from single observations, so agent.chunk and agent.history must be 1"
+    )]
     NoChunks(&'static str),
 }
 

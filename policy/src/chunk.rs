@@ -8,25 +8,29 @@ use quad_nn::{Precision, bytes};
 use serde::{Deserialize, Serialize};
 use std::mem;
 
-/// Chunks of actions, which the networks know as one action each.
+/// Chunks of actions, which the networks know as one action each, and the last observations, which
+/// they know as one observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(default, deny_unknown_fields)]
 pub struct Chunk {
+    /// Observations that a chunk is drawn from, oldest first; before an episode's first, it is
+    /// repeated.
+    pub history: usize,
     /// Steps h of a chunk; 1 is a single action.
     pub length: usize,
-    /// Steps k ≤ h that are executed before the next chunk is drawn.
+    /// Steps ≤ h that are executed before the next chunk is drawn.
     pub replan: usize,
 }
 
 impl Default for Chunk {
     fn default() -> Self {
-        Self { length: 1, replan: 1 }
+        Self { history: 1, length: 1, replan: 1 }
     }
 }
 
 impl Chunk {
     pub(crate) fn is_single(&self) -> bool {
-        self.length == 1
+        self.length == 1 && self.history == 1
     }
 }
 
@@ -42,16 +46,33 @@ pub(crate) fn chunked(policy: Box<dyn Policy>, chunk: Chunk) -> Result<Box<dyn P
     if chunk.is_single() {
         return Ok(policy);
     }
-    let (value, width) = (chunk.length, policy.action_dim());
-    check_range("chunk.length", value, width)?;
-    check_range("chunk.replan", chunk.replan, value)?;
-    if !width.is_multiple_of(value) {
-        return Err(PolicyError::Range { field: "chunk.length", value });
+    for (field, value, width) in [
+        ("chunk.history", chunk.history, policy.observation_dim()),
+        ("chunk.length", chunk.length, policy.action_dim()),
+    ] {
+        check_range(field, value, width)?;
+        if !width.is_multiple_of(value) {
+            return Err(PolicyError::Range { field, value });
+        }
     }
+    check_range("chunk.replan", chunk.replan, chunk.length)?;
     Ok(Box::new(Chunked { policy, chunk }))
 }
 
 impl Chunked {
+    /// Adds an observation to what each state has seen.
+    fn see(&self, observations: &[f32], states: &mut [EpisodeState]) {
+        for (observation, state) in observations.chunks(self.observation_dim()).zip(states) {
+            match state.seen.is_empty() {
+                true => state.seen = observation.repeat(self.chunk.history),
+                false => {
+                    state.seen.drain(..observation.len());
+                    state.seen.extend(observation);
+                }
+            }
+        }
+    }
+
     /// Takes the next action of each state's chunk; `draw` acts in the states that have none left.
     fn execute(
         &self,
@@ -60,12 +81,13 @@ impl Chunked {
         actions: &mut [f32],
         draw: impl FnOnce(&[f32], &mut [EpisodeState], &mut [f32]) -> Result<()>,
     ) -> Result<()> {
-        let (o, a, width) = (self.observation_dim(), self.action_dim(), self.policy.action_dim());
+        let (a, width) = (self.action_dim(), self.policy.action_dim());
+        self.see(observations, states);
         let mut places = Vec::from_iter(0..states.len());
         places.retain(|place| states[*place].chunk.is_empty());
         if !places.is_empty() {
-            let observation = |place: &usize| &observations[place * o..][..o];
-            let observations = Vec::from_iter(places.iter().flat_map(observation).copied());
+            let seen = places.iter().flat_map(|place| &states[*place].seen);
+            let observations = Vec::from_iter(seen.copied());
             let take = |place: &usize| mem::replace(&mut states[*place], EpisodeState::new(0));
             let mut drawing = Vec::from_iter(places.iter().map(take));
             let mut chunks = vec![0.0; places.len() * width];
@@ -85,7 +107,7 @@ impl Chunked {
 
 impl Policy for Chunked {
     fn observation_dim(&self) -> usize {
-        self.policy.observation_dim()
+        self.policy.observation_dim() / self.chunk.history
     }
 
     fn action_dim(&self) -> usize {
@@ -105,7 +127,7 @@ impl Policy for Chunked {
     }
 
     fn memory(&self, states: usize) -> u64 {
-        let own = states * (self.observation_dim() + 2 * self.policy.action_dim());
+        let own = states * 2 * (self.policy.observation_dim() + self.policy.action_dim());
         let moved = states * (size_of::<EpisodeState>() + size_of::<usize>());
         self.policy.memory(states).saturating_add(bytes(own as u128) + moved as u64)
     }
@@ -138,7 +160,9 @@ impl Policy for Chunked {
 
     /// The first action and the value of each chunk that is drawn, in states without one.
     fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Samples> {
-        let Samples { actions, values } = self.policy.sample(observations, states)?;
+        self.see(observations, states);
+        let seen = Vec::from_iter(states.iter().flat_map(|state| &state.seen).copied());
+        let Samples { actions, values } = self.policy.sample(&seen, states)?;
         let first = |chunk: &[f32]| chunk[..self.action_dim()].to_vec();
         let actions = actions.chunks_exact(self.policy.action_dim()).flat_map(first).collect();
         Ok(Samples { actions, values })

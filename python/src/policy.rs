@@ -272,9 +272,10 @@ impl PyPolicy {
     }
 
     /// The file's header, a dictionary: version of the learner, environment, step, names of the
-    /// numbers in observations and actions, chunk (its length, and the steps of it that are executed),
-    /// scaling (data's = offset + scale · network's, or None); and from `learner export` run, task,
-    /// algorithm, data with its license, score, and judgment.
+    /// numbers in observations and actions, chunk (its length, the steps of it that are executed, and
+    /// the observations that it is drawn from), scaling (data's = offset + scale · network's, or
+    /// None); and from `learner export` run, task, algorithm, data with its license, score, and
+    /// judgment.
     #[getter]
     fn about<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         py.import("json")?.call_method1("loads", (&self.about,))

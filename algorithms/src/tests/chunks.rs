@@ -22,7 +22,7 @@ fn chunked(mut table: toml::Table, chunk: i64) -> toml::Table {
 #[test]
 fn windows_beyond_the_end_of_an_episode_are_masked() {
     let mut context = context(0, &Device::Cpu);
-    context.window = Window { length: 3, gamma: 0.5 };
+    context.window = Window { length: 3, gamma: 0.5, ..Window::ONE };
     let data = arrays();
     let batch = context.batch(&[0, 8, 18]).unwrap();
     let (r, a) = (&data.rewards, |row: usize| &data.actions[row * DIMS.1..][..DIMS.1]);
@@ -46,7 +46,8 @@ fn windows_beyond_the_end_of_an_episode_are_masked() {
 fn a_policy_of_chunks_acts_step_by_step() {
     let names = ALGORITHMS.iter().filter(|known| known.chunks).map(|known| known.name);
     assert_eq!(Vec::from_iter(names), CLONING.map(|(name, _)| name));
-    for (definition, table) in variants().into_iter().filter(|(known, _)| known.chunks) {
+    for (definition, mut table) in variants().into_iter().filter(|(known, _)| known.chunks) {
+        table.insert("history".to_owned(), 2.into());
         let mut agent = agent(definition, &chunked(table, 4), &context(0, &Device::Cpu));
         for values in train(&mut agent, STEPS) {
             assert!(values.iter().flatten().all(|value| value.is_finite()), "{values:?}");

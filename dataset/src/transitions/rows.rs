@@ -14,6 +14,8 @@ const ACTION_LIMIT: f32 = 1.0 - 1e-5;
 /// The steps that an example covers: h in a row, fewer where the episode ends before.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Window {
+    /// Observations k ≥ 1 that are seen at a time; before the episode's first, it is repeated.
+    pub history: usize,
     /// h ≥ 1.
     pub length: usize,
     /// Discount γ of a step.
@@ -22,19 +24,19 @@ pub struct Window {
 
 impl Window {
     /// A single transition.
-    pub const ONE: Self = Self { length: 1, gamma: 1.0 };
+    pub const ONE: Self = Self { history: 1, length: 1, gamma: 1.0 };
 }
 
 /// Mini-batch of B transitions, or of B windows of n ≤ h transitions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Batch {
-    /// s_t, B × o.
+    /// s_{t−k+1} … s_t, B × k·o.
     pub observations: Vec<f32>,
     /// a_t … a_{t+h−1}, B × h·a. After the n-th, which is the episode's last, it is repeated.
     pub actions: Vec<f32>,
     /// Σ γ^i·r_{t+i} over the n steps, B.
     pub rewards: Vec<f32>,
-    /// s_{t+n}, B × o.
+    /// s_{t+n−k+1} … s_{t+n}, B × k·o.
     pub next_observations: Vec<f32>,
     /// 0 where the episode terminated, else γ^(n−1), which is 1 for a transition; B.
     pub masks: Vec<f32>,
@@ -126,10 +128,20 @@ impl Rows {
         episodes
     }
 
+    /// The transition at `index` after the `length` − 1 that come before it, the first of an episode
+    /// as often as it takes.
+    fn history(&self, index: u32, length: usize) -> impl Iterator<Item = u32> {
+        let leads_on = |back: &u32| *back <= index && self.next(index - back).is_some();
+        let before = (1..length as u32).take_while(leads_on).count() as u32;
+        (0..length as u32).rev().map(move |back| index - back.min(before))
+    }
+
     /// Adds the window that begins with the transition at `index`.
     pub fn copy_to(&self, batch: &mut Batch, index: u32, window: Window) {
         let (all, row) = (&self.recording, |index: u32| self.starts[index as usize] as usize);
-        batch.observations.extend_from_slice(all.observation(row(index)));
+        for seen in self.history(index, window.history) {
+            batch.observations.extend_from_slice(all.observation(row(seen)));
+        }
         batch.actions.extend_from_slice(all.action(row(index)));
         let (mut last, mut reward, mut discount, mut steps) =
             (index, all.rewards[row(index)], 1.0, 1);
@@ -142,6 +154,9 @@ impl Rows {
             batch.actions.extend_from_slice(all.action(row(last)));
         }
         batch.rewards.push(reward);
+        for seen in self.history(last, window.history - 1) {
+            batch.next_observations.extend_from_slice(all.observation(row(seen)));
+        }
         batch.next_observations.extend_from_slice(all.next_observation(row(last)));
         batch.masks.push(if all.terminals[row(last)] { 0.0 } else { discount });
         batch.steps.push(steps);

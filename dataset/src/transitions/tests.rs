@@ -99,7 +99,7 @@ fn windows_of_steps_end_with_their_episode() {
     let (actions, rewards) = (&[0.1, 0.2, 0.3, 0.4], &[1.0, 2.0, 4.0, 8.0]);
     transitions.add_episode(PracticeRows { observations, actions, rewards, terminated }).unwrap();
     let mut batch = Batch::default();
-    let window = Window { length: 3, gamma: 0.5 };
+    let window = Window { length: 3, gamma: 0.5, ..Window::ONE };
     transitions.gather_windows(&[5, 0, 2, 4, 7], window, &mut batch);
     let expected = Batch {
         observations: vec![10.0, 0.0, 3.0, 5.0, 12.0],
@@ -119,6 +119,12 @@ fn windows_of_steps_end_with_their_episode() {
         size: 5,
     };
     assert_eq!(batch, expected);
+
+    transitions.gather_windows(&[5, 3, 7], Window { history: 3, ..window }, &mut batch);
+    let of_three = [[10.0, 10.0, 10.0], [3.0, 3.0, 4.0], [10.0, 11.0, 12.0]].concat();
+    let next = [[11.0, 12.0, 13.0], [3.0, 4.0, 5.0], [12.0, 13.0, 14.0]].concat();
+    assert_eq!((batch.observations, batch.next_observations), (of_three, next));
+    assert_eq!(batch.rewards, [3.0, 4.0, 8.0]);
 }
 
 #[test]
@@ -145,7 +151,8 @@ fn experience_follows_the_dataset_and_is_scaled_as_it_was() {
         transitions.add_episode(PracticeRows { observations, actions, rewards, terminated })
     };
     episode(&[10.0, 11.0, 12.0], &[0.045, 0.09], &[3.0, 5.0], false).unwrap();
-    episode(&[20.0, 21.0], &[0.0], &[1.0], true).unwrap();
+    // Beyond the range of a dataset's actions.
+    episode(&[20.0, 21.0], &[-1.5], &[1.0], true).unwrap();
     assert_eq!((transitions.len(), transitions.experience_len()), (5, 3));
     assert_eq!(transitions.episodes(), [0..2, 2..4, 4..5]);
     assert_eq!(transitions.experience_episodes(), [5..7, 7..8]);
@@ -183,14 +190,4 @@ fn experience_that_a_dataset_would_be_refused_for_is_refused() {
         assert!(problem.contains(expected), "{problem}");
     }
     assert_eq!(transitions.experience_len(), 0);
-}
-
-#[test]
-fn an_action_of_experience_beyond_the_range_is_clipped() {
-    let (transitions, mut batch) = (transitions(d4rl()), Batch::default());
-    let (observations, actions, rewards) = (&[0.0; 2][..], &[-1.5][..], &[0.0][..]);
-    let episode = PracticeRows { observations, actions, rewards, terminated: true };
-    transitions.add_episode(episode).unwrap();
-    transitions.gather(&[transitions.len() as u32], &mut batch);
-    assert_eq!(batch.actions, [-(1.0 - 1e-5)]);
 }

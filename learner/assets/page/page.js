@@ -167,7 +167,7 @@ function showLive(live) {
 function practice(now) {
   if (!now) return [];
   const newest = now.steps > 0 ? number(now.return) : "–";
-  return [["environment steps", `${now.steps} of ${now.target}`], ["return in practice", newest], ["waited for practice", duration(now.wait_seconds)]];
+  return [["experience", `${now.steps} of ${now.target}`], ["return in practice", newest], ["waited for practice", duration(now.wait_seconds)]];
 }
 
 async function refresh() {

@@ -17,8 +17,8 @@ pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> an
     let milliseconds = price.step_seconds * 1e3;
     let hours = price.step_seconds * steps as f64 / 3600.0;
     let (mut grows, mut kept) = (String::new(), "snapshots and checkpoints");
-    if experiment.online.is_some() {
-        let bytes = HumanBytes(price.experience_bytes(experiment));
+    if let Some(online) = &experiment.online {
+        let bytes = HumanBytes(price.experience_bytes(online.steps));
         (grows, kept) =
             (format!("; experience adds {bytes}"), "snapshots, checkpoints and experience");
     }

@@ -1,6 +1,6 @@
 //! All evaluations of a run.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -68,12 +68,8 @@ pub(crate) struct Scoreboard {
     next_job: u64,
     /// Scores of an earlier incarnation, by step, whose evaluation is not open yet.
     earlier: BTreeMap<u64, SavedScores>,
-    /// Numbers of the practice episodes that are open, by seed.
-    pub(super) practice: HashMap<u64, u64>,
-    /// Hashes of the recorded practice episodes' frames, by seed.
-    practiced: HashMap<u64, Hash>,
-    /// Seeds of episodes that an earlier incarnation may have opened.
-    opened_before: HashSet<u64>,
+    /// Practice episodes by seed.
+    practice: HashMap<u64, Practice>,
     practice_ended: bool,
 }
 
@@ -88,8 +84,6 @@ impl Scoreboard {
             next_job: 1,
             earlier,
             practice: HashMap::new(),
-            practiced: HashMap::new(),
-            opened_before: HashSet::new(),
             practice_ended: false,
         }
     }
@@ -125,38 +119,38 @@ impl Scoreboard {
 
     /// Opens an episode of practice.
     pub fn open_practice(&mut self, opening: &Opening, weights: Hash) {
-        self.practice.insert(opening.seed, opening.episode);
-        let episode = Evaluation::practice(opening, weights);
-        self.evaluations.insert(Key::Practice(opening.episode), episode);
+        let Opening { episode, seed, .. } = *opening;
+        self.practice.insert(seed, Practice::Open { episode });
+        self.evaluations.insert(Key::Practice(episode), Evaluation::practice(opening, weights));
     }
 
     /// Expects an episode of practice that an earlier incarnation may have opened.
     pub fn expect_practice(&mut self, seed: u64) {
-        self.opened_before.insert(seed);
+        self.practice.insert(seed, Practice::NotYet);
     }
 
     /// Ends practice: evaluators get no more of its episodes.
     pub fn end_practice(&mut self) {
         self.practice_ended = true;
-        self.opened_before.clear();
         let evaluations = &mut self.evaluations;
         evaluations.retain(|_, it| it.practice.is_none() || it.waiting() == 0);
-        self.practice.retain(|_, episode| evaluations.contains_key(&Key::Practice(*episode)));
+        self.practice.retain(|_, practice| match practice {
+            Practice::Open { episode } => evaluations.contains_key(&Key::Practice(*episode)),
+            Practice::Recorded(_) => true,
+            Practice::NotYet => false,
+        });
     }
 
     /// The practice episode with this seed, if the run has it.
     pub fn practice(&self, seed: u64) -> Option<Practice> {
-        let recorded = self.practiced.get(&seed).map(|hash| Practice::Recorded(*hash));
-        let open = || Some(Practice::Open { episode: *self.practice.get(&seed)? });
-        let before = || self.opened_before.contains(&seed).then_some(Practice::NotYet);
-        recorded.or_else(open).or_else(before)
+        self.practice.get(&seed).copied()
     }
 
     /// Records a practice episode, whose frame has this hash, as delivered. Returns the number of
     /// jobs that this ends.
     pub fn record_practice(&mut self, seed: u64, hash: Hash) -> usize {
-        self.practiced.insert(seed, hash);
-        let Some(episode) = self.practice.remove(&seed) else { return 0 };
+        let before = self.practice.insert(seed, Practice::Recorded(hash));
+        let Some(Practice::Open { episode }) = before else { return 0 };
         let (key, open) = (Key::Practice(episode), self.jobs.len());
         self.evaluations.remove(&key);
         self.jobs.retain(|_, open| open.key != key);
@@ -195,14 +189,15 @@ impl Scoreboard {
         missing
     }
 
-    /// Hands out a job: the next practice episode, or waiting episodes of the oldest step. An evaluator has one job at a time; a
-    /// repeated claim, after a lost answer, gets the same answer.
+    /// Hands out a job: the next practice episode, or waiting episodes of the oldest step. An
+    /// evaluator has one job at a time; a repeated claim, after a lost answer, gets the same answer.
     pub fn claim(&mut self, claim: Claim<'_>, now: Instant) -> Claimed {
         let Claim { evaluator, attempt, fits, present } = claim;
         if !fits {
             return Claimed::Wait(DOES_NOT_FIT);
         }
-        let often = if self.practice.is_empty() { ASK_AGAIN } else { ASK_FOR_PRACTICE };
+        let practices = matches!(self.evaluations.first_key_value(), Some((Key::Practice(_), _)));
+        let often = if practices { ASK_FOR_PRACTICE } else { ASK_AGAIN };
         let wait = Claimed::Wait(interval(present, often));
         if let Some(open) = self.jobs.get_mut(evaluator) {
             if open.attempt == attempt {

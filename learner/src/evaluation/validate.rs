@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use quad_protocol::{Episode, EpisodeScore, ScoreReport};
 
 use super::episodes::Key;
+use super::outcomes::Practice;
 use super::refusal::{Refusal, require};
 use super::scoreboard::Scoreboard;
 
@@ -44,8 +45,11 @@ impl Scoreboard {
     /// [`validate`](Self::validate).
     pub fn validate_practice(&self, episode: &Episode) -> Result<(), Refusal> {
         let seed = episode.score.seed;
-        let key = self.practice.get(&seed).map(|number| Key::Practice(*number));
-        let open = key.and_then(|key| self.evaluations.get(&key)).ok_or(Refusal::Practice(seed))?;
+        let open = match self.practice(seed) {
+            Some(Practice::Open { episode }) => self.evaluations.get(&Key::Practice(episode)),
+            _ => None,
+        };
+        let open = open.ok_or(Refusal::Practice(seed))?;
         require(open.step == episode.step, Refusal::Step)?;
         require(open.weights == episode.weights, Refusal::Weights)?;
         require(episode.dims() == self.rules.dims, Refusal::Rows(seed))?;

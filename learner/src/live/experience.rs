@@ -26,12 +26,8 @@ pub(super) struct Experience {
     partial: BTreeMap<u64, (Hash, Vec<u8>)>,
 }
 
-/// A whole episode, which its last piece has completed.
-struct Whole {
-    request: Request,
-    number: u64,
-    episode: Episode,
-}
+/// The last piece's request, the number and the episode, which is complete.
+type Whole = (Request, u64, Episode);
 
 impl Experience {
     pub fn new(log: ExperienceLog, inbox: Inbox, coordinator: Coordinator) -> Self {
@@ -50,9 +46,7 @@ impl Experience {
             self.coordinator.extend_lease(&piece.evaluator, piece.incarnation, piece.job);
             match self.add(&piece, &whole) {
                 Ok(Added::Reply(reply)) => request.reply(&reply),
-                Ok(Added::Whole(number, episode)) => {
-                    whole.push(Whole { request, number, episode });
-                }
+                Ok(Added::Whole(number, episode)) => whole.push((request, number, episode)),
                 Err(why @ NotAccepted::NotYet) => request.reject(&why, &self.coordinator.metrics),
                 Err(why) => {
                     self.coordinator.metrics.reject(why.label());
@@ -64,14 +58,15 @@ impl Experience {
         if whole.is_empty() {
             return;
         }
-        let frames = whole.iter().filter_map(|it| self.partial.get(&it.episode.score.seed));
+        let frames = whole.iter().filter_map(|(_, _, it)| self.partial.get(&it.score.seed));
         match self.log.append(frames) {
             Ok(()) => {
                 disk.accepted(beat);
-                for Whole { request, number, episode } in whole {
+                for (request, number, episode) in whole {
                     let seed = episode.score.seed;
                     let Some((hash, _)) = self.partial.remove(&seed) else { continue };
-                    self.inbox.add(number, episode);
+                    // Training may have ended.
+                    self.inbox.send((number, episode)).ok();
                     request.reply(&self.coordinator.record_practice(seed, hash));
                 }
             }
@@ -79,7 +74,7 @@ impl Experience {
             Err(error) => {
                 let error = format!("{:#}", anyhow::Error::from(error));
                 disk.refused(beat, &error);
-                for Whole { request, .. } in whole {
+                for (request, ..) in whole {
                     let why = NotAccepted::NotSaved(error.clone());
                     request.reject(&why, &self.coordinator.metrics);
                 }
@@ -95,6 +90,7 @@ impl Experience {
             Practice::NotYet => return Err(NotAccepted::NotYet),
             Practice::Recorded(hash) => {
                 if hash != piece.hash {
+                    self.coordinator.metrics.practice.differences.inc();
                     warn!(
                         seed, evaluator = %piece.evaluator,
                         "an episode was played again with other bits; the first delivery counts"
@@ -108,7 +104,7 @@ impl Experience {
             Ok(Added::Reply(PieceReply::Continue { incarnation, offset }))
         };
         // Another evaluator's last piece came just before.
-        if whole.iter().any(|whole| whole.number == number) {
+        if whole.iter().any(|(_, other, _)| *other == number) {
             return at(piece.offset as usize);
         }
         let none = || (piece.hash, Vec::new());

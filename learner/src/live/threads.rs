@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -103,14 +104,13 @@ impl Threads {
 
         let disk = |writer| DiskStatus::new(writer, metrics.disk_trouble(writer), events.clone());
         let disk_of_scores = disk(Writer::Scores);
-        let inbox = Inbox::default();
+        let (inbox, recorded) = mpsc::channel();
         let mut practice =
-            Practice::new(experiment, transitions, inbox.clone(), metrics.practice.clone());
-        let experience = match &practice {
-            Some(_) => Some(open_experience(dir, experiment, step > 0, &inbox, &coordinator)?),
-            None => None,
-        };
+            Practice::new(experiment, transitions, recorded, metrics.practice.clone());
+        let mut experience = None;
         if let Some(practice) = &mut practice {
+            let opened = open_experience(dir, experiment, step > 0, inbox, &coordinator)?;
+            experience = Some(opened);
             practice.resume(step).hint(OTHER_FOLDER)?;
         }
         let scores =
@@ -180,7 +180,7 @@ fn open_experience(
     dir: &RunDir,
     experiment: &Experiment,
     resumed: bool,
-    inbox: &Inbox,
+    inbox: Inbox,
     coordinator: &Coordinator,
 ) -> anyhow::Result<Experience> {
     let (log, records) = dir.experience_log()?;
@@ -193,12 +193,12 @@ fn open_experience(
         let seed = practice_seed(experiment.seed, number);
         if let Some((hash, episode)) = episodes.remove(&seed) {
             coordinator.record_practice(seed, hash);
-            inbox.add(number, episode);
+            inbox.send((number, episode)).ok();
         } else if resumed || recorded > 0 {
             coordinator.expect_practice(seed);
         }
     }
     let error = "experience.log has episodes of another run";
     episodes.is_empty().then_some(()).context(error).hint(OTHER_FOLDER)?;
-    Ok(Experience::new(log, inbox.clone(), coordinator.clone()))
+    Ok(Experience::new(log, inbox, coordinator.clone()))
 }

@@ -66,6 +66,7 @@ metrics! {
         target: IntGauge("experience_rows_target", "Environment steps of practice that this run will do"),
         rows: IntGauge("experience_rows", "Environment steps of practice that training has absorbed"),
         episodes: IntGauge("experience_episodes", "Episodes of practice that training has absorbed"),
+        differences: IntCounter("practice_differences_total", "Episodes of practice that came again with other bits"),
         episode_return: Gauge("practice_return", "Return of the newest of them"),
         score: Gauge("practice_score", "Score of the newest of them"),
         wait_seconds: Counter("practice_wait_seconds_total", "Time that training has waited for practice"),

@@ -4,8 +4,9 @@
 
 use std::collections::BTreeMap;
 use std::mem;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::mpsc::{Receiver, Sender};
 use std::time::{Duration, Instant};
 
 use quad_dataset::{OnlineSampler, PracticeRows, Transitions};
@@ -21,50 +22,13 @@ const POLL: Duration = Duration::from_millis(100);
 
 /// Names of practice's numbers in `metrics.jsonl`, and what they are.
 pub(crate) const COLUMNS: [(&str, &str); 3] = [
-    ("environment_steps", "Environment steps of practice that training has absorbed"),
+    ("experience_rows", "Environment steps of practice that training has absorbed"),
     ("practice_return", "Return of the newest episode of practice"),
     ("practice_wait_seconds", "Time that this learner has waited for practice"),
 ];
 
-/// Recorded episodes that training has not absorbed yet, by number. Clones share them.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Inbox {
-    shared: Arc<(Mutex<BTreeMap<u64, Episode>>, Condvar)>,
-}
-
-impl Inbox {
-    pub fn add(&self, number: u64, episode: Episode) {
-        self.lock().insert(number, episode);
-        self.shared.1.notify_all();
-    }
-
-    fn contains(&self, number: u64) -> bool {
-        self.lock().contains_key(&number)
-    }
-
-    fn take(&self, number: u64) -> Option<Episode> {
-        self.lock().remove(&number)
-    }
-
-    /// Waits for an episode, and calls `alive` all the while; `None` if training is to `stop`.
-    fn wait(&self, number: u64, stop: &AtomicBool, mut alive: impl FnMut()) -> Option<Episode> {
-        let mut episodes = self.lock();
-        while !stop.load(Ordering::Relaxed) {
-            if let Some(episode) = episodes.remove(&number) {
-                return Some(episode);
-            }
-            alive();
-            let woken = self.shared.1.wait_timeout(episodes, POLL);
-            episodes = woken.unwrap_or_else(PoisonError::into_inner).0;
-        }
-        None
-    }
-
-    // A thread that panicked here left the map as it was before its change or after it.
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<u64, Episode>> {
-        self.shared.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
+/// Takes episodes with their numbers to training, once they are on the disk.
+pub(crate) type Inbox = Sender<(u64, Episode)>;
 
 /// The practice of a run.
 pub(crate) struct Practice {
@@ -78,7 +42,9 @@ pub(crate) struct Practice {
     /// Episodes opened, the last of which are still to be announced.
     opened: u64,
     openings: Vec<Opening>,
-    inbox: Inbox,
+    recorded: Receiver<(u64, Episode)>,
+    /// Recorded episodes that are not absorbed yet, by number.
+    waiting: BTreeMap<u64, Episode>,
     transitions: Arc<Transitions>,
     sampler: OnlineSampler,
     metrics: PracticeMetrics,
@@ -100,7 +66,7 @@ impl Practice {
     pub fn new(
         experiment: &Experiment,
         transitions: Arc<Transitions>,
-        inbox: Inbox,
+        recorded: Receiver<(u64, Episode)>,
         metrics: PracticeMetrics,
     ) -> Option<Self> {
         let online = experiment.online.clone()?;
@@ -116,7 +82,8 @@ impl Practice {
             episodes: 0,
             opened: 0,
             openings: Vec::new(),
-            inbox,
+            recorded,
+            waiting: BTreeMap::new(),
             transitions,
             sampler,
             metrics,
@@ -142,9 +109,10 @@ impl Practice {
 
     /// Absorbs the episodes that a checkpoint of this step has learned from.
     pub fn resume(&mut self, step: u64) -> Result<(), PracticeError> {
+        self.waiting.extend(self.recorded.try_iter());
         while self.has_begun(step) && self.due() < step {
             let number = self.episodes;
-            let episode = self.inbox.take(number).ok_or(PracticeError::Missing(number))?;
+            let episode = self.waiting.remove(&number).ok_or(PracticeError::Missing(number))?;
             self.absorb(&episode)?;
         }
         Ok(())
@@ -161,26 +129,24 @@ impl Practice {
         stop: &AtomicBool,
         beat: &Heartbeat,
     ) -> Result<bool, PracticeError> {
-        let mut counted = Instant::now();
-        let mut count = || {
-            let seconds = mem::replace(&mut counted, Instant::now()).elapsed().as_secs_f64();
-            self.metrics.wait_seconds.inc_by(seconds);
-        };
-        let episode = self.inbox.wait(self.episodes, stop, || {
+        while !stop.load(Ordering::Relaxed) {
+            if let Some(episode) = self.waiting.remove(&self.episodes) {
+                return self.absorb(&episode).map(|()| true);
+            }
             beat.alive();
-            count();
-        });
-        count();
-        episode.map_or(Ok(false), |episode| self.absorb(&episode).map(|()| true))
+            let begin = Instant::now();
+            self.waiting.extend(self.recorded.recv_timeout(POLL));
+            self.metrics.wait_seconds.inc_by(begin.elapsed().as_secs_f64());
+        }
+        Ok(false)
     }
 
     /// Episodes that are open since the last call and not recorded yet.
     pub fn take_openings(&mut self) -> Vec<Opening> {
-        let mut openings = mem::take(&mut self.openings);
+        self.waiting.extend(self.recorded.try_iter());
         let is_open =
-            |it: &Opening| it.episode >= self.episodes && !self.inbox.contains(it.episode);
-        openings.retain(is_open);
-        openings
+            |it: &Opening| it.episode >= self.episodes && !self.waiting.contains_key(&it.episode);
+        mem::take(&mut self.openings).into_iter().filter(is_open).collect()
     }
 
     fn absorb(&mut self, episode: &Episode) -> Result<(), PracticeError> {

@@ -12,13 +12,16 @@ use super::agent::{begin, origin};
 /// Time of the measurement, of all phases together.
 const MEASURED: Duration = Duration::from_secs(1);
 
+/// Bytes of an environment step in memory beside its numbers: its place, and marks of its end.
+const MARKS: u64 = 9;
+
 /// The cost of a run.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct Price {
     pub step_seconds: f64,
     pub snapshot_bytes: u64,
     pub checkpoint_bytes: u64,
-    /// Bytes of an environment step of practice: observation, action and reward.
+    /// Bytes on disk of an environment step of practice: observation, action and reward.
     pub row_bytes: u64,
 }
 
@@ -45,22 +48,23 @@ impl Price {
         })
     }
 
-    /// Bytes of the experience of a whole run.
-    pub fn experience_bytes(&self, experiment: &Experiment) -> u64 {
-        experiment.online.as_ref().map_or(0, |online| online.steps * self.row_bytes)
+    /// Bytes of memory that experience takes by the end of a run of `online.steps`.
+    pub fn experience_bytes(&self, steps: u64) -> u64 {
+        steps * (self.row_bytes + MARKS)
     }
 
     /// Bytes on disk of a whole run: its snapshots, the checkpoints that are kept, and experience.
     pub fn bytes(&self, experiment: &Experiment) -> u64 {
         let schedule = experiment.schedule();
-        let practice = experiment.online.as_ref().map_or(0, |online| {
+        let (mut snapshots, mut rows) = (schedule.evaluations(), 0);
+        if let Some(online) = &experiment.online {
             let steps =
                 (experiment.steps..schedule.steps).step_by(online.snapshot_interval as usize);
-            steps.filter(|step| !schedule.is_evaluated(*step)).count() as u64
-        });
-        let snapshots = (schedule.evaluations() + practice).max(1);
+            snapshots += steps.filter(|step| !schedule.is_evaluated(*step)).count() as u64;
+            rows = online.steps;
+        }
         let kept = Checkpoint::KEPT as u64 * self.checkpoint_bytes;
-        snapshots * self.snapshot_bytes + kept + self.experience_bytes(experiment)
+        snapshots.max(1) * self.snapshot_bytes + kept + rows * self.row_bytes
     }
 }
 

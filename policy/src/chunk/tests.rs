@@ -13,19 +13,18 @@ use rand_chacha::ChaCha8Rng;
 const A: usize = 2;
 
 /// A policy of chunks of three steps, and what draws them.
-fn config(candidates: u32) -> PolicyConfig {
+fn config(observation_dim: usize, candidates: u32) -> PolicyConfig {
     let (actor, critic) = (layers(Activation::Relu, &[8]), layers(Activation::Relu, &[8]));
-    let shape =
-        ActorCriticShape { observation_dim: 1, action_dim: 3 * A, actor, critic, critics: 2 };
+    let shape = ActorCriticShape { observation_dim, action_dim: 3 * A, actor, critic, critics: 2 };
     PolicyConfig::OneStep { shape, choice: Choice::best_of(candidates) }
 }
 
 fn drawing(candidates: u32) -> Box<dyn Policy> {
-    load(&initial(config(candidates))).unwrap()
+    load(&initial(config(1, candidates))).unwrap()
 }
 
 fn policy(candidates: u32, replan: usize) -> Box<dyn Policy> {
-    chunked(drawing(candidates), Chunk { length: 3, replan }).unwrap()
+    chunked(drawing(candidates), Chunk { history: 1, length: 3, replan }).unwrap()
 }
 
 /// The actions of one more step in these states.
@@ -52,6 +51,27 @@ fn the_first_actions_of_a_chunk_are_executed_before_the_next_is_drawn() {
             assert_eq!(action, chunk[number % replan * A..][..A], "step {number} of {replan}");
         }
     }
+}
+
+#[test]
+fn a_chunk_is_drawn_from_the_last_observations() {
+    let drawing = load(&initial(config(2, 4))).unwrap();
+    let chunk = Chunk { history: 2, length: 3, replan: 3 };
+    let policy = chunked(load(&initial(config(2, 4))).unwrap(), chunk).unwrap();
+    assert_eq!(policy.observation_dim(), 1);
+    let (mut state, mut expected) = ([drawing.begin(7)], [drawing.begin(7)]);
+    for seen in [[0.0, 0.0], [0.2, 0.3]] {
+        let drawn = step(&*drawing, &seen, &mut expected);
+        let first = seen[1];
+        for (number, action) in drawn.chunks(A).enumerate() {
+            let observation = [first + number as f32 / 10.0];
+            assert_eq!(step(&*policy, &observation, &mut state), action, "{seen:?}, {number}");
+        }
+    }
+    assert!(matches!(
+        chunked(drawing, Chunk { history: 3, ..chunk }),
+        Err(PolicyError::Range { field: "chunk.history", .. })
+    ));
 }
 
 /// The second episode begins a step later, so that no two draw at the same time.
@@ -90,7 +110,7 @@ fn samples_are_the_first_actions_of_chunks() {
 #[test]
 fn a_file_says_the_chunk_and_scales_each_action() {
     let generator = &mut ChaCha8Rng::seed_from_u64(5);
-    let policy = config(2);
+    let policy = config(1, 2);
     let weights = |layout: &Layout| Weights::initial(layout, generator, &candle_core::Device::Cpu);
     let tensors = policy.tensors(weights).unwrap();
     let actions = Affine { offset: vec![4.0, -1.0], scale: vec![2.0, 0.5] };
@@ -100,7 +120,7 @@ fn a_file_says_the_chunk_and_scales_each_action() {
         let header = Header { chunk, scaling: Some(scaling.clone()), ..header };
         header.to_safetensors(&tensors).unwrap()
     };
-    let chunk = Chunk { length: 3, replan: 2 };
+    let chunk = Chunk { history: 1, length: 3, replan: 2 };
     let found = load(&file(chunk)).unwrap();
     let expected = scaled(self::policy(2, 2), scaling.clone()).unwrap();
     let mut states = [[found.begin(3)], [found.begin(3)]];
@@ -111,7 +131,7 @@ fn a_file_says_the_chunk_and_scales_each_action() {
     assert_eq!(Header::<()>::read(&file(chunk)).unwrap().chunk, chunk);
 
     let refused = |length, replan| {
-        let chunked = chunked(drawing(1), Chunk { length, replan });
+        let chunked = chunked(drawing(1), Chunk { history: 1, length, replan });
         matches!(chunked, Err(PolicyError::Range { .. }))
     };
     assert!(refused(0, 0) && refused(4, 1) && refused(12, 1) && refused(3, 4) && refused(3, 0));

@@ -15,6 +15,8 @@ pub struct EpisodeState {
     given: Vec<f32>,
     /// Memory from step to step, such as a plan; empty when an episode begins.
     pub memory: Vec<f32>,
+    /// The last observations, oldest first, of a policy that sees several.
+    pub(crate) seen: Vec<f32>,
     /// The actions of a chunk that are still to be executed.
     pub(crate) chunk: Vec<f32>,
 }
@@ -25,7 +27,7 @@ impl EpisodeState {
     pub fn new(seed: u64) -> Self {
         let mut noise = ChaCha8Rng::seed_from_u64(seed);
         noise.set_stream(POLICY_STREAM);
-        Self { noise, given: Vec::new(), memory: Vec::new(), chunk: Vec::new() }
+        Self { noise, given: Vec::new(), memory: Vec::new(), seen: Vec::new(), chunk: Vec::new() }
     }
 
     /// Begins an episode whose first normal numbers are these, for a comparison with another

@@ -106,4 +106,4 @@ fn next(reader: &mut impl Read) -> io::Result<Option<(Hash, Vec<u8>)>> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

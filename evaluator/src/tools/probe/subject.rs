@@ -6,7 +6,8 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{Normalize, RewardScaling};
 use quad_nn::{Ensemble, NoisePredictor};
 use quad_policy::{
-    Choice, DiffusionPolicy, Header, Policy, PolicyConfig, PolicyError, Precision, read_tensors,
+    Choice, Chunk, DiffusionPolicy, Header, Policy, PolicyConfig, PolicyError, Precision,
+    read_tensors,
 };
 use quad_protocol::Origin;
 use quad_run::files;
@@ -18,7 +19,7 @@ use crate::tools::film;
 use crate::tools::score::{ScoreArgs, Subject};
 
 const OTHERS: &str =
-    "probe a run of `--algorithm quad`, with any guidance, without --normalize and chunks";
+    "probe a run of `--algorithm quad`, with any guidance, without --normalize, chunks and history";
 
 pub struct Probed {
     /// The policy as it is evaluated, which visits the states.
@@ -66,7 +67,7 @@ impl Probed {
         let PolicyConfig::Diffusion { shape, .. } = header.policy else {
             return Err(anyhow!("{name} has no diffusion policy")).hint(OTHERS);
         };
-        if header.chunk.length > 1 {
+        if header.chunk != Chunk::default() {
             return Err(anyhow!("{name} acts for several steps at a time")).hint(OTHERS);
         }
         let tensors = &mut read_tensors(&file)?;

@@ -1,6 +1,7 @@
 //! Tests of the order of practice and gradient steps.
 
 use std::sync::atomic::AtomicBool;
+use std::sync::mpsc;
 
 use quad_protocol::{Episode, Exploration, Hash, Name, practice_seed};
 use quad_run::config::{Experiment, Online};
@@ -42,12 +43,13 @@ fn episode(rows: usize) -> Episode {
 
 /// Practice whose first `recorded` episodes have come.
 fn practice(recorded: usize) -> (Practice, Inbox) {
-    let (inbox, registry) = (Inbox::default(), prometheus::Registry::new());
-    let metrics = PracticeMetrics::new(&registry).unwrap();
-    let practice =
-        Practice::new(&experiment(), Arc::new(transitions()), inbox.clone(), metrics).unwrap();
-    (0..).zip(&LENGTHS[..recorded]).for_each(|(number, rows)| inbox.add(number, episode(*rows)));
-    (practice, inbox)
+    let metrics = PracticeMetrics::new(&prometheus::Registry::new()).unwrap();
+    let (inbox, episodes) = mpsc::channel();
+    for (number, rows) in (0..).zip(&LENGTHS[..recorded]) {
+        inbox.send((number, episode(*rows))).unwrap();
+    }
+    let transitions = Arc::new(transitions());
+    (Practice::new(&experiment(), transitions, episodes, metrics).unwrap(), inbox)
 }
 
 /// An opening, or the batch of a gradient step.
@@ -63,7 +65,8 @@ fn happens(practice: &mut Practice, inbox: &Inbox, from: u64) -> Vec<Happened> {
     for step in from..experiment().total_steps() {
         loop {
             for opening in practice.take_openings() {
-                inbox.add(opening.episode, episode(LENGTHS[opening.episode as usize]));
+                let number = opening.episode;
+                inbox.send((number, episode(LENGTHS[number as usize]))).unwrap();
                 all.push(Happened::Opened(opening));
             }
             if !practice.is_due(step) {

@@ -53,7 +53,9 @@ def model(policy: Policy, **changes: Any) -> ModelProto:
     single = {"candidates": 1, "rule": "best", "guidance": 0.0}  # Of a policy without critics.
     choice = {**(policy.choice or single), **{name: change for name, change in changes.items() if change is not None}}
     file, graph, a = File(policy.to_bytes()), Graph(), policy.action_size
-    observations = to_network(file, graph.input("observations", (policy.observation_size,)))
+    chunk, o = file.chunk or {}, policy.observation_size
+    seen = chunk.get("history", 1)
+    observations = to_network(file, graph.input("observations", (seen, o) if seen > 1 else (o,))).reshape(-1, seen * o)
     inputs = {name: graph.input(name, array.shape[1:]) for name, array in drawn.items()}
     if file.kind == "gaussian":
         return graph.model({"actions": (to_user(file, gaussian.mode(file, observations)), (a,))}, repr(policy))
@@ -72,7 +74,7 @@ def model(policy: Policy, **changes: Any) -> ModelProto:
         values, scores = critics(file, choice, observations, actions)
         beside["values"] = values, (candidates,)
         actions = choose(actions, scores, rule, candidates, inputs.get("uniform"))
-    shape = (file.chunk["length"], a) if file.chunk else (a,)
-    metadata = {"chunk": file.chunk["length"], "replan": file.chunk["replan"]} if file.chunk else {}
+    shape = (chunk["length"], a) if chunk else (a,)
+    metadata = {"chunk": chunk["length"], "replan": chunk["replan"]} if chunk else {}
     taken = to_user(file, actions.reshape(-1, *shape))
     return graph.model({"actions": (taken, shape), **beside}, repr(policy), **metadata)

@@ -10,7 +10,7 @@ use super::*;
 use crate::fixtures::config;
 
 /// A practice episode of two steps.
-fn episode(seed: u64) -> Episode {
+pub(crate) fn episode(seed: u64) -> Episode {
     Episode {
         score: EpisodeScore { seed, episode_return: 3.0, length: 2, score: 3.0 },
         observations: vec![0.0, 1.0, 2.0],

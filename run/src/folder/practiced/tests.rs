@@ -1,23 +1,15 @@
 //! Tests of what `learner verify` says of experience.
 
-use quad_protocol::{Episode, EpisodeScore, Name, encode};
+use quad_protocol::{Episode, Name, encode};
 
 use super::*;
 use crate::config::resolve;
 use crate::fixtures::config;
+use crate::folder::experience::tests::episode;
 
 /// The first practice episodes of a run of seed 0, of two steps each.
 fn episodes() -> [Episode; 2] {
-    [0, 1].map(|number| {
-        let (seed, precision) = (practice_seed(0, number), Name::new("f32-avx2").unwrap());
-        Episode {
-            score: EpisodeScore { seed, episode_return: 3.0, length: 2, score: 3.0 },
-            observations: vec![0.0, 1.0, 2.0],
-            actions: vec![0.5, -0.5],
-            rewards: vec![1.0, 2.0],
-            ..Episode::new(10, Hash::of(b"weights"), precision, seed)
-        }
-    })
+    [0, 1].map(|number| episode(practice_seed(0, number)))
 }
 
 /// Findings on a run of four environment steps with these episodes.
