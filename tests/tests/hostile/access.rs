@@ -8,7 +8,7 @@ use quad_tests::PATIENCE;
 use quad_tests::certificates::{Certificates, come_in, connect};
 use quad_tests::made_up::name;
 use quad_tests::router::protected_router;
-use quad_tests::setting::{ENDLESS, IDLE, SHORT};
+use quad_tests::setting::{ENDLESS, IDLE, SHORT, Setting};
 use quad_tests::system::Scratch;
 use tokio::time::timeout;
 use zenoh::sample::SampleKind;
@@ -20,14 +20,15 @@ pub const HOST: &str = "127.0.0.1";
 const BRIEF: u64 = 20;
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_run_completes_through_the_shipped_router() {
+async fn a_run_with_practice_completes_through_the_shipped_router() {
     let Some(certificates) = Certificates::make() else { return };
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let scratch = Scratch::new();
     let [ours, theirs] = ["learner", "evaluator"].map(|role| certificates.argument(role));
     let connect = ["--connect", &endpoint, "--certificates"];
     let _evaluator = scratch.evaluator_with("trusted", &[&connect[..], &[&theirs]].concat());
-    let mut learner = scratch.learner_with("run", SHORT, &[&connect[..], &[&ours]].concat());
+    let setting = Setting { eval_interval: 250, online_steps: 300, ..SHORT };
+    let mut learner = scratch.learner_with("run", setting, &[&connect[..], &[&ours]].concat());
     learner.assert_completes(PATIENCE);
 }
 

@@ -128,15 +128,17 @@ async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
         assert_eq!(answers(&other, "quad/run/jobs").await, 0, "{impostor:?}");
     }
     let mut held = Vec::new();
-    for key in ["jobs", "scores", "weights/*"] {
+    for key in ["jobs", "scores", "experience", "weights/*"] {
         held.push(answer(&learner, &format!("quad/run/{key}")).await);
     }
     for (session, key, expected) in [
         (&evaluator, "quad/run/jobs", 1),
         (&evaluator, "quad/run/scores", 1),
+        (&evaluator, "quad/run/experience", 1),
         (&evaluator, "quad/run/weights/7", 1),
         (&monitor, "quad/run/jobs", 0),
         (&monitor, "quad/run/scores", 0),
+        (&monitor, "quad/run/experience", 0),
         (&monitor, "quad/run/weights/7", 1),
     ] {
         let deadline = Instant::now() + PATIENCE;
