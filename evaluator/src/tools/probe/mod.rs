@@ -21,8 +21,10 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use candle_core::{DType, Device, Tensor};
+use quad_dataset::DatasetError;
 use quad_protocol::episode_seeds;
 use quad_run::results::statistics::mean;
+use quad_runtime::Hint;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -52,6 +54,7 @@ pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
 struct Probe<'a> {
     args: &'a ProbeArgs,
     probed: Probed,
+    recorded: Option<Recorded>,
     states: Vec<Arc<State>>,
     /// `[n, o]`.
     observations: Tensor,
@@ -63,6 +66,7 @@ struct Probe<'a> {
 impl<'a> Probe<'a> {
     fn new(args: &'a ProbeArgs) -> anyhow::Result<Self> {
         let probed = Probed::read(args)?;
+        let recorded = recorded(args, &probed)?;
         info!("visiting {} states", args.states);
         let seeds = episode_seeds(args.seed, args.step, args.states);
         let visit = |seed: &u64| State::visit(&probed.subject, *seed).map(Arc::new);
@@ -74,7 +78,7 @@ impl<'a> Probe<'a> {
         let mut random = ChaCha8Rng::seed_from_u64(args.seed);
         let of_state = |_| Vec::from_iter((0..args.rollouts).map(|_| random.random()));
         let seeds = (0..states.len()).map(of_state).collect();
-        Ok(Self { args, probed, states, observations, seeds, random })
+        Ok(Self { args, probed, recorded, states, observations, seeds, random })
     }
 
     fn returns(&self, queries: Vec<Query>) -> anyhow::Result<Vec<f64>> {
@@ -118,7 +122,7 @@ impl<'a> Probe<'a> {
         let half = self.args.rollouts as usize / 2;
         let returns = returns.chunks_exact(self.args.rollouts as usize);
         let halves = Vec::from_iter(returns.map(|all| [mean(&all[..half]), mean(&all[half..])]));
-        let recorded = self.recorded()?;
+        let recorded = self.recorded.as_ref();
         let of_state = |(index, state): (usize, &Arc<State>)| {
             let rows = index * CANDIDATES..(index + 1) * CANDIDATES;
             let values = Vec::from_iter(values.iter().map(|values| values[rows.clone()].to_vec()));
@@ -126,22 +130,22 @@ impl<'a> Probe<'a> {
             Candidates {
                 values: rules(&values, self.args.kappa),
                 halves: [0, 1].map(|which| halves.iter().map(|of| of[which]).collect()),
-                distances: recorded.as_ref().map(|of| of.distances(&state.observation, actions)),
+                distances: recorded.map(|of| of.distances(&state.observation, actions)),
             }
         };
         let candidates = Vec::from_iter(self.states.iter().enumerate().map(of_state));
         Ok(choosing(&candidates, self.args.kappa))
     }
+}
 
-    /// The data, if it is there.
-    fn recorded(&self) -> anyhow::Result<Option<Recorded>> {
-        let path = self.args.dataset.as_ref().unwrap_or(&self.probed.dataset);
-        let name = path.display();
-        if self.args.dataset.is_none() && !path.exists() {
-            warn!("{name} is not there, so no distance from the data is measured");
-            return Ok(None);
-        }
-        let recorded = Recorded::read(path, self.probed.subject.spec);
-        recorded.map(Some).with_context(|| format!("cannot use {name}"))
+/// The data, if it is there.
+fn recorded(args: &ProbeArgs, probed: &Probed) -> anyhow::Result<Option<Recorded>> {
+    let path = args.dataset.as_ref().unwrap_or(&probed.dataset);
+    let name = path.display();
+    if args.dataset.is_none() && !path.exists() {
+        warn!("{name} is not there, so no distance from the data is measured");
+        return Ok(None);
     }
+    let recorded = Recorded::read(path, probed.subject.spec).hint_of(DatasetError::hint);
+    recorded.map(Some).with_context(|| format!("cannot use {name}"))
 }
