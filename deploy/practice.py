@@ -20,6 +20,8 @@ scores = defaultdict(list)  # by method, environment and column: a number for ea
 for file in sorted(Path(sys.argv[1]).glob("*/report.json")):
     environment, method = re.fullmatch(r"(\w+)-demo-\w+-(.+)-seed\d+", file.parent.name).groups()
     report = json.loads(file.read_text())
+    if report["episodes_missing"]:
+        continue
     before = [it["score"]["mean"] for it in report["evaluations"] if it.get("environment_steps") == 0]
     if before:
         scores[method, environment, "before"].append(statistics.fmean(before[-3:]))

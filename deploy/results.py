@@ -28,7 +28,7 @@ def row(*cells):
 def chosen(choice):
     """How a policy chose, in a word or two."""
     if choice is None:
-        return "mean"
+        return "none"
     return str(choice["candidates"])
 
 

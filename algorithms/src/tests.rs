@@ -365,6 +365,11 @@ fn contradictory_hyper_parameters_are_refused() {
         ("diffuser", toml::toml! { replan_every = 1000 }, "at most the horizon"),
         ("quad", toml::toml! { eta.maximum = -1.0 }, "at least 0"),
         ("quad", toml::toml! { eta.initial = 1e9 }, "between eta.minimum and eta.maximum"),
+        (
+            "quad",
+            toml::toml! { guidance = "none" guidance_at = "denoised" },
+            "agent.guidance_at is denoised, but must be absent",
+        ),
         ("quad", toml::toml! { chunk = 0 }, "a whole number from 1"),
         ("idql", toml::toml! { chunk = 3 replan = 4 }, "agent.replan is 4, but must be at most"),
         ("fql", toml::toml! { replan = 2 }, "at most agent.chunk"),

@@ -35,7 +35,7 @@ pub enum PolicyError {
     NoGuidance,
     #[error("this policy draws no candidates, so there is nothing to choose among")]
     NoCandidates,
-    #[error("this policy has no critics, which would value a single action")]
+    #[error("this policy has no critics, which would value its actions")]
     NoCritics,
     #[error("the critics of this policy value chunks of {0} actions, not a single one")]
     ValuesChunks(usize),
@@ -62,7 +62,10 @@ impl PolicyError {
                 "score it without --candidates, --rule, --aggregate and --guidance"
             }
             Self::ValuesChunks(_) => "the samples of a policy come with the values of their chunks",
-            Self::Range { .. } | Self::Temperature(_) | Self::Guidance(_) => {
+            Self::Temperature(_) | Self::Guidance(_) => {
+                "give another number; a file with such a number is damaged"
+            }
+            Self::Range { .. } => {
                 "give a smaller number above 0; a file with such a number is damaged"
             }
             _ => {

@@ -288,7 +288,7 @@ impl PyPolicy {
     }
 
     /// The choice among candidates: a dictionary of `act`'s arguments candidates, rule, aggregate and
-    /// guidance; None if the policy draws nothing.
+    /// guidance; None if the policy has no critics.
     #[getter]
     fn choice<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
         self.policy.choice().map(|choice| as_dictionary(py, choice)).transpose()

@@ -21,9 +21,11 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use candle_core::{Device, Tensor};
+use quad_dataset::DatasetError;
 use quad_policy::Aggregate;
 use quad_protocol::episode_seeds;
 use quad_run::results::statistics::mean;
+use quad_runtime::Hint;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -53,6 +55,7 @@ pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
 struct Probe<'a> {
     args: &'a ProbeArgs,
     probed: Probed,
+    recorded: Option<Recorded>,
     states: Vec<Arc<State>>,
     /// `[n, o]`.
     observations: Tensor,
@@ -64,6 +67,7 @@ struct Probe<'a> {
 impl<'a> Probe<'a> {
     fn new(args: &'a ProbeArgs) -> anyhow::Result<Self> {
         let probed = Probed::read(args)?;
+        let recorded = recorded(args, &probed)?;
         info!("visiting {} states", args.states);
         let seeds = episode_seeds(args.seed, args.step, args.states);
         let visit = |seed: &u64| State::visit(&probed.subject, *seed).map(Arc::new);
@@ -75,7 +79,7 @@ impl<'a> Probe<'a> {
         let mut random = ChaCha8Rng::seed_from_u64(args.seed);
         let of_state = |_| Vec::from_iter((0..args.rollouts).map(|_| random.random()));
         let seeds = (0..states.len()).map(of_state).collect();
-        Ok(Self { args, probed, states, observations, seeds, random })
+        Ok(Self { args, probed, recorded, states, observations, seeds, random })
     }
 
     fn mechanism(&mut self) -> anyhow::Result<[Grid; 3]> {
@@ -115,7 +119,6 @@ impl<'a> Probe<'a> {
             let of_actions = returns.chunks_exact(rollouts);
             Vec::from_iter(of_actions.map(|returns| mean(&returns[half.clone()])))
         });
-        let recorded = self.recorded()?;
         let of_state = |(index, state): (usize, &Arc<State>)| {
             let rows = index * CANDIDATES..(index + 1) * CANDIDATES;
             let of_rows = |all: &Vec<f64>| all[rows.clone()].to_vec();
@@ -123,22 +126,22 @@ impl<'a> Probe<'a> {
             Candidates {
                 values: values.each_ref().map(of_rows),
                 halves: halves.each_ref().map(of_rows),
-                distances: recorded.as_ref().map(|of| of.distances(&state.observation, actions)),
+                distances: self.recorded.as_ref().map(|of| of.distances(&state.observation, actions)),
             }
         };
         let candidates = Vec::from_iter(self.states.iter().enumerate().map(of_state));
         Ok(choosing(&candidates, self.args.kappa))
     }
+}
 
-    /// The data, if it is there.
-    fn recorded(&self) -> anyhow::Result<Option<Recorded>> {
-        let path = self.args.dataset.as_ref().unwrap_or(&self.probed.dataset);
-        let name = path.display();
-        if self.args.dataset.is_none() && !path.exists() {
-            warn!("{name} is not there, so no distance from the data is measured");
-            return Ok(None);
-        }
-        let recorded = Recorded::read(path, self.probed.subject.spec);
-        recorded.map(Some).with_context(|| format!("cannot use {name}"))
+/// The data, if it is there.
+fn recorded(args: &ProbeArgs, probed: &Probed) -> anyhow::Result<Option<Recorded>> {
+    let path = args.dataset.as_ref().unwrap_or(&probed.dataset);
+    let name = path.display();
+    if args.dataset.is_none() && !path.exists() {
+        warn!("{name} is not there, so no distance from the data is measured");
+        return Ok(None);
     }
+    let recorded = Recorded::read(path, probed.subject.spec).hint_of(DatasetError::hint);
+    recorded.map(Some).with_context(|| format!("cannot use {name}"))
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, Transitions};
+use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, Transitions, benchmarks};
 
 /// Number of most similar recorded states.
 const SIMILAR: usize = 32;
@@ -15,7 +15,8 @@ pub struct Recorded {
 
 impl Recorded {
     pub fn read(path: &Path, spec: &'static EnvironmentSpec) -> Result<Self, DatasetError> {
-        let options = ReadOptions { environment: Some(spec), ..ReadOptions::default() };
+        let task = benchmarks::relabeling(&spec.name);
+        let options = ReadOptions { environment: Some(spec), task, ..ReadOptions::default() };
         let (all, mut transitions) = (Transitions::read(path, &options)?, Batch::default());
         all.gather(&Vec::from_iter(0..all.len() as u32), &mut transitions);
         let scale = all.standard_units().observations.map_or(Vec::new(), |units| units.scale);
@@ -48,6 +49,8 @@ impl Recorded {
 
 #[cfg(test)]
 mod tests {
+    use quad_dataset::{Arrays, Names, environment, write_own};
+
     use super::*;
 
     /// The second dimension varies ten times as much; the third is constant.
@@ -61,5 +64,27 @@ mod tests {
         let recorded = Recorded { transitions, scale: vec![1.0, 1e4, 0.0] };
         let distances = recorded.distances(&[0.0, 0.0, 9.0], &[vec![34.0, 4.0], vec![2.5, 0.0]]);
         assert_eq!(distances, [5.0, 0.5]);
+    }
+
+    /// OGBench's files have no rewards, which follow from the task.
+    #[test]
+    fn rows_of_ogbenchs_mazes_are_labeled_by_their_task() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("maze.hdf5");
+        let spec = environment::find("pointmaze-medium-singletask-v0").unwrap();
+        let [x, y] = spec.maze.unwrap().goal.map(|x| x as f32);
+        let arrays = Arrays {
+            observation_dim: 2,
+            action_dim: 2,
+            observations: vec![x, y, 0.0, 0.0],
+            actions: vec![0.5; 4],
+            rewards: vec![0.0; 2],
+            next_observations: vec![0.0; 4],
+            terminals: vec![false; 2],
+            timeouts: vec![false, true],
+        };
+        write_own(&path, arrays, Names::default()).unwrap();
+        let recorded = Recorded::read(&path, spec).unwrap();
+        assert_eq!(recorded.transitions.masks, [0.0, 1.0]);
     }
 }
