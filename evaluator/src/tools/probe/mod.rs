@@ -119,6 +119,7 @@ impl<'a> Probe<'a> {
             let of_actions = returns.chunks_exact(rollouts);
             Vec::from_iter(of_actions.map(|returns| mean(&returns[half.clone()])))
         });
+        let recorded = self.recorded.as_ref();
         let of_state = |(index, state): (usize, &Arc<State>)| {
             let rows = index * CANDIDATES..(index + 1) * CANDIDATES;
             let of_rows = |all: &Vec<f64>| all[rows.clone()].to_vec();
@@ -126,7 +127,7 @@ impl<'a> Probe<'a> {
             Candidates {
                 values: values.each_ref().map(of_rows),
                 halves: halves.each_ref().map(of_rows),
-                distances: self.recorded.as_ref().map(|of| of.distances(&state.observation, actions)),
+                distances: recorded.map(|of| of.distances(&state.observation, actions)),
             }
         };
         let candidates = Vec::from_iter(self.states.iter().enumerate().map(of_state));
