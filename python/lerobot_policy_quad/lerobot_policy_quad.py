@@ -39,7 +39,7 @@ class QuadConfig(PreTrainedConfig):
 
 
 class QuadPolicy(PreTrainedPolicy):
-    """Acts one step at a time. Each row of a batch is an episode; torch's global generator gives its seed."""
+    """Acts a step or a chunk at a time. Each row of a batch is an episode; torch's global generator gives its seed."""
 
     config_class, name = QuadConfig, "quad"
     forward = get_optim_params = _untrainable
@@ -84,8 +84,7 @@ class QuadPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         self._episodes = None
 
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, torch.Tensor], **_) -> torch.Tensor:
+    def _rows(self, batch: dict[str, torch.Tensor]) -> np.ndarray:
         parts = []
         for feature, names in self._seen.items():
             if feature not in batch:
@@ -96,11 +95,23 @@ class QuadPolicy(PreTrainedPolicy):
             parts.append(np.asarray(numbers, np.float32).reshape(len(numbers), -1))
             if parts[-1].shape[1] != len(names):
                 raise ValueError(f"{feature} has {parts[-1].shape[1]} numbers, not {len(names)}: {', '.join(names)}")
-        rows = np.concatenate(parts, axis=1)[:, self._observations]
+        return np.concatenate(parts, axis=1)[:, self._observations]
+
+    def _begin(self, count: int) -> quad_rl.Episodes:
+        seed = int(torch.randint(2**31, ()))
+        return self.policy.begin([*range(seed, seed + count)])
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, torch.Tensor], **_) -> torch.Tensor:
+        rows = self._rows(batch)
         if self._episodes is None or len(self._episodes) != len(rows):
-            seed = int(torch.randint(2**31, ()))
-            self._episodes = self.policy.begin([*range(seed, seed + len(rows))])
+            self._episodes = self._begin(len(rows))
         return torch.from_numpy(self._episodes.act(rows)[:, self._actions])
 
+    @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, torch.Tensor], **_) -> torch.Tensor:
-        return self.select_action(batch)[:, None]
+        """The actions of a new chunk that are executed, [n, replan, action_size], whatever `select_action` has left of its own."""
+        rows = self._rows(batch)
+        episodes = self._begin(len(rows))  # The first call draws the chunk that the others execute.
+        actions = [episodes.act(rows)[:, self._actions] for _ in range(self.policy.about["chunk"]["replan"])]
+        return torch.from_numpy(np.stack(actions, axis=1))

@@ -52,10 +52,10 @@ def test_its_own_class_sees_the_same_frames(tmp_path):
     assert np.array_equal(rows.next_observations[~rows.terminals], np.roll(seen, -1, 0)[kept][~rows.terminals]) and len(rows.rewards) == 41
 
 
-def exported(folder, dataset):
+def exported(folder, dataset, *more):
     """A policy's folder, and its snapshot."""
     dataset.save(folder / "data.hdf5")
-    options = ["--task", "own-data", "--env", "mine", "--steps", "2", "--normalize", "actions,observations"]
+    options = ["--task", "own-data", "--env", "mine", "--steps", "2", "--normalize", "actions,observations", *more]
     snapshot = train(folder / "run", folder / "data.hdf5", *options)
     export_lerobot(snapshot, folder / "policy")
     return folder / "policy", snapshot
@@ -95,6 +95,30 @@ def test_a_policy_acts_by_the_names_of_columns(tmp_path):
     }.items():
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_a_chunk_is_new_and_has_the_actions_that_are_executed(tmp_path):
+    quad, torch = pytest.importorskip("lerobot_policy_quad"), pytest.importorskip("torch")
+    rng, seen, done = np.random.default_rng(0), ["observation.state.a", "observation.state.b"], ["action.x", "action.y"]
+    table = {name: rng.uniform(-1, 1, 200) for name in [*seen, *done]} | {"run": np.arange(200) // 50}
+    dataset = Dataset.from_frame(table, observations=seen, actions=done, reward="run", episode="run")
+    folder, snapshot = exported(tmp_path, dataset, "--agent", "chunk=3", "--agent", "replan=2")
+    meta = SimpleNamespace(features={"observation.state": {"names": ["a", "b"]}, "action": {"names": ["y", "x"]}})
+    config = quad.PreTrainedConfig.from_pretrained(folder)
+    policy = quad.QuadPolicy.from_pretrained(folder, config=config, dataset_meta=meta)
+    rows = rng.normal(size=(4, 2)).astype(np.float32)
+
+    def played(seed):
+        episodes = Policy.load(snapshot).begin([*range(seed, seed + 4)])
+        return np.stack([episodes.act(rows)[:, ::-1] for _ in range(2)], axis=1)
+
+    torch.manual_seed(0)
+    one, other = (int(torch.randint(2**31, ())) for _ in range(2))
+    torch.manual_seed(0)
+    batch = {"observation.state": torch.from_numpy(rows)}
+    first, chunk, second = policy.select_action(batch), policy.predict_action_chunk(batch), policy.select_action(batch)
+    assert np.array_equal(np.stack([first, second], axis=1), played(one)), "a chunk leaves other episodes as they are"
+    assert chunk.shape == (4, 2, 2) and np.array_equal(chunk, played(other))
 
 
 def test_lerobot_eval_takes_the_path_of_a_policy(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import signal
 import subprocess
 import sys
 import tomllib
@@ -228,6 +229,42 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys, monkeypatch):
     }.items():
         status, said = convert(*words)
         assert status == 1 and said.startswith("quad-convert: ") and message in said, said
+
+
+def test_one_command_trains_on_a_log_without_rewards_and_goes_on(tmp_path, monkeypatch, capsys):
+    log = table(steps=60).drop(columns="gain").rename(columns={"x": "q1", "v": "q2", "torque": "u1"})
+    log.to_csv(tmp_path / "log.csv", index=False)
+    words = ["log.csv", "--observations", "q2", "q*", "--actions", "u*", "--episode", "run", "--reward", "none", "--out", "robot.hdf5",
+             "--train", "--steps", "100000000", "--set", "batch_size=32", "--agent", "actor={hidden=[16]}"]
+    monkeypatch.chdir(tmp_path)
+
+    def interrupted():
+        """What it says until a Ctrl-C ends it."""
+        process = subprocess.Popen([Path(sys.executable).parent / "quad-convert", *words], stderr=subprocess.PIPE, text=True)
+        said = [process.stderr.readline()]
+        while "its metrics at" not in said[-1]:
+            assert said[-1], said
+            said.append(process.stderr.readline())
+        process.send_signal(signal.SIGINT)
+        said.append(process.communicate(timeout=600)[1])
+        assert process.returncode == 75, said
+        return "".join(said)
+
+    said = interrupted()
+    assert "diffusion-policy; seed 0" in said and "`--algorithm diffusion-policy` clones without rewards" in said
+    assert "runs/own-data-diffusion-policy-seed0 continues after step " in interrupted()
+    with h5py.File(tmp_path / "robot.hdf5") as file:
+        assert list(file.attrs["observation_names"]) == ["q2", "q1"] and list(file.attrs["action_names"]) == ["u1"]
+        assert len(file["rewards"]) == 177 and not np.any(file["rewards"])
+    config = tomllib.loads((tmp_path / "runs/own-data-diffusion-policy-seed0/config.toml").read_text())
+    assert config["experiment"]["normalize"] == ["actions", "observations"]
+
+    own = ["--task", "mine", "--normalize=rewards", "--algorithm", "iql"]
+    assert _convert._training(own, "none") == own
+    (tmp_path / "robot.hdf5").unlink()
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    assert _convert.main(words) == 1 and not (tmp_path / "robot.hdf5").exists()
+    assert capsys.readouterr().err.startswith("quad-convert: there is no program `learner` in ")
 
 
 MISSING = {

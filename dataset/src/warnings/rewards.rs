@@ -28,7 +28,7 @@ pub(super) fn alike(recording: &Recording) -> Option<String> {
     let is_finite = rewards().all(f32::is_finite);
     let but = match recording.terminals.contains(&true) && first != 0.0 {
         true => " but how soon an episode terminates",
-        false => "",
+        false => "; `--algorithm diffusion-policy` clones without rewards",
     };
     (is_finite && most - least <= ALIKE * most.abs().max(least.abs())).then(|| {
         format!(

@@ -1,20 +1,22 @@
-"""`quad-convert`: other programs' data as a file that `learner train --dataset` takes."""
+"""`quad-convert`: other programs' data as a file that `learner train --dataset` takes, or trained on at once."""
 
 from __future__ import annotations
 
 import argparse
 import inspect
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from quad_rl._dataset import Dataset
+from quad_rl._train import learner
 
 _OPTIONS = {
     "action": "LeRobot: the feature with the actions (action)",
-    "reward": "success-at-end, step-cost, or a column",
+    "reward": "success-at-end, step-cost, a column, or none, for data to clone",
     "terminate": "LeRobot, robomimic: success, never, or a column",
     "terminal": "tables: success, never, or a column",
     "episode": "tables: the column that is the same in all rows of an episode",
@@ -34,25 +36,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("source", help="a folder of LeRobot or Minari, a file of robomimic, a table, minari:ID, ogbench:NAME")
     parser.add_argument("--out", required=True, metavar="FILE", help="the file to write, such as my-robot.hdf5")
-    parser.add_argument("--observations", nargs="+", metavar="COLUMN", help="observations, in this order")
+    parser.add_argument("--observations", nargs="+", metavar="COLUMN", help="observations, in this order; tables: also 'q*'")
     parser.add_argument("--actions", nargs="+", metavar="COLUMN", help="actions (tables, robomimic)")
     parser.add_argument("--success", nargs="+", help="all, a column, or the successful episodes' numbers or names")
     parser.add_argument("--continuous", action="store_true", default=None, help="integer actions are continuous: amounts, not choices")
     for name, text in _OPTIONS.items():
         parser.add_argument(f"--{name}", help=text)
+    parser.add_argument("--train", nargs=argparse.REMAINDER, help="then run learner train with all that follows")
     given = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
-    source, out = given.pop("source"), given.pop("out")
+    source, out, training = given.pop("source"), given.pop("out"), given.pop("train", None)
     try:
+        program = None if training is None else learner()
         dataset = _read(source, given)
         dataset.save(out)
-    except (ValueError, ImportError, OSError) as error:
+    except (ValueError, ImportError, OSError, RuntimeError) as error:
         print(f"quad-convert: {error}", file=sys.stderr)
         return 1
     except Exception as error:  # A source's library may raise anything, such as httpx's errors without a network.
         print(f"quad-convert: {source} cannot be read: {type(error).__name__}: {error}", file=sys.stderr)
         return 1
-    _print(f"{dataset}\n\nwritten to {out}: learner train --task own-data --env my-robot --dataset {out} --normalize actions,observations")
+    command = ["learner", "train", "--dataset", out, *_training(training or [], given.get("reward"))]
+    _print(f"{dataset}\n\nwritten to {out}: {shlex.join(command)}")
+    if program is not None:
+        os.execv(program, command)  # Ctrl-C and the exit status are the learner's.
     return 0
+
+
+def _training(given: list[str], reward: str | None) -> list[str]:
+    """These arguments of `learner train`, and the usual ones of other names."""
+    usual = {"--task": "own-data", "--normalize": "actions,observations"}
+    if reward == "none":
+        usual["--algorithm"] = "diffusion-policy"
+    named = {word.partition("=")[0] for word in given}
+    return [*(word for pair in usual.items() if pair[0] not in named for word in pair), *given]
 
 
 def _print(text: str) -> None:

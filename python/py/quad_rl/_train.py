@@ -178,14 +178,18 @@ class _Display:
         self._bar = text
 
 
-def _start(*arguments: str) -> subprocess.Popen[str]:
-    """Starts the learner beside this Python, otherwise the one on the PATH."""
+def learner() -> str:
+    """The learner beside this Python, otherwise the one on the PATH. Raises RuntimeError if there is none."""
     path = os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", "")])
     program = shutil.which("learner", path=path)
     if program is None:
         raise RuntimeError(f"there is no program `learner` in {path}\nhint: the wheel of deploy/wheel.sh contains it")
+    return program
+
+
+def _start(*arguments: str) -> subprocess.Popen[str]:
     return start(
-        [program, *arguments],
+        [learner(), *arguments],
         ends_with_thread=True,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

@@ -21,7 +21,8 @@ fn rewards_that_are_all_alike() {
         format!("array `rewards`: all are alike (1), {alike} but how soon an episode terminates");
     assert_eq!(warnings(&cart, true), [expected]);
     cart.rewards.fill(0.0);
-    let expected = format!("array `rewards`: all are alike (0), {alike}");
+    let remedy = "; `--algorithm diffusion-policy` clones without rewards";
+    let expected = format!("array `rewards`: all are alike (0), {alike}{remedy}");
     assert_eq!(warnings(&cart, false), [expected]);
     cart.rewards[70] = 1e-1;
     assert_eq!(warnings(&cart, false), [""; 0]);

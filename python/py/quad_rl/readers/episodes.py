@@ -168,14 +168,14 @@ def _suspect_going_on(log: Log, rule: str, flags: list[NDArray[np.bool_]]) -> No
 
 def _reward(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
     rule = rule or log.reward
-    ways = '"success-at-end" (1 there), "step-cost" (-1 a step, 0 there), a column, or a function of the episode'
+    ways = '"success-at-end" (1 there), "step-cost" (-1 a step, 0 there), "none" (to clone), a column, or a function of the episode'
     if not rule:
         raise ValueError(f"no rewards were recorded, and nothing says what is rewarded\nhint: reward={ways}; {_HOW}")
     if rule in _OF_SUCCESS:
         if won is None:
             raise ValueError(f"reward={rule!r} needs to know which episodes are successes\nhint: {_HOW}")
         log.notes.append(f"{sum(won)} of {len(won)} episodes are successes")
-    elif isinstance(rule, str):
+    elif isinstance(rule, str) and rule != "none":
         _check(log, rule)
     return rule
 
@@ -219,6 +219,8 @@ def _flags(rule: Rule, episode: Episode, has_won: bool, steps: int) -> NDArray[A
 def _rewards(rule: Rule, episode: Episode, has_won: bool, steps: int) -> Any:
     if callable(rule):
         return _call(rule, episode)
+    if rule == "none":
+        return np.zeros(steps)
     if rule not in _OF_SUCCESS:
         return episode.columns[str(rule)]
     step, end = _OF_SUCCESS[str(rule)]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
 from collections.abc import Callable, Sequence
+from itertools import chain
 from os import PathLike
 from typing import Any
 
@@ -35,9 +37,10 @@ def from_frame(
     frame: a data frame (pandas, Polars, a pyarrow Table, a dictionary of arrays), or the path of a CSV or Parquet file, which
         needs pyarrow.
     observations, actions: the columns that are seen and done, in this order; one may hold lists. They are called so in the
-        file and in the policy.
+        file and in the policy. "q*" stands for all columns of such names, in the table's order.
     reward: a column; "success-at-end", which is 1 at the last step of a success and else 0; "step-cost", which is -1, and 0
-        there; or a function of the episode, a dictionary of columns, that gives a number for each step.
+        there; "none", which is 0, for data to clone; or a function of the episode, a dictionary of columns, that gives a number
+        for each step.
     episode: the column whose rows of the same value are an episode.
     terminal: where the task itself was over after the step: a column of flags, "success" (the last step of a success), "never",
         or a function of the episode. By default "success" if that is known.
@@ -57,6 +60,7 @@ def from_frame(
     if not {*observations, *actions, episode} & {*there} and any(map(_is_number, there)):
         hint = "hint: write one above them, such as " + ",".join([*observations, *actions, episode])
         raise ValueError(f"{place} has no line of names: its first line is {', '.join(there)}\n{hint}")
+    observations, actions = _matching(observations, there), _matching(actions, there)
     words = columns_of(observations, actions, reward, terminal, success)
     columns = {name: _column(table, name, place) for name in there if words is None or name in words or name == episode}
     if episode not in columns:
@@ -92,6 +96,14 @@ def _episodes(ids: NDArray[Any], column: str, place: str, apart: str | None) -> 
         return list(numbers), of, [f"{those}; they count in the table's order"]
     names = [listed[row] for row in np.flatnonzero(begins)]
     return names, np.cumsum(begins) - 1, [f"{len(torn)} of {len(numbers)} names are those of several episodes: {len(names)} in all"]
+
+
+def _matching(names: Sequence[str], there: list[str]) -> Sequence[str]:
+    """The columns of these names or patterns, each once; what matches none stays, to be refused."""
+    if isinstance(names, str):
+        return names
+    found = ([name] if name in there else fnmatch.filter(there, name) or [name] for name in names)
+    return [*dict.fromkeys(chain.from_iterable(found))]
 
 
 def _is_number(name: str) -> bool:
