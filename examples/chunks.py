@@ -13,15 +13,21 @@ class Ahead:
     """Acts as `policy.begin(seed)`, but never waits for a chunk: ValueError if the next one is late."""
 
     def __init__(self, policy, seed=0):
-        self.episode, self.replan = policy.begin(seed), policy.about["chunk"]["replan"]
+        self.policy, self.seed, self.replan = policy, seed, policy.about["chunk"]["replan"]
         self.pool, self.coming, self.queue, self.dropped = ThreadPoolExecutor(1), None, deque(), 0
+        self.seen = deque(maxlen=policy.about["chunk"]["history"])
 
-    def chunk(self, seen):
-        return [self.episode.act(seen) for _ in range(self.replan)]  # The first draws the chunk that the others execute.
+    def chunk(self, seed, seen):
+        episode = self.policy.begin(seed)
+        for before in seen[:-1]:
+            episode.observe(before)
+        return [episode.act(seen[-1]) for _ in range(self.replan)]  # The first draws the chunk that the others execute.
 
     def act(self, seen):
+        self.seen.append(seen)
         if self.coming is None and len(self.queue) <= self.replan // 2:
-            self.coming, self.since = self.pool.submit(self.chunk, seen), 0
+            self.coming, self.since = self.pool.submit(self.chunk, self.seed, [*self.seen]), 0
+            self.seed += 1
         if self.coming and self.coming.done():
             coming, self.coming = self.coming, None
             self.queue = deque(coming.result()[self.since :])  # Without those of the steps since it was begun.

@@ -60,19 +60,6 @@ pub(crate) fn chunked(policy: Box<dyn Policy>, chunk: Chunk) -> Result<Box<dyn P
 }
 
 impl Chunked {
-    /// Adds an observation to what each state has seen.
-    fn see(&self, observations: &[f32], states: &mut [EpisodeState]) {
-        for (observation, state) in observations.chunks(self.observation_dim()).zip(states) {
-            match state.seen.is_empty() {
-                true => state.seen = observation.repeat(self.chunk.history),
-                false => {
-                    state.seen.drain(..observation.len());
-                    state.seen.extend(observation);
-                }
-            }
-        }
-    }
-
     /// Takes the next action of each state's chunk; `draw` acts in the states that have none left.
     fn execute(
         &self,
@@ -82,7 +69,7 @@ impl Chunked {
         draw: impl FnOnce(&[f32], &mut [EpisodeState], &mut [f32]) -> Result<()>,
     ) -> Result<()> {
         let (a, width) = (self.action_dim(), self.policy.action_dim());
-        self.see(observations, states);
+        self.observe(observations, states);
         let mut places = Vec::from_iter(0..states.len());
         places.retain(|place| states[*place].chunk.is_empty());
         if !places.is_empty() {
@@ -132,6 +119,18 @@ impl Policy for Chunked {
         self.policy.memory(states).saturating_add(bytes(own as u128) + moved as u64)
     }
 
+    fn observe(&self, observations: &[f32], states: &mut [EpisodeState]) {
+        for (observation, state) in observations.chunks(self.observation_dim()).zip(states) {
+            match state.seen.is_empty() {
+                true => state.seen = observation.repeat(self.chunk.history),
+                false => {
+                    state.seen.drain(..observation.len());
+                    state.seen.extend(observation);
+                }
+            }
+        }
+    }
+
     fn begin(&self, seed: u64) -> EpisodeState {
         self.policy.begin(seed)
     }
@@ -160,7 +159,7 @@ impl Policy for Chunked {
 
     /// The first action and the value of each chunk that is drawn, in states without one.
     fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Samples> {
-        self.see(observations, states);
+        self.observe(observations, states);
         let seen = Vec::from_iter(states.iter().flat_map(|state| &state.seen).copied());
         let Samples { actions, values } = self.policy.sample(&seen, states)?;
         let first = |chunk: &[f32]| chunk[..self.action_dim()].to_vec();

@@ -40,6 +40,9 @@ pub trait Policy: Send + Sync {
         EpisodeState::new(seed)
     }
 
+    /// Takes note of observations in which it does not act, if it sees several at a time.
+    fn observe(&self, _observations: &[f32], _states: &mut [EpisodeState]) {}
+
     /// Shape of the standard normal numbers that [`Self::act`] draws in the first state of an
     /// episode; empty if it draws none. [`Choice::uniforms`] uniform numbers follow.
     fn noise(&self) -> Vec<usize> {

@@ -76,6 +76,10 @@ impl Policy for Scaled {
         self.policy.memory(states).saturating_add(bytes(observations))
     }
 
+    fn observe(&self, observations: &[f32], states: &mut [EpisodeState]) {
+        self.policy.observe(&self.observations(observations), states);
+    }
+
     fn begin(&self, seed: u64) -> EpisodeState {
         self.policy.begin(seed)
     }

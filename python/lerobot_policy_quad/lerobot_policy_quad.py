@@ -111,7 +111,9 @@ class QuadPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, torch.Tensor], **_) -> torch.Tensor:
         """The actions of a new chunk that are executed, [n, replan, action_size], whatever `select_action` has left of its own."""
-        rows = self._rows(batch)
+        chunk, rows = self.policy.about["chunk"], self._rows(batch)
+        if chunk["history"] > 1:
+            raise ValueError("the policy sees several observations, and a batch has one\nhint: train it with --agent history=1")
         episodes = self._begin(len(rows))  # The first call draws the chunk that the others execute.
-        actions = [episodes.act(rows)[:, self._actions] for _ in range(self.policy.about["chunk"]["replan"])]
+        actions = [episodes.act(rows)[:, self._actions] for _ in range(chunk["replan"])]
         return torch.from_numpy(np.stack(actions, axis=1))

@@ -25,6 +25,19 @@ impl Episodes {
         Self { states: begin(&*policy, seeds), policy, names }
     }
 
+    /// Checks observations of this many episodes.
+    fn rows<'a>(&self, observations: &'a ArrayLike<'_>, episodes: usize) -> PyResult<Rows<'a>> {
+        let width = self.policy.observation_dim();
+        let given = Rows::of("observations", observations, width, &self.names.observations)?;
+        if given.count != episodes {
+            return Err(PyValueError::new_err(format!(
+                "{} rows of observations for {episodes} episodes; rows=[…] says to which of them they belong",
+                given.count,
+            )));
+        }
+        Ok(given)
+    }
+
     /// Checks that rows are within range and distinct.
     fn check(&self, rows: Vec<i64>) -> PyResult<Vec<usize>> {
         let count = self.states.len();
@@ -57,25 +70,25 @@ impl Episodes {
         observations: ArrayLike<'py>,
         rows: Option<Vec<i64>>,
     ) -> PyResult<Array<'py>> {
-        let width = self.policy.observation_dim();
-        let given = Rows::of("observations", &observations, width, &self.names.observations)?;
         let rows = match rows {
             Some(rows) => self.check(rows)?,
             None => (0..self.states.len()).collect(),
         };
-        if given.count != rows.len() {
-            return Err(PyValueError::new_err(format!(
-                "{} rows of observations for {} episodes; rows=[…] says to which of them they belong",
-                given.count,
-                rows.len()
-            )));
-        }
+        let given = self.rows(&observations, rows.len())?;
         // The policy takes a slice of states.
         let take = |row: &usize| mem::replace(&mut self.states[*row], EpisodeState::new(0));
         let mut states: Vec<_> = rows.iter().map(take).collect();
         let acted = act(py, &*self.policy, &given, &mut states);
         rows.iter().zip(states).for_each(|(row, state)| self.states[*row] = state);
         acted
+    }
+
+    /// Takes note of the observation of each episode, [n, observation_size], without acting, for a
+    /// policy that sees several at a time (`history` of its chunk in `Policy.about`). Raises as `act`.
+    fn observe(&mut self, observations: ArrayLike<'_>) -> PyResult<()> {
+        let given = self.rows(&observations, self.states.len())?;
+        self.policy.observe(&given.values, &mut self.states);
+        Ok(())
     }
 
     fn __len__(&self) -> usize {

@@ -82,7 +82,7 @@ class Slow:
     """A policy whose chunks, ten times what it sees and three more, take until they are released."""
 
     def __init__(self):
-        self.about, self.left, self.released = {"chunk": {"length": 6, "replan": 4}}, [], Semaphore(0)
+        self.about, self.left, self.released = {"chunk": {"history": 1, "length": 6, "replan": 4}}, [], Semaphore(0)
 
     def begin(self, seed):
         return self
@@ -131,4 +131,4 @@ def test_chunks_are_executed_at_30_hertz(snapshot, tmp_path):
     took, missed = CHUNKS["loop"](ahead.act, policy.observation_size, steps=60)
     assert len(took) == 60 and missed < 30, missed
     seen = dict.fromkeys(SEEN, 0.5)
-    np.testing.assert_array_equal(CHUNKS["Ahead"](policy).chunk(seen)[0], policy.begin(0).act(seen))
+    np.testing.assert_array_equal(CHUNKS["Ahead"](policy).chunk(0, [seen])[0], policy.begin(0).act(seen))

@@ -49,14 +49,16 @@ def compare(policy, path, **choice):
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     for seed, states in enumerate(batches()):
         chunk = policy.about["chunk"]
-        seen = states if chunk["history"] == 1 else np.repeat(states[:, None], chunk["history"], axis=1)
-        inputs = {"observations": seen, **policy.noise(len(states), seed=seed, **choice)}
+        seen = [states * (i + 1) / chunk["history"] for i in range(chunk["history"])]
+        inputs = {"observations": states if len(seen) == 1 else np.stack(seen, axis=1), **policy.noise(len(states), seed=seed, **choice)}
         assert {given.name for given in session.get_inputs()} == set(inputs)
         found = dict(zip((out.name for out in session.get_outputs()), session.run(None, inputs)))
         if "values" in found:
             asked = {name: choice[name] for name in ("candidates", "aggregate", "guidance") if name in choice}
             close(found["values"], policy.sample(states, seed=seed, **asked)[1], by)
         episodes = policy.begin(range(seed, seed + len(states)), **choice)
+        for before in seen[:-1]:
+            episodes.observe(before)
         if chunk["length"] > 1:
             assert found["actions"].shape == (len(states), chunk["length"], policy.action_size)
             assert session.get_modelmeta().custom_metadata_map == {"chunk": str(chunk["length"]), "replan": str(chunk["replan"])}

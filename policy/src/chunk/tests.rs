@@ -68,6 +68,9 @@ fn a_chunk_is_drawn_from_the_last_observations() {
             assert_eq!(step(&*policy, &observation, &mut state), action, "{seen:?}, {number}");
         }
     }
+    policy.observe(&[0.5], &mut state);
+    let drawn = step(&*drawing, &[0.5, 0.6], &mut expected);
+    assert_eq!(step(&*policy, &[0.6], &mut state), drawn[..A]);
     assert!(matches!(
         chunked(drawing, Chunk { history: 3, ..chunk }),
         Err(PolicyError::Range { field: "chunk.history", .. })
