@@ -10,7 +10,7 @@
 # ROLE decides what the certificate allows:
 #   router     others connect to it, at one of HOST...
 #   learner    publishes weights, answers jobs and scores; with HOST..., evaluators may also connect to it directly
-#   evaluator  claims jobs and delivers scores
+#   evaluator  claims jobs and delivers scores and experience
 #   monitor    reads, and changes nothing
 # HOST is a name or an address, spelled as in endpoints; localhost and 127.0.0.1 are always added.
 #

@@ -4,12 +4,13 @@
 //! caller does slow work, like writing scores, between two calls.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::mem;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use quad_protocol::{
-    Episode, EpisodeScore, Hash, JobReply, JobRequest, Name, Piece, PieceReply, Progress,
-    ScoreReply, ScoreReport, episode_seeds,
+    CodecError, Episode, EpisodeScore, Hash, JobReply, JobRequest, Name, Piece, PieceReply,
+    Progress, ScoreReply, ScoreReport, episode_seeds,
 };
 use quad_run::folder::SavedScores;
 use serde_json::{Value, json};
@@ -45,6 +46,8 @@ struct State {
     failed_steps: BTreeSet<(u64, Option<u64>)>,
     /// Names for which it was reported that two evaluators use them.
     shared_names: BTreeSet<Name>,
+    /// True once it was reported that an evaluator has another version.
+    told_version: bool,
 }
 
 impl Coordinator {
@@ -61,6 +64,7 @@ impl Coordinator {
             evaluators: Evaluators::new(metrics.clone(), events.clone(), Instant::now()),
             failed_steps: BTreeSet::new(),
             shared_names: BTreeSet::new(),
+            told_version: false,
         };
         Self { state: Arc::new(Mutex::new(state)), rules, metrics, events }
     }
@@ -209,6 +213,15 @@ impl Coordinator {
                 }
                 JobReply::HandedBack { incarnation, accepted }
             }
+        }
+    }
+
+    /// Reports once that a claim is of another version: its evaluator is here and gets no job.
+    pub(super) fn unread_claim(&self, why: &NotAccepted) {
+        if let NotAccepted::Codec(error @ CodecError::Version { .. }) = why
+            && !mem::replace(&mut self.lock().told_version, true)
+        {
+            self.events.line(format!("an evaluator gets no job: {error}"));
         }
     }
 

@@ -48,11 +48,7 @@ impl Experience {
                 Ok(Added::Reply(reply)) => request.reply(&reply),
                 Ok(Added::Whole(number, episode)) => whole.push((request, number, episode)),
                 Err(why @ NotAccepted::NotYet) => request.reject(&why, &self.coordinator.metrics),
-                Err(why) => {
-                    self.coordinator.metrics.reject(why.label());
-                    let (incarnation, reason) = (self.coordinator.incarnation(), why.to_string());
-                    request.reply(&PieceReply::Refused { incarnation, reason });
-                }
+                Err(why) => refuse(request, &why, &self.coordinator),
             }
         }
         if whole.is_empty() {
@@ -138,6 +134,13 @@ impl Experience {
         self.coordinator.validate_practice(&episode)?;
         Ok(Added::Whole(number, episode))
     }
+}
+
+/// Tells an evaluator that its episode will never be accepted.
+pub(super) fn refuse(request: Request, why: &NotAccepted, coordinator: &Coordinator) {
+    coordinator.metrics.reject(why.label());
+    let (incarnation, reason) = (coordinator.incarnation(), why.to_string());
+    request.reply(&PieceReply::Refused { incarnation, reason });
 }
 
 enum Added {

@@ -13,9 +13,9 @@ use quad_runtime::Heartbeat;
 
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
-use super::experience::Experience;
+use super::experience::{Experience, refuse};
 use super::requests::{NotAccepted, Request};
-use crate::evaluation::Validated;
+use crate::evaluation::{Refusal, Validated};
 
 /// Most reports that are written together.
 const MOST_TOGETHER: usize = 256;
@@ -62,6 +62,11 @@ impl Scores {
             self.record(reports.into_iter(), beat);
             if let Some(experience) = &mut self.experience {
                 experience.receive(pieces.into_iter(), &mut self.disk, beat);
+                continue;
+            }
+            // Evaluators owe them to an earlier run of this name.
+            for (request, piece) in pieces {
+                refuse(request, &Refusal::Practice(piece.seed).into(), &self.coordinator);
             }
         }
         Ok(())

@@ -45,7 +45,9 @@ impl Services {
     pub fn job(&self, request: Request) {
         let coordinator = self.coordinator().clone();
         self.answer(&self.answers, request, move |request| {
-            Ok(encode(&coordinator.job(&request.message::<JobRequest>()?))?.into())
+            let message = request.message::<JobRequest>();
+            let message = message.inspect_err(|why| coordinator.unread_claim(why))?;
+            Ok(encode(&coordinator.job(&message))?.into())
         });
     }
 

@@ -12,7 +12,7 @@ use quad_tests::{PATIENCE, eventually, http};
 use zenoh::Session;
 use zenoh::qos::CongestionControl;
 
-const KEYS: &str = "weights weights/1 weights/x jobs scores progress/x live/learner x";
+const KEYS: &str = "weights weights/1 weights/x jobs scores experience progress/x live/learner x";
 
 /// Payloads that no receiver may take for a message, derived from a real one.
 fn garbage(real: &[u8]) -> Vec<Vec<u8>> {
@@ -74,6 +74,9 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
         let label = format!("reason=\"{reason}\"");
         learner.wait_for_metric("rejected_messages_total", &label, |count| count > 0.0);
     }
+    const OLD: &str = "an evaluator gets no job: the message has protocol version";
+    learner.process.wait_for_log(OLD, PATIENCE);
+    assert_eq!(learner.process.log().matches(OLD).count(), 1, "it is told once");
 
     let count = learner.scores().len();
     learner.wait_for_scores(count + 2 * ENDLESS.episodes as usize);

@@ -3,12 +3,13 @@
 
 use std::time::{Duration, Instant};
 
+use quad_protocol::{PieceReply, encode, keys};
 use quad_run::folder::read_metrics;
 use quad_tests::PATIENCE;
 use quad_tests::crowd::Crowd;
-use quad_tests::made_up::name;
+use quad_tests::made_up::{self, name};
 use quad_tests::router::router;
-use quad_tests::setting::Setting;
+use quad_tests::setting::{ENDLESS, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
 use tokio::runtime::Runtime;
 
@@ -39,6 +40,19 @@ fn any_number_of_evaluators_makes_the_same_run() {
     for other in &runs[1..] {
         runs[0].assert_same_as(other);
     }
+}
+
+/// An evaluator that owes an episode claims no job of the run: without an answer it never would.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_without_practice_refuses_an_episode_of_an_earlier_run_of_its_name() {
+    let scratch = Scratch::new();
+    let learner = scratch.learner("run", ENDLESS);
+    let (session, run) = (made_up::client(&learner.endpoint()).await, name("run"));
+    let job = made_up::claim_eventually(&session, &run, "late").await;
+    let frame = encode(&made_up::episode(&job)).unwrap();
+    let piece = made_up::piece(&job, "late", &frame, 0);
+    let reply = made_up::ask(&session, keys::experience(&run), &piece).await;
+    assert!(matches!(reply, Some(PieceReply::Refused { .. })), "{reply:?}");
 }
 
 /// Prints the environment steps per second that a learner takes in while it trains nothing.
