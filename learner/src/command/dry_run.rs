@@ -12,7 +12,8 @@ use quad_runtime::print;
 use crate::train::Price;
 
 pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
-    let (experiment, steps) = (&config.experiment, config.experiment.total_steps());
+    let experiment = &config.experiment;
+    let steps = experiment.total_steps() - experiment.schedule().start;
     let price = Price::measure(experiment, config.run.device, transitions)?;
     let milliseconds = price.step_seconds * 1e3;
     let hours = price.step_seconds * steps as f64 / 3600.0;

@@ -12,6 +12,8 @@ use toml::Table;
 /// The end of a complete run.
 pub(super) struct From {
     checkpoint: Checkpoint,
+    /// Hash of the checkpoint.
+    pub hash: String,
     experiment: Experiment,
     dataset_sha256: Option<String>,
 }
@@ -35,12 +37,13 @@ impl From {
             })
             .hint("let it end first: `learner train` with its settings continues it")?;
         let mut own = Table::try_from(&config.experiment)?;
-        own.insert("from".to_owned(), Hash::of(&checkpoint.state).to_string().into());
+        let hash = Hash::of(&checkpoint.state).to_string();
+        own.insert("from".to_owned(), hash.clone().into());
         // A share of 0 is not in the table, but the task may have another.
         own.insert("hold_out".to_owned(), config.experiment.hold_out.into());
         let preset = Preset::of_run(&config, own).hint_of(ConfigError::hint)?;
         let (experiment, dataset_sha256) = (config.experiment, config.dataset.sha256);
-        Ok((Self { checkpoint, experiment, dataset_sha256 }, preset))
+        Ok((Self { checkpoint, hash, experiment, dataset_sha256 }, preset))
     }
 
     /// Checks that the dataset is the run's, and that the checkpoint's numbers still mean the same.

@@ -13,6 +13,7 @@ mod train;
 
 use std::fmt::Alignment::{Left, Right};
 use std::io;
+use std::path::Path;
 
 use anyhow::anyhow;
 use clap::CommandFactory;
@@ -170,29 +171,43 @@ fn all_readable(unreadable: usize) -> anyhow::Result<()> {
 }
 
 fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
-    let mut all_held = true;
-    let mut report = |about: String, findings: Findings| {
-        all_held &= findings.all_held();
-        print(&format!("{about}{findings}"))
-    };
+    let (mut all_held, mut unreadable) = (true, 0);
     for dir in &args.dirs {
         let about = match args.dirs.len() {
             1 => String::new(),
             _ => format!("{}: ", dir.display()),
         };
-        report(about.clone(), verify::verify(dir)?)?;
-        if let Some((findings, promise)) = practiced(dir)? {
-            report(about.clone(), findings)?;
-            print(&format!("{about}{promise}"))?;
-        }
-        if let Some(other) = &args.same_as {
-            for findings in verify::compare(dir, other)? {
-                report(format!("with {}: ", other.display()), findings)?;
+        match check_run(dir, &about, args.same_as.as_deref()) {
+            Ok(held) => all_held &= held,
+            Err(error) if args.dirs.len() > 1 => {
+                warn!("{about}{error:#}");
+                unreadable += 1;
             }
+            Err(error) => return Err(error),
         }
     }
     anyhow::ensure!(all_held, "not everything held");
-    Ok(())
+    all_readable(unreadable)
+}
+
+/// Prints what holds of a run. True if everything does.
+fn check_run(dir: &Path, about: &str, same_as: Option<&Path>) -> anyhow::Result<bool> {
+    let mut all_held = true;
+    let mut report = |about: &str, findings: Findings| {
+        all_held &= findings.all_held();
+        print(&format!("{about}{findings}"))
+    };
+    report(about, verify::verify(dir)?)?;
+    if let Some((findings, promise)) = practiced(dir)? {
+        report(about, findings)?;
+        print(&format!("{about}{promise}"))?;
+    }
+    if let Some(other) = same_as {
+        for findings in verify::compare(dir, other)? {
+            report(&format!("with {}: ", other.display()), findings)?;
+        }
+    }
+    Ok(all_held)
 }
 
 fn list_runs(args: &ListArgs) -> anyhow::Result<()> {

@@ -18,6 +18,7 @@ use quad_runtime::{Health, Hint, ListenError, hinted, print, serve_metrics, unfi
 use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
+use toml::Value;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
@@ -41,6 +42,10 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         None => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
     };
     let experiment = preset.resolve(&args.changes()).hint_of(ConfigError::hint)?;
+    if experiment.from.as_ref() != from.as_ref().map(|from| &from.hash) {
+        return Err(anyhow!("the key `from` names a checkpoint, which is not there"))
+            .hint("leave it out: --from RUN sets it, and begins with the run's last checkpoint");
+    }
     let label = &preset.label;
     let Some(dataset) = &experiment.dataset else {
         return Err(anyhow!("{label} has no dataset of its own"))
@@ -76,6 +81,13 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         warn!("{warning}");
     }
     let experiment = &config.experiment;
+    let (steps, start) = (experiment.total_steps(), experiment.agent.get("actor_ema_start"));
+    if let Some(start) = start.and_then(Value::as_integer).filter(|start| steps <= *start as u64) {
+        warn!(
+            "the target actor, by which QUAD acts, stays as it began: it moves after step {start} (agent.actor_ema_start), and this \
+             run has {steps}"
+        );
+    }
     let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
     if needs_evaluators && environment::find(&experiment.environment).is_err() {
         info!(

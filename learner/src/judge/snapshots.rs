@@ -4,11 +4,12 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
-use quad_policy::{Policy, Precision, load_policy};
-use quad_protocol::Hash;
+use quad_policy::{Chunk, Header, Policy, PolicyError, Precision, load_policy};
+use quad_protocol::{Hash, Origin};
 use quad_run::config::RunConfig;
 use quad_run::folder::{RunDir, walk};
 use quad_runtime::Hint;
+use tracing::warn;
 
 const HELP: &str = "what can be judged is the folder of a run, or a snapshot in it, like RUN/snapshots/step_000020000.safetensors";
 
@@ -72,9 +73,21 @@ impl Snapshot {
         let config = folder.read_config()?;
         let file = folder.read_snapshot(step)?;
         let path = folder.snapshot_path(step);
-        let policy = load_policy(&file, Precision::F32)
-            .map_err(|error| anyhow!("{} is not a policy: {error}", path.display()))
+        let load = || {
+            let header = Header::<Origin>::read(&file)?;
+            Ok((load_policy(&file, Precision::F32)?, header.chunk))
+        };
+        let (policy, chunk) = load()
+            .map_err(|error: PolicyError| anyhow!("{} is not a policy: {error}", path.display()))
             .hint(HELP)?;
+        let Chunk { history, replan, .. } = chunk;
+        if history > 1 || replan > 1 {
+            warn!(
+                "{} is judged as if each state were an episode's first, but it sees {history} observations and executes {replan} \
+                 actions of a chunk",
+                path.display()
+            );
+        }
         Ok(Self {
             step,
             weights: Hash::of(&file).to_string(),

@@ -5,10 +5,17 @@ use quad_run::config::tables::parse_assignment;
 use quad_run::results::RunReport;
 use quad_run::results::departures::as_given;
 
-/// `learner train` with all settings that decide the outcome of the run. None if the run is of no
-/// task that this learner has, or lacks a value of its task.
+/// `learner train` with all settings that decide the outcome of the run; a comment if it goes on from
+/// another run, whose folder is not known. None if the run is of no task that this learner has, or
+/// lacks a value of its task.
 pub fn command(run: &RunReport) -> Option<String> {
     let experiment = &run.config.experiment;
+    if let (Some(hash), Some(online)) = (&experiment.from, &experiment.online) {
+        let (dir, steps) = (&run.dir, online.steps);
+        return Some(format!(
+            "# {dir:?} goes on from the run with the checkpoint {hash}: learner train --from RUN --online-steps {steps}"
+        ));
+    }
     let preset = as_given(run, false).ok()?;
     let mut words = vec!["learner train --task".to_owned(), quoted(&run.task)];
     let mut push = |flag: &str, value: &str| words.extend([flag.to_owned(), quoted(value)]);

@@ -17,9 +17,6 @@ use super::run_config::RunConfig;
 use super::tables::merge;
 use super::tasks::{self, Task};
 
-/// A key below `[online]` that algorithms which can learn from practice have.
-const REQUIRED: &str = "updates_per_step";
-
 /// A task, or a file that may change one.
 pub struct Preset {
     /// The task's name, or the file's without folder and extension; part of the names of runs.
@@ -70,6 +67,7 @@ impl Preset {
     pub fn resolve(&self, changes: &Table) -> Result<Experiment, ConfigError> {
         let definition = self.algorithm(changes)?;
         let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
+        let can_practice = table.contains_key("online");
         let mut of_task = self.task.map_or_else(Table::new, |task| task.keys.clone());
         // An algorithm that learns from practice alone does so in each task.
         if table.get("steps") == Some(&Value::Integer(0)) {
@@ -81,7 +79,7 @@ impl Preset {
         check_places(&table, changes)?;
         merge(&mut table, changes.clone());
         table.insert("algorithm".to_owned(), definition.name.into());
-        if table.get("online").is_some_and(|online| online.get(REQUIRED).is_none()) {
+        if table.contains_key("online") && !can_practice {
             return Err(ConfigError::NoPractice(definition.name));
         }
         let Some(environment) = table.get("environment") else {

@@ -56,7 +56,10 @@ impl RunReport {
             EvaluationReport::new(step, &episodes, experiment)
         };
         let evaluations: Vec<_> = by_step.into_iter().filter_map(evaluate).collect();
-        let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).collect();
+        // Means of policies from before practice and after it would be of neither.
+        let begins = experiment.practice_begins().unwrap_or(0);
+        let complete: Vec<_> =
+            evaluations.iter().filter(|e| e.complete && e.step > begins).collect();
         let mean = |evaluations: &[&EvaluationReport]| {
             let scores = Vec::from_iter(evaluations.iter().map(|e| e.score.mean));
             Spread::of(&scores).map(|spread| spread.mean)

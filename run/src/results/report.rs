@@ -37,7 +37,8 @@ pub struct RunReport {
     pub evaluations: Vec<EvaluationReport>,
     /// Episodes of planned evaluations without a score.
     pub episodes_missing: u64,
-    /// Mean score of the last 3 complete evaluations; absent if there are fewer.
+    /// Mean score of the last 3 complete evaluations, with practice of those after it has begun;
+    /// absent if there are fewer.
     pub mean_last_3: Option<f64>,
     pub mean_last_5: Option<f64>,
     /// Absent for runs that are not longer.

@@ -13,10 +13,10 @@ use crate::own_data::{train, write_log};
 /// Two short runs on the log of a robot, which hold out two episodes of it.
 fn runs(folder: &Path) -> [PathBuf; 2] {
     write_log(&folder.join("robot.hdf5"), 1.0);
-    [("quad", ""), ("iql", "--agent value.hidden=[32]")].map(|(name, value)| {
+    [("quad", "chunk=2"), ("iql", "value.hidden=[32]")].map(|(name, value)| {
         let run = folder.join("runs").join(name);
         let data = folder.join("robot.hdf5");
-        let flags = format!("--algorithm {name} {value}");
+        let flags = format!("--algorithm {name} --agent {value}");
         train(data.to_str().unwrap(), run.to_str().unwrap(), &flags);
         run
     })
@@ -40,6 +40,7 @@ fn policies_are_judged_by_the_data_alone() {
 
     let (_, log) = judge(&[&quad], short);
     assert!(log.contains("judging 1 policies takes about"), "{log}");
+    assert!(log.contains("sees 1 observations and executes 2 actions of a chunk"), "{log}");
     let (found, _) = judge(&[&all], short);
     let policies = found["policies"].as_array().unwrap();
     assert_eq!(policies.len(), 2);

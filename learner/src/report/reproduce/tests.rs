@@ -51,6 +51,10 @@ fn the_command_reproduces_the_experiment() {
         assert!(command.contains(words) && !command.contains("--device"), "{command}");
     }
     let mut config = config("r", 7);
+    let changes = toml! { from = "0123" online.steps = 5000 };
+    let from = resolve("hopper-demo", &changes).unwrap();
+    let command = command_for(&RunConfig { experiment: from, ..config.clone() }).unwrap();
+    assert!(command.starts_with('#') && command.contains("0123: learner train --from RUN"));
     config.run.device = Device::Cuda;
     assert!(command_for(&config).unwrap().contains(" --device cuda "));
     let mut agent = config.experiment.agent.to_table();

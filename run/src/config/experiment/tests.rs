@@ -82,6 +82,10 @@ agent.candidates = 2",
         ("online.steps = 1000", "1000 environment steps ends within its warm-up of 1000"),
         ("algorithm = 'rlpd'\nonline.steps = 0", "0 steps without practice"),
         ("algorithm = 'sfbc'\nonline.steps = 9", "sfbc learns from a dataset alone"),
+        (
+            "algorithm = 'dtql'\nonline = { steps = 9, updates_per_step = 1 }",
+            "dtql learns from a dataset alone",
+        ),
     ] {
         let error = one_line(&resolve("hopper-demo", &changes.parse().unwrap()).unwrap_err());
         assert!(error.contains(words), "{error}");
