@@ -32,7 +32,9 @@ pub(super) fn take(table: &mut Table) -> Result<(Chunk, Window), AgentError> {
     let replan = replan.map_or(length, |replan| *replan);
     check("replan", replan, replan <= length, "at most agent.chunk (--agent replan=K changes it)")?;
     let history = history.map_or(1, |history| *history);
-    ["chunk", "replan", "history"].map(|key| table.remove(key));
+    for key in ["chunk", "replan", "history"] {
+        table.remove(key);
+    }
     let number = |value: &Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
     let gamma = table.get("gamma").and_then(number).unwrap_or(1.0) as f32;
     Ok((Chunk { history, length, replan }, Window { history, length, gamma }))
