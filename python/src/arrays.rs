@@ -9,13 +9,13 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use std::borrow::Cow;
 
-/// An array-like argument: float32 arrays as they are, anything else converted by NumPy.
-pub struct ArrayLike<'py> {
-    array: PyArrayLikeDyn<'py, f32, AllowTypeChange>,
-    /// Columns of a table, such as pandas's, or keys of a dictionary.
-    columns: Vec<String>,
-    /// True if it was a dictionary, whose order does not count.
-    by_name: bool,
+/// An array-like argument.
+pub enum ArrayLike<'py> {
+    /// Float32 arrays as they are, anything else converted by NumPy; and the columns of a table, such
+    /// as pandas's.
+    Array(PyArrayLikeDyn<'py, f32, AllowTypeChange>, Vec<String>),
+    /// Numbers by their names, in any order.
+    Numbers(Bound<'py, PyDict>),
 }
 
 impl<'a, 'py> FromPyObject<'a, 'py> for ArrayLike<'py> {
@@ -23,15 +23,11 @@ impl<'a, 'py> FromPyObject<'a, 'py> for ArrayLike<'py> {
 
     fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
         if let Ok(numbers) = given.cast::<PyDict>() {
-            let array =
-                given.py().import("numpy")?.call_method1("stack", (numbers.values(), -1))?;
-            let columns = numbers.keys().extract()?;
-            return Ok(Self { array: array.extract()?, columns, by_name: true });
+            return Ok(Self::Numbers(numbers.to_owned()));
         }
         let names = given.getattr("columns").and_then(|columns| columns.try_iter());
         let names = names.and_then(|names| names.map(|name| name?.extract()).collect());
-        let columns = names.unwrap_or_default();
-        Ok(Self { array: given.extract()?, columns, by_name: false })
+        Ok(Self::Array(given.extract()?, names.unwrap_or_default()))
     }
 }
 
@@ -56,37 +52,47 @@ impl<'a> Rows<'a> {
         width: usize,
         names: &[String],
     ) -> PyResult<Self> {
-        let ArrayLike { array, columns, by_name } = given;
-        let (list, refused) = (names.join(", "), |error| Err(PyValueError::new_err(error)));
-        if !by_name && !names.is_empty() && !columns.is_empty() && columns != names {
-            let columns = columns.join(", ");
-            return refused(format!(
+        let (array, columns) = match given {
+            ArrayLike::Array(array, columns) => (array, columns),
+            ArrayLike::Numbers(numbers) => {
+                let array: PyArrayLikeDyn<'_, f32, AllowTypeChange> =
+                    stacked(name, numbers, names)?.extract()?;
+                let Rows { values, count, single } = Rows::of_array(name, &array, width, names)?;
+                return Ok(Self { values: Cow::Owned(values.into_owned()), count, single });
+            }
+        };
+        if !names.is_empty() && !columns.is_empty() && columns != names {
+            let (columns, list) = (columns.join(", "), names.join(", "));
+            return Err(PyValueError::new_err(format!(
                 "{name} has the columns {columns}, but the policy takes, in this order, {list}"
-            ));
+            )));
         }
-        let places = if *by_name { places(name, columns, names)? } else { Vec::new() };
-        let across = if *by_name { columns.len() } else { width };
+        Self::of_array(name, array, width, names)
+    }
+
+    fn of_array(
+        name: &str,
+        array: &'a PyArrayLikeDyn<'_, f32, AllowTypeChange>,
+        width: usize,
+        names: &[String],
+    ) -> PyResult<Self> {
+        let refused = |error| Err(PyValueError::new_err(error));
         let (count, single) = match *array.shape() {
-            [columns] if columns == across => (1, true),
-            [count, columns] if columns == across => (count, false),
+            [columns] if columns == width => (1, true),
+            [count, columns] if columns == width => (count, false),
             ref shape => {
                 let shape = shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
+                let list = names.join(", ");
                 let list = if names.is_empty() { list } else { format!(": {list}") };
                 return refused(format!(
                     "{name} has shape [{shape}], but must have [n, {width}] or [{width}]{list}"
                 ));
             }
         };
-        let copied = || Vec::from_iter(array.as_array().iter().copied());
         let values = match array.as_slice() {
-            _ if *by_name => {
-                let all = copied();
-                let of_row = |row: &[f32]| Vec::from_iter(places.iter().map(|place| row[*place]));
-                Cow::Owned(all.chunks(across).flat_map(of_row).collect())
-            }
             // A slice may also have the order of columns.
             Ok(values) if array.is_c_contiguous() => Cow::Borrowed(values),
-            _ => Cow::Owned(copied()),
+            _ => Cow::Owned(array.as_array().iter().copied().collect()),
         };
         if let Some(i) = values.iter().position(|value| !value.is_finite()) {
             let (row, column, value) = (i / width, i % width, values[i]);
@@ -110,18 +116,29 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// The position of each name among a dictionary's keys.
-fn places(name: &str, keys: &[String], names: &[String]) -> PyResult<Vec<usize>> {
+/// An array of a dictionary's numbers of these names, `[width]` or `[n, width]`.
+fn stacked<'py>(
+    name: &str,
+    numbers: &Bound<'py, PyDict>,
+    names: &[String],
+) -> PyResult<Bound<'py, PyAny>> {
     if names.is_empty() {
         let error = format!(
             "{name} is a dictionary, but the policy's data has no names\nhint: give its numbers in its order"
         );
         return Err(PyValueError::new_err(error));
     }
-    let lacking = Vec::from_iter(names.iter().filter(|name| !keys.contains(name)).cloned());
+    let (mut found, mut lacking) = (Vec::new(), Vec::new());
+    for name in names {
+        match numbers.get_item(name)? {
+            Some(number) => found.push(number),
+            None => lacking.push(name.as_str()),
+        }
+    }
     if !lacking.is_empty() {
+        let keys = Vec::from_iter(numbers.keys().iter().map(|key| key.to_string()));
         let error = format!("{name} lacks {}; it has {}", lacking.join(", "), keys.join(", "));
         return Err(PyValueError::new_err(error));
     }
-    Ok(names.iter().filter_map(|name| keys.iter().position(|key| key == name)).collect())
+    numbers.py().import("numpy")?.call_method1("stack", (found, -1))
 }

@@ -121,6 +121,9 @@ def test_refuses_invalid_arrays(tmp_path):
         r"episode 0: observations has shape \[4, 11\], but must have \[5, k\]": lambda: Dataset.from_episodes(
             [{**episode, "observations": good["observations"][:4]}]
         ),
+        r"episode 0: observations has shape \[7, 11\], but must have \[5, k\]": lambda: Dataset.from_episodes(
+            [{**episode, "observations": good["observations"][:7]}]
+        ),
         "same size": lambda: Dataset.from_episodes([episode, {**episode, "actions": np.zeros(5)}]),
         "of which none makes a transition\nhint: ": lambda: Dataset.from_arrays(
             **{name: array[:0] for name, array in good.items()}).save(tmp_path / "none"),

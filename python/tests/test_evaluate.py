@@ -107,7 +107,8 @@ def test_gymnasium_by_id_with_references(tmp_path, data):
         assert score["score"] == pytest.approx(2.0 * score["return"], rel=1e-12) and score["return"] != 0.0
 
 
-def test_success_is_a_rate(tmp_path, data):
+def test_success_is_a_rate(tmp_path, data, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path, tmp_path])  # A Path, which Python ignores.
     learner = Learner(tmp_path / "run", data, steps=20)
     with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=learner.endpoint, workers=1, score="success"):
         assert learner.end()[0] == 0

@@ -208,6 +208,15 @@ def test_a_shift_is_suspected_only_where_all_successes_have_it(tmp_path):
     assert "shifted" not in "\n".join(Dataset.from_lerobot(write(tmp_path / "data", given), **STATE).notes)
 
 
+def test_texts_may_have_ends_of_lines_of_their_own(tmp_path):
+    task = "pick\u2028and place\x85"  # As LeRobot writes them.
+    folder = write(tmp_path / "data", [one | {"task": task} for one in episodes()], "v2.1")
+    for path in (folder / "meta").glob("*.jsonl"):
+        lines = [json.dumps(json.loads(line), ensure_ascii=False) for line in path.read_text().split("\n")[:-1]]
+        path.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+    assert len(Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all", task=task)) == sum(range(5, 11))
+
+
 def test_names_may_be_given_by_their_places(tmp_path):
     folder = write(tmp_path / "data", episodes())
     info = json.loads((folder / "meta/info.json").read_text())

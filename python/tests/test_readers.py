@@ -76,6 +76,11 @@ def test_robomimic_s_next_observations_are_the_following_rows(demonstrations):
     coarse = Dataset.from_robomimic(demonstrations, **seen)
     assert len(coarse) == len(right) and np.abs(rows(coarse)[3] - rows(right)[3]).max() < 2e-3
     with h5py.File(demonstrations, "a") as file:
+        demo = file["data/demo_2"]
+        demo["obs/object"][4], demo["next_obs/object"][3] = np.nan, np.nan
+    with pytest.raises(ValueError, match="episode demo_2: observations, row 4: number 3 is nan"):
+        Dataset.from_robomimic(demonstrations, **seen)
+    with h5py.File(demonstrations, "a") as file:
         demo = file["data/demo_3"]
         for array in [demo["actions"], demo["rewards"], demo["dones"], *demo["obs"].values(), *demo["next_obs"].values()]:
             name, kept = array.name, np.delete(array[()], [2, 4], 0)
@@ -119,6 +124,22 @@ def test_isaac_lab_s_recorder(tmp_path):
     assert np.array_equal(rows(dataset)[0], np.concatenate(made)) and dataset.observation_names[0] == "obs[0]"
     assert np.flatnonzero(rows(dataset)[4]).tolist() == [5, 11, 22] and (rows(dataset)[2] == 0).sum() == 3
     assert "3 of 4 episodes are successes" in dataset.notes
+
+
+def test_actions_that_are_observed_are_not_those_that_are_done(tmp_path):
+    """Isaac Lab's terms of `obs` may have the action before, by the name of the action."""
+    rng, path = np.random.default_rng(0), tmp_path / "dataset.hdf5"
+    with h5py.File(path, "w") as file:
+        for i in range(2):
+            demo, done = file.create_group(f"data/demo_{i}"), rng.uniform(-1, 1, (6, 2)).astype(np.float32)
+            demo["actions"], demo["obs/actions"] = done, np.concatenate([np.zeros((1, 2), np.float32), done[:-1]])
+            demo["obs/eef_pos"], demo.attrs["success"] = rng.normal(size=(6, 3)), True
+    dataset = Dataset.from_robomimic(path, observations=["eef_pos"], reward="step-cost")
+    with h5py.File(path) as file:
+        assert np.array_equal(rows(dataset)[1], np.concatenate([file[f"data/demo_{i}/actions"] for i in range(2)]))
+    assert not any("come after" in note for note in dataset.notes), "success is of the whole demonstration"
+    with pytest.raises(ValueError, match="'actions' is both seen, below obs, and done\nhint: "):
+        Dataset.from_robomimic(path, observations=["eef_pos", "actions"], reward="step-cost")
 
 
 def elsewhere(file, name, secret):

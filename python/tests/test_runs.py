@@ -24,10 +24,11 @@ def test_runs_are_a_table(hopper_runs, data, tmp_path):
             np.testing.assert_allclose([row.score, row.score_std], [np.mean(scores), np.std(scores, ddof=1)])
     assert table.groupby("step").score.mean().notna().all()
 
-    (tmp_path / "no run").mkdir()
-    train(tmp_path / "unscored", data, "--task", "own-data", "--steps", "1")
-    unscored = runs([tmp_path / "*", hopper_runs / "seed1"])
+    (tmp_path / "of[0]" / "no run").mkdir(parents=True)
+    train(tmp_path / "of[0]" / "unscored", data, "--task", "own-data", "--steps", "1")
+    unscored = runs([tmp_path / "of*" / "*", hopper_runs / "seed1"])
     assert [(row["run"], row["step"]) for row in unscored] == [("unscored", None), ("seed1", 10), ("seed1", 20)]
+    assert runs(tmp_path / "of[0]" / "unscored") == unscored[:1], "a folder is no pattern"
     assert set(unscored[0]) >= {"score", "score_std", "return", "length", "complete", "mean_last_3", "agent"}
     assert runs(tmp_path / "nothing*") == []
 

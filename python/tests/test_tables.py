@@ -109,6 +109,11 @@ def test_what_a_table_lacks_is_asked_for(tmp_path):
         ("there is no episode", frame[:0], {**rule, "success": "all"}),
         (r"the table: x, row 3 is masked \(1 such rows\)\nhint: leave",
          {**frame, "x": np.ma.masked_array(frame["x"], np.arange(60) == 3)}, {**rule, "success": "all"}),
+        ("column 'fell' holds object, no numbers\nhint: it may have empty places", frame.assign(fell=pd.array([True, None] * 30, "boolean")),
+         {**rule, "reward": "gain", "terminal": "fell"}),
+        ("the table has several columns 'x'", pd.concat([frame, frame[["x"]]], axis=1), {**rule, "success": "all"}),
+        ("the table: column 'x' has 61 rows, but 'run' has 60", {**frame, "x": np.zeros(61)}, {**rule, "success": "all"}),
+        ("the table: column 'x' has lists of several lengths", frame.assign(x=[[1.0, 2.0], [1.0]] * 30), {**rule, "success": "all"}),
         ("episode b: terminations, row 4: 0.5 is neither 0 nor 1", frame.assign(fell=np.arange(60) == 4).assign(fell=lambda f: f["fell"] / 2),
          {**rule, "reward": "gain", "terminal": "fell"}),
     ]:
@@ -122,8 +127,9 @@ def test_a_table_without_a_line_of_names(tmp_path):
         Dataset.from_frame(tmp_path / "log.csv", **COLUMNS, reward="gain", terminal="fell")
     frame = pd.DataFrame(table()[["x", "v", "torque", "gain", "run"]].to_numpy())  # Its own columns are numbers.
     frame.to_csv(tmp_path / "numbers.csv", index=False)
-    read = Dataset.from_frame(tmp_path / "numbers.csv", observations=["0", "1"], actions=["2"], episode="4", reward="3", terminal="never")
-    assert read.observation_names == ["0", "1"] and len(read) == 57
+    for source in (tmp_path / "numbers.csv", frame):
+        read = Dataset.from_frame(source, observations=["0", "1"], actions=["2"], episode="4", reward="3", terminal="never")
+        assert read.observation_names == ["0", "1"] and len(read) == 57
     with pytest.raises(ValueError, match="there is no column 'x'"):
         Dataset.from_frame(tmp_path / "numbers.csv", observations=["x"], actions=["2"], episode="4", reward="3", success="all")
 
@@ -160,7 +166,8 @@ def test_names_go_into_the_file_and_the_policy(snapshots, tmp_path):
     assert np.array_equal(policy.act(seen, seed=1), policy.act(seen.to_numpy(), seed=1))
     numbers = {"odometer": np.full(180, NAN), **{name: seen[name].to_numpy() for name in ("v", "x")}}
     assert np.array_equal(policy.act(seen, seed=1), policy.act(numbers, seed=1))
-    one = {"v": float(seen["v"][0]), "x": float(seen["x"][0]), "odometer": NAN}
+    others = {"odometer": NAN, "robot": "mine", "camera": np.zeros((4, 6, 3), np.uint8)}
+    one = {"v": float(seen["v"][0]), "x": float(seen["x"][0]), **others}
     assert np.array_equal(policy.act(one, seed=1), policy.act(seen.to_numpy()[0], seed=1))
     assert np.array_equal(policy.begin(7).act(one), policy.act(seen.to_numpy()[0], seed=7))
     assert np.array_equal(policy.value(one, {"torque": 3.0}), policy.value(seen.to_numpy()[0], [3.0]))

@@ -59,7 +59,7 @@ class Evaluators:
         connect = [connect] if isinstance(connect, str) else list(connect)
         serve = {"connect": connect, "certificates": certificates, "precision": precision}
         task = {"name": name, "make": environment, "score": _score(score), "seed": 0, "parent": os.getpid(), "serve": serve}
-        payload = [json.dumps(sys.path).encode(), cloudpickle.dumps(task)]
+        payload = [json.dumps(sys.path, default=str).encode(), cloudpickle.dumps(task)]  # Some add a Path to it.
         self._process = os.getpid()
         self._stopping = threading.Event()
         self._error: Exception | None = None

@@ -60,5 +60,5 @@ def export_lerobot(policy: Policy | str | PathLike[str], folder: str | PathLike[
     for name, steps in _STEPS.items():
         (root / f"{name}.json").write_text(json.dumps({"name": name, "steps": steps}, indent=2))
     card = _CARD.format(policy=policy, seen=", ".join(f"`{name}`" for name in seen), about=json.dumps(policy.about, indent=2))
-    (root / "README.md").write_text(card)
+    (root / "README.md").write_text(card, encoding="utf-8")
     (root / "config.json").write_text(json.dumps(config, indent=2))

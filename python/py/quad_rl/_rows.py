@@ -35,6 +35,11 @@ def rows_of_episodes(episodes: Iterable[Any]) -> Rows:
     parts = [episode_rows(f"episode {i}: ", episode) for i, episode in enumerate(episodes)]
     if not parts:
         raise ValueError("there is no episode")
+    return joined(parts)
+
+
+def joined(parts: Iterable[Rows]) -> Rows:
+    """The rows of all episodes."""
     try:
         return Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
     except ValueError as error:
@@ -59,7 +64,8 @@ def episode_rows(where: str, episode: Any) -> Rows:
         ends.append(flags if flags.ndim else np.where(np.arange(steps) == steps - 1, flags, 0))
     observations = plain(where, "observations", get("observations"))
     after = observations[1:] if len(observations) == steps + 1 else None
-    rows = rows_of(where, observations[:steps], get("actions"), get("rewards"), ends[0], ends[1], after)
+    before = observations if after is None else observations[:-1]
+    rows = rows_of(where, before, get("actions"), get("rewards"), ends[0], ends[1], after)
     if after is None:
         return followed(rows)
     rows.timeouts[-1] |= not rows.terminals[-1]

@@ -28,7 +28,8 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
     A learner may be writing the folders. A run that cannot be read is left out, with a warning that names it.
     """
     patterns = [folders] if isinstance(folders, (str, PathLike)) else folders
-    found = [path for pattern in patterns for path in sorted(glob.glob(os.path.expanduser(os.fspath(pattern))))]
+    expanded = [os.path.expanduser(os.fspath(pattern)) for pattern in patterns]
+    found = [path for given in expanded for path in ([given] if os.path.exists(given) else sorted(glob.glob(given)))]
     rows: list[dict[str, Any]] = []
     for path in found:
         try:

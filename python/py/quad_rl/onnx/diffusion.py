@@ -21,7 +21,8 @@ def embeddings(file: File, steps: int) -> Array:
 def cosine(steps: int) -> Array:
     """α_t of the cosine schedule for t = 1..T."""
     falls = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
-    return np.maximum(falls[1:] / falls[:-1], 0.001)
+    alpha: Array = np.maximum(falls[1:] / falls[:-1], 0.001)
+    return alpha
 
 
 def draw(file: File, observations: Value, noise: Value, candidates: int, guidance: float = 0.0) -> Value:

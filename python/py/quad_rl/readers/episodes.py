@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Union
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_rl._rows import Rows, Source, episode_rows, plain
+from quad_rl._rows import Source, episode_rows, joined, plain
 
 # A word or the name of a column, or a function of an episode, which is a dictionary of its columns, T rows each, and `episode`,
 # its number or name.
@@ -97,7 +97,7 @@ def dataset(
     if empty:
         notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
     names = [[name for column in columns for name in _names(log, column)] for columns in (observations, actions)]
-    return Source(Rows(*(np.concatenate(arrays) for arrays in zip(*parts))), (names[0], names[1]), notes)
+    return Source(joined(parts), (names[0], names[1]), notes)
 
 
 def _check(log: Log, name: str) -> None:
@@ -109,7 +109,8 @@ def _check(log: Log, name: str) -> None:
         raise ValueError(f"there is no column {name!r}{where}\nhint: there are {', '.join(map(repr, there))}")
     kind = log.episodes[0].columns[name].dtype
     if kind.kind not in "fiub":
-        raise ValueError(f"column {name!r} holds {kind}, no numbers")
+        hint = "\nhint: it may have empty places, such as None" if kind == object else ""
+        raise ValueError(f"column {name!r} holds {kind}, no numbers{hint}")
 
 
 def _names(log: Log, column: str) -> list[str]:
@@ -158,8 +159,8 @@ def _successes(log: Log, rule: Success) -> list[bool] | None:
 
 
 def _suspect_going_on(log: Log, rule: str, flags: list[NDArray[np.bool_]]) -> None:
-    """Says so where many rows come after the success that their episode is for."""
-    later = sum(len(flag) - 1 - int(np.argmax(flag)) for flag in flags if flag.any())
+    """Says so where many rows come after the success that their episode is for. Where all have it, it is the episode's."""
+    later = sum(len(flag) - 1 - int(np.argmax(flag)) for flag in flags if flag.any() and not flag.all())
     rows = sum(map(len, flags))
     if later > _MANY * rows:
         log.notes.append(f"{later} of {rows} rows ({later / rows:.0%}) come after their episode's first {rule}, as if the task went on: "

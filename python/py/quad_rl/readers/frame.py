@@ -56,15 +56,21 @@ def from_frame(
     path = isinstance(frame, (str, PathLike))
     place = os.fspath(frame) if path else "the table"
     table = _read(place) if path else frame
-    there = [str(name) for name in getattr(table, "column_names", getattr(table, "columns", table))]
-    if not {*observations, *actions, episode} & {*there} and any(map(_is_number, there)):
+    keys = [*getattr(table, "column_names", getattr(table, "columns", table))]  # pandas's may be numbers.
+    there = [str(key) for key in keys]
+    if path and not {*observations, *actions, episode} & {*there} and any(map(_is_number, there)):
         hint = "hint: write one above them, such as " + ",".join([*observations, *actions, episode])
         raise ValueError(f"{place} has no line of names: its first line is {', '.join(there)}\n{hint}")
     observations, actions = _matching(observations, there), _matching(actions, there)
     words = columns_of(observations, actions, reward, terminal, success)
-    columns = {name: _column(table, name, place) for name in there if words is None or name in words or name == episode}
+    read = {name: key for name, key in zip(there, keys) if words is None or name in words or name == episode}
+    for name in [name for name in read if there.count(name) > 1]:
+        raise ValueError(f"{place} has several columns {name!r}")
+    columns = {name: _column(table[key], name, place) for name, key in read.items()}
     if episode not in columns:
         raise ValueError(f"{place}: there is no column {episode!r} for episodes\nhint: there are {', '.join(map(repr, there))}")
+    for name in [name for name in columns if len(columns[name]) != len(columns[episode])]:
+        raise ValueError(f"{place}: column {name!r} has {len(columns[name])} rows, but {episode!r} has {len(columns[episode])}")
     names, of, notes = _episodes(columns[episode], episode, place, apart)
     order, cuts = np.argsort(of, kind="stable"), np.cumsum(np.bincount(of, minlength=1))[:-1]
     parts = zip(*(np.split(array[order], cuts) for array in columns.values())) if names else ()
@@ -114,14 +120,16 @@ def _is_number(name: str) -> bool:
         return False
 
 
-def _column(table: Any, name: str, place: str) -> NDArray[Any]:
-    column = table[name]
+def _column(column: Any, name: str, place: str) -> NDArray[Any]:
     if hasattr(column, "combine_chunks"):
         return array_of(column, name, place)
     to_numpy: Callable[[], Any] | None = getattr(column, "to_numpy", None)
     array = plain(f"{place}: ", name, to_numpy() if to_numpy else column)
     if array.dtype == object and len(array) and not isinstance(array[0], str):
-        return np.stack([np.asarray(row) for row in array])
+        rows = [np.asarray(row) for row in array]
+        if len({row.shape for row in rows}) > 1:
+            raise ValueError(f"{place}: column {name!r} has lists of several lengths, or empty places")
+        return np.stack(rows)
     return array
 
 

@@ -62,7 +62,7 @@ def from_lerobot(
     root = Path(folder)
     if not (root / "meta/info.json").is_file():
         raise ValueError(f"{root} is no LeRobot dataset: there is no meta/info.json")
-    info = json.loads((root / "meta/info.json").read_text())
+    info = json.loads((root / "meta/info.json").read_bytes())
     version, streams = str(info.get("codebase_version")), info["features"]
     if not version.startswith(("v2.", "v3.")):
         raise ValueError(f"{root}: a LeRobot dataset of {version}, but v2.x and v3.x are read\nhint: LeRobot converts it")
@@ -140,7 +140,7 @@ def _meta(root: Path, name: str) -> list[dict[str, Any]]:
     """Rows of meta/NAME: lines of JSON in v2, Parquet in v3."""
     lines = root / f"meta/{name}.jsonl"
     if lines.exists():
-        return [json.loads(line) for line in lines.read_text().splitlines()]
+        return [json.loads(line) for line in lines.read_bytes().splitlines()]  # Texts may have other ends of lines.
     parquet, rows = library("pyarrow.parquet", "lerobot"), []
     for file in sorted((root / "meta").glob(f"{name}*/**/*.parquet")) + sorted((root / "meta").glob(f"{name}.parquet")):
         opened = parquet.ParquetFile(file)

@@ -60,7 +60,9 @@ def from_robomimic(
         episodes: list[Episode] = []
         for name in names:
             group = source["data"][name]
-            low, images = _sort(group)
+            for key in {*actions} & {*observations} & {*_below(group, "obs")}:
+                raise ValueError(f"{file}: {key!r} is both seen, below obs, and done\nhint: copy one of these arrays to another name")
+            low, images = _sort(group, observations)
             there = list(low)
             for key in {*observations} & {*images}:
                 raise ValueError(f"{file}: {key} holds images, but only rows of numbers are learned from")
@@ -89,9 +91,14 @@ def _below(group: Any, name: str) -> dict[str, Any]:
     return {"obs": there} if hasattr(there, "dtype") else {key: one for key, one in there.items() if hasattr(one, "dtype")}
 
 
-def _sort(group: Any) -> tuple[dict[str, Any], list[str]]:
-    """Arrays of rows of numbers by their names, those of `obs` among them, and names of images."""
-    arrays = {**{name: group[name] for name in group if hasattr(group[name], "dtype")}, **_below(group, "obs")}
+def _sort(group: Any, observations: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """Arrays of rows of numbers by their names, those of `obs` among them, and names of images.
+
+    A name of two arrays is that below `obs` if it is observed, else the demonstration's own: Isaac Lab's `obs/actions` are the
+    actions before.
+    """
+    own = {name: group[name] for name in group if hasattr(group[name], "dtype")}
+    arrays = own | {name: array for name, array in _below(group, "obs").items() if name in observations or name not in own}
     images = [name for name, array in arrays.items() if array.ndim > 2]
     return {name: array for name, array in arrays.items() if array.ndim in (1, 2)}, images
 
@@ -101,7 +108,8 @@ def _check_following(where: str, key: str, seen: NDArray[Any], after: NDArray[An
     if len(seen) != len(after):
         raise ValueError(f"{where}: next_obs has {len(after)} rows of {key!r}, but obs has {len(seen)}")
     coarse = min(seen.dtype, after.dtype, key=lambda dtype: dtype.itemsize)  # One of them may have been rounded.
-    differs = seen[1:].astype(coarse) != after[:-1].astype(coarse)
+    following, there = seen[1:].astype(coarse), after[:-1].astype(coarse)
+    differs = (following != there) & ((following == following) | (there == there))  # NaN has its own error.
     rows = np.flatnonzero(differs.any(axis=tuple(range(1, differs.ndim))))
     if len(rows):
         hint = "hint: rows between them were left out; Dataset.from_arrays takes next_observations of any rows"
