@@ -28,10 +28,13 @@ const DIMS: (usize, usize) = (11, 3);
 /// The task whose values all algorithms but QUAD are measured with.
 const TASK: &str = "hopper-medium-v2";
 
+/// A value in place of the task's.
+type Change = Option<(&'static str, u32)>;
+
 /// Other configurations that are measured: task, algorithm, and a value in place of the task's.
 /// deploy/bench/bench.py knows QUAD's shapes; algorithms/benches/jax_step.py names all as they are
 /// named here.
-const CONFIGURATIONS: [(&str, [&str; 2], Option<(&str, u32)>); 5] = [
+const CONFIGURATIONS: [(&str, [&str; 2], Change); 5] = [
     ("paper, 10 samples", ["hopper-medium-replay-v2", "quad"], Some(("samples", 10))),
     ("paper, 1 sample", ["hopper-medium-replay-v2", "quad"], Some(("samples", 1))),
     ("demo", ["hopper-demo", "quad"], Some(("samples", 1))),
@@ -47,7 +50,7 @@ struct Experiment {
     total_steps: u64,
 }
 
-fn experiment([task, algorithm]: [&str; 2], change: Option<(&str, u32)>) -> Experiment {
+fn experiment([task, algorithm]: [&str; 2], change: Change) -> Experiment {
     let definition =
         *ALGORITHMS.iter().find(|known| known.name == algorithm).expect("an algorithm");
     let mut values = Values::of(&definition).for_task(Some(task));
