@@ -61,6 +61,8 @@ pub struct Transitions {
     warnings: Vec<String>,
     reward: RewardScaling,
     scaling: Scaling,
+    /// Of held-out transitions: the standard units of those that are learned from.
+    of_training: Option<Scaling>,
 }
 
 /// Training and validation transitions.
@@ -120,10 +122,13 @@ impl Transitions {
         let rewards = options.reward.scaling(&returns).ok_or(Problem::SameReturns)?;
         let scaling = options.normalize.scaling(&recording, rewards);
         let new = |recording| Self::new(recording, environment, rewards, scaling.clone());
-        let held_out = held_out.map(new).filter(|held_out| held_out.len() > 0);
+        let mut held_out = held_out.map(new).filter(|held_out| held_out.len() > 0);
         let warnings = warnings::warnings(&recording, options.normalize, options.reward);
         let mut training = new(recording);
         training.warnings = warnings;
+        if let Some(held_out) = &mut held_out {
+            held_out.of_training = Some(training.standard_units());
+        }
         Ok(Split { training, held_out, episodes })
     }
 
@@ -143,6 +148,7 @@ impl Transitions {
             dataset,
             reward,
             scaling,
+            of_training: None,
         }
     }
 
@@ -172,9 +178,12 @@ impl Transitions {
         &self.dataset.recording.names
     }
 
-    /// Map of each dimension of the dataset to mean 0 and standard deviation 1, or scale 0 if it is
-    /// constant.
+    /// Map of each dimension of the training transitions to mean 0 and standard deviation 1, or scale
+    /// 0 if it is constant.
     pub fn standard_units(&self) -> Scaling {
+        if let Some(units) = &self.of_training {
+            return units.clone();
+        }
         let all = &self.dataset.recording;
         let is_transition = |row: usize| all.kinds[row] == RowKind::Transition;
         let of = |values, width| Some(normalize::standard_units(values, width, is_transition));

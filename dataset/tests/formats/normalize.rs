@@ -115,3 +115,12 @@ fn rewards_have_a_mean_square_of_1() {
     assert_eq!(training.scaling().rewards, Some(size));
     assert_close("held out", &all(&held_out.unwrap()).rewards, &[3.0 / size, 4.0 / size]);
 }
+
+#[test]
+fn standard_units_of_held_out_episodes_are_those_of_training() {
+    let two = Arrays { timeouts: vec![false, true, false, true], ..arrays() };
+    let Split { training, held_out, .. } = split(two, ACTIONS, RewardRule::AsIs, &[1]);
+    let units = training.standard_units();
+    assert_eq!(units.observations.clone().unwrap().offset, [1_000_001.0, 3.0, 0.1]);
+    assert_eq!(held_out.unwrap().standard_units(), units);
+}
