@@ -75,9 +75,15 @@ impl Averages {
             GuidanceAt::Denoised => noise.denoising.clean(noisy, predicted)?,
         };
         let gradients = critics.action_gradients(&batch.observations, &at)?;
+        // Critics align in actions that are guided, not in those beyond the end of an episode.
+        let guided = |x: &Tensor| match &batch.within {
+            Some(within) => x.broadcast_mul(within),
+            None => Ok(x.clone()),
+        };
+        let (gradients, predicted) = (guided(&gradients)?, guided(predicted)?);
         #[cfg(feature = "cuda")]
         if config.guidance == Guidance::Quad && noisy.device().is_cuda() {
-            return self.guide_on_gpu(config, [&values, &gradients, predicted]);
+            return self.guide_on_gpu(config, [&values, &gradients, &predicted]);
         }
         let scale = (values.abs()?.mean_all()? + 1e-6)?;
         let gradients = gradients.broadcast_div(&scale)?;

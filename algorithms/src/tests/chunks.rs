@@ -66,13 +66,34 @@ fn a_policy_of_chunks_acts_step_by_step() {
     }
 }
 
-/// In episodes of one step the second half of a chunk of two is never seen.
-#[test]
-fn actions_beyond_the_end_of_an_episode_are_not_cloned() {
+/// Episodes of one step, in which the second half of a chunk of two is never seen.
+fn single_steps() -> Context {
     let mut arrays = arrays();
     (arrays.terminals, arrays.timeouts) = (vec![true; 10 * BATCH], vec![false; 10 * BATCH]);
     let transitions = Arc::new(Transitions::of(arrays).unwrap());
-    let context = Context { transitions, ..context(0, &Device::Cpu) };
+    Context { transitions, ..context(0, &Device::Cpu) }
+}
+
+/// An actor that predicts no noise has no direction in which critics could align.
+#[test]
+fn actions_beyond_the_end_of_an_episode_do_not_decide_lambda() {
+    let is_quad =
+        |table: &toml::Table| table.get("guidance").and_then(toml::Value::as_str) == Some("quad");
+    let (definition, table) = variants().into_iter().find(|(_, table)| is_quad(table)).unwrap();
+    let mut agent = agent(definition, &chunked(table, 2), &single_steps());
+    for (name, weights) in agent.algorithm.state_dict().networks() {
+        if name == "actor" {
+            weights.change(|values| values.slice_set(&(values * 0.0)?, 0, 0)).unwrap();
+        }
+    }
+    train(&mut agent, 1);
+    let state = agent.algorithm.state_dict().save().unwrap();
+    assert_eq!(state["nu_squared"].to_vec1::<f32>().unwrap(), [0.0]);
+}
+
+#[test]
+fn actions_beyond_the_end_of_an_episode_are_not_cloned() {
+    let context = single_steps();
     for (name, network) in CLONING {
         let of_algorithm = variants().into_iter().filter(|(known, _)| known.name == name);
         for (definition, table) in of_algorithm {
