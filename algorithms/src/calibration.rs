@@ -44,9 +44,10 @@ impl MonteCarlo {
 }
 
 /// The returns of an episode. Where each of its steps has the same reward and it does not terminate,
-/// it never reached its goal: its return is that of going on like this for ever.
+/// it never reached its goal: its return is that of going on like this for ever, if that has an end.
 fn discounted(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f32> {
-    if rewards.len() > 1 && !terminates && rewards.iter().all(|reward| *reward == rewards[0]) {
+    let failed = rewards.len() > 1 && !terminates;
+    if failed && gamma < 1.0 && rewards.iter().all(|reward| *reward == rewards[0]) {
         return vec![(f64::from(rewards[0]) / (1.0 - gamma)) as f32; rewards.len()];
     }
     let mut after = 0.0;
@@ -67,6 +68,12 @@ fn discounted(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f32> {
 mod tests {
     use super::*;
     use quad_dataset::{Arrays, PracticeRows};
+
+    #[test]
+    fn returns_without_a_discount_are_finite() {
+        assert_eq!(discounted(&[0.0, 0.0], false, 1.0), [0.0, 0.0]);
+        assert_eq!(discounted(&[1.0, 1.0], false, 1.0), [2.0, 1.0]);
+    }
 
     #[test]
     fn returns_reach_to_the_end_of_episodes_and_follow_experience() {
