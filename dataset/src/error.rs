@@ -181,6 +181,9 @@ impl Problem {
                     "{advice}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
                 );
             }
+            Self::Array(_, Unreadable(source)) if source.to_string().contains(NEWER) => {
+                return format!("a newer HDF5 library wrote it: {REWRITE}");
+            }
             Self::OtherMaze(_) => {
                 "choose one of its own tasks, such as antmaze-large-navigate-singletask-task1-v0, or another dataset"
             }
@@ -226,7 +229,7 @@ impl Problem {
                 "learning needs a reward for each step; a task such as antmaze-large-navigate-singletask-task1-v0 has those of OGBench's mazes, and with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds others"
             }
             Self::Array(_, Group) => {
-                "an observation may be an array or a Dict of arrays, but not a Dict of Dicts: with quad_rl installed, `quad-convert FOLDER --out my-robot.hdf5` makes one row of it"
+                "write what is in the group as columns of one array; in a Minari folder, observations may be a Dict of arrays, and of a Dict of Dicts `quad-convert FOLDER --out my-robot.hdf5` makes one row, with quad_rl installed"
             }
             Self::Array(_, DiscreteActions) => {
                 "store continuous actions as float32; where they leave [-1, 1], `learner train --normalize actions` scales them"
@@ -254,6 +257,9 @@ impl Problem {
         hint.to_owned()
     }
 }
+
+/// Part of libhdf5's message on a version of the format that it does not know.
+const NEWER: &str = "bad version number";
 
 const REWRITE: &str = "pip install h5py hdf5plugin; then write it again, with your names for OLD and NEW: python -c \"import h5py, \
     hdf5plugin; a, b = h5py.File('OLD'), h5py.File('NEW', 'w'); b.attrs.update(a.attrs); a.visititems(lambda name, x: \

@@ -5,6 +5,9 @@ use crate::recording::{Recording, RowKind};
 use crate::statistics::Figures;
 use crate::tables::reward::RewardScaling;
 
+/// Standard deviation of float32's last bit, relative to the number.
+const ROUNDING: f64 = 1e-7;
+
 /// Columns to normalize before training. Files list them by name, in any order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "Vec<Column>", into = "Vec<Column>")]
@@ -73,14 +76,14 @@ pub(crate) fn apply(scaling: &Scaling, recording: &mut Recording) {
 }
 
 /// Map of each column to mean 0 and standard deviation 1 in the rows that count. A column that is
-/// constant, in float32, has scale 0.
+/// constant but for [`ROUNDING`] has scale 0, else a robot that moves it would be far off its data.
 pub(crate) fn standard_units(
     values: &[f32],
     width: usize,
     counts: impl Fn(usize) -> bool,
 ) -> Affine {
-    let of = |figures: &Figures| match figures.min == figures.max {
-        true => (figures.min as f32, 0.0), // By rounding, the deviation might not be 0.
+    let of = |figures: &Figures| match figures.deviation <= ROUNDING * figures.size {
+        true => (figures.min as f32, 0.0),
         false => (figures.mean as f32, figures.deviation as f32),
     };
     let columns = Figures::of_columns(values, width, counts);

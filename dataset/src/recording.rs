@@ -142,8 +142,11 @@ impl Recording {
 
     /// True if `following`, the next transition after `row`, starts in its next state.
     fn continues(&self, row: usize, following: usize) -> bool {
+        if following == row + 1 {
+            return self.next_observations.is_none() || !self.jumps(row);
+        }
         let (start, next) = (self.observation(following), self.observation(row + 1));
-        following == row + 1 || !differ(start, next, Rounding::default())
+        !differ(start, next, Rounding::default())
     }
 
     /// True if a row's stored next observation differs from the following row's observation.
@@ -209,5 +212,13 @@ pub(crate) mod tests {
         assert_eq!(found(&recording), ("rewards".to_owned(), 4));
         recording.parts = vec![(0, "episode_0".to_owned()), (3, "episode_1".to_owned())];
         assert_eq!(found(&recording), ("episode_1/rewards".to_owned(), 1));
+    }
+
+    #[test]
+    fn a_trajectory_ends_where_a_stored_next_observation_is_not_the_next_row_s() {
+        let mut recording = recording(&[RowKind::Transition; 4]);
+        assert_eq!(recording.trajectory_returns(), [6.0]);
+        recording.next_observations = Some(vec![1.0, 9.0, 3.0, 4.0]);
+        assert_eq!(recording.trajectory_returns(), [1.0, 5.0]);
     }
 }

@@ -27,7 +27,8 @@ pub(super) fn read(
     };
     // The recording continues after the goal: only timeouts end an episode.
     let is_maze = environment.is_some_and(|environment| environment.maze.is_some());
-    let goal = is_maze || file.has("infos/goal");
+    // Goals without terminals, as of mazes with dense rewards, end nothing.
+    let goal = is_maze || (file.has("infos/goal") && terminals.contains(&true));
     let until_timeout = goal && timeouts.contains(&true);
     let ends = (0..rows).map(|row| timeouts[row] || (terminals[row] && !until_timeout));
     let kind = |row: usize| match timeouts[row] || row + 1 == rows {

@@ -1,7 +1,6 @@
 //! HDF5 reader that checks each array for presence, type, shape and size. Damaged HDF5 structures
 //! are left to libhdf5, whose version 1.10 crashes on some: open files from trusted sources only.
 
-use std::fmt::Display;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -236,11 +235,13 @@ fn text_in(holder: &Container) -> Option<String> {
     if texts.len() == 1 { texts.pop() } else { None }
 }
 
-/// Texts in an attribute or an array, of variable or fixed length, ASCII or UTF-8.
+/// Texts in an attribute or an array, of variable or fixed length, ASCII or UTF-8. Files also hold
+/// Latin-1, which `hdf5` would pass on as a `str`.
 fn texts_in(holder: &Container) -> Option<Vec<String>> {
-    fn as_type<T: H5Type + Display>(holder: &Container) -> Option<Vec<String>> {
+    fn as_type<T: H5Type + AsRef<[u8]>>(holder: &Container) -> Option<Vec<String>> {
         let texts = holder.read_raw::<T>().ok()?;
-        Some(texts.iter().map(T::to_string).collect())
+        let text = |text: &T| String::from_utf8_lossy(text.as_ref()).into_owned();
+        Some(texts.iter().map(text).collect())
     }
     as_type::<VarLenUnicode>(holder)
         .or_else(|| as_type::<VarLenAscii>(holder))

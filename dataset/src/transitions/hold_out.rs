@@ -88,8 +88,8 @@ impl Recording {
     }
 
     pub(super) fn extend(&mut self, from: &Recording, rows: Range<usize>) {
-        if let Some((_, group)) = from.parts.iter().find(|(first, _)| *first == rows.start) {
-            self.parts.push((self.rows(), group.clone()));
+        if let Ok(part) = from.parts.binary_search_by_key(&rows.start, |(first, _)| *first) {
+            self.parts.push((self.rows(), from.parts[part].1.clone()));
         }
         let columns = |width: usize| rows.start * width..rows.end * width;
         let (states, actions) = (columns(from.observation_dim), columns(from.action_dim));

@@ -8,6 +8,7 @@ mod resets;
 mod rest;
 mod rewards;
 mod sizes;
+mod unwritten;
 
 use crate::normalize::Normalize;
 use crate::recording::Recording;
@@ -48,6 +49,7 @@ pub(crate) fn of_numbers(
             warnings.extend(rewards::size(recording));
         }
     }
+    warnings.extend(unwritten::rows(recording));
     warnings.extend(copied.into_iter().chain(rest).chain(late));
     warnings.extend(sizes::columns(recording, normalize));
     warnings

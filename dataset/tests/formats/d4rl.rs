@@ -95,3 +95,15 @@ fn a_recording_with_a_goal_goes_on_after_it_in_whatever_environment() {
     // Returns exclude rewards after the goal.
     assert_eq!((transitions.statistics().episodes, transitions.statistics().return_max), (2, 1.0));
 }
+
+#[test]
+fn a_goal_without_terminals_does_not_end_returns() {
+    let (_folder, path) = scratch("maze2d.hdf5");
+    let mut arrays = steps(8, 2, 1);
+    (arrays.timeouts[3], arrays.timeouts[7]) = (true, true);
+    let file = write(&path, &arrays);
+    file.create_group("infos").unwrap();
+    put(&file, "infos/goal", &[8, 2], &[0.0f32; 16]);
+    drop(file);
+    assert_eq!(try_read(&path, None).unwrap().statistics().return_mean, 4.0);
+}

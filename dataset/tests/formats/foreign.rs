@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use ndarray::Array2;
 use npyz::WriterBuilder;
 use npyz::half::f16;
-use quad_dataset::{Problem, RewardRule, data_file, inspect};
+use quad_dataset::{ArrayProblem, Problem, RewardRule, data_file, inspect};
 use tempfile::{TempDir, tempdir};
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
@@ -148,6 +148,14 @@ fn an_unknown_filter_is_named_with_what_rewrites_the_file() {
         let message = format!("array `observations` is compressed by {filter}");
         assert_refused(&path, None, &message, "python -c");
     }
+}
+
+#[test]
+fn a_newer_librarys_array_is_not_called_damaged() {
+    let unknown = "unable to open dataset: bad version number for layout message";
+    let problem = ArrayProblem::Unreadable(hdf5::Error::from(unknown));
+    let hint = Problem::Array("rewards".to_owned(), problem).hint();
+    assert!(hint.starts_with("a newer HDF5 library wrote it: pip install h5py"), "{hint}");
 }
 
 #[test]

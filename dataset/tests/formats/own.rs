@@ -125,6 +125,20 @@ fn arrays_are_written_and_read_again() {
 }
 
 #[test]
+fn names_in_latin_1_become_utf_8() {
+    let (_folder, path) = scratch("own.hdf5");
+    let observations = ["x", "y", "in grad#"].map(str::to_owned).to_vec();
+    let names = Names { observations, actions: Vec::new() };
+    write_own(&path, Arrays { actions: vec![0.25; 12], ..arrays() }, names).unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    let place = bytes.windows(8).position(|bytes| bytes == b"in grad#").unwrap();
+    bytes[place + 7] = 0xb0; // The degree sign.
+    std::fs::write(&path, bytes).unwrap();
+    let transitions = try_read(&path, None).unwrap();
+    assert_eq!(transitions.names().observations[2], "in grad\u{fffd}");
+}
+
+#[test]
 fn arrays_that_would_be_refused_are_not_written() {
     let (folder, path) = scratch("own.hdf5");
     type Spoil = fn(&mut Arrays);

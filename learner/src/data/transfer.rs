@@ -56,18 +56,20 @@ pub fn transfer(
         request = request.header("Range", format!("bytes={}-", partial.length));
     }
     let mut response = request.call().map_err(network)?;
-    match response.status() {
-        StatusCode::OK => partial.clear()?,
-        StatusCode::PARTIAL_CONTENT if first_byte(&response) == Some(partial.length) => {}
+    let first = match response.status() {
+        StatusCode::OK => 0,
+        StatusCode::PARTIAL_CONTENT if first_byte(&response) == Some(partial.length) => {
+            partial.length
+        }
         StatusCode::PARTIAL_CONTENT | StatusCode::RANGE_NOT_SATISFIABLE => {
             partial.clear()?;
             let reason = "the server did not continue where the last connection broke";
             return Err(Failure::Passing(reason.to_owned()));
         }
         status => return Err(refusal(status)),
-    }
+    };
     let rest = response.body().content_length();
-    let bytes = match (expected, rest.map(|rest| partial.length + rest)) {
+    let bytes = match (expected, rest.map(|rest| first + rest)) {
         (Some(expected), Some(found)) if found != expected => {
             let reason = format!("the server's file has {found} bytes, but must have {expected}");
             return Err(Failure::Lasting(reason));
@@ -78,6 +80,10 @@ pub fn transfer(
             return Err(Failure::Lasting(reason.to_owned()));
         }
     };
+    // Not before: a page in place of the file is refused by its size, and costs no part.
+    if first == 0 {
+        partial.clear()?;
+    }
     progress.start(partial.length, bytes);
     append(response.body_mut(), bytes, partial, progress)
 }

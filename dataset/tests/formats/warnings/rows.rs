@@ -47,6 +47,28 @@ fn next_observations_that_are_the_rows_own() {
 }
 
 #[test]
+fn rows_that_were_never_written() {
+    let mut arrays = mass(60, 0.1);
+    let rows = arrays.rewards.len() + 100;
+    for (values, width) in [
+        (&mut arrays.observations, O),
+        (&mut arrays.next_observations, O),
+        (&mut arrays.actions, 2),
+        (&mut arrays.rewards, 1),
+    ] {
+        values.resize(rows * width, 0.0);
+    }
+    for flags in [&mut arrays.terminals, &mut arrays.timeouts] {
+        flags.resize(rows, false);
+    }
+    for own in [false, true] {
+        assert!(any(&problems(&arrays, own), "array `observations`: 0 in the last 100 rows ("));
+    }
+    arrays.timeouts[rows - 1] = true;
+    assert!(!any(&problems(&arrays, true), "array `observations`: 0 in"));
+}
+
+#[test]
 fn actions_that_are_the_state() {
     let degrees = 180.0 / std::f32::consts::PI;
     for (unit, own) in [(1.0, false), (1.0, true), (100.0, true), (degrees, true)] {

@@ -186,6 +186,15 @@ fn a_mirror_is_tried_first_and_its_part_is_kept() {
 }
 
 #[test]
+fn a_page_in_place_of_the_file_costs_no_part() {
+    let folder = TempDir::new().unwrap();
+    fs::write(folder.path().join("file.hdf5.0123.partial"), &content()[..70_000]).unwrap();
+    let (portal, good) = (serve(&[page(b"<!DOCTYPE html>".to_vec())]), serve(&[WHOLE]));
+    fetch(&dataset(&[&portal, &good]), &folder).unwrap();
+    assert_eq!((portal.requests(), good.requests()), (vec![70_000], vec![70_000]));
+}
+
+#[test]
 fn a_file_in_the_cache_is_verified_and_not_changed() {
     let (folder, server) = (TempDir::new().unwrap(), serve(&[WHOLE]));
     let path = folder.path().join("file.hdf5");
