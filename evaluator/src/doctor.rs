@@ -12,6 +12,7 @@ use quad_runtime::{
 };
 use zenoh::Session;
 
+use crate::serve::ZENOH_TIMEOUT;
 use crate::sim::{Environments, Rollout, Simulations};
 use crate::tools::film::{Gl, INSTALL};
 
@@ -119,10 +120,10 @@ async fn problem_of(session: &Session, run: &Name) -> anyhow::Result<Option<Stri
     let claim = encode(&JobRequest::Claim { evaluator, attempt, environments })?;
     let replies = session.get(keys::jobs(run)).payload(claim).timeout(ANSWER_TIMEOUT);
     let replies = replies.await.map_err(anyhow::Error::msg)?;
-    let Ok(reply) = replies.recv_async().await else {
-        return Ok(Some(format!("its learner has not answered within {ANSWER_TIMEOUT:?}")));
-    };
+    let silent = || Some(format!("its learner has not answered within {ANSWER_TIMEOUT:?}"));
+    let Ok(reply) = replies.recv_async().await else { return Ok(silent()) };
     Ok(match reply.result() {
+        Err(error) if *error.payload().to_bytes() == *ZENOH_TIMEOUT => silent(),
         Ok(sample) => {
             let payload = sample.payload();
             let answer = decode_from::<JobReply>(payload.len(), payload.reader());

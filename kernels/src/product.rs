@@ -27,6 +27,10 @@ pub enum Matrix<'a> {
     TransposeOfColumns(&'a [f32], usize, usize),
 }
 
+/// The crate `gemm` adds by another order in products with a transpose that have no more numbers than
+/// this, or one row.
+const FEW: usize = 256;
+
 /// First element, column stride, row stride.
 type Strided = (*const f32, isize, isize);
 
@@ -146,7 +150,8 @@ impl Packed {
     }
 }
 
-/// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's backward pass through `product`.
+/// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's backward pass through `product`. The bits of a
+/// row do not depend on the number of rows.
 pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = g.len() / n;
     #[cfg(target_arch = "x86_64")]
@@ -157,6 +162,13 @@ pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: us
         return unsafe {
             avx512::multiply_transposed(m, k, n, g.as_ptr(), w.as_ptr(), out.as_mut_ptr())
         };
+    }
+    let least = (FEW / k + 1).max(2);
+    if m < least {
+        let rows = [g, &vec![0.0; (least - m) * n][..]].concat();
+        let mut all = vec![0.0; least * k];
+        by_gemm([least, n, k], Matrix::RowMajor(&rows), Matrix::TransposeOf(w), &mut all);
+        return out.copy_from_slice(&all[..m * k]);
     }
     by_gemm([m, n, k], Matrix::RowMajor(g), Matrix::TransposeOf(w), out);
 }
@@ -233,6 +245,28 @@ mod tests {
             outer_rows(&x, &g, above, (0, k), n);
             outer_rows(&x, &g, below, (from, k), n);
             assert_eq!(out, whole, "{what}, outer in two parts");
+        }
+    }
+
+    /// Guidance takes gradients of as many rows as there are candidates in a batch of episodes, none
+    /// of which may depend on others.
+    #[test]
+    fn a_row_of_a_transposed_product_does_not_depend_on_others() {
+        let generator = &mut ChaCha8Rng::seed_from_u64(1);
+        let mut numbers = |len: usize| -> Vec<f32> {
+            (0..len).map(|_| generator.random_range(-1.0..1.0)).collect()
+        };
+        for (k, n) in [(17, 64), (40, 256), (48, 48), (256, 40), (64, 64)] {
+            let (g, w) = (numbers(128 * n), numbers(k * n));
+            let rows = |m: usize| {
+                let mut out = vec![f32::NAN; m * k];
+                product_transposed(&g[..m * n], &w, &mut out, k, n);
+                out
+            };
+            let all = rows(128);
+            for m in [1, 2, 6, 15, 70] {
+                assert_eq!(rows(m), all[..m * k], "{m} rows, {k} × {n}");
+            }
         }
     }
 }

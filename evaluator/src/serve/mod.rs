@@ -53,6 +53,7 @@ use crate::metrics::Metrics;
 use crate::sim::Environments;
 use discovery::Discovery;
 use evaluate::Evaluator;
+pub(crate) use query::ZENOH_TIMEOUT;
 use worker::Worker;
 
 const AFTER_HELP: &str = "\

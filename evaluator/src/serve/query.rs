@@ -12,7 +12,7 @@ use crate::metrics::Metrics;
 /// Capacity for answers to one query. One answer is enough, and few peers answer.
 const MAX_ANSWERS: usize = 64;
 /// The error with which Zenoh itself, not the learner, replies to a query that timed out.
-const ZENOH_TIMEOUT: &[u8] = b"Timeout";
+pub const ZENOH_TIMEOUT: &[u8] = b"Timeout";
 /// Most bytes of a learner's error in a message.
 const MAX_ERROR_LEN: usize = 200;
 

@@ -1,6 +1,8 @@
 //! `learner doctor` and `evaluator doctor` with a learner, a router or a disk of their own. The other
 //! checks are in doctor.trycmd.
 
+use std::sync::Mutex;
+
 use quad_protocol::keys;
 use quad_tests::made_up::name;
 use quad_tests::process::command;
@@ -74,6 +76,21 @@ async fn a_learner_of_another_version_fails() {
     let line = format!("evaluator doctor --connect {endpoint}");
     let text = tokio::task::spawn_blocking(move || doctor(&line)).await.unwrap();
     assert_found(&text, "FAIL", "run", &["protocol version 999", "hint: update"]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_learner_that_hangs_fails() {
+    let (endpoint, run) = (free_endpoint(), name("hanging"));
+    let session = router(&endpoint).await;
+    // A question that is dropped would have its end as the answer.
+    let kept = Mutex::new(Vec::new());
+    let queryable = session.declare_queryable(keys::jobs(&run));
+    let queryable = queryable.callback(move |query| kept.lock().unwrap().push(query));
+    let _queryable = queryable.await.unwrap();
+    let _token = session.liveliness().declare_token(keys::live_learner(&run, 1)).await.unwrap();
+    let line = format!("evaluator doctor --connect {endpoint}");
+    let text = tokio::task::spawn_blocking(move || doctor(&line)).await.unwrap();
+    assert_found(&text, "FAIL", "run", &["hanging: its learner has not answered within 5s"]);
 }
 
 #[test]

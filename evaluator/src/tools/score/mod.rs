@@ -40,7 +40,7 @@ fn measure(subject: &Subject) -> anyhow::Result<Scored> {
     let batches = seeds.par_chunks(BATCH).with_max_len(1);
     let batches = batches.map(|seeds| subject.roll_out(seeds));
     let scored = Scored {
-        snapshot: subject.path.clone(),
+        snapshot: subject.path.display().to_string(),
         weights: subject.weights.to_string(),
         environment: subject.spec.name.clone(),
         step: subject.step,

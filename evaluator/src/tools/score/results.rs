@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
-use std::path::PathBuf;
 
 use quad_policy::Choice;
 use quad_protocol::EpisodeScore;
@@ -13,7 +12,8 @@ use serde::Serialize;
 /// The results of one policy with one way to choose.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Scored {
-    pub snapshot: PathBuf,
+    /// Path of the file.
+    pub snapshot: String,
     /// BLAKE3 of the file.
     pub weights: String,
     pub environment: String,
@@ -62,9 +62,8 @@ pub fn table(scored: &[Scored]) -> String {
     let snapshots = Vec::from_iter(scored.chunk_by(|one, next| one.snapshot == next.snapshot));
     for of_one in &snapshots {
         let first = &of_one[0];
-        let (snapshot, episodes) = (first.snapshot.display(), first.episodes.len());
-        let mut row = vec![snapshot.to_string(), first.step.to_string()];
-        row.extend([first.environment.clone(), episodes.to_string()]);
+        let mut row = vec![first.snapshot.clone(), first.step.to_string()];
+        row.extend([first.environment.clone(), first.episodes.len().to_string()]);
         row.extend(titles.iter().map(|title| {
             let found = of_one.iter().find(|scored| scored.title() == *title);
             text(found.and_then(Scored::spread))
