@@ -25,7 +25,7 @@ use super::dry_run;
 use super::from::From;
 use super::outside::{Outside, training_threads};
 use crate::cli::TrainArgs;
-use crate::data::{LocalDataset, Source, load};
+use crate::data::{LocalDataset, Source, load, warnings};
 use crate::live::{
     Display, Ending, Events, Incarnation, MainLoop, Metrics, PageState, Run, STUCK, Threads,
 };
@@ -69,6 +69,9 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     start_pool(args.threads)?;
     let data = load(&dataset.path, &experiment)?;
+    for warning in warnings(&dataset.path, &data.training) {
+        warn!("{warning}");
+    }
     let config = run_config(args, &name, preset.task_name(), experiment, dataset, &data)?;
     if let Some(begun) = &begun {
         begun.check_same_config(&config)?;

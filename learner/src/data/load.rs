@@ -23,13 +23,15 @@ pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
     let result = Transitions::read_split(path, &options, hold_out).hint_of(DatasetError::hint);
     let path = path.display();
     let split = result.with_context(|| format!("cannot learn from {path}"))?;
-    for warning in split.training.warnings() {
-        tracing::warn!("{path}: {warning}");
-    }
     let (there, batch) = (split.training.len(), experiment.batch_size);
     if there < batch as usize {
         let error = anyhow!("{there} transitions are fewer than a batch of {batch}");
         return Err(error).hint("record more data, or ask for less with --set batch_size=N");
     }
     Ok(split)
+}
+
+/// Suspicious properties of the transitions at `path`, a sentence each.
+pub fn warnings(path: &Path, transitions: &Transitions) -> impl Iterator<Item = String> {
+    transitions.warnings().iter().map(move |warning| format!("{}: {warning}", path.display()))
 }

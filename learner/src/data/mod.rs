@@ -16,5 +16,5 @@ mod transfer;
 mod verify;
 
 pub(crate) use fetch::LocalDataset;
-pub(crate) use load::load;
+pub(crate) use load::{load, warnings};
 pub(crate) use source::Source;

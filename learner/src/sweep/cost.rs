@@ -1,6 +1,6 @@
 //! Estimates the cost of a study from one second of training of each of its configurations.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ use rayon::ThreadPoolBuilder;
 use tracing::warn;
 
 use super::study::PlannedRun;
-use crate::data::load;
+use crate::data::{load, warnings};
 use crate::train::Price;
 
 /// Further configurations are assumed to cost as much as the mean of these.
@@ -36,8 +36,14 @@ impl Cost {
         dataset: impl Fn(&PlannedRun) -> Option<&'a Path>,
     ) -> anyhow::Result<Self> {
         let one_thread = ThreadPoolBuilder::new().num_threads(1).build()?;
-        let measure = |run: &PlannedRun, path: &Path| {
+        let mut told = BTreeSet::new();
+        let mut measure = |run: &PlannedRun, path: &Path| {
             let transitions = load(path, &run.experiment)?.training;
+            for warning in warnings(path, &transitions) {
+                if told.insert(warning.clone()) {
+                    warn!("{warning}");
+                }
+            }
             one_thread.install(|| Price::measure(&run.experiment, Device::Cpu, transitions))
         };
         let mut prices: BTreeMap<String, Price> = BTreeMap::new();
