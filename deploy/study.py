@@ -150,4 +150,5 @@ def main():
     study.print_pairs(choices)
 
 
-main()
+if __name__ == "__main__":
+    main()
