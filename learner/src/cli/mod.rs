@@ -24,8 +24,8 @@ pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
 
 const FETCH_NOTE: &str = "\
-The learner writes the file into D4RL's cache folder: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. It tries $QUAD_DATASETS_URL, the
-address of a folder, first. After a broken connection it continues the fetch, also the next time.";
+The learner writes the file into its benchmark's cache folder: $D4RL_DATASET_DIR or ~/.d4rl/datasets, or ~/.ogbench/data. It tries
+$QUAD_DATASETS_URL, the address of a folder, first. After a broken connection it continues the fetch, also the next time.";
 
 const DOCTOR_NOTE: &str = "\
 The learner prints a line per check: ok, warn or FAIL, with a hint if you can do something. The exit code is 1 if a check
