@@ -71,7 +71,13 @@ impl Subject {
             let cannot = || format!("{name} cannot choose actions this way");
             policy.with_context(cannot).map(subject)
         };
-        choices.into_iter().map(with_choice).collect()
+        let subjects = choices.into_iter().map(with_choice).collect::<anyhow::Result<Vec<_>>>()?;
+        let chooses = |of: &Self| of.policy.choice().is_some_and(|choice| choice.candidates > 1);
+        if (args.rule.is_some() || args.aggregate.is_some()) && !subjects.iter().any(chooses) {
+            let nothing = "samples one action per state, so --rule and --aggregate change nothing";
+            return Err(anyhow!("{name} {nothing}")).hint("add --candidates N, or leave them out");
+        }
+        Ok(subjects)
     }
 
     /// Plays the episodes of some seeds as one batch.
@@ -125,9 +131,12 @@ fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
 
 #[cfg(test)]
 mod tests {
-    use quad_policy::{Aggregate, Rule};
+    use std::fs;
+
+    use quad_policy::{Aggregate, DiffusionShape, Rule};
 
     use super::*;
+    use crate::serve::fixtures::{file, smallest};
 
     #[test]
     fn options_replace_the_policy_s_own_choice() {
@@ -142,5 +151,30 @@ mod tests {
         assert_eq!(choices(&args, Some(own)), [own]);
         (own.guidance, args.rule, args.guidance) = (0.5, None, Some(2.0));
         assert_eq!(choices(&args, Some(own)), [Choice { guidance: 2.0, ..own }]);
+    }
+    #[test]
+    fn a_choice_among_less_than_two_actions_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("policy.safetensors");
+        let problem = |critics, candidates: &[u32], aggregate| {
+            fs::write(&path, file("hopper", DiffusionShape { critics, ..smallest() }, 1)).unwrap();
+            let candidates = candidates.to_vec();
+            let args = ScoreArgs { candidates, aggregate: Some(aggregate), ..Default::default() };
+            let error = Subject::read(&path, &args).err();
+            error.map_or_else(String::new, |error| format!("{error:#}"))
+        };
+        let (mean, min) = (Aggregate::Mean, Aggregate::Min);
+        for (critics, candidates, aggregate, expected) in [
+            (0, &[][..], min, "no critics"),
+            (0, &[], mean, "one action per state"),
+            (0, &[1, 10], mean, "no critics"),
+            (2, &[], min, "one action per state"),
+            (2, &[1], min, "one action per state"),
+            (2, &[1, 10], min, ""),
+        ] {
+            let found = problem(critics, candidates, aggregate);
+            let fits = found.contains(expected) && found.is_empty() == expected.is_empty();
+            assert!(fits, "{critics} critics, {candidates:?}: {found:?}, not {expected:?}");
+        }
     }
 }
