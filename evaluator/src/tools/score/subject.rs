@@ -10,7 +10,7 @@ use quad_run::files;
 use quad_runtime::Hint;
 
 use super::args::{MOST_EPISODES, ScoreArgs};
-use crate::sim::{Environments, Rollout, Simulations};
+use crate::sim::{self, Environments, Rollout, Simulation, Simulations};
 
 const SNAPSHOT: &str = "pass files like RUN/snapshots/step_000020000.safetensors; \
                         RUN/snapshots/*.safetensors are all of a run";
@@ -88,11 +88,40 @@ impl Subject {
         let mut rollout = Rollout::new(make, sizes, seeds, |seed| policy.begin(seed))?;
         while !rollout.is_done() {
             rollout.step(|observations, states, actions| {
-                let acted = policy.act(observations, states, actions);
-                acted.with_context(|| format!("{}: the policy cannot act", self.path.display()))
+                policy.act(observations, states, actions).with_context(|| self.cannot_act())
             })?;
         }
         Ok(rollout.into_scores())
+    }
+
+    /// Plays the episode of a seed. `see` gets the simulation, and the undiscounted return so far, in
+    /// each state in which the policy acts; those of the last state are returned.
+    pub fn play(
+        &self,
+        seed: u64,
+        environment_seed: u64,
+        mut see: impl FnMut(&Simulation, f64),
+    ) -> anyhow::Result<(Simulation, f64)> {
+        let policy = &*self.policy;
+        let mut simulation = sim::make(self.spec, environment_seed)?;
+        simulation.reset(seed);
+        let (mut memory, mut action) = ([policy.begin(seed)], vec![0.0; policy.action_dim()]);
+        let mut episode_return = 0.0;
+        loop {
+            see(&simulation, episode_return);
+            let observation = simulation.observation().iter().map(|x| *x as f32);
+            let acted = policy.act(&Vec::from_iter(observation), &mut memory, &mut action);
+            acted.with_context(|| self.cannot_act())?;
+            let step = simulation.step(&action);
+            episode_return += step.reward;
+            if step.terminated || step.truncated {
+                return Ok((simulation, episode_return));
+            }
+        }
+    }
+
+    fn cannot_act(&self) -> String {
+        format!("{}: the policy cannot act", self.path.display())
     }
 
     fn check(&self) -> anyhow::Result<()> {
