@@ -32,7 +32,7 @@ fn largest(values: &[f64]) -> usize {
 }
 
 impl Candidates {
-    /// Draws candidates in each state, of which `observations` `[n, o]` are, and measures true values.
+    /// Draws candidates in each of n states, whose `observations` are `[n, o]`, and measures them.
     pub fn draw(
         Probed { actor, critics, oracle, .. }: &Probed,
         states: &[State],

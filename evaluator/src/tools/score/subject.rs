@@ -75,7 +75,8 @@ impl Subject {
         let chooses = |of: &Self| of.policy.choice().is_some_and(|choice| choice.candidates > 1);
         if (args.rule.is_some() || args.aggregate.is_some()) && !subjects.iter().any(chooses) {
             let nothing = "samples one action per state, so --rule and --aggregate change nothing";
-            return Err(anyhow!("{name} {nothing}")).hint("add --candidates N, or leave them out");
+            return Err(anyhow!("{name} {nothing}"))
+                .hint("take more --candidates, or leave them out");
         }
         Ok(subjects)
     }
