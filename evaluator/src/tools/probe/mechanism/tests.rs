@@ -14,20 +14,20 @@ fn samples(noise: f64) -> Vec<Sample> {
     let rollouts = [[1, 1], [1, 3], [3, 1], [3, 3]];
     let states = [0.5, -1.0, 2.0, 0.75].into_iter().zip(rollouts).map(|(s, rollouts)| State {
         observation: vec![s, 1.0],
-        rollouts: rollouts.to_vec(),
+        rollouts: Vec::from(rollouts),
         ..State::default()
     });
     let states = Vec::from_iter(states);
     let at = |(state, t): (usize, usize)| {
-        let action = [[0.25, -0.5], [-0.5, 0.5]][t - 1];
+        let action: [f32; 2] = [[0.25, -0.5], [-0.5, 0.5]][t - 1];
         let pairs = states[state].observation.iter().zip(&action);
         let gradient = Vec::from_iter(pairs.map(|(s, a)| f64::from(s - a)));
         let of_critic = |sign: f64| vec![gradient[0] + t as f64 * (0.5 + sign), gradient[1]];
         Noisy {
             state,
             t,
-            action: action.to_vec(),
-            direction: [[1.0, 0.0], [0.6, 0.8]][t - 1].to_vec(),
+            action: Vec::from(action),
+            direction: Vec::from([[1.0, 0.0], [0.6, 0.8]][t - 1]),
             gradients: vec![of_critic(1.0), of_critic(-1.0)],
             denoised: gradient,
         }
