@@ -89,7 +89,7 @@ fn dot(x: &[f64], y: &[f64]) -> f64 {
     x.iter().zip(y).fold(0.0, |sum, (x, y)| sum + x * y)
 }
 
-/// The mean, in the arithmetic of published tables.
+/// The mean as candle computes it, by a product with 1/n.
 fn mean(values: &[f64]) -> f64 {
     values.iter().fold(0.0, |sum, x| sum + x) * (1.0 / values.len() as f64)
 }
