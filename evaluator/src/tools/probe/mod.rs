@@ -2,8 +2,8 @@
 //!
 //! `args`: the arguments; `subject`: the snapshot's networks; `states`: states that its policy visits;
 //! `oracle`: true values. `noisy`: noisy actions, with the critics' gradients; `slopes`: true slopes
-//! beside them; `mechanism`: statistics of these. `choosing`: statistics of candidates; `recorded`:
-//! the data near them. `grid`: tables of estimates; `ranks`: rank correlation.
+//! beside them; `mechanism`: statistics of these. `choosing`: candidates, and statistics of them;
+//! `recorded`: the data near them. `grid`: tables of estimates; `ranks`: rank correlation.
 
 mod args;
 mod choosing;
