@@ -50,7 +50,7 @@ impl Metrics {
         let received = "Weight snapshots received whole and verified";
         let score = "Normalized score of each scored episode";
         let practiced = "Practice episodes that a learner has acknowledged";
-        let duration = "Time from a job's hand-out to the end of its last episode";
+        let duration = "Time from the beginning of a job's episodes to the end of the last";
         let rejected = "Messages from the wire that were not used, by reason";
         let runs = IntGauge::with_opts(opts("runs", "Runs that are being served"))?;
         let metrics = Metrics {

@@ -209,7 +209,7 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>>
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, tensors)?),
         PolicyConfig::Score { shape, choice } => {
-            Box::new(ScorePolicy::load(&shape, choice, tensors, precision)?)
+            Box::new(ScorePolicy::load(&shape, choice, tensors)?)
         }
         PolicyConfig::Diffuser { shape, choice } => {
             let units = shape.units.clone();

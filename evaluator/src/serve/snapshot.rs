@@ -16,6 +16,9 @@ use crate::metrics::Metrics;
 
 /// Most bytes of kept snapshots, over all runs. The largest allowed snapshot fits.
 const MAX_BYTES: usize = 256 << 20;
+/// Label of a snapshot from a learner process that is not followed. It is no fault: after a restart,
+/// the new process is followed when the current job is done.
+const OTHER_INCARNATION: &str = "other_incarnation";
 
 /// Compares everything but the file, whose hash decoding has verified.
 pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
@@ -102,7 +105,7 @@ impl Listener {
             }
             Err((label, problem)) => {
                 metrics.rejected(label);
-                if !shared.warned.swap(true, Relaxed) {
+                if label != OTHER_INCARNATION && !shared.warned.swap(true, Relaxed) {
                     warn!(%run, "ignored a bad snapshot (further ones are only counted): {problem}");
                 }
             }
@@ -133,7 +136,7 @@ fn read(sample: &Sample, run: &Name, state: &State) -> Result<Snapshot, (&'stati
     }
     if snapshot.incarnation != state.incarnation.load(Relaxed) {
         let problem = "it is from another learner process".to_owned();
-        return Err(("other_incarnation", problem));
+        return Err((OTHER_INCARNATION, problem));
     }
     Ok(snapshot)
 }

@@ -64,7 +64,6 @@ impl ScorePolicy {
         shape: &ScorePolicyShape,
         choice: Choice,
         tensors: &mut Tensors,
-        precision: Precision,
     ) -> Result<CandidatePolicy> {
         check_dims(shape.observation_dim, shape.action_dim)?;
         check_range("evaluations", shape.evaluations, MOST_EVALUATIONS)?;
@@ -74,7 +73,7 @@ impl ScorePolicy {
         let solver = DpmSolver::new(shape.evaluations);
         let networks = Networks {
             actor: Box::new(ScoreActor { network, solver }),
-            critics: Some(Ensemble::take(shape.critic(), tensors, CRITIC, precision)?),
+            critics: Some(Ensemble::take(shape.critic(), tensors, CRITIC, Precision::F32)?),
             value: None,
             precision: Precision::F32,
         };
@@ -120,7 +119,7 @@ mod tests {
             observation_dim: 3,
             action_dim: 2,
             actor: layers(Activation::Silu, &[16, 8]),
-            critic: layers(Activation::Silu, &[16, 8]),
+            critic: layers(Activation::Silu, &[64; 2]),
             evaluations,
         };
         initial(PolicyConfig::Score { shape, choice })
@@ -131,10 +130,13 @@ mod tests {
     fn the_action_is_the_mean_of_the_best_candidates() {
         let rule = "average:1e-7:4".parse().unwrap();
         let file = file(5, Choice::new(6, Aggregate::Mean, rule));
-        let policy = load_policy(&file, Precision::Bf16).unwrap();
-        assert_eq!(policy.precision(), Precision::F32);
+        let [policy, exact] =
+            [Precision::Bf16, Precision::F32].map(|asked| load_policy(&file, asked).unwrap());
         let (observations, seeds) = ([0.5, -0.2, 0.1, 1.0, 0.0, -1.0], [7, 8]);
-        let Samples { actions, values } = sample(&*policy, &observations, &seeds).unwrap();
+        assert_eq!(policy.precision(), Precision::F32);
+        let samples = sample(&*policy, &observations, &seeds).unwrap();
+        assert_eq!(samples, sample(&*exact, &observations, &seeds).unwrap());
+        let Samples { actions, values } = samples;
         let taken = act(&*policy, &observations, &seeds).unwrap();
         for (i, taken) in taken.chunks_exact(2).enumerate() {
             let (actions, values) = (&actions[i * 12..][..12], &values[i * 6..][..6]);

@@ -54,7 +54,8 @@ impl CandidatePolicy {
         if choice.rule == Rule::Nearest && networks.value.is_none() {
             return Err(PolicyError::NoValue);
         }
-        if choice.candidates > 1 && networks.critics.is_none() {
+        let unvalued = Choice { guidance: choice.guidance, ..Choice::best_of(1) };
+        if choice != unvalued && networks.critics.is_none() {
             return Err(PolicyError::NoCritics);
         }
         let policy = Self { choice, networks };

@@ -59,16 +59,27 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     let replies = session.get(keys::weights_at(&run, first)).await.unwrap();
     let reply = replies.recv_async().await.unwrap().into_result().unwrap();
     let snapshot = reply.payload().to_bytes();
-    decode::<Snapshot>(&snapshot).unwrap();
+    let mut earlier: Snapshot = decode(&snapshot).unwrap();
+    earlier.incarnation -= 1;
+    let put = session.put(keys::weights(&run), encode(&earlier).unwrap());
+    put.congestion_control(CongestionControl::Block).await.unwrap();
+    let evaluator_page = evaluator.metrics();
+    let count_of = |reason: &str| {
+        let page = http::metrics(&evaluator_page)?;
+        let label = format!("reason=\"{reason}\"");
+        let count = http::sum(&page, "quad_evaluator_rejected_messages_total", &label);
+        (count > 0.0).then_some(())
+    };
+    eventually("the evaluator counts weights of another learner process", PATIENCE, || {
+        count_of("other_incarnation")
+    });
+
     let request = made_up::claim("client", 1, "hopper");
     let payloads = garbage(&snapshot).into_iter().chain(garbage(&encode(&request).unwrap()));
     send_everywhere(&session, payloads).await;
 
-    let evaluator_page = evaluator.metrics();
     eventually("the evaluator counts weights that are not what they say", PATIENCE, || {
-        let page = http::metrics(&evaluator_page)?;
-        (http::sum(&page, "quad_evaluator_rejected_messages_total", "reason=\"hash\"") > 0.0)
-            .then_some(())
+        count_of("hash")
     });
     for reason in ["empty", "not_quad", "version", "truncated", "oversized", "kind"] {
         let label = format!("reason=\"{reason}\"");
@@ -83,6 +94,7 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     assert!(learner.process.is_running() && evaluator.process.is_running());
     let said = evaluator.process.log().matches("ignored a bad snapshot").count();
     assert_eq!(said, 1, "bad weights are logged once");
+    evaluator.process.assert_not_said("another learner process");
     learner.process.assert_not_said("panicked");
     evaluator.process.assert_not_said("panicked");
 }

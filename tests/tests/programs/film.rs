@@ -133,6 +133,10 @@ fn a_film_is_whole_or_absent() {
     let output =
         film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", "/nowhere").output().unwrap();
     assert_refused(&output, "cannot start ffmpeg", "--out film.gif");
+    fs::write(&ffmpeg, "#!/bin/sh\nexit 3\n").unwrap();
+    let output =
+        film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", &path).output().unwrap();
+    assert_refused(&output, "ffmpeg ended with exit status: 3", "--out film.gif");
     assert!(!folder.join("film.mp4").exists());
 
     let Some(disk) = SmallDisk::mount(&folder.join("disk"), 1) else { return };

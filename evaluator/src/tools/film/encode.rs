@@ -5,7 +5,7 @@ use std::io::Write;
 use std::iter::once;
 use std::process::{Command, Stdio};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use color_quant::NeuQuant;
 use gif::{Encoder, Frame, Repeat};
 use quad_run::files;
@@ -101,7 +101,8 @@ fn video(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::R
     }
     let status = ffmpeg.wait()?;
     if !status.success() {
-        bail!("ffmpeg ended with {status}");
+        return Err(anyhow!("ffmpeg ended with {status}"))
+            .hint("its message is above; --out film.gif needs no other program");
     }
     Ok(files::read(&path)?)
 }

@@ -1,9 +1,8 @@
 //! Plays an episode and keeps its poses, which are drawn afterwards.
 
-use anyhow::Context;
 use quad_protocol::episode_seeds;
 
-use crate::sim::{self, Simulation};
+use crate::sim::Simulation;
 use crate::tools::score::Subject;
 
 /// Subject of one picture.
@@ -36,26 +35,12 @@ impl Episode {
         seed: Option<u64>,
         environment_seed: u64,
     ) -> anyhow::Result<Self> {
-        let policy = &*subject.policy;
         let seed = seed.unwrap_or_else(|| episode_seeds(subject.seed, subject.step, 1)[0]);
-        let mut simulation = sim::make(subject.spec, environment_seed)?;
-        simulation.reset(seed);
-        let (mut states, mut action) = ([policy.begin(seed)], vec![0.0; policy.action_dim()]);
-        let mut episode_return = 0.0;
-        let mut poses = vec![pose(&simulation, episode_return)];
-        loop {
-            let observation = simulation.observation().iter().map(|&value| value as f32);
-            policy
-                .act(&Vec::from_iter(observation), &mut states, &mut action)
-                .with_context(|| format!("{}: the policy cannot act", subject.path.display()))?;
-            let step = simulation.step(&action);
-            episode_return += step.reward;
-            poses.push(pose(&simulation, episode_return));
-            if step.terminated || step.truncated {
-                break;
-            }
-        }
-        let choice = policy.choice().map(|choice| choice.to_string());
+        let mut poses = Vec::new();
+        let see = |simulation: &Simulation, so_far| poses.push(pose(simulation, so_far));
+        let (last, episode_return) = subject.play(seed, environment_seed, see)?;
+        poses.push(pose(&last, episode_return));
+        let choice = subject.policy.choice().map(|choice| choice.to_string());
         let choice = choice.unwrap_or_else(|| "no candidates".to_owned());
         Ok(Self { seed, poses, gradient_step: subject.step, choice })
     }

@@ -31,7 +31,7 @@ pub struct ProbeArgs {
     #[arg(long, value_name = "X", default_value = "0.1", value_parser = change)]
     pub h: f32,
     /// κ of the lower confidence bound mean − κ·std
-    #[arg(long, value_name = "X", default_value = "1")]
+    #[arg(long, value_name = "X", default_value = "1", value_parser = kappa)]
     pub kappa: f32,
     /// Dataset to which the distance of chosen actions is measured [default: the run's, if it is
     /// there]
@@ -48,4 +48,21 @@ pub struct ProbeArgs {
 fn change(text: &str) -> Result<f32, &'static str> {
     let number = text.parse().ok().filter(|h: &f32| *h > 0.0 && *h < 1.0);
     number.ok_or("a number between 0 and 1")
+}
+
+fn kappa(text: &str) -> Result<f32, &'static str> {
+    let number = text.parse().ok().filter(|kappa: &f32| (0.0..=f32::MAX).contains(kappa));
+    number.ok_or("a number of at least 0")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_that_give_no_slope_or_bound_are_refused() {
+        assert!(["0", "1", "nan", "x"].iter().all(|text| change(text).is_err()));
+        assert!(["-1", "nan", "inf", "x"].iter().all(|text| kappa(text).is_err()));
+        assert_eq!((change("0.5"), kappa("0")), (Ok(0.5), Ok(0.0)));
+    }
 }

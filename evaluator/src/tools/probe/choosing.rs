@@ -1,12 +1,20 @@
 //! The choice among candidates, judged by their true values.
 
+use candle_core::Tensor;
+use quad_policy::Aggregate;
 use quad_run::results::statistics::mean;
+use rand::Rng;
 
 use super::grid::Grid;
+use super::noisy::normal;
+use super::oracle::Query;
 use super::ranks::rank_correlation;
+use super::recorded::Recorded;
+use super::states::State;
+use super::subject::Probed;
 
 /// Candidates of a state.
-pub const CANDIDATES: usize = 32;
+const CANDIDATES: usize = 32;
 
 /// The candidates of one state.
 pub struct Candidates {
@@ -24,6 +32,49 @@ fn largest(values: &[f64]) -> usize {
 }
 
 impl Candidates {
+    /// Draws candidates in each of n states, whose `observations` are `[n, o]`, and measures them.
+    pub fn draw(
+        Probed { actor, critics, oracle, .. }: &Probed,
+        states: &[State],
+        observations: &Tensor,
+        recorded: Option<&Recorded>,
+        kappa: f32,
+        random: &mut impl Rng,
+    ) -> anyhow::Result<Vec<Self>> {
+        let shape = actor.shape();
+        let shape = (shape.diffusion_steps, states.len() * CANDIDATES, shape.action_dim);
+        let actions = actor.sample(observations, &normal(shape, random)?)?;
+        let values = critics.values(observations, &actions)?.flatten_all()?.to_vec1::<f32>()?;
+        let actions = actions.to_vec2::<f32>()?;
+        let rules = [Aggregate::Mean, Aggregate::Min, Aggregate::MeanMinusStd(kappa)];
+        let values = rules.map(|rule| {
+            Vec::from_iter(rule.reduce(&values, actions.len()).into_iter().map(f64::from))
+        });
+
+        let mut queries = Vec::new();
+        for (state, actions) in states.iter().zip(actions.chunks_exact(CANDIDATES)) {
+            for action in actions {
+                let query = |&seed| Query { state, action: action.clone(), seed };
+                queries.extend(state.rollouts.iter().map(query));
+            }
+        }
+        let (returns, rollouts) = (oracle.returns(&queries)?, states[0].rollouts.len());
+        let halves = [0..rollouts / 2, rollouts / 2..rollouts].map(|half| {
+            let of_actions = returns.chunks_exact(rollouts);
+            Vec::from_iter(of_actions.map(|returns| mean(&returns[half.clone()])))
+        });
+        let of_state = |(index, state): (usize, &State)| {
+            let rows = index * CANDIDATES..(index + 1) * CANDIDATES;
+            let of_rows = |all: &Vec<f64>| all[rows.clone()].to_vec();
+            Self {
+                values: values.each_ref().map(of_rows),
+                halves: halves.each_ref().map(of_rows),
+                distances: recorded.map(|of| of.distances(&state.observation, &actions[rows])),
+            }
+        };
+        Ok(states.iter().enumerate().map(of_state).collect())
+    }
+
     fn truth(&self) -> Vec<f64> {
         let [one, other] = &self.halves;
         one.iter().zip(other).map(|(one, other)| (one + other) / 2.0).collect()

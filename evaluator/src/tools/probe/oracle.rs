@@ -1,7 +1,5 @@
 //! True values: discounted returns of rollouts that begin with a given action in a given state.
 
-use std::sync::Arc;
-
 use anyhow::Context;
 use quad_dataset::{EnvironmentSpec, RewardScaling};
 use quad_policy::Policy;
@@ -9,15 +7,14 @@ use rayon::prelude::*;
 use tracing::info;
 
 use super::states::State;
-use crate::sim::{self, Environment, EnvironmentError, Rollout, Simulation, Step};
+use crate::sim::{self, EnvironmentError};
 
 /// Rollouts per batch. The limit bounds memory; a larger batch is hardly faster.
 const BATCH: usize = 256;
 
 /// A rollout to be made.
-#[derive(Clone)]
-pub struct Query {
-    pub state: Arc<State>,
+pub struct Query<'a> {
+    pub state: &'a State,
     /// The first action.
     pub action: Vec<f32>,
     /// Seed of the policy's noise.
@@ -36,78 +33,52 @@ pub struct Oracle {
 
 impl Oracle {
     /// The discounted return of each rollout, in the critics' units.
-    pub fn returns(&self, queries: Vec<Query>) -> anyhow::Result<Vec<f64>> {
+    pub fn returns(&self, queries: &[Query<'_>]) -> anyhow::Result<Vec<f64>> {
         info!("{} rollouts", queries.len());
-        let indices = Vec::from_iter(0..queries.len() as u64);
-        let queries: Arc<[Query]> = queries.into();
-        let batches = indices.par_chunks(BATCH).with_max_len(1);
-        let batches = batches.map(|indices| self.roll_out(&queries, indices));
-        Ok(batches.collect::<anyhow::Result<Vec<_>>>()?.concat())
+        let batches = queries.par_chunks(BATCH).with_max_len(1);
+        let returns = batches.map(|batch| self.roll_out(batch));
+        Ok(returns.collect::<anyhow::Result<Vec<_>>>()?.concat())
     }
 
-    fn roll_out(&self, queries: &Arc<[Query]>, indices: &[u64]) -> anyhow::Result<Vec<f64>> {
-        let policy = &*self.policy;
-        let sizes = (policy.observation_dim(), policy.action_dim());
-        let make = || -> Result<Box<dyn Environment>, EnvironmentError> {
-            Ok(Box::new(Continuation {
-                simulation: sim::make(self.spec, 0)?,
-                queries: queries.clone(),
-                first: None,
-                rewards: self.rewards,
-                gamma: self.gamma,
-                discount: 1.0,
-                left: self.length,
-            }))
+    fn roll_out(&self, queries: &[Query<'_>]) -> anyhow::Result<Vec<f64>> {
+        let (policy, width) = (&*self.policy, self.policy.action_dim());
+        let begin = |query: &Query<'_>| {
+            let mut simulation = sim::make(self.spec, 0)?;
+            simulation.set_state(&query.state.qpos, &query.state.qvel);
+            if let Some(goal) = &query.state.goal {
+                simulation.set_goal(goal);
+            }
+            Ok(simulation)
         };
-        let begin = |index| policy.begin(queries[index as usize].seed);
-        let mut rollout = Rollout::new(make, sizes, indices, begin)?;
-        while !rollout.is_done() {
-            rollout.step(|observations, states, actions| {
-                policy.act(observations, states, actions).context("the policy cannot act")
-            })?;
+        let live = queries.iter().map(begin).collect::<Result<Vec<_>, EnvironmentError>>()?;
+        let mut live = Vec::from_iter(live.into_iter().enumerate());
+        let mut memories = Vec::from_iter(queries.iter().map(|query| policy.begin(query.seed)));
+        let (mut returns, mut discount) = (vec![0.0; queries.len()], 1.0);
+        for step in 0..self.length {
+            if live.is_empty() {
+                break;
+            }
+            let observed = live.iter().flat_map(|(_, simulation)| simulation.observation());
+            let observations = Vec::from_iter(observed.map(|x| *x as f32));
+            let mut actions = vec![0.0; live.len() * width];
+            let acted = policy.act(&observations, &mut memories, &mut actions);
+            acted.context("the policy cannot act")?;
+            for row in (0..live.len()).rev() {
+                let (index, simulation) = &mut live[row];
+                let action = match step {
+                    0 => &*queries[*index].action,
+                    _ => &actions[row * width..][..width],
+                };
+                let step = simulation.step(action);
+                returns[*index] += discount * f64::from(self.rewards.apply(step.reward as f32));
+                if step.terminated {
+                    live.swap_remove(row);
+                    memories.swap_remove(row);
+                }
+            }
+            discount *= self.gamma;
         }
-        Ok(rollout.into_scores().iter().map(|episode| episode.episode_return).collect())
-    }
-}
-
-/// An environment whose episodes are the queries, by their indices.
-struct Continuation {
-    simulation: Simulation,
-    queries: Arc<[Query]>,
-    /// Taken in place of the policy's action.
-    first: Option<Vec<f32>>,
-    rewards: RewardScaling,
-    gamma: f64,
-    discount: f64,
-    left: u32,
-}
-
-impl Environment for Continuation {
-    fn reset(&mut self, index: u64) -> Result<(), EnvironmentError> {
-        let Query { state, action, .. } = &self.queries[index as usize];
-        self.simulation.set_state(&state.qpos, &state.qvel);
-        if let Some(goal) = &state.goal {
-            self.simulation.set_goal(goal);
-        }
-        self.first = Some(action.clone());
-        Ok(())
-    }
-
-    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
-        let first = self.first.take();
-        let step = self.simulation.step(first.as_deref().unwrap_or(action));
-        let reward = self.discount * f64::from(self.rewards.apply(step.reward as f32));
-        self.discount *= self.gamma;
-        self.left -= 1;
-        Ok(Step { reward, truncated: self.left == 0, ..step })
-    }
-
-    fn observation(&self) -> &[f64] {
-        self.simulation.observation()
-    }
-
-    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
-        Ok(episode_return)
+        Ok(returns)
     }
 }
 
@@ -128,8 +99,8 @@ mod tests {
         hopper.reset(3);
         hopper.step(&[0.3, -0.2, 0.1]);
         let (qpos, qvel) = (hopper.qpos().to_vec(), hopper.qvel().to_vec());
-        let state = Arc::new(State { qpos, qvel, ..State::default() });
-        let query = |first, seed| Query { state: state.clone(), action: vec![first; 3], seed };
+        let state = State { qpos, qvel, ..State::default() };
+        let query = |first, seed| Query { state: &state, action: vec![first; 3], seed };
         let queries = [query(0.5, 1), query(-0.5, 1), query(0.5, 2)];
         let rewards = RewardRule::Subtract1.scaling(&[]).unwrap();
         let mut oracle = Oracle { spec, policy, rewards, gamma: 0.9, length: 0 };
@@ -137,7 +108,7 @@ mod tests {
         // The robot falls within the longer one.
         for length in [3, 2000] {
             oracle.length = length;
-            let returns = oracle.returns(queries.to_vec()).unwrap();
+            let returns = oracle.returns(&queries).unwrap();
             for (Query { action, seed, .. }, found) in queries.iter().zip(&returns) {
                 hopper.set_state(&state.qpos, &state.qvel);
                 let (mut memory, mut expected, mut n) = ([oracle.policy.begin(*seed)], 0.0, 0);

@@ -10,7 +10,7 @@ use quad_run::files;
 use quad_runtime::Hint;
 
 use super::args::{MOST_EPISODES, ScoreArgs};
-use crate::sim::{Environments, Rollout, Simulations};
+use crate::sim::{self, Environments, Rollout, Simulation, Simulations};
 
 const SNAPSHOT: &str = "pass files like RUN/snapshots/step_000020000.safetensors; \
                         RUN/snapshots/*.safetensors are all of a run";
@@ -71,7 +71,14 @@ impl Subject {
             let cannot = || format!("{name} cannot choose actions this way");
             policy.with_context(cannot).map(subject)
         };
-        choices.into_iter().map(with_choice).collect()
+        let subjects = choices.into_iter().map(with_choice).collect::<anyhow::Result<Vec<_>>>()?;
+        let chooses = |of: &Self| of.policy.choice().is_some_and(|choice| choice.candidates > 1);
+        if (args.rule.is_some() || args.aggregate.is_some()) && !subjects.iter().any(chooses) {
+            let nothing = "samples one action per state, so --rule and --aggregate change nothing";
+            return Err(anyhow!("{name} {nothing}"))
+                .hint("take more --candidates, or leave them out");
+        }
+        Ok(subjects)
     }
 
     /// Plays the episodes of some seeds as one batch.
@@ -82,11 +89,40 @@ impl Subject {
         let mut rollout = Rollout::new(make, sizes, seeds, |seed| policy.begin(seed))?;
         while !rollout.is_done() {
             rollout.step(|observations, states, actions| {
-                let acted = policy.act(observations, states, actions);
-                acted.with_context(|| format!("{}: the policy cannot act", self.path.display()))
+                policy.act(observations, states, actions).with_context(|| self.cannot_act())
             })?;
         }
         Ok(rollout.into_scores())
+    }
+
+    /// Plays the episode of a seed. `see` gets the simulation, and the undiscounted return so far, in
+    /// each state in which the policy acts; those of the last state are returned.
+    pub fn play(
+        &self,
+        seed: u64,
+        environment_seed: u64,
+        mut see: impl FnMut(&Simulation, f64),
+    ) -> anyhow::Result<(Simulation, f64)> {
+        let policy = &*self.policy;
+        let mut simulation = sim::make(self.spec, environment_seed)?;
+        simulation.reset(seed);
+        let (mut memory, mut action) = ([policy.begin(seed)], vec![0.0; policy.action_dim()]);
+        let mut episode_return = 0.0;
+        loop {
+            see(&simulation, episode_return);
+            let observation = simulation.observation().iter().map(|x| *x as f32);
+            let acted = policy.act(&Vec::from_iter(observation), &mut memory, &mut action);
+            acted.with_context(|| self.cannot_act())?;
+            let step = simulation.step(&action);
+            episode_return += step.reward;
+            if step.terminated || step.truncated {
+                return Ok((simulation, episode_return));
+            }
+        }
+    }
+
+    fn cannot_act(&self) -> String {
+        format!("{}: the policy cannot act", self.path.display())
     }
 
     fn check(&self) -> anyhow::Result<()> {
@@ -125,9 +161,12 @@ fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
 
 #[cfg(test)]
 mod tests {
-    use quad_policy::{Aggregate, Rule};
+    use std::fs;
+
+    use quad_policy::{Aggregate, DiffusionShape, Rule};
 
     use super::*;
+    use crate::serve::fixtures::{file, smallest};
 
     #[test]
     fn options_replace_the_policy_s_own_choice() {
@@ -142,5 +181,30 @@ mod tests {
         assert_eq!(choices(&args, Some(own)), [own]);
         (own.guidance, args.rule, args.guidance) = (0.5, None, Some(2.0));
         assert_eq!(choices(&args, Some(own)), [Choice { guidance: 2.0, ..own }]);
+    }
+    #[test]
+    fn a_choice_among_less_than_two_actions_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("policy.safetensors");
+        let problem = |critics, candidates: &[u32], aggregate| {
+            fs::write(&path, file("hopper", DiffusionShape { critics, ..smallest() }, 1)).unwrap();
+            let candidates = candidates.to_vec();
+            let args = ScoreArgs { candidates, aggregate: Some(aggregate), ..Default::default() };
+            let error = Subject::read(&path, &args).err();
+            error.map_or_else(String::new, |error| format!("{error:#}"))
+        };
+        let (mean, min) = (Aggregate::Mean, Aggregate::Min);
+        for (critics, candidates, aggregate, expected) in [
+            (0, &[][..], min, "no critics"),
+            (0, &[], mean, "one action per state"),
+            (0, &[1, 10], mean, "no critics"),
+            (2, &[], min, "one action per state"),
+            (2, &[1], min, "one action per state"),
+            (2, &[1, 10], min, ""),
+        ] {
+            let found = problem(critics, candidates, aggregate);
+            let fits = found.contains(expected) && found.is_empty() == expected.is_empty();
+            assert!(fits, "{critics} critics, {candidates:?}: {found:?}, not {expected:?}");
+        }
     }
 }

@@ -61,7 +61,14 @@ fn a_policy_without_critics_takes_what_it_draws() {
     assert!(without.memory(5) < with.memory(5));
     let lacks_critics = |error| matches!(error, Some(PolicyError::NoCritics));
     assert!(lacks_critics(file(0, 2).err()));
-    assert!(lacks_critics(without.with_choice(Choice::best_of(2)).err()));
+    for (candidates, aggregate, rule) in [
+        (2, Aggregate::Mean, Rule::Best),
+        (1, Aggregate::Min, Rule::Best),
+        (1, Aggregate::Mean, Rule::softmax(1.0)),
+    ] {
+        let choice = Choice::new(candidates, aggregate, rule);
+        assert!(lacks_critics(without.with_choice(choice).err()), "{choice}");
+    }
     assert!(lacks_critics(without.value(&[0.5; 4], &[0.0; 2]).err()));
 }
 

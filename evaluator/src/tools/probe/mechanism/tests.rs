@@ -1,9 +1,5 @@
 //! Statistics of critics whose errors are known.
 
-use std::sync::Arc;
-
-use candle_core::{Device, Tensor};
-
 use super::super::noisy::Noisy;
 use super::super::oracle::Query;
 use super::super::slopes::measure;
@@ -14,40 +10,37 @@ use super::*;
 /// ±`noise`·(a₁ + a₂) and any other of their own. At t the two critics' mean is wrong by t/2 in the
 /// first dimension, and each of them by ±t more.
 fn samples(noise: f64) -> Vec<Sample> {
-    let observations = [0.5f32, -1.0, 2.0, 0.75];
-    let of = Vec::from_iter((0..4).flat_map(|state| [(state, 1), (state, 2)]));
-    let action = |t: usize| [[0.25, -0.5], [-0.5, 0.5]][t - 1];
-    let gradient = |state: usize, t: usize| {
-        let [x, y] = action(t);
-        [f64::from(observations[state]) - x, 1.0 - y]
-    };
-    let of_critic = |(state, t): (usize, usize), sign: f64| {
-        let [x, y] = gradient(state, t);
-        [x + t as f64 * (0.5 + sign), y]
-    };
-    let rows = |row: &dyn Fn(usize, usize) -> [f64; 2]| {
-        let numbers = Vec::from_iter(of.iter().map(|(state, t)| row(*state, *t).to_vec()));
-        Tensor::new(numbers, &Device::Cpu).unwrap()
-    };
-    let critics = [1.0, -1.0].map(|sign| rows(&|state, t| of_critic((state, t), sign)));
-    let noisy = Noisy {
-        actions: rows(&|_, t| action(t)),
-        directions: rows(&|_, t| [[1.0, 0.0], [0.6, 0.8]][t - 1]),
-        gradients: Tensor::stack(&critics, 1).unwrap(),
-        denoised: rows(&gradient),
-        of: of.clone(),
-    };
-    let state = |s| Arc::new(State { observation: vec![s, 1.0], ..State::default() });
     // The four ways to draw two signs.
-    let seeds = [[1, 1], [1, 3], [3, 1], [3, 3]].map(Vec::from);
-    let value = |Query { state, action, seed }: &Query| {
+    let rollouts = [[1, 1], [1, 3], [3, 1], [3, 3]];
+    let states = [0.5, -1.0, 2.0, 0.75].into_iter().zip(rollouts).map(|(s, rollouts)| State {
+        observation: vec![s, 1.0],
+        rollouts: Vec::from(rollouts),
+        ..State::default()
+    });
+    let states = Vec::from_iter(states);
+    let at = |(state, t): (usize, usize)| {
+        let action: [f32; 2] = [[0.25, -0.5], [-0.5, 0.5]][t - 1];
+        let pairs = states[state].observation.iter().zip(&action);
+        let gradient = Vec::from_iter(pairs.map(|(s, a)| f64::from(s - a)));
+        let of_critic = |sign: f64| vec![gradient[0] + t as f64 * (0.5 + sign), gradient[1]];
+        Noisy {
+            state,
+            t,
+            action: Vec::from(action),
+            direction: Vec::from([[1.0, 0.0], [0.6, 0.8]][t - 1]),
+            gradients: vec![of_critic(1.0), of_critic(-1.0)],
+            denoised: gradient,
+        }
+    };
+    let noisy = Vec::from_iter((0..4).flat_map(|state| [(state, 1), (state, 2)]).map(at));
+    let value = |Query { state, action, seed }: &Query<'_>| {
         let signed = (*seed as f64 - 2.0) * noise;
         let pairs = state.observation.iter().zip(action);
         let pairs = pairs.map(|(s, a)| (f64::from(*s), f64::from(*a)));
         pairs.map(|(s, a)| s * a - a * a / 2.0 + signed * a).sum::<f64>() + 9.0 * *seed as f64
     };
-    let returns = |queries: Vec<Query>| Ok(queries.iter().map(value).collect());
-    measure(&noisy, &observations.map(state), &seeds, 0.125, returns).unwrap()
+    let returns = |queries: &[Query<'_>]| Ok(queries.iter().map(value).collect());
+    measure(&noisy, &states, 0.125, returns).unwrap()
 }
 
 fn close(found: f64, expected: f64, what: &str) {
