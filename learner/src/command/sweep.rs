@@ -1,6 +1,6 @@
 //! `learner sweep`, from the parsed command line to the summary of all runs.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt::Alignment::{Left, Right};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -43,6 +43,9 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
         failed.push(format!("{}: its folder cannot be read", run.name));
     }
     runs.retain(|(_, state)| !matches!(state, State::Complete | State::Unreadable));
+    for doubt in BTreeSet::from_iter(runs.iter().flat_map(|(run, _)| &run.doubts)) {
+        warn!("{doubt}");
+    }
     let mut ended = match todo {
         0 => Outcome::default(),
         _ => work(args, &study.name, &folder, runs)?,

@@ -9,16 +9,13 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_run::config::{
-    ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters,
-};
+use quad_run::config::{ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo};
 use quad_run::folder::{Checkpoint, ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
 use quad_runtime::{Health, Hint, ListenError, hinted, print, serve_metrics, unfinished};
 use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
-use toml::Value;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
@@ -41,7 +38,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         Some(run) => From::read(run).map(|(from, preset)| (Some(from), preset))?,
         None => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
     };
-    let experiment = preset.resolve(&args.changes()).hint_of(ConfigError::hint)?;
+    let changes = args.changes();
+    let experiment = preset.resolve(&changes).hint_of(ConfigError::hint)?;
     if experiment.from.as_ref() != from.as_ref().map(|from| &from.hash) {
         return Err(anyhow!("the key `from` names a checkpoint, which is not there"))
             .hint("leave it out: --from RUN sets it, and begins with the run's last checkpoint");
@@ -78,18 +76,9 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     }
     info!("{}", config.dataset.summary());
     info!("{}", config.experiment.summary()?);
-    if let Some(task) = preset.task
-        && let Some(warning) = hyperparameters::not_given(&config.experiment.definition()?, task)
-    {
-        warn!("{warning}");
-    }
     let experiment = &config.experiment;
-    let (steps, start) = (experiment.total_steps(), experiment.agent.get("actor_ema_start"));
-    if let Some(start) = start.and_then(Value::as_integer).filter(|start| steps <= *start as u64) {
-        warn!(
-            "the target actor, by which QUAD acts, stays as it began: it moves after step {start} (agent.actor_ema_start), and this \
-             run has {steps}"
-        );
+    for doubt in preset.doubts(experiment, &changes)? {
+        warn!("{doubt}");
     }
     let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
     if needs_evaluators && environment::find(&experiment.environment).is_err() {
