@@ -312,7 +312,9 @@ fn run_name(path: &Path) -> anyhow::Result<Name> {
     let folder = path.file_name().unwrap_or_default().to_string_lossy();
     Name::new(folder)
         .with_context(|| format!("the run folder {path:?} gives no name for the run"))
-        .hint("its last part must be 1 to 64 letters, digits, dots, dashes or underscores")
+        .hint(
+            "name a folder by --run-dir, whose last part is 1 to 64 letters, digits, dots, dashes or underscores",
+        )
 }
 
 /// The CPU and the instructions that training uses.
