@@ -122,7 +122,7 @@ impl RunPage {
             "steps": report.steps,
             "practice_begins": config.experiment.practice_begins(),
             "measure": report.measure(),
-            "dataset_score": report.dataset_score,
+            "dataset_score": report.dataset_measure(),
             "dataset": config.dataset.summary(),
             "settings": toml::to_string(config)?,
             "metrics": Value::from_iter(metrics),
