@@ -120,10 +120,13 @@ impl Group<'_> {
     }
 }
 
-/// Groups runs, in the order in which they are given.
+/// Groups runs, in the order in which they are given, but those without scores last: they join
+/// others.
 pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     let mut groups: Vec<Group> = Vec::new();
-    for run in runs {
+    let (scored, unscored): (Vec<_>, Vec<_>) =
+        runs.iter().partition(|run| run.reached() != Some(0));
+    for run in scored.into_iter().chain(unscored) {
         let mut settings = settings::of_run(&run.config);
         settings.remove("seed");
         if let Some(group) = groups.iter_mut().find(|group| group.fits(run, &settings)) {
