@@ -1,21 +1,26 @@
 //! `learner train`, from the parsed command line to the report.
 
+use std::net::SocketAddr;
 use std::num::NonZero;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
+use prometheus::Registry;
 use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo};
 use quad_run::folder::{Checkpoint, ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
-use quad_runtime::{Health, Hint, ListenError, hinted, print, serve_metrics, unfinished};
+use quad_runtime::{
+    Health, Hint, ListenError, MetricsServer, hinted, print, serve_metrics, unfinished,
+};
 use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
+use toml::Table;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
@@ -74,10 +79,34 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     if let Some(begun) = &begun {
         begun.check_same_config(&config)?;
     }
+    announce(&config, &preset, &changes, &source)?;
+    debug!("{config:?}");
+    if args.dry_run {
+        return dry_run::estimate(&path, &config, data.training);
+    }
+
+    let runtime = super::runtime()?;
+    let first = from.map(From::into_checkpoint);
+    let run = run_to_end(args, outside, &path, (begun, first), &config, data);
+    let ended = runtime.block_on(run);
+    let concluded =
+        ended.and_then(|(run_dir, ending)| conclude(&runtime, &run_dir, &config, ending));
+    // Does not wait for a thread that a broken disk blocks.
+    runtime.shutdown_background();
+    concluded
+}
+
+/// Logs what the run learns from and how, and what the user may not expect of it.
+fn announce(
+    config: &RunConfig,
+    preset: &Preset,
+    changes: &Table,
+    source: &Source,
+) -> anyhow::Result<()> {
     info!("{}", config.dataset.summary());
-    info!("{}", config.experiment.summary()?);
     let experiment = &config.experiment;
-    for doubt in preset.doubts(experiment, &changes)? {
+    info!("{}", experiment.summary()?);
+    for doubt in preset.doubts(experiment, changes)? {
         warn!("{doubt}");
     }
     let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
@@ -93,20 +122,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     if !experiment.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
-    debug!("{config:?}");
-    if args.dry_run {
-        return dry_run::estimate(&path, &config, data.training);
-    }
-
-    let runtime = super::runtime()?;
-    let first = from.map(From::into_checkpoint);
-    let run = run_to_end(args, outside, &path, (begun, first), &config, data);
-    let ended = runtime.block_on(run);
-    let concluded =
-        ended.and_then(|(run_dir, ending)| conclude(&runtime, &run_dir, &config, ending));
-    // Does not wait for a thread that a broken disk blocks.
-    runtime.shutdown_background();
-    concluded
+    Ok(())
 }
 
 fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
@@ -166,11 +182,7 @@ async fn run_to_end(
         coordinator: Arc::default(),
     };
     let coordinator = page_state.coordinator.clone();
-    let live = Arc::new(move || page_state.to_json());
-    let page = page::routes(path.to_owned(), Some(live));
-    let server = serve_metrics(args.http, registry, health.clone(), page).await;
-    let server = server.hint_of(ListenError::hint)?;
-    info!("page: http://{}/", server.address);
+    let server = serve_page(args.http, path, page_state, registry).await?;
     let (o, a) = (data.training.observation_dim(), data.training.action_dim());
     let task = Task::new(&experiment.environment, o, a);
     let mut agent = begin(experiment, device, data.training)?;
@@ -193,8 +205,7 @@ async fn run_to_end(
     // A later start has a larger number; the low bits distinguish two that start in the same
     // millisecond.
     let number = now()? << 16 | u64::from(rand::random::<u16>());
-    let run = run.clone();
-    let incarnation = Incarnation { run, number };
+    let incarnation = Incarnation { run: run.clone(), number };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let run = Run {
         incarnation: incarnation.clone(),
@@ -224,6 +235,22 @@ async fn run_to_end(
         evaluators: outside.evaluators,
     };
     Ok((dir, main_loop.run(opening).await))
+}
+
+/// Serves the page and the metrics of the run in a folder.
+async fn serve_page(
+    address: SocketAddr,
+    path: &Path,
+    state: PageState,
+    registry: Registry,
+) -> anyhow::Result<MetricsServer> {
+    let health = state.health.clone();
+    let live = Arc::new(move || state.to_json());
+    let page = page::routes(path.to_owned(), Some(live));
+    let server = serve_metrics(address, registry, health, page).await;
+    let server = server.hint_of(ListenError::hint)?;
+    info!("page: http://{}/", server.address);
+    Ok(server)
 }
 
 fn open_or_create(

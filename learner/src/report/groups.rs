@@ -173,14 +173,10 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     reports
 }
 
-fn report(
-    runs: &[&RunReport],
-    method: String,
-    differs: Vec<String>,
-    select: Select,
-) -> GroupReport {
+/// The runs that count, and why others do not.
+fn counted<'a>(runs: &[&'a RunReport]) -> (Vec<&'a RunReport>, Vec<String>) {
     let (mut counted, mut left_out) = (Vec::<&RunReport>::new(), Vec::new());
-    for run in runs {
+    for run in runs.iter().copied() {
         let (dir, seed) = (run.dir.display(), run.seed);
         if run.newest().is_none() {
             left_out.push(format!("{dir} has no complete evaluation"));
@@ -192,6 +188,16 @@ fn report(
             counted.push(run);
         }
     }
+    (counted, left_out)
+}
+
+fn report(
+    runs: &[&RunReport],
+    method: String,
+    differs: Vec<String>,
+    select: Select,
+) -> GroupReport {
+    let (counted, left_out) = counted(runs);
     let values = |value: fn(&RunReport) -> Option<f64>| -> Option<Vec<f64>> {
         counted.iter().map(|run| value(run)).collect()
     };
