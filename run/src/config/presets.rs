@@ -107,14 +107,19 @@ impl Preset {
         let definition = experiment.definition()?;
         let not_given = self.task.and_then(|task| hyperparameters::not_given(&definition, task));
         let mut doubts = Vec::from_iter(not_given);
+        let changed = Vec::from_iter(keys(changes).into_iter().map(|(key, _)| key));
         if let Some(variant) = definition.report.variant {
             let (key, value) = (variant.key, experiment.variant()?);
-            let unused = (variant.unused)(value).iter().map(|key| format!("agent.{key}"));
-            let unused = Vec::from_iter(unused);
-            for (changed, _) in keys(changes) {
-                if unused.contains(&changed) {
-                    doubts.push(format!("{changed} has no effect on a policy with {key} {value}"));
+            for unused in (variant.unused)(value).iter().map(|key| format!("agent.{key}")) {
+                if changed.contains(&unused) {
+                    doubts.push(format!("{unused} has no effect on a policy with {key} {value}"));
                 }
+            }
+        }
+        let of_practice = |key: &&String| key.starts_with("online.") && *key != "online.steps";
+        for unused in changed.iter().filter(of_practice) {
+            if experiment.online.is_none() {
+                doubts.push(format!("{unused} has no effect without practice (--online-steps N)"));
             }
         }
         let steps = experiment.total_steps();
@@ -196,6 +201,11 @@ mod tests {
                      1000",
                 ),
             ),
+            (
+                "online.warmup = 100",
+                Some("online.warmup has no effect without practice (--online-steps N)"),
+            ),
+            ("online = { steps = 5000, warmup = 100 }", None),
             ("steps = 1001\nagent.tau = 0.5", None),
             ("agent = { guidance = 'shuffled', tau = 0.5 }", None),
             // The task's own τ has no effect, either, but nobody asked for it.
