@@ -96,7 +96,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     concluded
 }
 
-/// Logs what the run learns from and how, and what the user may not expect of it.
+/// Logs the data and the settings of the run, and warnings about them.
 fn announce(
     config: &RunConfig,
     preset: &Preset,

@@ -70,7 +70,7 @@ pub(crate) struct PlannedRun {
     pub changes: Table,
     /// The preset with its changes.
     pub experiment: Experiment,
-    /// Those of its preset, which several runs may share.
+    /// Warnings about its settings, which other runs may share.
     pub doubts: Vec<String>,
     pub source: Source,
 }

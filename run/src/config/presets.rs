@@ -97,8 +97,8 @@ impl Preset {
         Ok(experiment)
     }
 
-    /// What a user may not expect of the resolved experiment: values that the algorithm's authors do
-    /// not give, changes without effect, and a policy that does not learn.
+    /// Warnings about the experiment that `changes` resolve to: the algorithm's authors give no values
+    /// for the task, a change has no effect, or the policy does not learn.
     pub fn doubts(
         &self,
         experiment: &Experiment,
