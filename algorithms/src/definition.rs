@@ -185,13 +185,16 @@ pub struct Reporting {
     pub counts: &'static [&'static str],
     /// The hyper-parameter over which its paper draws scores.
     pub axis: Option<Axis>,
+    /// The hyper-parameter with the step after which the target actor moves, where that acts.
+    pub acts_after: Option<&'static str>,
     /// Summary of a run's metrics.
     pub summary: Option<Summarize>,
 }
 
 impl Reporting {
     /// For an algorithm with neither variants nor figures of its own.
-    pub const PLAIN: Self = Self { variant: None, counts: &[], axis: None, summary: None };
+    pub const PLAIN: Self =
+        Self { variant: None, counts: &[], axis: None, acts_after: None, summary: None };
     /// For an algorithm whose policy chooses among candidates.
     pub const CANDIDATES: Self = Self { counts: &["candidates"], ..Self::PLAIN };
 }
@@ -203,6 +206,8 @@ pub struct Variant {
     pub key: &'static str,
     /// The label of the variant with this value in tables and figures.
     pub called: fn(&str) -> String,
+    /// Hyper-parameters that change no policy of the variant with this value.
+    pub unused: fn(&str) -> &'static [&'static str],
 }
 
 /// A hyper-parameter over which scores are drawn, on a logarithmic scale.

@@ -15,6 +15,10 @@ pub(super) const DEFINITION: Definition = Definition {
         variant: Some(Variant {
             key: "divergence",
             called: |divergence| format!("ivr {divergence}"),
+            unused: |divergence| match divergence {
+                "sparse" => &["alpha.exponential"],
+                _ => &["alpha.sparse"],
+            },
         }),
         ..Reporting::PLAIN
     },

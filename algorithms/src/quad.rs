@@ -26,8 +26,9 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     report: Reporting {
         // DAC and behavior cloning (none) have names of their own.
-        variant: Some(Variant { key: "guidance", called: str::to_owned }),
+        variant: Some(Variant { key: "guidance", called: str::to_owned, unused: config::unused }),
         axis: Some(Axis { key: "tau", symbol: "τ" }),
+        acts_after: Some("actor_ema_start"),
         summary: Some(summary::of),
         ..Reporting::CANDIDATES
     },

@@ -124,8 +124,11 @@ pub(crate) fn create_folder(path: &Path) -> io::Result<()> {
     if let Some(parent) = path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
         create_folder(parent)?;
     }
-    fs::create_dir(path)?;
-    synchronize_folder(path)
+    match fs::create_dir(path) {
+        // Of two learners that begin at once, the other made it.
+        Err(error) if error.kind() != ErrorKind::AlreadyExists || !path.is_dir() => Err(error),
+        _ => synchronize_folder(path),
+    }
 }
 
 /// Makes the names in the folder of `path` durable.

@@ -128,3 +128,13 @@ impl Config {
         Ok(config)
     }
 }
+
+/// Hyper-parameters that change no policy with this guidance: without λ those of Eq. 23 and 24, and
+/// without Q-gradients those of η's dual ascent, too.
+pub(super) fn unused(guidance: &str) -> &'static [&'static str] {
+    match guidance {
+        "dac" | "constant" => &["tau", "delta", "nu_ema_rate"],
+        "none" => &["tau", "delta", "nu_ema_rate", "eta.threshold", "eta.rate"],
+        _ => &[],
+    }
+}

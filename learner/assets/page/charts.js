@@ -63,8 +63,8 @@ export function chart(parent, key, title, about, lines) {
   const last = lines.map(({ label, points }) => `${label} ${number(points.at(-1)?.[1])}`).join(", ");
   if (!charts.has(key)) {
     const figure = element("figure");
-    const caption = element("figcaption", title);
-    caption.append(element("p", about, { class: "muted" }));
+    const [caption, heading, note] = [element("figcaption"), element("span"), element("p", "", { class: "muted" })];
+    caption.append(heading, note);
     const [place, names] = [element("div", "", { class: "chart", role: "img" }), element("div", "", { class: "legend" })];
     figure.append(caption, place, names);
     parent.append(figure);
@@ -74,10 +74,12 @@ export function chart(parent, key, title, about, lines) {
       drawPoints: file.length < 60, pointSize: 3, ...colors(),
       axes: { x: { drawGrid: false, axisLabelFormatter: short }, y: { axisLabelWidth: 56, axisLabelFormatter: number } },
     });
-    charts.set(key, { graph, figure, place, shown: "" });
+    charts.set(key, { graph, figure, place, heading, note, shown: "" });
   }
   const entry = charts.get(key);
-  const shown = JSON.stringify([labels, file.length, file.at(-1)]);
+  // The user may have ticked other runs.
+  [entry.heading.textContent, entry.note.textContent] = [title, about];
+  const shown = JSON.stringify([labels, file]);
   if (shown !== entry.shown) {
     entry.shown = shown;
     entry.graph.updateOptions({ file, labels, drawPoints: file.length < 60 });

@@ -83,7 +83,8 @@ function showCharts(runs) {
   const labeled = (run, label) => (runs.length === 1 ? label : [run.run, label].filter(Boolean).join(" "));
   const scores = runs.map((run) => ({ label: labeled(run, "") || "mean", points: run.evaluations.filter((one) => one[4]) }));
   if (scores.some(({ points }) => points.length)) {
-    const data = runs.length === 1 ? `; the data's own episodes have ${number(runs[0].dataset_score)}` : "";
+    const ofData = runs.length === 1 ? runs[0].dataset_score : null;
+    const data = ofData === null ? "" : `; the data's own episodes have ${number(ofData)}`;
     const begins = runs.length === 1 && runs[0].practice_begins !== null ? ` Practice begins after step ${runs[0].practice_begins}.` : "";
     const about = `Mean over an evaluation's episodes, ± their standard deviation${data}.${begins}`;
     const measure = runs.every((run) => run.measure === "return") ? "Return" : "Score";

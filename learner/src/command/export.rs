@@ -25,8 +25,11 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     };
     let run = args.run.display();
     let Some(step) = step.filter(|step| steps.contains(step)) else {
-        let steps = Vec::from_iter(steps.iter().map(u64::to_string)).join(", ");
-        let hint = format!("its snapshots are of the steps {steps}; name one: --step N");
+        let named = Vec::from_iter(steps.iter().map(u64::to_string)).join(", ");
+        let hint = match steps.is_empty() {
+            true => "the learner keeps one at each evaluation, and at the end".to_owned(),
+            false => format!("its snapshots are of the steps {named}; name one: --step N"),
+        };
         return Err(anyhow!("{run} has no snapshot {what}")).hint(hint);
     };
     let file = folder.read_snapshot(step)?;

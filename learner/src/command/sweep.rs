@@ -1,6 +1,6 @@
 //! `learner sweep`, from the parsed command line to the summary of all runs.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt::Alignment::{Left, Right};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -43,6 +43,9 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
         failed.push(format!("{}: its folder cannot be read", run.name));
     }
     runs.retain(|(_, state)| !matches!(state, State::Complete | State::Unreadable));
+    for doubt in BTreeSet::from_iter(runs.iter().flat_map(|(run, _)| &run.doubts)) {
+        warn!("{doubt}");
+    }
     let mut ended = match todo {
         0 => Outcome::default(),
         _ => work(args, &study.name, &folder, runs)?,
@@ -104,17 +107,13 @@ fn shares(cores: usize, threads: usize, jobs: Option<u16>, runs: usize) -> (usiz
     (jobs, left.max(1))
 }
 
-fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Outcome> {
-    let threads = threads_asked().map_or(1, usize::from);
-    let cores = available_parallelism()?.get();
-    let (jobs, cores) = shares(cores, threads, args.jobs, left.len());
-    let count = args.evaluators.unwrap_or(cores);
-    let count = if args.connect.is_some() { 0 } else { count };
-    let mut evaluators = LocalEvaluators::new(count, cores)?;
-    // Fetched once, not by each learner.
-    let mut datasets = BTreeMap::<Option<String>, Option<PathBuf>>::new();
-    let mut refusal = None;
-    for (run, _) in &left {
+/// The data of each run, by its name or path; `None` where there is none.
+type Datasets = BTreeMap<Option<String>, Option<PathBuf>>;
+
+/// Fetches each dataset once, in place of each learner. Fails if no run of several can begin.
+fn obtain(left: &Runs, is_alone: bool) -> anyhow::Result<Datasets> {
+    let (mut datasets, mut refusal) = (Datasets::new(), None);
+    for (run, _) in left {
         let fetch = || {
             let dataset = run.source.obtain().hint(record_hint(&run.experiment));
             let refused = |error| {
@@ -123,15 +122,24 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
             };
             dataset.map_err(refused).ok().map(|dataset| dataset.path)
         };
-        let dataset = run.experiment.dataset.clone();
-        datasets.entry(dataset).or_insert_with(fetch);
+        datasets.entry(run.experiment.dataset.clone()).or_insert_with(fetch);
     }
-    if let Some(refusal) = refusal
-        && args.index.is_none()
-        && datasets.values().all(Option::is_none)
-    {
-        return Err(refusal.context("no run can begin"));
+    match refusal {
+        Some(refusal) if !is_alone && datasets.values().all(Option::is_none) => {
+            Err(refusal.context("no run can begin"))
+        }
+        _ => Ok(datasets),
     }
+}
+
+fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Outcome> {
+    let threads = threads_asked().map_or(1, usize::from);
+    let cores = available_parallelism()?.get();
+    let (jobs, cores) = shares(cores, threads, args.jobs, left.len());
+    let count = args.evaluators.unwrap_or(cores);
+    let count = if args.connect.is_some() { 0 } else { count };
+    let mut evaluators = LocalEvaluators::new(count, cores)?;
+    let datasets = obtain(&left, args.index.is_some())?;
     let mut step_seconds = BTreeMap::new();
     // A single run, such as a task of an array job, starts at once and prints its own forecast.
     if args.index.is_none() {

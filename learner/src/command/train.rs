@@ -1,24 +1,26 @@
 //! `learner train`, from the parsed command line to the report.
 
+use std::net::SocketAddr;
 use std::num::NonZero;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
+use prometheus::Registry;
 use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_run::config::{
-    ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters,
-};
+use quad_run::config::{ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo};
 use quad_run::folder::{Checkpoint, ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
-use quad_runtime::{Health, Hint, ListenError, hinted, print, serve_metrics, unfinished};
+use quad_runtime::{
+    Health, Hint, ListenError, MetricsServer, hinted, print, serve_metrics, unfinished,
+};
 use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
-use toml::Value;
+use toml::Table;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
@@ -41,7 +43,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         Some(run) => From::read(run).map(|(from, preset)| (Some(from), preset))?,
         None => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
     };
-    let experiment = preset.resolve(&args.changes()).hint_of(ConfigError::hint)?;
+    let changes = args.changes();
+    let experiment = preset.resolve(&changes).hint_of(ConfigError::hint)?;
     if experiment.from.as_ref() != from.as_ref().map(|from| &from.hash) {
         return Err(anyhow!("the key `from` names a checkpoint, which is not there"))
             .hint("leave it out: --from RUN sets it, and begins with the run's last checkpoint");
@@ -76,34 +79,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     if let Some(begun) = &begun {
         begun.check_same_config(&config)?;
     }
-    info!("{}", config.dataset.summary());
-    info!("{}", config.experiment.summary()?);
-    if let Some(task) = preset.task
-        && let Some(warning) = hyperparameters::not_given(&config.experiment.definition()?, task)
-    {
-        warn!("{warning}");
-    }
-    let experiment = &config.experiment;
-    let (steps, start) = (experiment.total_steps(), experiment.agent.get("actor_ema_start"));
-    if let Some(start) = start.and_then(Value::as_integer).filter(|start| steps <= *start as u64) {
-        warn!(
-            "the target actor, by which QUAD acts, stays as it began: it moves after step {start} (agent.actor_ema_start), and this \
-             run has {steps}"
-        );
-    }
-    let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
-    if needs_evaluators && environment::find(&experiment.environment).is_err() {
-        info!(
-            "scores come from evaluators that have the environment {}, which only Python's can (docs/python.md)",
-            experiment.environment
-        );
-    }
-    if let Some(doubt) = source.doubt(&config.dataset.path, &experiment.environment) {
-        warn!("{doubt}");
-    }
-    if !experiment.precision.is_available() {
-        warn!("{}", Precision::UNAVAILABLE);
-    }
+    announce(&config, &preset, &changes, &source)?;
     debug!("{config:?}");
     if args.dry_run {
         return dry_run::estimate(&path, &config, data.training);
@@ -118,6 +94,35 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     // Does not wait for a thread that a broken disk blocks.
     runtime.shutdown_background();
     concluded
+}
+
+/// Logs the data and the settings of the run, and warnings about them.
+fn announce(
+    config: &RunConfig,
+    preset: &Preset,
+    changes: &Table,
+    source: &Source,
+) -> anyhow::Result<()> {
+    info!("{}", config.dataset.summary());
+    let experiment = &config.experiment;
+    info!("{}", experiment.summary()?);
+    for doubt in preset.doubts(experiment, changes)? {
+        warn!("{doubt}");
+    }
+    let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
+    if needs_evaluators && environment::find(&experiment.environment).is_err() {
+        info!(
+            "scores come from evaluators that have the environment {}, which only Python's can (docs/python.md)",
+            experiment.environment
+        );
+    }
+    if let Some(doubt) = source.doubt(&config.dataset.path, &experiment.environment) {
+        warn!("{doubt}");
+    }
+    if !experiment.precision.is_available() {
+        warn!("{}", Precision::UNAVAILABLE);
+    }
+    Ok(())
 }
 
 fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
@@ -177,11 +182,7 @@ async fn run_to_end(
         coordinator: Arc::default(),
     };
     let coordinator = page_state.coordinator.clone();
-    let live = Arc::new(move || page_state.to_json());
-    let page = page::routes(path.to_owned(), Some(live));
-    let server = serve_metrics(args.http, registry, health.clone(), page).await;
-    let server = server.hint_of(ListenError::hint)?;
-    info!("page: http://{}/", server.address);
+    let server = serve_page(args.http, path, page_state, registry).await?;
     let (o, a) = (data.training.observation_dim(), data.training.action_dim());
     let task = Task::new(&experiment.environment, o, a);
     let mut agent = begin(experiment, device, data.training)?;
@@ -204,8 +205,7 @@ async fn run_to_end(
     // A later start has a larger number; the low bits distinguish two that start in the same
     // millisecond.
     let number = now()? << 16 | u64::from(rand::random::<u16>());
-    let run = run.clone();
-    let incarnation = Incarnation { run, number };
+    let incarnation = Incarnation { run: run.clone(), number };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let run = Run {
         incarnation: incarnation.clone(),
@@ -235,6 +235,22 @@ async fn run_to_end(
         evaluators: outside.evaluators,
     };
     Ok((dir, main_loop.run(opening).await))
+}
+
+/// Serves the page and the metrics of the run in a folder.
+async fn serve_page(
+    address: SocketAddr,
+    path: &Path,
+    state: PageState,
+    registry: Registry,
+) -> anyhow::Result<MetricsServer> {
+    let health = state.health.clone();
+    let live = Arc::new(move || state.to_json());
+    let page = page::routes(path.to_owned(), Some(live));
+    let server = serve_metrics(address, registry, health, page).await;
+    let server = server.hint_of(ListenError::hint)?;
+    info!("page: http://{}/", server.address);
+    Ok(server)
 }
 
 fn open_or_create(
@@ -323,7 +339,9 @@ fn run_name(path: &Path) -> anyhow::Result<Name> {
     let folder = path.file_name().unwrap_or_default().to_string_lossy();
     Name::new(folder)
         .with_context(|| format!("the run folder {path:?} gives no name for the run"))
-        .hint("its last part must be 1 to 64 letters, digits, dots, dashes or underscores")
+        .hint(
+            "name a folder by --run-dir, whose last part is 1 to 64 letters, digits, dots, dashes or underscores",
+        )
 }
 
 /// The CPU and the instructions that training uses.

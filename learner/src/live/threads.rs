@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use quad_algorithms::Agent;
-use quad_dataset::{BatchSampler, Task};
+use quad_dataset::{BatchSampler, Task, Transitions};
 use quad_protocol::{Episode, Hash, practice_seed};
 use quad_run::config::{Experiment, RunConfig};
 use quad_run::folder::{Log, ResumePoint, RunDir};
@@ -84,16 +84,7 @@ impl Threads {
             resume(&mut agent, &checkpoint)?;
         }
         let transitions = agent.transitions().clone();
-        let rules = Rules {
-            run: incarnation.run.clone(),
-            incarnation: incarnation.number,
-            task: run.task,
-            seed: experiment.seed,
-            dims: (transitions.observation_dim(), transitions.action_dim()),
-            episodes: experiment.episodes,
-            job_episodes: JOB_EPISODES,
-            lease: LEASE,
-        };
+        let rules = rules(&incarnation, experiment, run.task, &transitions);
         let coordinator = Coordinator::new(rules, earlier, metrics.clone(), events.clone());
         let schedule = experiment.schedule();
         for (&step, &hash) in known.iter().filter(|(step, _)| schedule.is_evaluated(**step)) {
@@ -104,15 +95,8 @@ impl Threads {
 
         let disk = |writer| DiskStatus::new(writer, metrics.disk_trouble(writer), events.clone());
         let disk_of_scores = disk(Writer::Scores);
-        let (inbox, recorded) = mpsc::channel();
-        let mut practice =
-            Practice::new(experiment, transitions, recorded, metrics.practice.clone());
-        let mut experience = None;
-        if let Some(practice) = &mut practice {
-            let opened = open_experience(dir, experiment, step > 0, inbox, &coordinator)?;
-            experience = Some(opened);
-            practice.resume(step).hint(OTHER_FOLDER)?;
-        }
+        let practice = open_practice(dir, experiment, step, transitions, &coordinator)?;
+        let (practice, experience) = practice.unzip();
         let scores =
             Scores { log: run.scores, deliveries, coordinator, disk: disk_of_scores, experience };
         let writer = Writer::Scores.thread();
@@ -129,13 +113,10 @@ impl Threads {
         let snapshots = spawn_alive(writer, events, beat, move |beat| snapshots.run(beat))?;
 
         let stop = Arc::new(AtomicBool::new(false));
+        let (rows, size) = (agent.dataset_len(), experiment.batch_size as usize);
+        let sampler = BatchSampler::new(rows, size, experiment.seed, step);
         let training = Training {
-            sampler: BatchSampler::new(
-                agent.dataset_len(),
-                experiment.batch_size as usize,
-                experiment.seed,
-                step,
-            ),
+            sampler,
             agent,
             practice,
             saved: None,
@@ -173,6 +154,43 @@ impl Threads {
         self.services.deliveries.send(Delivery::End).ok();
         self.scores.join().ok();
     }
+}
+
+fn rules(
+    Incarnation { run, number }: &Incarnation,
+    experiment: &Experiment,
+    task: Task,
+    transitions: &Transitions,
+) -> Rules {
+    Rules {
+        run: run.clone(),
+        incarnation: *number,
+        task,
+        seed: experiment.seed,
+        dims: (transitions.observation_dim(), transitions.action_dim()),
+        episodes: experiment.episodes,
+        job_episodes: JOB_EPISODES,
+        lease: LEASE,
+    }
+}
+
+/// Practice of a run after gradient step `step`, with the experience that the run has; `None` in a
+/// run without any.
+fn open_practice(
+    dir: &RunDir,
+    experiment: &Experiment,
+    step: u64,
+    transitions: Arc<Transitions>,
+    coordinator: &Coordinator,
+) -> anyhow::Result<Option<(Practice, Experience)>> {
+    let (inbox, recorded) = mpsc::channel();
+    let metrics = coordinator.metrics.practice.clone();
+    let Some(mut practice) = Practice::new(experiment, transitions, recorded, metrics) else {
+        return Ok(None);
+    };
+    let experience = open_experience(dir, experiment, step > 0, inbox, coordinator)?;
+    practice.resume(step).hint(OTHER_FOLDER)?;
+    Ok(Some((practice, experience)))
 }
 
 /// Opens the run's log of experience, and puts what it has into the inbox.

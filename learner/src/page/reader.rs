@@ -71,10 +71,18 @@ impl Reader {
         if self.runs.len() >= MAX_RUNS && !self.runs.contains_key(&name) {
             self.runs.clear();
         }
+        // Runs of two studies may have the same name.
+        let shown = (*dir != self.root).then(|| name.clone());
         let new = || (RunPage::of(dir), Cache::default());
         let (run, cache) = self.runs.entry(name).or_insert_with(new);
         let failed = |error| json!({ "error": format!("{error:#}") });
-        Some(cache.get(RUN_LIFETIME, || run.read().unwrap_or_else(failed)))
+        Some(cache.get(RUN_LIFETIME, || {
+            let mut page = run.read().unwrap_or_else(failed);
+            if let Some(name) = shown {
+                page["run"] = name.into();
+            }
+            page
+        }))
     }
 }
 
@@ -114,7 +122,7 @@ impl RunPage {
             "steps": report.steps,
             "practice_begins": config.experiment.practice_begins(),
             "measure": report.measure(),
-            "dataset_score": report.dataset_score,
+            "dataset_score": report.dataset_measure(),
             "dataset": config.dataset.summary(),
             "settings": toml::to_string(config)?,
             "metrics": Value::from_iter(metrics),

@@ -77,6 +77,7 @@ async fn the_api_has_runs_with_scores_metrics_and_settings() {
     let [list, run] = [0, 1].map(|index| serde_json::from_str::<Value>(&answers[index].1).unwrap());
     let names = list.as_array().unwrap().iter().map(|run| &run["name"]);
     assert_eq!(Vec::from_iter(names), ["a", "b/c"]);
+    assert_eq!(run["run"], "b/c");
     let whole = json!([2000, 11.0, 2f64.sqrt(), 2, true]);
     let part = json!([4000, 5.0, null, 1, false]);
     assert_eq!(run["evaluations"], json!([whole, part]));

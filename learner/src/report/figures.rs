@@ -73,16 +73,15 @@ pub fn learning_curve(run: &RunReport) -> Plot {
         title: format!("{}: {measure} over {episodes} episodes", run.run),
         x: "gradient steps",
         y: measure,
-        references: vec![dataset_mean(run)],
+        references: dataset_mean(run).into_iter().collect(),
         begins: begins([run]),
         lines: vec![line],
         ..Plot::default()
     }
 }
 
-fn dataset_mean(run: &RunReport) -> (String, f64) {
-    let mean = run.dataset_score;
-    (format!("dataset mean {mean:.1}"), mean)
+fn dataset_mean(run: &RunReport) -> Option<(String, f64)> {
+    run.dataset_measure().map(|mean| (format!("dataset mean {mean:.1}"), mean))
 }
 
 /// Gradient steps after which practice begins.
@@ -91,7 +90,8 @@ fn begins<'a>(runs: impl IntoIterator<Item = &'a RunReport>) -> BTreeSet<u64> {
 }
 
 fn curves(task: &str, groups: &[&GroupReport]) -> Plot {
-    let mut references = Vec::from_iter(groups.iter().map(|group| dataset_mean(&group.runs[0])));
+    let references = groups.iter().filter_map(|group| dataset_mean(&group.runs[0]));
+    let mut references = Vec::from_iter(references);
     references.sort_by(|(_, one), (_, other)| one.total_cmp(other));
     references.dedup();
     Plot {

@@ -120,10 +120,13 @@ impl Group<'_> {
     }
 }
 
-/// Groups runs, in the order in which they are given.
+/// Groups runs, in the order in which they are given, but those without scores last: they join
+/// others.
 pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     let mut groups: Vec<Group> = Vec::new();
-    for run in runs {
+    let (scored, unscored): (Vec<_>, Vec<_>) =
+        runs.iter().partition(|run| run.reached() != Some(0));
+    for run in scored.into_iter().chain(unscored) {
         let mut settings = settings::of_run(&run.config);
         settings.remove("seed");
         if let Some(group) = groups.iter_mut().find(|group| group.fits(run, &settings)) {
@@ -170,14 +173,10 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     reports
 }
 
-fn report(
-    runs: &[&RunReport],
-    method: String,
-    differs: Vec<String>,
-    select: Select,
-) -> GroupReport {
+/// The runs that count, and why others do not.
+fn counted<'a>(runs: &[&'a RunReport]) -> (Vec<&'a RunReport>, Vec<String>) {
     let (mut counted, mut left_out) = (Vec::<&RunReport>::new(), Vec::new());
-    for run in runs {
+    for run in runs.iter().copied() {
         let (dir, seed) = (run.dir.display(), run.seed);
         if run.newest().is_none() {
             left_out.push(format!("{dir} has no complete evaluation"));
@@ -189,6 +188,16 @@ fn report(
             counted.push(run);
         }
     }
+    (counted, left_out)
+}
+
+fn report(
+    runs: &[&RunReport],
+    method: String,
+    differs: Vec<String>,
+    select: Select,
+) -> GroupReport {
+    let (counted, left_out) = counted(runs);
     let values = |value: fn(&RunReport) -> Option<f64>| -> Option<Vec<f64>> {
         counted.iter().map(|run| value(run)).collect()
     };

@@ -70,6 +70,8 @@ pub(crate) struct PlannedRun {
     pub changes: Table,
     /// The preset with its changes.
     pub experiment: Experiment,
+    /// Warnings about its settings, which other runs may share.
+    pub doubts: Vec<String>,
     pub source: Source,
 }
 
@@ -195,14 +197,14 @@ impl File {
             return Err(anyhow!("it needs one of task and preset"))
                 .hint("[run] may have it, or an axis");
         };
-        let experiment = Preset::read(preset)
-            .and_then(|preset| preset.resolve(&changes))
-            .hint_of(ConfigError::hint)?;
+        let known = Preset::read(preset).hint_of(ConfigError::hint)?;
+        let experiment = known.resolve(&changes).hint_of(ConfigError::hint)?;
+        let doubts = known.doubts(&experiment, &changes)?;
         let dataset = experiment.dataset.as_deref().context("it names no dataset");
         let source = Source::parse(dataset.hint("add to [run] a line dataset = \"FILE\"")?)?;
         source.check_environment(&experiment.environment)?;
         let preset = preset.clone();
-        Ok(PlannedRun { index, name, preset, changes, experiment, source })
+        Ok(PlannedRun { index, name, preset, changes, experiment, doubts, source })
     }
 
     /// Changes of a combination. Later tables override earlier ones: [run], method, command line,

@@ -61,7 +61,10 @@ fn curves_show_complete_evaluations_only() {
     assert!(!begins(&[small(0, 0.0)]));
 
     let robot = small(0, 0.0).set("experiment.environment", "my-robot");
-    assert!(!curve(&[robot.scores_are_returns()]).contains("normalized"));
+    assert!(!curve(&[robot.clone().scores_are_returns()]).contains("normalized"));
+    // A score that evaluators define is none of the data's.
+    let has_mean = |run: Run| curve(&[run]).contains("dataset mean");
+    assert!(has_mean(robot.clone().scores_are_returns()) && !has_mean(robot));
 }
 
 #[test]

@@ -73,7 +73,7 @@ fn write_reported() {
     unscored.scores.clear();
     small(0, 0.0).write("report/twice/a");
     small(0, 4.0).write("report/twice/b");
-    unscored.write("report/twice/c");
+    unscored.write("report/twice/0");
     let mut best = small(0, 0.0);
     (0..2).for_each(|episode| best.score(7000, episode, 10.0, "00"));
     best.write("report/best");

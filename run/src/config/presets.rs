@@ -14,7 +14,7 @@ use super::error::ConfigError;
 use super::experiment::Experiment;
 use super::hyperparameters;
 use super::run_config::RunConfig;
-use super::tables::merge;
+use super::tables::{keys, merge};
 use super::tasks::{self, Task};
 
 /// A task, or a file that may change one.
@@ -97,6 +97,43 @@ impl Preset {
         Ok(experiment)
     }
 
+    /// Warnings about the experiment that `changes` resolve to: the algorithm's authors give no values
+    /// for the task, a change has no effect, or the policy does not learn.
+    pub fn doubts(
+        &self,
+        experiment: &Experiment,
+        changes: &Table,
+    ) -> Result<Vec<String>, ConfigError> {
+        let definition = experiment.definition()?;
+        let not_given = self.task.and_then(|task| hyperparameters::not_given(&definition, task));
+        let mut doubts = Vec::from_iter(not_given);
+        let changed = Vec::from_iter(keys(changes).into_iter().map(|(key, _)| key));
+        if let Some(variant) = definition.report.variant {
+            let (key, value) = (variant.key, experiment.variant()?);
+            for unused in (variant.unused)(value).iter().map(|key| format!("agent.{key}")) {
+                if changed.contains(&unused) {
+                    doubts.push(format!("{unused} has no effect on a policy with {key} {value}"));
+                }
+            }
+        }
+        let of_practice = |key: &&String| key.starts_with("online.") && *key != "online.steps";
+        for unused in changed.iter().filter(of_practice) {
+            if experiment.online.is_none() {
+                doubts.push(format!("{unused} has no effect without practice (--online-steps N)"));
+            }
+        }
+        let steps = experiment.total_steps();
+        if let Some(key) = definition.report.acts_after
+            && let Some(start) = experiment.agent.get(key).and_then(Value::as_integer)
+            && steps <= start as u64
+        {
+            doubts.push(format!(
+                "the target actor, which acts, stays as it began: it moves after step {start} (agent.{key}), and this run has {steps}"
+            ));
+        }
+        Ok(doubts)
+    }
+
     /// The algorithm of the changes, else of the file, else the first of all.
     fn algorithm(&self, changes: &Table) -> Result<Definition, ConfigError> {
         match changes.get("algorithm").or(self.own.get("algorithm")) {
@@ -135,4 +172,51 @@ fn text_of(value: &Value) -> String {
 /// Reads a preset and [resolves](Preset::resolve) it with changes.
 pub fn resolve(preset: &str, changes: &Table) -> Result<Experiment, ConfigError> {
     Preset::read(preset)?.resolve(changes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn doubts_name_changes_without_effect_and_an_actor_that_does_not_move() {
+        let preset = Preset::read("hopper-demo").unwrap();
+        for (changes, expected) in [
+            (
+                "agent = { guidance = 'dac', tau = 0.5, eta.threshold = 1.0 }",
+                Some("agent.tau has no effect on a policy with guidance dac"),
+            ),
+            (
+                "agent = { guidance = 'none', eta = { threshold = 1.0, initial = 2.0 } }",
+                Some("agent.eta.threshold has no effect on a policy with guidance none"),
+            ),
+            (
+                "algorithm = 'ivr'\nagent = { divergence = 'sparse', alpha.exponential = 2.0 }",
+                Some("agent.alpha.exponential has no effect on a policy with divergence sparse"),
+            ),
+            (
+                "steps = 1000",
+                Some(
+                    "the target actor, which acts, stays as it began: it moves after step 1000 (agent.actor_ema_start), and this run has \
+                     1000",
+                ),
+            ),
+            (
+                "online.warmup = 100",
+                Some("online.warmup has no effect without practice (--online-steps N)"),
+            ),
+            ("online = { steps = 5000, warmup = 100 }", None),
+            ("steps = 1001\nagent.tau = 0.5", None),
+            ("agent = { guidance = 'shuffled', tau = 0.5 }", None),
+            // The task's own τ has no effect, either, but nobody asked for it.
+            ("agent.guidance = 'dac'", None),
+            // Its actor acts, not the target actor.
+            ("algorithm = 'dql'\nsteps = 1000", None),
+        ] {
+            let changes: Table = changes.parse().unwrap();
+            let experiment = preset.resolve(&changes).unwrap();
+            let doubts = preset.doubts(&experiment, &changes).unwrap();
+            assert_eq!(doubts, Vec::from_iter(expected), "{changes}");
+        }
+    }
 }

@@ -126,3 +126,21 @@ fn reads_the_rest_of_a_file_up_to_a_limit() {
     assert_eq!(rest(&mut file, 7).unwrap_err().kind(), ErrorKind::FileTooLarge);
     assert_eq!(rest(&mut file, LARGEST).unwrap(), [0; 8]);
 }
+
+#[test]
+fn several_may_make_a_folder_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    for round in 0..20 {
+        let path = folder.path().join(format!("{round}/runs/mine"));
+        let begin = std::sync::Barrier::new(8);
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| {
+                    begin.wait();
+                    create_folder(&path).unwrap();
+                });
+            }
+        });
+        assert!(path.is_dir());
+    }
+}

@@ -126,6 +126,12 @@ impl RunReport {
         }
     }
 
+    /// [`Self::measure`] of the dataset's trajectories, their mean; absent where evaluators define the
+    /// score, which the dataset does not have.
+    pub fn dataset_measure(&self) -> Option<f64> {
+        (!self.own_score).then_some(self.dataset_score)
+    }
+
     /// [`Self::measure`] with its unit; in a maze, the fraction of episodes that reach the goal.
     pub fn measure_with_unit(&self) -> &'static str {
         match environment::find(&self.config.experiment.environment) {

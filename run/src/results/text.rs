@@ -48,7 +48,7 @@ impl RunReport {
             ("last 3 evaluations:", self.mean_last_3),
             ("last 5 evaluations:", self.mean_last_5),
             ("last 50000 steps:", self.mean_last_50000_steps),
-            ("dataset:", (!self.own_score).then_some(self.dataset_score)),
+            ("dataset:", self.dataset_measure()),
         ] {
             if let Some(mean) = mean {
                 text += &format!("mean {measure} of the {name:19} {mean:.2}\n");

@@ -84,7 +84,7 @@ fn a_browser_compares_finished_runs() {
             "<title>2 runs</title>",
             "&lt;img src=x onerror=alert(1)&gt;",
             "aria-label=\"Score, newest values: one ",
-            ", other ",
+            ", &lt;img src=x onerror=alert(1)&gt; ",
         ],
     );
     assert!(!ticked.contains("<img"), "{ticked}");

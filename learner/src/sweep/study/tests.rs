@@ -153,6 +153,12 @@ fn the_studies_of_the_repository() {
         // The task's own steps.
         assert!(study.runs.iter().all(|run| run.experiment.steps >= 100_000), "{name}");
     }
+    // One τ for all methods, some of which have no use for it.
+    let study = Study::read(&folder.join("lambda.toml"), &[], &[]).unwrap();
+    let doubts = BTreeSet::from_iter(study.runs.iter().flat_map(|run| &run.doubts));
+    let expected = ["dac", "none"]
+        .map(|name| format!("agent.tau has no effect on a policy with guidance {name}"));
+    assert!(doubts.into_iter().eq(&expected));
     // The example of the documentation: 3 tasks, 2 methods, 2 values of τ and 3 seeds, without dac
     // in the maze, and with one τ for dac.
     let page = include_str!("../../../../studies/README.md");
