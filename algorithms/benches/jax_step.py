@@ -99,13 +99,13 @@ def outcome(config, state, inputs):
 
 
 def step(config, state, inputs):
-    """What becomes of the state, and the numbers that are measured beside it."""
+    """The state after a step, and the numbers that are measured beside it."""
     out = outcome(config, state, inputs)
     measured = {name: x for name, x in out.items() if name not in state and jnp.ndim(x) == 0}
     return jax.tree.map(lambda x, new: jnp.reshape(new, x.shape), state, {n: out.get(n, state[n]) for n in state}), measured
 
 
-# What is timed.
+# The configurations to time.
 
 
 def merge(below, changes):

@@ -5,7 +5,7 @@
 //! and what its authors' code does, is in docs/deviations.md.
 
 use super::denoising::Denoising;
-use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler};
+use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
 use super::iql::expectile_loss;
 use super::prelude::*;
 use quad_nn::Reverse;
@@ -82,7 +82,7 @@ impl Config {
 
 /// The policy toward the data's actions.
 fn bc_loss(networks: &Networks, batch: &Minibatch, noise: &Denoising) -> Result<Loss> {
-    let (_, predicted) = networks.denoise(batch, noise)?;
+    let (_, predicted) = denoise(&networks.actor, batch, noise)?;
     Ok(Loss::new("bc_loss", (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?))
 }
 

@@ -33,14 +33,18 @@ impl Networks {
     pub fn sample_next(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
         self.actor.target.sample(&batch.next_observations, noise)
     }
+}
 
-    /// The batch's actions made noisy, and the noise that the actor predicts in them, `[B, a]`; in
-    /// those beyond the end of their episode, the noise itself.
-    pub fn denoise(&self, batch: &Minibatch, noise: &Denoising) -> Result<(Tensor, Tensor)> {
-        let noisy = noise.noisy(&batch.actions)?;
-        let predicted = self.actor.predict(&batch.observations, &noisy, &noise.t)?;
-        Ok((noisy, batch.within_episodes(predicted, &noise.epsilon)?))
-    }
+/// The batch's actions made noisy, and the noise that the actor predicts in them, `[B, a]`; in those
+/// beyond the end of their episode, the noise itself.
+pub(super) fn denoise(
+    actor: &NoisePredictor,
+    batch: &Minibatch,
+    noise: &Denoising,
+) -> Result<(Tensor, Tensor)> {
+    let noisy = noise.noisy(&batch.actions)?;
+    let predicted = actor.predict(&batch.observations, &noisy, &noise.t)?;
+    Ok((noisy, batch.within_episodes(predicted, &noise.epsilon)?))
 }
 
 /// Draws the random numbers of a diffusion policy, on the CPU.

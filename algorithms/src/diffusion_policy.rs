@@ -2,8 +2,7 @@
 //! Diffusion"): a diffusion policy that clones chunks of the data's actions, without critics. What
 //! differs from its authors' code is in docs/deviations.md.
 
-use super::denoising::Denoising;
-use super::diffusion::{Sampler, noise_predictor};
+use super::diffusion::{Sampler, denoise, noise_predictor};
 use super::prelude::*;
 use candle_nn::loss::mse;
 use quad_nn::{NoisePredictor, Reverse};
@@ -72,12 +71,10 @@ impl Cloning {
     fn loss(&self, step: u64, indices: &[u32]) -> Result<Loss> {
         let (batch, actor) = (self.context.batch(indices)?, &self.networks.actor);
         let random = self.context.random(step);
-        let noise: Denoising =
+        let noise =
             Sampler { random, batch_size: indices.len(), shape: &self.shape, actor }.denoising()?;
-        let noisy = noise.noisy(&batch.actions)?;
-        let predicted = actor.predict(&batch.observations, &noisy, &noise.t)?;
-        let learned = batch.within_episodes(predicted, &noise.epsilon)?;
-        Ok(Loss::new("bc_loss", mse(&learned, &noise.epsilon)?))
+        let (_, predicted) = denoise(actor, &batch, &noise)?;
+        Ok(Loss::new("bc_loss", mse(&predicted, &noise.epsilon)?))
     }
 
     fn learning_rate(&self, step: u64) -> f32 {

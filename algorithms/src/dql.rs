@@ -4,7 +4,7 @@
 //! paper's; where its authors' code does otherwise, docs/deviations.md says so.
 
 use super::denoising::Denoising;
-use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler};
+use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
 use super::inputs::Inputs;
 use super::prelude::*;
 use candle_nn::loss::mse;
@@ -112,7 +112,7 @@ impl Config {
 
     /// The policy: cloned, Eq. 2, and moved toward what the critics value, Eq. 3.
     fn actor_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
-        let (_, predicted) = networks.denoise(batch, &noise.denoising)?;
+        let (_, predicted) = denoise(&networks.actor, batch, &noise.denoising)?;
         let bc_loss = mse(&predicted, &noise.denoising.epsilon)?;
         let q_loss = q_loss(networks, batch, noise)?;
         let loss = (&bc_loss + (&q_loss * f64::from(*self.eta))?)?;

@@ -1,7 +1,7 @@
 //! Fitted Q evaluation (Le, Voloshin and Yue 2019, "Batch Policy Learning under Constraints"; with
-//! the clipped targets of Fu et al. 2021, "Benchmarks for Deep Off-Policy Evaluation"): the
-//! value of a given policy, learned from the data alone. Q moves toward r +
-//! γ·mask·Q̂(s', a') with the action a' that the policy takes at s', drawn once for each s'.
+//! the clipped targets of Fu et al. 2021, "Benchmarks for Deep Off-Policy Evaluation"): the value of
+//! a given policy, learned from the data alone. Q moves toward r + γ·mask·Q̂(s', a') with the action
+//! a' that the policy takes at s', drawn once for each s'.
 //!
 //! It makes no policy, so it is not among [`ALGORITHMS`](crate::ALGORITHMS): `learner judge` runs it.
 

@@ -24,7 +24,10 @@ macro_rules! checked {
             fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
                 let value = <$number>::deserialize(deserializer)?;
                 let holds: fn($number) -> bool = $holds;
-                if holds(value) { Ok(Self(value)) } else { Err(D::Error::custom(format_args!("{value} is not {}", $range))) }
+                match holds(value) {
+                    true => Ok(Self(value)),
+                    false => Err(D::Error::custom(format_args!("{value} is not {}", $range))),
+                }
             }
         }
     };

@@ -1,7 +1,6 @@
 //! IDQL (Hansen-Estruch et al. 2023, "IDQL: Implicit Q-Learning as an Actor-Critic Method with
 //! Diffusion Policies"): IQL's critics and a diffusion policy that only clones the data, as
-//! AlignIQL trains them. When it acts, the policy takes
-//! its sample of the largest value.
+//! AlignIQL trains them. When it acts, the policy takes its sample of the largest value.
 
 use super::align_iql::{Config, METRICS};
 use super::prelude::*;

@@ -10,7 +10,7 @@ mod noise;
 mod summary;
 
 use super::definition::Axis;
-use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler};
+use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
 use super::prelude::*;
 use super::state_dict::write;
 use config::{Config, Guidance, TargetReduce};
@@ -84,7 +84,7 @@ impl Quad {
         batch: &Minibatch,
         noise: &Noise,
     ) -> Result<(Loss, Option<Guide>)> {
-        let (noisy, predicted) = networks.denoise(batch, &noise.denoising)?;
+        let (noisy, predicted) = denoise(&networks.actor, batch, &noise.denoising)?;
         let error = (predicted.detach() - &noise.denoising.epsilon)?;
         let epsilon = &noise.denoising.epsilon;
         if self.config.guidance == Guidance::None {
@@ -146,12 +146,8 @@ impl DiffusionUpdate for Quad {
             self.averages.set(&guide.averages)?;
             // Line 12: dual ascent on η, with the actor as it is now.
             if let Some(threshold) = self.config.eta.threshold {
-                let (epsilon, t) = (&noise.denoising.epsilon, &noise.denoising.t);
-                let noisy = noise.denoising.noisy(&batch.actions)?;
-                let actor = networks.actor.detach();
-                let predicted = actor.predict(&batch.observations, &noisy, t)?;
-                let predicted = batch.within_episodes(predicted, epsilon)?;
-                let bc_loss = squared_error(&predicted, epsilon)?;
+                let (_, predicted) = denoise(&networks.actor.detach(), batch, &noise.denoising)?;
+                let bc_loss = squared_error(&predicted, &noise.denoising.epsilon)?;
                 write(&self.eta, &self.ascended_eta((bc_loss - f64::from(*threshold))?)?)?;
             }
         }

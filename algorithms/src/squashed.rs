@@ -170,8 +170,7 @@ mod tests {
         assert!((number(&log_density) - number(&again)).abs() < 1e-10);
     }
 
-    /// Where tanh(u) is 1 in float32, the density is still that of u: log(1 − tanh² u) is 2·(log 2 − u)
-    /// there.
+    /// The density is still that of u: log(1 − tanh² u) is 2·(log 2 − u) where tanh(u) is 1 in f32.
     #[test]
     fn densities_are_finite_where_actions_round_to_one() {
         let one = |x: f32| Tensor::from_slice(&[x], (1, 1), &Device::Cpu).unwrap();

@@ -195,8 +195,8 @@ fn metrics_are_finite_and_trained_weights_have_gradients() {
         {
             let moment: Vec<f32> = moment.flatten_all().unwrap().to_vec1().unwrap();
             let zeros = moment.iter().filter(|x| **x == 0.0).count();
-            // Where a window has one step left, four of five taps of Diffuser's convolutions see
-            // only what is beside it.
+            // Four of five taps of Diffuser's convolutions see only padding where a window has one
+            // step left.
             let most = if definition.name == "diffuser" {
                 moment.len() * 4 / 5
             } else {

@@ -53,15 +53,11 @@ impl EnsembleShape {
 
     /// Numbers held by a forward pass of all networks, with `repeat` rows for each state.
     pub fn floats(&self, states: u128, repeat: u128) -> u128 {
-        let rows = states * repeat * self.members as u128;
-        let inside = match self.layers.norm {
-            false => tile_floats(repeat, &self.layers),
-            // The plain implementation holds whole layers: input and output of an operation.
-            true => rows * 4 * self.layers.widest() as u128,
-        };
+        let rows = states * repeat;
         // An observation for each action, and both side by side.
-        let inputs = states * repeat * (2 * self.observation_dim + self.action_dim) as u128;
-        rows * self.outputs as u128 + inputs + inside
+        let inputs = 2 * self.observation_dim + self.action_dim;
+        let each = inputs + self.members * self.outputs;
+        rows * each as u128 + tile_floats(repeat, &self.layers)
     }
 
     /// Tensors `{0..}.kernel` `[K, in, out]` and `{0..}.bias` `[K, out]`, and with a norm `.scale`
@@ -117,5 +113,19 @@ impl NoiseShape {
         let mut specs = self.time_layers().specs("time.", false);
         specs.extend(self.trunk_layers().specs("trunk.", false));
         Layout::new(specs)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An evaluator refuses jobs of 256 MiB.
+    #[test]
+    fn forty_states_of_dtql_with_all_candidates_take_megabytes() {
+        let layers = MlpConfig { norm: true, ..MlpConfig::mish(&[256; 3]) };
+        let critics = EnsembleShape::critics(2, (29, 8), &layers);
+        let held = bytes(critics.floats(40, 1024) - tile_floats(1024, &layers));
+        assert_eq!(held, 40 * 1024 * 4 * (2 * 29 + 8 + 2));
     }
 }

@@ -55,7 +55,7 @@ def update(config, state, inputs):
 
 
 def act(config, state, inputs):
-    """What the EMA draws from each state."""
+    """The EMA's draws from each state."""
     noise, steps = inputs["select_noise"], config["agent"]["diffusion_steps"]
     (beta, alpha_bar), states, x = schedule(steps), repeated(inputs["select_observations"], noise), noise[0]
     for t in range(steps, 0, -1):

@@ -146,7 +146,7 @@ def update(config, state, inputs):
 
 
 def act(config, state, inputs):
-    """What the candidates of the online actor are worth, and how likely each is drawn, before the update."""
+    """The values of the online actor's candidates, and the probability that each is drawn, before the update."""
     agent, noise = config["agent"], inputs["select_noise"]
     states = repeated(inputs["select_observations"], noise)
     candidates, _ = fast_chain(state["actor"], states, noise, agent["actor"]["activation"])

@@ -27,7 +27,7 @@ CRITICS = 2
 SIGMA_DATA = 0.5
 TIME_FEATURES, TIME_HIDDEN, TIME_EMBEDDING = 16, 32, 16
 LOG_STD = -5.0, 2.0
-# What PyTorch's layer norm adds to the variance.
+# Number that PyTorch's layer norm adds to the variance.
 TORCH_EPSILON = 1e-5
 # Large rates, so that a mistake in an optimizer or an average is far larger than float32's rounding.
 AGENT = {
@@ -187,7 +187,7 @@ def update(config, state, inputs):
 
 
 def act(config, state, inputs):
-    """What the candidates of the one-step policy are worth, and how likely each is drawn, before the update."""
+    """The values of the one-step policy's candidates, and the probability that each is drawn, before the update."""
     agent, noise = config["agent"], inputs["select_noise"][0]
     states = np.broadcast_to(inputs["select_observations"][:, None], noise.shape[:-1] + (config["observation_dim"],))
     candidates = fast_actions(state["actor"], states, noise, agent["actor"]["activation"])

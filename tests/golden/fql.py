@@ -97,7 +97,7 @@ actor_gradient = compiled(jax.value_and_grad(actor_loss, has_aux=True))
 
 
 def windows(config, inputs):
-    """What a chunk is from each row on, for rows of several episodes: its actions, the last of the episode over and over once it
+    """The chunk from each row on, for rows of several episodes: its actions, the last of the episode over and over once it
     is over; where they are within the episode; its discounted rewards; the state after it; and what that is discounted by.
     """
     agent, chunks = config["agent"], []
@@ -138,7 +138,7 @@ def best_actions(config, state, states, noise):
 
 
 def flow_actions(config, flow, states, noise):
-    """Where the flow leads in Euler steps, before it is clipped."""
+    """The end of the flow in Euler steps, before it is clipped."""
     steps, x = config["agent"]["flow_steps"], noise
     for i in range(steps):
         times = np.full(len(states), i / steps)
@@ -182,7 +182,7 @@ def update(config, state, inputs):
 
 
 def act(config, state, inputs):
-    """What the policy draws, and the smaller of the values by the critics that choose."""
+    """The policy's draws, and the smaller of their values by the critics that choose."""
     agent, noise = config["agent"], inputs["select_noise"][0]
     states = np.broadcast_to(inputs["select_observations"][:, None], noise.shape[:-1] + (config["observation_dim"],))
     if config["algorithm"] == "qc":

@@ -1,4 +1,4 @@
-"""How far QUAD's guidance is trusted: λ (Eq. 24) or what a control has in its place, and what is measured of it."""
+"""The weight of QUAD's guidance, λ (Eq. 24) or what a control has in its place, and what is measured of it."""
 
 import numpy as np
 
@@ -54,7 +54,7 @@ def group_means(weights, groups, count):
 
 
 def measure(agent, t, weights, nu_squared, sigma_squared, gradient, error):
-    """What λ [B] does, NaN of a fifth without a sample; and the cosine of guidance ḡ [B, a] and behavior cloning, whose error is ε_θ − ε [B, a]."""
+    """Metrics of λ [B], NaN of a fifth without a sample; and the cosine of guidance ḡ [B, a] and behavior cloning, whose error is ε_θ − ε [B, a]."""
     fifths = FIFTHS * (t - 1) // agent["diffusion_steps"]
     cosine = (gradient * error).sum(-1) / np.linalg.norm(gradient, axis=-1) / np.linalg.norm(error, axis=-1)
     out = {f"lambda_quantile_{q}": np.quantile(weights, q / 100) for q in QUANTILES}

@@ -1,4 +1,4 @@
-"""What IQL and its kin share: V(s) from the target critics' smaller value, a Gaussian policy cloned from the data with
+"""Shared by IQL and its kin: V(s) from the target critics' smaller value, a Gaussian policy cloned from the data with
 weights, and twin critics toward r + γ·V(s'). V and the actor are ensembles of one.
 """
 

@@ -56,7 +56,7 @@ def shaken(tensors, rng):
 
 
 def is_stable(algorithm, config, state, inputs, expected):
-    """Whether small changes of what it starts from change the outcome little: they do not where large terms cancel."""
+    """True if small changes of what it starts from change the outcome little: they do not where large terms cancel."""
     rng, wanted = np.random.default_rng(0), flatten(expected)
     for _ in range(3):
         others = shaken(state, rng), inputs | shaken(inputs, rng)

@@ -1,4 +1,4 @@
-"""What the algorithms share: networks, Adam, averages, and random numbers to start from.
+"""Shared by the algorithms: networks, Adam, averages, and random numbers to start from.
 
 Networks and their gradients are JAX in float64; everything else is NumPy. Parameters are a dictionary of arrays named
 as in the files, kernels [in, out].
@@ -93,7 +93,7 @@ def decayed(rate, config, online=1.0):
 
 
 def adam_step(state, name, gradients, rate, step, weight_decay=0.0):
-    """What Adam (AdamW, with weight decay) makes of the network called name and of its moments; steps count from 0."""
+    """The network called name and its moments after a step of Adam (AdamW, with weight decay); steps count from 0."""
     beta1, beta2 = ADAM["beta1"], ADAM["beta2"]
     m = {n: beta1 * x + (1 - beta1) * gradients[n] for n, x in state[f"adam_m.{name}"].items()}
     v = {n: beta2 * x + (1 - beta2) * gradients[n] ** 2 for n, x in state[f"adam_v.{name}"].items()}
@@ -113,7 +113,7 @@ def shape(hidden, activation="mish", norm=False):
 
 
 def configuration(algorithm, batch_size, step, agent):
-    """What a folder's config.json says, at Hopper's sizes."""
+    """A folder's config.json, at Hopper's sizes."""
     return {
         "algorithm": algorithm,
         "observation_dim": 11,

@@ -288,7 +288,7 @@ def random_inputs(config, rng, size, state):
 
 
 def eta_is_free(config, came):
-    """Whether η stays, or moves well within its bounds and by a step well below the largest."""
+    """True if η stays, or moves well within its bounds and by a step well below the largest."""
     agent, eta = config["agent"], came["unbounded_eta"]
     if agent["guidance"] == "none" or "threshold" not in agent["eta"]:
         return True

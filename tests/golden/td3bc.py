@@ -50,7 +50,7 @@ def make_config(variant, size):
 
 
 def cloning_of(config):
-    """What the distance to the data is multiplied by: with practice it moves linearly from 1."""
+    """Factor of the distance to the data: with practice it moves linearly from 1."""
     done = max(0, config["step"] - config["total_steps"]) / config.get("online_steps", 1)
     return (1 - done) + done * config["agent"]["online_cloning"]
 

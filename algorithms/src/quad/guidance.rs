@@ -8,11 +8,27 @@ use crate::state_dict::{StateDict, write};
 use candle_core::{DType, Device, Result, Tensor};
 use quad_nn::{Ensemble, mean_and_variance};
 
-/// λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), `[B]`, of ν̂², `[]`, and σ², `[B]`; and the denominator.
-fn lambda(nu_squared: &Tensor, sigma_squared: &Tensor, config: &Config) -> Result<[Tensor; 2]> {
-    let (tau, delta) = (f64::from(config.tau), f64::from(*config.delta));
-    let denominator = sigma_squared.affine(1.0 / tau, delta)?.broadcast_add(nu_squared)?;
-    Ok([denominator.recip()?.broadcast_mul(nu_squared)?, denominator])
+/// λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24) of ν̂², `[]`, and σ², `[B]`, or the weight in its place, `[B]`;
+/// and the share of the batch in which δ decides λ, `[]`.
+fn lambda(
+    nu_squared: &Tensor,
+    sigma_squared: &Tensor,
+    config: &Config,
+) -> Result<(Tensor, Tensor)> {
+    let (ones, zero) = (sigma_squared.ones_like()?, nu_squared.zeros_like()?);
+    match config.guidance {
+        Guidance::Quad | Guidance::Mean | Guidance::Shuffled => {
+            let (tau, delta) = (f64::from(config.tau), f64::from(*config.delta));
+            let denominator = sigma_squared.affine(1.0 / tau, delta)?.broadcast_add(nu_squared)?;
+            let decided = denominator.lt(100.0 * delta)?.to_dtype(DType::F32)?.mean_all()?;
+            Ok((denominator.recip()?.broadcast_mul(nu_squared)?, decided))
+        }
+        Guidance::Dac | Guidance::None => Ok((ones, zero)),
+        Guidance::Constant => {
+            let lambda = config.lambda.map_or(1.0, |lambda| f64::from(*lambda));
+            Ok((ones.affine(lambda, 0.0)?, zero))
+        }
+    }
 }
 
 /// Guidance at noisy actions; constants.
@@ -97,19 +113,7 @@ impl Averages {
         let average = (before + ((&spread - before)? * f64::from(*config.nu_ema_rate))?)?;
         let nu_squared = before.lt(0f32)?.where_cond(&spread, &average)?; // Eq. 23
 
-        let (ones, zero) = (sigma_squared.ones_like()?, nu_squared.zeros_like()?);
-        let (mut weight, delta_share) = match config.guidance {
-            Guidance::Quad | Guidance::Mean | Guidance::Shuffled => {
-                let [lambda, denominator] = lambda(&nu_squared, &sigma_squared, config)?;
-                let decided = denominator.lt(100.0 * f64::from(*config.delta))?;
-                (lambda, decided.to_dtype(DType::F32)?.mean_all()?)
-            }
-            Guidance::Dac | Guidance::None => (ones, zero),
-            Guidance::Constant => {
-                let lambda = config.lambda.map_or(1.0, |lambda| f64::from(*lambda));
-                (ones.affine(lambda, 0.0)?, zero)
-            }
-        };
+        let (mut weight, delta_share) = lambda(&nu_squared, &sigma_squared, config)?;
         let t = &noise.denoising.t;
         let lambda_means = self.lambda_means.as_ref();
         let lambda_means =

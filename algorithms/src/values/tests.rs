@@ -102,6 +102,24 @@ fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
     }
 }
 
+/// Else it would have the rest from a network of other layers, such as its initial weights.
+#[test]
+fn a_group_with_another_network_names_all_of_it() {
+    for definition in ALGORITHMS {
+        let values = Values::of(definition);
+        let shared = &values.shared["agent"];
+        for (pattern, group) in &values.groups {
+            let agent = group.get("agent").and_then(Value::as_table).into_iter().flatten();
+            for (name, network) in agent.filter(|(_, value)| value.get("activation").is_some()) {
+                for key in shared[name].as_table().unwrap().keys() {
+                    let named = network.get(key).is_some();
+                    assert!(named, "{}: {key} of {name} for {pattern}", definition.name);
+                }
+            }
+        }
+    }
+}
+
 #[test]
 fn merging_changes_the_named_keys_alone() {
     let mut table = toml::toml! { a = 1.5 b = [1, 2] [c] d = 1 e = "x" };

@@ -8,7 +8,7 @@ use std::arch::x86_64::{
 };
 use std::cell::RefCell;
 
-/// Whether this CPU multiplies so, and faster than in f32: by AMX, or by AVX512-BF16, which nearly
+/// True if this CPU multiplies so, and faster than in f32: by AMX, or by AVX512-BF16, which nearly
 /// doubles the speed of AMD's CPUs but is slower than f32 on Intel's (0.6 times, where it was
 /// measured).
 pub(crate) fn available() -> bool {

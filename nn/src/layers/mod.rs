@@ -1,6 +1,5 @@
 //! Fully connected networks act(x·W + b), K of one shape side by side.
 
-/// Few operations for a GPU, with a backward pass written out.
 /// Hidden layers in a configuration.
 pub(crate) mod config;
 /// Offsets of the layers in the vector of weights.

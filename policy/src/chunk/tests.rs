@@ -24,7 +24,7 @@ fn drawing(candidates: u32) -> Box<dyn Policy> {
 }
 
 fn policy(candidates: u32, replan: usize) -> Box<dyn Policy> {
-    chunked(drawing(candidates), Chunk { history: 1, length: 3, replan }).unwrap()
+    chunked(drawing(candidates), Chunk { length: 3, replan, ..Chunk::default() }).unwrap()
 }
 
 /// The actions of one more step in these states.
@@ -123,7 +123,7 @@ fn a_file_says_the_chunk_and_scales_each_action() {
         let header = Header { chunk, scaling: Some(scaling.clone()), ..header };
         header.to_safetensors(&tensors).unwrap()
     };
-    let chunk = Chunk { history: 1, length: 3, replan: 2 };
+    let chunk = Chunk { length: 3, replan: 2, ..Chunk::default() };
     let found = load(&file(chunk)).unwrap();
     let expected = scaled(self::policy(2, 2), scaling.clone()).unwrap();
     let mut states = [[found.begin(3)], [found.begin(3)]];
@@ -134,7 +134,7 @@ fn a_file_says_the_chunk_and_scales_each_action() {
     assert_eq!(Header::<()>::read(&file(chunk)).unwrap().chunk, chunk);
 
     let refused = |length, replan| {
-        let chunked = chunked(drawing(1), Chunk { history: 1, length, replan });
+        let chunked = chunked(drawing(1), Chunk { length, replan, ..Chunk::default() });
         matches!(chunked, Err(PolicyError::Range { .. }))
     };
     assert!(refused(0, 0) && refused(4, 1) && refused(12, 1) && refused(3, 4) && refused(3, 0));
