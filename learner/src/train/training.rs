@@ -143,8 +143,7 @@ impl Training {
     /// Absorbs practice until another gradient step goes with it. False if training is to stop.
     fn practice(&mut self, beat: &Heartbeat) -> Result<bool, TrainError> {
         let step = self.agent.step();
-        let practice = self.practice.as_ref().filter(|practice| practice.has_begun(step));
-        if practice.is_some_and(|practice| practice.is_snapshot(step)) && self.saved != Some(step) {
+        if self.practices_with(step) && self.saved != Some(step) {
             self.save_policy(step, beat)?;
         }
         let Some(practice) = self.practice.as_mut().filter(|practice| practice.has_begun(step))
@@ -160,6 +159,11 @@ impl Training {
                 return Ok(false);
             }
         }
+    }
+
+    /// True if practice is played with the policy after this gradient step.
+    fn practices_with(&self, step: u64) -> bool {
+        self.practice.as_ref().is_some_and(|practice| practice.is_snapshot(step))
     }
 
     /// Empty if the row of this step has no such metrics.
@@ -184,8 +188,7 @@ impl Training {
         self.saved = Some(step);
         let file = self.agent.policy(self.origin.clone()).map_err(TrainError::at(step))?;
         self.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
-        let evaluate = self.schedule.is_evaluated(step);
-        let practice = self.practice.as_ref().is_some_and(|practice| practice.is_snapshot(step));
+        let (evaluate, practice) = (self.schedule.is_evaluated(step), self.practices_with(step));
         let policy = TrainedPolicy { step, file, evaluate, practice };
         self.queue.snapshot(policy, &self.stop, beat);
         Ok(())
