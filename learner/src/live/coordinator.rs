@@ -146,9 +146,9 @@ impl Coordinator {
         self.lock().scoreboard.practice(piece.seed).ok_or(Refusal::Practice(piece.seed))
     }
 
-    /// Checks an episode of practice. Changes nothing.
-    pub(super) fn validate_practice(&self, episode: &Episode) -> Result<(), Refusal> {
-        self.lock().scoreboard.validate_practice(episode)
+    /// Checks the episode of practice with this number. Changes nothing.
+    pub(super) fn validate_practice(&self, number: u64, episode: &Episode) -> Result<(), Refusal> {
+        self.lock().scoreboard.validate_practice(number, episode)
     }
 
     /// Counts an episode of practice that is on the disk. Returns its acknowledgment.

@@ -13,7 +13,7 @@ use tracing::warn;
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
 use super::requests::{NotAccepted, Request};
-use crate::evaluation::{Practice, Refusal};
+use crate::evaluation::Practice;
 use crate::train::Inbox;
 
 /// Practice episodes on their way to the disk, and then to training.
@@ -128,10 +128,7 @@ impl Experience {
             return Err(CodecError::Hash { claimed: piece.hash, found }.into());
         }
         let episode: Episode = decode(bytes)?;
-        if episode.score.seed != seed {
-            return Err(Refusal::Practice(seed).into());
-        }
-        self.coordinator.validate_practice(&episode)?;
+        self.coordinator.validate_practice(number, &episode)?;
         Ok(Added::Whole(number, episode))
     }
 }

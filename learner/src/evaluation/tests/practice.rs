@@ -85,10 +85,10 @@ fn only_episodes_that_fit_their_opening_are_accepted() {
     let check = |change: fn(&mut Episode)| {
         let mut episode = episode(100);
         change(&mut episode);
-        bench.board.validate_practice(&episode)
+        bench.board.validate_practice(0, &episode)
     };
     assert_eq!(check(|_| ()), Ok(()));
-    assert_eq!(check(|it| it.score.seed = 102), Err(Refusal::Practice(102)));
+    assert_eq!(check(|it| it.score.seed = 101), Err(Refusal::Practice(101)), "it is another's");
     assert_eq!(check(|it| it.step = 1000), Err(Refusal::Step));
     assert_eq!(check(|it| it.weights = hash(1)), Err(Refusal::Weights));
     assert_eq!(check(|it| it.actions = vec![0.0; 2 * 4]), Err(Refusal::Rows(100)));
@@ -102,8 +102,8 @@ fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
     bench.job("a", 0);
     bench.board.end_practice();
     assert_eq!(bench.job("b", 0).practice, None);
-    assert_eq!(bench.board.validate_practice(&episode(100)), Ok(()));
-    assert_eq!(bench.board.validate_practice(&episode(101)), Err(Refusal::Practice(101)));
+    assert_eq!(bench.board.validate_practice(0, &episode(100)), Ok(()));
+    assert_eq!(bench.board.validate_practice(1, &episode(101)), Err(Refusal::Practice(101)));
     bench.leave("a", 1);
     assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }
