@@ -54,8 +54,8 @@ impl Experience {
         if whole.is_empty() {
             return;
         }
-        let frames = whole.iter().filter_map(|(_, _, it)| self.partial.get(&it.score.seed));
-        match self.log.append(frames) {
+        let partial = whole.iter().filter_map(|(_, _, it)| self.partial.get(&it.score.seed));
+        match self.log.append(partial.map(|(_, frame)| frame.as_slice())) {
             Ok(()) => {
                 disk.accepted(beat);
                 for (request, number, episode) in whole {
