@@ -17,7 +17,8 @@ use super::refusal::{Refusal, require};
 /// one for each evaluator, so that hundreds of idle ones do not keep the learner busy. A new
 /// snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
-/// The same while there is practice, in which the learner may wait for it.
+/// The same from the first practice episode to the end of practice: training may come to the next
+/// one, and wait for it, at any time.
 const ASK_FOR_PRACTICE: [Duration; 2] = [Duration::from_millis(20); 2];
 /// Time between an evaluator's progress messages, likewise.
 const PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(40)];
@@ -196,7 +197,7 @@ impl Scoreboard {
         if !fits {
             return Claimed::Wait(DOES_NOT_FIT);
         }
-        let practices = matches!(self.evaluations.first_key_value(), Some((Key::Practice(_), _)));
+        let practices = !self.practice.is_empty() && !self.practice_ended;
         let often = if practices { ASK_FOR_PRACTICE } else { ASK_AGAIN };
         let wait = Claimed::Wait(interval(present, often));
         if let Some(open) = self.jobs.get_mut(evaluator) {

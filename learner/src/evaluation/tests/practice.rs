@@ -97,6 +97,26 @@ fn only_episodes_that_fit_their_opening_are_accepted() {
 }
 
 #[test]
+fn as_long_as_there_is_practice_evaluators_ask_for_it_often() {
+    let mut bench = bench();
+    bench.present = 1;
+    let pause = |bench: &mut Bench| loop {
+        match bench.claim("a", 0, 0) {
+            Claimed::Wait(pause) => return pause.as_millis(),
+            Claimed::Job { job, .. } if job.practice.is_some() => {
+                bench.board.record_practice(job.seeds[0], hash(7));
+            }
+            Claimed::Job { job, .. } => {
+                bench.deliver(&full_report(&job, "a")).unwrap();
+            }
+        }
+    };
+    assert_eq!(pause(&mut bench), 20, "none is open, but another may be at any time");
+    bench.board.end_practice();
+    assert_eq!(pause(&mut bench), 500);
+}
+
+#[test]
 fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
     let mut bench = bench();
     bench.job("a", 0);
