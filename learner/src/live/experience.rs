@@ -3,11 +3,13 @@
 //! A piece is small, since a learner takes no larger messages. There are as many episodes in
 //! pieces as the run has open, and none is longer than the environment allows.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
-use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode};
-use quad_run::folder::ExperienceLog;
-use quad_runtime::Heartbeat;
+use anyhow::Context;
+use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode, practice_seed};
+use quad_run::config::Experiment;
+use quad_run::folder::{ExperienceLog, RunDir};
+use quad_runtime::{Heartbeat, Hint};
 use tracing::warn;
 
 use super::coordinator::Coordinator;
@@ -15,6 +17,9 @@ use super::disk::DiskStatus;
 use super::requests::{NotAccepted, Request};
 use crate::evaluation::Practice;
 use crate::train::Inbox;
+
+/// The hint of a checkpoint or log without the other.
+pub(super) const OTHER_FOLDER: &str = "experience.log belongs to the run: copy it from where the checkpoint is from, or begin anew with --fresh";
 
 /// Practice episodes on their way to the disk, and then to training.
 pub(super) struct Experience {
@@ -30,8 +35,33 @@ pub(super) struct Experience {
 type Whole = (Request, u64, Episode);
 
 impl Experience {
-    pub fn new(log: ExperienceLog, inbox: Inbox, coordinator: Coordinator) -> Self {
-        Self { log, inbox, coordinator, partial: BTreeMap::new() }
+    /// Opens the run's log, and puts what it has into the inbox. An episode that is not there may
+    /// have been played, if the run is `resumed`.
+    pub fn open(
+        dir: &RunDir,
+        experiment: &Experiment,
+        resumed: bool,
+        inbox: Inbox,
+        coordinator: &Coordinator,
+    ) -> anyhow::Result<Self> {
+        let (log, records) = dir.experience_log()?;
+        let by_seed = |(hash, episode): (Hash, Episode)| (episode.score.seed, (hash, episode));
+        let mut episodes: HashMap<u64, _> = records.into_iter().map(by_seed).collect();
+        let recorded = episodes.len() as u64;
+        let lag = experiment.online.as_ref().map_or(0, |online| online.lag);
+        // Seeds are those of the first episodes: more were never open.
+        for number in 0..recorded + u64::from(lag) {
+            let seed = practice_seed(experiment.seed, number);
+            if let Some((hash, episode)) = episodes.remove(&seed) {
+                coordinator.record_practice(seed, hash);
+                inbox.send((number, episode)).ok();
+            } else if resumed || recorded > 0 {
+                coordinator.expect_practice(seed);
+            }
+        }
+        let error = "experience.log has episodes of another run";
+        episodes.is_empty().then_some(()).context(error).hint(OTHER_FOLDER)?;
+        Ok(Self { log, inbox, coordinator: coordinator.clone(), partial: BTreeMap::new() })
     }
 
     /// Answers each piece. Episodes that are complete are written together first.
