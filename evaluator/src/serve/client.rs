@@ -240,10 +240,11 @@ impl RunClient {
             let late = |_| Err(QueryError::NoAnswer(keys::experience(run)));
             let Err(error) = delivered.unwrap_or_else(late) else { return };
             // A learner that answers with an error has received the scores and may still save them.
-            // If the job went back now, others would run it again.
-            let retry = matches!(error, QueryError::Unusable { .. });
-            answered |= retry && !is_episode;
-            if !retry || Instant::now() + RETRY > until {
+            // If the job went back now, others would run it again. An episode of a robot or a person
+            // cannot be run again.
+            let unusable = matches!(error, QueryError::Unusable { .. });
+            answered |= unusable && !is_episode;
+            if !(unusable || is_episode) || Instant::now() + RETRY > until {
                 warn!(%run, "the learner has not acknowledged the results: {error}");
                 break;
             }
