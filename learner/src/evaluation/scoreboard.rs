@@ -216,9 +216,7 @@ impl Scoreboard {
         let Some((key, seeds)) = handed_out.or_else(|| self.straggler(id, now)) else {
             return wait;
         };
-        let Some(Evaluation { step, weights, practice, .. }) = self.evaluations.get(&key) else {
-            return wait;
-        };
+        let Evaluation { step, weights, practice, .. } = &self.evaluations[&key];
         self.next_job += 1;
         let progress = interval(present, PROGRESS);
         // One message may be lost, and the next one late.

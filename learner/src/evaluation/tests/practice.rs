@@ -120,10 +120,12 @@ fn as_long_as_there_is_practice_evaluators_ask_for_it_often() {
 fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
     let mut bench = bench();
     bench.job("a", 0);
+    bench.board.expect_practice(102);
     bench.board.end_practice();
     assert_eq!(bench.job("b", 0).practice, None);
     assert_eq!(bench.board.validate_practice(0, &episode(100)), Ok(()));
     assert_eq!(bench.board.validate_practice(1, &episode(101)), Err(Refusal::Practice(101)));
+    assert_eq!([101, 102].map(|seed| bench.board.practice(seed)), [None; 2]);
     bench.leave("a", 1);
     assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }
@@ -135,7 +137,4 @@ fn an_episode_of_an_earlier_incarnation_is_kept_by_its_evaluator_until_it_is_ope
     assert_eq!(bench.board.practice(100), Some(Practice::NotYet));
     bench.board.open_practice(&opening(0), hash(500));
     assert_eq!(bench.board.practice(100), Some(Practice::Open { episode: 0 }));
-    bench.board.expect_practice(101);
-    bench.board.end_practice();
-    assert_eq!(bench.board.practice(101), None, "training ends without it");
 }

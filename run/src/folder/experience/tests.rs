@@ -55,16 +55,15 @@ fn an_incomplete_record_at_the_end_is_cut_off() {
 #[test]
 fn a_damaged_record_before_another_one_is_an_error() {
     let (_folder, run, path, bytes) = recorded();
-    let record_length = bytes.len() / 3;
+    let start = bytes.len() / 3;
     // In length, hash, begin and end of the frame of the second.
-    for at in [0, 3, 4, 36, record_length - 1] {
+    for at in [0, 3, 4, 36, start - 1] {
         let mut damaged = bytes.clone();
-        damaged[record_length + at] ^= 0x40;
+        damaged[start + at] ^= 0x40;
         fs::write(&path, &damaged).unwrap();
         let error = run.experience_log().unwrap_err();
-        let expected =
-            format!("record 2, at byte {record_length}, is damaged, but one after it is complete");
-        assert!(error.to_string().ends_with(&expected), "{at}: {error}");
+        let words = format!("record 2, at byte {start}, is damaged, but one after it is complete");
+        assert!(error.to_string().ends_with(&words), "{at}: {error}");
         assert!(error.hint().contains("a copy of the file"));
         assert!(read_experience(run.path()).is_err());
         assert_eq!(fs::read(&path).unwrap(), damaged);
