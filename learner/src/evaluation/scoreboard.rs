@@ -17,9 +17,11 @@ use super::refusal::{Refusal, require};
 /// one for each evaluator, so that hundreds of idle ones do not keep the learner busy. A new
 /// snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
-/// The same from the first practice episode to the end of practice: training may come to the next
-/// one, and wait for it, at any time.
+/// The same while there is practice to play, for which training may wait.
 const ASK_FOR_PRACTICE: [Duration; 2] = [Duration::from_millis(20); 2];
+/// The same between two episodes of practice: training comes to the next one when it has learned
+/// from another, which may be short.
+const ASK_BETWEEN: [Duration; 2] = [Duration::from_millis(100), Duration::from_millis(20)];
 /// Time between an evaluator's progress messages, likewise.
 const PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(40)];
 /// Longest time between progress messages.
@@ -197,8 +199,11 @@ impl Scoreboard {
         if !fits {
             return Claimed::Wait(DOES_NOT_FIT);
         }
-        let practices = !self.practice.is_empty() && !self.practice_ended;
-        let often = if practices { ASK_FOR_PRACTICE } else { ASK_AGAIN };
+        let often = match self.evaluations.first_key_value() {
+            Some((Key::Practice(_), _)) => ASK_FOR_PRACTICE,
+            _ if self.practice_ended || self.practice.is_empty() => ASK_AGAIN,
+            _ => ASK_BETWEEN,
+        };
         let wait = Claimed::Wait(interval(present, often));
         if let Some(open) = self.jobs.get_mut(evaluator) {
             if open.attempt == attempt {

@@ -97,7 +97,7 @@ fn only_episodes_that_fit_their_opening_are_accepted() {
 }
 
 #[test]
-fn as_long_as_there_is_practice_evaluators_ask_for_it_often() {
+fn between_two_episodes_evaluators_ask_more_often_than_after_the_last() {
     let mut bench = bench();
     bench.present = 1;
     let pause = |bench: &mut Bench| loop {
@@ -111,7 +111,7 @@ fn as_long_as_there_is_practice_evaluators_ask_for_it_often() {
             }
         }
     };
-    assert_eq!(pause(&mut bench), 20, "none is open, but another may be at any time");
+    assert_eq!(pause(&mut bench), 100, "none is open, but another will be soon");
     bench.board.end_practice();
     assert_eq!(pause(&mut bench), 500);
 }
