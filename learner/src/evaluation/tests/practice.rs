@@ -129,12 +129,3 @@ fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
     bench.leave("a", 1);
     assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }
-
-#[test]
-fn an_episode_of_an_earlier_incarnation_is_kept_by_its_evaluator_until_it_is_open_again() {
-    let mut bench = Bench::new();
-    bench.board.expect_practice(100);
-    assert_eq!(bench.board.practice(100), Some(Practice::NotYet));
-    bench.board.open_practice(&opening(0), hash(500));
-    assert_eq!(bench.board.practice(100), Some(Practice::Open { episode: 0 }));
-}
