@@ -298,7 +298,8 @@ async fn deliver_scores(
     timeout: Duration,
 ) -> Result<Option<String>, QueryError> {
     let Connection { run, metrics, .. } = connection;
-    Ok(match connection.deliver(report, timeout).await? {
+    let delivered = connection.deliver(keys::scores(run), report, timeout, ScoreReply::incarnation);
+    Ok(match delivered.await? {
         ScoreReply::Recorded { new, duplicates, .. } => {
             let scores = report.episodes.iter().map(|episode| episode.score);
             let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
@@ -321,7 +322,8 @@ async fn deliver_episode(
 ) -> Result<Option<String>, QueryError> {
     let (Connection { run, metrics, .. }, seed) = (connection, parcel.seed());
     loop {
-        match connection.deliver_piece(&parcel.piece(), timeout).await? {
+        let (key, piece) = (keys::experience(run), parcel.piece());
+        match connection.deliver(key, &piece, timeout, PieceReply::incarnation).await? {
             PieceReply::Continue { offset, .. } => {
                 let unusable = |reason| QueryError::Unusable { key: keys::experience(run), reason };
                 parcel.continue_at(offset).map_err(unusable)?;

@@ -325,7 +325,7 @@ impl Scoreboard {
         failed: Option<Instant>,
     ) -> Option<(u64, Vec<(u64, u64)>)> {
         let step = self.jobs.get(evaluator).filter(|open| open.job.id == id)?.job.step;
-        Some((step, self.release(evaluator, failed)?))
+        Some((step, self.release(evaluator, failed).given_up))
     }
 
     /// Takes back the jobs whose lease has run out.
@@ -334,31 +334,29 @@ impl Scoreboard {
         let evaluators = Vec::from_iter(expired.map(|(evaluator, _)| evaluator.clone()));
         let mut lost = Lost { jobs: evaluators.len(), given_up: Vec::new() };
         for evaluator in &evaluators {
-            lost.given_up.extend(self.release(evaluator, Some(now)).unwrap_or_default());
+            lost.given_up.extend(self.release(evaluator, Some(now)).given_up);
         }
         lost
     }
 
     /// Takes back the job of an evaluator that has left.
     pub fn evaluator_left(&mut self, evaluator: &Name, now: Instant) -> Lost {
-        match self.release(evaluator, Some(now)) {
-            Some(given_up) => Lost { jobs: 1, given_up },
-            None => Lost::default(),
-        }
+        self.release(evaluator, Some(now))
     }
 
-    /// Ends the job of an evaluator. Its episodes wait for the next job, except those that are
-    /// given up, which it returns.
-    fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Option<Vec<(u64, u64)>> {
-        let OpenJob { key, job: Job { id, step, seeds, .. }, .. } = self.jobs.remove(evaluator)?;
-        let given_up = match self.evaluations.get_mut(&key) {
-            Some(evaluation) => evaluation.take_back(id, &seeds, lost),
-            None => Vec::new(),
+    /// Ends the job of an evaluator, if it has one. Its episodes wait for the next job, except those
+    /// that are given up.
+    fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Lost {
+        let Some(OpenJob { key, job, .. }) = self.jobs.remove(evaluator) else {
+            return Lost::default();
         };
+        let evaluation = self.evaluations.get_mut(&key);
+        let given_up = evaluation.map(|it| it.take_back(job.id, &job.seeds, lost));
         if self.practice_ended {
             self.end_practice();
         }
-        Some(given_up.into_iter().map(|seed| (step, seed)).collect())
+        let given_up = given_up.into_iter().flatten().map(|seed| (job.step, seed)).collect();
+        Lost { jobs: 1, given_up }
     }
 }
 

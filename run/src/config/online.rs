@@ -65,8 +65,8 @@ impl Online {
             ("online.snapshot_interval", self.snapshot_interval, 1, MOST),
         ] {
             if !(least..=most).contains(&value) {
-                let (value, range) = (value.to_string(), format!("from {least} to {most}"));
-                return Err(ConfigError::OutOfRange { field, value, range });
+                let range = format!("from {least} to {most}");
+                return Err(ConfigError::out_of_range(field, value, &range));
             }
         }
         if self.warmup >= self.steps {
@@ -77,8 +77,7 @@ impl Online {
             [("online.share", self.share.unwrap_or(1.0)), ("online.noise", self.noise.into())]
         {
             if !(0.0..=1.0).contains(&value) {
-                let (value, range) = (value.to_string(), "from 0 to 1".to_owned());
-                return Err(ConfigError::OutOfRange { field, value, range });
+                return Err(ConfigError::out_of_range(field, value, "from 0 to 1"));
             }
         }
         Ok(())
