@@ -131,7 +131,6 @@ impl Threads {
             ),
             agent,
             practice,
-            saved: None,
             held_out: run.held_out,
             schedule,
             origin: origin(experiment),
