@@ -316,16 +316,16 @@ impl Scoreboard {
     }
 
     /// Takes a job back from an evaluator that leaves, or has `failed` to do it, which counts as if
-    /// it had been lost. Returns the step and the episodes that are given up; `None` if the
-    /// evaluator has no such job.
+    /// it had been lost. Returns it and the episodes that are given up; `None` if the evaluator has
+    /// no such job.
     pub fn hand_back(
         &mut self,
         evaluator: &Name,
         id: u64,
         failed: Option<Instant>,
-    ) -> Option<(u64, Vec<(u64, u64)>)> {
-        let step = self.jobs.get(evaluator).filter(|open| open.job.id == id)?.job.step;
-        Some((step, self.release(evaluator, failed).given_up))
+    ) -> Option<(Job, Vec<(u64, u64)>)> {
+        let job = self.jobs.get(evaluator).filter(|open| open.job.id == id)?.job.clone();
+        Some((job, self.release(evaluator, failed).given_up))
     }
 
     /// Takes back the jobs whose lease has run out.

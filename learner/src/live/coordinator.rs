@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use quad_protocol::{
-    CodecError, Episode, EpisodeScore, Hash, JobReply, JobRequest, Name, Piece, PieceReply,
+    CodecError, Episode, EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Piece, PieceReply,
     Progress, ScoreReply, ScoreReport, episode_seeds,
 };
 use quad_run::folder::SavedScores;
@@ -198,15 +198,11 @@ impl Coordinator {
             }
             JobRequest::HandBack { evaluator, job, failed } => {
                 let when = failed.is_some().then_some(now);
-                let at = state.scoreboard.job_of(evaluator);
-                let practice = at.is_some_and(|(job, _)| job.practice.is_some());
                 let handed_back = state.scoreboard.hand_back(evaluator, *job, when);
                 let accepted = handed_back.is_some();
-                if let Some((step, given_up)) = handed_back {
+                if let Some((job, given_up)) = handed_back {
                     match failed {
-                        Some(reason) => {
-                            self.failed(&mut state, (step, practice), evaluator, reason)
-                        }
+                        Some(reason) => self.failed(&mut state, &job, evaluator, reason),
                         None => self.metrics.jobs("handed_back", 1),
                     }
                     self.given_up(&state, &given_up);
@@ -298,8 +294,8 @@ impl Coordinator {
 
     /// Reports a job that an evaluator could not run, once for each step and, of practice, each
     /// minute.
-    fn failed(&self, state: &mut State, of: (u64, bool), evaluator: &Name, reason: &str) {
-        let (step, practice) = of;
+    fn failed(&self, state: &mut State, job: &Job, evaluator: &Name, reason: &str) {
+        let (step, practice) = (job.step, job.practice.is_some());
         self.metrics.jobs("failed", 1);
         let printable = reason.chars().filter(|c| !c.is_control());
         let reason = String::from_iter(printable.take(LONGEST_REASON));
