@@ -10,7 +10,7 @@ use quad_run::folder::SavedScores;
 
 use super::episodes::{Evaluation, Key};
 use super::open_job::OpenJob;
-use super::outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, Practice, Recorded};
+use super::outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, PracticeEpisode, Recorded};
 use super::refusal::{Refusal, require};
 
 /// Time after which an evaluator without a job asks again: the larger of this time, and the second
@@ -72,7 +72,7 @@ pub(crate) struct Scoreboard {
     /// Scores of an earlier incarnation, by step, whose evaluation is not open yet.
     earlier: BTreeMap<u64, SavedScores>,
     /// Practice episodes by seed.
-    practice: HashMap<u64, Practice>,
+    practice: HashMap<u64, PracticeEpisode>,
     practice_ended: bool,
 }
 
@@ -123,13 +123,13 @@ impl Scoreboard {
     /// Opens an episode of practice.
     pub fn open_practice(&mut self, opening: &Opening, weights: Hash) {
         let Opening { episode, seed, .. } = *opening;
-        self.practice.insert(seed, Practice::Open { episode });
+        self.practice.insert(seed, PracticeEpisode::Open { episode });
         self.evaluations.insert(Key::Practice(episode), Evaluation::practice(opening, weights));
     }
 
     /// Expects an episode of practice that an earlier incarnation may have opened.
     pub fn expect_practice(&mut self, seed: u64) {
-        self.practice.insert(seed, Practice::NotYet);
+        self.practice.insert(seed, PracticeEpisode::NotYet);
     }
 
     /// Ends practice: evaluators get no more of its episodes.
@@ -138,22 +138,22 @@ impl Scoreboard {
         let evaluations = &mut self.evaluations;
         evaluations.retain(|_, it| it.practice.is_none() || it.waiting() == 0);
         self.practice.retain(|_, practice| match practice {
-            Practice::Open { episode } => evaluations.contains_key(&Key::Practice(*episode)),
-            Practice::Recorded(_) => true,
-            Practice::NotYet => false,
+            PracticeEpisode::Open { episode } => evaluations.contains_key(&Key::Practice(*episode)),
+            PracticeEpisode::Recorded(_) => true,
+            PracticeEpisode::NotYet => false,
         });
     }
 
     /// The practice episode with this seed, if the run has it.
-    pub fn practice(&self, seed: u64) -> Option<Practice> {
+    pub fn practice(&self, seed: u64) -> Option<PracticeEpisode> {
         self.practice.get(&seed).copied()
     }
 
     /// Records a practice episode, whose frame has this hash, as delivered. Returns the number of
     /// jobs that this ends.
     pub fn record_practice(&mut self, seed: u64, hash: Hash) -> usize {
-        let before = self.practice.insert(seed, Practice::Recorded(hash));
-        let Some(Practice::Open { episode }) = before else { return 0 };
+        let before = self.practice.insert(seed, PracticeEpisode::Recorded(hash));
+        let Some(PracticeEpisode::Open { episode }) = before else { return 0 };
         let (key, open) = (Key::Practice(episode), self.jobs.len());
         self.evaluations.remove(&key);
         self.jobs.retain(|_, open| open.key != key);

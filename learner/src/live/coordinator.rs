@@ -21,7 +21,8 @@ use super::events::{Event, Events};
 use super::metrics::{Metrics, unix_time};
 use super::requests::NotAccepted;
 use crate::evaluation::{
-    Claim, Claimed, Lost, Opening, OtherWeights, Practice, Refusal, Rules, Scoreboard, Validated,
+    Claim, Claimed, Lost, Opening, OtherWeights, PracticeEpisode, Refusal, Rules, Scoreboard,
+    Validated,
 };
 
 /// Most characters of an evaluator's error message that the learner logs.
@@ -136,7 +137,7 @@ impl Coordinator {
     }
 
     /// The practice episode of a piece, if the run has it and it is not too long.
-    pub(super) fn practice(&self, piece: &Piece) -> Result<Practice, Refusal> {
+    pub(super) fn practice(&self, piece: &Piece) -> Result<PracticeEpisode, Refusal> {
         if piece.run != self.rules.run {
             return Err(Refusal::Run);
         }

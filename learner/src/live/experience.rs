@@ -112,9 +112,9 @@ impl Experience {
         let incarnation = self.coordinator.incarnation();
         let seed = piece.seed;
         let number = match self.coordinator.practice(piece)? {
-            Practice::Open { episode } => episode,
-            Practice::NotYet => return Err(NotAccepted::NotYet),
-            Practice::Recorded(hash) => {
+            PracticeEpisode::Open { episode } => episode,
+            PracticeEpisode::NotYet => return Err(NotAccepted::NotYet),
+            PracticeEpisode::Recorded(hash) => {
                 if hash != piece.hash {
                     self.coordinator.metrics.practice.differences.inc();
                     warn!(

@@ -3,7 +3,7 @@
 use quad_protocol::{Episode, Exploration};
 
 use super::*;
-use crate::evaluation::{Opening, Practice};
+use crate::evaluation::{Opening, PracticeEpisode};
 
 const EXPLORATION: Exploration = Exploration::Policy { noise: 0.1 };
 
@@ -50,9 +50,9 @@ fn an_episode_is_played_until_it_is_recorded_and_counts_once() {
         bench.hand_back("a", &job, Some(100 * failure)).unwrap();
     }
     let job = bench.job("a", 10_000);
-    assert_eq!(bench.board.practice(100), Some(Practice::Open { episode: 0 }));
+    assert_eq!(bench.board.practice(100), Some(PracticeEpisode::Open { episode: 0 }));
     assert_eq!(bench.board.record_practice(100, hash(7)), 1);
-    assert_eq!(bench.board.practice(100), Some(Practice::Recorded(hash(7))));
+    assert_eq!(bench.board.practice(100), Some(PracticeEpisode::Recorded(hash(7))));
     assert_eq!(bench.hand_back("a", &job, None), None, "the job is done");
     assert_eq!(bench.job("a", 10_001).seeds, [101]);
     assert_eq!(bench.board.practice(102), None);
