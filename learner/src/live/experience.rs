@@ -73,7 +73,6 @@ impl Experience {
     ) {
         let mut whole = Vec::new();
         for (request, piece) in pieces {
-            self.coordinator.extend_lease(&piece.evaluator, piece.incarnation, piece.job);
             match self.add(&piece, &whole) {
                 Ok(Added::Reply(reply)) => request.reply(&reply),
                 Ok(Added::Whole(number, episode)) => whole.push((request, number, episode)),
