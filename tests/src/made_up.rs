@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
 use quad_protocol::{
-    Episode, EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Piece, Progress,
-    ScoreReport, decode, encode, keys,
+    Episode, EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Piece, PieceReply,
+    Progress, ScoreReport, decode, encode, keys,
 };
 use quad_runtime::{Endpoints, open_session};
 use tokio::time::sleep;
@@ -73,7 +73,7 @@ pub fn scores(job: &Job, evaluator: &str) -> ScoreReport {
 }
 
 /// An episode of practice in Hopper, of 1,000 steps.
-pub fn episode(job: &Job) -> Episode {
+fn episode(job: &Job) -> Episode {
     let hopper = environment::find("hopper").expect("hopper is known");
     let (steps, reward) = (1000, 2.0);
     let episode_return = steps as f64 * f64::from(reward);
@@ -85,22 +85,6 @@ pub fn episode(job: &Job) -> Episode {
         actions: vec![0.1; steps * 3],
         rewards: vec![reward; steps],
         ..Episode::new(job.step, job.weights, name("f32"), seed)
-    }
-}
-
-/// The piece of an episode's frame from `offset` on.
-pub fn piece(job: &Job, evaluator: &str, frame: &[u8], offset: usize) -> Piece {
-    let end = frame.len().min(offset + Piece::MOST);
-    Piece {
-        evaluator: name(evaluator),
-        run: job.run.clone(),
-        incarnation: job.incarnation,
-        job: job.id,
-        seed: job.seeds[0],
-        hash: Hash::of(frame),
-        length: frame.len() as u32,
-        offset: offset as u32,
-        bytes: frame[offset..end].to_vec(),
     }
 }
 
@@ -128,5 +112,30 @@ pub async fn claim_eventually(session: &Session, run: &Name, evaluator: &str) ->
         }
         assert!(begin.elapsed() < PATIENCE, "no job for {evaluator}");
         sleep(Duration::from_millis(50)).await;
+    }
+}
+
+/// Delivers an episode of practice, as if the job's policy had played it. Returns the last answer.
+pub async fn deliver_practice(session: &Session, job: &Job, evaluator: &str) -> PieceReply {
+    let frame = encode(&episode(job)).expect("it is small");
+    let mut piece = Piece {
+        evaluator: name(evaluator),
+        run: job.run.clone(),
+        incarnation: job.incarnation,
+        job: job.id,
+        seed: job.seeds[0],
+        hash: Hash::of(&frame),
+        length: frame.len() as u32,
+        offset: 0,
+        bytes: Vec::new(),
+    };
+    loop {
+        let rest = &frame[piece.offset as usize..];
+        piece.bytes = rest[..rest.len().min(Piece::MOST)].to_vec();
+        match ask(session, keys::experience(&job.run), &piece).await {
+            Some(PieceReply::Continue { offset, .. }) => piece.offset = offset,
+            Some(answer) => return answer,
+            None => sleep(Duration::from_millis(50)).await,
+        }
     }
 }

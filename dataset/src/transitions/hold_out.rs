@@ -59,19 +59,47 @@ impl Recording {
     }
 
     /// Training episodes, held-out episodes if there are any, and the indices of the latter.
-    pub(crate) fn hold_out(self, hold_out: HoldOut<'_>) -> (Self, Option<Self>, Vec<usize>) {
+    pub(crate) fn hold_out(mut self, hold_out: HoldOut<'_>) -> (Self, Option<Self>, Vec<usize>) {
         let episodes = self.rows_of_episodes();
         let out = chosen(hold_out, episodes.len());
         if out.is_empty() {
             return (self, None, out);
         }
-        let mut parts = [self.like(), self.like()];
+        let (mut held_out, mut kept) = (self.like(), Vec::new());
         for (number, rows) in episodes.into_iter().enumerate() {
-            parts[usize::from(out.binary_search(&number).is_ok())].extend(&self, rows);
+            match out.binary_search(&number) {
+                Ok(_) => held_out.extend(&self, rows),
+                Err(_) => kept.push(rows),
+            }
         }
-        parts.iter_mut().for_each(Self::close);
-        let [training, held_out] = parts;
-        (training, Some(held_out), out)
+        self.keep(&kept);
+        self.close();
+        held_out.close();
+        (self, Some(held_out), out)
+    }
+
+    /// Drops all other rows in place: there may be no memory for a second dataset.
+    fn keep(&mut self, kept: &[Range<usize>]) {
+        let (states, actions) = (self.observation_dim, self.action_dim);
+        let (mut parts, mut first) = (Vec::new(), 0);
+        for rows in kept {
+            if let Ok(part) = self.parts.binary_search_by_key(&rows.start, |(row, _)| *row) {
+                parts.push((first, self.parts[part].1.clone()));
+            }
+            first += rows.len();
+        }
+        self.parts = parts;
+        self.unused_next_observations = None;
+        if let Some(next) = &mut self.next_observations {
+            keep(next, states, kept);
+        }
+        keep(&mut self.observations, states, kept);
+        keep(&mut self.actions, actions, kept);
+        keep(&mut self.rewards, 1, kept);
+        keep(&mut self.kinds, 1, kept);
+        for flags in [&mut self.terminals, &mut self.timeouts, &mut self.ends] {
+            keep(flags, 1, kept);
+        }
     }
 
     fn like(&self) -> Recording {
@@ -116,6 +144,16 @@ impl Recording {
     }
 }
 
+/// Moves the rows that stay, in ascending order, to the front of a column.
+fn keep<T: Copy>(column: &mut Vec<T>, width: usize, kept: &[Range<usize>]) {
+    let mut end = 0;
+    for rows in kept {
+        column.copy_within(rows.start * width..rows.end * width, end);
+        end += rows.len() * width;
+    }
+    column.truncate(end);
+}
+
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
@@ -141,19 +179,26 @@ mod tests {
         let mut seen = BTreeSet::new();
         for seed in 0..20 {
             let hold_out = HoldOut::Fraction { fraction: 0.25, seed };
-            let (training, held_out, out) = whole().hold_out(hold_out);
+            let all = whole();
+            let place = all.observations.as_ptr();
+            let (training, held_out, out) = all.hold_out(hold_out);
             let (number, held_out) = (&out[0], held_out.unwrap());
             assert_eq!(out.len(), 1);
+            assert_eq!(training.observations.as_ptr(), place, "a copy takes as much memory again");
             let rows = &episodes[*number];
             let (own, others): (Vec<usize>, _) = (0..7).partition(|row| rows.contains(row));
-            // Rewards equal row indices; one more row, a final state, may follow.
+            // Rewards and observations equal row indices; one more row, a final state, may follow.
             for (part, rows) in [(&held_out, own), (&training, others)] {
                 let rewards = Vec::from_iter(rows.into_iter().map(|row| row as f32));
                 assert_eq!(part.rewards[..rewards.len()], rewards);
+                assert_eq!(part.observations[..rewards.len()], rewards);
                 let is_last = |row: usize| row + 1 == part.rows();
                 assert!(!part.transitions().any(is_last), "no next state");
             }
             assert_eq!(held_out.parts, [(0, rows.start.to_string())]);
+            let is_there =
+                |(first, name): &(usize, String)| training.rewards[*first].to_string() == *name;
+            assert!(training.parts.len() == 3 && training.parts.iter().all(is_there));
             let again = whole().hold_out(HoldOut::Episodes(&out));
             assert_eq!(again.0.rewards, training.rewards);
             seen.insert(*number);

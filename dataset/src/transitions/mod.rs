@@ -255,14 +255,6 @@ impl Transitions {
         episodes
     }
 
-    /// First index of each run of `length ≥ 1` consecutive transitions within an episode.
-    pub fn window_starts(&self, length: u32) -> Vec<u32> {
-        let starts = |episode: Range<u32>| {
-            episode.start..(episode.end + 1).saturating_sub(length).max(episode.start)
-        };
-        self.episodes().into_iter().flat_map(starts).collect()
-    }
-
     /// Copies the transitions at `indices` into `batch`.
     pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
         self.gather_windows(indices, Window::ONE, batch);

@@ -80,17 +80,6 @@ fn rows_with_next_observations_of_their_own_follow_one_another_where_these_say_s
     assert_eq!((transitions.next_action(1), transitions.next_action(3)), (None, None));
 }
 
-#[test]
-fn windows_lie_within_episodes() {
-    let transitions = transitions(d4rl());
-    assert_eq!(transitions.window_starts(1), [0, 1, 2, 3, 4]);
-    assert_eq!(transitions.window_starts(2), [0, 2]);
-    assert!(transitions.window_starts(3).is_empty());
-    let mut batch = Batch::default();
-    transitions.gather(&Vec::from_iter(2..4), &mut batch);
-    assert_eq!((batch.observations, batch.next_observations), (vec![3.0, 4.0], vec![4.0, 5.0]));
-}
-
 /// Rewards and observations are row numbers, actions a hundredth of them.
 #[test]
 fn windows_of_steps_end_with_their_episode() {

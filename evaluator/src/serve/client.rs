@@ -34,9 +34,7 @@ const MAX_REASON_LEN: usize = 1000;
 /// A claimed job, until the learner has acknowledged its results or its return. Meanwhile the
 /// evaluator claims no other.
 struct Claimed {
-    id: u64,
-    incarnation: u64,
-    step: u64,
+    job: Job,
     /// Results to deliver; without, the job goes back.
     owed: Option<Owed>,
     /// Reason of the return, for people.
@@ -146,13 +144,7 @@ impl RunClient {
         self.attempt = None;
         Ok(match reply {
             JobReply::Job(job) => {
-                self.claimed = Some(Claimed {
-                    id: job.id,
-                    incarnation: job.incarnation,
-                    step: job.step,
-                    owed: None,
-                    failed: None,
-                });
+                self.claimed = Some(Claimed { job: job.clone(), owed: None, failed: None });
                 Some(job)
             }
             JobReply::Wait { milliseconds, .. } => {
@@ -199,10 +191,10 @@ impl RunClient {
     /// acknowledged.
     pub async fn deliver(&mut self, timeout: Duration) -> Result<(), QueryError> {
         let connection = &self.connection;
-        let Some(Claimed { step, owed: Some(owed), .. }) = &mut self.claimed else {
+        let Some(Claimed { job, owed: Some(owed), .. }) = &mut self.claimed else {
             return self.hand_back(timeout).await;
         };
-        let (run, step) = (&connection.run, *step);
+        let (run, step) = (&connection.run, job.step);
         let refused = match owed {
             Owed::Scores(report) => deliver_scores(connection, report, timeout).await?,
             Owed::Episode(parcel) => deliver_episode(connection, step, parcel, timeout).await?,
@@ -240,10 +232,11 @@ impl RunClient {
             let late = |_| Err(QueryError::NoAnswer(keys::experience(run)));
             let Err(error) = delivered.unwrap_or_else(late) else { return };
             // A learner that answers with an error has received the scores and may still save them.
-            // If the job went back now, others would run it again.
-            let retry = matches!(error, QueryError::Unusable { .. });
-            answered |= retry && !is_episode;
-            if !retry || Instant::now() + RETRY > until {
+            // If the job went back now, others would run it again. An episode of a robot or a person
+            // cannot be run again.
+            let unusable = matches!(error, QueryError::Unusable { .. });
+            answered |= unusable && !is_episode;
+            if !(unusable || is_episode) || Instant::now() + RETRY > until {
                 warn!(%run, "the learner has not acknowledged the results: {error}");
                 break;
             }
@@ -267,8 +260,8 @@ impl RunClient {
 
     async fn hand_back(&mut self, timeout: Duration) -> Result<(), QueryError> {
         let Some(claimed) = &self.claimed else { return Ok(()) };
-        let (incarnation, failed) = (claimed.incarnation, claimed.failed.clone());
-        let returned = self.connection.hand_back(claimed.id, incarnation, failed, timeout);
+        let (incarnation, failed) = (claimed.job.incarnation, claimed.failed.clone());
+        let returned = self.connection.hand_back(claimed.job.id, incarnation, failed, timeout);
         match returned.await {
             Ok(true) => info!(run = %self.connection.run, "a job was handed back"),
             // If another process is followed by now, the one that gave the job may be gone.
@@ -283,8 +276,8 @@ impl RunClient {
     pub fn give_up(self) {
         let Connection { run, metrics, .. } = &self.connection;
         self.snapshots.forget(run);
-        if let Some(Claimed { step, owed: Some(_), .. }) = self.claimed {
-            warn!(%run, step, "the learner did not return; its results are dropped");
+        if let Some(Claimed { job, owed: Some(_), .. }) = &self.claimed {
+            warn!(%run, step = job.step, "the learner did not return; its results are dropped");
             metrics.job_abandoned();
         }
     }
@@ -297,7 +290,8 @@ async fn deliver_scores(
     timeout: Duration,
 ) -> Result<Option<String>, QueryError> {
     let Connection { run, metrics, .. } = connection;
-    Ok(match connection.deliver(report, timeout).await? {
+    let delivered = connection.deliver(keys::scores(run), report, timeout, ScoreReply::incarnation);
+    Ok(match delivered.await? {
         ScoreReply::Recorded { new, duplicates, .. } => {
             let scores = report.episodes.iter().map(|episode| episode.score);
             let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
@@ -320,7 +314,8 @@ async fn deliver_episode(
 ) -> Result<Option<String>, QueryError> {
     let (Connection { run, metrics, .. }, seed) = (connection, parcel.seed());
     loop {
-        match connection.deliver_piece(&parcel.piece(), timeout).await? {
+        let (key, piece) = (keys::experience(run), parcel.piece());
+        match connection.deliver(key, &piece, timeout, PieceReply::incarnation).await? {
             PieceReply::Continue { offset, .. } => {
                 let unusable = |reason| QueryError::Unusable { key: keys::experience(run), reason };
                 parcel.continue_at(offset).map_err(unusable)?;

@@ -2,10 +2,7 @@
 
 use std::time::Duration;
 
-use quad_protocol::{
-    Job, JobReply, JobRequest, Message, Name, Piece, PieceReply, Progress, ScoreReply, ScoreReport,
-    Snapshot, encode, keys,
-};
+use quad_protocol::{Job, JobReply, JobRequest, Message, Name, Progress, Snapshot, encode, keys};
 use tracing::debug;
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
@@ -69,26 +66,17 @@ impl Connection {
         Ok(matches!(reply, JobReply::HandedBack { accepted: true, .. }))
     }
 
-    pub async fn deliver(
+    /// Delivers results. Of the learner's answer, `incarnation_of` reads whose it is.
+    pub async fn deliver<A: Message + Send + 'static>(
         &self,
-        report: &ScoreReport,
+        key: String,
+        results: &impl Message,
         timeout: Duration,
-    ) -> Result<ScoreReply, QueryError> {
+        incarnation_of: fn(&A) -> u64,
+    ) -> Result<A, QueryError> {
         let incarnation = self.incarnation;
-        let check = move |reply: &ScoreReply| is_from(incarnation, reply.incarnation());
-        let key = keys::scores(&self.run);
-        self.query(key, encode(report)?, timeout, check).await
-    }
-
-    pub async fn deliver_piece(
-        &self,
-        piece: &Piece,
-        timeout: Duration,
-    ) -> Result<PieceReply, QueryError> {
-        let incarnation = self.incarnation;
-        let check = move |reply: &PieceReply| is_from(incarnation, reply.incarnation());
-        let key = keys::experience(&self.run);
-        self.query(key, encode(piece)?, timeout, check).await
+        let check = move |reply: &A| is_from(incarnation, incarnation_of(reply));
+        self.query(key, encode(results)?, timeout, check).await
     }
 
     /// Requests the snapshot that `job` names.

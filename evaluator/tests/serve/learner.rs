@@ -144,10 +144,7 @@ fn answer(query: &Query, state: &Mutex<State>, weights: &Snapshot) {
     } else if key == keys::experience(&run) {
         let piece: Piece = decode(&payload).unwrap();
         locked.events.push(Event::Piece(piece.clone()));
-        match locked.behavior {
-            Behavior::DiskFull => query.reply_err("No space left on device").wait().unwrap(),
-            _ => locked.take(piece).into_iter().for_each(|answer| reply(query, &answer)),
-        }
+        locked.take(piece).into_iter().for_each(|answer| reply(query, &answer));
     } else if key == keys::scores(&run) {
         let report: ScoreReport = decode(&payload).unwrap();
         let new = report.episodes.len() as u32;

@@ -1,6 +1,7 @@
 //! An episode of practice, which goes to the learner in pieces until it has saved it.
 
 use quad_protocol::{Episode, Exploration, Hash, Job, Piece, PieceReply, decode};
+use tokio::task::spawn_blocking;
 
 use super::learner::{Behavior, Evaluator, Event, Learner, State, file_for, job};
 
@@ -94,10 +95,23 @@ async fn a_job_with_a_refused_episode_is_handed_back() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_leaving_evaluator_hands_back_what_is_not_acknowledged() {
-    let (learner, evaluator, _token) = start(Behavior::Silent).await;
-    learner.wait_for(|events| pieces(events).first().cloned()).await;
-    assert!(evaluator.leave().success());
-    assert_eq!(learner.wait_for_hand_back().await, None);
-    assert!(pieces(&learner.events()).len() > 1, "they are sent again");
+async fn a_leaving_evaluator_sends_its_episode_again_and_hands_the_job_back_in_the_end() {
+    for answers in [true, false] {
+        let (learner, evaluator, _token) = start(Behavior::Silent).await;
+        learner.wait_for(|events| pieces(events).first().cloned()).await;
+        let left = spawn_blocking(move || evaluator.leave());
+        learner.wait_for(|events| pieces(events).get(1).cloned()).await;
+        if answers {
+            learner.behave(Behavior::Records);
+        }
+        assert!(left.await.unwrap().success());
+        if answers {
+            assert_eq!(
+                (learner.count(Event::is_handed_back), learner.lock().job.clone()),
+                (0, None)
+            );
+        } else {
+            assert_eq!(learner.wait_for_hand_back().await, None);
+        }
+    }
 }

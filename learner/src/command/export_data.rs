@@ -2,6 +2,7 @@
 
 use anyhow::anyhow;
 use quad_dataset::{DatasetError, Metadata, PracticeRows, write_practice};
+use quad_protocol::Episode;
 use quad_run::folder::{RunDir, read_experience};
 use quad_runtime::{Hint, print};
 
@@ -16,13 +17,9 @@ pub fn export(args: &ExportDataArgs) -> anyhow::Result<()> {
         );
     };
     let episodes = Vec::from_iter(played.iter().map(|episode| {
-        let rows = PracticeRows {
-            observations: &episode.observations,
-            actions: &episode.actions,
-            rewards: &episode.rewards,
-            terminated: episode.terminated,
-        };
-        (rows, &*episode.interventions)
+        let Episode { observations, actions, rewards, terminated, interventions, .. } = episode;
+        let rows = PracticeRows { observations, actions, rewards, terminated: *terminated };
+        (rows, interventions.as_slice())
     }));
     let experiment = &config.experiment;
     let metadata = Metadata {

@@ -137,11 +137,7 @@ impl Evaluation {
 
     /// Hands out an episode once more, whose evaluator is slow.
     pub fn hand_out_again(&mut self, job: u64) -> Vec<u64> {
-        let indices = Vec::from_iter(self.handed_out.iter().copied());
-        for &index in &indices {
-            self.set_state(index, EpisodeState::HandedOut { job });
-        }
-        indices.into_iter().map(|index| self.episodes[index].seed).collect()
+        self.give(job, Vec::from_iter(self.handed_out.iter().copied()))
     }
 
     /// Hands out episodes that wait and do not rest. After a failure `few` at most, in case the
@@ -151,10 +147,15 @@ impl Evaluation {
         let mut ready = ready.filter(|&index| !self.episodes[index].rests(now)).peekable();
         let lost = ready.peek().is_some_and(|&index| self.episodes[index].lost > 0);
         let indices = Vec::from_iter(ready.take(if lost { few } else { most }));
-        for &index in &indices {
+        self.give(job, indices)
+    }
+
+    fn give(&mut self, job: u64, indices: Vec<usize>) -> Vec<u64> {
+        let give = |index| {
             self.set_state(index, EpisodeState::HandedOut { job });
-        }
-        indices.into_iter().map(|index| self.episodes[index].seed).collect()
+            self.episodes[index].seed
+        };
+        indices.into_iter().map(give).collect()
     }
 
     /// Takes back the episodes of a job that have no score yet. `lost` is when its evaluator was

@@ -24,7 +24,7 @@ mod scoreboard;
 mod tests;
 mod validate;
 
-pub(crate) use outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, Practice};
+pub(crate) use outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, PracticeEpisode};
 pub(crate) use refusal::Refusal;
 pub(crate) use scoreboard::{Rules, Scoreboard};
 pub(crate) use validate::Validated;

@@ -36,7 +36,7 @@ pub(crate) struct Opening {
 
 /// A practice episode as the learner knows it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Practice {
+pub(crate) enum PracticeEpisode {
     /// It is waited for.
     Open { episode: u64 },
     /// It was recorded, with a frame of this hash.

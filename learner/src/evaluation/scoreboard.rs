@@ -10,15 +10,18 @@ use quad_run::folder::SavedScores;
 
 use super::episodes::{Evaluation, Key};
 use super::open_job::OpenJob;
-use super::outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, Practice, Recorded};
+use super::outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, PracticeEpisode, Recorded};
 use super::refusal::{Refusal, require};
 
 /// Time after which an evaluator without a job asks again: the larger of this time, and the second
 /// one for each evaluator, so that hundreds of idle ones do not keep the learner busy. A new
 /// snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
-/// The same while there is practice, in which the learner may wait for it.
+/// The same while there is practice to play, for which training may wait.
 const ASK_FOR_PRACTICE: [Duration; 2] = [Duration::from_millis(20); 2];
+/// The same between two episodes of practice: training comes to the next one when it has learned
+/// from another, which may be short.
+const ASK_BETWEEN: [Duration; 2] = [Duration::from_millis(100), Duration::from_millis(20)];
 /// Time between an evaluator's progress messages, likewise.
 const PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(40)];
 /// Longest time between progress messages.
@@ -69,7 +72,7 @@ pub(crate) struct Scoreboard {
     /// Scores of an earlier incarnation, by step, whose evaluation is not open yet.
     earlier: BTreeMap<u64, SavedScores>,
     /// Practice episodes by seed.
-    practice: HashMap<u64, Practice>,
+    practice: HashMap<u64, PracticeEpisode>,
     practice_ended: bool,
 }
 
@@ -120,13 +123,13 @@ impl Scoreboard {
     /// Opens an episode of practice.
     pub fn open_practice(&mut self, opening: &Opening, weights: Hash) {
         let Opening { episode, seed, .. } = *opening;
-        self.practice.insert(seed, Practice::Open { episode });
+        self.practice.insert(seed, PracticeEpisode::Open { episode });
         self.evaluations.insert(Key::Practice(episode), Evaluation::practice(opening, weights));
     }
 
     /// Expects an episode of practice that an earlier incarnation may have opened.
     pub fn expect_practice(&mut self, seed: u64) {
-        self.practice.insert(seed, Practice::NotYet);
+        self.practice.insert(seed, PracticeEpisode::NotYet);
     }
 
     /// Ends practice: evaluators get no more of its episodes.
@@ -135,22 +138,22 @@ impl Scoreboard {
         let evaluations = &mut self.evaluations;
         evaluations.retain(|_, it| it.practice.is_none() || it.waiting() == 0);
         self.practice.retain(|_, practice| match practice {
-            Practice::Open { episode } => evaluations.contains_key(&Key::Practice(*episode)),
-            Practice::Recorded(_) => true,
-            Practice::NotYet => false,
+            PracticeEpisode::Open { episode } => evaluations.contains_key(&Key::Practice(*episode)),
+            PracticeEpisode::Recorded(_) => true,
+            PracticeEpisode::NotYet => false,
         });
     }
 
     /// The practice episode with this seed, if the run has it.
-    pub fn practice(&self, seed: u64) -> Option<Practice> {
+    pub fn practice(&self, seed: u64) -> Option<PracticeEpisode> {
         self.practice.get(&seed).copied()
     }
 
     /// Records a practice episode, whose frame has this hash, as delivered. Returns the number of
     /// jobs that this ends.
     pub fn record_practice(&mut self, seed: u64, hash: Hash) -> usize {
-        let before = self.practice.insert(seed, Practice::Recorded(hash));
-        let Some(Practice::Open { episode }) = before else { return 0 };
+        let before = self.practice.insert(seed, PracticeEpisode::Recorded(hash));
+        let Some(PracticeEpisode::Open { episode }) = before else { return 0 };
         let (key, open) = (Key::Practice(episode), self.jobs.len());
         self.evaluations.remove(&key);
         self.jobs.retain(|_, open| open.key != key);
@@ -196,8 +199,11 @@ impl Scoreboard {
         if !fits {
             return Claimed::Wait(DOES_NOT_FIT);
         }
-        let practices = matches!(self.evaluations.first_key_value(), Some((Key::Practice(_), _)));
-        let often = if practices { ASK_FOR_PRACTICE } else { ASK_AGAIN };
+        let often = match self.evaluations.first_key_value() {
+            Some((Key::Practice(_), _)) => ASK_FOR_PRACTICE,
+            _ if self.practice_ended || self.practice.is_empty() => ASK_AGAIN,
+            _ => ASK_BETWEEN,
+        };
         let wait = Claimed::Wait(interval(present, often));
         if let Some(open) = self.jobs.get_mut(evaluator) {
             if open.attempt == attempt {
@@ -215,9 +221,7 @@ impl Scoreboard {
         let Some((key, seeds)) = handed_out.or_else(|| self.straggler(id, now)) else {
             return wait;
         };
-        let Some(Evaluation { step, weights, practice, .. }) = self.evaluations.get(&key) else {
-            return wait;
-        };
+        let Evaluation { step, weights, practice, .. } = &self.evaluations[&key];
         self.next_job += 1;
         let progress = interval(present, PROGRESS);
         // One message may be lost, and the next one late.
@@ -312,16 +316,16 @@ impl Scoreboard {
     }
 
     /// Takes a job back from an evaluator that leaves, or has `failed` to do it, which counts as if
-    /// it had been lost. Returns the step and the episodes that are given up; `None` if the
-    /// evaluator has no such job.
+    /// it had been lost. Returns it and the episodes that are given up; `None` if the evaluator has
+    /// no such job.
     pub fn hand_back(
         &mut self,
         evaluator: &Name,
         id: u64,
         failed: Option<Instant>,
-    ) -> Option<(u64, Vec<(u64, u64)>)> {
-        let step = self.jobs.get(evaluator).filter(|open| open.job.id == id)?.job.step;
-        Some((step, self.release(evaluator, failed)?))
+    ) -> Option<(Job, Vec<(u64, u64)>)> {
+        let job = self.jobs.get(evaluator).filter(|open| open.job.id == id)?.job.clone();
+        Some((job, self.release(evaluator, failed).given_up))
     }
 
     /// Takes back the jobs whose lease has run out.
@@ -330,31 +334,29 @@ impl Scoreboard {
         let evaluators = Vec::from_iter(expired.map(|(evaluator, _)| evaluator.clone()));
         let mut lost = Lost { jobs: evaluators.len(), given_up: Vec::new() };
         for evaluator in &evaluators {
-            lost.given_up.extend(self.release(evaluator, Some(now)).unwrap_or_default());
+            lost.given_up.extend(self.release(evaluator, Some(now)).given_up);
         }
         lost
     }
 
     /// Takes back the job of an evaluator that has left.
     pub fn evaluator_left(&mut self, evaluator: &Name, now: Instant) -> Lost {
-        match self.release(evaluator, Some(now)) {
-            Some(given_up) => Lost { jobs: 1, given_up },
-            None => Lost::default(),
-        }
+        self.release(evaluator, Some(now))
     }
 
-    /// Ends the job of an evaluator. Its episodes wait for the next job, except those that are
-    /// given up, which it returns.
-    fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Option<Vec<(u64, u64)>> {
-        let OpenJob { key, job: Job { id, step, seeds, .. }, .. } = self.jobs.remove(evaluator)?;
-        let given_up = match self.evaluations.get_mut(&key) {
-            Some(evaluation) => evaluation.take_back(id, &seeds, lost),
-            None => Vec::new(),
+    /// Ends the job of an evaluator, if it has one. Its episodes wait for the next job, except those
+    /// that are given up.
+    fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Lost {
+        let Some(OpenJob { key, job, .. }) = self.jobs.remove(evaluator) else {
+            return Lost::default();
         };
+        let evaluation = self.evaluations.get_mut(&key);
+        let given_up = evaluation.map(|it| it.take_back(job.id, &job.seeds, lost));
         if self.practice_ended {
             self.end_practice();
         }
-        Some(given_up.into_iter().map(|seed| (step, seed)).collect())
+        let given_up = given_up.into_iter().flatten().map(|seed| (job.step, seed)).collect();
+        Lost { jobs: 1, given_up }
     }
 }
 

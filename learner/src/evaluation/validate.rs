@@ -5,7 +5,6 @@ use std::collections::BTreeSet;
 use quad_protocol::{Episode, EpisodeScore, ScoreReport};
 
 use super::episodes::Key;
-use super::outcomes::Practice;
 use super::refusal::{Refusal, require};
 use super::scoreboard::Scoreboard;
 
@@ -41,14 +40,12 @@ impl Scoreboard {
         Ok(validated)
     }
 
-    /// Checks an episode of practice against its opening. Changes nothing, as
+    /// Checks the episode of practice with this number against its opening. Changes nothing, as
     /// [`validate`](Self::validate).
-    pub fn validate_practice(&self, episode: &Episode) -> Result<(), Refusal> {
+    pub fn validate_practice(&self, number: u64, episode: &Episode) -> Result<(), Refusal> {
         let seed = episode.score.seed;
-        let open = match self.practice(seed) {
-            Some(Practice::Open { episode }) => self.evaluations.get(&Key::Practice(episode)),
-            _ => None,
-        };
+        let open = self.evaluations.get(&Key::Practice(number));
+        let open = open.filter(|open| open.is_scored(seed).is_some());
         let open = open.ok_or(Refusal::Practice(seed))?;
         require(open.step == episode.step, Refusal::Step)?;
         require(open.weights == episode.weights, Refusal::Weights)?;

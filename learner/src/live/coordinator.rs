@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use quad_protocol::{
-    CodecError, Episode, EpisodeScore, Hash, JobReply, JobRequest, Name, Piece, PieceReply,
+    CodecError, Episode, EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Piece, PieceReply,
     Progress, ScoreReply, ScoreReport, episode_seeds,
 };
 use quad_run::folder::SavedScores;
@@ -21,7 +21,8 @@ use super::events::{Event, Events};
 use super::metrics::{Metrics, unix_time};
 use super::requests::NotAccepted;
 use crate::evaluation::{
-    Claim, Claimed, Lost, Opening, OtherWeights, Practice, Refusal, Rules, Scoreboard, Validated,
+    Claim, Claimed, Lost, Opening, OtherWeights, PracticeEpisode, Refusal, Rules, Scoreboard,
+    Validated,
 };
 
 /// Most characters of an evaluator's error message that the learner logs.
@@ -136,7 +137,7 @@ impl Coordinator {
     }
 
     /// The practice episode of a piece, if the run has it and it is not too long.
-    pub(super) fn practice(&self, piece: &Piece) -> Result<Practice, Refusal> {
+    pub(super) fn practice(&self, piece: &Piece) -> Result<PracticeEpisode, Refusal> {
         if piece.run != self.rules.run {
             return Err(Refusal::Run);
         }
@@ -146,9 +147,9 @@ impl Coordinator {
         self.lock().scoreboard.practice(piece.seed).ok_or(Refusal::Practice(piece.seed))
     }
 
-    /// Checks an episode of practice. Changes nothing.
-    pub(super) fn validate_practice(&self, episode: &Episode) -> Result<(), Refusal> {
-        self.lock().scoreboard.validate_practice(episode)
+    /// Checks the episode of practice with this number. Changes nothing.
+    pub(super) fn validate_practice(&self, number: u64, episode: &Episode) -> Result<(), Refusal> {
+        self.lock().scoreboard.validate_practice(number, episode)
     }
 
     /// Counts an episode of practice that is on the disk. Returns its acknowledgment.
@@ -198,15 +199,11 @@ impl Coordinator {
             }
             JobRequest::HandBack { evaluator, job, failed } => {
                 let when = failed.is_some().then_some(now);
-                let at = state.scoreboard.job_of(evaluator);
-                let practice = at.is_some_and(|(job, _)| job.practice.is_some());
                 let handed_back = state.scoreboard.hand_back(evaluator, *job, when);
                 let accepted = handed_back.is_some();
-                if let Some((step, given_up)) = handed_back {
+                if let Some((job, given_up)) = handed_back {
                     match failed {
-                        Some(reason) => {
-                            self.failed(&mut state, (step, practice), evaluator, reason)
-                        }
+                        Some(reason) => self.failed(&mut state, &job, evaluator, reason),
                         None => self.metrics.jobs("handed_back", 1),
                     }
                     self.given_up(&state, &given_up);
@@ -298,8 +295,8 @@ impl Coordinator {
 
     /// Reports a job that an evaluator could not run, once for each step and, of practice, each
     /// minute.
-    fn failed(&self, state: &mut State, of: (u64, bool), evaluator: &Name, reason: &str) {
-        let (step, practice) = of;
+    fn failed(&self, state: &mut State, job: &Job, evaluator: &Name, reason: &str) {
+        let (step, practice) = (job.step, job.practice.is_some());
         self.metrics.jobs("failed", 1);
         let printable = reason.chars().filter(|c| !c.is_control());
         let reason = String::from_iter(printable.take(LONGEST_REASON));

@@ -41,7 +41,7 @@ impl Writer {
     fn output(self) -> &'static str {
         match self {
             Self::Snapshots => "the run",
-            Self::Scores => "scores",
+            Self::Scores => "results",
         }
     }
 }

@@ -3,18 +3,23 @@
 //! A piece is small, since a learner takes no larger messages. There are as many episodes in
 //! pieces as the run has open, and none is longer than the environment allows.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
-use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode};
-use quad_run::folder::ExperienceLog;
-use quad_runtime::Heartbeat;
+use anyhow::Context;
+use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode, practice_seed};
+use quad_run::config::Experiment;
+use quad_run::folder::{ExperienceLog, RunDir};
+use quad_runtime::{Heartbeat, Hint};
 use tracing::warn;
 
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
 use super::requests::{NotAccepted, Request};
-use crate::evaluation::{Practice, Refusal};
+use crate::evaluation::Practice;
 use crate::train::Inbox;
+
+/// The hint of a checkpoint or log without the other.
+pub(super) const OTHER_FOLDER: &str = "experience.log belongs to the run: copy it from where the checkpoint is from, or begin anew with --fresh";
 
 /// Practice episodes on their way to the disk, and then to training.
 pub(super) struct Experience {
@@ -30,8 +35,33 @@ pub(super) struct Experience {
 type Whole = (Request, u64, Episode);
 
 impl Experience {
-    pub fn new(log: ExperienceLog, inbox: Inbox, coordinator: Coordinator) -> Self {
-        Self { log, inbox, coordinator, partial: BTreeMap::new() }
+    /// Opens the run's log, and puts what it has into the inbox. An episode that is not there may
+    /// have been played, if the run is `resumed`.
+    pub fn open(
+        dir: &RunDir,
+        experiment: &Experiment,
+        resumed: bool,
+        inbox: Inbox,
+        coordinator: &Coordinator,
+    ) -> anyhow::Result<Self> {
+        let (log, records) = dir.experience_log()?;
+        let by_seed = |(hash, episode): (Hash, Episode)| (episode.score.seed, (hash, episode));
+        let mut episodes: HashMap<u64, _> = records.into_iter().map(by_seed).collect();
+        let recorded = episodes.len() as u64;
+        let lag = experiment.online.as_ref().map_or(0, |online| online.lag);
+        // Seeds are those of the first episodes: more were never open.
+        for number in 0..recorded + u64::from(lag) {
+            let seed = practice_seed(experiment.seed, number);
+            if let Some((hash, episode)) = episodes.remove(&seed) {
+                coordinator.record_practice(seed, hash);
+                inbox.send((number, episode)).ok();
+            } else if resumed || recorded > 0 {
+                coordinator.expect_practice(seed);
+            }
+        }
+        let error = "experience.log has episodes of another run";
+        episodes.is_empty().then_some(()).context(error).hint(OTHER_FOLDER)?;
+        Ok(Self { log, inbox, coordinator: coordinator.clone(), partial: BTreeMap::new() })
     }
 
     /// Answers each piece. Episodes that are complete are written together first.
@@ -43,7 +73,6 @@ impl Experience {
     ) {
         let mut whole = Vec::new();
         for (request, piece) in pieces {
-            self.coordinator.extend_lease(&piece.evaluator, piece.incarnation, piece.job);
             match self.add(&piece, &whole) {
                 Ok(Added::Reply(reply)) => request.reply(&reply),
                 Ok(Added::Whole(number, episode)) => whole.push((request, number, episode)),
@@ -54,8 +83,8 @@ impl Experience {
         if whole.is_empty() {
             return;
         }
-        let frames = whole.iter().filter_map(|(_, _, it)| self.partial.get(&it.score.seed));
-        match self.log.append(frames) {
+        let partial = whole.iter().filter_map(|(_, _, it)| self.partial.get(&it.score.seed));
+        match self.log.append(partial.map(|(_, frame)| frame.as_slice())) {
             Ok(()) => {
                 disk.accepted(beat);
                 for (request, number, episode) in whole {
@@ -82,9 +111,9 @@ impl Experience {
         let incarnation = self.coordinator.incarnation();
         let seed = piece.seed;
         let number = match self.coordinator.practice(piece)? {
-            Practice::Open { episode } => episode,
-            Practice::NotYet => return Err(NotAccepted::NotYet),
-            Practice::Recorded(hash) => {
+            PracticeEpisode::Open { episode } => episode,
+            PracticeEpisode::NotYet => return Err(NotAccepted::NotYet),
+            PracticeEpisode::Recorded(hash) => {
                 if hash != piece.hash {
                     self.coordinator.metrics.practice.differences.inc();
                     warn!(
@@ -128,10 +157,7 @@ impl Experience {
             return Err(CodecError::Hash { claimed: piece.hash, found }.into());
         }
         let episode: Episode = decode(bytes)?;
-        if episode.score.seed != seed {
-            return Err(Refusal::Practice(seed).into());
-        }
-        self.coordinator.validate_practice(&episode)?;
+        self.coordinator.validate_practice(number, &episode)?;
         Ok(Added::Whole(number, episode))
     }
 }

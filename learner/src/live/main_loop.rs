@@ -236,7 +236,7 @@ impl MainLoop {
             self.metrics.disk_trouble(*writer).set(1);
             let waits = match writer {
                 Writer::Snapshots => "snapshots and checkpoints wait for it; training continues",
-                Writer::Scores => "scores wait for it; evaluators keep theirs",
+                Writer::Scores => "results wait for it; evaluators keep theirs",
             };
             let silent = STUCK.as_secs();
             self.display.line(&format!(

@@ -111,9 +111,7 @@ impl Scores {
             Err(error) => {
                 let error = format!("{:#}", anyhow::Error::from(error));
                 self.disk.refused(beat, &error);
-                for (request, report, _) in batch {
-                    let ScoreReport { evaluator, incarnation, job, .. } = &report;
-                    self.coordinator.extend_lease(evaluator, *incarnation, *job);
+                for (request, ..) in batch {
                     let why = NotAccepted::NotSaved(error.clone());
                     request.reject(&why, &self.coordinator.metrics);
                 }

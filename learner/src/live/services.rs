@@ -54,8 +54,7 @@ impl Services {
     pub fn scores(&self, mut request: Request) {
         match request.message::<ScoreReport>() {
             Ok(report) => {
-                let ScoreReport { evaluator, incarnation, job, .. } = &report;
-                self.coordinator().extend_lease(evaluator, *incarnation, *job);
+                self.coordinator().extend_lease(&report.evaluator, report.incarnation, report.job);
                 self.deliver(Delivery::Scores(request, report));
             }
             Err(why) => self.answer(&self.answers, request, |_| Err(why)),
@@ -64,7 +63,10 @@ impl Services {
 
     pub fn experience(&self, mut request: Request) {
         match request.message::<Piece>() {
-            Ok(piece) => self.deliver(Delivery::Piece(request, piece)),
+            Ok(piece) => {
+                self.coordinator().extend_lease(&piece.evaluator, piece.incarnation, piece.job);
+                self.deliver(Delivery::Piece(request, piece));
+            }
             Err(why) => self.answer(&self.answers, request, |_| Err(why)),
         }
     }

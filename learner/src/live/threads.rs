@@ -1,16 +1,13 @@
 //! The threads of a run, started together and ended in order.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use anyhow::Context;
 use quad_algorithms::Agent;
 use quad_dataset::{BatchSampler, Task, Transitions};
-use quad_protocol::{Episode, Hash, practice_seed};
 use quad_run::config::{Experiment, RunConfig};
 use quad_run::folder::{Log, ResumePoint, RunDir};
 use quad_runtime::{Health, Hint};
@@ -19,7 +16,7 @@ use super::coordinator::Coordinator;
 use super::disk::{DiskStatus, Writer};
 use super::duplicate::Incarnation;
 use super::events::Events;
-use super::experience::Experience;
+use super::experience::{Experience, OTHER_FOLDER};
 use super::metrics::Metrics;
 use super::scores::{Delivery, Scores};
 use super::services::Services;
@@ -27,7 +24,7 @@ use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
 use super::weights::Weights;
 use crate::evaluation::Rules;
-use crate::train::{HeldOut, Inbox, OutputQueue, Practice, Training, origin, resume};
+use crate::train::{HeldOut, OutputQueue, Practice, Training, origin, resume};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when
 /// hundreds wait.
@@ -39,9 +36,6 @@ const LEASE: Duration = Duration::from_secs(180);
 pub(crate) const STUCK: Duration = Duration::from_secs(30);
 /// Training is stuck if it has not reported for this long; its slowest steps take seconds.
 const TRAINING_STUCK: Duration = Duration::from_secs(300);
-
-/// A checkpoint without the experience that it has learned from.
-const OTHER_FOLDER: &str = "experience.log belongs to the run: copy it from where the checkpoint is from, or begin anew with --fresh";
 
 /// A run and its state.
 pub(crate) struct Run<'a> {
@@ -119,7 +113,6 @@ impl Threads {
             sampler,
             agent,
             practice,
-            saved: None,
             held_out: run.held_out,
             schedule,
             origin: origin(experiment),
@@ -188,35 +181,7 @@ fn open_practice(
     let Some(mut practice) = Practice::new(experiment, transitions, recorded, metrics) else {
         return Ok(None);
     };
-    let experience = open_experience(dir, experiment, step > 0, inbox, coordinator)?;
+    let experience = Experience::open(dir, experiment, step > 0, inbox, coordinator)?;
     practice.resume(step).hint(OTHER_FOLDER)?;
     Ok(Some((practice, experience)))
-}
-
-/// Opens the run's log of experience, and puts what it has into the inbox.
-fn open_experience(
-    dir: &RunDir,
-    experiment: &Experiment,
-    resumed: bool,
-    inbox: Inbox,
-    coordinator: &Coordinator,
-) -> anyhow::Result<Experience> {
-    let (log, records) = dir.experience_log()?;
-    let by_seed = |(hash, episode): (Hash, Episode)| (episode.score.seed, (hash, episode));
-    let mut episodes: HashMap<u64, _> = records.into_iter().map(by_seed).collect();
-    let recorded = episodes.len() as u64;
-    let lag = experiment.online.as_ref().map_or(0, |online| online.lag);
-    // Seeds are those of the first episodes: more were never open.
-    for number in 0..recorded + u64::from(lag) {
-        let seed = practice_seed(experiment.seed, number);
-        if let Some((hash, episode)) = episodes.remove(&seed) {
-            coordinator.record_practice(seed, hash);
-            inbox.send((number, episode)).ok();
-        } else if resumed || recorded > 0 {
-            coordinator.expect_practice(seed);
-        }
-    }
-    let error = "experience.log has episodes of another run";
-    episodes.is_empty().then_some(()).context(error).hint(OTHER_FOLDER)?;
-    Ok(Experience::new(log, inbox, coordinator.clone()))
 }

@@ -8,7 +8,6 @@ use prometheus::{
     Counter, Gauge, Histogram, HistogramOpts, IntCounter, IntGauge, Registry, exponential_buckets,
 };
 use quad_algorithms::Metric;
-use quad_protocol::EpisodeScore;
 
 use super::results::held_out_name;
 
@@ -70,15 +69,6 @@ metrics! {
         episode_return: Gauge("practice_return", "Return of the newest of them"),
         score: Gauge("practice_score", "Score of the newest of them"),
         wait_seconds: Counter("practice_wait_seconds_total", "Time that training has waited for practice"),
-    }
-}
-
-impl PracticeMetrics {
-    pub fn absorbed(&self, rows: u64, score: &EpisodeScore) {
-        self.rows.set(i64::try_from(rows).unwrap_or(i64::MAX));
-        self.episodes.inc();
-        self.episode_return.set(score.episode_return);
-        self.score.set(score.score);
     }
 }
 

@@ -7,8 +7,7 @@
 //!
 //! In reading order: `training` (the loop), `practice` (the order of experience and gradient steps),
 //! `agent` and `device`, `held_out` (metrics on episodes that are kept out), `output_queue`,
-//! `metrics`, `results`.
-//! `price` estimates the cost of a run, on its caller's thread.
+//! `metrics`, `results`. `price` estimates the cost of a run, on its caller's thread.
 
 mod agent;
 pub(crate) mod device;

@@ -36,11 +36,9 @@ pub(crate) struct Practice {
     /// Gradient steps before practice.
     begin: u64,
     seed: u64,
-    /// Rows and episodes absorbed.
-    rows: u64,
+    /// Episodes absorbed.
     episodes: u64,
-    /// Episodes opened, the last of which are still to be announced.
-    opened: u64,
+    /// Episodes that are open and still to be announced.
     openings: Vec<Opening>,
     recorded: Receiver<(u64, Episode)>,
     /// Recorded episodes that are not absorbed yet, by number.
@@ -78,9 +76,7 @@ impl Practice {
             online,
             begin,
             seed,
-            rows: 0,
             episodes: 0,
-            opened: 0,
             openings: Vec::new(),
             recorded,
             waiting: BTreeMap::new(),
@@ -88,13 +84,17 @@ impl Practice {
             sampler,
             metrics,
         };
-        (0..lag).for_each(|_| practice.open(begin));
+        (0..u64::from(lag)).for_each(|episode| practice.open(episode, begin));
         Some(practice)
+    }
+
+    fn rows(&self) -> u64 {
+        self.transitions.experience_len() as u64
     }
 
     /// Gradient step up to which training goes on with the rows that it has.
     fn due(&self) -> u64 {
-        self.begin + self.online.updates_after(self.rows)
+        self.begin + self.online.updates_after(self.rows())
     }
 
     /// True from the first gradient step of practice on.
@@ -150,43 +150,44 @@ impl Practice {
     }
 
     fn absorb(&mut self, episode: &Episode) -> Result<(), PracticeError> {
-        let (number, step) = (self.episodes, self.due());
-        let Episode { observations, actions, rewards, terminated, .. } = episode;
+        let (number, step, metrics) = (self.episodes, self.due(), &self.metrics);
+        let Episode { observations, actions, rewards, terminated, score, .. } = episode;
         let rows = PracticeRows { observations, actions, rewards, terminated: *terminated };
         let added = self.transitions.add_episode(rows);
         added.map_err(|source| PracticeError::Rows { number, source })?;
-        self.rows += rewards.len() as u64;
+        metrics.rows.set(i64::try_from(self.rows()).unwrap_or(i64::MAX));
+        metrics.episodes.inc();
+        metrics.episode_return.set(score.episode_return);
+        metrics.score.set(score.score);
         self.episodes += 1;
-        self.metrics.absorbed(self.rows, &episode.score);
-        if self.rows < self.online.steps {
-            self.open(step);
+        if self.rows() < self.online.steps {
+            self.open(number + u64::from(self.online.lag), step);
         }
         Ok(())
     }
 
-    /// Opens the next episode at this gradient step.
-    fn open(&mut self, step: u64) {
+    /// Opens an episode at this gradient step.
+    fn open(&mut self, episode: u64, step: u64) {
         let Online { warmup, uniform_warmup, noise, .. } = self.online;
-        let exploration = match uniform_warmup && self.rows < warmup {
+        let exploration = match uniform_warmup && self.rows() < warmup {
             true => Exploration::Uniform,
             false => Exploration::Policy { noise },
         };
-        let (episode, step) = (self.opened, self.online.newest_snapshot(self.begin, step));
+        let step = self.online.newest_snapshot(self.begin, step);
         let seed = practice_seed(self.seed, episode);
         self.openings.push(Opening { episode, step, seed, exploration });
-        self.opened += 1;
     }
 
     /// Numbers for a line of `metrics.jsonl`.
     pub fn row(&self) -> Vec<(&'static str, f64)> {
         let metrics = &self.metrics;
-        let values = [self.rows as f64, metrics.episode_return.get(), metrics.wait_seconds.get()];
+        let values = [self.rows() as f64, metrics.episode_return.get(), metrics.wait_seconds.get()];
         COLUMNS.iter().map(|(name, _)| *name).zip(values).collect()
     }
 
     /// The rows of gradient step `step`, the first of which is 1.
     pub fn batch(&mut self, step: u64) -> &[u32] {
-        let (dataset, experience) = (self.transitions.len(), self.transitions.experience_len());
-        self.sampler.items(step, dataset, experience)
+        let Self { transitions, sampler, .. } = self;
+        sampler.items(step, transitions.len(), transitions.experience_len())
     }
 }

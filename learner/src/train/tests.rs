@@ -109,7 +109,6 @@ fn run(agent: Agent, held_out: Option<HeldOut>, schedule: Schedule, stop: bool) 
         sampler: BatchSampler::new(agent.dataset_len(), 4, 0, agent.step()),
         agent,
         practice: None,
-        saved: None,
         held_out,
         schedule,
         origin: origin(&resolve("hopper-demo", &toml::Table::new()).unwrap()),

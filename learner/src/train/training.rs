@@ -55,8 +55,6 @@ pub(crate) struct Training {
     /// Batches of the dataset alone.
     pub sampler: BatchSampler,
     pub practice: Option<Practice>,
-    /// Gradient step of the newest snapshot.
-    pub saved: Option<u64>,
     pub held_out: Option<HeldOut>,
     pub schedule: Schedule,
     /// Origin of the snapshots; the step is set for each.
@@ -93,6 +91,10 @@ impl Training {
         let (steps, metrics) = (self.schedule.steps, self.agent.metrics());
         let mut means = Means::new(metrics.len());
         let mut next_checkpoint = start + self.checkpoint_every;
+        let first = self.agent.step();
+        if first < steps && self.practices_with(first) {
+            self.save_policy(first, beat)?;
+        }
         while self.agent.step() < steps {
             if !self.practice(beat)? {
                 let step = self.agent.step();
@@ -126,7 +128,7 @@ impl Training {
                 let practice = online.map_or(Vec::new(), Practice::row);
                 self.queue.row(Row { step, seconds, metrics, values, held_out, practice });
             }
-            if is_last || self.schedule.is_evaluated(step) {
+            if is_last || self.schedule.is_evaluated(step) || self.practices_with(step) {
                 self.save_policy(step, beat)?;
             }
             if is_last || stopped || updated >= next_checkpoint {
@@ -143,10 +145,6 @@ impl Training {
     /// Absorbs practice until another gradient step goes with it. False if training is to stop.
     fn practice(&mut self, beat: &Heartbeat) -> Result<bool, TrainError> {
         let step = self.agent.step();
-        let practice = self.practice.as_ref().filter(|practice| practice.has_begun(step));
-        if practice.is_some_and(|practice| practice.is_snapshot(step)) && self.saved != Some(step) {
-            self.save_policy(step, beat)?;
-        }
         let Some(practice) = self.practice.as_mut().filter(|practice| practice.has_begun(step))
         else {
             return Ok(true);
@@ -160,6 +158,11 @@ impl Training {
                 return Ok(false);
             }
         }
+    }
+
+    /// True if practice is played with the policy after this gradient step.
+    fn practices_with(&self, step: u64) -> bool {
+        self.practice.as_ref().is_some_and(|practice| practice.is_snapshot(step))
     }
 
     /// Empty if the row of this step has no such metrics.
@@ -181,11 +184,9 @@ impl Training {
         let begin = Instant::now();
         debug!(step, "snapshot");
         self.origin.step = step;
-        self.saved = Some(step);
         let file = self.agent.policy(self.origin.clone()).map_err(TrainError::at(step))?;
         self.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
-        let evaluate = self.schedule.is_evaluated(step);
-        let practice = self.practice.as_ref().is_some_and(|practice| practice.is_snapshot(step));
+        let (evaluate, practice) = (self.schedule.is_evaluated(step), self.practices_with(step));
         let policy = TrainedPolicy { step, file, evaluate, practice };
         self.queue.snapshot(policy, &self.stop, beat);
         Ok(())

@@ -271,8 +271,7 @@ fn write_practiced() {
             interventions: if number == 0 { vec![3, 4] } else { Vec::new() },
             ..Episode::new(20_000, Hash::of(b"weights"), precision, seed)
         };
-        let frame = encode(&episode).unwrap();
-        log.append(&[(Hash::of(&frame), frame)]).unwrap();
+        log.append([&*encode(&episode).unwrap()]).unwrap();
     }
 }
 

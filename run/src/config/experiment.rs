@@ -104,7 +104,8 @@ impl Experiment {
 
     /// Gradient steps of the whole run.
     pub fn total_steps(&self) -> u64 {
-        self.steps.saturating_add(self.online.as_ref().map_or(0, Online::updates))
+        let online = self.online.as_ref().map_or(0, |online| online.updates_after(online.steps));
+        self.steps.saturating_add(online)
     }
 
     /// Environment steps of practice that the gradient steps up to `step` go with; `None` without

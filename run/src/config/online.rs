@@ -30,11 +30,6 @@ pub struct Online {
 }
 
 impl Online {
-    /// Gradient steps online.
-    pub fn updates(&self) -> u64 {
-        self.updates_after(self.steps)
-    }
-
     /// Gradient steps that go with the first `rows` environment steps.
     pub fn updates_after(&self, rows: u64) -> u64 {
         rows.min(self.steps).saturating_sub(self.warmup) * u64::from(self.updates_per_step)

@@ -24,15 +24,15 @@ const BEGIN: &[u8; 4] = b"QUAD";
 pub struct ExperienceLog(Log);
 
 impl ExperienceLog {
-    /// Appends frames with their hashes, durably: all of them, or none if it fails.
+    /// Appends frames, durably: all of them, or none if it fails.
     pub fn append<'a>(
         &mut self,
-        frames: impl IntoIterator<Item = &'a (Hash, Vec<u8>)>,
+        frames: impl IntoIterator<Item = &'a [u8]>,
     ) -> Result<(), RunDirError> {
         let mut bytes = Vec::new();
-        for (hash, frame) in frames {
+        for frame in frames {
             bytes.extend((frame.len() as u32).to_le_bytes());
-            bytes.extend(hash.bytes());
+            bytes.extend(Hash::of(frame).bytes());
             bytes.extend(frame);
         }
         self.0.append_bytes(&bytes)

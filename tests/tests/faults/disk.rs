@@ -80,13 +80,13 @@ fn scores_wait_for_a_full_disk() {
     disk.fill();
     let evaluator = scratch.evaluator("one", &learner.endpoint());
     learner.wait_for_metric("disk_trouble", "scores", |trouble| trouble == 1.0);
-    learner.process.wait_for_log("scores cannot be saved", PATIENCE);
-    assert_unwell(&learner, "scores cannot be saved");
+    learner.process.wait_for_log("results cannot be saved", PATIENCE);
+    assert_unwell(&learner, "results cannot be saved");
     evaluator.process.wait_for_log("No space left on device", PATIENCE);
     assert!(learner.scores().is_empty());
 
     disk.clear();
-    learner.process.wait_for_log("scores can be saved again", PATIENCE);
+    learner.process.wait_for_log("results can be saved again", PATIENCE);
     learner.assert_completes(PATIENCE);
     let page = http::metrics(&evaluator.metrics()).unwrap();
     let measured = http::sum(&page, "quad_evaluator_episodes_total", "");

@@ -1,9 +1,8 @@
 //! A learner continues from what its run's folder holds, whatever has become of that.
 
 use std::fs;
-use std::time::Duration;
 
-use quad_protocol::{Hash, PieceReply, encode, keys};
+use quad_protocol::{Hash, PieceReply};
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
 use quad_tests::made_up::{self, name};
@@ -139,16 +138,8 @@ async fn an_episode_that_was_played_before_a_crash_is_recorded_after_it() {
     let recorded = made_up::claim_eventually(&session, &run, "one").await;
     let kept = made_up::claim_eventually(&session, &run, "two").await;
     for job in [recorded, kept] {
-        let (frame, mut offset) = (encode(&made_up::episode(&job)).unwrap(), 0);
-        loop {
-            let piece = made_up::piece(&job, "one", &frame, offset);
-            match made_up::ask(&session, keys::experience(&run), &piece).await {
-                Some(PieceReply::Continue { offset: next, .. }) => offset = next as usize,
-                Some(PieceReply::Recorded { .. }) => break,
-                Some(PieceReply::Refused { reason, .. }) => panic!("{reason}"),
-                None => tokio::time::sleep(Duration::from_millis(50)).await,
-            }
-        }
+        let answer = made_up::deliver_practice(&session, &job, "one").await;
+        assert!(matches!(answer, PieceReply::Recorded { .. }), "{answer:?}");
         learner.process.kill();
         learner = start();
         session = made_up::client(&learner.endpoint()).await;

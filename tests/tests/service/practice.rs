@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_protocol::{PieceReply, encode, keys};
+use quad_protocol::PieceReply;
 use quad_run::folder::read_metrics;
 use quad_tests::PATIENCE;
 use quad_tests::crowd::Crowd;
@@ -49,10 +49,8 @@ async fn a_run_without_practice_refuses_an_episode_of_an_earlier_run_of_its_name
     let learner = scratch.learner("run", ENDLESS);
     let (session, run) = (made_up::client(&learner.endpoint()).await, name("run"));
     let job = made_up::claim_eventually(&session, &run, "late").await;
-    let frame = encode(&made_up::episode(&job)).unwrap();
-    let piece = made_up::piece(&job, "late", &frame, 0);
-    let reply = made_up::ask(&session, keys::experience(&run), &piece).await;
-    assert!(matches!(reply, Some(PieceReply::Refused { .. })), "{reply:?}");
+    let answer = made_up::deliver_practice(&session, &job, "late").await;
+    assert!(matches!(answer, PieceReply::Refused { .. }), "{answer:?}");
 }
 
 /// Prints the environment steps per second that a learner takes in while it trains nothing.

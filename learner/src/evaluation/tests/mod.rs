@@ -84,7 +84,8 @@ impl Bench {
         failed: Option<u64>,
     ) -> Option<(u64, Vec<(u64, u64)>)> {
         let failed = failed.map(|seconds| self.at(seconds));
-        self.board.hand_back(&name(evaluator), job.id, failed)
+        let handed_back = self.board.hand_back(&name(evaluator), job.id, failed);
+        handed_back.map(|(job, given_up)| (job.step, given_up))
     }
 
     fn leave(&mut self, evaluator: &str, seconds: u64) -> Lost {

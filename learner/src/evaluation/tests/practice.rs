@@ -3,7 +3,7 @@
 use quad_protocol::{Episode, Exploration};
 
 use super::*;
-use crate::evaluation::{Opening, Practice};
+use crate::evaluation::{Opening, PracticeEpisode};
 
 const EXPLORATION: Exploration = Exploration::Policy { noise: 0.1 };
 
@@ -50,9 +50,9 @@ fn an_episode_is_played_until_it_is_recorded_and_counts_once() {
         bench.hand_back("a", &job, Some(100 * failure)).unwrap();
     }
     let job = bench.job("a", 10_000);
-    assert_eq!(bench.board.practice(100), Some(Practice::Open { episode: 0 }));
+    assert_eq!(bench.board.practice(100), Some(PracticeEpisode::Open { episode: 0 }));
     assert_eq!(bench.board.record_practice(100, hash(7)), 1);
-    assert_eq!(bench.board.practice(100), Some(Practice::Recorded(hash(7))));
+    assert_eq!(bench.board.practice(100), Some(PracticeEpisode::Recorded(hash(7))));
     assert_eq!(bench.hand_back("a", &job, None), None, "the job is done");
     assert_eq!(bench.job("a", 10_001).seeds, [101]);
     assert_eq!(bench.board.practice(102), None);
@@ -85,10 +85,10 @@ fn only_episodes_that_fit_their_opening_are_accepted() {
     let check = |change: fn(&mut Episode)| {
         let mut episode = episode(100);
         change(&mut episode);
-        bench.board.validate_practice(&episode)
+        bench.board.validate_practice(0, &episode)
     };
     assert_eq!(check(|_| ()), Ok(()));
-    assert_eq!(check(|it| it.score.seed = 102), Err(Refusal::Practice(102)));
+    assert_eq!(check(|it| it.score.seed = 101), Err(Refusal::Practice(101)), "it is another's");
     assert_eq!(check(|it| it.step = 1000), Err(Refusal::Step));
     assert_eq!(check(|it| it.weights = hash(1)), Err(Refusal::Weights));
     assert_eq!(check(|it| it.actions = vec![0.0; 2 * 4]), Err(Refusal::Rows(100)));
@@ -97,25 +97,35 @@ fn only_episodes_that_fit_their_opening_are_accepted() {
 }
 
 #[test]
-fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
+fn between_two_episodes_evaluators_ask_more_often_than_after_the_last() {
     let mut bench = bench();
-    bench.job("a", 0);
+    bench.present = 1;
+    let pause = |bench: &mut Bench| loop {
+        match bench.claim("a", 0, 0) {
+            Claimed::Wait(pause) => return pause.as_millis(),
+            Claimed::Job { job, .. } if job.practice.is_some() => {
+                bench.board.record_practice(job.seeds[0], hash(7));
+            }
+            Claimed::Job { job, .. } => {
+                bench.deliver(&full_report(&job, "a")).unwrap();
+            }
+        }
+    };
+    assert_eq!(pause(&mut bench), 100, "none is open, but another will be soon");
     bench.board.end_practice();
-    assert_eq!(bench.job("b", 0).practice, None);
-    assert_eq!(bench.board.validate_practice(&episode(100)), Ok(()));
-    assert_eq!(bench.board.validate_practice(&episode(101)), Err(Refusal::Practice(101)));
-    bench.leave("a", 1);
-    assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
+    assert_eq!(pause(&mut bench), 500);
 }
 
 #[test]
-fn an_episode_of_an_earlier_incarnation_is_kept_by_its_evaluator_until_it_is_open_again() {
-    let mut bench = Bench::new();
-    bench.board.expect_practice(100);
-    assert_eq!(bench.board.practice(100), Some(Practice::NotYet));
-    bench.board.open_practice(&opening(0), hash(500));
-    assert_eq!(bench.board.practice(100), Some(Practice::Open { episode: 0 }));
-    bench.board.expect_practice(101);
+fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
+    let mut bench = bench();
+    bench.job("a", 0);
+    bench.board.expect_practice(102);
     bench.board.end_practice();
-    assert_eq!(bench.board.practice(101), None, "training ends without it");
+    assert_eq!(bench.job("b", 0).practice, None);
+    assert_eq!(bench.board.validate_practice(0, &episode(100)), Ok(()));
+    assert_eq!(bench.board.validate_practice(1, &episode(101)), Err(Refusal::Practice(101)));
+    assert_eq!([101, 102].map(|seed| bench.board.practice(seed)), [None; 2]);
+    bench.leave("a", 1);
+    assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }

@@ -52,42 +52,34 @@ fn practice(recorded: usize) -> (Practice, Inbox) {
     (Practice::new(&experiment(), transitions, episodes, metrics).unwrap(), inbox)
 }
 
-/// An opening, or the batch of a gradient step.
-#[derive(Clone, Debug, PartialEq)]
-enum Happened {
-    Opened(Opening),
-    Updated(u64, Vec<u32>),
-}
-
-/// Trains from a gradient step to the end. Episodes come as late as they may.
-fn happens(practice: &mut Practice, inbox: &Inbox, from: u64) -> Vec<Happened> {
-    let (mut all, stop) = (Vec::new(), AtomicBool::new(false));
+/// Trains from a gradient step to the end. Episodes come as late as they may. Returns the openings
+/// and the batches.
+fn train(practice: &mut Practice, inbox: &Inbox, from: u64) -> (Vec<Opening>, Vec<Vec<u32>>) {
+    let (mut openings, mut batches, stop) = (Vec::new(), Vec::new(), AtomicBool::new(false));
     for step in from..experiment().total_steps() {
         loop {
             for opening in practice.take_openings() {
                 let number = opening.episode;
                 inbox.send((number, episode(LENGTHS[number as usize]))).unwrap();
-                all.push(Happened::Opened(opening));
+                openings.push(opening);
             }
             if !practice.is_due(step) {
                 break;
             }
             assert!(practice.absorb_next(&stop, &beat()).unwrap());
         }
-        all.push(Happened::Updated(step + 1, practice.batch(step + 1).to_vec()));
+        batches.push(practice.batch(step + 1).to_vec());
     }
-    all
+    (openings, batches)
 }
 
 #[test]
 fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
     let (mut practice, inbox) = practice(0);
     assert!(!practice.has_begun(BEGIN - 1) && practice.has_begun(BEGIN));
-    let all = happens(&mut practice, &inbox, BEGIN);
-    let opened = all.iter().filter_map(|happened| match happened {
-        Happened::Opened(opening) => Some(*opening),
-        Happened::Updated(..) => None,
-    });
+    let stopped = practice.absorb_next(&AtomicBool::new(true), &beat());
+    assert!(!stopped.unwrap(), "a wait can be ended");
+    let (openings, _) = train(&mut practice, &inbox, BEGIN);
     let noise = Exploration::Policy { noise: 0.1 };
     // After 3, 7, 9, 15 and 16 rows, gradient steps 10, 14, 18, 30 and 32 are due.
     let expected = [
@@ -99,35 +91,23 @@ fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
         (5, 18, noise),
         (6, 30, noise),
     ];
-    let expected = expected.map(|(episode, step, exploration)| Opening {
-        episode,
-        step,
-        seed: practice_seed(0, episode),
-        exploration,
-    });
-    assert_eq!(Vec::from_iter(opened), expected);
+    let opening = |(episode, step, exploration)| {
+        let seed = practice_seed(0, episode);
+        Opening { episode, step, seed, exploration }
+    };
+    assert_eq!(openings, expected.map(opening));
 }
 
 #[test]
 fn practice_continues_from_any_step_as_if_it_had_not_stopped() {
     let (mut whole, inbox) = practice(0);
-    let all = happens(&mut whole, &inbox, BEGIN);
+    let (_, batches) = train(&mut whole, &inbox, BEGIN);
     for from in BEGIN..experiment().total_steps() {
         let (mut resumed, inbox) = practice(LENGTHS.len());
         resumed.resume(from).unwrap();
-        let updates = |all: &[Happened]| {
-            let mut all = all.to_vec();
-            all.retain(|happened| matches!(happened, Happened::Updated(step, _) if *step > from));
-            all
-        };
-        assert_eq!(happens(&mut resumed, &inbox, from), updates(&all), "from step {from}");
+        let rest = batches[(from - BEGIN) as usize..].to_vec();
+        assert_eq!(train(&mut resumed, &inbox, from), (vec![], rest), "from step {from}");
     }
     let (mut resumed, _) = practice(1);
     assert!(resumed.resume(experiment().total_steps()).is_err(), "experience is missing");
-}
-
-#[test]
-fn training_that_waits_for_practice_can_be_stopped() {
-    let (mut practice, _) = practice(0);
-    assert!(!practice.absorb_next(&AtomicBool::new(true), &beat()).unwrap());
 }

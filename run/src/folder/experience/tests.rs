@@ -20,9 +20,8 @@ pub(crate) fn episode(seed: u64) -> Episode {
     }
 }
 
-fn framed(seed: u64) -> (Hash, Vec<u8>) {
-    let frame = encode(&episode(seed)).unwrap();
-    (Hash::of(&frame), frame)
+fn frame(seed: u64) -> Vec<u8> {
+    encode(&episode(seed)).unwrap()
 }
 
 /// A run with the records of seeds 1, 2 and 3, the path of their file, and its contents.
@@ -32,8 +31,8 @@ fn recorded() -> (TempDir, RunDir, PathBuf, Vec<u8>) {
     assert_eq!(read_experience(run.path()).unwrap(), []);
     let (mut log, records) = run.experience_log().unwrap();
     assert_eq!(records, []);
-    log.append(&[framed(1)]).unwrap();
-    log.append(&[framed(2), framed(3)]).unwrap();
+    log.append([&*frame(1)]).unwrap();
+    log.append([&*frame(2), &*frame(3)]).unwrap();
     let path = run.path().join("experience.log");
     let bytes = fs::read(&path).unwrap();
     (folder, run, path, bytes)
@@ -47,8 +46,8 @@ fn an_incomplete_record_at_the_end_is_cut_off() {
         fs::write(&path, &bytes[..2 * record_length + kept]).unwrap();
         assert_eq!(read_experience(run.path()).unwrap(), [1, 2].map(episode));
         let (mut log, records) = run.experience_log().unwrap();
-        assert_eq!(records, [1, 2].map(|seed| (framed(seed).0, episode(seed))));
-        log.append(&[framed(3)]).unwrap();
+        assert_eq!(records, [1, 2].map(|seed| (Hash::of(&frame(seed)), episode(seed))));
+        log.append([&*frame(3)]).unwrap();
         assert_eq!(fs::read(&path).unwrap(), bytes, "{kept} bytes");
     }
 }
@@ -56,16 +55,15 @@ fn an_incomplete_record_at_the_end_is_cut_off() {
 #[test]
 fn a_damaged_record_before_another_one_is_an_error() {
     let (_folder, run, path, bytes) = recorded();
-    let record_length = bytes.len() / 3;
+    let start = bytes.len() / 3;
     // In length, hash, begin and end of the frame of the second.
-    for at in [0, 3, 4, 36, record_length - 1] {
+    for at in [0, 3, 4, 36, start - 1] {
         let mut damaged = bytes.clone();
-        damaged[record_length + at] ^= 0x40;
+        damaged[start + at] ^= 0x40;
         fs::write(&path, &damaged).unwrap();
         let error = run.experience_log().unwrap_err();
-        let expected =
-            format!("record 2, at byte {record_length}, is damaged, but one after it is complete");
-        assert!(error.to_string().ends_with(&expected), "{at}: {error}");
+        let words = format!("record 2, at byte {start}, is damaged, but one after it is complete");
+        assert!(error.to_string().ends_with(&words), "{at}: {error}");
         assert!(error.hint().contains("a copy of the file"));
         assert!(read_experience(run.path()).is_err());
         assert_eq!(fs::read(&path).unwrap(), damaged);
@@ -75,14 +73,13 @@ fn a_damaged_record_before_another_one_is_an_error() {
 #[test]
 fn the_log_of_a_program_of_another_version_is_read_but_no_other_message() {
     let (_folder, run, path, _) = recorded();
-    let (_, frame) = framed(4);
     // A byte of the version, and the kind.
     for (at, expected) in [(4, Ok(vec![episode(4)])), (6, Err("is of kind 6, kind 7 belongs here"))]
     {
-        let mut frame = frame.clone();
+        let mut frame = frame(4);
         frame[at] ^= 1;
-        let length = (frame.len() as u32).to_le_bytes();
-        fs::write(&path, [&length[..], Hash::of(&frame).bytes(), &frame].concat()).unwrap();
+        fs::remove_file(&path).unwrap();
+        run.experience_log().unwrap().0.append([&*frame]).unwrap();
         let read = read_experience(run.path()).map_err(|error| error.to_string());
         match expected {
             Ok(episodes) => assert_eq!(read.unwrap(), episodes),

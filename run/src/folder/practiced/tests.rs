@@ -25,11 +25,8 @@ fn verified_in(environment: &str, episodes: &[Episode]) -> (String, &'static str
     config.experiment.online = resolve("hopper-demo", &online).unwrap().online;
     let (run, _) = RunDir::create(&folder.path().join("a"), &config).unwrap();
     run.write_snapshot(10, b"weights").unwrap();
-    let framed = episodes.iter().map(|episode| {
-        let frame = encode(episode).unwrap();
-        (Hash::of(&frame), frame)
-    });
-    run.experience_log().unwrap().0.append(&Vec::from_iter(framed)).unwrap();
+    let frames = Vec::from_iter(episodes.iter().map(|episode| encode(episode).unwrap()));
+    run.experience_log().unwrap().0.append(frames.iter().map(Vec::as_slice)).unwrap();
     let (findings, promise) = practiced(run.path()).unwrap().unwrap();
     (findings.to_string(), promise)
 }
