@@ -123,7 +123,12 @@ pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> Strin
 /// Checks an endpoint from the command line and returns it unchanged: a `value_parser`.
 pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
     let is_known = text.starts_with(OPEN) || text.starts_with(PROTECTED);
-    match is_known && text.parse::<EndPoint>().is_ok() {
+    // Zenoh takes any text for an address, and would try it for ever.
+    let is_address = |(host, port): (&str, &str)| {
+        !host.is_empty() && !host.contains(['/', ',']) && port.parse::<u16>().is_ok()
+    };
+    let has_address = address_of(text).rsplit_once(':').is_some_and(is_address);
+    match is_known && has_address && text.parse::<EndPoint>().is_ok() {
         true => Ok(text.to_owned()),
         false => Err(SessionError::NotAnEndpoint(text.to_owned())),
     }
@@ -159,6 +164,19 @@ mod tests {
             let endpoints = Endpoints { listen, ..Endpoints::default() };
             assert_eq!(endpoints.open_to_all(), (!is_local).then_some(endpoint));
             assert_eq!(endpoints.has_open_port(), has_open_port, "{endpoint}");
+            assert!(endpoints.check().is_ok(), "{endpoint}");
         }
+    }
+
+    #[test]
+    fn an_endpoint_has_one_host_and_a_port() {
+        for text in
+            ["tcp/127.0.0.1", "tcp/", "tcp/:7447", "tcp/learner:", "tcp/learner:99999", "tcp/[::1]"]
+        {
+            assert!(parse_endpoint(text).is_err(), "{text}");
+        }
+        assert!(parse_endpoint("tcp/a:7447,tcp/b:7447").is_err());
+        assert!(parse_endpoint("tcp/a:7447,b:7447").is_err());
+        assert!(parse_endpoint("udp/127.0.0.1:7447").is_err());
     }
 }
