@@ -1,11 +1,10 @@
 //! The command line.
 
-use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Context;
-use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap::{Args, CommandFactory, Parser, Subcommand, value_parser};
 use clap_complete::Shell;
 use quad_dataset::environment::{self, EnvironmentSpec};
 use quad_runtime::{Hint, certificates_folder, json, print};
@@ -56,8 +55,8 @@ struct CollectArgs {
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Least number of transitions; the last episode is recorded to its end
-    #[arg(long, value_name = "N", default_value = "100000")]
-    transitions: NonZeroUsize,
+    #[arg(long, value_name = "N", default_value = "100000", value_parser = value_parser!(u32).range(1..))]
+    transitions: u32,
     /// Seed of all random numbers
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -99,7 +98,7 @@ impl Cli {
             Command::Film(args) => print(&film::film(&args)?),
             Command::Probe(args) => print(&probe::probe(&args)?),
             Command::Collect(args) => {
-                let (out, transitions) = (&args.out, args.transitions.get());
+                let (out, transitions) = (&args.out, args.transitions as usize);
                 let summary = collect::collect(args.env, out, transitions, args.seed)?;
                 print(&format!("{}: {summary}", out.display()))
             }

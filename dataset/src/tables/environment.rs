@@ -63,9 +63,9 @@ pub fn all() -> &'static [EnvironmentSpec] {
     &ENVIRONMENTS
 }
 
-/// Error for an unknown environment.
+/// Error for an unknown environment. Its text has one environment for each simulation.
 #[derive(Debug, PartialEq, thiserror::Error)]
-#[error("unknown environment `{name}`; known: {}", names().join(", "))]
+#[error("unknown environment `{name}`; known: {}, and their other tasks", simulations().join(", "))]
 pub struct UnknownEnvironment {
     /// Unknown name.
     pub name: String,
@@ -74,6 +74,11 @@ pub struct UnknownEnvironment {
 /// Names of all environments.
 pub fn names() -> Vec<&'static str> {
     all().iter().map(|spec| spec.name.as_str()).collect()
+}
+
+fn simulations() -> Vec<&'static str> {
+    let own = all().iter().filter(|spec| spec.simulation() == spec.name);
+    own.map(|spec| spec.name.as_str()).collect()
 }
 
 /// Environment of the given name.
@@ -171,5 +176,14 @@ mod tests {
             assert!((whole - 1.0).abs() < 1e-9, "{name}: {shares:?}");
             assert!(recipe.searches.min(recipe.steps_per_transition) > 0, "{name}");
         }
+    }
+
+    #[test]
+    fn an_unknown_environment_is_told_with_few_others() {
+        let told = find("my-robot").unwrap_err().to_string();
+        for known in ["`my-robot`", "hopper", "antmaze-large,", "pointmaze-giant-singletask-v0,"] {
+            assert!(told.contains(known), "{told}");
+        }
+        assert!(!told.contains("task1") && told.len() < 400, "{told}");
     }
 }

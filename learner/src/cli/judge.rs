@@ -28,10 +28,10 @@ pub struct JudgeArgs {
     /// Discount γ of the values, from 0 to below 1
     #[arg(long, value_name = "X", default_value_t = 0.99, value_parser = parse_discount)]
     pub gamma: f32,
-    /// Gradient steps of each evaluation
+    /// Gradient steps of each evaluation, at least 100
     #[arg(long, value_name = "N", default_value_t = 30_000, value_parser = value_parser!(u64).range(100..))]
     pub steps: u64,
-    /// Evaluations of each policy, from seeds 0, 1, …
+    /// Evaluations of each policy, 2 to 16, from seeds 0, 1, …
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = value_parser!(u64).range(2..=16))]
     pub seeds: u64,
     /// Print JSON instead of a table

@@ -65,7 +65,7 @@ pub struct TrainArgs {
     normalize: Vec<String>,
     /// Share of the episodes to keep out of training; losses and values on them are in the metrics,
     /// as held_out_… [default: the task's, 0.1 for own-data, else 0]
-    #[arg(long, value_name = "SHARE")]
+    #[arg(long, value_name = "SHARE", value_parser = parse_share)]
     hold_out: Option<f64>,
     /// Folder of the run; its last part names the run. If it contains a run of the same
     /// configuration, that run continues [default: runs/TASK-VARIANT-seedSEED]
@@ -97,7 +97,7 @@ pub struct TrainArgs {
     pub evaluators: Option<usize>,
     /// Training threads, each of which keeps a core busy [default: RAYON_NUM_THREADS, or one per
     /// core, at most 16]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = parse_threads)]
     pub threads: Option<NonZero<usize>>,
     /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same
     /// authority, and endpoints are tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES,
@@ -197,4 +197,12 @@ fn parse_hyperparameter(text: &str) -> Result<Table, String> {
 fn parse_count(text: &str) -> Result<i64, &'static str> {
     let count = text.parse().ok().filter(|count| *count >= 0);
     count.ok_or("write a whole number such as 1000000, below 2⁶³")
+}
+
+fn parse_share(text: &str) -> Result<f64, &'static str> {
+    text.parse().map_err(|_| "write a share such as 0.1")
+}
+
+fn parse_threads(text: &str) -> Result<NonZero<usize>, &'static str> {
+    text.parse().map_err(|_| "write a whole number from 1")
 }

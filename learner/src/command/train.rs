@@ -112,7 +112,7 @@ fn announce(
     let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
     if needs_evaluators && environment::find(&experiment.environment).is_err() {
         info!(
-            "scores come from evaluators that have the environment {}, which only Python's can (docs/python.md)",
+            "no `evaluator serve` simulates {0}: quad_rl.evaluate(\"{0}\", …) in Python gives the scores (docs/python.md)",
             experiment.environment
         );
     }

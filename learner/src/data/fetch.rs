@@ -77,7 +77,7 @@ impl Fetcher {
         }
         let (name, path) = (&dataset.name, path.display());
         Err(anyhow!("no address has the dataset {name}{refusals}")).hint(format!(
-            "fetch the file elsewhere and put it at {path}, or name a mirror in QUAD_DATASETS_URL"
+            "fetch the file elsewhere and put it at {path}, or name a mirror by QUAD_DATASETS_URL=http://HOST/FOLDER"
         ))
     }
 

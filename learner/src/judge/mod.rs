@@ -103,9 +103,6 @@ fn forecast(evaluation: &Evaluation<'_>, snapshots: &[&Snapshot]) -> anyhow::Res
     let evaluating = evaluation.time()? * (snapshots.len() as u32 + 1);
     let minutes = |time: Duration| format!("{:.1}", time.as_secs_f64() / 60.0);
     let (all, acting) = (minutes(acting + evaluating), minutes(acting));
-    let count = snapshots.len();
-    info!(
-        "judging {count} policies takes about {all} minutes, {acting} of them to ask the policies for actions"
-    );
+    info!("judging takes about {all} minutes, {acting} of them to ask the policies for actions");
     Ok(())
 }

@@ -34,10 +34,12 @@ impl RunReport {
         let (run, task, agent) = (&self.run, &self.task, &self.agent);
         let (steps, seed, unit) = (self.steps, self.seed, self.measure_with_unit());
         let mut text = format!("{run}: task {task}, {agent}, {steps} steps, seed {seed}; {unit}");
-        text += &format!(", scored in {}\n\n", self.scored_in);
-        text += &table.render(Style::Text);
-        if self.evaluations.is_empty() {
-            text += "(no evaluation has a score yet)\n";
+        match self.evaluations.is_empty() {
+            true => text += "\n\n(no evaluation has a score yet)\n",
+            false => {
+                text += &format!(", scored in {}\n\n", self.scored_in);
+                text += &table.render(Style::Text);
+            }
         }
         if !self.is_complete() {
             let (missing, how) = (self.episodes_missing, self.how_complete());

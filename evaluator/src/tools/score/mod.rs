@@ -26,7 +26,7 @@ pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
     }
     let read = args.snapshots.iter().map(|path| Subject::read(path, args));
     let subjects = read.collect::<anyhow::Result<Vec<_>>>()?;
-    info!("scoring {} policies", subjects.len());
+    info!("policies to score: {}", subjects.len());
     let subjects: Vec<Subject> = subjects.into_iter().flatten().collect();
     let scored = subjects.par_iter().with_max_len(1).map(measure);
     let scored = scored.collect::<anyhow::Result<Vec<Scored>>>()?;
