@@ -23,7 +23,13 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
         At::Last => (steps.last().copied(), "yet"),
         At::Best => (best, "with a complete evaluation"),
     };
-    let run = args.run.display();
+    let (run, name) = (args.run.display(), args.out.display());
+    let out = args.out.canonicalize().ok();
+    let is_out = |step: &u64| folder.snapshot_path(*step).canonicalize().ok() == out;
+    if out.is_some() && steps.iter().any(is_out) {
+        return Err(anyhow!("{name} is a snapshot, which the run's scores name by its hash"))
+            .hint("choose another file by --out");
+    }
     let Some(step) = step.filter(|step| steps.contains(step)) else {
         let named = Vec::from_iter(steps.iter().map(u64::to_string)).join(", ");
         let hint = match steps.is_empty() {
@@ -48,8 +54,9 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     report.judgments.retain(|it| it.weights == weights);
     let about = about(&report, step, args.license.as_deref());
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
-    let name = args.out.display();
-    files::replace(&args.out, &exported).with_context(|| format!("cannot export to {name}"))?;
+    files::replace(&args.out, &exported)
+        .with_context(|| format!("cannot export to {name}"))
+        .hint("choose a file by --out, in a folder that is there and that you may write to")?;
     let (run, bytes) = (&report.run, exported.len());
     print(&format!("{name}: {run} @ {step}, {bytes} bytes"))
 }

@@ -35,6 +35,7 @@ impl RunReport {
         let (steps, seed, unit) = (self.steps, self.seed, self.measure_with_unit());
         let mut text = format!("{run}: task {task}, {agent}, {steps} steps, seed {seed}; {unit}");
         match self.evaluations.is_empty() {
+            true if self.is_complete() => text += "\n\n(the run has no evaluations)\n",
             true => text += "\n\n(no evaluation has a score yet)\n",
             false => {
                 text += &format!(", scored in {}\n\n", self.scored_in);
