@@ -42,8 +42,12 @@ pub fn threads(findings: &mut Findings) {
 /// hint for choosing another folder.
 pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str) {
     let path = &absolute(path).unwrap_or_else(|_| path.to_owned());
-    let folder = path.ancestors().find(|folder| folder.is_dir()).unwrap_or(path);
     let shown = path.display();
+    let folder = path.ancestors().find(|folder| folder.exists()).unwrap_or(path);
+    if !folder.is_dir() {
+        let found = format!("{shown} cannot be made: {} is no folder", folder.display());
+        return findings.fail(check, found, elsewhere);
+    }
     let room = format!("make room: old runs' snapshots and checkpoints may go; {elsewhere}");
     let (free, took) = match write_trial(folder) {
         Ok(found) => found,

@@ -67,6 +67,10 @@ pub fn connected<E: From<io::Error>>(
 }
 
 async fn connect(findings: &mut Findings, endpoints: &Endpoints) -> Option<Session> {
+    if let Err(error) = endpoints.check() {
+        findings.fail("connection", error.to_string(), error.hint());
+        return None;
+    }
     let endpoint = endpoints.connect.first()?;
     let address = address_of(endpoint);
     let reached = timeout(CONNECT, TcpStream::connect(address)).await;
