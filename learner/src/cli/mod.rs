@@ -218,6 +218,7 @@ impl TypedValueParser for TaskName {
     ) -> Result<String, clap::Error> {
         let named = |text: &str| match tasks::named(text) {
             Ok(task) => Ok(task.name.clone()),
+            Err(_) if presets::is_path(text) => Err("name a file by --preset".to_owned()),
             Err(error) => Err(error.hint()),
         };
         named.parse_ref(command, argument, value)

@@ -108,7 +108,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
         let seeds = |step| planned(step).into_iter().map(move |seed| (step, seed));
         let first = schedule.evaluated_steps().flat_map(seeds).filter(unscored);
         let first = first.take(LISTED).map(named).collect();
-        found.wrong.insert("without a score", (missing, first));
+        found.wrong.insert("without a score until the run continues", (missing, first));
     }
     Ok(found)
 }
