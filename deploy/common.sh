@@ -8,8 +8,8 @@ LOG=$DEPS/$NAME.log
 say() { echo "$NAME: $*" >&2; }
 die() { printf "$NAME: %s\n" "$@" >&2; exit 1; }
 
-# Prints the comment that the script begins with.
-usage() { sed -n '2,${/^#/!q; s/^# \?//p}' "$0"; }
+# Prints the comment that the script begins with. $0 may be relative to the caller's folder.
+usage() { sed -n '2,${/^#/!q; s/^# \?//p}' "$(find deploy -name "$(basename "$0")")"; }
 [ "${1:-}" != --help ] || { usage; exit; }
 
 # Runs a command silently; where it fails, shows what it said, then the given hint.

@@ -10,7 +10,7 @@ set -euo pipefail
 CERTIFICATES=${2:-${QUAD_CERTIFICATES:-}}
 if [ -n "$CERTIFICATES" ]; then
   # Relative to the caller's folder.
-  QUAD_CERTIFICATES=$(realpath -- "$CERTIFICATES")
+  QUAD_CERTIFICATES=$(realpath --canonicalize-existing -- "$CERTIFICATES")
   export QUAD_CERTIFICATES
 fi
 cd "$(dirname "$0")/.."

@@ -16,6 +16,8 @@ from results import row, spread
 
 COLUMNS = "before", "after", "alone"
 
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
 scores = defaultdict(list)  # by method, environment and column: a number for each seed
 for file in sorted(Path(sys.argv[1]).glob("*/report.json")):
     environment, method = re.fullmatch(r"(\w+)-demo-\w+-(.+)-seed\d+", file.parent.name).groups()
@@ -28,6 +30,8 @@ for file in sorted(Path(sys.argv[1]).glob("*/report.json")):
     column = "alone" if method.endswith("-alone") else "after"
     scores[method.removesuffix("-alone"), environment, column].append(report["mean_last_5"])
 
+if not scores:
+    sys.exit(f"no run below {sys.argv[1]} is complete: `learner sweep studies/practice.toml` trains them")
 environments = sorted({environment for _, environment, _ in scores})
 row("method", *(f"{environment}, {column}" for environment in environments for column in COLUMNS))
 row(*["---"] * (1 + len(COLUMNS) * len(environments)))

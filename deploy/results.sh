@@ -40,7 +40,7 @@ if [ $# -eq 0 ] || [ -z "$seeds" ]; then usage >&2; exit 2; fi
 
 # task FILE: the demonstration in the environment that the file's name begins with.
 task() {
-  case $(basename "$1") in
+  case $(basename -- "$1") in
     hopper*) echo hopper-demo ;;
     halfcheetah*) echo halfcheetah-demo ;;
     walker2d*) echo walker2d-demo ;;

@@ -3,6 +3,7 @@
 # (Gymnasium, Prometheus, …) is missing; tests that need mounts or recorded files say when they skip. Arguments go to `cargo test`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. deploy/common.sh
 
 deploy/setup.sh --tests
 # setup.sh unpacks Prometheus there if the machine has none.

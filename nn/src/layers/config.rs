@@ -11,7 +11,10 @@ const MOST_LAYERS: usize = 64;
 
 /// A network's hidden layers, as in a configuration or a policy's file.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(
+    deny_unknown_fields,
+    expecting = "a network, such as {hidden=[256, 256], activation=\"relu\"}"
+)]
 pub struct MlpConfig {
     /// Widths: 1 to 64 of them, each from 1 to 65535.
     #[serde(deserialize_with = "widths")]

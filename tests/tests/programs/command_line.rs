@@ -34,6 +34,18 @@ fn bash_completes_commands_and_arguments() {
 }
 
 #[test]
+fn scripts_explain_themselves_in_their_own_folder() {
+    let deploy = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy");
+    for (script, begin) in
+        [("./demo.sh", "The demonstration: "), ("zenoh/certificates.sh", "Makes certificates ")]
+    {
+        let output = Command::new("bash").args([script, "--help"]).current_dir(deploy).output();
+        let text = stdout(&output.unwrap());
+        assert!(text.starts_with(begin), "{script}: {text}");
+    }
+}
+
+#[test]
 fn only_terminals_are_colored_and_only_if_their_user_wants_it() {
     let scratch = Scratch::new();
     let train = format!(
