@@ -38,6 +38,9 @@ use crate::data::{Source, cache};
 use crate::judge::{Budget, judge};
 use crate::report::{Report, draw_all, write_html};
 
+const DAMAGED: &str = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode \
+                       is scored again";
+
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
     let done = match &cli.command {
         Command::Train(args) => train::train(args),
@@ -165,9 +168,7 @@ fn all_readable(unreadable: usize) -> anyhow::Result<()> {
     if unreadable == 0 {
         return Ok(());
     }
-    let hint = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode is \
-                scored again";
-    Err(anyhow!("{unreadable} folders cannot be read")).hint(hint)
+    Err(anyhow!("{unreadable} folders cannot be read")).hint(DAMAGED)
 }
 
 fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
@@ -217,9 +218,12 @@ fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
     if unreadable.is_empty() {
         return Ok(());
     }
+    let hint = match args.dirs.iter().all(|dir| dir.is_dir()) {
+        true => DAMAGED,
+        false => "`learner list DIR` lists the runs below another folder",
+    };
     let text = unreadable.join("\n  ");
-    Err(anyhow!("some runs cannot be read:\n  {text}"))
-        .hint("`learner list DIR` lists the runs below another folder")
+    Err(anyhow!("some runs cannot be read:\n  {text}")).hint(hint)
 }
 
 fn rank(args: &JudgeArgs) -> anyhow::Result<()> {

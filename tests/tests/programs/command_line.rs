@@ -1,4 +1,4 @@
-//! Completion and colors in a shell. Exit codes and errors are in the transcripts.
+//! Completion, colors and scripts in a shell. Exit codes and errors are in the transcripts.
 
 use std::process::Command;
 
