@@ -56,7 +56,7 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
     files::replace(&args.out, &exported)
         .with_context(|| format!("cannot export to {name}"))
-        .hint("choose a file by --out, in a folder that is there and that you may write to")?;
+        .hint("--out names a file in a folder that is there and that you may write in")?;
     let (run, bytes) = (&report.run, exported.len());
     print(&format!("{name}: {run} @ {step}, {bytes} bytes"))
 }

@@ -56,7 +56,9 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
 
 fn make(folder: &Path) -> anyhow::Result<()> {
     let failed = || format!("cannot make the folder {}", folder.display());
-    fs::create_dir_all(folder).with_context(failed)
+    fs::create_dir_all(folder)
+        .with_context(failed)
+        .hint("choose another folder: learner sweep STUDY.toml DIR")
 }
 
 /// Keeps others from the study's folder, or from the whole study if this is a part of it: two

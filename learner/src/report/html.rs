@@ -10,6 +10,7 @@ use minijinja::Environment;
 use minijinja::value::Serde;
 use quad_run::files;
 use quad_run::results::RunReport;
+use quad_runtime::Hint;
 use serde_json::{Value, json};
 use tracing::warn;
 
@@ -32,6 +33,7 @@ pub fn write(path: &Path, report: &Report) -> anyhow::Result<()> {
     let page = template.render(Serde(content(report)?))?;
     files::replace(path, page.as_bytes())
         .with_context(|| format!("cannot write {}", path.display()))
+        .hint("--html names a file in a folder that is there and that you may write in")
 }
 
 fn content(report: &Report) -> anyhow::Result<Value> {
