@@ -76,8 +76,9 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
         Ok(opened) => opened,
         Err(_) => {
             warn!(
-                "no connection to {} yet: no learner or router is there, or one of the two refuses the other's certificate; `learner doctor` \
-                 or `evaluator doctor` with this --connect finds out, RUST_LOG=zenoh::net::runtime=debug logs each try",
+                "no connection to {} yet: no learner or router is there, or one of the two refuses the other's certificate; \
+                 `learner doctor` or `evaluator doctor` with this --connect finds out, \
+                 RUST_LOG=zenoh::net::runtime=debug logs each try",
                 endpoints.connect.join(", ")
             );
             rx.await

@@ -45,7 +45,7 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
     let shown = path.display();
     let folder = path.ancestors().find(|folder| folder.exists()).unwrap_or(path);
     if !folder.is_dir() {
-        let found = format!("{shown} cannot be made: {} is no folder", folder.display());
+        let found = format!("{shown} cannot be made: {} is not a folder", folder.display());
         return findings.fail(check, found, elsewhere);
     }
     let room = format!("make room: old runs' snapshots and checkpoints may go; {elsewhere}");
