@@ -56,6 +56,9 @@ impl SessionError {
             SessionError::NoCertificates(_) => {
                 "name their folder by --certificates DIR or QUAD_CERTIFICATES; deploy/zenoh/certificates.sh makes one"
             }
+            SessionError::Endpoint { reason, .. } if !reason.contains("in use") => {
+                "--listen takes an address of this machine, or 0.0.0.0 for all of its addresses; --connect the router's"
+            }
             _ => {
                 "if the port is taken, perhaps by another learner, choose a free one with --listen tcp/127.0.0.1:0, \
                  or join a router with --connect"
@@ -166,6 +169,16 @@ mod tests {
             assert_eq!(endpoints.has_open_port(), has_open_port, "{endpoint}");
             assert!(endpoints.check().is_ok(), "{endpoint}");
         }
+    }
+
+    #[test]
+    fn a_taken_port_and_an_address_of_another_machine_have_different_hints() {
+        let hint = |reason: &str| {
+            let [endpoints, reason] = ["tcp/192.0.2.1:7447", reason].map(str::to_owned);
+            SessionError::Endpoint { endpoints, reason }.hint()
+        };
+        assert!(hint("Address already in use (os error 98)").contains("port is taken"));
+        assert!(hint("Cannot assign requested address (os error 99)").contains("0.0.0.0"));
     }
 
     #[test]
