@@ -16,7 +16,8 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
     let name = path.display();
     if !path.is_dir() {
         return match step {
-            None => Ok(path.to_owned()),
+            None if path.exists() => Ok(path.to_owned()),
+            None => Err(anyhow!("there is no {name}")).hint(RUN),
             Some(_) => Err(anyhow!("{name} is not the folder of a run"))
                 .hint("--step needs the folder of a run"),
         };
