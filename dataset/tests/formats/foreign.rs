@@ -44,7 +44,11 @@ fn files_of_other_formats_are_named() {
         (b"episode,obs0,reward\n0,0.1,1.0\n", "a table as text (CSV)"),
         ("Höhe;Länge\n0,1;0,2\n".as_bytes(), "a table as text (CSV)"),
         (b"0.1\t0.2\n", "a table as text (CSV)"),
+        (b"#ROSBAG V2.0\n\x45\0\0\0", "a ROS bag"),
+        (b"\x89MCAP0\r\n\x01", "an MCAP file"),
+        (b"SQLite format 3\0\x10\0", "a SQLite database"),
         (&zip("policy/data.pkl"), "a PyTorch file"),
+        (&zip("timeouts.npy"), "an npz archive with `timeouts`"),
         (&zip("readme.txt"), NEITHER),
         (b"nothing that is known\n", NEITHER),
         (b"\0,\0,", NEITHER),
@@ -52,6 +56,27 @@ fn files_of_other_formats_are_named() {
     ] {
         fs::write(&path, content).unwrap();
         assert_named(&path, what);
+    }
+}
+
+#[test]
+fn what_stands_in_a_files_place_is_named() {
+    let (_folder, path) = scratch("log.hdf5");
+    for (content, what, hint) in [
+        (
+            &b"version https://git-lfs.github.com/spec/v1\noid"[..],
+            "a pointer of Git LFS",
+            "git lfs pull",
+        ),
+        (
+            b"<!DOCTYPE html><title>Not found, sorry</title>",
+            "a web page, or other XML",
+            "its own link",
+        ),
+        (b"\x1f\x8b\x08\0\0", "a file compressed by gzip", "gunzip"),
+    ] {
+        fs::write(&path, content).unwrap();
+        assert_refused(&path, None, &format!("{what}, {NONE}"), hint);
     }
 }
 
@@ -69,6 +94,16 @@ fn folders_of_other_formats_are_named() {
         assert_named(folder.path(), what);
         let error = data_file(folder.path()).unwrap_err();
         assert_error(&error, &format!(" {value}, {NONE}"), "");
+    }
+    for (file, what) in [
+        (".zgroup", "a Zarr store"),
+        ("zarr.json", "a Zarr store"),
+        ("features.json", "a dataset of TensorFlow"),
+        ("metadata.yaml", "a ROS 2 bag"),
+    ] {
+        let (folder, path) = scratch(file);
+        fs::write(path, "").unwrap();
+        assert_named(folder.path(), what);
     }
     let empty = tempdir().unwrap();
     let problem = data_file(empty.path()).unwrap_err().problem;
