@@ -237,7 +237,7 @@ fn a_file_whose_writer_never_closed_it() {
     drop(file);
 }
 
-fn write_archive(path: &Path, masks: [u32; 8]) {
+fn write_archive(path: &Path, masks: Option<[u32; 8]>) {
     fn put<T: npyz::AutoSerialize>(archive: &mut ZipWriter<fs::File>, name: &str, values: Vec<T>) {
         let mut bytes = Vec::new();
         let array = npyz::WriteOptions::new().default_dtype().shape(&[8]);
@@ -253,7 +253,9 @@ fn write_archive(path: &Path, masks: [u32; 8]) {
     put(&mut archive, "actions", vec![f16::from_f32(0.5); 8]);
     put(&mut archive, "rewards", vec![0i16, -3, -6, -9, -12, -15, -18, -21]);
     put(&mut archive, "terminals", vec![0u16, 0, 0, 0, 0, 0, 0, 1]);
-    put(&mut archive, "masks", masks.to_vec());
+    if let Some(masks) = masks {
+        put(&mut archive, "masks", masks.to_vec());
+    }
     put(&mut archive, "valids", vec![1u64, 1, 1, 1, 1, 1, 1, 0]);
     archive.finish().unwrap();
 }
@@ -261,15 +263,22 @@ fn write_archive(path: &Path, masks: [u32; 8]) {
 #[test]
 fn an_archive_of_short_numbers_is_read() {
     let (_folder, path) = scratch("log.npz");
-    write_archive(&path, [1; 8]);
+    write_archive(&path, Some([1; 8]));
     let batch = all(&read(&path, None, RewardRule::AsIs));
     assert_eq!(batch.next_observations, [0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75]);
     assert_eq!(batch.rewards, [0.0, -3.0, -6.0, -9.0, -12.0, -15.0, -18.0]);
     // A trajectory that ends where nothing more is to be gained is not cut off.
     for (last, terminals, timeouts) in [(0, 1.0 / 7.0, 0.0), (1, 0.0, 1.0 / 7.0)] {
-        write_archive(&path, [1, 1, 1, 1, 1, 1, last, last]);
+        write_archive(&path, Some([1, 1, 1, 1, 1, 1, last, last]));
         let inspection = inspect(&path, None).unwrap();
         let shares = (inspection.terminals, inspection.timeouts);
         assert_eq!(shares, (terminals, timeouts));
     }
+    let lacks_masks = || {
+        let problems = inspect(&path, None).unwrap().problems;
+        problems.iter().any(|problem| problem.starts_with("no array `masks`"))
+    };
+    assert!(!lacks_masks());
+    write_archive(&path, None);
+    assert!(lacks_masks());
 }
