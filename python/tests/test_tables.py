@@ -243,6 +243,8 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys, monkeypatch):
         "--task does not apply to this source": [*log, "--reward", "gain", "--task", "pick"],
         "nothing says what is rewarded": [folder, "--observations", "observation.state"],
         "there is no nothing.csv": ["nothing.csv"],
+        "is a folder of neither LeRobot (meta/info.json) nor Minari (metadata.json)": [tmp_path],
+        "reads D4RL's and your own HDF5 files as they are": [tmp_path / "out.hdf5", "--observations", "object"],
         "has no rewards": ["ogbench:cube-double-play-v0"],
         "hint: put it and antmaze-giant-navigate-v0-val.npz there": ["ogbench:antmaze-giant-navigate-singletask-v0", "--folder", tmp_path],
         "OGBench has no task none-huge-singletask-v0": ["ogbench:none-huge-singletask-v0", "--folder", tmp_path],
