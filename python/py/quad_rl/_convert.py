@@ -106,7 +106,8 @@ def _reader(source: str) -> tuple[Callable[..., Dataset], str]:
             return Dataset.from_lerobot, source
         if any((path / name).is_file() for name in ("metadata.json", "data/metadata.json")):
             return Dataset.from_minari, source
-        raise ValueError(f"{source} is a folder of neither LeRobot (meta/info.json) nor Minari (metadata.json)\nhint: give that of one dataset, or a file")
+        hint = "hint: give that of one dataset, or a file"
+        raise ValueError(f"{source} is a folder of neither LeRobot (meta/info.json) nor Minari (metadata.json)\n{hint}")
     with path.open("rb") as file:
         is_hdf5 = file.read(8) == b"\x89HDF\r\n\x1a\n"
     return (Dataset.from_robomimic if is_hdf5 else Dataset.from_frame), source
