@@ -79,8 +79,9 @@ pub enum Problem {
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // The messages say what each is.
 pub enum ArrayProblem {
+    /// With the names of the arrays and groups that are in its place.
     #[error("is missing")]
-    Missing,
+    Missing(Vec<String>),
     #[error("is a group of arrays, but must be an array")]
     Group,
     #[error("holds {0}, but must hold {1}")]
@@ -89,6 +90,8 @@ pub enum ArrayProblem {
     DiscreteActions,
     #[error("has shape {0:?}, but must have rows, or rows of numbers")]
     Axes(Vec<usize>),
+    #[error("has shape {0:?}, but must have {1} rows")]
+    Rows(Vec<usize>, usize),
     #[error("has shape {0:?}, but must have {shape}", shape = shape(*.1))]
     Shape(Vec<usize>, [usize; 2]),
     #[error("claims the shape {0:?}, more than a file of {1} bytes can hold")]
@@ -139,6 +142,8 @@ pub enum Load {
     Convert(&'static str),
     /// Advice on loading it in Python.
     Python(&'static str),
+    /// Advice on getting the file that this one stands for.
+    Get(&'static str),
 }
 
 /// The shape of an array; that of one number a row has no second axis.
@@ -149,10 +154,25 @@ fn shape([rows, width]: [usize; 2]) -> String {
     }
 }
 
-fn such_rows(rows: usize) -> String {
+pub(crate) fn such_rows(rows: usize) -> String {
     match rows {
         1 => String::new(),
         _ => format!(" ({rows} such rows)"),
+    }
+}
+
+/// Advice on an array that is missing where there are others.
+fn missing(array: &str, there: &[String]) -> String {
+    let advice = match array == "rewards" {
+        true => {
+            "learning needs a reward for each step; a task such as antmaze-large-navigate-singletask-task1-v0 has those of OGBench's mazes, and with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds others"
+        }
+        false => ARRAYS,
+    };
+    let more = if there.len() > MOST_NAMES { ", …" } else { "" };
+    match &there[..there.len().min(MOST_NAMES)] {
+        [] => advice.to_owned(),
+        some => format!("in its place are {}{more}; {advice}", some.join(", ")),
     }
 }
 
@@ -181,6 +201,8 @@ impl Problem {
                     "{advice}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
                 );
             }
+            Self::Foreign(_, Load::Get(advice)) => return (*advice).to_owned(),
+            Self::Array(array, Missing(there)) => return missing(array, there),
             Self::Array(_, Unreadable(source)) if source.to_string().contains(NEWER) => {
                 return format!("a newer HDF5 library wrote it: {REWRITE}");
             }
@@ -195,7 +217,7 @@ impl Problem {
                 "a dataset is a D4RL file (.hdf5), a folder of Minari, an OGBench file (.npz), or your own HDF5 file as docs/data.md describes"
             }
             Self::UnknownFolder => {
-                "give the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0"
+                "give one file, or the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0; in Python, `quad_rl.Dataset.from_episodes` makes a file of episodes in several (docs/python.md)"
             }
             Self::Truncated { .. }
             | Self::DamagedHdf5(_)
@@ -225,18 +247,16 @@ impl Problem {
                 "unless all rewards are alike, another reward rule learns from them: --set reward=as-is"
             }
             Self::Write(_) => "check that the disk has room and the folder is writable",
-            Self::Array(array, Missing) if array == "rewards" => {
-                "learning needs a reward for each step; a task such as antmaze-large-navigate-singletask-task1-v0 has those of OGBench's mazes, and with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds others"
-            }
             Self::Array(_, Group) => {
                 "write what is in the group as columns of one array; in a Minari folder, observations may be a Dict of arrays, and of a Dict of Dicts `quad-convert FOLDER --out my-robot.hdf5` makes one row, with quad_rl installed"
             }
             Self::Array(_, DiscreteActions) => {
                 "store continuous actions as float32; where they leave [-1, 1], `learner train --normalize actions` scales them"
             }
-            Self::Array(_, Missing | Type(..) | Axes(_) | Shape(..)) => {
-                "docs/data.md says which arrays a file must have, and of which shape and type; all need the same number of rows"
+            Self::Array(_, Axes(_)) => {
+                "each row is a number or a row of numbers: flatten what has more axes, and make numbers of images first, as an encoder does"
             }
+            Self::Array(_, Type(..) | Rows(..) | Shape(..)) => ARRAYS,
             Self::Array(_, Oversized(..)) => {
                 "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
             }
@@ -257,6 +277,11 @@ impl Problem {
         hint.to_owned()
     }
 }
+
+const ARRAYS: &str = "docs/data.md says which arrays a file must have, and of which shape and type; all need the same number of rows";
+
+/// Number of names that are listed.
+const MOST_NAMES: usize = 8;
 
 /// Part of libhdf5's message on a version of the format that it does not know.
 const NEWER: &str = "bad version number";

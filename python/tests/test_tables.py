@@ -103,14 +103,17 @@ def test_what_a_table_lacks_is_asked_for(tmp_path):
         ("episode a: observations, row 13: number 0 is nan", holes, {**rule, "success": "all"}),
         ("there is no column 'run' for episodes\nhint: there are 'x', 'v'", frame.drop(columns="run"), rule),
         ("no column 'y'\nhint: there are 'x', 'v', 'torque', 'gain', 'run', 'fell'", frame, {**rule, "observations": ["y"], "success": "all"}),
-        ("column 'run' holds", frame, {**rule, "observations": ["run"], "success": "all"}),
+        ("column 'run', row 0 of episode b holds 'b' in place of a number\nhint: ", frame, {**rule, "observations": ["run"], "success": "all"}),
         ("\nhint: success= a column", frame, rule),
         ('hint: terminal="success", or rewards', frame, {**rule, "success": "all", "terminal": "never"}),
         ("there is no episode", frame[:0], {**rule, "success": "all"}),
         (r"the table: x, row 3 is masked \(1 such rows\)\nhint: leave",
          {**frame, "x": np.ma.masked_array(frame["x"], np.arange(60) == 3)}, {**rule, "success": "all"}),
-        ("column 'fell' holds object, no numbers\nhint: it may have empty places", frame.assign(fell=pd.array([True, None] * 30, "boolean")),
+        ("column 'fell', row 1 of episode b holds '<NA>' in place of a number\nhint: numbers are written like 0.5", frame.assign(fell=pd.array([True, None] * 30, "boolean")),
          {**rule, "reward": "gain", "terminal": "fell"}),
+        ("column 'x', row 13 of episode a holds '-' in place of a number", frame.assign(x=frame["x"].astype(str).where(np.arange(60) != 33, "-")),
+         {**rule, "success": "all"}),
+        ("observations and actions are lists of columns, of one at least", frame, {**rule, "actions": [], "success": "all"}),
         ("the table has several columns 'x'", pd.concat([frame, frame[["x"]]], axis=1), {**rule, "success": "all"}),
         ("the table: column 'x' has 61 rows, but 'run' has 60", {**frame, "x": np.zeros(61)}, {**rule, "success": "all"}),
         ("the table: column 'x' has lists of several lengths", frame.assign(x=[[1.0, 2.0], [1.0]] * 30), {**rule, "success": "all"}),
@@ -132,6 +135,16 @@ def test_a_table_without_a_line_of_names(tmp_path):
         assert read.observation_names == ["0", "1"] and len(read) == 57
     with pytest.raises(ValueError, match="there is no column 'x'"):
         Dataset.from_frame(tmp_path / "numbers.csv", observations=["x"], actions=["2"], episode="4", reward="3", success="all")
+
+
+@pytest.mark.parametrize("name, cut", [("log.csv", 9), ("log.parquet", 100)])
+def test_a_table_that_is_still_being_written_is_named(tmp_path, name, cut):
+    table().to_csv(tmp_path / "log.csv", index=False)
+    table().to_parquet(tmp_path / "log.parquet")
+    part = tmp_path / f"part-{name}"
+    part.write_bytes((tmp_path / name).read_bytes()[:-cut])
+    with pytest.raises(ValueError, match=rf"(?s)part-{name} is no whole CSV or Parquet file: .*\nhint: its"):
+        Dataset.from_frame(part, **COLUMNS, reward="gain", terminal="fell")
 
 
 def test_whole_numbers_are_actions_if_they_are_said_to_be():
@@ -230,6 +243,8 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys, monkeypatch):
         "--task does not apply to this source": [*log, "--reward", "gain", "--task", "pick"],
         "nothing says what is rewarded": [folder, "--observations", "observation.state"],
         "there is no nothing.csv": ["nothing.csv"],
+        "is a folder of neither LeRobot (meta/info.json) nor Minari (metadata.json)": [tmp_path],
+        "reads D4RL's and your own HDF5 files as they are": [tmp_path / "out.hdf5", "--observations", "object"],
         "has no rewards": ["ogbench:cube-double-play-v0"],
         "hint: put it and antmaze-giant-navigate-v0-val.npz there": ["ogbench:antmaze-giant-navigate-singletask-v0", "--folder", tmp_path],
         "OGBench has no task none-huge-singletask-v0": ["ogbench:none-huge-singletask-v0", "--folder", tmp_path],

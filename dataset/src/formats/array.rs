@@ -27,17 +27,15 @@ impl<T> Array<T> {
     }
 
     pub(crate) fn of_rows(self, rows: usize) -> Result<Self, Problem> {
-        let width = self.width;
-        self.of_shape(rows, width)
+        match self.rows() == rows {
+            true => Ok(self),
+            false => Err(ArrayProblem::Rows(self.shape, rows).of(&self.name)),
+        }
     }
 
     pub(crate) fn sized(self, rows: usize, width: usize) -> Result<Vec<T>, Problem> {
-        Ok(self.of_shape(rows, width)?.values)
-    }
-
-    fn of_shape(self, rows: usize, width: usize) -> Result<Self, Problem> {
         match (self.rows(), self.width) == (rows, width) {
-            true => Ok(self),
+            true => Ok(self.values),
             false => Err(ArrayProblem::Shape(self.shape, [rows, width]).of(&self.name)),
         }
     }

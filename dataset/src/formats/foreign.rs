@@ -6,7 +6,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::error::Load::{self, Convert, Python};
+use crate::error::Load::{self, Convert, Get, Python};
 use crate::error::Problem;
 
 /// Number of leading bytes that identify a format.
@@ -24,8 +24,12 @@ const MATLAB: Load = Python(
 const PICKLE: Load =
     Python("load it by pickle.load, if you trust who wrote it: a pickle can run any program");
 
+const ROS: Load = Python(
+    "load it by the library rosbags, and take of all topics what was the latest at each command",
+);
+
 /// First bytes of a file, name of its format, and remedy.
-const STARTS: [(&[u8], &str, Load); 8] = [
+const STARTS: [(&[u8], &str, Load); 13] = [
     (b"PAR1", "a Parquet file", TABLE),
     (b"ARROW1", "an Arrow file", ARROW),
     (b"\x80\x02", "a Python pickle", PICKLE),
@@ -34,7 +38,23 @@ const STARTS: [(&[u8], &str, Load); 8] = [
     (b"\x80\x05", "a Python pickle", PICKLE),
     (b"\x93NUMPY", "a single NumPy array", NUMPY),
     (b"MATLAB", "a MATLAB file", MATLAB),
+    (b"#ROSBAG", "a ROS bag", ROS),
+    (b"\x89MCAP", "an MCAP file, as ROS 2 records them", ROS),
+    (b"SQLite format 3", "a SQLite database, as ROS 2's bags (.db3) are", ROS),
+    (b"\x1f\x8b", "a file compressed by gzip", Get("unpack it by gunzip")),
+    (b"version https://git-lfs", "a pointer of Git LFS", Get("`git lfs pull` fetches the file")),
 ];
+
+/// A file in a folder, name of the folder's format, and remedy.
+const FOLDERS: [(&str, &str, Load); 4] = [
+    (".zgroup", "a Zarr store", ZARR),
+    ("zarr.json", "a Zarr store", ZARR),
+    ("features.json", "a dataset of TensorFlow, as RLDS's are", TENSORFLOW),
+    ("metadata.yaml", "a ROS 2 bag", ROS),
+];
+
+const ZARR: Load = Python("load it by zarr.open");
+const TENSORFLOW: Load = Python("load it by tensorflow_datasets.builder_from_directory");
 
 fn foreign(what: impl Into<String>, load: Load) -> Problem {
     Problem::Foreign(what.into(), load)
@@ -61,6 +81,9 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
     }
     match text.starts_with(['{', '[']) {
         true => foreign("a JSON file", JSON),
+        false if text.trim_start().starts_with('<') => {
+            foreign("a web page, or other XML", Get("download the file by its own link"))
+        }
         false if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", TABLE),
         false => Problem::UnknownFormat,
     }
@@ -79,7 +102,8 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
     }
     let format = |file| text(file, "data_format").filter(|format| format != "hdf5");
     let Some(format) = format("data/metadata.json").or_else(|| format("metadata.json")) else {
-        return Problem::UnknownFolder;
+        let known = FOLDERS.iter().find(|(file, _, _)| folder.join(file).exists());
+        return known.map_or(Problem::UnknownFolder, |(_, what, load)| foreign(*what, *load));
     };
     let load = Convert("quad-convert FOLDER");
     foreign(format!("a Minari dataset stored as {format}"), load)
@@ -96,9 +120,13 @@ pub(crate) fn of_robomimic(has_rewards: bool) -> Problem {
     }
 }
 
-/// The problem with a zip archive of these files, if it is not NumPy's.
+/// The problem with a zip archive of these files, if they are not OGBench's.
 pub(crate) fn of_archive(files: &[impl AsRef<str>]) -> Option<Problem> {
     let has = |ending: &str| files.iter().any(|name| name.as_ref().ends_with(ending));
+    if has("timeouts.npy") {
+        // In OGBench's layout all ends are `terminals`, and those of the task are in `masks`.
+        return Some(foreign("an npz archive with `timeouts`, which OGBench's have not", NUMPY));
+    }
     if has(".npy") {
         return None;
     }

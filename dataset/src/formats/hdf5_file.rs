@@ -153,7 +153,8 @@ impl Hdf5File {
 
     fn dataset(&self, array: &str) -> Result<hdf5::Dataset, ArrayProblem> {
         if !self.has(array) {
-            return Err(ArrayProblem::Missing);
+            let group = array.rsplit_once('/').map_or("/", |(group, _)| group);
+            return Err(ArrayProblem::Missing(self.members(group).unwrap_or_default()));
         }
         let problem = |source: hdf5::Error| match self.file.group(array) {
             Ok(_) => ArrayProblem::Group,

@@ -105,6 +105,10 @@ impl Source {
         matches!(self, Self::D4rl(file) if !file.has("timeouts"))
     }
 
+    pub(crate) fn lacks_masks(&self) -> bool {
+        matches!(self, Self::OgBench(file) if file.has("rewards") && !file.has("masks"))
+    }
+
     /// Reads all rows. `environment` gives the time limit and goal of a D4RL file; `task` replaces
     /// rewards and masks.
     pub(crate) fn read(

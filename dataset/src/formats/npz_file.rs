@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use npyz::half::f16;
 use npyz::{DType, Deserialize, NpyFile, Order, TypeChar};
 use zip::ZipArchive;
-use zip::result::ZipError;
 
 use crate::error::{ArrayProblem, DatasetError, Problem};
 use crate::formats::array::{Array, check_size};
@@ -62,10 +61,12 @@ impl NpzFile {
     }
 
     fn read(&mut self, array: &str, continuous: bool) -> Result<Array<f32>, Problem> {
-        let entry = self.archive.by_name(&entry(array)).map_err(|error| match error {
-            ZipError::FileNotFound => ArrayProblem::Missing.of(array),
-            other => other.into(),
-        })?;
+        if !self.has(array) {
+            let names = self.archive.file_names().filter_map(Result::ok);
+            let there = names.filter_map(|name| Some(name.strip_suffix(".npy")?.to_owned()));
+            return Err(ArrayProblem::Missing(there.collect()).of(array));
+        }
+        let entry = self.archive.by_name(&entry(array))?;
         let (shape, values) =
             values(entry.size(), entry, continuous).map_err(|problem| problem.of(array))?;
         Array::new(array, shape, values)

@@ -22,6 +22,9 @@ pub(super) fn findings(
         };
         findings.push(format!("no array `timeouts`: an episode is taken to end {end}"));
     }
+    if source.lacks_masks() {
+        findings.push("no array `masks`: no step counts as terminal, as `terminals` are the ends of OGBench's trajectories".to_owned());
+    }
     let of_ends = warnings::of_ends(recording);
     if of_ends.is_empty() {
         let strays = checks::strays(recording).filter(|(_, refused)| !refused);

@@ -79,9 +79,9 @@ fn percent(part: usize, whole: usize) -> String {
 }
 
 impl Recording {
-    /// Rows with a following step, at most [`ENOUGH`].
+    /// Rows that lead to the following one, at most [`ENOUGH`].
     fn some_that_go_on(&self) -> Vec<usize> {
         let rows = (0..self.rows()).step_by(self.rows().div_ceil(ENOUGH).max(1));
-        rows.filter(|&row| self.goes_on(row)).collect()
+        rows.filter(|&row| self.goes_on(row) && !self.jumps(row)).collect()
     }
 }

@@ -1,6 +1,7 @@
 //! Observations and actions whose scale is too large or too small.
 
 use super::{named, short};
+use crate::error::such_rows;
 use crate::normalize::Normalize;
 use crate::recording::{Recording, RowKind};
 use crate::statistics::Figures;
@@ -11,23 +12,29 @@ use crate::statistics::Figures;
 const LARGEST: f64 = 100.0;
 /// Smallest accepted standard deviation of a dimension that changes. D4RL's smallest is 0.05.
 const SMALLEST: f64 = 1e-3;
+/// Largest fraction of the rows that is taken for errors where it alone makes a dimension large.
+const ERRORS: f64 = 0.01;
 const ROUNDING: f64 = 1e-6;
 
 pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String> {
     let Recording { observation_dim, action_dim, observations, actions, kinds, names, .. } =
         recording;
     let mut warnings = Vec::new();
+    let is_transition = |row: usize| kinds[row] == RowKind::Transition;
+    let columns = Figures::of_columns(observations, *observation_dim, is_transition);
+    let is_large = |column: &Figures| (column.size > LARGEST).then_some(column.size);
+    let large = most(&columns, is_large);
+    let errors = large.as_ref().and_then(|(large, _)| errors(recording, large));
+    let is_scaled = normalize.observations || errors.is_some();
+    warnings.extend(errors);
+    warnings.extend(large.filter(|_| !is_scaled).map(|(large, largest)| {
+        format!(
+            "array `observations`: far from ±1 in {}, of size {largest:.0}, which spoils training; `learner train --normalize observations` \
+             trains on it",
+            named(&large, &names.observations)
+        )
+    }));
     if !normalize.observations {
-        let is_transition = |row: usize| kinds[row] == RowKind::Transition;
-        let columns = Figures::of_columns(observations, *observation_dim, is_transition);
-        let is_large = |column: &Figures| (column.size > LARGEST).then_some(column.size);
-        warnings.extend(most(&columns, is_large).map(|(large, largest)| {
-            format!(
-                "array `observations`: far from ±1 in {}, of size {largest:.0}, which spoils training; `learner train --normalize observations` \
-                 trains on it",
-                named(&large, &names.observations)
-            )
-        }));
         warnings.extend(small("observations", &columns, &names.observations));
     }
     if !normalize.actions {
@@ -35,6 +42,24 @@ pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String
         warnings.extend(small("actions", &columns, &names.actions));
     }
     warnings
+}
+
+/// A few rows that alone make these columns large.
+fn errors(recording: &Recording, large: &[usize]) -> Option<String> {
+    let error = |row: usize| {
+        let of = |&column: &usize| (row, column, recording.observation(row)[column]);
+        large.iter().map(of).find(|(_, _, value)| f64::from(value.abs()) > LARGEST)
+    };
+    let errors = Vec::from_iter(recording.transitions().filter_map(error));
+    let is_few = errors.len() as f64 <= ERRORS * recording.transitions().count() as f64;
+    let (row, column, value) = *errors.first().filter(|_| is_few)?;
+    let (array, row) = recording.place("observations", row);
+    Some(format!(
+        "array `{array}`, row {row}: {value} in {}, far from nearly all other rows{}; a sensor's error, or a number that stands for \
+         none? leave out or repair these rows, or scales and networks follow them",
+        named(&[column], &recording.names.observations),
+        such_rows(errors.len())
+    ))
 }
 
 fn small(array: &str, columns: &[Figures], names: &[String]) -> Option<String> {

@@ -90,6 +90,10 @@ fn a_missing_array() {
         hdf5::File::open_rw(&path).unwrap().unlink(array).unwrap();
         refused(&path, &format!("array `{array}` is missing"));
     }
+    let (_folder, path) = subject();
+    hdf5::File::open_rw(&path).unwrap().relink("terminals", "dones").unwrap();
+    let there = "in its place are actions, dones, observations, rewards, timeouts; ";
+    assert_refused(&path, Some(hopper()), "array `terminals` is missing", there);
     let error = RecordedRows::read(subject().1, hopper()).err().unwrap();
     assert_error(&error, "array `infos/qpos` is missing", "");
 }
@@ -109,6 +113,8 @@ fn an_array_that_is_not_what_it_must_be() {
     spoiled("observations", &[ROWS, 17], &half, message);
     let message = "`actions` has 6 numbers a row, but `hopper` has 3";
     spoiled("actions", &[ROWS, 6], &half[..ROWS * 6], message);
+    let message = "array `actions` has shape [3, 20], but must have 20 rows";
+    spoiled("actions", &[3, ROWS], &half[..ROWS * 3], message);
     let message = "array `rewards` has shape [19], but must have [20]";
     spoiled("rewards", &[ROWS - 1], &half[..ROWS - 1], message);
     let message = "array `terminals` has shape [20, 2], but must have [20]";

@@ -44,7 +44,11 @@ fn files_of_other_formats_are_named() {
         (b"episode,obs0,reward\n0,0.1,1.0\n", "a table as text (CSV)"),
         ("Höhe;Länge\n0,1;0,2\n".as_bytes(), "a table as text (CSV)"),
         (b"0.1\t0.2\n", "a table as text (CSV)"),
+        (b"#ROSBAG V2.0\n\x45\0\0\0", "a ROS bag"),
+        (b"\x89MCAP0\r\n\x01", "an MCAP file"),
+        (b"SQLite format 3\0\x10\0", "a SQLite database"),
         (&zip("policy/data.pkl"), "a PyTorch file"),
+        (&zip("timeouts.npy"), "an npz archive with `timeouts`"),
         (&zip("readme.txt"), NEITHER),
         (b"nothing that is known\n", NEITHER),
         (b"\0,\0,", NEITHER),
@@ -52,6 +56,27 @@ fn files_of_other_formats_are_named() {
     ] {
         fs::write(&path, content).unwrap();
         assert_named(&path, what);
+    }
+}
+
+#[test]
+fn what_stands_in_a_files_place_is_named() {
+    let (_folder, path) = scratch("log.hdf5");
+    for (content, what, hint) in [
+        (
+            &b"version https://git-lfs.github.com/spec/v1\noid"[..],
+            "a pointer of Git LFS",
+            "git lfs pull",
+        ),
+        (
+            b"<!DOCTYPE html><title>Not found, sorry</title>",
+            "a web page, or other XML",
+            "its own link",
+        ),
+        (b"\x1f\x8b\x08\0\0", "a file compressed by gzip", "gunzip"),
+    ] {
+        fs::write(&path, content).unwrap();
+        assert_refused(&path, None, &format!("{what}, {NONE}"), hint);
     }
 }
 
@@ -69,6 +94,16 @@ fn folders_of_other_formats_are_named() {
         assert_named(folder.path(), what);
         let error = data_file(folder.path()).unwrap_err();
         assert_error(&error, &format!(" {value}, {NONE}"), "");
+    }
+    for (file, what) in [
+        (".zgroup", "a Zarr store"),
+        ("zarr.json", "a Zarr store"),
+        ("features.json", "a dataset of TensorFlow"),
+        ("metadata.yaml", "a ROS 2 bag"),
+    ] {
+        let (folder, path) = scratch(file);
+        fs::write(path, "").unwrap();
+        assert_named(folder.path(), what);
     }
     let empty = tempdir().unwrap();
     let problem = data_file(empty.path()).unwrap_err().problem;
@@ -202,7 +237,7 @@ fn a_file_whose_writer_never_closed_it() {
     drop(file);
 }
 
-fn write_archive(path: &Path, masks: [u32; 8]) {
+fn write_archive(path: &Path, masks: Option<[u32; 8]>) {
     fn put<T: npyz::AutoSerialize>(archive: &mut ZipWriter<fs::File>, name: &str, values: Vec<T>) {
         let mut bytes = Vec::new();
         let array = npyz::WriteOptions::new().default_dtype().shape(&[8]);
@@ -218,7 +253,9 @@ fn write_archive(path: &Path, masks: [u32; 8]) {
     put(&mut archive, "actions", vec![f16::from_f32(0.5); 8]);
     put(&mut archive, "rewards", vec![0i16, -3, -6, -9, -12, -15, -18, -21]);
     put(&mut archive, "terminals", vec![0u16, 0, 0, 0, 0, 0, 0, 1]);
-    put(&mut archive, "masks", masks.to_vec());
+    if let Some(masks) = masks {
+        put(&mut archive, "masks", masks.to_vec());
+    }
     put(&mut archive, "valids", vec![1u64, 1, 1, 1, 1, 1, 1, 0]);
     archive.finish().unwrap();
 }
@@ -226,15 +263,22 @@ fn write_archive(path: &Path, masks: [u32; 8]) {
 #[test]
 fn an_archive_of_short_numbers_is_read() {
     let (_folder, path) = scratch("log.npz");
-    write_archive(&path, [1; 8]);
+    write_archive(&path, Some([1; 8]));
     let batch = all(&read(&path, None, RewardRule::AsIs));
     assert_eq!(batch.next_observations, [0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75]);
     assert_eq!(batch.rewards, [0.0, -3.0, -6.0, -9.0, -12.0, -15.0, -18.0]);
     // A trajectory that ends where nothing more is to be gained is not cut off.
     for (last, terminals, timeouts) in [(0, 1.0 / 7.0, 0.0), (1, 0.0, 1.0 / 7.0)] {
-        write_archive(&path, [1, 1, 1, 1, 1, 1, last, last]);
+        write_archive(&path, Some([1, 1, 1, 1, 1, 1, last, last]));
         let inspection = inspect(&path, None).unwrap();
         let shares = (inspection.terminals, inspection.timeouts);
         assert_eq!(shares, (terminals, timeouts));
     }
+    let lacks_masks = || {
+        let problems = inspect(&path, None).unwrap().problems;
+        problems.iter().any(|problem| problem.starts_with("no array `masks`"))
+    };
+    assert!(!lacks_masks());
+    write_archive(&path, None);
+    assert!(lacks_masks());
 }

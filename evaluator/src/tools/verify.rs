@@ -80,7 +80,7 @@ const ENVIRONMENT: &str = "name its environment with --env NAME";
 
 fn hint(error: &DatasetError) -> String {
     match error.problem {
-        Problem::Array(_, ArrayProblem::Missing) => OTHER_FILE.to_owned(),
+        Problem::Array(_, ArrayProblem::Missing(_)) => OTHER_FILE.to_owned(),
         _ => error.hint(),
     }
 }

@@ -15,7 +15,7 @@ use tracing::warn;
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
 use super::requests::{NotAccepted, Request};
-use crate::evaluation::Practice;
+use crate::evaluation::PracticeEpisode;
 use crate::train::Inbox;
 
 /// The hint of a checkpoint or log without the other.

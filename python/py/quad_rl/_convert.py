@@ -102,7 +102,12 @@ def _reader(source: str) -> tuple[Callable[..., Dataset], str]:
     if not path.exists():
         raise ValueError(f"there is no {source}")
     if path.is_dir():
-        return (Dataset.from_lerobot if (path / "meta/info.json").is_file() else Dataset.from_minari), source
+        if (path / "meta/info.json").is_file():
+            return Dataset.from_lerobot, source
+        if any((path / name).is_file() for name in ("metadata.json", "data/metadata.json")):
+            return Dataset.from_minari, source
+        hint = "hint: give that of one dataset, or a file"
+        raise ValueError(f"{source} is a folder of neither LeRobot (meta/info.json) nor Minari (metadata.json)\n{hint}")
     with path.open("rb") as file:
         is_hdf5 = file.read(8) == b"\x89HDF\r\n\x1a\n"
     return (Dataset.from_robomimic if is_hdf5 else Dataset.from_frame), source

@@ -59,6 +59,18 @@ fn observations_too_large_or_too_small_to_train_on_as_they_are() {
 }
 
 #[test]
+fn a_few_rows_far_from_all_others() {
+    let mut cart = cart(false);
+    // The second observation of one row, which is also what followed the row before.
+    cart.observations[7 * O + 1] = 1e6;
+    cart.next_observations[6 * O + 1] = 1e6;
+    let start = "array `observations`, row 7: 1000000 in column 1, far from nearly all other rows;";
+    assert_warned(&cart, true, start, "a sensor's error");
+    let normalize = Normalize { observations: true, ..NONE };
+    assert!(training_warnings(&cart, true, normalize)[0].starts_with(start));
+}
+
+#[test]
 fn actions_too_small_to_learn() {
     let mut cart = cart(false);
     cart.actions.chunks_exact_mut(2).for_each(|action| action[1] *= 1e-4);

@@ -1,6 +1,9 @@
-use quad_dataset::Arrays;
+use quad_dataset::{Arrays, inspect};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
-use super::{O, assert_sound, assert_warned, mass, problems, warnings};
+use super::{O, assert_sound, assert_warned, empty, mass, problems, record, warnings};
+use crate::{put, scratch, write};
 
 /// Sound data with the observation of each row taken `from` another, by the row and its number in
 /// the episode.
@@ -109,4 +112,38 @@ fn observations_that_are_a_row_late() {
             assert!(any(&problems(&late, own), "array `observations`: one row late?"));
         }
     }
+}
+
+#[test]
+fn rows_out_of_order_are_not_called_late() {
+    let (mut random, mut sound) = (ChaCha8Rng::seed_from_u64(5), empty());
+    for _ in 0..30 {
+        let state = [random.random_range(-2.0..2.0), random.random_range(-2.0..2.0), 0.0, 0.0];
+        record(&mut sound, 40, state, |[x, y, ..]| {
+            // The next action says where the next state is.
+            let mut act = |x: f32| -0.4 * x + random.random_range(-0.2_f32..0.2);
+            let action = [act(x), act(y)];
+            (action, [x + 0.1 * action[0], y + 0.1 * action[1], 0.0, 0.0], -x.hypot(y), false)
+        });
+    }
+    let rows = sound.rewards.len();
+    let place = |row: usize| row * 7919 % rows;
+    let shuffled = |values: &[f32], width: usize| -> Vec<f32> {
+        (0..rows).flat_map(|row| values[place(row) * width..][..width].to_vec()).collect()
+    };
+    let next_observations = shuffled(&sound.next_observations, O);
+    let arrays = Arrays {
+        observations: shuffled(&sound.observations, O),
+        actions: shuffled(&sound.actions, 2),
+        rewards: shuffled(&sound.rewards, 1),
+        timeouts: (0..rows).map(|row| sound.timeouts[place(row)]).collect(),
+        ..sound.clone()
+    };
+    let (_folder, path) = scratch("shuffled.hdf5");
+    let file = write(&path, &arrays);
+    put(&file, "next_observations", &[rows, O], &next_observations);
+    drop(file);
+    let problems = inspect(&path, None).unwrap().problems;
+    let [problem] = &problems[..] else { panic!("{problems:?}") };
+    assert!(problem.starts_with("array `next_observations`, row 0: not the"), "{problem}");
 }

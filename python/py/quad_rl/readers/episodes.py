@@ -59,12 +59,19 @@ def width(array: NDArray[Any]) -> int:
     return int(np.prod(array.shape[1:]))
 
 
+def is_number(value: Any) -> bool:
+    """Whether `float` takes it."""
+    try:
+        float(value)
+        return True
+    except (TypeError, ValueError):
+        return False
+
+
 def dataset(
     log: Log, observations: Sequence[str], actions: Sequence[str], reward: Rule, success: Success, terminate: Rule
 ) -> Source:
     """The transitions of a source. Raises ValueError, with a hint, for what it does not have and nothing else says."""
-    if isinstance(observations, str) or isinstance(actions, str):
-        raise ValueError("observations and actions are lists of columns")
     episodes, notes = [episode for episode in log.episodes if episode.steps], log.notes
     count, stepless = len(episodes), len(log.episodes) - len(episodes)
     log = log._replace(episodes=episodes)
@@ -72,6 +79,8 @@ def dataset(
         notes.append(f"{stepless} of {count + stepless} episodes dropped: without a step")
     if not episodes:
         raise ValueError("\n".join(["there is no episode", *notes]))
+    if any(isinstance(columns, str) or not columns for columns in (observations, actions)):
+        raise ValueError("observations and actions are lists of columns, of one at least")
     for name in [*observations, *actions]:
         _check(log, name)
     won = _successes(log, success)
@@ -107,10 +116,12 @@ def _check(log: Log, name: str) -> None:
         there = lacking[0].columns if some else log.there or lacking[0].columns
         where = f" in episode {lacking[0].name} ({len(lacking)} such episodes)" if some else ""
         raise ValueError(f"there is no column {name!r}{where}\nhint: there are {', '.join(map(repr, there))}")
-    kind = log.episodes[0].columns[name].dtype
-    if kind.kind not in "fiub":
-        hint = "\nhint: it may have empty places, such as None" if kind == object else ""
-        raise ValueError(f"column {name!r} holds {kind}, no numbers{hint}")
+    if log.episodes[0].columns[name].dtype.kind not in "fiub":
+        values = [(episode.name, row, value) for episode in log.episodes
+                  for row, of_row in enumerate(episode.columns[name]) for value in np.ravel(of_row)]
+        number, row, value = next((place for place in values if not is_number(place[2])), values[0])
+        hint = "hint: numbers are written like 0.5; leave out rows without one, or fill them"
+        raise ValueError(f"column {name!r}, row {row} of episode {number} holds {str(value)!r} in place of a number\n{hint}")
 
 
 def _names(log: Log, column: str) -> list[str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quad_rl._extras import library
 from quad_rl._rows import Source, plain
 from quad_rl.readers.arrow import array_of
-from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
+from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset, is_number
 
 _EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # How the libraries of tables write that nothing is there.
 
@@ -58,7 +58,7 @@ def from_frame(
     table = _read(place) if path else frame
     keys = [*getattr(table, "column_names", getattr(table, "columns", table))]  # pandas's may be numbers.
     there = [str(key) for key in keys]
-    if path and not {*observations, *actions, episode} & {*there} and any(map(_is_number, there)):
+    if path and not {*observations, *actions, episode} & {*there} and any(map(is_number, there)):
         hint = "hint: write one above them, such as " + ",".join([*observations, *actions, episode])
         raise ValueError(f"{place} has no line of names: its first line is {', '.join(there)}\n{hint}")
     observations, actions = _matching(observations, there), _matching(actions, there)
@@ -112,14 +112,6 @@ def _matching(names: Sequence[str], there: list[str]) -> Sequence[str]:
     return [*dict.fromkeys(chain.from_iterable(found))]
 
 
-def _is_number(name: str) -> bool:
-    try:
-        float(name)
-        return True
-    except ValueError:
-        return False
-
-
 def _column(column: Any, name: str, place: str) -> NDArray[Any]:
     if hasattr(column, "combine_chunks"):
         return array_of(column, name, place)
@@ -134,11 +126,15 @@ def _column(column: Any, name: str, place: str) -> NDArray[Any]:
 
 
 def _read(path: str) -> Any:
-    library("pyarrow", "table")
+    invalid = library("pyarrow", "table").ArrowInvalid
     with open(path, "rb") as file:
         first = file.readline(1 << 16)
-    if first.startswith(b"PAR1"):
-        return library("pyarrow.parquet", "table").read_table(path)
-    csv = library("pyarrow.csv", "table")
-    delimiter = max(",;\t", key=first.decode(errors="replace").count)
-    return csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
+    try:
+        if first.startswith(b"PAR1"):
+            return library("pyarrow.parquet", "table").read_table(path)
+        csv = library("pyarrow.csv", "table")
+        delimiter = max(",;\t", key=first.decode(errors="replace").count)
+        return csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
+    except invalid as error:
+        hint = "hint: its writer must have closed it; each line of a CSV file has as many fields as the first, which has the names"
+        raise ValueError(f"{path} is no whole CSV or Parquet file: {error}\n{hint}") from None

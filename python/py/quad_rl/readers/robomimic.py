@@ -45,7 +45,8 @@ def from_robomimic(
     actions = [actions] if isinstance(actions, str) else actions
     with opened(file, "robomimic") as source:
         if "data" not in source or not any(name.startswith("demo") for name in source["data"]):
-            raise ValueError(f"{file} is no file of robomimic's: it has no group data/demo_0")
+            hint = "hint: `learner train --dataset` reads D4RL's and your own HDF5 files as they are (docs/data.md)"
+            raise ValueError(f"{file} is no file of robomimic's: it has no group data/demo_0\n{hint}")
         names: list[str] = sorted(source["data"], key=lambda name: (len(name), name))  # demo_2 before demo_10.
         notes: list[str] = []
         there: list[str] = []
