@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, value_parser};
+use clap::{Args, ValueEnum, value_parser};
 
 /// Compare a run's critics with true values, which the simulator gives
 ///
@@ -24,8 +24,8 @@ pub struct ProbeArgs {
     /// Rollouts of each action
     #[arg(long, value_name = "N", default_value = "16", value_parser = value_parser!(u32).range(2..))]
     pub rollouts: u32,
-    /// Most steps of a rollout
-    #[arg(long, value_name = "N", default_value = "50", value_parser = value_parser!(u32).range(1..))]
+    /// Most steps of a rollout: fewer miss what an action changes later, as a fall
+    #[arg(long, value_name = "N", default_value = "400", value_parser = value_parser!(u32).range(1..))]
     pub length: u32,
     /// Change of an action to either side, of which slopes are central differences
     #[arg(long, value_name = "X", default_value = "0.1", value_parser = change)]
@@ -33,6 +33,9 @@ pub struct ProbeArgs {
     /// κ of the lower confidence bound mean − κ·std
     #[arg(long, value_name = "X", default_value = "1", value_parser = kappa)]
     pub kappa: f32,
+    /// Tables to make [default: all]
+    #[arg(long, value_enum)]
+    pub tables: Option<Tables>,
     /// Dataset to which the distance of chosen actions is measured [default: the run's, if it is
     /// there]
     #[arg(long, value_name = "PATH")]
@@ -43,6 +46,14 @@ pub struct ProbeArgs {
     /// Print the tables as JSON
     #[arg(long)]
     pub json: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Tables {
+    /// The critics' gradients at noisy actions
+    Gradients,
+    /// The choice among candidates
+    Choices,
 }
 
 fn change(text: &str) -> Result<f32, &'static str> {

@@ -28,6 +28,7 @@ use rayon::prelude::*;
 use tracing::{info, warn};
 
 pub(crate) use args::ProbeArgs;
+use args::Tables;
 use choosing::{Candidates, choosing};
 use grid::Grid;
 use mechanism::mechanism;
@@ -53,13 +54,19 @@ pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
     let observations = Tensor::from_vec(observations, shape, &Device::Cpu)?;
 
     let Probed { oracle, actor, critics, tau, delta, .. } = &probed;
-    let (noisy, outside, scale) = noisy::draw((actor, critics), &observations, args.h, random)?;
-    let samples = measure(&noisy, &states, args.h, |queries| oracle.returns(queries))?;
-    let judged = mechanism(samples, states.len(), &outside, (*tau, delta * scale * scale));
-    let recorded = recorded.as_ref();
-    let candidates =
-        Candidates::draw(&probed, &states, &observations, recorded, args.kappa, random)?;
-    let tables = Vec::from_iter(judged.into_iter().chain(choosing(&candidates, args.kappa)));
+    let mut tables = Vec::new();
+    if args.tables != Some(Tables::Choices) {
+        let (noisy, outside, scale) = noisy::draw((actor, critics), &observations, args.h, random)?;
+        let samples = measure(&noisy, &states, args.h, |queries| oracle.returns(queries))?;
+        let weighting = (*tau, delta * scale * scale);
+        tables.extend(mechanism(samples, states.len(), &outside, weighting));
+    }
+    if args.tables != Some(Tables::Gradients) {
+        let recorded = recorded.as_ref();
+        let candidates =
+            Candidates::draw(&probed, &states, &observations, recorded, args.kappa, random)?;
+        tables.extend(choosing(&candidates, args.kappa));
+    }
     if args.json {
         return Ok(quad_runtime::json(&tables)?);
     }
