@@ -1,5 +1,7 @@
 //! True slopes of the value beside the critics'.
 
+use quad_run::results::statistics::mean;
+
 use super::noisy::Noisy;
 use super::oracle::Query;
 use super::states::State;
@@ -78,20 +80,19 @@ impl Noisy {
             variance,
             denoised: dot(denoised, direction),
             truth,
-            noise: spread * (1.0 / (slopes.len() as f64 - 1.0)),
+            noise: spread / (slopes.len() as f64 - 1.0),
             lambda: f64::NAN,
-            along: [along(gradients), along(&[center(gradients)]), along(&[denoised.clone()])],
+            along: [
+                along(gradients),
+                along(&[center(gradients)]),
+                along(std::slice::from_ref(denoised)),
+            ],
         }
     }
 }
 
 fn dot(x: &[f64], y: &[f64]) -> f64 {
-    x.iter().zip(y).fold(0.0, |sum, (x, y)| sum + x * y)
-}
-
-/// The mean as candle computes it, by a product with 1/n.
-fn mean(values: &[f64]) -> f64 {
-    values.iter().fold(0.0, |sum, x| sum + x) * (1.0 / values.len() as f64)
+    x.iter().zip(y).map(|(x, y)| x * y).sum()
 }
 
 /// Mean and population variance.
