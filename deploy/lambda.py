@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Draws the figures of docs/lambda.md: the paired differences of studies/lambda.toml, and what `evaluator probe` found.
+"""Draws the figures of docs/lambda.md.
 
-    python3 deploy/lambda.py probes/*.json
+    python3 deploy/lambda.py probes/*.json scores/*.json
 
-A probe's output, `evaluator probe RUN --step N --json`, is named after its task and step: hopper-demo-20000.json. Needs matplotlib.
+Beside the scores of studies/lambda.toml it takes outputs of `evaluator probe --json`, named after task and step
+(hopper-demo-20000.json), and of `evaluator score --json`, named after task and rule (hopper-demo-min.json). Needs matplotlib.
 """
 
 import json
@@ -22,18 +23,25 @@ HOME = Path(__file__).parent.parent
 CHOICE = "best of 10"
 PAIRS = [("quad", "shuffled"), ("quad", "mean"), ("quad", "dac"), ("dac", "none"), ("denoised", "dac")]
 WEIGHTS = {
-    "λ = 1": "DAC: λ = 1",
-    "best constant": "best constant",
+    "λ = 1": "λ = 1 (DAC)",
+    "best constant": "the best constant",
     "mean λ of each t": "mean λ of each t",
     "shuffled λ": "shuffled λ",
-    "QUAD's λ": "QUAD's λ",
     "1, at the denoised estimate": "λ = 1, at the denoised estimate",
 }
-COUNTS = [2, 5, 10, 32]
+
+RULES = {"mean": "critics' mean", "min": "their minimum", "mean-minus-std-1": "mean − std", "mean-minus-std-3": "mean − 3 std"}
+
+
+TASKS = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "antmaze": "umaze"}
 
 
 def name(task):
-    return {"half": "HalfCheetah", "hopp": "Hopper", "walk": "Walker2d", "antm": "umaze"}[task[:4]]
+    return TASKS[task.split("-")[0]]
+
+
+def in_order(tasks):
+    return dict(sorted(tasks.items(), key=lambda of: list(TASKS.values()).index(name(of[0]))))
 
 
 def save(figure, file):
@@ -47,9 +55,9 @@ def draw_pairs():
     for row, (ours, theirs) in enumerate(PAIRS):
         ours, theirs = (study.of_method(method, CHOICE) for method in (ours, theirs))
         differences = {key: ours[key] - theirs[key] for key in ours if key in theirs}
-        for color, task in enumerate(dict.fromkeys(task for task, _ in differences)):
-            dots = [difference for (of, _), difference in differences.items() if of == task]
-            label = name(task) if row == 0 else None
+        for color, task in enumerate(("hopper", "walker2d")):
+            dots = [difference for (of, _), difference in differences.items() if of.startswith(task)]
+            label = TASKS[task] if row == 0 else None
             axes.plot(dots, [row - 0.1 + 0.2 * color] * len(dots), "o", color=f"C{color}", alpha=0.7, label=label)
         if len(differences) > 1:
             axes.plot(interval(list(differences.values())), [row, row], color="black")
@@ -62,37 +70,58 @@ def draw_pairs():
     save(figure, "lambda-pairs.svg")
 
 
-def draw(probes, file, title, label, rows, column):
-    """A column of a probe's table: panels are tasks, groups steps, dots rows."""
+def draw_risks(probes):
+    """Risks of weights less that of QUAD's λ: panels are tasks, groups steps."""
     figure, panels = pyplot.subplots(1, len(probes), figsize=(9, 3.2), layout="constrained", squeeze=False)
     for axes, (task, steps) in zip(panels[0], probes.items()):
         for group, step in enumerate(sorted(steps)):
-            table = next(table for table in steps[step] if table["title"].startswith(title))
-            estimates = {row: numbers[table["columns"].index(column)] for row, numbers in table["rows"]}
-            for place, (row, text) in enumerate(rows.items()):
-                number = estimates[row]
-                errors = [[number["value"] - number["low"]], [number["high"] - number["value"]]]
-                x = group + 0.8 * (place / (len(rows) - 1) - 0.5)
-                axes.errorbar(x, number["value"], errors, fmt="o", color=f"C{place}", label=text if group == 0 else None)
+            table = next(table for table in steps[step] if table["title"].startswith("Risk of weights"))
+            numbers = {row: row_numbers[table["columns"].index("above QUAD's λ")] for row, row_numbers in table["rows"]}
+            for place, (row, text) in enumerate(WEIGHTS.items()):
+                value, low, high = (numbers[row][key] for key in ("value", "low", "high"))
+                x = group + 0.15 * (place - len(WEIGHTS) // 2)
+                label = text if group == 0 else None
+                axes.errorbar(x, value, [[value - low], [high - value]], fmt="o", color=f"C{place}", label=label)
         axes.axhline(0, color="gray", linewidth=0.8)
+        axes.set_yscale("symlog", linthresh=0.2)
         axes.set_xticks(range(len(steps)), [f"{step // 1000},000 steps" for step in sorted(steps)])
         axes.set_title(name(task))
-    panels[0][0].set_ylabel(label)
+    panels[0][0].set_ylabel("risk above QUAD's λ (Eq. 14)")
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    save(figure, file)
+    save(figure, "lambda-risk.svg")
+
+
+def draw_choices(scores):
+    """Mean scores over the number of candidates: panels are tasks, lines rules."""
+    figure, panels = pyplot.subplots(1, len(scores), figsize=(9, 3), layout="constrained", squeeze=False)
+    for axes, (task, rules) in zip(panels[0], scores.items()):
+        for rule, snapshots in rules.items():
+            by_count = defaultdict(list)
+            for snapshot in snapshots:
+                by_count[snapshot["choice"]["candidates"]] += [episode["score"] for episode in snapshot["episodes"]]
+            counts = sorted(by_count)
+            axes.plot(range(len(counts)), [fmean(by_count[count]) for count in counts], "o-", label=RULES[rule])
+            axes.set_xticks(range(len(counts)), counts)
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel("candidates")
+        axes.set_title(name(task))
+    panels[0][0].set_ylabel("score")
+    panels[0][0].legend()
+    save(figure, "lambda-choice.svg")
 
 
 def main(files):
     matplotlib.rcParams["svg.hashsalt"] = "quad"  # the same file each time
-    probes = defaultdict(dict)  # by task and step
+    probes, scores = defaultdict(dict), defaultdict(dict)
     for file in map(Path, files):
-        task, step = re.fullmatch(r"(.+)-([0-9]+)", file.stem).groups()
-        probes[task][int(step)] = json.loads(file.read_text())
+        task, what = re.fullmatch(r"(.+-demo)-(.+)", file.stem).groups()
+        if what.isdigit():
+            probes[task][int(what)] = json.loads(file.read_text())
+        else:
+            scores[task][what] = json.loads(file.read_text())
     draw_pairs()
-    locomotion = {task: steps for task, steps in probes.items() if not task.startswith("antmaze")}
-    draw(locomotion, "lambda-risk.svg", "Risk of weights", "risk (Eq. 14)", WEIGHTS, "risk")
-    counts = {f"largest mean of {count}": f"best of {count}" for count in COUNTS}
-    draw(probes, "lambda-choice.svg", "Choices", "true value above\nthe mean candidate", counts, "above the mean candidate")
+    draw_risks(in_order({task: steps for task, steps in probes.items() if not task.startswith("antmaze")}))
+    draw_choices(in_order(scores))
 
 
 if __name__ == "__main__":
