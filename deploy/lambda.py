@@ -95,9 +95,9 @@ def draw_choices(scores):
     """Mean scores over the number of candidates: panels are tasks, lines rules."""
     figure, panels = pyplot.subplots(1, len(scores), figsize=(9, 3), layout="constrained", squeeze=False)
     for axes, (task, rules) in zip(panels[0], scores.items()):
-        for rule, snapshots in rules.items():
+        for rule in (rule for rule in RULES if rule in rules):
             by_count = defaultdict(list)
-            for snapshot in snapshots:
+            for snapshot in rules[rule]:
                 by_count[snapshot["choice"]["candidates"]] += [episode["score"] for episode in snapshot["episodes"]]
             counts = sorted(by_count)
             axes.plot(range(len(counts)), [fmean(by_count[count]) for count in counts], "o-", label=RULES[rule])
