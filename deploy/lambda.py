@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """Draws the figures of docs/lambda.md.
 
-    python3 deploy/lambda.py probes/*.json scores/*.json
+    python3 deploy/lambda.py [FILE...]
 
-Beside the scores of studies/lambda.toml it takes outputs of `evaluator probe --json`, named after task and step
-(hopper-demo-20000.json), and of `evaluator score --json`, named after task and rule (hopper-demo-min.json). Needs matplotlib.
+The scores of studies/lambda.toml make one figure. Outputs of `evaluator probe --json`, named after task and step
+(hopper-demo-20000.json), make the second, of `evaluator score --json`, named after task and rule (hopper-demo-min.json), the
+third. Needs matplotlib.
 """
 
 import json
@@ -29,10 +30,7 @@ WEIGHTS = {
     "shuffled λ": "shuffled λ",
     "1, at the denoised estimate": "λ = 1, at the denoised estimate",
 }
-
 RULES = {"mean": "critics' mean", "min": "their minimum", "mean-minus-std-1": "mean − std", "mean-minus-std-3": "mean − 3 std"}
-
-
 TASKS = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "antmaze": "umaze"}
 
 
@@ -120,8 +118,10 @@ def main(files):
         else:
             scores[task][what] = json.loads(file.read_text())
     draw_pairs()
-    draw_risks(in_order({task: steps for task, steps in probes.items() if not task.startswith("antmaze")}))
-    draw_choices(in_order(scores))
+    if probes:
+        draw_risks(in_order(probes))
+    if scores:
+        draw_choices(in_order(scores))
 
 
 if __name__ == "__main__":
