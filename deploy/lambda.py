@@ -110,6 +110,7 @@ def draw_choices(scores):
 
 def main(files):
     matplotlib.rcParams["svg.hashsalt"] = "quad"  # the same file each time
+    matplotlib.rcParams["svg.fonttype"] = "none"  # text as text, not as outlines
     probes, scores = defaultdict(dict), defaultdict(dict)
     for file in map(Path, files):
         task, what = re.fullmatch(r"(.+-demo)-(.+)", file.stem).groups()

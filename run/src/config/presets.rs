@@ -208,7 +208,7 @@ mod tests {
             ("online = { steps = 5000, warmup = 100 }", None),
             ("steps = 1001\nagent.tau = 0.5", None),
             ("agent = { guidance = 'shuffled', tau = 0.5 }", None),
-            // The task's own τ has no effect, either, but nobody asked for it.
+            // The task's own τ has no effect, either, but the changes do not name it.
             ("agent.guidance = 'dac'", None),
             // Its actor acts, not the target actor.
             ("algorithm = 'dql'\nsteps = 1000", None),

@@ -182,6 +182,7 @@ mod tests {
         (own.guidance, args.rule, args.guidance) = (0.5, None, Some(2.0));
         assert_eq!(choices(&args, Some(own)), [Choice { guidance: 2.0, ..own }]);
     }
+
     #[test]
     fn a_choice_among_less_than_two_actions_is_refused() {
         let folder = tempfile::tempdir().unwrap();
