@@ -6,13 +6,13 @@
 //! - [`Algorithm`]: the interface to the learner; [`Agent`]: an algorithm in training.
 //! - `networks`: networks with optimizers and targets, which an algorithm declares once;
 //!   `state_dict`; `losses`; `hyperparameters`: types that check themselves; `random`; `context`:
-//!   the data and settings of a run; `chunk`: several steps at a time. `prelude` has the names of these for an algorithm's file.
+//!   the data and settings of a run; `chunk`: several steps at a time. `prelude` has the names of
+//!   these for an algorithm's file.
 //! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
 //!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`. `fql` is the one to read first; `qc` shares
 //!   its flow, and `diffusion_policy` QUAD's noise predictor.
 //!
-//! A new algorithm is a file here, a line in [`ALGORITHMS`], `presets/NAME.toml`, and a script with
-//! golden folders in `tests/golden`.
+//! CONTRIBUTING.md says what a new algorithm needs.
 
 #![deny(unsafe_code)]
 

@@ -8,8 +8,7 @@
 //! - `file`: [`load_policy`] reads a policy from a file with a [`Header`].
 //! - `kinds/`: [`GaussianPolicy`]; [`DiffusionPolicy`], [`ScorePolicy`], and those of an
 //!   [`ActorCriticShape`] with a [`SquashedActor`], a [`OneStepActor`] or a [`FlowActor`], which draw
-//!   candidates;
-//!   [`DiffuserPolicy`], which draws plans with a [`Planner`].
+//!   candidates; [`DiffuserPolicy`], which draws plans with a [`Planner`].
 //! - `sampling/`: candidates, and the [`Choice`] among them.
 
 #![deny(unsafe_code)]
