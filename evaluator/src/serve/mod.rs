@@ -61,10 +61,12 @@ The evaluator finds all runs at its endpoints, also runs that start later, and s
 (Ctrl-C, SIGTERM, SIGHUP or SIGUSR1): the learner gives its job to another evaluator.
 
 Examples:
-  evaluator serve                                       a learner on this machine
-  evaluator serve --connect tcp/learner.example:7447    a learner or router elsewhere
-  evaluator serve --connect tls/learner.example:7447 --certificates certificates/box7    the same, by TLS
-  evaluator serve --http 127.0.0.1:9101              with http://127.0.0.1:9101/metrics
+  # For a learner on this machine.
+  evaluator serve
+
+  # For a learner or router elsewhere, without and with TLS.
+  evaluator serve --connect tcp/learner.example:7447
+  evaluator serve --connect tls/learner.example:7447 --certificates certificates/box7
 
 RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 

@@ -10,7 +10,7 @@ use toml::Table;
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
-  # All runs of a study, as many at a time as this machine has cores for.
+  # All runs of a study.
   learner sweep studies/demo.toml
 
   # List the runs and their states.
@@ -62,7 +62,7 @@ pub struct SweepArgs {
     /// port]
     #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address, requires = "index")]
     pub http: Option<SocketAddr>,
-    /// Runs at a time [default: uses three of four cores, and leaves the fourth for evaluators]
+    /// Runs at a time [default: three for every four cores, so that evaluators have the fourth]
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]
     pub jobs: Option<u16>,
     /// Number of evaluators to start; they serve all runs and log to DIR/STUDY [default: one for

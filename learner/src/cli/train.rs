@@ -124,10 +124,10 @@ pub struct TrainArgs {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Instead of the algorithm's value for the task")]
 struct OverrideArgs {
-    /// Gradient steps on the dataset; 0 with --online-steps
+    /// Gradient steps on the dataset; 0 only with practice
     #[arg(long, value_name = "N", value_parser = parse_count)]
     steps: Option<i64>,
-    /// Environment steps of practice, from which the learner goes on learning [default: 0]
+    /// Environment steps of practice, from which the learner goes on learning
     #[arg(long, value_name = "N", value_parser = parse_count)]
     online_steps: Option<i64>,
     /// Gradient steps between two evaluations; 0 trains without any evaluation
@@ -140,7 +140,7 @@ struct OverrideArgs {
     #[arg(long, value_name = "N", value_parser = parse_count)]
     seed: Option<i64>,
     /// Precision of forward passes without gradient: f32, or bf16, which rounds and is faster on
-    /// CPUs with AMX or AVX512-BF16
+    /// CPUs with AMX or AMD's AVX512-BF16
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
 }
