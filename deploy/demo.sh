@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh; then
-# a policy that hops on and on, by RLPD, which learns from the same file and from what evaluators live through.
+# a policy that hops on and on, by RLPD, which learns from the same file and from evaluators' episodes.
 #
 # Installs what is missing, builds, records the dataset, trains, and ends with the run's table, learning curve, a film of its
 # best snapshot (where OpenGL is installed) and an HTML report. Run again, it skips finished steps and resumes an interrupted

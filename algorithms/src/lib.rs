@@ -8,6 +8,8 @@
 //!   `state_dict`; `losses`; `hyperparameters`: types that check themselves; `random`; `context`:
 //!   the data and settings of a run; `chunk`: several steps at a time. `prelude` has the names of
 //!   these for an algorithm's file.
+//! - `returns` of recorded episodes, `phases` of a run; `calibration`: Cal-QL's; `fqe`: the
+//!   value of a policy, by the data alone; `replay`: updates as CUDA graphs.
 //! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
 //!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`. `fql` is the one to read first; `qc` shares
 //!   its flow, and `diffusion_policy` QUAD's noise predictor.

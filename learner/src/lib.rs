@@ -7,8 +7,8 @@
 //! - `cli` is the command line; [`command`] runs a command, up to its exit code.
 //! - `sweep` runs many runs, each as a process.
 //! - `live` is a run at work: threads, main loop, Zenoh.
-//! - `local_evaluators` are evaluators that a learner or a sweep starts itself; `children` are
-//!   processes that end with this one.
+//! - `local_evaluators` are evaluators that a learner or a sweep starts; `children` are processes
+//!   that end with this one.
 //! - `page` shows runs in a browser.
 //! - `report` summarizes scores as tables and figures.
 //! - `judge` ranks policies without a simulator.

@@ -2,7 +2,7 @@
 //!
 //! # Layout
 //!
-//! - [`Weights`]: a network's weights as one vector of named tensors; `gradients/`: the [`Gradients`]
+//! - [`Weights`]: a network's weights, named tensors in one vector; `gradients/`: the [`Gradients`]
 //!   of a loss with respect to them; [`Adam`] applies these.
 //! - `layers/`: K fully connected networks as one operation, configured by [`MlpConfig`].
 //! - [`Ensemble`]: such networks as critics, value functions or means, of an [`EnsembleShape`].

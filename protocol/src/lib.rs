@@ -3,8 +3,8 @@
 //! # Layout
 //!
 //! In reading order: `name` and `hash`; [`keys`]; `snapshot` and `origin`, weights and the header of
-//! their file; `seeds` and `job`, an evaluator gets episodes to run; `progress`; `score`; `experience`; `codec`,
-//! messages to bytes and back.
+//! their file; `seeds` and `job`, the episodes that an evaluator runs; `progress`; `score`;
+//! `experience`; `codec`, messages to bytes and back.
 //!
 //! Nothing here knows what the weights mean or how episodes are simulated.
 

@@ -12,7 +12,8 @@
 //!   sessions that show them.
 //! - [`made_up`]: messages that tests make up; [`crowd`]: hundreds of evaluators that only talk.
 //! - [`link`]: a connection on which things go wrong.
-//! - [`power`]: what a disk holds after a power cut; [`small_disk`]: one that is soon full.
+//! - [`power`]: what a disk holds after a power cut; [`small_disk`]: one that is soon full;
+//!   [`hanging_disk`]: one that hangs.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
 //! - [`prometheus`]: one to start and ask; [`dashboard`]: what Grafana's panels ask it.
 //!
