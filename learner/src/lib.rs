@@ -16,9 +16,6 @@
 //! - `evaluation` tracks which episodes wait for a score, and which evaluator has which. It does no
 //!   input or output.
 //! - `data` finds or fetches the data that a run learns from.
-//!
-//! Below it: the crate `quad_run` has the folder, settings and results of a run, `quad_algorithms`
-//! the algorithms.
 
 #![allow(missing_docs)]
 #![deny(unsafe_code)]

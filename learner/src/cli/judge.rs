@@ -9,9 +9,6 @@ Examples:
   # Which of these five policies is to be tried first on the robot?
   learner judge runs/iql runs/xql runs/dql runs/quad runs/dtql
 
-  # All runs below a folder, as JSON.
-  learner judge runs/robot --json
-
   # Where did this run begin to get worse?
   learner judge runs/quad/snapshots/*.safetensors
 

@@ -18,8 +18,8 @@ Examples:
   # One machine: the learner, and the evaluators that it starts.
   learner train --task hopper-demo --dataset data/hopper-demo.hdf5
 
-  # Another algorithm on the same data.
-  learner train --task hopper-demo --algorithm iql --dataset data/hopper-demo.hdf5
+  # Data of your own, by another algorithm.
+  learner train --task own-data --env my-robot --dataset my-robot.hdf5 --normalize actions,observations --algorithm iql
 
   # QUAD without guidance, which is behavior cloning.
   learner train --task hopper-demo --agent guidance=none --dataset data/hopper-demo.hdf5
@@ -27,11 +27,9 @@ Examples:
   # Print all values of the run, and the time, memory and disk that it will take.
   learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --dry-run
 
-  # Continue after a crash or Ctrl-C: the same command again.
-
 At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learner saves a checkpoint and ends with exit code 75; at a second signal it ends at
-once. The same command continues from the newest checkpoint in the run's folder. On the same machine an interrupted run ends with
-the same weights, bit for bit, as a run without interruption.";
+once. Then, or after a crash, the same command continues from the newest checkpoint in the run's folder. On the same machine an
+interrupted run ends with the same weights, bit for bit, as a run without interruption.";
 
 #[derive(Debug, Args)]
 pub struct TrainArgs {

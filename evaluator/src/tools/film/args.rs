@@ -20,8 +20,7 @@ libgl1-mesa-dri";
 /// Film an episode of a saved policy: an animation, a video or a strip of pictures
 ///
 /// The episode is one on which the run evaluates the snapshot, so its return equals the one in the
-/// run (with the same arithmetic). The caption shows the gradient step, the environment step, the
-/// return so far, and the number of candidates among which the policy chooses.
+/// run (with the same arithmetic).
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct FilmArgs {

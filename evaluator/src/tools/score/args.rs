@@ -22,9 +22,6 @@ Examples:
   # Draw one of fifty actions, with the softmax of the critics' smallest value.
   evaluator score runs/mine/snapshots/step_000020000.safetensors --candidates 50 --rule softmax:1 --aggregate min
 
-  # Guide the draws by the critics' gradients, too.
-  evaluator score runs/mine/snapshots/step_000020000.safetensors --guidance 0.1
-
 RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
 /// Score saved policies (snapshots of any run) on this machine
