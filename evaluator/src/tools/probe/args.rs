@@ -24,7 +24,7 @@ pub struct ProbeArgs {
     /// Rollouts of each action
     #[arg(long, value_name = "N", default_value = "16", value_parser = value_parser!(u32).range(2..))]
     pub rollouts: u32,
-    /// Most steps of a rollout. Fewer miss what an action changes later, as a fall; more are noisier
+    /// Most steps of a rollout. Fewer miss what an action changes later, such as a fall; more are noisier
     #[arg(long, value_name = "N", default_value = "400", value_parser = value_parser!(u32).range(1..))]
     pub length: u32,
     /// Change of an action to either side, of which slopes are central differences
