@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use quad_dataset::environment;
 use quad_policy::Precision;
 use quad_protocol::{JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
 use quad_runtime::doctor::{self, Findings};
@@ -13,10 +14,9 @@ use quad_runtime::{
 use zenoh::Session;
 
 use crate::serve::ZENOH_TIMEOUT;
-use crate::sim::{Environments, Rollout, Simulations};
+use crate::sim;
 use crate::tools::film::{Gl, INSTALL};
 
-const HOPPER: &str = "hopper";
 /// Time limit for learners' answers.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -67,13 +67,13 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     Ok(findings)
 }
 
-/// Runs one step of one episode. Without any libmujoco this program would not have started.
+/// Simulates one step. Without any libmujoco this program would not have started.
 fn simulator(findings: &mut Findings) {
     let version = mujoco_rs::mujoco_version();
     let step = || -> anyhow::Result<()> {
-        let sizes = Simulations.sizes(HOPPER).unwrap_or_default();
-        let make = || Simulations.make(HOPPER, 0);
-        Rollout::new(make, sizes, &[0], |_| ())?.step(|_, _, _| anyhow::Ok(()))?;
+        let mut hopper = sim::make(environment::find("hopper")?, 0)?;
+        hopper.reset(0);
+        hopper.step(&[0.0; 3]);
         Ok(())
     };
     match step() {

@@ -78,9 +78,8 @@ struct Recorder {
     environment: Simulation,
     /// From the initial state to the last: one more than steps.
     states: Vec<State>,
-    /// Clipped actions [action_dim].
-    actions: Vec<Vec<f64>>,
-    steps: Vec<Step>,
+    /// Clipped actions [action_dim], and what follows.
+    steps: Vec<(Vec<f64>, Step)>,
     episode_return: f64,
 }
 
@@ -95,7 +94,6 @@ impl Recorder {
         Ok(Self {
             environment: sim::make(spec, 0)?,
             states: Vec::new(),
-            actions: Vec::new(),
             steps: Vec::new(),
             episode_return: 0.0,
         })
@@ -104,7 +102,6 @@ impl Recorder {
     /// Runs an episode to its end, or until its score so far is above `ceiling`.
     fn run(&mut self, spec: &EnvironmentSpec, policy: &LinearPolicy, seed: u64, ceiling: f64) {
         self.states.clear();
-        self.actions.clear();
         self.steps.clear();
         self.episode_return = 0.0;
         let mut random = stream(seed, NOISE_STREAM);
@@ -119,9 +116,8 @@ impl Recorder {
                 *value = (f64::from(*value) + deviation * noise).clamp(-1.0, 1.0) as f32;
             }
             let step = self.environment.step(&action);
-            self.actions.push(action.iter().copied().map(f64::from).collect());
             self.episode_return += step.reward;
-            self.steps.push(step);
+            self.steps.push((action.iter().copied().map(f64::from).collect(), step));
             self.keep_state();
             if self.ended() || spec.normalized_score(self.episode_return) > ceiling {
                 return;
@@ -131,7 +127,7 @@ impl Recorder {
 
     fn ended(&self) -> bool {
         let last = self.steps.last();
-        last.is_some_and(|step| step.terminated || step.truncated)
+        last.is_some_and(|(_, step)| step.terminated || step.truncated)
     }
 
     fn keep_state(&mut self) {
@@ -143,11 +139,11 @@ impl Recorder {
     }
 
     fn write(&self, writer: &mut D4rlWriter) -> Result<(), DatasetError> {
-        for (i, step) in self.steps.iter().enumerate() {
+        for (i, (action, step)) in self.steps.iter().enumerate() {
             let state = &self.states[i];
             writer.push(&Row {
                 observation: &state.observation,
-                action: &self.actions[i],
+                action,
                 next_observation: &self.states[i + 1].observation,
                 reward: step.reward,
                 terminal: step.terminated,

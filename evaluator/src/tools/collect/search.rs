@@ -48,9 +48,9 @@ pub fn train(
         let mut search = Search::new(spec, random(index))?;
         while search.steps < steps {
             search.iterate();
-            progress.advance(index * steps + search.steps);
+            progress.advance(index * steps + search.steps.min(steps));
         }
-        let score = spec.normalized_score(search.recent_return());
+        let score = spec.normalized_score(search.mean_return);
         progress.say(&format!(
             "training, search {} of {searches}: normalized score {score:.1} after {} steps",
             index + 1,
@@ -65,8 +65,8 @@ struct Search {
     policy: LinearPolicy,
     /// The policies of all iterations; the first never moves.
     policies: Vec<LinearPolicy>,
-    /// Mean return of each iteration's trials.
-    returns: Vec<f64>,
+    /// Of the last iteration's trials.
+    mean_return: f64,
     moments: Moments,
     random: ChaCha8Rng,
     trials: Vec<Trial>,
@@ -103,18 +103,12 @@ impl Search {
         Ok(Self {
             trials: trials.collect::<Result<_, EnvironmentError>>()?,
             policies: vec![policy.clone()],
-            returns: Vec::new(),
+            mean_return: 0.0,
             policy,
             moments,
             random,
             steps: 0,
         })
-    }
-
-    /// Mean return of the trials of the last few iterations.
-    fn recent_return(&self) -> f64 {
-        let recent = &self.returns[self.returns.len().saturating_sub(5)..];
-        recent.iter().sum::<f64>() / recent.len().max(1) as f64
     }
 
     /// Runs one iteration.
@@ -165,8 +159,7 @@ impl Search {
         self.policy.normalizer = self.moments.normalizer();
         self.policies.push(self.policy.clone());
         let returns = self.trials.iter().map(|trial| trial.episode_return);
-        let mean = returns.sum::<f64>() / self.trials.len() as f64;
-        self.returns.push(mean);
+        self.mean_return = returns.sum::<f64>() / self.trials.len() as f64;
     }
 }
 

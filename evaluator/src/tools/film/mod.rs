@@ -28,7 +28,7 @@ pub(crate) use args::FilmArgs;
 use episode::Episode;
 pub(crate) use gl::{Gl, INSTALL};
 use output::{Layout, steps, stride};
-pub(crate) use run_folder::snapshot;
+use run_folder::snapshot;
 use stage::Stage;
 
 /// Makes the film. Returns the text to print.
@@ -72,7 +72,8 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     Ok(format!("{summary}film: {}", args.out.path.display()))
 }
 
-fn subject(path: &Path, step: Option<u64>) -> anyhow::Result<Subject> {
+/// The policy of a snapshot, or of a run's folder: of `step` there, or the best.
+pub(crate) fn subject(path: &Path, step: Option<u64>) -> anyhow::Result<Subject> {
     let snapshot = snapshot(path, step)?;
     let mut subjects = Subject::read(&snapshot, &ScoreArgs::default())?;
     Ok(subjects.remove(0))

@@ -24,15 +24,12 @@ pub struct ProbeArgs {
     /// Rollouts of each action
     #[arg(long, value_name = "N", default_value = "16", value_parser = value_parser!(u32).range(2..))]
     pub rollouts: u32,
-    /// Most steps of a rollout. Fewer miss what an action changes later, as a fall; more are noisier
+    /// Most steps of a rollout. Fewer miss what an action changes later, such as a fall; more are noisier
     #[arg(long, value_name = "N", default_value = "400", value_parser = value_parser!(u32).range(1..))]
     pub length: u32,
     /// Change of an action to either side, of which slopes are central differences
     #[arg(long, value_name = "X", default_value = "0.1", value_parser = change)]
     pub h: f32,
-    /// κ of the lower confidence bound mean − κ·std
-    #[arg(long, value_name = "X", default_value = "1", value_parser = kappa)]
-    pub kappa: f32,
     /// Tables to make [default: all]
     #[arg(long, value_enum)]
     pub tables: Option<Tables>,
@@ -61,19 +58,13 @@ fn change(text: &str) -> Result<f32, &'static str> {
     number.ok_or("a number between 0 and 1")
 }
 
-fn kappa(text: &str) -> Result<f32, &'static str> {
-    let number = text.parse().ok().filter(|kappa: &f32| (0.0..=f32::MAX).contains(kappa));
-    number.ok_or("a number of at least 0")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn numbers_that_give_no_slope_or_bound_are_refused() {
+    fn changes_that_give_no_slope_are_refused() {
         assert!(["0", "1", "nan", "x"].iter().all(|text| change(text).is_err()));
-        assert!(["-1", "nan", "inf", "x"].iter().all(|text| kappa(text).is_err()));
-        assert_eq!((change("0.5"), kappa("0")), (Ok(0.5), Ok(0.0)));
+        assert_eq!(change("0.5"), Ok(0.5));
     }
 }

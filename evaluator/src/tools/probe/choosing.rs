@@ -5,7 +5,7 @@ use quad_policy::Aggregate;
 use quad_run::results::statistics::mean;
 use rand::Rng;
 
-use super::grid::Grid;
+use super::grid::{Grid, means};
 use super::noisy::normal;
 use super::oracle::Query;
 use super::ranks::rank_correlation;
@@ -15,10 +15,16 @@ use super::subject::Probed;
 
 /// Candidates of a state.
 const CANDIDATES: usize = 32;
+/// Aggregates of the critics' values by which candidates are chosen.
+const AGGREGATES: [(Aggregate, &str); 3] = [
+    (Aggregate::Mean, "mean"),
+    (Aggregate::Min, "minimum"),
+    (Aggregate::MeanMinusStd(1.0), "mean − 1·std"),
+];
 
 /// The candidates of one state.
 pub struct Candidates {
-    /// Values by the mean, the minimum and the mean − κ·std over critics.
+    /// The critics' values by each of `AGGREGATES`.
     pub values: [Vec<f64>; 3],
     /// True values, each a mean over one half of the rollouts.
     pub halves: [Vec<f64>; 2],
@@ -38,7 +44,6 @@ impl Candidates {
         states: &[State],
         observations: &Tensor,
         recorded: Option<&Recorded>,
-        kappa: f32,
         random: &mut impl Rng,
     ) -> anyhow::Result<Vec<Self>> {
         let shape = actor.shape();
@@ -46,9 +51,8 @@ impl Candidates {
         let actions = actor.sample(observations, &normal(shape, random)?)?;
         let values = critics.values(observations, &actions)?.flatten_all()?.to_vec1::<f32>()?;
         let actions = actions.to_vec2::<f32>()?;
-        let rules = [Aggregate::Mean, Aggregate::Min, Aggregate::MeanMinusStd(kappa)];
-        let values = rules.map(|rule| {
-            Vec::from_iter(rule.reduce(&values, actions.len()).into_iter().map(f64::from))
+        let values = AGGREGATES.map(|(aggregate, _)| {
+            Vec::from_iter(aggregate.reduce(&values, actions.len()).into_iter().map(f64::from))
         });
 
         let mut queries = Vec::new();
@@ -80,69 +84,67 @@ impl Candidates {
         one.iter().zip(other).map(|(one, other)| (one + other) / 2.0).collect()
     }
 
-    /// Choices among `count`, in all groups of so many: the mean true value above that of a group's
-    /// mean candidate; the mean below that of its best one by one half of the rollouts, valued by
-    /// the other; and the mean distance.
-    fn choose(&self, rule: usize, count: usize) -> [f64; 3] {
-        let (truth, groups) = (self.truth(), CANDIDATES / count);
-        let mut sums = [0.0; 3];
-        for first in (0..groups).map(|group| group * count) {
+    /// Choices by one of `AGGREGATES` among `count`, in all groups of so many: the mean true value
+    /// above that of a group's mean candidate; the mean below that of its best one by one half of the
+    /// rollouts, valued by the other; and the mean distance.
+    fn choose(&self, aggregate: usize, count: usize) -> Vec<f64> {
+        let truth = self.truth();
+        let in_group = |first: usize| {
             let group = first..first + count;
-            let chosen = first + largest(&self.values[rule][group.clone()]);
+            let chosen = first + largest(&self.values[aggregate][group.clone()]);
             let regret = |by: usize| {
                 let best = first + largest(&self.halves[by][group.clone()]);
                 self.halves[1 - by][best] - self.halves[1 - by][chosen]
             };
-            sums[0] += truth[chosen] - mean(&truth[group.clone()]);
-            sums[1] += (regret(0) + regret(1)) / 2.0;
-            sums[2] += self.distances.as_ref().map_or(0.0, |distances| distances[chosen]);
-        }
-        sums.map(|sum| sum / groups as f64)
+            let gain = truth[chosen] - mean(&truth[group.clone()]);
+            let distance = self.distances.as_ref().map(|distances| distances[chosen]);
+            let numbers = [gain, (regret(0) + regret(1)) / 2.0];
+            Vec::from_iter(numbers.into_iter().chain(distance))
+        };
+        let groups = (0..CANDIDATES / count).map(|group| in_group(group * count));
+        means(&Vec::from_iter(groups))
     }
 }
 
 /// Tables of rank correlations and of choices.
-pub fn choosing(states: &[Candidates], kappa: f32) -> [Grid; 2] {
-    let rules = ["mean".to_owned(), "minimum".to_owned(), format!("mean − {kappa}·std")];
-    let correlations = |state: &Candidates| {
-        let halves = rank_correlation(&state.halves[0], &state.halves[1]);
-        let of_rules = state.values.iter().map(|values| rank_correlation(values, &state.truth()));
-        [halves].into_iter().chain(of_rules).collect()
+pub fn choosing(states: &[Candidates]) -> [Grid; 2] {
+    let row = |name: String, numbers: &dyn Fn(&Candidates) -> Vec<f64>| {
+        (name, Vec::from_iter(states.iter().map(numbers)))
     };
-    let mut columns = vec!["above the mean candidate", "regret", "distance from the data"];
-    columns.truncate(if states.iter().all(|state| state.distances.is_some()) { 3 } else { 2 });
-    let of_rules = (0..rules.len()).flat_map(|rule| [2, 5, 10, CANDIDATES].map(|n| (rule, n)));
-    let choices = Vec::from_iter([(0, 1)].into_iter().chain(of_rules));
-    let chosen = |state: &Candidates| {
-        let of_choice = |(rule, count)| state.choose(rule, count).into_iter().take(columns.len());
-        choices.iter().copied().flat_map(of_choice).collect()
-    };
-    let names = ["the other half of the rollouts".to_owned()];
-    let names = names.into_iter().chain(rules.iter().map(|rule| format!("the critics' {rule}")));
-    let of_choice = choices.iter().map(|(rule, count)| match count {
-        1 => "one candidate".to_owned(),
-        _ => format!("largest {} of {count}", rules[*rule]),
-    });
-    let correlation = ["rank correlation with the truth"];
+    let mut correlations = vec![row("the other half of the rollouts".to_owned(), &|state| {
+        vec![rank_correlation(&state.halves[0], &state.halves[1])]
+    })];
+    let mut choices = vec![row("one candidate".to_owned(), &|state| state.choose(0, 1))];
+    for (aggregate, (_, name)) in AGGREGATES.iter().enumerate() {
+        correlations.push(row(format!("the critics' {name}"), &|state| {
+            vec![rank_correlation(&state.values[aggregate], &state.truth())]
+        }));
+        for count in [2, 5, 10, CANDIDATES] {
+            let name = format!("largest {name} of {count}");
+            choices.push(row(name, &|state| state.choose(aggregate, count)));
+        }
+    }
+    let columns = ["above the mean candidate", "regret", "distance from the data"];
+    let known = if states[0].distances.is_some() { 3 } else { 2 };
     [
-        means("Values of 32 candidates", &correlation, names, states, correlations),
-        means("Choices among candidates", &columns, of_choice, states, chosen),
+        table("Values of 32 candidates", &["rank correlation with the truth"], correlations),
+        table("Choices among candidates", &columns[..known], choices),
     ]
 }
 
-/// A table of means over states.
-fn means(
+/// A table of means over states. A row has a name, and its numbers in each state.
+fn table(
     title: &'static str,
     columns: &[&'static str],
-    names: impl IntoIterator<Item = String>,
-    states: &[Candidates],
-    numbers: impl Fn(&Candidates) -> Vec<f64>,
+    rows: Vec<(String, Vec<Vec<f64>>)>,
 ) -> Grid {
-    let by_state = Vec::from_iter(states.iter().map(numbers));
-    let column =
-        |drawn: &[usize], at| mean(&Vec::from_iter(drawn.iter().map(|i| by_state[*i][at])));
-    Grid::of(title, columns, names, states.len(), |drawn| {
-        (0..by_state[0].len()).map(|at| column(drawn, at)).collect()
+    let states = Vec::from_iter(0..rows[0].1.len());
+    let names = rows.iter().map(|(name, _)| name.clone());
+    Grid::of(title, columns, names, &states, |drawn| {
+        let of_drawn = |numbers: &[Vec<f64>]| {
+            means(&Vec::from_iter(drawn.iter().map(|state| &numbers[**state])))
+        };
+        rows.iter().flat_map(|(_, numbers)| of_drawn(numbers)).collect()
     })
 }
 
@@ -168,7 +170,7 @@ mod tests {
         assert_eq!(state.choose(0, 10), [-6.75, 13.5, 1.25]);
         assert_eq!(state.choose(0, 32), [-23.25, 46.5, 0.0]);
         assert_eq!(state.choose(2, 2), [0.75, 0.0, 2.0]);
-        let [correlations, choices] = choosing(&[state], 1.0);
+        let [correlations, choices] = choosing(&[state]);
         let values = |grid: &Grid, row: usize| {
             Vec::from_iter(grid.rows[row].1.iter().map(|number| number.value))
         };

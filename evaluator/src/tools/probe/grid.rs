@@ -3,7 +3,7 @@
 use std::fmt;
 use std::fmt::Alignment::{Left, Right};
 
-use quad_run::results::statistics::{Estimate, estimates};
+use quad_run::results::statistics::{Estimate, estimates, mean};
 use quad_run::table::{Style, Table};
 use serde::Serialize;
 
@@ -17,20 +17,26 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// `statistics` computes the numbers of all rows, one after the other, from the states with these
-    /// indices.
-    pub fn of(
+    /// `statistics` computes the numbers of all rows, one after the other, from a sample of `states`.
+    pub fn of<T>(
         title: &'static str,
         columns: &[&'static str],
         names: impl IntoIterator<Item = String>,
-        states: usize,
-        statistics: impl Fn(&[usize]) -> Vec<f64>,
+        states: &[T],
+        statistics: impl Fn(&[&T]) -> Vec<f64>,
     ) -> Self {
-        let all = vec![Vec::from_iter(0..states)];
+        let all = vec![Vec::from_iter(states)];
         let found = estimates(&[&all], |drawn| statistics(&drawn[0][0]));
         let rows = names.into_iter().zip(found.chunks(columns.len()).map(<[_]>::to_vec));
         Self { title, columns: columns.to_vec(), rows: rows.collect() }
     }
+}
+
+/// The mean of some vectors.
+pub fn means(vectors: &[impl AsRef<[f64]>]) -> Vec<f64> {
+    let column =
+        |at: usize| mean(&Vec::from_iter(vectors.iter().map(|vector| vector.as_ref()[at])));
+    (0..vectors[0].as_ref().len()).map(column).collect()
 }
 
 impl fmt::Display for Grid {

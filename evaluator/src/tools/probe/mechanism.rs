@@ -37,8 +37,8 @@ pub fn mechanism(
     by_state.retain(|state| !state.is_empty());
     let steps = outside.len();
     let table = |title, columns: &[_], names, numbers: &dyn Fn(&[&Sample]) -> Vec<f64>| {
-        Grid::of(title, columns, names, by_state.len(), |drawn| {
-            numbers(&Vec::from_iter(drawn.iter().flat_map(|state| by_state[*state].clone())))
+        Grid::of(title, columns, names, &by_state, |drawn| {
+            numbers(&Vec::from_iter(drawn.iter().flat_map(|samples| samples.iter().copied())))
         })
     };
     let of_steps = outside.iter().zip(1..).map(|(outside, t)| {

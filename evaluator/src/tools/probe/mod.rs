@@ -40,7 +40,10 @@ use subject::Probed;
 /// Probes the snapshot of the command line. Returns the text to print.
 pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
     let probed = Probed::read(args)?;
-    let recorded = recorded(args, &probed)?;
+    let recorded = match args.tables {
+        Some(Tables::Gradients) => None,
+        _ => recorded(args, &probed)?,
+    };
     info!("visiting {} states", args.states);
     let seeds = episode_seeds(args.seed, args.step, args.states);
     let visited = seeds.par_iter().with_max_len(1).map(|seed| State::visit(&probed.subject, *seed));
@@ -63,9 +66,8 @@ pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
     }
     if args.tables != Some(Tables::Gradients) {
         let recorded = recorded.as_ref();
-        let candidates =
-            Candidates::draw(&probed, &states, &observations, recorded, args.kappa, random)?;
-        tables.extend(choosing(&candidates, args.kappa));
+        let candidates = Candidates::draw(&probed, &states, &observations, recorded, random)?;
+        tables.extend(choosing(&candidates));
     }
     if args.json {
         return Ok(quad_runtime::json(&tables)?);

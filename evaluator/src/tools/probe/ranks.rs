@@ -9,17 +9,16 @@ pub fn rank_correlation(x: &[f64], y: &[f64]) -> f64 {
     if size == 0.0 { 0.0 } else { dot(&x, &y) / size }
 }
 
-/// Ranks, less their mean.
+/// Ranks, less their mean: half of the count of smaller numbers less that of larger ones.
 fn centered_ranks(values: &[f64]) -> Vec<f64> {
-    let mut order = Vec::from_iter(0..values.len());
-    order.sort_unstable_by(|one, other| values[*one].total_cmp(&values[*other]));
-    let (mut ranks, mut first) = (vec![0.0; values.len()], 0);
-    for equal in order.chunk_by(|one, other| values[*one] == values[*other]) {
-        let rank = first as f64 + (equal.len() - 1) as f64 / 2.0;
-        equal.iter().for_each(|place| ranks[*place] = rank - (values.len() - 1) as f64 / 2.0);
-        first += equal.len();
-    }
-    ranks
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let rank = |value: &f64| {
+        let smaller = sorted.partition_point(|other| other < value);
+        let larger = sorted.len() - sorted.partition_point(|other| other <= value);
+        (smaller as f64 - larger as f64) / 2.0
+    };
+    values.iter().map(rank).collect()
 }
 
 #[cfg(test)]

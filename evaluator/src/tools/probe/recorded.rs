@@ -8,7 +8,8 @@ use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, Transition
 const SIMILAR: usize = 32;
 
 pub struct Recorded {
-    transitions: Batch,
+    observations: Vec<f32>,
+    actions: Vec<f32>,
     /// Standard deviation of each number of an observation.
     scale: Vec<f32>,
 }
@@ -17,28 +18,27 @@ impl Recorded {
     pub fn read(path: &Path, spec: &'static EnvironmentSpec) -> Result<Self, DatasetError> {
         let task = benchmarks::relabeling(&spec.name);
         let options = ReadOptions { environment: Some(spec), task, ..ReadOptions::default() };
-        let (all, mut transitions) = (Transitions::read(path, &options)?, Batch::default());
-        all.gather(&Vec::from_iter(0..all.len() as u32), &mut transitions);
+        let (all, mut rows) = (Transitions::read(path, &options)?, Batch::default());
+        all.gather(&Vec::from_iter(0..all.len() as u32), &mut rows);
         let scale = all.standard_units().observations.map_or(Vec::new(), |units| units.scale);
-        Ok(Self { transitions, scale })
+        Ok(Self { observations: rows.observations, actions: rows.actions, scale })
     }
 
     /// Distances of `actions` to the nearest action of the recorded states that are most similar to
     /// an observation.
     pub fn distances(&self, observation: &[f32], actions: &[Vec<f32>]) -> Vec<f64> {
-        let (recorded, a) = (&self.transitions, actions[0].len());
         let difference = |state: &[f32]| {
             let numbers = state.iter().zip(observation).zip(&self.scale);
             let varying = numbers.filter(|(_, scale)| **scale > 0.0);
             varying.map(|((x, y), scale)| ((x - y) / scale).powi(2)).sum::<f32>()
         };
-        let states = recorded.observations.chunks_exact(observation.len());
+        let states = self.observations.chunks_exact(observation.len());
         let mut states = Vec::from_iter(states.map(difference).enumerate());
         let similar = SIMILAR.min(states.len());
         states.select_nth_unstable_by(similar - 1, |one, other| one.1.total_cmp(&other.1));
         let distance = |action: &Vec<f32>| {
             let of_state = |(row, _): &(usize, f32)| {
-                let pairs = action.iter().zip(&recorded.actions[row * a..]);
+                let pairs = action.iter().zip(&self.actions[row * action.len()..]);
                 pairs.map(|(x, y)| f64::from(x - y).powi(2)).sum::<f64>().sqrt()
             };
             states[..similar].iter().map(of_state).fold(f64::INFINITY, f64::min)
@@ -49,8 +49,6 @@ impl Recorded {
 
 #[cfg(test)]
 mod tests {
-    use quad_dataset::{Arrays, Names, environment, write_own};
-
     use super::*;
 
     /// The second dimension varies ten times as much; the third is constant.
@@ -60,31 +58,8 @@ mod tests {
         let observations =
             (0..count).flat_map(|i| [i as f32, 10.0 * (i % 2) as f32, 5.0]).collect();
         let actions = (0..count).flat_map(|i| [i as f32, 0.0]).collect();
-        let transitions = Batch { observations, actions, size: count, ..Batch::default() };
-        let recorded = Recorded { transitions, scale: vec![1.0, 1e4, 0.0] };
+        let recorded = Recorded { observations, actions, scale: vec![1.0, 1e4, 0.0] };
         let distances = recorded.distances(&[0.0, 0.0, 9.0], &[vec![34.0, 4.0], vec![2.5, 0.0]]);
         assert_eq!(distances, [5.0, 0.5]);
-    }
-
-    /// OGBench's files have no rewards, which follow from the task.
-    #[test]
-    fn rows_of_ogbenchs_mazes_are_labeled_by_their_task() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("maze.hdf5");
-        let spec = environment::find("pointmaze-medium-singletask-v0").unwrap();
-        let [x, y] = spec.maze.unwrap().goal.map(|x| x as f32);
-        let arrays = Arrays {
-            observation_dim: 2,
-            action_dim: 2,
-            observations: vec![x, y, 0.0, 0.0],
-            actions: vec![0.5; 4],
-            rewards: vec![0.0; 2],
-            next_observations: vec![0.0; 4],
-            terminals: vec![false; 2],
-            timeouts: vec![false, true],
-        };
-        write_own(&path, arrays, Names::default()).unwrap();
-        let recorded = Recorded::read(&path, spec).unwrap();
-        assert_eq!(recorded.transitions.masks, [0.0, 1.0]);
     }
 }

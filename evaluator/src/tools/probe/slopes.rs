@@ -2,6 +2,7 @@
 
 use quad_run::results::statistics::mean;
 
+use super::grid::means;
 use super::noisy::Noisy;
 use super::oracle::Query;
 use super::states::State;
@@ -66,7 +67,7 @@ impl Noisy {
         };
         let [estimate, variance] = moments(&along_u(gradients));
         let [truth, spread] = moments(&along_u(slopes));
-        let true_gradient = center(slopes);
+        let true_gradient = means(slopes);
         let along = |gradients: &[Vec<f64>]| {
             let sizes = Vec::from_iter(gradients.iter().map(|of| dot(of, of).sqrt()));
             let pairs = gradients.iter().zip(&sizes);
@@ -84,7 +85,7 @@ impl Noisy {
             lambda: f64::NAN,
             along: [
                 along(gradients),
-                along(&[center(gradients)]),
+                along(&[means(gradients)]),
                 along(std::slice::from_ref(denoised)),
             ],
         }
@@ -100,10 +101,4 @@ fn moments(values: &[f64]) -> [f64; 2] {
     let center = mean(values);
     let squares = values.iter().map(|x| (x - center) * (x - center));
     [center, mean(&Vec::from_iter(squares))]
-}
-
-/// The mean of some vectors.
-fn center(vectors: &[Vec<f64>]) -> Vec<f64> {
-    let of_axis = |axis| mean(&Vec::from_iter(vectors.iter().map(|vector| vector[axis])));
-    (0..vectors[0].len()).map(of_axis).collect()
 }

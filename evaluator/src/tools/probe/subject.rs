@@ -16,7 +16,7 @@ use quad_runtime::Hint;
 use super::args::ProbeArgs;
 use super::oracle::Oracle;
 use crate::tools::film;
-use crate::tools::score::{ScoreArgs, Subject};
+use crate::tools::score::Subject;
 
 const OTHERS: &str =
     "probe a run of `--algorithm quad`, with any guidance, without --normalize, chunks and history";
@@ -38,10 +38,7 @@ impl Probed {
     pub fn read(args: &ProbeArgs) -> anyhow::Result<Self> {
         let name = args.run.display();
         let (_, config) = RunDir::open(&args.run).hint("pass the folder of a run")?;
-        let path = film::snapshot(&args.run, Some(args.step))?;
-        let subject = Subject::read(&path, &ScoreArgs::default())?.pop();
-        let subject = subject.context("a snapshot has a policy")?;
-
+        let subject = film::subject(&args.run, Some(args.step))?;
         let (experiment, data) = (config.experiment, config.dataset);
         let number = |key: &str| {
             let value = experiment.agent.get(key).and_then(|value| {
@@ -60,7 +57,8 @@ impl Probed {
         let rewards = experiment.reward.scaling(&returns);
         let rewards = rewards.with_context(|| format!("all returns of {name} are the same"))?;
 
-        let file = files::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let path = &subject.path;
+        let file = files::read(path).with_context(|| format!("cannot read {}", path.display()))?;
         let header = Header::<Origin>::read(&file).hint_of(PolicyError::hint)?;
         let PolicyConfig::Diffusion { shape, .. } = header.policy else {
             return Err(anyhow!("{name} has no diffusion policy")).hint(OTHERS);

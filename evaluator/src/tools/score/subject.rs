@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::{self, EnvironmentSpec};
-use quad_policy::{Choice, Header, Policy, PolicyError, load_policy};
+use quad_policy::{Choice, Header, Policy, PolicyConfig, PolicyError, load_policy};
 use quad_protocol::{EpisodeScore, Hash, Origin};
 use quad_run::files;
 use quad_runtime::Hint;
@@ -77,6 +77,10 @@ impl Subject {
             let nothing = "samples one action per state, so --rule and --aggregate change nothing";
             return Err(anyhow!("{name} {nothing}"))
                 .hint("take more --candidates, or leave them out");
+        }
+        if args.aggregate.is_some() && has_one_critic(&header.policy) {
+            return Err(anyhow!("{name} has one critic, so --aggregate changes nothing"))
+                .hint("leave it out");
         }
         Ok(subjects)
     }
@@ -159,6 +163,17 @@ fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
     }
 }
 
+fn has_one_critic(policy: &PolicyConfig) -> bool {
+    match policy {
+        PolicyConfig::Diffusion { shape, .. } => shape.critics == 1,
+        PolicyConfig::Squashed { shape, .. }
+        | PolicyConfig::OneStep { shape, .. }
+        | PolicyConfig::Flow { shape, .. } => shape.critics == 1,
+        PolicyConfig::Score { .. } | PolicyConfig::Diffuser { .. } => true,
+        PolicyConfig::Gaussian { .. } => false,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::fs;
@@ -184,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn a_choice_among_less_than_two_actions_is_refused() {
+    fn a_choice_that_changes_nothing_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("policy.safetensors");
         let problem = |critics, candidates: &[u32], aggregate| {
@@ -201,6 +216,7 @@ mod tests {
             (0, &[1, 10], mean, "no critics"),
             (2, &[], min, "one action per state"),
             (2, &[1], min, "one action per state"),
+            (1, &[1, 10], min, "one critic"),
             (2, &[1, 10], min, ""),
         ] {
             let found = problem(critics, candidates, aggregate);
