@@ -363,6 +363,7 @@ fn contradictory_hyper_parameters_are_refused() {
         ("sfbc", toml::toml! { averaged = 7 }, "at most candidates"),
         ("sfbc", toml::toml! { actor.norm = true }, "actor.norm"),
         ("diffuser", toml::toml! { replan_every = 1000 }, "at most the horizon"),
+        ("diffuser", toml::toml! { network.groups = 0 }, "agent.network.groups is 0"),
         ("quad", toml::toml! { eta.maximum = -1.0 }, "at least 0"),
         ("quad", toml::toml! { eta.initial = 1e9 }, "between eta.minimum and eta.maximum"),
         (
