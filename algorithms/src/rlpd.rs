@@ -3,21 +3,11 @@
 //! with an ensemble of critics that have layer norm, and many updates for each environment step. It
 //! learns nothing before practice begins. Its update is its authors' code's.
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
-use super::error::{AgentError, check};
-use super::hyperparameters::{Count, Positive, Rate, Steps, UnitInterval};
-use super::losses::{Loss, measured, smallest};
-use super::networks::{Initializer, TrainState, WithTarget, networks};
+use super::prelude::*;
 use super::squashed::Squashed;
-use super::state_dict::StateDict;
-use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors, Weights, cosine_decay};
-use quad_policy::{GaussianPolicy, PolicyConfig};
+use quad_nn::Weights;
+use quad_policy::GaussianPolicy;
 use rand::seq::index::sample;
-use serde::Deserialize;
-use toml::Table;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "rlpd",
@@ -36,7 +26,6 @@ const METRICS: &[Metric] = &metrics! {
     alpha: "α, the weight of the entropy, before its step. Measured in the policy's steps.";
 };
 
-/// RLPD's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
@@ -63,7 +52,7 @@ struct Config {
 }
 
 impl Config {
-    fn read(table: &Table) -> std::result::Result<Self, AgentError> {
+    fn read(table: &toml::Table) -> std::result::Result<Self, AgentError> {
         let config: Self = read(table)?;
         let (of, most) = (*config.target_critics, *config.critics);
         check("target_critics", of, of <= most, "at most agent.critics")?;
