@@ -1,7 +1,7 @@
 //! Decoders survive mutated messages: each gives an error or a message that encodes as the same
 //! bytes, and never panics.
 //!
-//! `QUAD_MUTATIONS=1000000 cargo test --release --workspace --test mutations` tries as many.
+//! `QUAD_MUTATIONS=1000000 cargo test --release -p quad-protocol --test mutations` tries as many.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod frames;

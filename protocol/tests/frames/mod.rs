@@ -1,4 +1,4 @@
-//! One message of each kind, for tests and for the fuzzer in protocol/fuzz.
+//! One message of each kind.
 #![allow(dead_code)] // Not every test uses all of it.
 
 use std::fmt::Debug;
