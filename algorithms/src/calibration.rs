@@ -12,7 +12,6 @@ pub(super) struct MonteCarlo {
 }
 
 impl MonteCarlo {
-    /// The returns of a dataset.
     pub fn new(transitions: &Transitions, gamma: f32) -> Self {
         let mut returns = Self { gamma: f64::from(gamma), returns: Vec::new() };
         returns.extend(transitions, transitions.episodes());

@@ -64,7 +64,6 @@ impl Context {
         self.random_for(Purpose::Noise, step)
     }
 
-    /// The random numbers of another purpose.
     pub(super) fn random_for(&self, purpose: Purpose, count: u64) -> Random {
         Random {
             generator: stream(self.seed, purpose, count),
@@ -79,7 +78,6 @@ impl Context {
         self.batch_on(indices, &self.device)
     }
 
-    /// [`Self::batch`] on another device.
     pub(super) fn batch_on(&self, indices: &[u32], device: &Device) -> Result<Minibatch> {
         let mut batch = Batch::default();
         self.transitions.gather_windows(indices, self.window, &mut batch);

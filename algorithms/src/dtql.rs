@@ -59,7 +59,6 @@ struct Config {
     critic_learning_rate: Positive,
     /// Decay of all learning rates to 0 along a cosine, from the end of pre-training on.
     cosine: bool,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     candidates: Candidates,
     /// Temperature of the softmax by which one of them is drawn, in units of Q.

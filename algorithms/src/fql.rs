@@ -43,7 +43,6 @@ struct Config {
     /// Euler steps of the flow.
     flow_steps: Count,
     learning_rate: Positive,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     /// Actions drawn to choose from, N_a; its authors take one.
     candidates: Candidates,

@@ -123,7 +123,6 @@ fn transitions(golden: &Golden) -> Transitions {
     Transitions::of(arrays).unwrap()
 }
 
-/// The context of a golden folder.
 pub(super) fn context(golden: &Golden, device: &Device) -> Context {
     Context {
         transitions: Arc::new(transitions(golden)),
@@ -138,7 +137,6 @@ pub(super) fn context(golden: &Golden, device: &Device) -> Context {
     }
 }
 
-/// The hyper-parameters of a golden folder.
 pub(super) fn table(golden: &Golden) -> toml::Table {
     toml::Table::try_from(&golden.config["agent"]).unwrap()
 }

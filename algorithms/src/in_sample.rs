@@ -24,7 +24,6 @@ pub(super) struct Helps {
 pub(super) const COSINE: &str =
     "The actor's learning rate; falls to 0 along a cosine, and is constant with practice.";
 
-/// The metrics of one algorithm.
 pub(super) const fn table(helps: Helps) -> [Metric; 9] {
     metrics! {
         target_q_mean held_out: helps.targets;
@@ -49,7 +48,6 @@ pub(super) struct Common {
     actor_learning_rate: Positive,
     critic_learning_rate: Positive,
     value_learning_rate: Positive,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
 }
 

@@ -63,7 +63,6 @@ impl Loss {
 
 /// The numbers of an update's metrics on their device.
 pub(super) struct Computed {
-    /// Names of the scalars.
     names: Vec<&'static str>,
     /// The scalars, then the other numbers, `[n]`.
     pub numbers: Tensor,
@@ -87,7 +86,6 @@ impl Computed {
     }
 }
 
-/// The metrics of some losses.
 pub(super) fn measured(losses: &[Loss]) -> Result<Measured> {
     Ok(Computed::new(losses)?.read()?.0)
 }

@@ -35,7 +35,6 @@ struct Config {
     /// Euler steps of the flow.
     flow_steps: Count,
     learning_rate: Positive,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     /// Chunks drawn to choose from, N, in targets too.
     candidates: Candidates,

@@ -35,7 +35,6 @@ struct Config {
     critics: Count,
     /// Critics of which the smallest value counts in the target, drawn anew in each step.
     target_critics: Count,
-    /// Discount γ.
     gamma: UnitInterval,
     /// Reward the next action's entropy in the target.
     entropy_backup: bool,
@@ -45,7 +44,6 @@ struct Config {
     learning_rate: Positive,
     /// Let the learning rate fall to 0 along a cosine over the run.
     decay: bool,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and α.
     actor_every: Steps,
@@ -69,7 +67,6 @@ networks! {
     }
 }
 
-/// The random numbers of one update.
 struct Noise {
     /// Noise of the next actions in the target, `[B, 1, a]`.
     next: Tensor,

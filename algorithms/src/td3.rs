@@ -11,7 +11,6 @@ use quad_policy::{Spread, gaussian_mean};
 use serde::de::DeserializeOwned;
 use toml::Table;
 
-/// The hyper-parameters that both algorithms have.
 #[derive(Clone, Deserialize)]
 pub(super) struct Common {
     actor: MlpConfig,
@@ -22,7 +21,6 @@ pub(super) struct Common {
     target_noise_limit: NotNegative,
     actor_learning_rate: Positive,
     critic_learning_rate: Positive,
-    /// EMA rate of the target networks.
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and targets.
     actor_every: Steps,

@@ -45,7 +45,6 @@ struct Config {
     random_actions: u8,
     /// Standard deviation of the noise on the data's actions that V sees.
     value_noise: NotNegative,
-    /// V's steps per update.
     value_steps: Count,
 }
 

@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 
 /// Kernel size of a block's convolutions.
 const TAPS: usize = 5;
-/// Largest number of levels.
 const MOST_LEVELS: usize = 8;
 /// Longest trajectory.
 const MOST_STEPS: usize = 1000;
@@ -36,7 +35,7 @@ pub struct TrajectoryConfig {
 pub struct Attention {
     /// Number of heads.
     pub heads: usize,
-    /// Length of a query.
+    /// Length of each head's queries, keys and values.
     pub width: usize,
 }
 
