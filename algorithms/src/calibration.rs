@@ -63,7 +63,6 @@ fn discounted(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f32> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use quad_dataset::{Arrays, PracticeRows};

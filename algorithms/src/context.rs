@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::{Batch, Transitions, Window};
-use quad_nn::{Ensemble, Precision, cosine_decay};
+use quad_nn::{Ensemble, Precision, cosine_decay, squared_error};
 
 use super::error::AlgorithmError;
 use super::inputs::Inputs;
@@ -195,8 +195,8 @@ impl Minibatch {
         Loss::of_critics(self.squared_error(critics, targets)?, targets)
     }
 
-    /// Mean over critics and batch of (Q_k(s, a) − y)², `[]`.
+    /// Mean over critics and batch of (Q_k(s, a) − y)², `[]`, for constants y, `[B]`.
     pub(super) fn squared_error(&self, critics: &Ensemble, targets: &Tensor) -> Result<Tensor> {
-        critics.squared_error(&self.observations, &self.actions, targets)
+        squared_error(&self.values(critics)?, &targets.detach())
     }
 }
