@@ -2,11 +2,8 @@
 //! the target critics' smaller value, a Gaussian policy is cloned from the data with weights, and
 //! twin critics move toward r + γ·V(s'). An algorithm of this kind is an [`ImplicitLosses`].
 
-use super::definition::read_with;
 use super::gaussian::Gaussian;
 use super::prelude::*;
-use serde::de::DeserializeOwned;
-use toml::Table;
 
 /// Largest weight of an action of the data.
 const MOST_WEIGHT: f64 = 100.0;
@@ -22,11 +19,6 @@ pub(super) struct Common {
     critic_learning_rate: Positive,
     value_learning_rate: Positive,
     ema_rate: Rate,
-}
-
-/// Reads a table of hyper-parameters with [`Common`]'s among them.
-pub(super) fn read<T: DeserializeOwned>(table: &Table) -> std::result::Result<T, AgentError> {
-    read_with::<Common, T>(table)
 }
 
 /// The hyper-parameters and equations of an algorithm.

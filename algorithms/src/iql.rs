@@ -2,7 +2,7 @@
 //! Q-Learning"): a value function learned by expectile regression, and a Gaussian policy cloned
 //! from the data with advantages as weights. Equations are that paper's.
 
-use super::in_sample::{Common, ImplicitLosses, InSample, read};
+use super::in_sample::{Common, ImplicitLosses, InSample};
 use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -11,7 +11,7 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     report: Reporting::PLAIN,
     chunks: false,
-    read: |table| Ok(start(read::<Config>(table)?, InSample::new)),
+    read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
 };
 
 const METRICS: &[Metric] = &metrics! {

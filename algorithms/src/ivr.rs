@@ -4,7 +4,7 @@
 //! SQL, sparse Q-learning, or EQL, exponential Q-learning. Equations are that paper's; where its
 //! authors' code does something else, docs/deviations.md says what holds.
 
-use super::in_sample::{Common, ImplicitLosses, InSample, read, scale_down};
+use super::in_sample::{Common, ImplicitLosses, InSample, scale_down};
 use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -23,7 +23,7 @@ pub(super) const DEFINITION: Definition = Definition {
         ..Reporting::PLAIN
     },
     chunks: false,
-    read: |table| Ok(start(read::<Config>(table)?, InSample::new)),
+    read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
 };
 
 /// (q − V)/α at which EQL's exponentials are cut off.

@@ -3,7 +3,7 @@
 //! data, β·ln E exp(Q/β), without a sample of a policy. What its authors' scripts add for single
 //! datasets is in `pairs` and `value_steps`.
 
-use super::in_sample::{Common, ImplicitLosses, InSample, read, scale_down};
+use super::in_sample::{Common, ImplicitLosses, InSample, scale_down};
 use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -12,7 +12,7 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     report: Reporting::PLAIN,
     chunks: false,
-    read: |table| Ok(start(read::<Config>(table)?, InSample::new)),
+    read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
 };
 
 /// Bound of the noise on the actions that V sees.
