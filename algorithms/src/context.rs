@@ -166,8 +166,8 @@ impl Minibatch {
         Ok((&self.rewards + ((next * &self.masks)? * f64::from(gamma))?)?.detach())
     }
 
-    /// A prediction about the batch's actions, with the truth in place of what it says of those beyond
-    /// the end of their episode, which are not learned; all `[B, a]`.
+    /// `predicted` within the episode and `truth` beyond its end, where nothing is to be learned; all
+    /// `[B, a]`.
     pub(super) fn within_episodes(&self, predicted: Tensor, truth: &Tensor) -> Result<Tensor> {
         match &self.within {
             Some(within) => (predicted * within)? + (truth * within.affine(-1.0, 1.0)?)?,

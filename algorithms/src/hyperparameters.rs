@@ -34,8 +34,8 @@ macro_rules! checked {
 }
 
 checked!(Finite(f32), |x| x.is_finite(), "finite");
-checked!(Positive(f32), |x| x > 0.0 && x.is_finite(), "above 0");
-checked!(NotNegative(f32), |x| x >= 0.0 && x.is_finite(), "at least 0");
+checked!(Positive(f32), |x| x > 0.0 && x.is_finite(), "above 0 and finite");
+checked!(NotNegative(f32), |x| x >= 0.0 && x.is_finite(), "at least 0 and finite");
 checked!(
     /// Within [0, 1]: a discount.
     UnitInterval(f32), |x| (0.0..=1.0).contains(&x), "in [0, 1]"

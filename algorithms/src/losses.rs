@@ -25,7 +25,7 @@ pub(super) fn lower_bound(values: &Tensor, kappa: f32) -> Result<Tensor> {
     mean - (variance.sqrt()? * f64::from(kappa))?
 }
 
-/// One value of the critics' constant ones, `[K, B]` → `[B]`.
+/// The aggregate of the critics' values, which are constants, `[K, B]` → `[B]`.
 pub(super) fn reduced(values: &Tensor, aggregate: Aggregate) -> Result<Tensor> {
     match aggregate {
         Aggregate::Mean => values.mean(0),
