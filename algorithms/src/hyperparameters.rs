@@ -1,6 +1,6 @@
 //! Types of hyper-parameters that check their range when they are read.
 
-use std::ops::{Deref, RangeInclusive};
+use std::ops::Deref;
 
 use quad_policy::Choice;
 use serde::Deserialize;
@@ -47,7 +47,7 @@ checked!(
 checked!(OpenUnit(f32), |x| x > 0.0 && x < 1.0, "between 0 and 1");
 checked!(
     /// A number of things: networks, samples, denoising steps.
-    Count(usize), |x| COUNTS.contains(&x), "a whole number from 1 to 1000"
+    Count(usize), |x| (1..=1000).contains(&x), "a whole number from 1 to 1000"
 );
 checked!(Steps(u64), |x| x > 0, "at least 1");
 
@@ -55,6 +55,3 @@ checked!(
     /// Actions that a policy draws in each state.
     Candidates(u32), |x| (1..=Choice::MOST_CANDIDATES).contains(&x), "a whole number from 1 to 10000"
 );
-
-/// Bounds of counts; those of a policy's denoising steps are the same.
-const COUNTS: RangeInclusive<usize> = 1..=1000;
