@@ -12,7 +12,7 @@ use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_kernels::product::{Matrix::RowMajor, by_gemm};
 use quad_nn::{
     Adam, AdamStep, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weighted, Weights,
-    open_gpu,
+    open_gpu, squared_error,
 };
 use quad_policy::DiffusionShape;
 use rand::{Rng, SeedableRng};
@@ -235,8 +235,8 @@ fn parts_of(
     let next = target_actor.sample(&observations, &noise)?;
     bench(group, "target critics", || target_critics.values(&observations, &next));
     let regress = |critics: &Ensemble| {
-        Gradients::of(&critics.squared_error(&observations, &actions, &targets)?)?
-            .with_respect_to(critics.weights())
+        let loss = squared_error(&critics.values(&observations, &actions)?, &targets)?;
+        Gradients::of(&loss)?.with_respect_to(critics.weights())
     };
     bench(group, "critic step", || regress(&critics));
     let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };

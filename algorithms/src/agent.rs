@@ -28,7 +28,6 @@ pub struct Agent {
     scaling: Option<Scaling>,
     /// The dataset's names of observations and actions.
     names: Names,
-    /// Updates done.
     step: u64,
 }
 
@@ -80,7 +79,7 @@ impl Agent {
         &self.transitions
     }
 
-    /// The metrics of its updates.
+    /// The algorithm's table of metrics, in the order of what [`Self::update`] returns.
     pub fn metrics(&self) -> &'static [Metric] {
         self.definition.metrics
     }
@@ -90,7 +89,7 @@ impl Agent {
         self.algorithm.phases()
     }
 
-    /// Updates done.
+    /// Updates done, which is the number of the next one.
     pub fn step(&self) -> u64 {
         self.step
     }

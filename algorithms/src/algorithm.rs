@@ -9,7 +9,7 @@ use super::state_dict::StateDict;
 /// Metrics of an update by the names in the algorithm's table.
 pub type Measured = Vec<(&'static str, f32)>;
 
-/// An algorithm in training.
+/// The updates of an algorithm, its policy and its state.
 pub trait Algorithm: Send {
     /// The number of examples that batches are drawn from: transitions, unless an algorithm leaves
     /// some out or learns from windows of them.

@@ -50,7 +50,6 @@ pub(super) struct Config {
     weight_decay: NotNegative,
     /// EMA rate of the target critics.
     ema_rate: Rate,
-    /// EMA rate of the target actor.
     actor_ema_rate: Rate,
     candidates: Candidates,
 }
@@ -80,7 +79,7 @@ impl Config {
     }
 }
 
-/// The policy toward the data's actions.
+/// ε_θ toward the noise in the data's actions: DDPM's loss.
 fn bc_loss(networks: &Networks, batch: &Minibatch, noise: &Denoising) -> Result<Loss> {
     let (_, predicted) = denoise(&networks.actor, batch, noise)?;
     Ok(Loss::new("bc_loss", (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?))

@@ -12,7 +12,6 @@ pub(super) struct MonteCarlo {
 }
 
 impl MonteCarlo {
-    /// The returns of a dataset.
     pub fn new(transitions: &Transitions, gamma: f32) -> Self {
         let mut returns = Self { gamma: f64::from(gamma), returns: Vec::new() };
         returns.extend(transitions, transitions.episodes());
@@ -50,21 +49,15 @@ fn discounted(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f32> {
     if failed && gamma < 1.0 && rewards.iter().all(|reward| *reward == rewards[0]) {
         return vec![(f64::from(rewards[0]) / (1.0 - gamma)) as f32; rewards.len()];
     }
-    let mut after = 0.0;
-    let mut returns: Vec<f32> = rewards
-        .iter()
-        .rev()
-        .map(|reward| {
-            after = f64::from(*reward) + gamma * after;
-            after as f32
-        })
-        .collect();
-    returns.reverse();
+    let (mut returns, mut after) = (rewards.to_vec(), 0.0);
+    for reward in returns.iter_mut().rev() {
+        after = f64::from(*reward) + gamma * after;
+        *reward = after as f32;
+    }
     returns
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use quad_dataset::{Arrays, PracticeRows};

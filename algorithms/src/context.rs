@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::{Batch, Transitions, Window};
-use quad_nn::{Ensemble, Precision, cosine_decay};
+use quad_nn::{Ensemble, Precision, cosine_decay, squared_error};
 
 use super::error::AlgorithmError;
 use super::inputs::Inputs;
@@ -64,7 +64,6 @@ impl Context {
         self.random_for(Purpose::Noise, step)
     }
 
-    /// The random numbers of another purpose.
     pub(super) fn random_for(&self, purpose: Purpose, count: u64) -> Random {
         Random {
             generator: stream(self.seed, purpose, count),
@@ -79,7 +78,6 @@ impl Context {
         self.batch_on(indices, &self.device)
     }
 
-    /// [`Self::batch`] on another device.
     pub(super) fn batch_on(&self, indices: &[u32], device: &Device) -> Result<Minibatch> {
         let mut batch = Batch::default();
         self.transitions.gather_windows(indices, self.window, &mut batch);
@@ -168,8 +166,8 @@ impl Minibatch {
         Ok((&self.rewards + ((next * &self.masks)? * f64::from(gamma))?)?.detach())
     }
 
-    /// A prediction about the batch's actions, with the truth in place of what it says of those beyond
-    /// the end of their episode, which are not learned; all `[B, a]`.
+    /// `predicted` within the episode and `truth` beyond its end, where nothing is to be learned; all
+    /// `[B, a]`.
     pub(super) fn within_episodes(&self, predicted: Tensor, truth: &Tensor) -> Result<Tensor> {
         match &self.within {
             Some(within) => (predicted * within)? + (truth * within.affine(-1.0, 1.0)?)?,
@@ -197,8 +195,8 @@ impl Minibatch {
         Loss::of_critics(self.squared_error(critics, targets)?, targets)
     }
 
-    /// Mean over critics and batch of (Q_k(s, a) − y)², `[]`.
+    /// Mean over critics and batch of (Q_k(s, a) − y)², `[]`, for constants y, `[B]`.
     pub(super) fn squared_error(&self, critics: &Ensemble, targets: &Tensor) -> Result<Tensor> {
-        critics.squared_error(&self.observations, &self.actions, targets)
+        squared_error(&self.values(critics)?, &targets.detach())
     }
 }

@@ -56,7 +56,6 @@ struct Config {
     actor_learning_rate: Positive,
     /// Learning rate of the critics and of α'.
     critic_learning_rate: Positive,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     phases: Phases,
 }
@@ -78,7 +77,6 @@ struct Phases {
 }
 
 impl Phases {
-    /// True during the cloning phase.
     fn is_cloning(&self, step: u64, total_steps: u64) -> bool {
         let [step, total, cloning, learning] =
             [step, total_steps, self.cloning, *self.learning].map(u128::from);

@@ -202,7 +202,7 @@ impl Reporting {
 /// The hyper-parameter that tells an algorithm's variants apart.
 #[derive(Clone, Copy)]
 pub struct Variant {
-    /// Its name.
+    /// Its key in the `[agent]` table.
     pub key: &'static str,
     /// The label of the variant with this value in tables and figures.
     pub called: fn(&str) -> String,
@@ -213,7 +213,7 @@ pub struct Variant {
 /// A hyper-parameter over which scores are drawn, on a logarithmic scale.
 #[derive(Clone, Copy)]
 pub struct Axis {
-    /// Its name.
+    /// Its key in the `[agent]` table.
     pub key: &'static str,
     /// Its symbol in the paper.
     pub symbol: &'static str,
@@ -230,9 +230,9 @@ pub type MetricsLine = BTreeMap<String, f64>;
 pub struct Summary {
     /// Its key in JSON.
     pub key: &'static str,
-    /// Its title.
+    /// Its heading in the report's page.
     pub title: &'static str,
-    /// Its numbers.
+    /// Its numbers, an object.
     pub json: serde_json::Value,
     /// Its lines for people.
     pub text: String,

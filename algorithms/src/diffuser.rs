@@ -8,7 +8,9 @@ mod windows;
 
 use super::prelude::*;
 use candle_nn::loss::mse;
-use quad_nn::{Layout, Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, Weights};
+use quad_nn::{
+    Layout, Reverse, Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, Weights,
+};
 use quad_policy::{DiffuserPolicy, DiffuserShape, ValueGuidance, with_first_state};
 use rand::Rng;
 use windows::{Batch, Windows};
@@ -117,7 +119,7 @@ impl Diffuser {
         weights[..a].fill(*config.first_action_weight);
         weights[a..a + o].fill(0.0);
         Ok(Self {
-            schedule: Schedule::cosine(*config.diffusion_steps),
+            schedule: Schedule::new(*config.diffusion_steps, Reverse::Cosine),
             loss_weights: Tensor::from_vec(weights, (horizon, a + o), &context.device)?,
             networks: Networks::new(&config.network, &mut Initializer::new(&context))?,
             windows,

@@ -80,7 +80,6 @@ impl Sampler<'_> {
 /// `update` is what a GPU records, so it is the same in all steps: `begin` sets the learning rates
 /// before it, and `end` does what only some steps do.
 pub(super) trait DiffusionUpdate: Send {
-    /// The random numbers of an update.
     type Noise: Inputs + Send;
 
     fn noise(&self, sampler: Sampler<'_>) -> Result<Self::Noise>;
@@ -98,7 +97,7 @@ pub(super) trait DiffusionUpdate: Send {
         Ok(())
     }
 
-    /// The losses of an update.
+    /// The losses that [`Self::update`] descends, without a step.
     fn losses(
         &self,
         networks: &Networks,

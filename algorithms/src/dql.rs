@@ -50,7 +50,6 @@ struct Config {
     gradient_clip: Positive,
     /// EMA rate of the target critics.
     ema_rate: Rate,
-    /// EMA rate of the target actor.
     actor_ema_rate: Rate,
     /// The target actor is updated in steps whose number, from 0, is a multiple of this …
     actor_ema_every: Steps,

@@ -59,7 +59,6 @@ struct Config {
     critic_learning_rate: Positive,
     /// Decay of all learning rates to 0 along a cosine, from the end of pre-training on.
     cosine: bool,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     candidates: Candidates,
     /// Temperature of the softmax by which one of them is drawn, in units of Q.
@@ -272,8 +271,7 @@ impl Algorithm for Dtql {
         let rule = Rule::softmax(*self.config.temperature);
         let choice = Choice::new(*self.config.candidates, Aggregate::Min, rule);
         let (actor, critics) = (&self.networks.actor.network, &self.networks.critic.target);
-        let shape = ActorCriticShape::of(actor, critics);
-        let tensors = ActorCriticShape::tensors(actor, critics)?;
+        let (shape, tensors) = ActorCriticShape::of(actor, critics)?;
         Ok((PolicyConfig::Squashed { shape, choice }, tensors))
     }
 

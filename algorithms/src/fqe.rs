@@ -26,7 +26,6 @@ pub struct FqeConfig {
     learning_rate: Positive,
     /// Share of the learning rate by which each step shrinks the weights.
     weight_decay: NotNegative,
-    /// EMA rate of the target critic.
     ema_rate: Rate,
 }
 

@@ -43,7 +43,6 @@ struct Config {
     /// Euler steps of the flow.
     flow_steps: Count,
     learning_rate: Positive,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     /// Actions drawn to choose from, N_a; its authors take one.
     candidates: Candidates,
@@ -162,8 +161,7 @@ impl Algorithm for Fql {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
         let (actor, critics) = (&self.networks.actor, &self.networks.critic.target);
-        let shape = ActorCriticShape::of(actor, critics);
-        let tensors = ActorCriticShape::tensors(actor, critics)?;
+        let (shape, tensors) = ActorCriticShape::of(actor, critics)?;
         Ok((PolicyConfig::OneStep { shape, choice }, tensors))
     }
 

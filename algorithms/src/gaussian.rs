@@ -11,7 +11,6 @@ use super::state_dict::{StateDict, Stateful};
 /// Bounds of log σ.
 const LOG_STD: (f32, f32) = (-5.0, 2.0);
 
-/// A Gaussian policy in training.
 pub(super) struct Gaussian {
     /// Network whose tanh is the mean.
     mean: TrainState<Ensemble>,

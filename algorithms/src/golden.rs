@@ -13,7 +13,9 @@ use super::state_dict::StateDict;
 use super::{ALGORITHMS, Hyperparameters};
 use candle_core::{D, DType, Device, Tensor};
 use quad_dataset::{Arrays, Transitions, Window};
-use quad_nn::{Precision, Scaling, Tensors, open_gpu};
+use quad_nn::{
+    NoisePredictor, NoiseShape, Precision, Reverse, Scaling, Tensors, Weights, open_gpu,
+};
 use quad_policy::{
     Aggregate, Choice, EpisodeState, Header, PolicyConfig, Rule, Samples, load_policy,
 };
@@ -123,7 +125,6 @@ fn transitions(golden: &Golden) -> Transitions {
     Transitions::of(arrays).unwrap()
 }
 
-/// The context of a golden folder.
 pub(super) fn context(golden: &Golden, device: &Device) -> Context {
     Context {
         transitions: Arc::new(transitions(golden)),
@@ -138,7 +139,6 @@ pub(super) fn context(golden: &Golden, device: &Device) -> Context {
     }
 }
 
-/// The hyper-parameters of a golden folder.
 pub(super) fn table(golden: &Golden) -> toml::Table {
     toml::Table::try_from(&golden.config["agent"]).unwrap()
 }
@@ -185,6 +185,14 @@ fn check_policy(golden: &Golden, algorithm: &dyn Algorithm) {
             golden.close("select.candidates", &actions);
         }
         golden.close(if name == "diffuser" { "select.values" } else { "select.q" }, &values);
+        if golden.inputs.contains_key("select_guidance") {
+            let guided = Choice { guidance: numbers(golden, "select_guidance")[0], ..choice };
+            let guided = policy.with_choice(guided).unwrap().sample(&observations, &mut begin());
+            golden.close(
+                "select.guided",
+                &Tensor::new(guided.unwrap().actions, &Device::Cpu).unwrap(),
+            );
+        }
         if let Rule::Softmax { temperature } = choice.rule {
             let q = (values.reshape((n, ())).unwrap() / f64::from(temperature)).unwrap();
             golden.close("select.probabilities", &candle_nn::ops::softmax(&q, D::Minus1).unwrap());
@@ -215,6 +223,36 @@ fn golden_update() {
         let one = std::env::var_os("GOLDEN_DIR").is_some();
         assert!(one || !goldens.is_empty(), "there are no golden folders of {name}");
     }
+}
+
+/// The reverse steps of QUAD's target actor, each by itself.
+#[test]
+fn golden_reverse_steps() -> candle_core::Result<()> {
+    for golden in goldens("quad") {
+        let shape = NoiseShape {
+            observation_dim: golden.count("/observation_dim"),
+            action_dim: golden.count("/action_dim"),
+            layers: serde_json::from_value(golden.config["agent"]["actor"].clone()).unwrap(),
+            diffusion_steps: golden.count("/agent/diffusion_steps"),
+            reverse: Reverse::ClipClean,
+        };
+        let mut state = golden.state.clone();
+        let weights = Weights::take(shape.layout(), &mut state, "target_actor.").unwrap();
+        let actor = NoisePredictor::new(shape.clone(), weights, Precision::F32);
+        let input = |name| golden.input(name, &Device::Cpu);
+        let (observations, actions) = (input("observations"), input("denoise_actions"));
+        let (mut clean, mut mean) = (Vec::new(), Vec::new());
+        for t in 1..=shape.diffusion_steps {
+            let x = actions.get(t - 1)?;
+            let all = Tensor::full(t as u32, x.dim(0)?, &Device::Cpu)?;
+            let epsilon = actor.predict(&observations, &x, &all)?;
+            clean.push(actor.schedule().clean(t, &x, &epsilon)?);
+            mean.push(actor.schedule().reverse(t, &x, &epsilon, None)?);
+        }
+        golden.close("denoise.x0", &Tensor::stack(&clean, 0)?);
+        golden.close("denoise.mean", &Tensor::stack(&mean, 0)?);
+    }
+    Ok(())
 }
 
 #[test]

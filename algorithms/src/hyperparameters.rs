@@ -1,6 +1,6 @@
 //! Types of hyper-parameters that check their range when they are read.
 
-use std::ops::{Deref, RangeInclusive};
+use std::ops::Deref;
 
 use quad_policy::Choice;
 use serde::Deserialize;
@@ -33,18 +33,9 @@ macro_rules! checked {
     };
 }
 
-checked!(
-    /// Neither infinite nor NaN.
-    Finite(f32), |x| x.is_finite(), "finite"
-);
-checked!(
-    /// Above 0 and finite.
-    Positive(f32), |x| x > 0.0 && x.is_finite(), "above 0"
-);
-checked!(
-    /// At least 0 and finite.
-    NotNegative(f32), |x| x >= 0.0 && x.is_finite(), "at least 0"
-);
+checked!(Finite(f32), |x| x.is_finite(), "finite");
+checked!(Positive(f32), |x| x > 0.0 && x.is_finite(), "above 0 and finite");
+checked!(NotNegative(f32), |x| x >= 0.0 && x.is_finite(), "at least 0 and finite");
 checked!(
     /// Within [0, 1]: a discount.
     UnitInterval(f32), |x| (0.0..=1.0).contains(&x), "in [0, 1]"
@@ -53,23 +44,14 @@ checked!(
     /// Within (0, 1]: the rate of an average.
     Rate(f32), |x| x > 0.0 && x <= 1.0, "in (0, 1]"
 );
-checked!(
-    /// Between 0 and 1.
-    OpenUnit(f32), |x| x > 0.0 && x < 1.0, "between 0 and 1"
-);
+checked!(OpenUnit(f32), |x| x > 0.0 && x < 1.0, "between 0 and 1");
 checked!(
     /// A number of things: networks, samples, denoising steps.
-    Count(usize), |x| COUNTS.contains(&x), "a whole number from 1 to 1000"
+    Count(usize), |x| (1..=1000).contains(&x), "a whole number from 1 to 1000"
 );
-checked!(
-    /// A number of gradient steps.
-    Steps(u64), |x| x > 0, "at least 1"
-);
+checked!(Steps(u64), |x| x > 0, "at least 1");
 
 checked!(
     /// Actions that a policy draws in each state.
     Candidates(u32), |x| (1..=Choice::MOST_CANDIDATES).contains(&x), "a whole number from 1 to 10000"
 );
-
-/// Bounds of counts; those of a policy's denoising steps are the same.
-const COUNTS: RangeInclusive<usize> = 1..=1000;

@@ -25,7 +25,7 @@ pub(super) fn lower_bound(values: &Tensor, kappa: f32) -> Result<Tensor> {
     mean - (variance.sqrt()? * f64::from(kappa))?
 }
 
-/// One value of the critics' constant ones, `[K, B]` → `[B]`.
+/// The aggregate of the critics' values, which are constants, `[K, B]` → `[B]`.
 pub(super) fn reduced(values: &Tensor, aggregate: Aggregate) -> Result<Tensor> {
     match aggregate {
         Aggregate::Mean => values.mean(0),
@@ -63,7 +63,6 @@ impl Loss {
 
 /// The numbers of an update's metrics on their device.
 pub(super) struct Computed {
-    /// Names of the scalars.
     names: Vec<&'static str>,
     /// The scalars, then the other numbers, `[n]`.
     pub numbers: Tensor,
@@ -87,7 +86,6 @@ impl Computed {
     }
 }
 
-/// The metrics of some losses.
 pub(super) fn measured(losses: &[Loss]) -> Result<Measured> {
     Ok(Computed::new(losses)?.read()?.0)
 }

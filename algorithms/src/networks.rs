@@ -142,7 +142,6 @@ impl<N: Weighted> Stateful for WithTarget<N> {
 /// Initializes the networks of a run, each from its own random stream.
 pub(super) struct Initializer<'a> {
     pub context: &'a Context,
-    /// Networks so far.
     count: u64,
 }
 

@@ -2,7 +2,9 @@
 
 pub(super) use super::algorithm::{Algorithm, Measured};
 pub(super) use super::context::{Context, Minibatch, select};
-pub(super) use super::definition::{Definition, Metric, Reporting, Variant, metrics, read, start};
+pub(super) use super::definition::{
+    Definition, Metric, Reporting, Variant, metrics, read, read_with, start,
+};
 pub(super) use super::error::{AgentError, AlgorithmError, check};
 pub(super) use super::hyperparameters::{
     Candidates, Count, Finite, NotNegative, OpenUnit, Positive, Rate, Steps, UnitInterval,

@@ -35,7 +35,6 @@ struct Config {
     /// Euler steps of the flow.
     flow_steps: Count,
     learning_rate: Positive,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     /// Chunks drawn to choose from, N, in targets too.
     candidates: Candidates,
@@ -112,8 +111,7 @@ impl Algorithm for Qc {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
         let (flow, critics) = (&self.networks.flow, &self.networks.critic);
-        let shape = ActorCriticShape::of(flow, critics);
-        let tensors = ActorCriticShape::tensors(flow, critics)?;
+        let (shape, tensors) = ActorCriticShape::of(flow, critics)?;
         Ok((PolicyConfig::Flow { shape, flow_steps: *self.config.flow_steps, choice }, tensors))
     }
 

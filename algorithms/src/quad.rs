@@ -77,7 +77,7 @@ impl Quad {
         batch.critic_loss(&networks.critic, &targets)
     }
 
-    /// Behavior cloning (Eq. 5), pulled along the gradients that the critics agree on (Eq. 19).
+    /// Behavior cloning (Eq. 6), pulled along the gradients that the critics agree on (Eq. 19).
     fn actor_loss(
         &self,
         networks: &Networks,
@@ -133,7 +133,7 @@ impl DiffusionUpdate for Quad {
         batch: &Minibatch,
         noise: &Noise,
     ) -> Result<Vec<Loss>> {
-        // Lines 4–7: the critics.
+        // Lines 4–7: the critics, and line 14: their EMA.
         let critic_loss = self.critic_loss(networks, batch, noise)?;
         let critic_norm = networks.critic.minimize_as_set(&critic_loss.value)?;
         networks.critic.soft_update(*self.config.ema_rate)?;
@@ -161,7 +161,7 @@ impl DiffusionUpdate for Quad {
         ])
     }
 
-    /// Line 12, too: the actor's EMA.
+    /// Line 13: the actor's EMA.
     fn end(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
         if step.is_multiple_of(*self.config.actor_ema_every) && step > self.config.actor_ema_start {
             networks.actor.soft_update(*self.config.ema_rate)?;

@@ -9,7 +9,6 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use std::ops::Range;
 
-/// Purpose of a random stream.
 #[derive(Clone, Copy)]
 #[repr(u64)]
 pub(super) enum Purpose {

@@ -4,7 +4,7 @@
 //! equations are that paper's.
 
 use super::prelude::*;
-use super::td3::{BcRegularizer, Common, Td3, read};
+use super::td3::{BcRegularizer, Common, Td3};
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "rebrac",
@@ -12,7 +12,7 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     report: Reporting::PLAIN,
     chunks: false,
-    read: |table| Ok(start(read::<Config>(table)?, Td3::new)),
+    read: |table| Ok(start(read_with::<Common, Config>(table)?, Td3::new)),
 };
 
 const METRICS: &[Metric] = &metrics! {

@@ -1,23 +1,13 @@
 //! RLPD (Ball, Smith, Kostrikov and Levine 2023, "Efficient Online Reinforcement Learning with
 //! Offline Data"): soft actor-critic on batches that are half of the dataset, half of experience,
-//! with an ensemble of critics that have layer norm, and many updates for each environment step. It
-//! learns nothing before practice begins. Its update is its authors' code's.
+//! with an ensemble of critics that have layer norm, and many updates for each environment step. Its
+//! presets have no steps before practice. Its update is its authors' code's.
 
-use super::algorithm::{Algorithm, Measured};
-use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, metrics, read, start};
-use super::error::{AgentError, check};
-use super::hyperparameters::{Count, Positive, Rate, Steps, UnitInterval};
-use super::losses::{Loss, measured, smallest};
-use super::networks::{Initializer, TrainState, WithTarget, networks};
+use super::prelude::*;
 use super::squashed::Squashed;
-use super::state_dict::StateDict;
-use candle_core::{Result, Tensor};
-use quad_nn::{AdamStep, Ensemble, MlpConfig, Tensors, Weights, cosine_decay};
-use quad_policy::{GaussianPolicy, PolicyConfig};
+use quad_nn::Weights;
+use quad_policy::GaussianPolicy;
 use rand::seq::index::sample;
-use serde::Deserialize;
-use toml::Table;
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "rlpd",
@@ -36,7 +26,6 @@ const METRICS: &[Metric] = &metrics! {
     alpha: "α, the weight of the entropy, before its step. Measured in the policy's steps.";
 };
 
-/// RLPD's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
@@ -46,7 +35,6 @@ struct Config {
     critics: Count,
     /// Critics of which the smallest value counts in the target, drawn anew in each step.
     target_critics: Count,
-    /// Discount γ.
     gamma: UnitInterval,
     /// Reward the next action's entropy in the target.
     entropy_backup: bool,
@@ -56,14 +44,13 @@ struct Config {
     learning_rate: Positive,
     /// Let the learning rate fall to 0 along a cosine over the run.
     decay: bool,
-    /// EMA rate of the target critics.
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and α.
     actor_every: Steps,
 }
 
 impl Config {
-    fn read(table: &Table) -> std::result::Result<Self, AgentError> {
+    fn read(table: &toml::Table) -> std::result::Result<Self, AgentError> {
         let config: Self = read(table)?;
         let (of, most) = (*config.target_critics, *config.critics);
         check("target_critics", of, of <= most, "at most agent.critics")?;
@@ -80,7 +67,6 @@ networks! {
     }
 }
 
-/// The random numbers of one update.
 struct Noise {
     /// Noise of the next actions in the target, `[B, 1, a]`.
     next: Tensor,

@@ -10,7 +10,6 @@ use super::gaussian::gaussian_policy;
 use super::networks::{Initializer, TrainState};
 use super::state_dict::{StateDict, Stateful};
 
-/// A squashed Gaussian policy in training.
 pub(super) struct Squashed {
     /// Mean and x of each state, `[n, 2a]`.
     pub network: TrainState<Ensemble>,
@@ -109,7 +108,6 @@ pub(super) struct Drawn {
 }
 
 impl Normal {
-    /// Makes constants of the distributions.
     pub fn detach(&self) -> Self {
         Self { mean: self.mean.detach(), log_std: self.log_std.detach() }
     }

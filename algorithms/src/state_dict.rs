@@ -40,13 +40,11 @@ impl<S: Stateful> Stateful for Option<S> {
 }
 
 impl<'a> StateDict<'a> {
-    /// Adds state under a name.
     pub(super) fn with(mut self, name: &str, state: &'a mut impl Stateful) -> Self {
         state.add_to(&mut self, name);
         self
     }
 
-    /// Adds the weights of a network.
     pub(super) fn weights(&mut self, name: String, weights: &'a mut Weights) {
         self.0.push((name, Entry::Weights(weights)));
     }

@@ -2,16 +2,12 @@
 //! TD3+BC and ReBRAC. Critics move in every step, the policy and the targets in every
 //! `actor_every`-th. An algorithm of this kind is a [`BcRegularizer`].
 
-use super::definition::read_with;
 use super::gaussian::gaussian_policy;
 use super::losses::joined;
 use super::prelude::*;
 use super::state_dict::write;
 use quad_policy::{Spread, gaussian_mean};
-use serde::de::DeserializeOwned;
-use toml::Table;
 
-/// The hyper-parameters that both algorithms have.
 #[derive(Clone, Deserialize)]
 pub(super) struct Common {
     actor: MlpConfig,
@@ -22,18 +18,12 @@ pub(super) struct Common {
     target_noise_limit: NotNegative,
     actor_learning_rate: Positive,
     critic_learning_rate: Positive,
-    /// EMA rate of the target networks.
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and targets.
     actor_every: Steps,
     /// Factor of the policy's distance to the data at the end of practice, toward which it moves
     /// linearly from 1.
     online_cloning: UnitInterval,
-}
-
-/// Reads a table of hyper-parameters with [`Common`]'s among them.
-pub(super) fn read<T: DeserializeOwned>(table: &Table) -> std::result::Result<T, AgentError> {
-    read_with::<Common, T>(table)
 }
 
 /// The hyper-parameters of an algorithm, and its way to keep the policy near the data's actions.

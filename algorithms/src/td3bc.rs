@@ -3,7 +3,7 @@
 //! are that paper's.
 
 use super::prelude::*;
-use super::td3::{BcRegularizer, Common, Td3, read};
+use super::td3::{BcRegularizer, Common, Td3};
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "td3-bc",
@@ -11,7 +11,7 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     report: Reporting::PLAIN,
     chunks: false,
-    read: |table| Ok(start(read::<Config>(table)?, Td3::new)),
+    read: |table| Ok(start(read_with::<Common, Config>(table)?, Td3::new)),
 };
 
 const METRICS: &[Metric] = &metrics! {

@@ -73,7 +73,7 @@ pub enum Activation {
 const GELU_ZERO: f32 = -6.9;
 const GELU_LINEAR: f32 = 5.4;
 
-/// GELU as x·σ(2u), where u is what the tanh is of.
+/// GELU as x·σ(2u), where u is the argument of its tanh.
 #[inline(always)]
 pub(crate) fn gelu_and_slope(x: f32) -> (f32, f32) {
     const TWICE: f32 = 2.0 * 0.797_884_6; // 2·√(2/π)

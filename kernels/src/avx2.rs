@@ -5,7 +5,6 @@ use std::arch::x86_64::{
     _mm256_setzero_ps, _mm256_storeu_ps,
 };
 
-/// Lanes of a register.
 const LANES: usize = 8;
 /// Columns of a block of the result: two registers.
 pub(crate) const COLUMNS: usize = 2 * LANES;

@@ -14,7 +14,6 @@ use std::cell::RefCell;
 
 use crate::level::Level;
 
-/// Lanes of a register.
 pub(crate) const LANES: usize = 16;
 /// Columns of a block of the result: two registers.
 pub(crate) const COLUMNS: usize = 2 * LANES;
@@ -42,7 +41,6 @@ pub(crate) struct Strided<T> {
 /// Two neighboring terms of a sum, rounded to bfloat16.
 type Pair = i32;
 
-/// True if this CPU has AVX512-BF16.
 fn has_bf16() -> bool {
     Level::in_use() == Level::Avx512 && is_x86_feature_detected!("avx512bf16")
 }

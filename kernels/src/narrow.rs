@@ -64,7 +64,6 @@ pub struct FirstLayer<'a> {
 }
 
 impl FirstLayer<'_> {
-    /// The action of a row.
     #[inline(always)]
     fn action(&self, row: usize) -> &[f32] {
         let action_dim = self.kernel.len() / self.shift.len();

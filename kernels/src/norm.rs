@@ -8,7 +8,7 @@ use crate::vectorized::vectorized;
 /// Partial sums side by side: one AVX-512 register of f32.
 const LANES: usize = 16;
 
-/// Numbers saved of a tile.
+/// Length of what is saved of a tile of `rows × width` numbers.
 pub fn saved_len(rows: usize, width: usize) -> usize {
     2 * width + rows * (1 + width)
 }

@@ -27,8 +27,8 @@ pub enum Matrix<'a> {
     TransposeOfColumns(&'a [f32], usize, usize),
 }
 
-/// The crate `gemm` adds by another order in products with a transpose that have no more numbers than
-/// this, or one row.
+/// In a product with a transpose, the crate `gemm` adds in another order where the result has one row
+/// or at most this many numbers.
 const FEW: usize = 256;
 
 /// First element, column stride, row stride.

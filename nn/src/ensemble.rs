@@ -8,7 +8,6 @@ use crate::layers::plain;
 use crate::precision::Precision;
 use crate::shape::EnsembleShape;
 use crate::slices::read_all;
-use crate::statistics::squared_error;
 use crate::weighted::weighted;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Error, Result, Tensor, Var, bail};
@@ -95,16 +94,6 @@ impl Ensemble {
         let shape = (observations.dim(0)?, 0);
         let none = Tensor::zeros(shape, observations.dtype(), observations.device())?;
         self.outputs(observations, &none)
-    }
-
-    /// Mean of (Q_k(s, a) − y)² over members and rows, `[]`, for constant `targets` y `[rows]`.
-    pub fn squared_error(
-        &self,
-        observations: &Tensor,
-        actions: &Tensor,
-        targets: &Tensor,
-    ) -> Result<Tensor> {
-        squared_error(&self.values(observations, actions)?, &targets.detach())
     }
 
     /// ∇_a Q_k(s, a) of each member, `[K, rows, a]`, as constants.

@@ -38,7 +38,6 @@ impl TensorSpec {
         Self { name, shape: shape.to_vec(), init }
     }
 
-    /// Numbers in the tensor.
     pub(crate) fn count(&self) -> usize {
         self.shape.iter().product()
     }
@@ -96,7 +95,7 @@ impl Layout {
         &self.0
     }
 
-    /// Numbers in the vector.
+    /// Numbers in the vector, P.
     pub fn count(&self) -> usize {
         self.0.iter().map(TensorSpec::count).sum()
     }

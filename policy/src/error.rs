@@ -27,9 +27,9 @@ pub enum PolicyError {
         "the scaling of {what} in the file is not {columns} finite offsets and as many finite scales, none below 0"
     )]
     Scaling { what: &'static str, columns: usize },
-    #[error("the softmax's temperature is {0}, but must be above 0")]
+    #[error("the softmax's temperature is {0}, but must be above 0 and finite")]
     Temperature(f32),
-    #[error("the strength of guidance is {0}, but must be a number of at least 0")]
+    #[error("the strength of guidance is {0}, but must be at least 0 and finite")]
     Guidance(f32),
     #[error("guidance takes a diffusion policy with critics, which this is not")]
     NoGuidance,

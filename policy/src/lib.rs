@@ -16,8 +16,6 @@
 mod chunk;
 mod error;
 mod file;
-#[cfg(test)]
-mod golden;
 mod kinds;
 mod policy;
 mod sampling;

@@ -9,7 +9,6 @@ use quad_nn::{Precision, bytes};
 use std::borrow::Cow;
 use std::sync::Arc;
 
-/// Converts observations and actions.
 struct Scaled {
     /// The policy in the networks' units.
     policy: Box<dyn Policy>,
@@ -29,7 +28,6 @@ pub(crate) fn scaled(policy: Box<dyn Policy>, scaling: Scaling) -> Result<Box<dy
     Ok(Box::new(Scaled { policy, scaling: Arc::new(scaling) }))
 }
 
-/// Converts numbers to the network's units.
 fn to_network<'a>(affine: Option<&Affine>, numbers: &'a [f32]) -> Cow<'a, [f32]> {
     let Some(affine) = affine else { return numbers.into() };
     let mut numbers = numbers.to_vec();

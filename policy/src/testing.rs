@@ -94,7 +94,6 @@ pub(crate) fn sample(policy: &dyn Policy, observations: &[f32], seeds: &[u64]) -
     policy.sample(observations, &mut states)
 }
 
-/// Index of the largest value.
 pub(crate) fn argmax(values: &[f32]) -> usize {
     (0..values.len()).max_by(|i, j| values[*i].total_cmp(&values[*j])).unwrap()
 }

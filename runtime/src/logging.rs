@@ -38,8 +38,11 @@ pub fn init_logging() -> Logging {
     let writer =
         NonBlockingBuilder::default().buffered_lines_limit(MOST_WAITING).thread_name("log");
     let (lines, guard) = writer.finish(std::io::stderr());
-    let filter =
-        EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_FILTER));
+    let filter = match env::var_os(EnvFilter::DEFAULT_ENV) {
+        // Says on stderr which parts it ignores.
+        Some(_) => EnvFilter::from_default_env(),
+        None => EnvFilter::new(DEFAULT_FILTER),
+    };
     let variable = |name| env::var_os(name).unwrap_or_default();
     let colors = std::io::stderr().is_terminal()
         && variable("NO_COLOR").is_empty()

@@ -167,8 +167,9 @@ fn own_names(name: &str, resolver: &str) -> Vec<String> {
     };
     let lists = resolver
         .lines()
-        .filter_map(|line| line.strip_prefix("search ").or(line.strip_prefix("domain ")));
-    let domains = lists.flat_map(str::split_whitespace).map(|domain| format!("{first}.{domain}"));
+        .map(str::split_whitespace)
+        .filter_map(|mut words| matches!(words.next(), Some("search" | "domain")).then_some(words));
+    let domains = lists.flatten().map(|domain| format!("{first}.{domain}"));
     domains.chain([first.to_owned(), name.to_owned()]).collect()
 }
 
@@ -202,7 +203,7 @@ mod tests {
 
     #[test]
     fn names_of_this_machine() {
-        let resolver = "nameserver 192.0.2.1\nsearch lab.example.org example.org\n";
+        let resolver = "nameserver 192.0.2.1\nsearch\tlab.example.org example.org\n";
         let own = own_names("box7.lan", resolver);
         for (host, anywhere, on_box7) in [
             ("127.0.0.1:8080", true, true),

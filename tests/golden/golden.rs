@@ -1,4 +1,4 @@
-//! Reads golden folders (tests/golden/README.md); shared by the tests of several crates.
+//! Reads golden folders (tests/golden/README.md).
 
 use candle_core::{DType, Device, Tensor};
 use std::collections::BTreeMap;
@@ -10,16 +10,13 @@ use std::process::Command;
 const TOLERANCE: f32 = 1e-4;
 /// Largest error for numbers of a fresh seed, any of which may happen to lie close to zero. A slip
 /// shows far more.
-#[allow(dead_code)] // not every crate makes some
 const FRESH_TOLERANCE: f32 = 1e-2;
 
 /// The seed of folders that are made for a test. One that never changes, so that a change is what
 /// makes the test fail.
-#[allow(dead_code)] // not every crate makes some
 const FRESH_SEED: &str = "1000";
 
 /// The script that makes golden folders.
-#[allow(dead_code)] // not every crate makes some
 pub const MAKE: &str = "tests/golden/make.py";
 
 /// A golden folder.
@@ -35,7 +32,6 @@ pub struct Golden {
 
 /// Runs a script of the repository that needs JAX; says whether it ran. Without the Python that
 /// deploy/setup.sh --tests sets up it is skipped, unless QUAD_REQUIRE_PEERS=1 asks for it.
-#[allow(dead_code)] // not every crate runs some
 #[allow(clippy::print_stderr)] // what is skipped is said
 pub fn run(script: &str, arguments: &[&str]) -> bool {
     let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
@@ -56,7 +52,6 @@ pub fn run(script: &str, arguments: &[&str]) -> bool {
 }
 
 /// Folders of all variants, of the seed that GOLDEN_SEED names; none where make.py cannot run.
-#[allow(dead_code)] // not every crate makes some
 pub fn fresh() -> Vec<Golden> {
     let seed = std::env::var("GOLDEN_SEED").unwrap_or_else(|_| FRESH_SEED.to_owned());
     let home = std::env::temp_dir().join(format!("golden-{seed}-{}", std::process::id()));

@@ -7,7 +7,6 @@ use quad_dataset::Transitions;
 use quad_nn::Scaling;
 use std::sync::Arc;
 
-/// The windows of a dataset.
 pub(super) struct Windows {
     transitions: Arc<Transitions>,
     /// Steps in a window, H.

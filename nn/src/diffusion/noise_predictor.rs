@@ -39,7 +39,7 @@ impl NoisePredictor {
         let architecture = Architecture {
             time: Mlp::new(shape.time_layers(), "time."),
             trunk: Mlp::new(shape.trunk_layers(), "trunk."),
-            schedule: Schedule::with(shape.diffusion_steps, shape.reverse),
+            schedule: Schedule::new(shape.diffusion_steps, shape.reverse),
             features: (0..=shape.diffusion_steps).flat_map(|t| sinusoids(t as f64)).collect(),
             features_tensor: OnceLock::new(),
             #[cfg(feature = "cuda")]

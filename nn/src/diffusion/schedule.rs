@@ -42,34 +42,18 @@ struct Step {
 }
 
 impl Schedule {
-    /// DAC's "vp": β_t = 1 − exp(−0.1/T − 0.5·(10 − 0.1)·(2t − 1)/T²).
-    pub fn variance_preserving(steps: usize, reverse: Reverse) -> Self {
+    /// The schedule of T steps that goes with a formula. [`Reverse::Cosine`] has ᾱ_t = f(t/T)/f(0)
+    /// with f(x) = cos²(π/2·(x + 0.008)/1.008), each β_t at most 0.999 (Nichol and Dhariwal 2021);
+    /// the others have DAC's "vp": β_t = 1 − exp(−0.1/T − 0.5·(10 − 0.1)·(2t − 1)/T²).
+    pub fn new(steps: usize, reverse: Reverse) -> Self {
         let total = steps as f64;
-        let alpha = |t: usize| {
-            (-0.1 / total - 0.5 * (10.0 - 0.1) * (2 * t - 1) as f64 / (total * total)).exp()
-        };
-        Self::of(steps, reverse, alpha)
-    }
-
-    /// ᾱ_t = f(t/T)/f(0) with f(x) = cos²(π/2·(x + 0.008)/1.008), each β_t at most 0.999 (Nichol
-    /// and Dhariwal 2021); the variance of a reverse step is the posterior's.
-    pub fn cosine(steps: usize) -> Self {
         let f = |t: usize| {
-            ((t as f64 / steps as f64 + 0.008) / 1.008 * std::f64::consts::FRAC_PI_2).cos().powi(2)
+            ((t as f64 / total + 0.008) / 1.008 * std::f64::consts::FRAC_PI_2).cos().powi(2)
         };
-        Self::of(steps, Reverse::Cosine, |t| (f(t) / f(t - 1)).max(0.001))
-    }
-
-    /// The schedule that goes with a formula.
-    pub fn with(steps: usize, reverse: Reverse) -> Self {
-        match reverse {
-            Reverse::Cosine => Self::cosine(steps),
-            _ => Self::variance_preserving(steps, reverse),
-        }
-    }
-
-    /// The schedule with these α_t for t = 1..T.
-    fn of(steps: usize, reverse: Reverse, alpha: impl Fn(usize) -> f64) -> Self {
+        let alpha = |t: usize| match reverse {
+            Reverse::Cosine => (f(t) / f(t - 1)).max(0.001),
+            _ => (-0.1 / total - 0.5 * (10.0 - 0.1) * (2 * t - 1) as f64 / (total * total)).exp(),
+        };
         let mut before = 1.0; // ᾱ_{t-1}
         let step = |t: usize| {
             let alpha = alpha(t);

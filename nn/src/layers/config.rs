@@ -6,7 +6,6 @@ use quad_kernels::activation::Activation;
 use serde::de::{Deserializer, Error};
 use serde::{Deserialize, Serialize};
 
-/// Largest number of hidden layers.
 const MOST_LAYERS: usize = 64;
 
 /// A network's hidden layers, as in a configuration or a policy's file.
@@ -47,7 +46,6 @@ pub enum NormEpsilon {
 }
 
 impl NormEpsilon {
-    /// ε as a number.
     pub(crate) fn value(self) -> f64 {
         match self {
             Self::Flax => 1e-6,
@@ -109,7 +107,6 @@ impl MlpConfig {
         Self { initial: self.initial, ..Self::mish(&[width]) }
     }
 
-    /// Width of the widest hidden layer.
     pub(crate) fn widest(&self) -> usize {
         self.hidden.iter().copied().max().unwrap_or(1)
     }

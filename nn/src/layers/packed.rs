@@ -9,7 +9,6 @@ use quad_kernels::product::Packed;
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 
-/// The packed kernels of some networks.
 pub(crate) struct Packing {
     pub precision: Precision,
     /// Set without waiting for another thread: a thread that waits in rayon for its own packing can
@@ -18,7 +17,6 @@ pub(crate) struct Packing {
 }
 
 impl Packing {
-    /// No kernels yet.
     pub fn new(precision: Precision) -> Self {
         Self { precision, kernels: OnceLock::new() }
     }

@@ -40,7 +40,6 @@ pub(crate) fn layer_norm(
     centered.broadcast_div(&deviation)?.broadcast_mul(scale)?.broadcast_add(shift)
 }
 
-/// A tensor by its name.
 pub(crate) fn named(weights: &Tensors, path: String) -> Result<&Tensor> {
     weights.get(&path).ok_or_else(|| Error::CannotFindTensor { path }.bt())
 }

@@ -23,7 +23,6 @@ pub(crate) struct Workspace {
     pub output: Buffer,
     /// State part of the first layer.
     base: Buffer,
-    /// Network output.
     out: Buffer,
     x: Vec<Buffer>,
     slope: Vec<Buffer>,

@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 
 /// Kernel size of a block's convolutions.
 const TAPS: usize = 5;
-/// Largest number of levels.
 const MOST_LEVELS: usize = 8;
 /// Longest trajectory.
 const MOST_STEPS: usize = 1000;
@@ -36,7 +35,7 @@ pub struct TrajectoryConfig {
 pub struct Attention {
     /// Number of heads.
     pub heads: usize,
-    /// Length of a query.
+    /// Length of each head's queries, keys and values.
     pub width: usize,
 }
 
@@ -44,6 +43,7 @@ pub struct Attention {
 #[derive(Debug, PartialEq, Eq)]
 #[allow(missing_docs)] // The names say it.
 pub struct TrajectoryError {
+    /// The key in `[agent]` and in a policy's file, such as `network.horizon`.
     pub field: &'static str,
     pub value: usize,
     pub range: &'static str,
@@ -60,28 +60,28 @@ impl TrajectoryConfig {
         };
         let up_to =
             |field, value, most, range| is(field, value, (1..=most).contains(&value), range);
-        up_to("multipliers", levels, MOST_LEVELS, "1 to 8 numbers")?;
-        up_to("groups", groups, MAX_DIM, "from 1 to 65535")?;
+        up_to("network.multipliers", levels, MOST_LEVELS, "1 to 8 numbers")?;
+        up_to("network.groups", groups, MAX_DIM, "from 1 to 65535")?;
         let even = (4..=MAX_DIM).contains(&channels) && channels.is_multiple_of(2);
         let range = "an even number from 4 to 65535";
-        is("channels", channels, even, range)?;
+        is("network.channels", channels, even, range)?;
         let halves = horizon.is_multiple_of(1 << (levels - 1));
         let holds = (1..=MOST_STEPS).contains(&horizon) && halves;
-        let range = "from 1 to 1000 and halved once for each further level";
-        is("horizon", horizon, holds, range)?;
+        let range = "from 1 to 1000 and a multiple of 2^(number of multipliers − 1)";
+        is("network.horizon", horizon, holds, range)?;
         for multiplier in &self.multipliers {
             let wide = channels.saturating_mul(*multiplier);
             let holds = (1..=MAX_DIM).contains(&wide) && wide.is_multiple_of(groups);
-            let range = "such that channels times it is at most 65535 and divided by groups";
-            is("multipliers", *multiplier, holds, range)?;
+            let range = "such that channels × it is at most 65535 and a multiple of groups";
+            is("network.multipliers", *multiplier, holds, range)?;
         }
-        let last = self.widths().last().copied().unwrap_or_default();
-        let range = "such that a quarter of the last level's channels is divided by groups";
-        is("multipliers", last, last.is_multiple_of(4 * groups), range)?;
+        let last = self.multipliers[levels - 1];
+        let range = "such that channels × the last is a multiple of 4 × groups";
+        is("network.multipliers", last, (channels * last).is_multiple_of(4 * groups), range)?;
         if let Some(Attention { heads, width }) = self.attention {
-            up_to("heads", heads, MAX_DIM, "from 1 to 65535")?;
+            up_to("network.attention.heads", heads, MAX_DIM, "from 1 to 65535")?;
             let range = "at least 1, and with the heads at most 65535";
-            up_to("width", width, MAX_DIM / heads, range)?;
+            up_to("network.attention.width", width, MAX_DIM / heads, range)?;
         }
         Ok(())
     }
@@ -198,15 +198,17 @@ mod tests {
             change(&mut config);
             assert_eq!(config.check().unwrap_err().field, field);
         };
-        refused("multipliers", |config| config.multipliers.clear());
-        refused("multipliers", |config| config.multipliers = vec![1, 1]);
-        refused("multipliers", |config| config.multipliers[1] = usize::MAX);
-        refused("multipliers", |config| config.multipliers[1] = 0);
-        refused("groups", |config| config.groups = 0);
-        refused("channels", |config| config.channels = 7);
-        refused("horizon", |config| config.horizon = 18);
-        refused("horizon", |config| config.horizon = 0);
-        refused("heads", |config| config.attention.as_mut().unwrap().heads = 0);
-        refused("width", |config| config.attention.as_mut().unwrap().width = usize::MAX);
+        refused("network.multipliers", |config| config.multipliers.clear());
+        refused("network.multipliers", |config| config.multipliers = vec![1, 1]);
+        refused("network.multipliers", |config| config.multipliers[1] = usize::MAX);
+        refused("network.multipliers", |config| config.multipliers[1] = 0);
+        refused("network.groups", |config| config.groups = 0);
+        refused("network.channels", |config| config.channels = 7);
+        refused("network.horizon", |config| config.horizon = 18);
+        refused("network.horizon", |config| config.horizon = 0);
+        refused("network.attention.heads", |config| config.attention.as_mut().unwrap().heads = 0);
+        refused("network.attention.width", |config| {
+            config.attention.as_mut().unwrap().width = usize::MAX
+        });
     }
 }

@@ -11,7 +11,6 @@ use candle_core::{Device, Result, Tensor};
 /// Number added to the variance of attention's layer norm.
 const EPSILON: f64 = 1e-5;
 
-/// The layers of one network.
 pub(crate) struct Layers<'a> {
     tensors: Tensors,
     config: &'a TrajectoryConfig,
@@ -67,7 +66,6 @@ impl<'a> Layers<'a> {
         normed_mish(&x, scale, shift, self.config.groups)
     }
 
-    /// A residual block.
     pub fn block(&self, name: &str, x: &Tensor, time: &Time) -> Result<Tensor> {
         let of_time = self.linear(&format!("{name}.time"), &time.activated)?;
         let inside = self.normed(&format!("{name}.0"), x)?.broadcast_add(&of_time)?;

@@ -33,23 +33,19 @@ impl ActorCriticShape {
         EnsembleShape::critics(self.critics, dims, &self.critic)
     }
 
-    /// The shape of a policy of these networks.
-    pub fn of(actor: &Ensemble, critics: &Ensemble) -> Self {
+    /// The shape of a policy of these networks, and the tensors of its file.
+    pub fn of(actor: &Ensemble, critics: &Ensemble) -> candle_core::Result<(Self, Tensors)> {
+        let mut tensors = actor.weights().tensors(ACTOR)?;
+        tensors.extend(critics.weights().tensors(CRITIC)?);
         let shape = critics.shape();
-        Self {
+        let shape = Self {
             observation_dim: shape.observation_dim,
             action_dim: shape.action_dim,
             actor: actor.shape().layers.clone(),
             critic: shape.layers.clone(),
             critics: shape.members,
-        }
-    }
-
-    /// The tensors of a policy's file.
-    pub fn tensors(actor: &Ensemble, critics: &Ensemble) -> candle_core::Result<Tensors> {
-        let mut tensors = actor.weights().tensors(ACTOR)?;
-        tensors.extend(critics.weights().tensors(CRITIC)?);
-        Ok(tensors)
+        };
+        Ok((shape, tensors))
     }
 
     /// Loads a policy, removing its tensors from `tensors`.

@@ -173,7 +173,6 @@ impl Policy for GaussianPolicy {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use crate::file::PolicyConfig;

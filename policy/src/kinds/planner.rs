@@ -4,7 +4,7 @@
 use crate::error::{PolicyError, check_dims, check_range};
 use candle_core::{Device, Error, Result, Tensor, Var};
 use quad_kernels::scaling::Scaling;
-use quad_nn::{Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, read};
+use quad_nn::{Reverse, Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, read};
 use serde::{Deserialize, Serialize};
 
 /// Bound of the denoising steps, and of the steps of guidance in each.
@@ -93,7 +93,7 @@ pub fn with_first_state(x: &Tensor, states: &Tensor) -> Result<Tensor> {
 impl Planner {
     /// A planner with networks of the shape.
     pub fn new(shape: DiffuserShape, model: TrajectoryModel, value: TrajectoryValue) -> Self {
-        let schedule = Schedule::cosine(shape.diffusion_steps);
+        let schedule = Schedule::new(shape.diffusion_steps, Reverse::Cosine);
         Self { shape, schedule, model, value }
     }
 

@@ -81,7 +81,6 @@ impl ScorePolicy {
     }
 }
 
-/// A score network and its solver.
 struct ScoreActor {
     network: ScoreNetwork,
     solver: DpmSolver,

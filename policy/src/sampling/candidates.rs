@@ -72,32 +72,29 @@ impl CandidatePolicy {
         guided.filter(|_| self.choice.guidance != 0.0)
     }
 
-    /// Draws the noise of all candidates, `noise vectors × states × candidates × action_dim`.
-    fn draw_noise(&self, states: &mut [EpisodeState]) -> Vec<f32> {
-        let (n, row) = (states.len(), self.choice.candidates as usize * self.action_dim());
-        let noises = self.networks.actor.noise_vectors();
+    /// The observations, `[states, o]`, and candidates drawn for them, `[states·candidates, a]`.
+    fn candidates(
+        &self,
+        observations: &[f32],
+        states: &mut [EpisodeState],
+    ) -> Result<(Tensor, Tensor)> {
+        let Networks { actor, .. } = &*self.networks;
+        let ((observation_dim, action_dim), noises) = (actor.dims(), actor.noise_vectors());
+        let (n, candidates) = (states.len(), self.choice.candidates as usize);
+        let row = candidates * action_dim;
         let mut noise = vec![0.0; noises * n * row];
         for (i, state) in states.iter_mut().enumerate() {
             for number in 0..noises {
                 state.fill_normal(&mut noise[(number * n + i) * row..][..row]);
             }
         }
-        noise
-    }
-
-    /// The observations, `[states, o]`, and their candidates, `[states·candidates, a]`, from noise.
-    fn candidates(&self, observations: &[f32], noise: Vec<f32>) -> Result<(Tensor, Tensor)> {
-        let (observation_dim, action_dim) = self.networks.actor.dims();
-        let states = observations.len() / observation_dim;
-        let rows = states * self.choice.candidates as usize;
-        let observations =
-            Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
-        let noise = Tensor::from_vec(noise, ((), rows, action_dim), &Device::Cpu)?;
+        let observations = Tensor::from_slice(observations, (n, observation_dim), &Device::Cpu)?;
+        let noise = Tensor::from_vec(noise, (noises, n * candidates, action_dim), &Device::Cpu)?;
         let drawn = match self.guided() {
             Some((actor, critics)) => {
                 actor.sample_guided(&observations, &noise, critics, self.choice.guidance)?
             }
-            None => self.networks.actor.draw(&observations, &noise)?,
+            None => actor.draw(&observations, &noise)?,
         };
         Ok((observations, drawn))
     }
@@ -109,17 +106,6 @@ impl CandidatePolicy {
         let critics = self.networks.critics.as_ref().ok_or(PolicyError::NoCritics)?;
         let values = critics.values(observations, actions)?;
         Ok(read(&values, |values: &[f32]| self.choice.aggregate.reduce(values, rows))?)
-    }
-
-    /// Draws candidates, `states × candidates × action_dim`, and their scores, `states × candidates`,
-    /// which are 0 for a single candidate.
-    pub fn draw(&self, observations: &[f32], noise: Vec<f32>) -> Result<(Vec<f32>, Vec<f32>)> {
-        let (observations, drawn) = self.candidates(observations, noise)?;
-        let scores = match self.choice.candidates {
-            1 => vec![0.0; drawn.dim(0)?],
-            _ => self.scores(&observations, &drawn)?,
-        };
-        Ok((read(&drawn, <[f32]>::to_vec)?, scores))
     }
 
     /// The numbers that the choice's rule compares: values Q, or −(Q − V)² for the rule `nearest`.
@@ -193,7 +179,12 @@ impl Policy for CandidatePolicy {
         actions: &mut [f32],
     ) -> Result<()> {
         let (action_dim, candidates) = (self.action_dim(), self.choice.candidates as usize);
-        let (drawn, scores) = self.draw(observations, self.draw_noise(states))?;
+        let (observations, drawn) = self.candidates(observations, states)?;
+        let scores = match candidates {
+            1 => vec![0.0; states.len()], // not compared
+            _ => self.scores(&observations, &drawn)?,
+        };
+        let drawn = read(&drawn, <[f32]>::to_vec)?;
         let drawn = drawn.chunks_exact(candidates * action_dim);
         let of_states = drawn.zip(scores.chunks_exact(candidates)).zip(states);
         for (action, ((drawn, scores), state)) in
@@ -205,7 +196,7 @@ impl Policy for CandidatePolicy {
     }
 
     fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Samples> {
-        let (observations, drawn) = self.candidates(observations, self.draw_noise(states))?;
+        let (observations, drawn) = self.candidates(observations, states)?;
         let values = self.values(&observations, &drawn)?;
         let actions = read(&drawn, <[f32]>::to_vec)?;
         check_numbers("a sampled action", &actions)?;

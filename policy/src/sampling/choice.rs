@@ -207,7 +207,6 @@ fn draw_several(
 impl FromStr for Aggregate {
     type Err = &'static str;
 
-    /// Parses the form of [`Display`](fmt::Display).
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let kappa =
             text.strip_prefix("mean-minus-std:").and_then(|kappa| kappa.parse::<f32>().ok());
@@ -248,7 +247,6 @@ impl fmt::Display for Aggregate {
 impl FromStr for Rule {
     type Err = &'static str;
 
-    /// Parses the form of [`Display`](fmt::Display).
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let expected = "one of best, softmax:TEMPERATURE, average:TEMPERATURE:ACTIONS and nearest";
         let temperature = |text: &str| text.parse().map_err(|_| expected);
