@@ -17,7 +17,6 @@ pub struct Metrics {
     pub environment_steps: IntCounter,
     pub snapshots_received: IntCounter,
     pub episode_score: Histogram,
-    pub practice_episodes: IntCounter,
     pub practice_rows: IntCounter,
     pub job_duration: Histogram,
     pub select_seconds: Counter,
@@ -49,7 +48,7 @@ impl Metrics {
         };
         let received = "Weight snapshots received whole and verified";
         let score = "Normalized score of each scored episode";
-        let practiced = "Practice episodes that a learner has acknowledged";
+        let practiced = "Environment steps of practice that a learner has acknowledged";
         let duration = "Time from the beginning of a job's episodes to the end of the last";
         let rejected = "Messages from the wire that were not used, by reason";
         let runs = IntGauge::with_opts(opts("runs", "Runs that are being served"))?;
@@ -58,8 +57,7 @@ impl Metrics {
             environment_steps: count("environment_steps_total", "Environment steps taken")?,
             snapshots_received: count("snapshots_received_total", received)?,
             episode_score: histogram("episode_score", score, SCORE_BUCKETS)?,
-            practice_episodes: count("practice_episodes_total", practiced)?,
-            practice_rows: count("practice_rows_total", "Their environment steps")?,
+            practice_rows: count("practice_rows_total", practiced)?,
             job_duration: histogram("job_duration_seconds", duration, SECONDS_BUCKETS)?,
             select_seconds: seconds("select_seconds_total", "Time spent choosing actions")?,
             physics_seconds: seconds("physics_seconds_total", "Time spent in the physics")?,
@@ -79,7 +77,7 @@ impl Metrics {
         self.jobs.with_label_values(&["scored"]).inc();
     }
 
-    /// Counts a practice job whose episodes the learner acknowledged.
+    /// Counts a practice job whose episode the learner acknowledged.
     pub fn job_practiced(&self) {
         self.jobs.with_label_values(&["practiced"]).inc();
     }

@@ -323,7 +323,6 @@ async fn deliver_episode(
             PieceReply::Recorded { duplicate, .. } => {
                 let rows = parcel.rows;
                 info!(%run, step, seed, rows, duplicate, "an episode of practice delivered");
-                metrics.practice_episodes.inc();
                 metrics.practice_rows.inc_by(rows);
                 metrics.job_practiced();
                 return Ok(None);

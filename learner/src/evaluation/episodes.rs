@@ -135,11 +135,6 @@ impl Evaluation {
         self.given_up.iter().map(|&index| self.episodes[index].seed)
     }
 
-    /// Hands out an episode once more, whose evaluator is slow.
-    pub fn hand_out_again(&mut self, job: u64) -> Vec<u64> {
-        self.give(job, Vec::from_iter(self.handed_out.iter().copied()))
-    }
-
     /// Hands out episodes that wait and do not rest. After a failure `few` at most, in case the
     /// episode is its cause.
     pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2], now: Instant) -> Vec<u64> {
@@ -147,10 +142,6 @@ impl Evaluation {
         let mut ready = ready.filter(|&index| !self.episodes[index].rests(now)).peekable();
         let lost = ready.peek().is_some_and(|&index| self.episodes[index].lost > 0);
         let indices = Vec::from_iter(ready.take(if lost { few } else { most }));
-        self.give(job, indices)
-    }
-
-    fn give(&mut self, job: u64, indices: Vec<usize>) -> Vec<u64> {
         let give = |index| {
             self.set_state(index, EpisodeState::HandedOut { job });
             self.episodes[index].seed

@@ -58,25 +58,22 @@ fn an_episode_is_played_until_it_is_recorded_and_counts_once() {
     assert_eq!(bench.board.practice(102), None);
 }
 
+/// Of two robots at one episode, the rows of one would be lost.
 #[test]
-fn the_episode_that_the_learner_waits_for_goes_to_a_second_evaluator_if_the_first_is_slow() {
+fn an_episode_is_one_evaluators_as_long_as_it_advances() {
     let mut bench = Bench::new();
-    bench.present = 4;
     bench.board.open_practice(&opening(0), hash(500));
     let slow = bench.job("slow", 0);
-    for evaluator in ["a", "b", "c"] {
-        // They have all that waits.
-        while let Claimed::Job { job, .. } = bench.claim(evaluator, 1, 0) {
+    for seconds in (5..60).step_by(5) {
+        bench.progress(&progress(&slow, "slow", seconds), seconds).unwrap();
+        assert_eq!(bench.expire(seconds), 0);
+        if let Claimed::Job { job, .. } = bench.claim("a", seconds, seconds) {
             assert_eq!(job.practice, None);
-            bench.deliver(&full_report(&job, evaluator)).unwrap();
+            bench.deliver(&full_report(&job, "a")).unwrap();
         }
     }
-    bench.progress(&progress(&slow, "slow", 5), 15).unwrap();
-    assert!(matches!(bench.claim("a", 2, 19), Claimed::Wait(_)));
-    let second = bench.job("a", 20);
-    assert_eq!((&second.seeds, second.practice), (&slow.seeds, slow.practice));
-    assert!(matches!(bench.claim("b", 2, 60), Claimed::Wait(_)), "two are enough");
-    assert_eq!(bench.board.record_practice(100, hash(7)), 2);
+    assert_eq!(bench.expire(65), 1);
+    assert_eq!(bench.job("a", 65).seeds, slow.seeds);
 }
 
 #[test]
@@ -117,15 +114,14 @@ fn between_two_episodes_evaluators_ask_more_often_than_after_the_last() {
 }
 
 #[test]
-fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
+fn after_the_end_of_practice_no_episode_is_handed_out_and_what_was_open_is_accepted() {
     let mut bench = bench();
     bench.job("a", 0);
     bench.board.expect_practice(102);
     bench.board.end_practice();
     assert_eq!(bench.job("b", 0).practice, None);
     assert_eq!(bench.board.validate_practice(0, &episode(100)), Ok(()));
-    assert_eq!(bench.board.validate_practice(1, &episode(101)), Err(Refusal::Practice(101)));
-    assert_eq!([101, 102].map(|seed| bench.board.practice(seed)), [None; 2]);
+    assert_eq!(bench.board.practice(102), None, "it is not waited for any more");
     bench.leave("a", 1);
     assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }
