@@ -67,7 +67,7 @@ impl Experience {
     /// Answers each piece. Episodes that are complete are written together first.
     pub fn receive(
         &mut self,
-        pieces: impl Iterator<Item = (Request, Piece)>,
+        pieces: Vec<(Request, Piece)>,
         disk: &mut DiskStatus,
         beat: &Heartbeat,
     ) {
@@ -141,11 +141,7 @@ impl Experience {
             }
             (*hash, *bytes) = none();
         }
-        if offset > bytes.len() {
-            return at(bytes.len());
-        }
-        if offset + piece.bytes.len() > bytes.len() {
-            bytes.truncate(offset);
+        if offset == bytes.len() {
             bytes.extend_from_slice(&piece.bytes);
         }
         if bytes.len() < piece.length as usize {

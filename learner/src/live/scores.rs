@@ -59,21 +59,20 @@ impl Scores {
                     Delivery::End => ended = true,
                 }
             }
-            self.record(reports.into_iter(), beat);
-            if let Some(experience) = &mut self.experience {
-                experience.receive(pieces.into_iter(), &mut self.disk, beat);
-                continue;
-            }
-            // Evaluators owe them to an earlier run of this name.
-            for (request, piece) in pieces {
-                refuse(request, &Refusal::Practice(piece.seed).into(), &self.coordinator);
+            self.record(reports, beat);
+            match &mut self.experience {
+                Some(experience) => experience.receive(pieces, &mut self.disk, beat),
+                // Evaluators owe them to an earlier run of this name.
+                None => pieces.into_iter().for_each(|(request, piece)| {
+                    refuse(request, &Refusal::Practice(piece.seed).into(), &self.coordinator);
+                }),
             }
         }
         Ok(())
     }
 
     /// Writes the new scores of reports, and answers each report.
-    fn record(&mut self, reports: impl Iterator<Item = (Request, ScoreReport)>, beat: &Heartbeat) {
+    fn record(&mut self, reports: Vec<(Request, ScoreReport)>, beat: &Heartbeat) {
         // Step and seed of the scores to write: a second score of an episode is a duplicate.
         let mut seen = BTreeSet::new();
         let (mut batch, mut lines) = (Vec::new(), Vec::new());
