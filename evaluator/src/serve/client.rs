@@ -92,7 +92,7 @@ impl RunClient {
     /// two learners of one name, the later one stops.
     pub fn follow(&mut self, incarnations: &BTreeSet<u64>) {
         if self.gone.take().is_some() {
-            self.turn.wake(Instant::now());
+            self.turn = Turn::new(Instant::now());
         }
         if let Some(&first) = incarnations.first()
             && !incarnations.contains(&self.connection.incarnation)
@@ -116,7 +116,7 @@ impl RunClient {
         debug!(run = %self.connection.run, incarnation, "following a learner");
         self.connection.incarnation = incarnation;
         self.listener.follow(incarnation);
-        self.turn.wake(Instant::now());
+        self.turn = Turn::new(Instant::now());
     }
 
     /// Makes the run due if its learner has published a snapshot.
@@ -152,7 +152,7 @@ impl RunClient {
                 let pause = Duration::from_millis(milliseconds).clamp(PAUSE[0], PAUSE[1]);
                 // Spreads out evaluators that a snapshot has woken together.
                 let pause = pause.mul_f64(rand::random_range(0.5..1.0));
-                self.turn.done(Instant::now(), pause);
+                self.turn = Turn::new(Instant::now() + pause);
                 None
             }
             JobReply::HandedBack { .. } => None,
@@ -202,7 +202,7 @@ impl RunClient {
         let Some(refused) = refused else {
             self.claimed = None;
             self.last_warning.clear();
-            self.turn.done(Instant::now(), Duration::ZERO);
+            self.turn = Turn::new(Instant::now());
             return Ok(());
         };
         warn!(%run, step, "the learner {refused}");

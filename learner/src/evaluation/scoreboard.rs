@@ -319,14 +319,9 @@ impl Scoreboard {
         lost
     }
 
-    /// Takes back the job of an evaluator that has left.
-    pub fn evaluator_left(&mut self, evaluator: &Name, now: Instant) -> Lost {
-        self.release(evaluator, Some(now))
-    }
-
-    /// Ends the job of an evaluator, if it has one. Its episodes wait for the next job, except those
-    /// that are given up.
-    fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Lost {
+    /// Ends the job of an evaluator, if it has one, which may be `lost` now. Its episodes wait for the
+    /// next job, except those that are given up.
+    pub fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Lost {
         let Some(OpenJob { key, job, .. }) = self.jobs.remove(evaluator) else {
             return Lost::default();
         };

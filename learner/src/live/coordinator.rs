@@ -242,7 +242,7 @@ impl Coordinator {
     /// Records that an evaluator has left; its job becomes free for others.
     pub fn left(&self, evaluator: &Name) {
         let mut state = self.lock();
-        let lost = state.scoreboard.evaluator_left(evaluator, Instant::now());
+        let lost = state.scoreboard.release(evaluator, Some(Instant::now()));
         state.evaluators.left(evaluator, lost.jobs > 0);
         self.lost(&state, &lost);
     }
@@ -273,12 +273,6 @@ impl Coordinator {
         self.count(&state);
         let (incarnation, new) = (self.rules.incarnation, new.len() as u32);
         ScoreReply::Recorded { incarnation, new, duplicates: *duplicates }
-    }
-
-    /// The answer to a report that the learner will never accept.
-    pub fn refused(&self, refusal: Refusal) -> ScoreReply {
-        let incarnation = self.rules.incarnation;
-        ScoreReply::Refused { incarnation, reason: refusal.to_string() }
     }
 
     /// Takes back jobs whose lease has expired. Call it several times a second.

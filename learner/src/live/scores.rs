@@ -7,7 +7,7 @@
 use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 
-use quad_protocol::{Piece, ScoreReport};
+use quad_protocol::{Piece, ScoreReply, ScoreReport};
 use quad_run::folder::{Log, ScoreLine};
 use quad_runtime::Heartbeat;
 
@@ -81,7 +81,9 @@ impl Scores {
                 Ok(validated) => validated,
                 Err(refusal) => {
                     self.coordinator.metrics.reject(refusal.label());
-                    request.reply(&self.coordinator.refused(refusal));
+                    let (incarnation, reason) =
+                        (self.coordinator.incarnation(), refusal.to_string());
+                    request.reply(&ScoreReply::Refused { incarnation, reason });
                     continue;
                 }
             };
