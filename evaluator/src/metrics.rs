@@ -72,25 +72,10 @@ impl Metrics {
         Ok(metrics)
     }
 
-    /// Counts a job whose scores the learner acknowledged.
-    pub fn job_scored(&self) {
-        self.jobs.with_label_values(&["scored"]).inc();
-    }
-
-    /// Counts a practice job whose episode the learner acknowledged.
-    pub fn job_practiced(&self) {
-        self.jobs.with_label_values(&["practiced"]).inc();
-    }
-
-    /// Counts a job that the leaving evaluator hands back, or whose results the learner refused or
-    /// never fetched.
-    pub fn job_abandoned(&self) {
-        self.jobs.with_label_values(&["abandoned"]).inc();
-    }
-
-    /// Counts a job whose weights, environment or policy failed.
-    pub fn job_failed(&self) {
-        self.jobs.with_label_values(&["failed"]).inc();
+    /// Counts a job by its end: `scored` or `practiced` if the learner acknowledged the results,
+    /// `abandoned` if it refused or never fetched them or this evaluator leaves, else `failed`.
+    pub fn job(&self, outcome: &'static str) {
+        self.jobs.with_label_values(&[outcome]).inc();
     }
 
     /// Counts a message that the evaluator did not use. The reasons are a fixed list, because the

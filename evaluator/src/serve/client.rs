@@ -42,7 +42,7 @@ struct Claimed {
 }
 
 pub struct RunClient {
-    connection: Connection,
+    pub connection: Connection,
     snapshots: Snapshots,
     listener: Listener,
     /// Number of the claim that has no answer yet.
@@ -168,10 +168,6 @@ impl RunClient {
         }
     }
 
-    pub fn publish_progress(&self, job: &Job, steps: u64, episodes: u32) {
-        self.connection.publish_progress(job, steps, episodes);
-    }
-
     pub fn has_job(&self) -> bool {
         self.claimed.is_some()
     }
@@ -206,7 +202,7 @@ impl RunClient {
             return Ok(());
         };
         warn!(%run, step, "the learner {refused}");
-        connection.metrics.job_abandoned();
+        connection.metrics.job("abandoned");
         self.return_job(Some(format!("it {refused}")));
         self.hand_back(timeout).await
     }
@@ -214,7 +210,7 @@ impl RunClient {
     /// Hands back the claimed job, which this evaluator could not run; if there is no answer,
     /// [`deliver`](Self::deliver) tries again.
     pub async fn fail(&mut self, reason: &str) {
-        self.connection.metrics.job_failed();
+        self.connection.metrics.job("failed");
         self.return_job(Some(reason.chars().take(MAX_REASON_LEN).collect()));
         if let Err(error) = self.hand_back(ANSWER_TIMEOUT).await {
             debug!(run = %self.connection.run, "{error}");
@@ -278,7 +274,7 @@ impl RunClient {
         self.snapshots.forget(run);
         if let Some(Claimed { job, owed: Some(_), .. }) = &self.claimed {
             warn!(%run, step = job.step, "the learner did not return; its results are dropped");
-            metrics.job_abandoned();
+            metrics.job("abandoned");
         }
     }
 }
@@ -298,7 +294,7 @@ async fn deliver_scores(
             scores.for_each(|score| metrics.episode_score.observe(score));
             let step = report.step;
             info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
-            metrics.job_scored();
+            metrics.job("scored");
             None
         }
         ScoreReply::Refused { reason, .. } => Some(format!("refused the scores: {reason}")),
@@ -324,7 +320,7 @@ async fn deliver_episode(
                 let rows = parcel.rows;
                 info!(%run, step, seed, rows, duplicate, "an episode of practice delivered");
                 metrics.practice_rows.inc_by(rows);
-                metrics.job_practiced();
+                metrics.job("practiced");
                 return Ok(None);
             }
             PieceReply::Refused { reason, .. } => {
