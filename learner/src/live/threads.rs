@@ -78,16 +78,7 @@ impl Threads {
             resume(&mut agent, &checkpoint)?;
         }
         let transitions = agent.transitions().clone();
-        let rules = Rules {
-            run: incarnation.run.clone(),
-            incarnation: incarnation.number,
-            task: run.task,
-            seed: experiment.seed,
-            dims: (transitions.observation_dim(), transitions.action_dim()),
-            episodes: experiment.episodes,
-            job_episodes: JOB_EPISODES,
-            lease: LEASE,
-        };
+        let rules = rules(&incarnation, experiment, run.task, &transitions);
         let coordinator = Coordinator::new(rules, earlier, metrics.clone(), events.clone());
         let schedule = experiment.schedule();
         for (&step, &hash) in known.iter().filter(|(step, _)| schedule.is_evaluated(**step)) {
@@ -155,6 +146,24 @@ impl Threads {
         self.snapshots.join().ok();
         self.services.deliveries.send(Delivery::End).ok();
         self.scores.join().ok();
+    }
+}
+
+fn rules(
+    Incarnation { run, number }: &Incarnation,
+    experiment: &Experiment,
+    task: Task,
+    transitions: &Transitions,
+) -> Rules {
+    Rules {
+        run: run.clone(),
+        incarnation: *number,
+        task,
+        seed: experiment.seed,
+        dims: (transitions.observation_dim(), transitions.action_dim()),
+        episodes: experiment.episodes,
+        job_episodes: JOB_EPISODES,
+        lease: LEASE,
     }
 }
 
