@@ -17,7 +17,6 @@ pub struct Metrics {
     pub environment_steps: IntCounter,
     pub snapshots_received: IntCounter,
     pub episode_score: Histogram,
-    pub practice_episodes: IntCounter,
     pub practice_rows: IntCounter,
     pub job_duration: Histogram,
     pub select_seconds: Counter,
@@ -49,7 +48,7 @@ impl Metrics {
         };
         let received = "Weight snapshots received whole and verified";
         let score = "Normalized score of each scored episode";
-        let practiced = "Practice episodes that a learner has acknowledged";
+        let practiced = "Environment steps of practice that a learner has acknowledged";
         let duration = "Time from the beginning of a job's episodes to the end of the last";
         let rejected = "Messages from the wire that were not used, by reason";
         let runs = IntGauge::with_opts(opts("runs", "Runs that are being served"))?;
@@ -58,8 +57,7 @@ impl Metrics {
             environment_steps: count("environment_steps_total", "Environment steps taken")?,
             snapshots_received: count("snapshots_received_total", received)?,
             episode_score: histogram("episode_score", score, SCORE_BUCKETS)?,
-            practice_episodes: count("practice_episodes_total", practiced)?,
-            practice_rows: count("practice_rows_total", "Their environment steps")?,
+            practice_rows: count("practice_rows_total", practiced)?,
             job_duration: histogram("job_duration_seconds", duration, SECONDS_BUCKETS)?,
             select_seconds: seconds("select_seconds_total", "Time spent choosing actions")?,
             physics_seconds: seconds("physics_seconds_total", "Time spent in the physics")?,
@@ -74,25 +72,10 @@ impl Metrics {
         Ok(metrics)
     }
 
-    /// Counts a job whose scores the learner acknowledged.
-    pub fn job_scored(&self) {
-        self.jobs.with_label_values(&["scored"]).inc();
-    }
-
-    /// Counts a practice job whose episodes the learner acknowledged.
-    pub fn job_practiced(&self) {
-        self.jobs.with_label_values(&["practiced"]).inc();
-    }
-
-    /// Counts a job that the leaving evaluator hands back, or whose results the learner refused or
-    /// never fetched.
-    pub fn job_abandoned(&self) {
-        self.jobs.with_label_values(&["abandoned"]).inc();
-    }
-
-    /// Counts a job whose weights, environment or policy failed.
-    pub fn job_failed(&self) {
-        self.jobs.with_label_values(&["failed"]).inc();
+    /// Counts a job by its end: `scored` or `practiced` if the learner acknowledged the results,
+    /// `abandoned` if it refused or never fetched them or this evaluator leaves, else `failed`.
+    pub fn job(&self, outcome: &'static str) {
+        self.jobs.with_label_values(&[outcome]).inc();
     }
 
     /// Counts a message that the evaluator did not use. The reasons are a fixed list, because the

@@ -17,11 +17,8 @@ pub struct Progress {
     pub incarnation: u64,
     /// [`Job::id`].
     pub job: u64,
-    /// Gradient step of the job's snapshot.
-    pub step: u64,
     /// Episodes of the job that have ended.
     pub episodes_done: u32,
-    pub episodes_total: u32,
     /// Environment steps of the job; 0 while its weights are fetched.
     pub steps_done: u64,
     /// Environment steps of all of the evaluator's jobs.
@@ -38,9 +35,7 @@ impl Progress {
             run: job.run.clone(),
             incarnation: job.incarnation,
             job: job.id,
-            step: job.step,
             episodes_done: 0,
-            episodes_total: job.seeds.len() as u32,
             steps_done: 0,
             environment_steps: 0,
             episodes: 0,

@@ -42,7 +42,7 @@ struct Claimed {
 }
 
 pub struct RunClient {
-    connection: Connection,
+    pub connection: Connection,
     snapshots: Snapshots,
     listener: Listener,
     /// Number of the claim that has no answer yet.
@@ -92,7 +92,7 @@ impl RunClient {
     /// two learners of one name, the later one stops.
     pub fn follow(&mut self, incarnations: &BTreeSet<u64>) {
         if self.gone.take().is_some() {
-            self.turn.wake(Instant::now());
+            self.turn = Turn::new(Instant::now());
         }
         if let Some(&first) = incarnations.first()
             && !incarnations.contains(&self.connection.incarnation)
@@ -116,7 +116,7 @@ impl RunClient {
         debug!(run = %self.connection.run, incarnation, "following a learner");
         self.connection.incarnation = incarnation;
         self.listener.follow(incarnation);
-        self.turn.wake(Instant::now());
+        self.turn = Turn::new(Instant::now());
     }
 
     /// Makes the run due if its learner has published a snapshot.
@@ -152,7 +152,7 @@ impl RunClient {
                 let pause = Duration::from_millis(milliseconds).clamp(PAUSE[0], PAUSE[1]);
                 // Spreads out evaluators that a snapshot has woken together.
                 let pause = pause.mul_f64(rand::random_range(0.5..1.0));
-                self.turn.done(Instant::now(), pause);
+                self.turn = Turn::new(Instant::now() + pause);
                 None
             }
             JobReply::HandedBack { .. } => None,
@@ -166,10 +166,6 @@ impl RunClient {
             Some(snapshot) => Ok(snapshot),
             None => Ok(Arc::new(self.connection.snapshot(job).await?)),
         }
-    }
-
-    pub fn publish_progress(&self, job: &Job, steps: u64, episodes: u32) {
-        self.connection.publish_progress(job, steps, episodes);
     }
 
     pub fn has_job(&self) -> bool {
@@ -202,11 +198,11 @@ impl RunClient {
         let Some(refused) = refused else {
             self.claimed = None;
             self.last_warning.clear();
-            self.turn.done(Instant::now(), Duration::ZERO);
+            self.turn = Turn::new(Instant::now());
             return Ok(());
         };
         warn!(%run, step, "the learner {refused}");
-        connection.metrics.job_abandoned();
+        connection.metrics.job("abandoned");
         self.return_job(Some(format!("it {refused}")));
         self.hand_back(timeout).await
     }
@@ -214,7 +210,7 @@ impl RunClient {
     /// Hands back the claimed job, which this evaluator could not run; if there is no answer,
     /// [`deliver`](Self::deliver) tries again.
     pub async fn fail(&mut self, reason: &str) {
-        self.connection.metrics.job_failed();
+        self.connection.metrics.job("failed");
         self.return_job(Some(reason.chars().take(MAX_REASON_LEN).collect()));
         if let Err(error) = self.hand_back(ANSWER_TIMEOUT).await {
             debug!(run = %self.connection.run, "{error}");
@@ -278,7 +274,7 @@ impl RunClient {
         self.snapshots.forget(run);
         if let Some(Claimed { job, owed: Some(_), .. }) = &self.claimed {
             warn!(%run, step = job.step, "the learner did not return; its results are dropped");
-            metrics.job_abandoned();
+            metrics.job("abandoned");
         }
     }
 }
@@ -298,7 +294,7 @@ async fn deliver_scores(
             scores.for_each(|score| metrics.episode_score.observe(score));
             let step = report.step;
             info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
-            metrics.job_scored();
+            metrics.job("scored");
             None
         }
         ScoreReply::Refused { reason, .. } => Some(format!("refused the scores: {reason}")),
@@ -323,9 +319,8 @@ async fn deliver_episode(
             PieceReply::Recorded { duplicate, .. } => {
                 let rows = parcel.rows;
                 info!(%run, step, seed, rows, duplicate, "an episode of practice delivered");
-                metrics.practice_episodes.inc();
                 metrics.practice_rows.inc_by(rows);
-                metrics.job_practiced();
+                metrics.job("practiced");
                 return Ok(None);
             }
             PieceReply::Refused { reason, .. } => {

@@ -38,13 +38,13 @@ impl Evaluator {
         let reject = |error: &JobError| metrics.rejected(error.label());
         job::check(job, &*self.environments).inspect_err(reject)?;
         // The learner grants time to load the policy as long as there are reports.
-        client.publish_progress(job, 0, 0);
+        client.connection.publish_progress(job, 0, 0);
         let policy = {
             let mut loading = std::pin::pin!(self.policy(job, client));
             loop {
                 tokio::select! {
                     policy = &mut loading => break policy?,
-                    () = sleep(heartbeat(job)) => client.publish_progress(job, 0, 0),
+                    () = sleep(heartbeat(job)) => client.connection.publish_progress(job, 0, 0),
                 }
             }
         };
@@ -52,7 +52,8 @@ impl Evaluator {
         let arithmetic = Name::new(policy.precision().arithmetic())?;
         let doing = if job.practice.is_some() { "practicing" } else { "evaluating" };
         info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "{doing}");
-        let report = |done: Done| client.publish_progress(job, done.steps, done.episodes);
+        let report =
+            |done: Done| client.connection.publish_progress(job, done.steps, done.episodes);
         let played = self.roll_out(job, policy, report).await?;
         Ok(Owed::new(job, self.name.clone(), arithmetic, played)?)
     }

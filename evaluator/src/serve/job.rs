@@ -122,7 +122,7 @@ fn run(
     }
     while !rollout.is_done() {
         if tx.is_closed() {
-            metrics.job_abandoned();
+            metrics.job("abandoned");
             anyhow::bail!("it was canceled");
         }
         if started.elapsed() > longest {

@@ -8,24 +8,16 @@ const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs
 /// Time at which a run is due.
 #[derive(Clone, Debug)]
 pub struct Turn {
-    ready_at: Instant,
+    pub ready_at: Instant,
     /// The pause after the next failure.
     back_off: Duration,
 }
 
 impl Turn {
-    /// The turn of a new run, which is due now.
-    pub fn new(now: Instant) -> Turn {
-        Turn { ready_at: now, back_off: BACK_OFF[0] }
-    }
-
-    pub fn ready_at(&self) -> Instant {
-        self.ready_at
-    }
-
-    /// The learner is back: the run is due, whatever failed before.
-    pub fn wake(&mut self, now: Instant) {
-        *self = Turn::new(now);
+    /// The first turn of a run or of a new learner, and each after a success. It comes after every
+    /// run that is due earlier.
+    pub fn new(ready_at: Instant) -> Turn {
+        Turn { ready_at, back_off: BACK_OFF[0] }
     }
 
     /// There may be work: the run is due, unless its last turn failed.
@@ -33,11 +25,6 @@ impl Turn {
         if self.back_off == BACK_OFF[0] {
             self.ready_at = self.ready_at.min(now);
         }
-    }
-
-    /// Ends a successful turn. The next one comes after `pause` and after every other due run.
-    pub fn done(&mut self, now: Instant, pause: Duration) {
-        *self = Turn::new(now + pause);
     }
 
     /// Ends a failed turn. Each pause is longer than the last.
@@ -71,7 +58,7 @@ mod tests {
             counts[i] += 1;
             now += Duration::from_secs(runs[i].0);
             match runs[i].1 {
-                Some(pause) => turns[i].done(now, Duration::from_secs(pause)),
+                Some(pause) => turns[i] = Turn::new(now + Duration::from_secs(pause)),
                 None => turns[i].failed(now),
             }
         }
@@ -89,16 +76,13 @@ mod tests {
     }
 
     #[test]
-    fn a_new_learner_ends_the_pause_after_a_failure_and_new_weights_do_not() {
+    fn new_weights_end_a_pause_but_not_the_one_after_a_failure() {
         let now = Instant::now();
-        let mut turn = Turn::new(now);
-        turn.done(now, Duration::from_secs(60));
+        let mut turn = Turn::new(now + Duration::from_secs(60));
         turn.nudge(now);
-        assert_eq!(turn.ready_at(), now);
+        assert_eq!(turn.ready_at, now);
         turn.failed(now);
         turn.nudge(now);
-        assert!(turn.ready_at() > now);
-        turn.wake(now);
-        assert_eq!(turn.ready_at(), now);
+        assert!(turn.ready_at > now);
     }
 }

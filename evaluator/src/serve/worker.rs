@@ -101,7 +101,7 @@ impl Worker {
     /// Waits until a run is due, runs come or go, or a new snapshot promises work.
     async fn wait(&mut self) -> anyhow::Result<()> {
         let due = self.clients.values().map(|client| match client.gone {
-            None => client.turn.ready_at(),
+            None => client.turn.ready_at,
             Some(since) => since + KEEP_RESULTS,
         });
         let latest = Instant::now() + self.evaluator.beat.interval();

@@ -1,7 +1,6 @@
 //! Episodes of one snapshot and their states: those of an evaluation, or one of practice.
 
-use std::collections::{BTreeSet, HashMap};
-use std::mem;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Exploration, Hash};
@@ -35,17 +34,18 @@ pub(super) struct Evaluation {
     episodes: Vec<Episode>,
     /// Indices of the episodes by seed.
     indices: HashMap<u64, usize>,
-    /// Indices of the episodes in each state but `Scored`. Complete evaluations become many, and
-    /// are passed over.
+    /// Indices of the episodes that wait. Complete evaluations become many, and are passed over.
     waiting: BTreeSet<usize>,
-    handed_out: BTreeSet<usize>,
+    /// Indices of the episodes that are handed out, with their jobs.
+    handed_out: BTreeMap<usize, u64>,
+    /// Indices of the episodes that are not waited for any more. Their scores are still accepted.
     given_up: BTreeSet<usize>,
 }
 
 #[derive(Debug)]
 struct Episode {
     seed: u64,
-    state: EpisodeState,
+    score: Option<EpisodeScore>,
     /// Number of evaluators that were lost with it, or could not do it.
     lost: u32,
     rests_until: Option<Instant>,
@@ -64,33 +64,20 @@ impl Episode {
     }
 }
 
-#[derive(Clone, Copy, Debug)]
-enum EpisodeState {
-    Waiting,
-    HandedOut {
-        job: u64,
-    },
-    /// The episode is not waited for any more. Its score is still accepted.
-    GivenUp,
-    Scored(EpisodeScore),
-}
-
 impl Evaluation {
     /// An evaluation of the episodes `seeds`, some of which may have a score already.
     pub fn new(step: u64, weights: Hash, seeds: &[u64], scores: &[EpisodeScore]) -> Self {
+        let episode = |&seed| Episode { seed, score: None, lost: 0, rests_until: None };
         let mut evaluation = Self {
             step,
             weights,
             practice: None,
-            episodes: Vec::new(),
+            episodes: seeds.iter().map(episode).collect(),
             indices: seeds.iter().enumerate().map(|(index, &seed)| (seed, index)).collect(),
             waiting: (0..seeds.len()).collect(),
-            handed_out: BTreeSet::new(),
+            handed_out: BTreeMap::new(),
             given_up: BTreeSet::new(),
         };
-        let waiting =
-            |&seed| Episode { seed, state: EpisodeState::Waiting, lost: 0, rests_until: None };
-        evaluation.episodes = seeds.iter().map(waiting).collect();
         evaluation.score(scores);
         evaluation
     }
@@ -99,25 +86,6 @@ impl Evaluation {
     pub fn practice(opening: &Opening, weights: Hash) -> Self {
         let Opening { step, seed, exploration, .. } = *opening;
         Self { practice: Some(exploration), ..Self::new(step, weights, &[seed], &[]) }
-    }
-
-    fn set_state(&mut self, index: usize, state: EpisodeState) {
-        let old = mem::replace(&mut self.episodes[index].state, state);
-        if let Some(indices) = self.indices_of(old) {
-            indices.remove(&index);
-        }
-        if let Some(indices) = self.indices_of(state) {
-            indices.insert(index);
-        }
-    }
-
-    fn indices_of(&mut self, state: EpisodeState) -> Option<&mut BTreeSet<usize>> {
-        match state {
-            EpisodeState::Waiting => Some(&mut self.waiting),
-            EpisodeState::HandedOut { .. } => Some(&mut self.handed_out),
-            EpisodeState::GivenUp => Some(&mut self.given_up),
-            EpisodeState::Scored(_) => None,
-        }
     }
 
     /// Number of episodes that have no score yet, and may still get one.
@@ -135,9 +103,10 @@ impl Evaluation {
         self.given_up.iter().map(|&index| self.episodes[index].seed)
     }
 
-    /// Hands out an episode once more, whose evaluator is slow.
+    /// Hands out episodes once more, whose evaluator is slow.
     pub fn hand_out_again(&mut self, job: u64) -> Vec<u64> {
-        self.give(job, Vec::from_iter(self.handed_out.iter().copied()))
+        self.handed_out.values_mut().for_each(|of| *of = job);
+        self.handed_out.keys().map(|&index| self.episodes[index].seed).collect()
     }
 
     /// Hands out episodes that wait and do not rest. After a failure `few` at most, in case the
@@ -147,12 +116,9 @@ impl Evaluation {
         let mut ready = ready.filter(|&index| !self.episodes[index].rests(now)).peekable();
         let lost = ready.peek().is_some_and(|&index| self.episodes[index].lost > 0);
         let indices = Vec::from_iter(ready.take(if lost { few } else { most }));
-        self.give(job, indices)
-    }
-
-    fn give(&mut self, job: u64, indices: Vec<usize>) -> Vec<u64> {
-        let give = |index| {
-            self.set_state(index, EpisodeState::HandedOut { job });
+        let give = |index: usize| {
+            self.waiting.remove(&index);
+            self.handed_out.insert(index, job);
             self.episodes[index].seed
         };
         indices.into_iter().map(give).collect()
@@ -165,16 +131,20 @@ impl Evaluation {
         let mut given_up = Vec::new();
         for &seed in seeds {
             let Some(&index) = self.indices.get(&seed) else { continue };
+            if self.handed_out.get(&index) != Some(&job) {
+                continue;
+            }
+            self.handed_out.remove(&index);
             let episode = &mut self.episodes[index];
-            if matches!(episode.state, EpisodeState::HandedOut { job: of } if of == job) {
-                lost.into_iter().for_each(|now| episode.lost(now));
-                let mut state = EpisodeState::Waiting;
-                // The learner waits for practice as long as it takes.
-                if episode.lost >= MOST_ATTEMPTS && self.practice.is_none() {
-                    state = EpisodeState::GivenUp;
-                    given_up.push(seed);
-                }
-                self.set_state(index, state);
+            if let Some(now) = lost {
+                episode.lost(now);
+            }
+            // The learner waits for practice as long as it takes.
+            if episode.lost >= MOST_ATTEMPTS && self.practice.is_none() {
+                self.given_up.insert(index);
+                given_up.push(seed);
+            } else {
+                self.waiting.insert(index);
             }
         }
         given_up
@@ -185,10 +155,10 @@ impl Evaluation {
         let mut jobs = BTreeSet::new();
         for score in scores {
             let Some(&index) = self.indices.get(&score.seed) else { continue };
-            if let EpisodeState::HandedOut { job } = self.episodes[index].state {
-                jobs.insert(job);
-            }
-            self.set_state(index, EpisodeState::Scored(*score));
+            self.waiting.remove(&index);
+            self.given_up.remove(&index);
+            jobs.extend(self.handed_out.remove(&index));
+            self.episodes[index].score = Some(*score);
         }
         jobs
     }
@@ -196,15 +166,12 @@ impl Evaluation {
     /// True if an episode has a score; `None` if there is no such episode.
     pub fn is_scored(&self, seed: u64) -> Option<bool> {
         let index = self.indices.get(&seed)?;
-        Some(matches!(self.episodes[*index].state, EpisodeState::Scored(_)))
+        Some(self.episodes[*index].score.is_some())
     }
 
     /// The scores in the order of the seeds, once all are there.
     pub fn scores(&self) -> Option<Vec<EpisodeScore>> {
-        let score = |episode: &Episode| match episode.state {
-            EpisodeState::Scored(score) => Some(score),
-            _ => None,
-        };
-        if self.pending() > 0 { None } else { self.episodes.iter().map(score).collect() }
+        let scores = self.episodes.iter().map(|episode| episode.score);
+        if self.pending() > 0 { None } else { scores.collect() }
     }
 }

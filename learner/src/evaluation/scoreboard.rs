@@ -132,16 +132,11 @@ impl Scoreboard {
         self.practice.insert(seed, PracticeEpisode::NotYet);
     }
 
-    /// Ends practice: evaluators get no more of its episodes.
+    /// Ends practice: evaluators get no more of its episodes. Those that are open are still accepted,
+    /// those that were expected are refused, since training has come to all that it needs.
     pub fn end_practice(&mut self) {
         self.practice_ended = true;
-        let evaluations = &mut self.evaluations;
-        evaluations.retain(|_, it| it.practice.is_none() || it.waiting() == 0);
-        self.practice.retain(|_, practice| match practice {
-            PracticeEpisode::Open { episode } => evaluations.contains_key(&Key::Practice(*episode)),
-            PracticeEpisode::Recorded(_) => true,
-            PracticeEpisode::NotYet => false,
-        });
+        self.practice.retain(|_, practice| *practice != PracticeEpisode::NotYet);
     }
 
     /// The practice episode with this seed, if the run has it.
@@ -199,9 +194,10 @@ impl Scoreboard {
         if !fits {
             return Claimed::Wait(DOES_NOT_FIT);
         }
+        let first = if self.practice_ended { Key::Evaluation(0) } else { Key::Practice(0) };
         let often = match self.evaluations.first_key_value() {
-            Some((Key::Practice(_), _)) => ASK_FOR_PRACTICE,
             _ if self.practice_ended || self.practice.is_empty() => ASK_AGAIN,
+            Some((Key::Practice(_), _)) => ASK_FOR_PRACTICE,
             _ => ASK_BETWEEN,
         };
         let wait = Claimed::Wait(interval(present, often));
@@ -214,11 +210,11 @@ impl Scoreboard {
         }
         let few = self.rules.job_episodes[0];
         let (id, most) = (self.next_job, self.job_episodes(present));
-        let handed_out = self.evaluations.iter_mut().find_map(|(&key, evaluation)| {
+        let handed_out = self.evaluations.range_mut(first..).find_map(|(&key, evaluation)| {
             let seeds = evaluation.hand_out(id, [few, most], now);
             (!seeds.is_empty()).then_some((key, seeds))
         });
-        let Some((key, seeds)) = handed_out.or_else(|| self.straggler(id, now)) else {
+        let Some((key, seeds)) = handed_out.or_else(|| self.straggler(first, id, now)) else {
             return wait;
         };
         let Evaluation { step, weights, practice, .. } = &self.evaluations[&key];
@@ -254,13 +250,12 @@ impl Scoreboard {
     }
 
     /// The practice episode that the learner waits for, if its only evaluator takes long.
-    fn straggler(&mut self, job: u64, now: Instant) -> Option<(Key, Vec<u64>)> {
-        let mut first = self.evaluations.first_entry()?;
-        let key = *first.key();
+    fn straggler(&mut self, first: Key, job: u64, now: Instant) -> Option<(Key, Vec<u64>)> {
+        let (&key, evaluation) = self.evaluations.range_mut(first..).next()?;
         let mut players = self.jobs.values().filter(|open| open.key == key);
         let alone = (players.next(), players.next());
         let (Key::Practice(_), (Some(only), None)) = (key, alone) else { return None };
-        (now >= only.handed_out + STRAGGLER).then(|| (key, first.get_mut().hand_out_again(job)))
+        (now >= only.handed_out + STRAGGLER).then(|| (key, evaluation.hand_out_again(job)))
     }
 
     /// Most episodes of a job: half of an evaluator's share of those that wait, so that none is
@@ -339,22 +334,14 @@ impl Scoreboard {
         lost
     }
 
-    /// Takes back the job of an evaluator that has left.
-    pub fn evaluator_left(&mut self, evaluator: &Name, now: Instant) -> Lost {
-        self.release(evaluator, Some(now))
-    }
-
-    /// Ends the job of an evaluator, if it has one. Its episodes wait for the next job, except those
-    /// that are given up.
-    fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Lost {
+    /// Ends the job of an evaluator, if it has one, which may be `lost` now. Its episodes wait for the
+    /// next job, except those that are given up.
+    pub fn release(&mut self, evaluator: &Name, lost: Option<Instant>) -> Lost {
         let Some(OpenJob { key, job, .. }) = self.jobs.remove(evaluator) else {
             return Lost::default();
         };
         let evaluation = self.evaluations.get_mut(&key);
         let given_up = evaluation.map(|it| it.take_back(job.id, &job.seeds, lost));
-        if self.practice_ended {
-            self.end_practice();
-        }
         let given_up = given_up.into_iter().flatten().map(|seed| (job.step, seed)).collect();
         Lost { jobs: 1, given_up }
     }

@@ -222,16 +222,17 @@ impl Coordinator {
         }
     }
 
-    pub(super) fn progress(&self, progress: Progress) -> Result<(), NotAccepted> {
+    pub(super) fn progress(&self, progress: &Progress) -> Result<(), Refusal> {
         let (mut state, now) = (self.lock(), Instant::now());
-        let shares_name = state.scoreboard.progress(&progress, now)?;
+        let shares_name = state.scoreboard.progress(progress, now)?;
         let (names, name) = (&mut state.shared_names, &progress.evaluator);
         if shares_name && names.len() < MOST_SHARED_NAMES && names.insert(name.clone()) {
             self.events.line(format!(
                 "two evaluators were started with --name {name}, and one of them gets no work; give each its own name"
             ));
         }
-        state.evaluators.progress(progress, now)
+        state.evaluators.progress(progress, now);
+        Ok(())
     }
 
     pub(super) fn joined(&self, evaluator: Name) -> Result<(), NotAccepted> {
@@ -241,7 +242,7 @@ impl Coordinator {
     /// Records that an evaluator has left; its job becomes free for others.
     pub fn left(&self, evaluator: &Name) {
         let mut state = self.lock();
-        let lost = state.scoreboard.evaluator_left(evaluator, Instant::now());
+        let lost = state.scoreboard.release(evaluator, Some(Instant::now()));
         state.evaluators.left(evaluator, lost.jobs > 0);
         self.lost(&state, &lost);
     }
@@ -274,14 +275,7 @@ impl Coordinator {
         ScoreReply::Recorded { incarnation, new, duplicates: *duplicates }
     }
 
-    /// The answer to a report that the learner will never accept.
-    pub fn refused(&self, refusal: Refusal) -> ScoreReply {
-        let incarnation = self.rules.incarnation;
-        ScoreReply::Refused { incarnation, reason: refusal.to_string() }
-    }
-
-    /// Takes back jobs whose lease has expired, and forgets evaluators that left long ago. Call it
-    /// several times a second.
+    /// Takes back jobs whose lease has expired. Call it several times a second.
     pub fn tick(&self) {
         let (mut state, now) = (self.lock(), Instant::now());
         state.evaluators.tick(now);

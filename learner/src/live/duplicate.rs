@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::anyhow;
 use quad_protocol::{Name, keys};
 use quad_runtime::hinted;
-use tracing::{debug, info};
+use tracing::info;
 use zenoh::Session;
 use zenoh::sample::{Sample, SampleKind};
 
@@ -78,10 +78,12 @@ pub(super) async fn watch(
     events: &Events,
 ) -> anyhow::Result<()> {
     let (mine, events, reported) = (incarnation.clone(), events.clone(), AtomicBool::new(false));
+    let begin = Instant::now();
     let callback = move |token: Sample| {
         if let Some(other) = keys::incarnation_of(token.key_expr().as_str())
             && token.kind() == SampleKind::Put
             && other < mine.number
+            && begin.elapsed() < TOGETHER
             && !reported.swap(true, Ordering::Relaxed)
         {
             events.send(Event::Failed(conflict(&mine, other)));
@@ -92,14 +94,7 @@ pub(super) async fn watch(
         .declare_subscriber(keys::all_incarnations(&incarnation.run))
         .history(true)
         .callback(callback);
-    let tokens = tokens.await.map_err(anyhow::Error::from_boxed)?;
-    tokio::spawn(async move {
-        tokio::time::sleep(TOGETHER).await;
-        if let Err(error) = tokens.undeclare().await {
-            debug!(%error, "learners' tokens are still received");
-        }
-    });
-    Ok(())
+    tokens.background().await.map_err(anyhow::Error::from_boxed)
 }
 
 fn conflict(Incarnation { run, number }: &Incarnation, other: u64) -> anyhow::Error {

@@ -10,8 +10,6 @@ use super::events::Events;
 use super::metrics::Metrics;
 use super::requests::NotAccepted;
 
-/// The metrics of an evaluator that has left are dropped this long after its last progress message.
-const FORGET_AFTER: Duration = Duration::from_secs(600);
 /// Most evaluators that the learner tracks: far above any real pool. The limit bounds the memory
 /// that made-up names take.
 const MOST_EVALUATORS: usize = 1024;
@@ -23,18 +21,23 @@ const PERIOD: Duration = Duration::from_secs(10);
 pub(super) struct Evaluators {
     metrics: Metrics,
     events: Events,
-    /// The connected evaluators, and whether each has the run's environment, once it has asked for
-    /// a job.
-    present: BTreeMap<Name, Option<bool>>,
-    last_seen: BTreeMap<Name, Instant>,
+    present: BTreeMap<Name, Present>,
     /// Start of the period, and how often an evaluator has come or gone in it.
     period: (Instant, usize),
 }
 
+/// A connected evaluator.
+#[derive(Debug, Default)]
+struct Present {
+    /// True if it has the run's environment; `None` until it asks for a job.
+    fits: Option<bool>,
+    /// Time of its last progress message.
+    last_seen: Option<Instant>,
+}
+
 impl Evaluators {
     pub fn new(metrics: Metrics, events: Events, now: Instant) -> Self {
-        let (present, last_seen) = (BTreeMap::new(), BTreeMap::new());
-        Self { metrics, events, present, last_seen, period: (now, 0) }
+        Self { metrics, events, present: BTreeMap::new(), period: (now, 0) }
     }
 
     pub fn count(&self) -> usize {
@@ -44,16 +47,16 @@ impl Evaluators {
     /// True if a connected evaluator may have the run's environment. An evaluator that has not asked
     /// for a job yet may: it may be at a long job of another run.
     pub fn any_may_fit(&self) -> bool {
-        self.present.values().any(|fits| *fits != Some(false))
+        self.present.values().any(|evaluator| evaluator.fits != Some(false))
     }
 
     /// The connected evaluators, for the page.
     pub fn to_json(&self, job_of: impl Fn(&Name) -> Option<Value>) -> Vec<Value> {
-        let evaluator = |(name, fits): (&Name, &Option<bool>)| {
+        let evaluator = |(name, Present { fits, last_seen }): (&Name, &Present)| {
             json!({
                 "name": name.as_str(),
                 "fits": *fits == Some(true),
-                "seconds_ago": self.last_seen.get(name).map(|seen| seen.elapsed().as_secs_f64()),
+                "seconds_ago": last_seen.map(|seen| seen.elapsed().as_secs_f64()),
                 "job": job_of(name),
             })
         };
@@ -62,8 +65,8 @@ impl Evaluators {
 
     /// Records that an evaluator asked for a job, and whether it has the run's environment.
     pub fn asked(&mut self, evaluator: &Name, fits: bool) {
-        if let Some(known) = self.present.get_mut(evaluator) {
-            *known = Some(fits);
+        if let Some(present) = self.present.get_mut(evaluator) {
+            present.fits = Some(fits);
         }
     }
 
@@ -75,7 +78,7 @@ impl Evaluators {
             return Err(NotAccepted::Crowd);
         }
         self.line(format!("evaluator {evaluator} is here"));
-        self.present.insert(evaluator, None);
+        self.present.insert(evaluator, Present::default());
         self.metrics.evaluators.present.set(self.present.len() as i64);
         Ok(())
     }
@@ -86,6 +89,7 @@ impl Evaluators {
             return;
         }
         self.metrics.evaluators.present.set(self.present.len() as i64);
+        self.metrics.evaluators.forget(evaluator);
         let job = if had_job { "; its unfinished job goes to others" } else { "" };
         self.line(format!("evaluator {evaluator} has left or lost its connection{job}"));
     }
@@ -97,26 +101,16 @@ impl Evaluators {
         }
     }
 
-    pub fn progress(&mut self, progress: Progress, now: Instant) -> Result<(), NotAccepted> {
-        let is_known = self.last_seen.contains_key(&progress.evaluator);
-        if self.last_seen.len() >= MOST_EVALUATORS && !is_known {
-            return Err(NotAccepted::Crowd);
+    /// Shows the progress of a connected evaluator.
+    pub fn progress(&mut self, progress: &Progress, now: Instant) {
+        if let Some(present) = self.present.get_mut(&progress.evaluator) {
+            present.last_seen = Some(now);
+            self.metrics.evaluators.observe(progress);
         }
-        self.metrics.evaluators.observe(&progress);
-        self.last_seen.insert(progress.evaluator, now);
-        Ok(())
     }
 
-    /// Forgets evaluators that left long ago, and reports how many lines the period had too many.
+    /// Reports how many lines the period had too many.
     pub fn tick(&mut self, now: Instant) {
-        self.last_seen.retain(|evaluator, seen| {
-            let is_recent = now.duration_since(*seen) < FORGET_AFTER;
-            let keep = is_recent || self.present.contains_key(evaluator);
-            if !keep {
-                self.metrics.evaluators.forget(evaluator);
-            }
-            keep
-        });
         let (since, lines) = self.period;
         if now.duration_since(since) >= PERIOD {
             if lines > MOST_LINES {

@@ -36,11 +36,10 @@ type Whole = (Request, u64, Episode);
 
 impl Experience {
     /// Opens the run's log, and puts what it has into the inbox. An episode that is not there may
-    /// have been played, if the run is `resumed`.
+    /// have been played, if the snapshot with which practice begins is there.
     pub fn open(
         dir: &RunDir,
         experiment: &Experiment,
-        resumed: bool,
         inbox: Inbox,
         coordinator: &Coordinator,
     ) -> anyhow::Result<Self> {
@@ -49,13 +48,14 @@ impl Experience {
         let mut episodes: HashMap<u64, _> = records.into_iter().map(by_seed).collect();
         let recorded = episodes.len() as u64;
         let lag = experiment.online.as_ref().map_or(0, |online| online.lag);
+        let has_begun = dir.snapshots()?.contains(&experiment.steps);
         // Seeds are those of the first episodes: more were never open.
         for number in 0..recorded + u64::from(lag) {
             let seed = practice_seed(experiment.seed, number);
             if let Some((hash, episode)) = episodes.remove(&seed) {
                 coordinator.record_practice(seed, hash);
                 inbox.send((number, episode)).ok();
-            } else if resumed || recorded > 0 {
+            } else if has_begun {
                 coordinator.expect_practice(seed);
             }
         }
@@ -67,7 +67,7 @@ impl Experience {
     /// Answers each piece. Episodes that are complete are written together first.
     pub fn receive(
         &mut self,
-        pieces: impl Iterator<Item = (Request, Piece)>,
+        pieces: Vec<(Request, Piece)>,
         disk: &mut DiskStatus,
         beat: &Heartbeat,
     ) {
@@ -141,11 +141,7 @@ impl Experience {
             }
             (*hash, *bytes) = none();
         }
-        if offset > bytes.len() {
-            return at(bytes.len());
-        }
-        if offset + piece.bytes.len() > bytes.len() {
-            bytes.truncate(offset);
+        if offset == bytes.len() {
             bytes.extend_from_slice(&piece.bytes);
         }
         if bytes.len() < piece.length as usize {

@@ -130,7 +130,7 @@ impl MainLoop {
                 }
                 Some(event) = self.events.recv() => match event {
                     Event::Failed(error) => return Ending::Failed(error),
-                    Event::TrainingEnded(Outcome::Stopped { .. }) => return Ending::Interrupted,
+                    Event::TrainingEnded(Outcome::Stopped) => return Ending::Interrupted,
                     // The stop came during the last step; the run does not wait for scores.
                     Event::TrainingEnded(_) if state.interrupted => return Ending::Interrupted,
                     Event::TrainingEnded(Outcome::Completed) => {

@@ -112,7 +112,7 @@ impl EvaluatorMetrics {
         self.last_seen.with_label_values(&label).set(unix_time());
     }
 
-    /// Drops the series of an evaluator that left long ago.
+    /// Drops the series of an evaluator that has left.
     pub fn forget(&self, evaluator: &Name) {
         let label = [evaluator.as_str()];
         // An error means that there is no such series, which is the goal.

@@ -13,8 +13,7 @@ use tokio::time::{sleep, timeout};
 use tracing::{debug, warn};
 use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
-use zenoh::pubsub::Subscriber;
-use zenoh::query::{Query, Queryable};
+use zenoh::query::Query;
 
 use super::duplicate::{self, Incarnation};
 use super::requests::Request;
@@ -85,11 +84,9 @@ async fn write_endpoints(run_dir: RunDir, endpoints: RunEndpoints) {
     }
 }
 
-/// The learner's declarations; dropping it undeclares them.
+/// The learner's session and its token. All else that is declared ends with the session.
 pub(super) struct Wire {
     session: Session,
-    _queryables: [Queryable<()>; 4],
-    _subscribers: [Subscriber<()>; 2],
     _token: LivelinessToken,
 }
 
@@ -107,34 +104,27 @@ impl Wire {
         duplicate::wait_until_gone(&session, incarnation).await?;
         let run = &incarnation.run;
         services.weights.online(&session);
-        let queryables = [
-            serve(&session, keys::weights_at_any_step(run), services, Services::weights).await?,
-            serve(&session, keys::jobs(run), services, Services::job).await?,
-            serve(&session, keys::scores(run), services, Services::scores).await?,
-            serve(&session, keys::experience(run), services, Services::experience).await?,
-        ];
+        serve(&session, keys::weights_at_any_step(run), services, Services::weights).await?;
+        serve(&session, keys::jobs(run), services, Services::job).await?;
+        serve(&session, keys::scores(run), services, Services::scores).await?;
+        serve(&session, keys::experience(run), services, Services::experience).await?;
         let zenoh = anyhow::Error::from_boxed;
         let receiver = services.clone();
         let progress = session
             .declare_subscriber(keys::all_progress(run))
             .callback(move |sample| receiver.progress(&sample));
-        let progress = progress.await.map_err(zenoh)?;
+        progress.background().await.map_err(zenoh)?;
         let (receiver, liveliness) = (services.clone(), session.liveliness());
         let evaluators = liveliness
             .declare_subscriber(keys::all_evaluators(run))
             .history(true)
             .callback(move |token| receiver.evaluator(&token));
-        let evaluators = evaluators.await.map_err(zenoh)?;
+        evaluators.background().await.map_err(zenoh)?;
         let token = liveliness.declare_token(keys::live_learner(run, incarnation.number));
         let token = token.await.map_err(zenoh)?;
         // Of two learners that start at once, neither may have seen the other.
         duplicate::watch(&session, incarnation, &services.coordinator().events).await?;
-        Ok(Self {
-            session,
-            _queryables: queryables,
-            _subscribers: [progress, evaluators],
-            _token: token,
-        })
+        Ok(Self { session, _token: token })
     }
 
     /// Closes the session; Zenoh still delivers earlier answers.
@@ -150,10 +140,10 @@ async fn serve(
     key: String,
     services: &Services,
     answer: fn(&Services, Request),
-) -> anyhow::Result<Queryable<()>> {
+) -> anyhow::Result<()> {
     let services = services.clone();
     let callback = move |query: Query| answer(&services, Request::new(query));
     // Complete: an evaluator that asks only for the best answer asks here, too.
     let queryable = session.declare_queryable(key).complete(true).callback(callback);
-    queryable.await.map_err(anyhow::Error::from_boxed)
+    queryable.background().await.map_err(anyhow::Error::from_boxed)
 }

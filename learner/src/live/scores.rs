@@ -7,7 +7,7 @@
 use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 
-use quad_protocol::{Piece, ScoreReport};
+use quad_protocol::{Piece, ScoreReply, ScoreReport};
 use quad_run::folder::{Log, ScoreLine};
 use quad_runtime::Heartbeat;
 
@@ -59,21 +59,20 @@ impl Scores {
                     Delivery::End => ended = true,
                 }
             }
-            self.record(reports.into_iter(), beat);
-            if let Some(experience) = &mut self.experience {
-                experience.receive(pieces.into_iter(), &mut self.disk, beat);
-                continue;
-            }
-            // Evaluators owe them to an earlier run of this name.
-            for (request, piece) in pieces {
-                refuse(request, &Refusal::Practice(piece.seed).into(), &self.coordinator);
+            self.record(reports, beat);
+            match &mut self.experience {
+                Some(experience) => experience.receive(pieces, &mut self.disk, beat),
+                // Evaluators owe them to an earlier run of this name.
+                None => pieces.into_iter().for_each(|(request, piece)| {
+                    refuse(request, &Refusal::Practice(piece.seed).into(), &self.coordinator);
+                }),
             }
         }
         Ok(())
     }
 
     /// Writes the new scores of reports, and answers each report.
-    fn record(&mut self, reports: impl Iterator<Item = (Request, ScoreReport)>, beat: &Heartbeat) {
+    fn record(&mut self, reports: Vec<(Request, ScoreReport)>, beat: &Heartbeat) {
         // Step and seed of the scores to write: a second score of an episode is a duplicate.
         let mut seen = BTreeSet::new();
         let (mut batch, mut lines) = (Vec::new(), Vec::new());
@@ -82,7 +81,9 @@ impl Scores {
                 Ok(validated) => validated,
                 Err(refusal) => {
                     self.coordinator.metrics.reject(refusal.label());
-                    request.reply(&self.coordinator.refused(refusal));
+                    let (incarnation, reason) =
+                        (self.coordinator.incarnation(), refusal.to_string());
+                    request.reply(&ScoreReply::Refused { incarnation, reason });
                     continue;
                 }
             };

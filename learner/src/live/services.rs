@@ -104,7 +104,9 @@ impl Services {
 
     pub fn progress(&self, sample: &Sample) {
         let progress = read::<Progress>(sample.payload());
-        self.count_rejected(progress.and_then(|progress| self.coordinator().progress(progress)));
+        self.count_rejected(progress.and_then(|progress| {
+            self.coordinator().progress(&progress).map_err(NotAccepted::Refused)
+        }));
     }
 
     pub fn evaluator(&self, token: &Sample) {

@@ -181,7 +181,7 @@ fn open_practice(
     let Some(mut practice) = Practice::new(experiment, transitions, recorded, metrics) else {
         return Ok(None);
     };
-    let experience = Experience::open(dir, experiment, step > 0, inbox, coordinator)?;
+    let experience = Experience::open(dir, experiment, inbox, coordinator)?;
     practice.resume(step).hint(OTHER_FOLDER)?;
     Ok(Some((practice, experience)))
 }

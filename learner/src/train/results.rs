@@ -99,8 +99,5 @@ impl Means {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Outcome {
     Completed,
-    /// Training was stopped after this gradient step.
-    Stopped {
-        step: u64,
-    },
+    Stopped,
 }

@@ -97,9 +97,8 @@ impl Training {
         }
         while self.agent.step() < steps {
             if !self.practice(beat)? {
-                let step = self.agent.step();
-                self.save_state(step)?;
-                return Ok(Outcome::Stopped { step });
+                self.save_state(self.agent.step())?;
+                return Ok(Outcome::Stopped);
             }
             let begin = Instant::now();
             let step = self.agent.step() + 1;
@@ -136,7 +135,7 @@ impl Training {
                 next_checkpoint = Instant::now() + self.checkpoint_every.max(pause);
             }
             if stopped {
-                return Ok(Outcome::Stopped { step });
+                return Ok(Outcome::Stopped);
             }
         }
         Ok(Outcome::Completed)

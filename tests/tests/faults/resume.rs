@@ -134,14 +134,14 @@ async fn an_episode_that_was_played_before_a_crash_is_recorded_after_it() {
     let flags = ["--listen", &endpoint, "--checkpoint-seconds", "3600"];
     let start = || scratch.learner_with("run", setting, &flags);
     let mut learner = start();
-    let mut session = made_up::client(&learner.endpoint()).await;
-    let recorded = made_up::claim_eventually(&session, &run, "one").await;
-    let kept = made_up::claim_eventually(&session, &run, "two").await;
-    for job in [recorded, kept] {
-        let answer = made_up::deliver_practice(&session, &job, "one").await;
-        assert!(matches!(answer, PieceReply::Recorded { .. }), "{answer:?}");
+    let session = made_up::client(&learner.endpoint()).await;
+    let first = made_up::claim_eventually(&session, &run, "one").await;
+    let second = made_up::claim_eventually(&session, &run, "two").await;
+    for job in [first, second] {
         learner.process.kill();
         learner = start();
-        session = made_up::client(&learner.endpoint()).await;
+        let session = made_up::client(&learner.endpoint()).await;
+        let answer = made_up::deliver_practice(&session, &job, "one").await;
+        assert!(matches!(answer, PieceReply::Recorded { .. }), "{answer:?}");
     }
 }

@@ -90,7 +90,7 @@ impl Bench {
 
     fn leave(&mut self, evaluator: &str, seconds: u64) -> Lost {
         let now = self.at(seconds);
-        self.board.evaluator_left(&name(evaluator), now)
+        self.board.release(&name(evaluator), Some(now))
     }
 
     fn extend_lease(&mut self, report: &ScoreReport, seconds: u64) {

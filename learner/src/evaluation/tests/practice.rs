@@ -117,15 +117,14 @@ fn between_two_episodes_evaluators_ask_more_often_than_after_the_last() {
 }
 
 #[test]
-fn after_the_end_of_practice_only_what_is_in_play_is_accepted() {
+fn after_the_end_of_practice_no_episode_is_handed_out_and_what_was_open_is_accepted() {
     let mut bench = bench();
     bench.job("a", 0);
     bench.board.expect_practice(102);
     bench.board.end_practice();
     assert_eq!(bench.job("b", 0).practice, None);
     assert_eq!(bench.board.validate_practice(0, &episode(100)), Ok(()));
-    assert_eq!(bench.board.validate_practice(1, &episode(101)), Err(Refusal::Practice(101)));
-    assert_eq!([101, 102].map(|seed| bench.board.practice(seed)), [None; 2]);
+    assert_eq!(bench.board.practice(102), None, "it is not waited for any more");
     bench.leave("a", 1);
     assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }
