@@ -12,6 +12,7 @@ use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo};
+use quad_run::counted;
 use quad_run::folder::{Checkpoint, ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
 use quad_runtime::{
@@ -311,13 +312,12 @@ fn conclude(
 }
 
 fn all_scored(report: RunReport) -> anyhow::Result<()> {
-    let missing = report.episodes_missing;
-    let error = anyhow!("training is complete, but {missing} episodes have no score");
-    let hint = "the log says why; fix it, and the same command hands them out again";
-    match missing {
-        0 => Ok(()),
-        _ => Err(hinted(error, hint)),
+    if report.is_complete() {
+        return Ok(());
     }
+    let missing = counted(report.episodes_missing as usize, "episode");
+    Err(anyhow!("training is complete, without the scores of {missing}"))
+        .hint("the log says why; fix it, and the same command hands them out again")
 }
 
 fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {

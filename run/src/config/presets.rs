@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use quad_algorithms::{ALGORITHMS, Definition, Values};
+use quad_algorithms::{ALGORITHMS, Definition, Values, in_words};
 use quad_dataset::environment;
 use serde::Deserialize;
 use toml::{Table, Value};
@@ -90,9 +90,10 @@ impl Preset {
         {
             table.insert("reward".to_owned(), rule);
         }
-        let preset = self.label.clone();
-        let parsed = Experiment::deserialize(table);
-        let mut experiment = parsed.map_err(|source| ConfigError::Keys { preset, source })?;
+        let mut experiment = Experiment::deserialize(table).map_err(|error| ConfigError::Keys {
+            preset: self.label.clone(),
+            reason: in_words(&error),
+        })?;
         experiment.check()?;
         Ok(experiment)
     }

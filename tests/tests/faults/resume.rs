@@ -122,7 +122,7 @@ fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
     let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
     learner.process.assert_ends(1, PATIENCE);
     learner.process.assert_said(&format!("without the snapshot of step {step}"));
-    learner.process.assert_said("but 1 episodes have no score");
+    learner.process.assert_said("without the scores of 1 episode");
     learner.process.assert_said("hint: ");
 }
 
