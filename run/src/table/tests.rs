@@ -20,8 +20,8 @@ fn special_characters_are_escaped() {
     table.push(["50 %, & more".to_owned(), "1 ± 2 \"x\"".to_owned()]);
     let latex = "\\begin{tabular}{lr}\n\\toprule\na\\_b & b \\\\\n\\midrule\n50 \\%, \\& more & 1 $\\pm$ 2 \"x\" \\\\\n\\bottomrule\n\\end{tabular}\n";
     assert_eq!(table.render(Style::Latex), latex);
-    let words = Block::Text("±1 of a_b\nand\n".to_owned());
-    assert_eq!(words.render(Style::Latex), "$\\pm$1 of a\\_b\n\nand\n\n");
+    let words = Block::Text("±1 of a_b\nα and γ\n".to_owned());
+    assert_eq!(words.render(Style::Latex), "$\\pm$1 of a\\_b\n\n$\\alpha$ and $\\gamma$\n\n");
 }
 
 /// Names of tasks and runs may be those of another user's files.
