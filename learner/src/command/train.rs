@@ -87,7 +87,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     }
 
     let runtime = super::runtime()?;
-    let first = from.map(From::into_checkpoint);
+    let first = from.map(|from| from.checkpoint);
     let run = run_to_end(args, outside, &path, (begun, first), &config, data);
     let ended = runtime.block_on(run);
     let concluded =

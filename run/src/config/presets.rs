@@ -196,13 +196,6 @@ mod tests {
                 Some("agent.alpha.exponential has no effect on a policy with divergence sparse"),
             ),
             (
-                "steps = 1000",
-                Some(
-                    "the target actor, which acts, stays as it began: it moves after step 1000 (agent.actor_ema_start), and this run has \
-                     1000",
-                ),
-            ),
-            (
                 "online.warmup = 100",
                 Some("online.warmup has no effect without practice (--online-steps N)"),
             ),

@@ -17,8 +17,7 @@ const LOCK: &str = "judgments.lock";
 pub struct Conditions {
     /// SHA-256 of the data.
     pub dataset: String,
-    /// The environment of the rewards; empty in older files.
-    #[serde(default)]
+    /// The environment of the rewards.
     pub environment: String,
     /// Indices of the episodes in whose first states policies are judged, in the file's order.
     pub episodes: Vec<usize>,
@@ -51,7 +50,6 @@ impl Estimate {
 #[allow(missing_docs)]
 pub struct Judgment {
     /// The folder of its run, as the reader calls it.
-    #[serde(default)]
     pub run: PathBuf,
     /// Gradient step of the snapshot.
     pub step: u64,
@@ -72,13 +70,12 @@ pub struct Judgment {
 }
 
 impl Judgment {
-    /// The judgments in a run's folder, without those of unknown environments.
+    /// The judgments in a run's folder.
     pub fn read_all(folder: &RunDir) -> Result<Vec<Self>, RunDirError> {
         if !folder.path().join(FILE).exists() {
             return Ok(Vec::new());
         }
         let mut judgments: Vec<Self> = folder.read_json(FILE)?;
-        judgments.retain(|judgment| !judgment.conditions.environment.is_empty());
         judgments.iter_mut().for_each(|judgment| judgment.run = folder.path().to_owned());
         Ok(judgments)
     }
