@@ -67,18 +67,3 @@ pub(crate) fn hide_certificates(command: &mut Command, endpoint: &str) {
         command.env_remove("QUAD_CERTIFICATES");
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[tokio::test]
-    async fn a_process_that_ignores_sigterm_is_killed() {
-        let mut command = Command::new("sh");
-        command.args(["-c", "trap '' TERM; while :; do sleep 0.01; done"]);
-        let process = Process::start(&mut command).unwrap();
-        tokio::time::sleep(Duration::from_millis(200)).await;
-        let status = process.end(Duration::from_millis(100)).await.unwrap();
-        assert_eq!(status.to_string(), "signal: 9 (SIGKILL)");
-    }
-}

@@ -2,23 +2,7 @@
 
 use crate::config::resolve;
 use quad_runtime::one_line;
-use toml::{Table, toml};
-
-#[test]
-fn changes_override_the_values_of_the_task() {
-    let preset = resolve("hopper-demo", &Table::new()).unwrap();
-    let changes = toml! { steps = 5 agent.guidance = "none" agent.tau = 1 };
-    let changed = resolve("hopper-demo", &changes).unwrap();
-    assert_eq!((changed.steps, changed.eval_interval), (5, preset.eval_interval));
-    assert_eq!(changed.agent["guidance"], "none".into());
-    assert_eq!(changed.agent["tau"], 1.0.into());
-}
-
-#[test]
-fn an_algorithm_of_practice_alone_trains_no_steps_before_it() {
-    let changes = toml! { algorithm = "rlpd" online.steps = 50000 };
-    assert_eq!(resolve("own-data", &changes).unwrap().steps, 0);
-}
+use toml::Table;
 
 #[test]
 fn demonstrations_are_short() {
