@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::spread::Spread;
+use crate::counted;
 use crate::folder::{Lock, RunDir, RunDirError};
 use crate::table::{Block, Table};
 
@@ -172,10 +173,10 @@ impl Ranking {
         push(["-", "behavior, as recorded", &recorded, "", ""]);
         let of = &self.conditions;
         let (environment, gamma, steps, seeds) = (&of.environment, of.gamma, of.steps, of.seeds);
-        let (verdict, count) = (&self.verdict, of.episodes.len());
+        let (verdict, episodes) = (&self.verdict, counted(of.episodes.len(), "episode"));
         let text = format!(
             "Judged without a simulator: a ranking, not a score.\n{verdict}\nValues are discounted returns (γ = {gamma}) in {environment} \
-             from the first states of {count} episodes on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
+             from the first states of {episodes} on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
              Distance: of the policy's actions from the data's, in standard deviations of the data's.\n"
         );
         [Block::Text(text), Block::Table(table)]
