@@ -79,7 +79,7 @@ pub fn in_words(error: &toml::de::Error) -> String {
                 message.replace(&format!("expected {name}\n"), &format!("expected {words}\n"));
         }
     }
-    message
+    message.trim_end().to_owned()
 }
 
 /// Checks that a hyper-parameter is in its range.

@@ -87,7 +87,8 @@ impl Cost {
         let left = HumanDuration(Duration::from_secs_f64((self.seconds / jobs as f64).ceil()));
         let (measured, bytes) = (counted(self.measured, "configuration"), HumanBytes(self.bytes));
         format!(
-            "training takes about {left}, {jobs} at a time (by a second's measurement of {measured}, each alone on one thread); these runs take {bytes} of disk"
+            "training takes about {left}, {jobs} at a time (by a second's measurement of {measured}, each alone on one \
+             thread); these runs take {bytes} of disk"
         )
     }
 }
