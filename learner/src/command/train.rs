@@ -110,8 +110,7 @@ fn announce(
     for doubt in preset.doubts(experiment, changes)? {
         warn!("{doubt}");
     }
-    let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
-    if needs_evaluators && environment::find(&experiment.environment).is_err() {
+    if experiment.needs_evaluators() && environment::find(&experiment.environment).is_err() {
         info!(
             "no `evaluator serve` simulates {0}: quad_rl.evaluate(\"{0}\", …) in Python gives the scores (docs/python.md)",
             experiment.environment

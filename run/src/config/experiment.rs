@@ -120,6 +120,11 @@ impl Experiment {
         self.online.as_ref().map(|_| self.steps).filter(|steps| *steps > 0)
     }
 
+    /// True if evaluators have something to play: evaluations or practice.
+    pub fn needs_evaluators(&self) -> bool {
+        self.eval_interval > 0 || self.online.is_some()
+    }
+
     /// The gradient steps and evaluations.
     pub fn schedule(&self) -> Schedule {
         let start = if self.from.is_some() { self.steps } else { 0 };
