@@ -23,20 +23,6 @@ fn create(path: &Path, seed: u64) -> Result<(RunDir, Log), RunDirError> {
 }
 
 #[test]
-fn a_run_is_not_overwritten_and_can_be_set_aside() {
-    let (folder, path, _run, log) = new_run();
-    drop(log);
-    assert!(matches!(create(&path, 1), Err(RunDirError::Occupied(_))));
-    for _ in 0..2 {
-        RunDir::open(&path).unwrap().0.set_aside().unwrap();
-        create(&path, 2).unwrap();
-    }
-    for (name, seed) in [("a.old1", 0), ("a.old2", 2)] {
-        assert_eq!(RunDir::open(&folder.path().join(name)).unwrap().1, config("a", seed));
-    }
-}
-
-#[test]
 fn of_two_learners_that_begin_at_once_one_is_refused() {
     let (_folder, path, _run, log) = new_run();
     fs::remove_file(path.join("config.toml")).unwrap();

@@ -19,7 +19,7 @@ fn a_stopped_learner_resumes_at_its_step() {
     let learner = || scratch.learner("run", ENDLESS);
     let step_of = |learner: &Learner| -> u64 {
         let line = learner.process.wait_for_log("continues after step", PATIENCE);
-        let step = line.split("continues after step ").nth(1).unwrap().split(';').next().unwrap();
+        let step = line.split("continues after step ").nth(1).unwrap().split(',').next().unwrap();
         step.parse().unwrap()
     };
     let mut first = learner();
