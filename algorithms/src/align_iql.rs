@@ -15,7 +15,7 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "align-iql",
     presets: include_str!("../../presets/align-iql.toml"),
     metrics: METRICS,
-    report: Reporting::CANDIDATES,
+    report: Reporting::PLAIN,
     chunks: false,
     read: |table| {
         Ok(start(read::<Config>(table)?, |config, context| config.start(Rule::Nearest, context)))

@@ -181,8 +181,6 @@ pub(crate) use metrics;
 pub struct Reporting {
     /// The hyper-parameter that tells its variants apart, if it has any.
     pub variant: Option<Variant>,
-    /// Counts among the hyper-parameters that reports name with a run, such as `candidates`.
-    pub counts: &'static [&'static str],
     /// The hyper-parameter over which its paper draws scores.
     pub axis: Option<Axis>,
     /// The hyper-parameter with the step after which the target actor moves, where that acts.
@@ -193,10 +191,7 @@ pub struct Reporting {
 
 impl Reporting {
     /// For an algorithm with neither variants nor figures of its own.
-    pub const PLAIN: Self =
-        Self { variant: None, counts: &[], axis: None, acts_after: None, summary: None };
-    /// For an algorithm whose policy chooses among candidates.
-    pub const CANDIDATES: Self = Self { counts: &["candidates"], ..Self::PLAIN };
+    pub const PLAIN: Self = Self { variant: None, axis: None, acts_after: None, summary: None };
 }
 
 /// The hyper-parameter that tells an algorithm's variants apart.

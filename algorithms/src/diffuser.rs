@@ -19,7 +19,7 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "diffuser",
     presets: include_str!("../../presets/diffuser.toml"),
     metrics: METRICS,
-    report: Reporting::CANDIDATES,
+    report: Reporting::PLAIN,
     chunks: false,
     read: |table| Ok(start(Config::read(table)?, Diffuser::new)),
 };

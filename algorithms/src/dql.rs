@@ -17,7 +17,7 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "dql",
     presets: include_str!("../../presets/dql.toml"),
     metrics: METRICS,
-    report: Reporting::CANDIDATES,
+    report: Reporting::PLAIN,
     chunks: false,
     read: |table| Ok(start(read(table)?, Config::start)),
 };

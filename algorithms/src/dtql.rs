@@ -16,7 +16,7 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "dtql",
     presets: include_str!("../../presets/dtql.toml"),
     metrics: METRICS,
-    report: Reporting::CANDIDATES,
+    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Dtql::new)),
 };

@@ -48,13 +48,38 @@ impl AlgorithmError {
 #[allow(missing_docs)] // The messages say what each variant is.
 pub enum AgentError {
     #[error("[agent]: {0}")]
-    Parse(#[from] toml::de::Error),
+    Parse(String),
     #[error("agent.{field} is {value}, but must be {range}")]
     Range { field: &'static str, value: String, range: &'static str },
     #[error(
         "{0} learns single actions from single observations, so agent.chunk and agent.history must be 1"
     )]
     NoChunks(&'static str),
+}
+
+impl From<toml::de::Error> for AgentError {
+    fn from(error: toml::de::Error) -> Self {
+        Self::Parse(in_words(&error))
+    }
+}
+
+/// The message of a TOML parser, with words for the types of Rust and serde.
+pub fn in_words(error: &toml::de::Error) -> String {
+    let mut message = error.to_string();
+    for (types, words) in [
+        (&["u64", "usize"][..], "a whole number from 0"),
+        (&["u32"], "a whole number from 0 to 4294967295"),
+        (&["f32", "f64"], "a number"),
+        (&["a sequence"], "a list"),
+        (&["a map", "struct Online"], "a table"),
+        (&["string only"], "a string"),
+    ] {
+        for name in types {
+            message =
+                message.replace(&format!("expected {name}\n"), &format!("expected {words}\n"));
+        }
+    }
+    message.trim_end().to_owned()
 }
 
 /// Checks that a hyper-parameter is in its range.

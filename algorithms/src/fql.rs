@@ -11,7 +11,7 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "fql",
     presets: include_str!("../../presets/fql.toml"),
     metrics: METRICS,
-    report: Reporting::CANDIDATES,
+    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Fql::new)),
 };

@@ -69,7 +69,7 @@ pub use context::{Context, Minibatch};
 pub use definition::{
     Axis, Definition, Hyperparameters, Metric, MetricsLine, Reporting, Start, Summary, Variant,
 };
-pub use error::{AgentError, AlgorithmError};
+pub use error::{AgentError, AlgorithmError, in_words};
 pub use fqe::{Fqe, FqeConfig, Units};
 pub use state_dict::StateDict;
 pub use values::{Values, fits, merge};

@@ -12,7 +12,7 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "qc",
     presets: include_str!("../../presets/qc.toml"),
     metrics: METRICS,
-    report: Reporting::CANDIDATES,
+    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Qc::new)),
 };

@@ -30,7 +30,6 @@ pub(super) const DEFINITION: Definition = Definition {
         axis: Some(Axis { key: "tau", symbol: "τ" }),
         acts_after: Some("actor_ema_start"),
         summary: Some(summary::of),
-        ..Reporting::CANDIDATES
     },
     chunks: true,
     read: |table| Ok(start(Config::read(table)?, Quad::start)),

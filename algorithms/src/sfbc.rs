@@ -17,7 +17,7 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "sfbc",
     presets: include_str!("../../presets/sfbc.toml"),
     metrics: METRICS,
-    report: Reporting::CANDIDATES,
+    report: Reporting::PLAIN,
     chunks: false,
     read: |table| Ok(start(Config::read(table)?, Sfbc::new)),
 };

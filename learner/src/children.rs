@@ -67,36 +67,3 @@ pub(crate) fn hide_certificates(command: &mut Command, endpoint: &str) {
         command.env_remove("QUAD_CERTIFICATES");
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// The folder of a study may be another user's.
-    #[test]
-    fn a_log_is_no_link_and_no_pipe() {
-        let folder = tempfile::tempdir().unwrap();
-        let [precious, link, pipe] =
-            ["precious", "link", "pipe"].map(|name| folder.path().join(name));
-        std::fs::write(&precious, "precious").unwrap();
-        std::os::unix::fs::symlink(&precious, &link).unwrap();
-        assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
-        let (tx, rx) = std::sync::mpsc::channel();
-        std::thread::spawn(move || {
-            let logged = |log: &Path| prepare(&mut Command::new("true"), log).is_ok();
-            tx.send([&link, &pipe, &precious].map(|log| logged(log)))
-        });
-        let logged = rx.recv_timeout(Duration::from_secs(60)).expect("it waits for a pipe");
-        assert_eq!(logged, [false, false, true]);
-    }
-
-    #[tokio::test]
-    async fn a_process_that_ignores_sigterm_is_killed() {
-        let mut command = Command::new("sh");
-        command.args(["-c", "trap '' TERM; while :; do sleep 0.01; done"]);
-        let process = Process::start(&mut command).unwrap();
-        tokio::time::sleep(Duration::from_millis(200)).await;
-        let status = process.end(Duration::from_millis(100)).await.unwrap();
-        assert_eq!(status.to_string(), "signal: 9 (SIGKILL)");
-    }
-}

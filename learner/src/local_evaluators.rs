@@ -162,19 +162,4 @@ mod tests {
         }
         assert_eq!(next_pause(pause, PAUSE[1]), PAUSE[0], "after long work");
     }
-
-    #[tokio::test]
-    async fn an_evaluator_that_ends_is_started_again() {
-        let (tx, mut rx) = tokio::sync::mpsc::unbounded_channel();
-        let (stop, command) = (CancellationToken::new(), Command::new("false"));
-        let report = move |line| tx.send(line).unwrap();
-        let running = tokio::spawn(keep_running(command, "log".into(), stop.clone(), report));
-        for seconds in [1, 2] {
-            let line = rx.recv().await.unwrap();
-            let place = format!("another takes its place in {seconds} s; their log is log");
-            assert!(line.contains("(exit status: 1)") && line.contains(&place), "{line}");
-        }
-        stop.cancel();
-        running.await.unwrap();
-    }
 }

@@ -7,6 +7,7 @@
 //! - [`folder`]: the files of a run.
 //! - [`config`]: the settings of a run.
 //! - [`table`]: tables as text, Markdown and LaTeX.
+//! - `counted`: numbers of things in messages.
 //! - [`files`]: opens and makes files in a run's folder, for all programs.
 
 #![deny(unsafe_code)]
@@ -15,6 +16,7 @@
 extern crate self as quad_run;
 
 pub mod config;
+mod counted;
 pub mod files;
 #[cfg(test)]
 mod fixtures;
@@ -22,3 +24,5 @@ pub mod folder;
 pub mod results;
 pub mod status;
 pub mod table;
+
+pub use counted::counted;

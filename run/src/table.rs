@@ -134,7 +134,9 @@ fn latex(text: &str) -> String {
         '<' | '>' => format!("${c}$"),
         '±' => "$\\pm$".to_owned(),
         '−' => "$-$".to_owned(),
+        'α' => "$\\alpha$".to_owned(),
         'β' => "$\\beta$".to_owned(),
+        'γ' => "$\\gamma$".to_owned(),
         other => other.to_string(),
     };
     text.chars().map(escaped).collect()

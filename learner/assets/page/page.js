@@ -126,7 +126,9 @@ function showDetails(runs) {
     table.append(element("thead"), element("tbody"));
     const columns = ["step", "seed", "score", "return", "length", "evaluator"];
     table.tHead.append(row(...columns.map((name) => element("th", name, { scope: "col" }))));
-    for (const one of run.episodes.toReversed()) table.tBodies[0].append(row(...columns.map((name) => one[name] === undefined ? "" : name === "evaluator" ? one[name] : number(one[name]))));
+    // Steps and seeds have every digit.
+    const cell = (value) => (typeof value === "string" || Number.isInteger(value) ? String(value) : number(value));
+    for (const one of run.episodes.toReversed()) table.tBodies[0].append(row(...columns.map((name) => cell(one[name]))));
     const wide = element("div", "", { class: "wide" });
     wide.append(element("h3", "Last episodes"), table);
     const about = [["task", run.task], ["algorithm", run.agent], ["seed", String(run.seed)], ["data", run.dataset]];

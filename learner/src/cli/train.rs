@@ -158,29 +158,26 @@ impl TrainArgs {
         for change in self.set.iter().chain(&self.agent) {
             tables::merge(&mut changes, change.clone());
         }
-        let mut set = |key: &str, value: Option<Value>| {
-            changes.extend(value.map(|value| (key.to_owned(), value)));
-        };
-        set("algorithm", self.algorithm.clone().map(Value::from));
-        set("environment", self.env.clone().map(Value::from));
-        set("dataset", self.dataset.clone().map(Value::from));
-        let normalize = Some(self.normalize.clone()).filter(|names| !names.is_empty());
-        set("normalize", normalize.map(Value::from));
-        set("hold_out", self.hold_out.map(Value::from));
         let flags = &self.overrides;
-        set("steps", flags.steps.map(Value::from));
         if let Some(steps) = flags.online_steps {
             let online = Table::from_iter([("steps".to_owned(), steps.into())]);
             tables::merge(&mut changes, Table::from_iter([("online".to_owned(), online.into())]));
         }
-        let mut set = |key: &str, value: Option<Value>| {
+        let normalize = Some(self.normalize.clone()).filter(|names| !names.is_empty());
+        for (key, value) in [
+            ("algorithm", self.algorithm.clone().map(Value::from)),
+            ("environment", self.env.clone().map(Value::from)),
+            ("dataset", self.dataset.clone().map(Value::from)),
+            ("normalize", normalize.map(Value::from)),
+            ("hold_out", self.hold_out.map(Value::from)),
+            ("steps", flags.steps.map(Value::from)),
+            ("eval_interval", flags.eval_interval.map(Value::from)),
+            ("episodes", flags.episodes.map(Value::from)),
+            ("seed", flags.seed.map(Value::from)),
+            ("precision", flags.precision.map(|precision| precision.name().into())),
+        ] {
             changes.extend(value.map(|value| (key.to_owned(), value)));
-        };
-        set("eval_interval", flags.eval_interval.map(Value::from));
-        set("episodes", flags.episodes.map(Value::from));
-        set("seed", flags.seed.map(Value::from));
-        let precision = flags.precision.map(Precision::name);
-        set("precision", precision.map(Value::from));
+        }
         changes
     }
 }

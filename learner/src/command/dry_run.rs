@@ -3,8 +3,9 @@
 
 use std::fs;
 use std::path::Path;
+use std::time::Duration;
 
-use indicatif::HumanBytes;
+use indicatif::{HumanBytes, HumanDuration};
 use quad_dataset::Transitions;
 use quad_run::config::RunConfig;
 use quad_runtime::print;
@@ -16,7 +17,8 @@ pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> an
     let steps = experiment.total_steps() - experiment.schedule().start;
     let price = Price::measure(experiment, config.run.device, transitions)?;
     let milliseconds = price.step_seconds * 1e3;
-    let hours = price.step_seconds * steps as f64 / 3600.0;
+    let all = Duration::try_from_secs_f64((price.step_seconds * steps as f64).ceil());
+    let all = HumanDuration(all.unwrap_or(Duration::MAX));
     let (mut grows, mut kept) = (String::new(), "snapshots and checkpoints");
     if let Some(online) = &experiment.online {
         let bytes = HumanBytes(price.experience_bytes(online.steps));
@@ -24,8 +26,8 @@ pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> an
             (format!("; experience adds {bytes}"), "snapshots, checkpoints and experience");
     }
     print(&format!(
-        "# folder: {}\n# data: {}\n# time: {milliseconds:.1} ms a gradient step, measured over a second; {hours:.2} hours for \
-         all {steps}\n# memory: {}, without evaluators{grows}\n# disk: {} for {kept}\n\n{}",
+        "# folder: {}\n# data: {}\n# time: {milliseconds:.1} ms a gradient step, measured over a second; {all} for all \
+         {steps}\n# memory: {}, without evaluators{grows}\n# disk: {} for {kept}\n\n{}",
         path.display(),
         config.dataset.summary(),
         peak_memory().map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string()),

@@ -3,6 +3,7 @@
 use anyhow::anyhow;
 use quad_dataset::{DatasetError, Metadata, PracticeRows, write_practice};
 use quad_protocol::Episode;
+use quad_run::counted;
 use quad_run::folder::{RunDir, read_experience};
 use quad_runtime::{Hint, print};
 
@@ -31,6 +32,6 @@ pub fn export(args: &ExportDataArgs) -> anyhow::Result<()> {
     write_practice(&args.out, environment, dims, &metadata, &episodes)
         .hint_of(DatasetError::hint)?;
     let rows: usize = episodes.iter().map(|(rows, _)| rows.rewards.len()).sum();
-    let (name, episodes) = (args.out.display(), episodes.len());
-    print(&format!("{name}: {rows} rows of {episodes} episodes in {environment}"))
+    let (name, episodes) = (args.out.display(), counted(episodes.len(), "episode"));
+    print(&format!("{name}: {rows} rows of {episodes} in {environment}"))
 }

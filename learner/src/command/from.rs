@@ -11,7 +11,7 @@ use toml::Table;
 
 /// The end of a complete run.
 pub(super) struct From {
-    checkpoint: Checkpoint,
+    pub checkpoint: Checkpoint,
     /// Hash of the checkpoint.
     pub hash: String,
     experiment: Experiment,
@@ -62,10 +62,5 @@ impl From {
         let Some((key, _)) = kept.iter().find(|(_, is_kept)| !is_kept) else { return Ok(()) };
         let error = anyhow!("the run of --from has learned with another value of {key}");
         Err(hinted(error, "leave it as it was there: what has been learned depends on it"))
-    }
-
-    /// The checkpoint to begin with.
-    pub fn into_checkpoint(self) -> Checkpoint {
-        self.checkpoint
     }
 }

@@ -21,6 +21,7 @@ use clap_complete::Shell;
 use quad_algorithms::{ALGORITHMS, Definition, Values};
 use quad_dataset::{DatasetError, benchmarks, environment};
 use quad_run::config::{ConfigError, Preset, hyperparameters, tasks};
+use quad_run::counted;
 use quad_run::folder::verify::{self, Findings};
 use quad_run::folder::{RunDirError, practiced};
 use quad_run::status::list;
@@ -168,7 +169,7 @@ fn all_readable(unreadable: usize) -> anyhow::Result<()> {
     if unreadable == 0 {
         return Ok(());
     }
-    Err(anyhow!("{unreadable} folders cannot be read")).hint(DAMAGED)
+    Err(anyhow!("{} cannot be read", counted(unreadable, "folder"))).hint(DAMAGED)
 }
 
 fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
@@ -282,6 +283,6 @@ fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let inspection = quad_dataset::inspect(&path, environment).hint_of(DatasetError::hint)?;
     show(args.json, &inspection, || inspection.to_string())?;
     let (problems, path) = (inspection.problems.len(), inspection.path.display());
-    anyhow::ensure!(problems == 0, "{problems} problems in {path}");
+    anyhow::ensure!(problems == 0, "{} in {path}", counted(problems, "problem"));
     Ok(())
 }

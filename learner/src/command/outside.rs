@@ -29,7 +29,10 @@ pub(super) struct Outside {
 
 impl Outside {
     pub fn new(args: &TrainArgs, experiment: &Experiment) -> anyhow::Result<Self> {
-        let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
+        let needs_evaluators = experiment.needs_evaluators();
+        if !needs_evaluators && args.evaluators.is_some_and(|count| count > 0) {
+            warn!("--evaluators has no effect: the run has neither evaluations nor practice");
+        }
         let endpoints = endpoints(args, needs_evaluators)?;
         let is_default = args.listen.is_none() && args.connect.is_none();
         let cores = available_parallelism()?.get();

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::thread::available_parallelism;
 
 use anyhow::{Context, anyhow};
+use quad_run::counted;
 use quad_run::folder::{Lock, RunDirError};
 use quad_run::status::State;
 use quad_run::table::{Style, Table};
@@ -37,7 +38,7 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     info!("{}: {}", study.name, study.about);
     let (all, todo) = (runs.len(), runs.len() - complete - unreadable);
     let begun = todo - new;
-    info!("{all} runs: {complete} complete, {todo} to do, of which {begun} have begun");
+    info!("{}: {complete} complete, {todo} to do ({begun} begun)", counted(all, "run"));
     let mut failed = Vec::new();
     for (run, _) in runs.iter().filter(|(_, state)| *state == State::Unreadable) {
         failed.push(format!("{}: its folder cannot be read", run.name));
@@ -185,19 +186,18 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
 }
 
 fn conclude(folder: &Path, count: usize, ended: Outcome) -> anyhow::Result<()> {
-    let (stopped, failed) = (ended.unfinished, ended.failed.len());
+    let (stopped, failed, runs) = (ended.unfinished, ended.failed.len(), counted(count, "run"));
     if failed > 0 {
         let reasons = ended.failed.join("\n  ");
-        return Err(anyhow!("{failed} of {count} runs have failed:\n  {reasons}"))
+        return Err(anyhow!("{failed} of {runs} failed:\n  {reasons}"))
             .hint("fix it and run the same command: unfinished runs continue");
     }
     if stopped > 0 {
-        let error = anyhow!("{stopped} of {count} runs are not complete");
+        let error = anyhow!("{stopped} of {runs} did not complete");
         let kept = "what they have reached is kept, and the same command continues from there";
         return Err(unfinished(error, kept));
     }
-    let folder = folder.display();
-    print(&format!("all {count} runs are complete: learner report {folder}"))
+    print(&format!("{runs} complete: learner report {}", folder.display()))
 }
 
 #[cfg(test)]

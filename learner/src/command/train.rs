@@ -12,6 +12,7 @@ use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo};
+use quad_run::counted;
 use quad_run::folder::{Checkpoint, ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
 use quad_runtime::{
@@ -86,7 +87,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     }
 
     let runtime = super::runtime()?;
-    let first = from.map(From::into_checkpoint);
+    let first = from.map(|from| from.checkpoint);
     let run = run_to_end(args, outside, &path, (begun, first), &config, data);
     let ended = runtime.block_on(run);
     let concluded =
@@ -109,8 +110,7 @@ fn announce(
     for doubt in preset.doubts(experiment, changes)? {
         warn!("{doubt}");
     }
-    let needs_evaluators = experiment.eval_interval > 0 || experiment.online.is_some();
-    if needs_evaluators && environment::find(&experiment.environment).is_err() {
+    if experiment.needs_evaluators() && environment::find(&experiment.environment).is_err() {
         info!(
             "no `evaluator serve` simulates {0}: quad_rl.evaluate(\"{0}\", …) in Python gives the scores (docs/python.md)",
             experiment.environment
@@ -311,13 +311,12 @@ fn conclude(
 }
 
 fn all_scored(report: RunReport) -> anyhow::Result<()> {
-    let missing = report.episodes_missing;
-    let error = anyhow!("training is complete, but {missing} episodes have no score");
-    let hint = "the log says why; fix it, and the same command hands them out again";
-    match missing {
-        0 => Ok(()),
-        _ => Err(hinted(error, hint)),
+    if report.is_complete() {
+        return Ok(());
     }
+    let missing = counted(report.episodes_missing as usize, "episode");
+    Err(anyhow!("training is complete, without the scores of {missing}"))
+        .hint("the log says why; fix it, and the same command hands them out again")
 }
 
 fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {

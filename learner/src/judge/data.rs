@@ -58,7 +58,9 @@ impl Data {
             }
         }
         let source = Source::Path(data.path.clone());
-        let hint = format!("put the data of the run {run} back");
+        let hint = format!(
+            "put the data of the run {run} back; a relative path is below the folder where `learner train` was started"
+        );
         let dataset = source.obtain().hint(hint)?;
         if data.sha256.is_some() && data.sha256 != Some(dataset.sha256.clone()) {
             let path = dataset.path.display();

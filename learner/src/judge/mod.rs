@@ -17,6 +17,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Context;
+use indicatif::HumanDuration;
 use quad_algorithms::{FqeConfig, Units};
 use quad_run::results::{Conditions, Judgment, Ranking};
 use tracing::{info, warn};
@@ -101,8 +102,7 @@ fn forecast(evaluation: &Evaluation<'_>, snapshots: &[&Snapshot]) -> anyhow::Res
         acting += Actions::time(&*snapshot.policy, evaluation.data)?;
     }
     let evaluating = evaluation.time()? * (snapshots.len() as u32 + 1);
-    let minutes = |time: Duration| format!("{:.1}", time.as_secs_f64() / 60.0);
-    let (all, acting) = (minutes(acting + evaluating), minutes(acting));
-    info!("judging takes about {all} minutes, {acting} of them to ask the policies for actions");
+    let (all, acting) = (HumanDuration(acting + evaluating), HumanDuration(acting));
+    info!("judging takes about {all}, {acting} of it for the policies' actions");
     Ok(())
 }

@@ -10,7 +10,7 @@ mod history;
 mod reader;
 
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use axum::Router;
 use axum::body::Bytes;
@@ -19,13 +19,11 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use serde_json::Value;
-use tokio::sync::Semaphore;
+use tokio::sync::Mutex;
 use tokio::task::spawn_blocking;
 
 use reader::Reader;
 
-/// Queries that wait for the reader; the server answers more of them with 503.
-const MAX_QUERIES: usize = 64;
 /// Only the page's own files are loaded, and no inline script runs.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; base-uri 'none'; \
                       form-action 'none'; frame-ancestors 'none'";
@@ -50,7 +48,6 @@ pub(crate) type Live = Arc<dyn Fn() -> Value + Send + Sync>;
 #[derive(Clone)]
 struct Site {
     reader: Arc<Mutex<Reader>>,
-    queries: Arc<Semaphore>,
     live: Option<Live>,
 }
 
@@ -72,8 +69,7 @@ pub(crate) fn routes(root: PathBuf, live: Option<Live>) -> Router {
         .route("/api/run/{*name}", get(run))
         .route("/api/live", get(live_state));
     let reader = Arc::new(Mutex::new(Reader::new(root)));
-    let queries = Arc::new(Semaphore::new(MAX_QUERIES));
-    router.with_state(Site { reader, queries, live })
+    router.with_state(Site { reader, live })
 }
 
 async fn runs(State(site): State<Site>) -> Response {
@@ -93,14 +89,8 @@ impl Site {
         self,
         read: impl FnOnce(&mut Reader) -> Option<Bytes> + Send + 'static,
     ) -> Response {
-        let Ok(query) = self.queries.try_acquire_owned() else {
-            return StatusCode::SERVICE_UNAVAILABLE.into_response();
-        };
-        let answer = spawn_blocking(move || {
-            let _query = query;
-            let reader = self.reader.lock();
-            read(&mut reader.unwrap_or_else(PoisonError::into_inner))
-        });
+        let mut reader = self.reader.lock_owned().await;
+        let answer = spawn_blocking(move || read(&mut reader));
         json(answer.await.ok().flatten())
     }
 }

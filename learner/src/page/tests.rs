@@ -15,8 +15,8 @@ use super::*;
 use crate::fixtures::{config, line};
 
 /// Head and body of each answer.
-async fn get(root: &Path, live: Option<Live>, paths: &[&str]) -> Vec<(String, String)> {
-    let pages = routes(root.to_owned(), live);
+async fn get(root: &Path, paths: &[&str]) -> Vec<(String, String)> {
+    let pages = routes(root.to_owned(), None);
     let any_port = ([127, 0, 0, 1], 0).into();
     let server = serve_metrics(any_port, Default::default(), Health::default(), pages).await;
     let server = server.unwrap();
@@ -39,7 +39,7 @@ async fn get(root: &Path, live: Option<Live>, paths: &[&str]) -> Vec<(String, St
 async fn the_page_needs_no_other_host_and_has_no_inline_script() {
     let folder = tempfile::tempdir().unwrap();
     let paths = ["/", "/page.js", "/charts.js", "/dygraph.js", "/page.css"];
-    let answers = get(folder.path(), None, &paths).await;
+    let answers = get(folder.path(), &paths).await;
     let (head, page) = &answers[0];
     assert!(head.contains("default-src 'none'; script-src 'self'"), "{head}");
     assert!(!head.contains("unsafe"), "{head}");
@@ -70,7 +70,7 @@ async fn the_api_has_runs_with_scores_metrics_and_settings() {
     }
     let missing = ["/api/run/nonsense", "/api/run/..%2Fb%2Fc", "/api/live"];
     let paths = [&["/api/runs", "/api/run/b%2Fc"][..], &missing].concat();
-    let answers = get(folder.path(), None, &paths).await;
+    let answers = get(folder.path(), &paths).await;
     for (head, _) in &answers[2..] {
         assert!(head.starts_with("HTTP/1.1 404"), "{answers:?}");
     }
@@ -87,12 +87,4 @@ async fn the_api_has_runs_with_scores_metrics_and_settings() {
     assert_eq!(run["metrics"].as_array().unwrap().len(), metrics.len());
     let settings = run["settings"].as_str().unwrap();
     assert!(settings.contains("[experiment.agent]"));
-}
-
-#[tokio::test]
-async fn the_api_has_the_learners_state() {
-    let folder = tempfile::tempdir().unwrap();
-    let live: Live = Arc::new(|| json!({ "step": 7 }));
-    let answers = get(folder.path(), Some(live), &["/api/live"]).await;
-    assert_eq!(answers[0].1, "{\"step\":7}");
 }

@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::Context;
 use quad_algorithms::{ALGORITHMS, Axis, Definition};
 use quad_run::config::settings::{self, Settings};
+use quad_run::counted;
 use quad_run::results::RunReport;
 use quad_run::results::statistics::{self, Estimate, Runs};
 use quad_runtime::Hint;
@@ -120,9 +121,8 @@ fn curve(group: &GroupReport) -> Line {
         let mean = |step| runs.iter().map(|run| run[step]).sum::<f64>() / runs.len() as f64;
         steps.iter().copied().map(mean).collect()
     });
-    let plural = if group.runs.len() == 1 { "" } else { "s" };
     let part = group.reached.map_or("", |_| ", not complete");
-    let label = format!("{} ({} seed{plural}{part})", group.method, group.runs.len());
+    let label = format!("{} ({}{part})", group.method, counted(group.runs.len(), "seed"));
     let points = steps.iter().map(|step| **step as f64).zip(means).collect();
     Line { label, points }
 }

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use quad_dataset::{GoalDraw, environment};
 use quad_run::config::Device;
 use quad_run::config::settings::{self, Settings, differences};
+use quad_run::counted;
 use quad_run::results::departures::{as_given, departures};
 use quad_run::results::published::{self, Published};
 use quad_run::results::{RunReport, joined};
@@ -65,11 +66,10 @@ pub struct GroupReport {
 impl GroupReport {
     /// `4 seeds, 2000000 steps on cpu, scored in f32`.
     pub fn provenance(&self) -> String {
-        let (seeds, scored_in) = (self.seeds.len(), &self.scored_in);
-        let plural = if seeds == 1 { "" } else { "s" };
+        let (seeds, scored_in) = (counted(self.seeds.len(), "seed"), &self.scored_in);
         let goals = self.goals.map_or("", |_| " with a goal each");
         let (steps, device) = (self.steps_in_words(), self.device.name());
-        format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {scored_in}")
+        format!("{seeds}{goals}, {steps} on {device}, scored in {scored_in}")
     }
 
     pub fn measure(&self) -> &'static str {
@@ -174,7 +174,7 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
 }
 
 /// The runs that count, and why others do not.
-fn counted<'a>(runs: &[&'a RunReport]) -> (Vec<&'a RunReport>, Vec<String>) {
+fn that_count<'a>(runs: &[&'a RunReport]) -> (Vec<&'a RunReport>, Vec<String>) {
     let (mut counted, mut left_out) = (Vec::<&RunReport>::new(), Vec::new());
     for run in runs.iter().copied() {
         let (dir, seed) = (run.dir.display(), run.seed);
@@ -197,7 +197,7 @@ fn report(
     differs: Vec<String>,
     select: Select,
 ) -> GroupReport {
-    let (counted, left_out) = counted(runs);
+    let (counted, left_out) = that_count(runs);
     let values = |value: fn(&RunReport) -> Option<f64>| -> Option<Vec<f64>> {
         counted.iter().map(|run| value(run)).collect()
     };

@@ -8,8 +8,8 @@ use anyhow::Context;
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::Environment;
 use minijinja::value::Serde;
-use quad_run::files;
 use quad_run::results::RunReport;
+use quad_run::{counted, files};
 use quad_runtime::Hint;
 use serde_json::{Value, json};
 use tracing::warn;
@@ -38,7 +38,6 @@ pub fn write(path: &Path, report: &Report) -> anyhow::Result<()> {
 
 fn content(report: &Report) -> anyhow::Result<Value> {
     let tasks: BTreeSet<&str> = report.runs.iter().map(|run| &*run.task).collect();
-    let plural = if report.runs.len() == 1 { "" } else { "s" };
     let complete = report.runs.iter().filter(|run| run.is_complete()).count();
     let mut plots = Vec::new();
     for (_, plot) in figures::all(report) {
@@ -50,7 +49,7 @@ fn content(report: &Report) -> anyhow::Result<Value> {
     }
     Ok(json!({
         "title": Vec::from_iter(tasks).join(", "),
-        "subtitle": format!("{} run{plural}, {complete} complete", report.runs.len()),
+        "subtitle": format!("{}, {complete} complete", counted(report.runs.len(), "run")),
         "version": env!("CARGO_PKG_VERSION"),
         "blocks": report.summaries(true),
         "figures": plots,

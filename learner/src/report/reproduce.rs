@@ -28,8 +28,11 @@ pub fn command(run: &RunReport) -> Option<String> {
     }
     let [ours, theirs] = [experiment, &preset].map(settings::of_experiment);
     for key in differences(&ours, &theirs) {
-        if !matches!(key.as_str(), "environment" | "seed") {
-            push("--set", &assignment(key, ours.get(key)?));
+        match (key.as_str(), ours.get(key)) {
+            ("environment" | "seed", _) => {}
+            // A share of 0 is not among the settings, but the task may have another.
+            ("hold_out", None) => push("--hold-out", "0"),
+            (_, value) => push("--set", &assignment(key, value?)),
         }
     }
     if run.config.run.device != Default::default() {

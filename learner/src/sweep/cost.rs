@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use indicatif::{HumanBytes, HumanDuration};
 use quad_run::config::{Device, settings};
+use quad_run::counted;
 use quad_run::status::State;
 use rayon::ThreadPoolBuilder;
 use tracing::warn;
@@ -83,10 +84,10 @@ impl Cost {
 
     /// The cost in words, with this many runs at a time.
     pub fn text(&self, jobs: usize) -> String {
-        let left = HumanDuration(Duration::from_secs_f64(self.seconds / jobs as f64));
-        let (measured, bytes) = (self.measured, HumanBytes(self.bytes));
+        let left = HumanDuration(Duration::from_secs_f64((self.seconds / jobs as f64).ceil()));
+        let (measured, bytes) = (counted(self.measured, "configuration"), HumanBytes(self.bytes));
         format!(
-            "training takes about {left}, {jobs} at a time (by a second's measurement of {measured} configurations, each alone on one \
+            "training takes about {left}, {jobs} at a time (by a second's measurement of {measured}, each alone on one \
              thread); these runs take {bytes} of disk"
         )
     }

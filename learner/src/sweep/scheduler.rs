@@ -138,7 +138,7 @@ impl Sweep {
             left += self.seconds(run, state.step(steps), steps);
         }
         let (running, waiting) = (running.len(), self.waiting.len());
-        let mut total = format!("{complete} runs complete, {running} at work, {waiting} waiting");
+        let mut total = format!("runs: {complete} complete, {running} at work, {waiting} waiting");
         if !failed.is_empty() {
             total += &format!(", {} failed", failed.len());
         }

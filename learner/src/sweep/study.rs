@@ -166,7 +166,7 @@ impl File {
                 }
                 Err(error) => {
                     hints.extend(quad_runtime::hints(&error).map(str::to_owned));
-                    sentence(&error)
+                    one_line(&*error).trim_end().replace('\n', " ")
                 }
             };
             names_by_problem.entry(problem).or_default().push(name);
@@ -248,19 +248,6 @@ fn set(table: &mut Table, key: &str, value: &Value) {
     if let Value::Table(change) = key.rsplit('.').fold(value.clone(), below) {
         tables::merge(table, change);
     }
-}
-
-/// An error in one line, with the causes that it does not quote.
-fn sentence(error: &anyhow::Error) -> String {
-    let mut sentence = String::new();
-    for cause in error.chain() {
-        let text = cause.to_string().trim().replace('\n', " ");
-        if !sentence.contains(&text) {
-            sentence += if sentence.is_empty() { "" } else { ": " };
-            sentence += &text;
-        }
-    }
-    sentence
 }
 
 fn some_of(names: &[String]) -> String {

@@ -28,7 +28,7 @@ pub(crate) fn begin(
     transitions: Transitions,
 ) -> anyhow::Result<Agent> {
     let agent = new_agent(experiment, device, transitions, experiment.batch_size as usize)?;
-    if experiment.eval_interval > 0 || experiment.online.is_some() {
+    if experiment.needs_evaluators() {
         let (bytes, most) = (agent.policy(origin(experiment))?.len(), Snapshot::MOST_FILE);
         if bytes > most {
             let error = anyhow!(

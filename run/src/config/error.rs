@@ -20,8 +20,8 @@ pub enum ConfigError {
     NotToml { preset: String, source: toml::de::Error },
     #[error("preset {preset} cannot be used")]
     Preset { preset: String, source: Box<ConfigError> },
-    #[error("preset {preset} cannot be used")]
-    Keys { preset: String, source: toml::de::Error },
+    #[error("these settings of {preset} cannot be used: {reason}")]
+    Keys { preset: String, reason: String },
     #[error("preset {0} names neither a task nor an environment")]
     NoEnvironment(String),
     #[error("{field} is {value}, but must be {range}")]

@@ -10,6 +10,7 @@ use super::error::ConfigError;
 use super::hyperparameters;
 use super::online::Online;
 use super::schedule::Schedule;
+use crate::counted;
 
 /// Upper bounds, far above any use; each evaluation keeps a snapshot.
 const MOST_EPISODES: u64 = 10_000;
@@ -87,17 +88,14 @@ impl Experiment {
         Ok(known.map_or_else(|| variant.to_owned(), |known| (known.called)(variant)))
     }
 
-    /// Name, variant and counts of the algorithm: `quad, guidance dac, 10 candidates`.
+    /// Name, variant and candidates of the algorithm: `quad, guidance dac, 10 candidates`.
     pub fn method(&self) -> Result<String, ConfigError> {
-        let report = self.definition()?.report;
         let mut method = self.algorithm.clone();
-        if let Some(variant) = report.variant {
+        if let Some(variant) = self.definition()?.report.variant {
             method += &format!(", {} {}", variant.key, self.variant()?);
         }
-        for key in report.counts {
-            if let Some(count) = self.agent.get(*key) {
-                method += &format!(", {count} {key}");
-            }
+        if let Some(count) = self.agent.get("candidates").and_then(Value::as_integer) {
+            method += &format!(", {}", counted(count as usize, "candidate"));
         }
         Ok(method)
     }
@@ -118,6 +116,11 @@ impl Experiment {
     /// Gradient step after which practice begins, if others come before it.
     pub fn practice_begins(&self) -> Option<u64> {
         self.online.as_ref().map(|_| self.steps).filter(|steps| *steps > 0)
+    }
+
+    /// True if evaluators have something to play: evaluations or practice.
+    pub fn needs_evaluators(&self) -> bool {
+        self.eval_interval > 0 || self.online.is_some()
     }
 
     /// The gradient steps and evaluations.

@@ -13,22 +13,3 @@ pub fn did_you_mean<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) ->
         false => format!("did you mean {}? ", names.join(", ")),
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::did_you_mean;
-
-    #[test]
-    fn suggests_similar_names() {
-        let known = ["hopper-demo", "walker2d-demo", "walker2d-medium-replay-v2"];
-        for (word, answer) in [
-            ("hoper-demo", "hopper-demo"),
-            ("walker2d-medium-reply-v2", "walker2d-medium-replay-v2"),
-            ("walker", "walker2d-demo, walker2d-medium-replay-v2"),
-        ] {
-            let expected = format!("did you mean {answer}? ");
-            assert_eq!(did_you_mean(word, known), expected);
-        }
-        assert_eq!(did_you_mean("zzz", known), "");
-    }
-}

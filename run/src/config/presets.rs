@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use quad_algorithms::{ALGORITHMS, Definition, Values};
+use quad_algorithms::{ALGORITHMS, Definition, Values, in_words};
 use quad_dataset::environment;
 use serde::Deserialize;
 use toml::{Table, Value};
@@ -90,9 +90,10 @@ impl Preset {
         {
             table.insert("reward".to_owned(), rule);
         }
-        let preset = self.label.clone();
-        let parsed = Experiment::deserialize(table);
-        let mut experiment = parsed.map_err(|source| ConfigError::Keys { preset, source })?;
+        let mut experiment = Experiment::deserialize(table).map_err(|error| ConfigError::Keys {
+            preset: self.label.clone(),
+            reason: in_words(&error),
+        })?;
         experiment.check()?;
         Ok(experiment)
     }
@@ -193,13 +194,6 @@ mod tests {
             (
                 "algorithm = 'ivr'\nagent = { divergence = 'sparse', alpha.exponential = 2.0 }",
                 Some("agent.alpha.exponential has no effect on a policy with divergence sparse"),
-            ),
-            (
-                "steps = 1000",
-                Some(
-                    "the target actor, which acts, stays as it began: it moves after step 1000 (agent.actor_ema_start), and this run has \
-                     1000",
-                ),
             ),
             (
                 "online.warmup = 100",

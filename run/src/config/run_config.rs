@@ -6,6 +6,7 @@ use quad_protocol::Name;
 use serde::{Deserialize, Serialize};
 
 use super::experiment::Experiment;
+use crate::counted;
 
 /// Device on which a run trains; evaluators use the CPU.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -93,15 +94,14 @@ pub struct DatasetInfo {
 impl DatasetInfo {
     /// Size and quality of the data, in one line.
     pub fn summary(&self) -> String {
-        let (transitions, episodes) = (self.transitions, self.episodes);
-        let mean = self.mean_return;
-        let mut text =
-            format!("{transitions} transitions of {episodes} episodes, mean return {mean:.2}");
+        let (transitions, mean) = (self.transitions, self.mean_return);
+        let episodes = counted(self.episodes as usize, "episode");
+        let mut text = format!("{transitions} transitions of {episodes}, mean return {mean:.2}");
         if let Some(score) = self.mean_score {
             text += &format!(", mean score {score:.2}");
         }
         if !self.held_out.is_empty() {
-            text += &format!("; {} more are held out", self.held_out.len());
+            text += &format!("; held out: {}", counted(self.held_out.len(), "episode"));
         }
         text
     }

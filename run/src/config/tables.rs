@@ -38,9 +38,6 @@ mod tests {
         ] {
             assert_eq!(parse_assignment(text), Ok(expected.parse().unwrap()));
         }
-        for (wrong, words) in [("agent.tau", "KEY=VALUE"), ("agent tau=1", "agent tau")] {
-            let error = parse_assignment(wrong).unwrap_err();
-            assert!(error.contains(words), "{error}");
-        }
+        assert!(parse_assignment("agent tau=1").unwrap_err().contains("agent tau"));
     }
 }

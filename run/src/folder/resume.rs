@@ -13,6 +13,7 @@ use super::lines::ScoreLine;
 use super::log::Log;
 use super::run_dir::RunDir;
 use crate::config::{Experiment, RunConfig, settings};
+use crate::counted;
 
 /// The saved scores of one evaluation.
 #[derive(Clone, Debug, PartialEq)]
@@ -102,7 +103,8 @@ impl ExistingRun {
         let scored = point.scores.values();
         let episodes: usize = scored.map(|scores| scores.episodes.len()).sum();
         let (path, step) = (dir.path().display(), point.step());
-        info!("the run in {path} continues after step {step}; {episodes} episodes are scored");
+        let scored = counted(episodes, "scored episode");
+        info!("the run in {path} continues after step {step}, with {scored}");
         Ok((dir, scores, point))
     }
 }

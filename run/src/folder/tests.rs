@@ -1,17 +1,13 @@
 //! Tests of a run folder.
 
-use std::fs::{self, File};
+use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
-use std::process::Command;
-use std::sync::mpsc::channel;
-use std::time::Duration;
 
-use quad_runtime::one_line;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::{Checkpoint, ExistingRun, Log, RunDir, RunDirError};
+use super::{ExistingRun, Log, RunDir, RunDirError};
 use crate::fixtures::{config, line};
 
 /// A new run in a temporary folder.
@@ -24,20 +20,6 @@ fn new_run() -> (TempDir, PathBuf, RunDir, Log) {
 
 fn create(path: &Path, seed: u64) -> Result<(RunDir, Log), RunDirError> {
     RunDir::create(path, &config("a", seed))
-}
-
-#[test]
-fn a_run_is_not_overwritten_and_can_be_set_aside() {
-    let (folder, path, _run, log) = new_run();
-    drop(log);
-    assert!(matches!(create(&path, 1), Err(RunDirError::Occupied(_))));
-    for _ in 0..2 {
-        RunDir::open(&path).unwrap().0.set_aside().unwrap();
-        create(&path, 2).unwrap();
-    }
-    for (name, seed) in [("a.old1", 0), ("a.old2", 2)] {
-        assert_eq!(RunDir::open(&folder.path().join(name)).unwrap().1, config("a", seed));
-    }
 }
 
 #[test]
@@ -158,31 +140,6 @@ fn does_not_write_through_links_to_folders() {
     run.remove_partial_files();
     assert!(run.write_snapshot(10, b"weights").is_err() && partial.exists());
     assert_eq!(fs::read_to_string(snapshot).unwrap(), "precious");
-}
-
-#[test]
-fn does_not_wait_for_pipes_or_read_huge_files() {
-    let (_folder, path, run, _log) = new_run();
-    let (step, state) = (10, b"state".to_vec());
-    run.write_checkpoint(&Checkpoint { step, state }).unwrap();
-    let checkpoint = path.join("checkpoints/step_000000020_0000000000000000.safetensors");
-    for path in [&checkpoint, &run.snapshot_path(20)] {
-        assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
-    }
-    File::create(run.snapshot_path(30)).unwrap().set_len(1 << 42).unwrap();
-    symlink(run.snapshot_path(30), run.snapshot_path(40)).unwrap();
-    // A pipe and a link are no snapshots.
-    assert_eq!(run.snapshots().unwrap(), [30]);
-    let (tx, rx) = channel();
-    std::thread::spawn(move || {
-        let refused = [20, 30].map(|step| one_line(&run.read_snapshot(step).unwrap_err()));
-        tx.send((refused, run.newest_checkpoint()))
-    });
-    let received = rx.recv_timeout(Duration::from_secs(60));
-    let ([pipe, huge], newest) = received.expect("it waits for a pipe");
-    assert!(pipe.contains("a pipe"), "{pipe}");
-    assert!(huge.contains("too large"), "{huge}");
-    assert_eq!(newest.unwrap().map(|checkpoint| checkpoint.step), Some(10));
 }
 
 #[test]

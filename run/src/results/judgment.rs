@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::spread::Spread;
+use crate::counted;
 use crate::folder::{Lock, RunDir, RunDirError};
 use crate::table::{Block, Table};
 
@@ -17,8 +18,7 @@ const LOCK: &str = "judgments.lock";
 pub struct Conditions {
     /// SHA-256 of the data.
     pub dataset: String,
-    /// The environment of the rewards; empty in older files.
-    #[serde(default)]
+    /// The environment of the rewards.
     pub environment: String,
     /// Indices of the episodes in whose first states policies are judged, in the file's order.
     pub episodes: Vec<usize>,
@@ -51,7 +51,6 @@ impl Estimate {
 #[allow(missing_docs)]
 pub struct Judgment {
     /// The folder of its run, as the reader calls it.
-    #[serde(default)]
     pub run: PathBuf,
     /// Gradient step of the snapshot.
     pub step: u64,
@@ -72,13 +71,12 @@ pub struct Judgment {
 }
 
 impl Judgment {
-    /// The judgments in a run's folder, without those of unknown environments.
+    /// The judgments in a run's folder.
     pub fn read_all(folder: &RunDir) -> Result<Vec<Self>, RunDirError> {
         if !folder.path().join(FILE).exists() {
             return Ok(Vec::new());
         }
         let mut judgments: Vec<Self> = folder.read_json(FILE)?;
-        judgments.retain(|judgment| !judgment.conditions.environment.is_empty());
         judgments.iter_mut().for_each(|judgment| judgment.run = folder.path().to_owned());
         Ok(judgments)
     }
@@ -175,10 +173,10 @@ impl Ranking {
         push(["-", "behavior, as recorded", &recorded, "", ""]);
         let of = &self.conditions;
         let (environment, gamma, steps, seeds) = (&of.environment, of.gamma, of.steps, of.seeds);
-        let (verdict, count) = (&self.verdict, of.episodes.len());
+        let (verdict, episodes) = (&self.verdict, counted(of.episodes.len(), "episode"));
         let text = format!(
             "Judged without a simulator: a ranking, not a score.\n{verdict}\nValues are discounted returns (γ = {gamma}) in {environment} \
-             from the first states of {count} episodes on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
+             from the first states of {episodes} on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
              Distance: of the policy's actions from the data's, in standard deviations of the data's.\n"
         );
         [Block::Text(text), Block::Table(table)]

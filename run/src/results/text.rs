@@ -3,6 +3,7 @@
 use std::fmt::Alignment::Right;
 
 use super::report::RunReport;
+use crate::counted;
 use crate::table::{Style, Table};
 
 impl RunReport {
@@ -43,8 +44,8 @@ impl RunReport {
             }
         }
         if !self.is_complete() {
-            let (missing, how) = (self.episodes_missing, self.how_complete());
-            text += &format!("{missing} episodes have no score: {how}\n");
+            let missing = counted(self.episodes_missing as usize, "episode");
+            text += &format!("{missing} without a score: {}\n", self.how_complete());
         }
         text.push('\n');
         for (name, mean) in [

@@ -19,7 +19,7 @@ fn a_stopped_learner_resumes_at_its_step() {
     let learner = || scratch.learner("run", ENDLESS);
     let step_of = |learner: &Learner| -> u64 {
         let line = learner.process.wait_for_log("continues after step", PATIENCE);
-        let step = line.split("continues after step ").nth(1).unwrap().split(';').next().unwrap();
+        let step = line.split("continues after step ").nth(1).unwrap().split(',').next().unwrap();
         step.parse().unwrap()
     };
     let mut first = learner();
@@ -122,7 +122,7 @@ fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
     let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
     learner.process.assert_ends(1, PATIENCE);
     learner.process.assert_said(&format!("without the snapshot of step {step}"));
-    learner.process.assert_said("but 1 episodes have no score");
+    learner.process.assert_said("without the scores of 1 episode");
     learner.process.assert_said("hint: ");
 }
 

@@ -55,6 +55,7 @@ fn a_browser_shows_a_run_at_work() {
         ],
     );
     assert_has(&page, &["Last episodes", "episodes = 6"]);
+    assert!(!page.contains("e+15</td>"), "seeds have every digit: {page}");
 }
 
 #[test]

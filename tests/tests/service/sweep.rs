@@ -87,7 +87,7 @@ fn a_sweep_resumes_and_a_failed_run_ends_no_other() {
     let (undisturbed, study) = (Study::new(), Study::new());
     let mut sweep = undisturbed.sweep(&["--jobs", "2"]);
     sweep.assert_succeeds(PATIENCE);
-    assert!(sweep.out().contains("all 4 runs are complete"), "{}", sweep.out());
+    assert!(sweep.out().contains("4 runs complete"), "{}", sweep.out());
     sweep.assert_said("training takes about");
 
     assert_eq!(study.states(), ["not begun"; 4]);
@@ -103,7 +103,7 @@ fn a_sweep_resumes_and_a_failed_run_ends_no_other() {
     study.wait_for(victim);
     signal("KILL", child_of(&sweep, victim));
     sweep.assert_ends(1, PATIENCE);
-    sweep.assert_said("1 of 4 runs have failed");
+    sweep.assert_said("1 of 4 runs failed");
     sweep.assert_said(&format!("{victim}: the learner ended by signal: 9 (SIGKILL)"));
     sweep.assert_said(&format!("{victim}/learner.log"));
     let states = study.states();

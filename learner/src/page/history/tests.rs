@@ -92,38 +92,3 @@ fn long_runs_are_averaged() {
     assert!((rows[0].values[1].0 - sum).abs() < 1e-9, "{:?}", rows[0]);
     assert!(self::rows(&history).len() < 50_000);
 }
-
-#[test]
-fn training_phases_have_their_own_metrics() {
-    let line = |n: u64| match n {
-        ..=700 => json!({ "step": n, "seconds": 1, "first": 1 }),
-        701..=1400 => json!({ "step": n, "seconds": 1, "second": 2, "both": n % 2 }),
-        _ => json!({ "step": n, "seconds": 1, "third": 3, "second": 4 }),
-    };
-    let lines = |last| Vec::from_iter((1..=last).map(|n| format!("{}\n", line(n)))).concat();
-    let history = history(&[lines(2), lines(2100)]);
-    assert_eq!(history.names, ["first", "both", "second", "third"]);
-    let text = rows(&history);
-    assert!(text.starts_with("[[8.0,1.0,1.0,null,null,null],"), "{text}");
-    assert!(text.ends_with(",[2100.0,1.0,null,null,4.0,3.0]]"), "{text}");
-    let middle = &history.rows[history.rows.len() / 2].values;
-    assert_eq!(middle[..], [(0.0, 0), (4.0, 8), (16.0, 8), (0.0, 0)]);
-    // A row across two phases averages in no zeros.
-    for Row { values, .. } in &history.rows {
-        assert_eq!(values[0].0, f64::from(values[0].1), "{text}");
-    }
-}
-
-#[test]
-fn numbers_have_five_digits() {
-    for (number, expected) in [
-        (0.0, Some(0.0)),
-        (-2.345_678_9, Some(-2.3457)),
-        (12_345_678.9, Some(12_346_000.0)),
-        (1.234_567_8e-20, Some(1.2346e-20)),
-        (f64::NAN, None),
-        (f64::INFINITY, None),
-    ] {
-        assert_eq!(rounded(number), expected);
-    }
-}

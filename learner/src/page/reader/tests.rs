@@ -3,7 +3,7 @@
 use std::fs;
 
 use super::*;
-use crate::fixtures::{config, line};
+use crate::fixtures::config;
 
 #[test]
 fn a_new_run_in_the_same_folder_is_shown_alone() {
@@ -25,15 +25,4 @@ fn a_new_run_in_the_same_folder_is_shown_alone() {
         assert!(rows.iter().all(|row| row[2] == started as f64), "{rows:?}");
         RunDir::at(&dir).set_aside().unwrap();
     }
-}
-
-#[test]
-fn the_newest_episodes_are_shown() {
-    let folder = tempfile::tempdir().unwrap();
-    let dir = folder.path().join("run");
-    let (_, mut scores) = RunDir::create(&dir, &config("run", 1)).unwrap();
-    scores.append(&Vec::from_iter((1..=25).map(|n| line(100 * n, 1, n as f64)))).unwrap();
-    let shown = RunPage::of(&dir).read().unwrap();
-    let steps = shown["episodes"].as_array().unwrap().iter().map(|episode| &episode["step"]);
-    assert!(steps.eq(&Vec::from_iter((6..=25).map(|n| json!(100 * n)))));
 }

@@ -51,6 +51,13 @@ fn the_command_reproduces_the_experiment() {
         assert!(command.contains(words) && !command.contains("--device"), "{command}");
     }
     let mut config = config("r", 7);
+    let changes = toml! { environment = "hopper" dataset = "x.hdf5" hold_out = 0.0 };
+    let mut own_data = config.clone();
+    own_data.run.task = "own-data".to_owned();
+    own_data.experiment = resolve("own-data", &changes).unwrap();
+    let command = command_for(&own_data).unwrap();
+    assert!(command.contains(" --hold-out 0 "), "{command}");
+    assert_eq!(experiment_of(&command), own_data.experiment, "{command}");
     let changes = toml! { from = "0123" online.steps = 5000 };
     let from = resolve("hopper-demo", &changes).unwrap();
     let command = command_for(&RunConfig { experiment: from, ..config.clone() }).unwrap();
