@@ -17,6 +17,7 @@ Rule = Union[str, Callable[[Mapping[str, Any]], Any], None]
 Success = Union[Rule, Sequence[Any]]
 _HOW = 'success= a column, "all", a list of episodes, or a function of the episode'
 _MANY = 0.1  # The share of rows after a success that is worth a word; a few let the robot come to rest.
+_FEWEST, _EVEN = 20, 0.9  # The fewest steps by which a clock is known, and the share of them that are about as long as usual.
 _OF_SUCCESS = {"success-at-end": (0.0, 1.0), "step-cost": (-1.0, 0.0)}
 
 
@@ -106,7 +107,8 @@ def dataset(
     if empty:
         notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
     names = [[name for column in columns for name in _names(log, column)] for columns in (observations, actions)]
-    return Source(joined(parts), (names[0], names[1]), notes)
+    rows = joined(parts)
+    return Source(rows, (names[0], names[1]), notes + _clocks(log, observations))
 
 
 def _check(log: Log, name: str) -> None:
@@ -133,6 +135,19 @@ def _names(log: Log, column: str) -> list[str]:
 
 def _beside(columns: Mapping[str, NDArray[Any]], names: Sequence[str]) -> NDArray[Any]:
     return np.concatenate([columns[name].reshape(len(columns[name]), -1) for name in names], axis=1)
+
+
+def _clocks(log: Log, observations: Sequence[str]) -> list[str]:
+    """Names what grows by about the same in each step, as times and numbers of rows do."""
+    clocks = []
+    for column in observations:
+        steps = np.concatenate([np.diff(_beside(episode.columns, [column]).astype(float), axis=0) for episode in log.episodes])
+        if len(steps) >= _FEWEST:
+            usual = np.median(steps, axis=0)
+            even = np.mean(abs(steps - usual) <= usual / 4, axis=0)
+            clocks += [name for name, by, share in zip(_names(log, column), usual, even) if by > 0 and share > _EVEN]
+    return [f"{', '.join(clocks)}: grows by about the same in each step, as a clock does; leave it out of the observations, unless "
+            "what to do depends on the time"] if clocks else []
 
 
 def _call(rule: Callable[[Mapping[str, Any]], Any], episode: Episode) -> Any:
