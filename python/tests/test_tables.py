@@ -297,7 +297,7 @@ def test_one_command_trains_on_a_log_without_rewards_and_goes_on(tmp_path, monke
     monkeypatch.chdir(tmp_path)
 
     def interrupted():
-        """What it says until a Ctrl-C ends it."""
+        """Its log until a Ctrl-C ends it."""
         process = subprocess.Popen([Path(sys.executable).parent / "quad-convert", *words], stderr=subprocess.PIPE, text=True)
         said = [process.stderr.readline()]
         while "its metrics at" not in said[-1]:

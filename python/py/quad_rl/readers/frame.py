@@ -20,7 +20,7 @@ from quad_rl.readers.arrow import array_of
 from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset, is_number
 
 TABLES = (".csv", ".tsv", ".parquet")  # Of the files in a folder.
-_EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # How the libraries of tables write that nothing is there.
+_EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # Empty places, as libraries of tables write them.
 _CLOCK = re.compile(r"(^t|time|stamp)(_?(s|ms|us|ns|sec|seconds))?$", re.IGNORECASE)
 _GAP = 1.5  # Of a step's usual length.
 _FEWEST = 20  # Steps by which a clock is known.
