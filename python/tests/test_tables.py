@@ -98,6 +98,8 @@ def test_what_a_table_lacks_is_asked_for(tmp_path):
     by_name = Dataset.from_frame(frame, **rule, success=["a"])
     assert by_name._rows.terminals.sum() == 1 and by_name._rows.rewards[38] == 0 and by_name._rows.rewards.sum() == -57
     assert "no episode terminates" in Dataset.from_frame(frame, **{**rule, "reward": "gain"}).notes[0]
+    done = Dataset.from_frame(frame.rename(columns={"fell": "Done"}), **{**rule, "reward": "gain"})
+    assert done.notes[0] == "no terminal is given: 'Done', if that says where the task was over?"
     holes = frame.assign(x=frame["x"].where(np.arange(60) != 33))
     holes.to_parquet(tmp_path / "holes.parquet")
     for message, source, asked in [

@@ -22,6 +22,7 @@ from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, da
 TABLES = (".csv", ".tsv", ".parquet")  # Of the files in a folder.
 _EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # Empty places, as libraries of tables write them.
 _CLOCK = re.compile(r"(^t|time|stamp)(_?(s|ms|us|ns|sec|seconds))?$", re.IGNORECASE)
+_ENDS = {"done", "dones", "terminal", "terminals", "terminated"}
 _GAP = 1.5  # Of a step's usual length.
 _FEWEST = 20  # Steps by which a clock is known.
 
@@ -84,6 +85,9 @@ def from_frame(
     for name, key in zip(there, keys):
         if _CLOCK.search(name) and name != episode and there.count(name) == 1:
             notes += _leaps(table[key], name, of)
+    ends = [name for name in there if name.lower() in _ENDS]
+    if ends and terminal is None and success is None:
+        notes.append(f"no terminal is given: {ends[0]!r}, if that says where the task was over?")
     order, cuts = np.argsort(of, kind="stable"), np.cumsum(np.bincount(of, minlength=1))[:-1]
     parts = zip(*(np.split(array[order], cuts) for array in columns.values())) if names else ()
     episodes = [Episode(name, dict(zip(columns, part)), {}) for name, part in zip(names, parts)]
