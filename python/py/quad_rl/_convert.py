@@ -21,7 +21,7 @@ _OPTIONS = {
     "reward": "success-at-end, step-cost, a column, or none, for data to clone",
     "terminate": "LeRobot, robomimic: success, never, or a column",
     "terminal": "tables: success, never, or a column",
-    "episode": "tables: the column that is the same in all rows of an episode",
+    "episode": "tables: the column that is the same in all rows of an episode; file, for a folder of tables",
     "apart": "tables: how an episode's rows may be apart, interleaved or repeated",
     "task": "LeRobot: the only task to read, or all",
     "filter": "robomimic: a filter key such as train",
@@ -108,7 +108,7 @@ def _reader(source: str) -> tuple[Callable[..., Dataset], str]:
             return Dataset.from_lerobot, source
         if any((path / name).is_file() for name in ("metadata.json", "data/metadata.json")):
             return Dataset.from_minari, source
-        if any(file.suffix in TABLES for file in path.iterdir()):
+        if any(file.suffix.lower() in TABLES for file in path.iterdir()):
             return Dataset.from_frame, source
     else:
         with path.open("rb") as file:

@@ -166,7 +166,7 @@ def _column(column: Any, name: str, place: str) -> NDArray[Any]:
 def _read(path: str) -> Any:
     pa = library("pyarrow", "table")
     if os.path.isdir(path):
-        files = [file for file in sorted(Path(path).iterdir()) if file.suffix in TABLES]
+        files = [file for file in sorted(Path(path).iterdir()) if file.suffix.lower() in TABLES]
         tables = [(file.stem, _read(str(file))) for file in files]
         tables = [table.append_column("file", pa.array([stem] * len(table), pa.string())) for stem, table in tables]
         return pa.concat_tables(tables, promote_options="permissive")
