@@ -107,8 +107,8 @@ def dataset(
     if empty:
         notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
     names = [[name for column in columns for name in _names(log, column)] for columns in (observations, actions)]
-    rows = joined(parts)
-    return Source(rows, (names[0], names[1]), notes + _clocks(log, observations))
+    transitions = joined(parts)
+    return Source(transitions, (names[0], names[1]), notes + _clocks(log, observations))
 
 
 def _check(log: Log, name: str) -> None:
