@@ -25,13 +25,6 @@ def row(*cells):
     print("|", " | ".join(cells), "|")
 
 
-def chosen(choice):
-    """How a policy chose, in a word or two."""
-    if choice is None:
-        return "none"
-    return str(choice["candidates"])
-
-
 def main(runs):
     scores = defaultdict(list)  # by method, candidates and file: a number for each seed
     files, settings = {}, set()
@@ -42,7 +35,7 @@ def main(runs):
         means = defaultdict(list)  # by candidates: a number for each snapshot
         for scored in json.loads((run / "score.json").read_text()):
             episodes = [episode["score"] for episode in scored["episodes"]]
-            means[chosen(scored["choice"])].append(statistics.fmean(episodes))
+            means[str(scored["choice"]["candidates"]) if scored["choice"] else "none"].append(statistics.fmean(episodes))
             settings.add(f"{len(episodes)} episodes each in {scored['precision']}")
         for candidates, of_snapshots in means.items():
             scores[method, candidates, file].append(statistics.fmean(of_snapshots))

@@ -217,7 +217,7 @@ impl Problem {
                 "a dataset is a D4RL file (.hdf5), a folder of Minari, an OGBench file (.npz), or your own HDF5 file as docs/data.md describes"
             }
             Self::UnknownFolder => {
-                "give one file, or the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0; in Python, `quad_rl.Dataset.from_episodes` makes a file of episodes in several (docs/python.md)"
+                "give one file, or the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0; with quad_rl installed, `quad-convert FOLDER … --episode file` makes a file of a folder of tables (docs/data.md)"
             }
             Self::Truncated { .. }
             | Self::DamagedHdf5(_)

@@ -16,7 +16,6 @@ mod inspect;
 mod normalize;
 mod practice;
 mod recording;
-mod rounding;
 mod statistics;
 mod tables;
 mod transitions;

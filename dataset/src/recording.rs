@@ -1,4 +1,3 @@
-use crate::rounding::Rounding;
 use crate::statistics::Episode;
 
 /// Largest difference between two copies of the same observation.
@@ -36,8 +35,6 @@ pub(crate) struct Recording {
     pub next_observations: Option<Vec<f32>>,
     /// N × o, stored in a D4RL file and used only for checks.
     pub unused_next_observations: Option<Vec<f32>>,
-    /// Precision to which only one of the two arrays of observations was rounded.
-    pub rounding: Rounding,
     pub kinds: Vec<RowKind>,
     /// True where the mask is 0, so that the critics do not bootstrap.
     pub terminals: Vec<bool>,
@@ -146,17 +143,15 @@ impl Recording {
             return self.next_observations.is_none() || !self.jumps(row);
         }
         let (start, next) = (self.observation(following), self.observation(row + 1));
-        !differ(start, next, Rounding::default())
+        !differ(start, next)
     }
 
     /// True if a row's stored next observation differs from the following row's observation.
     pub(crate) fn jumps(&self, row: usize) -> bool {
         let unused = self.unused_next_observations.as_ref();
         let stored = self.next_observations.as_ref().or(unused);
-        stored.filter(|_| row + 1 < self.rows()).is_some_and(|stored| {
-            let (next, following) = (self.row_of(stored, row), self.observation(row + 1));
-            differ(next, following, self.rounding)
-        })
+        let stored = stored.filter(|_| row + 1 < self.rows());
+        stored.is_some_and(|stored| differ(self.row_of(stored, row), self.observation(row + 1)))
     }
 
     /// Appends a final state to all columns but the observations.
@@ -178,9 +173,8 @@ impl Recording {
     }
 }
 
-fn differ(a: &[f32], b: &[f32], rounding: Rounding) -> bool {
-    let pairs = a.iter().zip(b).filter(|(a, b)| !rounding.explains(**a, **b));
-    let square: f64 = pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum();
+fn differ(a: &[f32], b: &[f32]) -> bool {
+    let square: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
     square.sqrt() > SAME_OBSERVATION
 }
 

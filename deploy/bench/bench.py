@@ -59,7 +59,7 @@ def back(rows, hidden, outputs):
 
 
 def parts(hidden, critics, samples, predictions):
-    """What a gradient step consists of: {benchmark: its arithmetic}; nothing counts as shared between rows."""
+    """The parts of a gradient step: {benchmark: its arithmetic}; nothing counts as shared between rows."""
     actor = lambda rows: forward(rows, OBSERVATION + ACTION + TIME, hidden, ACTION)
     critic = lambda rows: forward(rows, OBSERVATION + ACTION, hidden, 1)
     rows = critics * BATCH
@@ -121,7 +121,7 @@ class Peer:
 
 
 def moment(jax, *benches):
-    """What JAX took just now, and what benches (of which the first measures the machine's peaks) take now."""
+    """JAX's times just now, and those of benches, of which the first measures the machine's peaks."""
     seconds = {}
     for bench, names in benches:
         seconds |= criterion(bench, names)
@@ -185,7 +185,7 @@ def machine(rounds, count):
 
 
 def has_bf16(rounds):
-    """Whether this machine is faster in bf16; else it was not timed."""
+    """True if this machine is faster in bf16; else it was not timed."""
     return any(", bf16" in name for name in rounds[0]["seconds"])
 
 

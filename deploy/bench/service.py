@@ -65,7 +65,7 @@ def metric(page, name):
 
 
 class Learner:
-    """What a learner's /metrics says, and what its processes take."""
+    """A learner's /metrics, and the memory of its processes."""
 
     def __init__(self, pid, address):
         self.pid, self.address = pid, address

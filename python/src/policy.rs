@@ -102,22 +102,6 @@ impl PyPolicy {
         act(py, &*policy, &rows, &mut states)
     }
 
-    /// `act`, by the name that d3rlpy has for it.
-    #[pyo3(signature = (observations, *, candidates = None, rule = None, aggregate = None, guidance = None, seed = None))]
-    #[expect(clippy::too_many_arguments, reason = "they are Python's")]
-    fn predict<'py>(
-        &self,
-        py: Python<'py>,
-        observations: ArrayLike<'py>,
-        candidates: Option<i64>,
-        rule: Option<String>,
-        aggregate: Option<String>,
-        guidance: Option<f32>,
-        seed: Option<&Bound<'py, PyAny>>,
-    ) -> PyResult<Array<'py>> {
-        self.act(py, observations, candidates, rule, aggregate, guidance, seed)
-    }
-
     /// Draws candidates of `act`: (actions [n, candidates, action_size], values [n, candidates]),
     /// float32; for one state, without the first axis. With the same seed, `act` chooses among these.
     /// Raises as `act`, and ValueError if the policy has no critics.

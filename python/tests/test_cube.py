@@ -12,7 +12,7 @@ import pytest
 import quad_rl
 
 ROOT = Path(__file__).parents[2]
-# What makes the page's example quick.
+# Changes that make the page's example quick.
 QUICK = {
     'agent={"expectile": 0.9}': 'agent={"actor.hidden": [8], "critic.hidden": [8], "value.hidden": [8]}, set={"batch_size": 16}',
     "steps=30_000, eval_interval=6_000": "steps=20, eval_interval=20",

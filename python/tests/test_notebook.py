@@ -7,7 +7,7 @@ import pytest
 from nbclient import NotebookClient
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-# What each shows. Commands of a shell do not fail a cell.
+# Texts that each shows. Commands of a shell do not fail a cell.
 SHOWN = {
     "from_python": ("20027 transitions", "transitions   20026", "run folder: runs/iql", "returns: [", "10 candidates"),
     "robot": ("episodes      300", "page: http://", "training is done", "4 -> 2 numbers", "of the policy's"),

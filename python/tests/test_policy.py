@@ -100,7 +100,7 @@ def test_a_row_depends_on_its_seed_alone(snapshots):
     actions = policy.act(states, seed=3)
     assert actions.dtype == np.float32 and actions.shape == (200, ACTION)
     for same in (policy.act(states, seed=range(3, 203)), policy.act(states, seed=np.arange(3, 203)),
-                 policy.begin(range(3, 203)).act(states), policy.predict(states, seed=3)):
+                 policy.begin(range(3, 203)).act(states)):
         assert np.array_equal(actions, same)
     assert np.array_equal(actions[7], policy.act(states[7], seed=10))
     assert np.array_equal(actions[7], policy.begin(10).act(states[7:8])[0])

@@ -54,7 +54,7 @@ from numpy.typing import NDArray
 
 policy: quad_rl.Policy = quad_rl.Policy.load("x", precision="bf16")
 action: NDArray[np.float32] = policy.act([0.0], candidates=3, seed=np.arange(1))
-action = policy.predict(np.zeros(3), rule="best", aggregate="min", seed=None)
+action = policy.act(np.zeros(3), rule="best", aggregate="min", seed=None)
 drawn, values = policy.sample(action, candidates=2, seed=[1])
 number = float(policy.value(action, drawn[0]))
 episodes: quad_rl.Episodes = policy.begin(range(3))

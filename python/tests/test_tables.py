@@ -39,9 +39,11 @@ def test_a_table_of_any_kind_makes_the_same_transitions(tmp_path):
     right = rows(Dataset.from_arrays(**arrays, terminations=frame["fell"], truncations=ends & ~frame["fell"]))
     frame.to_csv(tmp_path / "log.csv", index=False)
     frame.to_csv(tmp_path / "log.tsv", index=False, sep="\t")
+    frame.to_csv(tmp_path / "semicolons.csv", index=False, sep=";")
     frame.to_parquet(tmp_path / "log.parquet", row_group_size=7)
     lists = pa.Table.from_pandas(frame).append_column("both", pa.array(list(frame[["x", "v"]].to_numpy())))
     for source, changed in [(frame, {}), (tmp_path / "log.csv", {}), (str(tmp_path / "log.tsv"), {}), (tmp_path / "log.parquet", {}),
+                            (tmp_path / "semicolons.csv", {}),
                             ({name: column.to_numpy() for name, column in frame.items()}, {}), (lists, {"observations": ["both"]}),
                             (lists.to_pandas(), {"observations": ["both"]}),
                             (frame.sort_values(["fell", "run"], kind="stable").sort_index(level=0), {})]:
@@ -96,6 +98,8 @@ def test_what_a_table_lacks_is_asked_for(tmp_path):
     by_name = Dataset.from_frame(frame, **rule, success=["a"])
     assert by_name._rows.terminals.sum() == 1 and by_name._rows.rewards[38] == 0 and by_name._rows.rewards.sum() == -57
     assert "no episode terminates" in Dataset.from_frame(frame, **{**rule, "reward": "gain"}).notes[0]
+    done = Dataset.from_frame(frame.rename(columns={"fell": "Done"}), **{**rule, "reward": "gain"})
+    assert done.notes[0] == "no terminal is given: 'Done', if that says where the task was over?"
     holes = frame.assign(x=frame["x"].where(np.arange(60) != 33))
     holes.to_parquet(tmp_path / "holes.parquet")
     for message, source, asked in [
@@ -162,6 +166,35 @@ def test_many_rows_after_a_success_are_told():
     assert any(note.startswith("51 of 60 rows (85%) come after their episode's first won, as if the task went on: ") for note in told), told
     frame["won"] = np.arange(60) % 20 >= 18
     assert not any("come after" in note for note in Dataset.from_frame(frame, **COLUMNS, reward="gain", success="won").notes)
+
+
+@pytest.mark.parametrize("unit", [1, "datetime64[ns]"])
+def test_clocks_and_what_they_say_of_the_rows_are_told(unit):
+    frame, time = table(), 0.02 * (np.arange(60) % 20)
+    time[10:20] += 0.6
+    time[31] = time[30]
+    time[50], time[51] = time[51], time[50]
+    frame["time"] = time if unit == 1 else (1_760_000_000 + time) * np.timedelta64(1_000_000_000, "ns") + np.datetime64(0, "ns")
+    frame["stamp"], frame["lifetime"], frame["frame_index"] = "none", frame["x"], np.arange(60) % 20
+    rule = {**COLUMNS, "reward": "gain", "terminal": "fell"}
+    assert Dataset.from_frame(frame, **rule).notes[0] == (
+        "of 57 steps, by their 'time', 4 take more than 1.5 times the usual 0.02, up to 0.62, as if rows were missing: begin another "
+        "episode there; 1 take no time, as if rows were there twice; 1 go back: sort the rows")
+    every = Dataset.from_frame(frame.drop(columns=["time", "stamp"]), **{**rule, "observations": ["*"]})
+    assert every.observation_names == ["x", "v", "lifetime", "frame_index"], "nothing that has another role"
+    assert every.notes[0].startswith("2 of 3 episodes: the last step") and every.notes[1:] == [
+        "frame_index: grows by about the same in each step, as a clock does; leave it out of the observations, unless what to do depends "
+        "on the time"]
+
+
+def test_a_folder_has_an_episode_a_file(tmp_path):
+    frame = table().assign(v=np.arange(60) % 20)
+    for name, part in frame.drop(columns="run").groupby(frame["run"]):
+        part.assign(v=part["v"] + (name == "b") / 2).to_csv(tmp_path / f"{name}.csv", index=False)
+    read = Dataset.from_frame(tmp_path, **{**COLUMNS, "episode": "file"}, reward="gain", terminal="fell")
+    right = Dataset.from_frame(frame.assign(v=frame["v"] + (frame["run"] == "b") / 2).sort_values("run", kind="stable"), **COLUMNS,
+                               reward="gain", terminal="fell")
+    assert all(map(np.array_equal, rows(read), rows(right)))
 
 
 def test_names_go_into_the_file_and_the_policy(snapshots, tmp_path):
@@ -238,12 +271,17 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys, monkeypatch):
         raise OSError("no network")
 
     monkeypatch.setattr("ogbench.download_datasets", no_network)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "log.mcap").write_bytes(b"\x89MCAP0\r\n\x01\0")
+    np.savez(tmp_path / "maze.npz", **{name: np.zeros((4, 1)) for name in ("observations", "actions", "rewards", "terminals")})
     for message, words in {
         "needs --actions and --reward": [tmp_path / "log.csv", "--observations", "x", "--episode", "run"],
         "--task does not apply to this source": [*log, "--reward", "gain", "--task", "pick"],
         "nothing says what is rewarded": [folder, "--observations", "observation.state"],
         "there is no nothing.csv": ["nothing.csv"],
-        "is a folder of neither LeRobot (meta/info.json) nor Minari (metadata.json)": [tmp_path],
+        "a folder without Minari's main_data.hdf5": [tmp_path / "empty"],
+        "an MCAP file, as ROS 2 records them": [tmp_path / "log.mcap"],
+        "reads it as it is": [tmp_path / "maze.npz"],
         "reads D4RL's and your own HDF5 files as they are": [tmp_path / "out.hdf5", "--observations", "object"],
         "has no rewards": ["ogbench:cube-double-play-v0"],
         "hint: put it and antmaze-giant-navigate-v0-val.npz there": ["ogbench:antmaze-giant-navigate-singletask-v0", "--folder", tmp_path],
@@ -261,7 +299,7 @@ def test_one_command_trains_on_a_log_without_rewards_and_goes_on(tmp_path, monke
     monkeypatch.chdir(tmp_path)
 
     def interrupted():
-        """What it says until a Ctrl-C ends it."""
+        """Its log until a Ctrl-C ends it."""
         process = subprocess.Popen([Path(sys.executable).parent / "quad-convert", *words], stderr=subprocess.PIPE, text=True)
         said = [process.stderr.readline()]
         while "its metrics at" not in said[-1]:
@@ -327,14 +365,6 @@ def test_episodes_keep_their_names_and_their_order(tmp_path):
     frame["won"] = np.arange(60) == 25  # In the middle of c.
     by_column = Dataset.from_frame(frame, **COLUMNS, reward="step-cost", success="won")
     assert all(np.array_equal(array, other) for array, other in zip(rows(dataset), rows(by_column)))
-
-
-@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-def test_a_csv_may_have_any_delimiter(tmp_path, delimiter):
-    frame = table()
-    frame.to_csv(tmp_path / "log.csv", index=False, sep=delimiter)
-    read, right = (Dataset.from_frame(source, **COLUMNS, reward="gain") for source in (tmp_path / "log.csv", frame))
-    assert all(np.array_equal(array, other) for array, other in zip(rows(read), rows(right)))
 
 
 @pytest.mark.parametrize("message, x", [

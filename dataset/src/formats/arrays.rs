@@ -9,7 +9,6 @@ use crate::error::{ArrayProblem, DatasetError, Problem};
 use crate::formats::hdf5_file::Hdf5File;
 use crate::formats::new_file::{Column, NewFile, text};
 use crate::recording::{Names, Recording, RowKind};
-use crate::rounding::Rounding;
 
 /// Value of the root attribute `layout` that distinguishes this layout from D4RL's.
 pub(super) const LAYOUT: &str = "transitions";
@@ -57,7 +56,6 @@ impl Arrays {
         }
         let ends = (0..rows).map(|row| self.terminals[row] || self.timeouts[row]);
         Ok(Recording {
-            rounding: Rounding::between(&self.observations, Some(&self.next_observations)),
             observation_dim: o,
             action_dim: a,
             kinds: vec![RowKind::Transition; rows],

@@ -3,7 +3,6 @@
 use crate::error::Problem;
 use crate::formats::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
-use crate::rounding::Rounding;
 use crate::tables::environment::EnvironmentSpec;
 
 /// Reads a file as D4RL's `qlearning_dataset` does: the next observation is the following row's,
@@ -39,7 +38,6 @@ pub(super) fn read(
     let stored = stored.then(|| file.table("next_observations", rows, observations.width));
     let unused_next_observations = stored.transpose()?;
     let mut recording = Recording {
-        rounding: Rounding::between(&observations.values, unused_next_observations.as_ref()),
         observation_dim: observations.width,
         action_dim: actions.width,
         observations: observations.values,

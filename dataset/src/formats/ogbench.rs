@@ -1,7 +1,6 @@
 use crate::error::Problem;
 use crate::formats::npz_file::NpzFile;
 use crate::recording::{Recording, RowKind};
-use crate::rounding::Rounding;
 use crate::tables::maze::MazeTask;
 
 /// Reads a file of OGBench. `terminals` mark the end of a trajectory; the mask is 0 only where
@@ -33,7 +32,6 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
     let ends: Vec<bool> = (0..rows).map(is_last).collect();
     let kind = |&last: &bool| if last { RowKind::LastState } else { RowKind::Transition };
     Ok(Recording {
-        rounding: Rounding::between(&observations.values, next_observations.as_ref()),
         observation_dim,
         action_dim: actions.width,
         observations: observations.values,

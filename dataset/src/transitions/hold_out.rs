@@ -107,7 +107,6 @@ impl Recording {
             observation_dim: self.observation_dim,
             action_dim: self.action_dim,
             next_observations: self.next_observations.as_ref().map(|_| Vec::new()),
-            rounding: self.rounding,
             terminal_array: self.terminal_array,
             goal: self.goal,
             names: self.names.clone(),

@@ -168,12 +168,6 @@ fn arrays_that_would_be_refused_are_not_written() {
 }
 
 #[test]
-fn rows_in_any_order_are_learned_from_with_the_next_observations_of_their_own() {
-    let strange = Arrays { next_observations: vec![7.0; 18], actions: vec![0.25; 12], ..arrays() };
-    assert_eq!(all(&Transitions::of(strange).unwrap()).next_observations, [7.0; 18]);
-}
-
-#[test]
 fn episodes_that_are_held_out_keep_their_next_observations() {
     let (_folder, path) = scratch("own.hdf5");
     write_own(&path, Arrays { actions: vec![0.25; 12], ..arrays() }, Names::default()).unwrap();

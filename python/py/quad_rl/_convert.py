@@ -11,15 +11,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from quad_rl import _quad_rl
 from quad_rl._dataset import Dataset
 from quad_rl._train import learner
+from quad_rl.readers.frame import TABLES
 
 _OPTIONS = {
     "action": "LeRobot: the feature with the actions (action)",
     "reward": "success-at-end, step-cost, a column, or none, for data to clone",
     "terminate": "LeRobot, robomimic: success, never, or a column",
     "terminal": "tables: success, never, or a column",
-    "episode": "tables: the column that is the same in all rows of an episode",
+    "episode": "tables: the column that is the same in all rows of an episode; file, for a folder of tables",
     "apart": "tables: how an episode's rows may be apart, interleaved or repeated",
     "task": "LeRobot: the only task to read, or all",
     "filter": "robomimic: a filter key such as train",
@@ -34,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Converts LeRobot, robomimic, Minari, OGBench, CSV or Parquet to a file for `learner train --dataset`.",
         epilog="help(quad_rl.Dataset.from_lerobot) and its siblings explain each option. From Python, some may be functions.",
     )
-    parser.add_argument("source", help="a folder of LeRobot or Minari, a file of robomimic, a table, minari:ID, ogbench:NAME")
+    parser.add_argument("source", help="a folder of LeRobot or Minari, a file of robomimic, a table or a folder of them, minari:ID, ogbench:NAME")
     parser.add_argument("--out", required=True, metavar="FILE", help="the file to write, such as my-robot.hdf5")
     parser.add_argument("--observations", nargs="+", metavar="COLUMN", help="observations, in this order; tables: also 'q*'")
     parser.add_argument("--actions", nargs="+", metavar="COLUMN", help="actions (tables, robomimic)")
@@ -106,11 +108,17 @@ def _reader(source: str) -> tuple[Callable[..., Dataset], str]:
             return Dataset.from_lerobot, source
         if any((path / name).is_file() for name in ("metadata.json", "data/metadata.json")):
             return Dataset.from_minari, source
-        hint = "hint: give that of one dataset, or a file"
-        raise ValueError(f"{source} is a folder of neither LeRobot (meta/info.json) nor Minari (metadata.json)\n{hint}")
-    with path.open("rb") as file:
-        is_hdf5 = file.read(8) == b"\x89HDF\r\n\x1a\n"
-    return (Dataset.from_robomimic if is_hdf5 else Dataset.from_frame), source
+        if any(file.suffix.lower() in TABLES for file in path.iterdir()):
+            return Dataset.from_frame, source
+    else:
+        with path.open("rb") as file:
+            start = file.read(256)
+        if start.startswith(b"\x89HDF\r\n\x1a\n"):
+            return Dataset.from_robomimic, source
+        if start.startswith(b"PAR1") or b"\0" not in start:
+            return Dataset.from_frame, source
+    _quad_rl.inspect_dataset(path)  # Its error names other formats.
+    raise ValueError(f"`learner train --dataset {source}` reads it as it is")
 
 
 def _success(words: list[str]) -> Any:

@@ -34,8 +34,8 @@ def _dataset_by(read: Callable[P, Source]) -> Callable[P, Dataset]:
 class Dataset:
     """Recorded transitions, to be trained on with `learner train --task own-data --dataset FILE`.
 
-    Made by one of the functions `from_…`; `save` writes the file. `len` is the number of transitions; `repr` is a line,
-    `print` shows what is in it, what looks wrong, and `notes`, what to know of how a source was read.
+    Made by one of the functions `from_…`; `save` writes the file. `len` is the number of transitions; `print` shows
+    statistics, problems and `notes`.
     """
 
     from_d3rlpy = staticmethod(_dataset_by(d3rlpy.from_d3rlpy))
@@ -102,7 +102,7 @@ class Dataset:
         _quad_rl.write_dataset(path, *self._rows, *self._names)
 
     def inspect(self) -> dict[str, Any]:
-        """What is in it, and what looks wrong: the dictionary of `learner datasets inspect --json`. Raises as `save`."""
+        """Statistics and problems: the dictionary of `learner datasets inspect --json`. Raises as `save`."""
         inspection: dict[str, Any] = json.loads(self._inspected()[0])
         return inspection
 
@@ -115,17 +115,17 @@ class Dataset:
 
     @property
     def notes(self) -> list[str]:
-        """What to know of how a source was read, a sentence each, such as what was left out."""
+        """Notes on reading the source, such as what was left out, a sentence each."""
         return list(self._notes)
 
     @property
     def observation_names(self) -> list[str]:
-        """What the source calls the numbers of an observation, as the file and the policy have it; empty without names."""
+        """The source's names of the numbers of an observation, also in the file and the policy; empty if it has none."""
         return list(self._names[0])
 
     @property
     def action_names(self) -> list[str]:
-        """What the source calls the numbers of an action."""
+        """The source's names of the numbers of an action."""
         return list(self._names[1])
 
     def __len__(self) -> int:

@@ -21,16 +21,6 @@ class Policy:
         guidance: float | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> NDArray[np.float32]: ...
-    def predict(
-        self,
-        observations: ArrayLike | Mapping[str, ArrayLike],
-        *,
-        candidates: int | None = None,
-        rule: str | None = None,
-        aggregate: str | None = None,
-        guidance: float | None = None,
-        seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
-    ) -> NDArray[np.float32]: ...
     def sample(
         self,
         observations: ArrayLike | Mapping[str, ArrayLike],

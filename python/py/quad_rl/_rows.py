@@ -28,7 +28,7 @@ class Source(NamedTuple):
 
     rows: Rows
     names: tuple[list[str], list[str]] = ([], [])  # Of the numbers of an observation, and of an action.
-    notes: list[str] = []  # What to know of how it was read.
+    notes: list[str] = []
 
 
 def rows_of_episodes(episodes: Iterable[Any]) -> Rows:
@@ -48,11 +48,11 @@ def joined(parts: Iterable[Rows]) -> Rows:
 
 def episode_rows(where: str, episode: Any) -> Rows:
     def get(name: str) -> Any:
-        for name in (name, _NAMES.get(name, name)):
-            if isinstance(episode, Mapping) and name in episode:
-                return episode[name]
-            if hasattr(episode, name):
-                return getattr(episode, name)
+        for key in (name, _NAMES.get(name, name)):
+            if isinstance(episode, Mapping) and key in episode:
+                return episode[key]
+            if hasattr(episode, key):
+                return getattr(episode, key)
         raise ValueError(f"{where}there are no {name}")
 
     steps = len(get("rewards"))

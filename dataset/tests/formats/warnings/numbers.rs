@@ -1,9 +1,7 @@
 use quad_dataset::{Arrays, Inspection, Normalize, inspect};
 
-use super::{
-    O, assert_sound, assert_warned, cart, observe, problems, training_warnings, warnings, write_as,
-};
-use crate::{put, scratch};
+use super::{O, assert_warned, cart, observe, training_warnings, warnings, write_as};
+use crate::scratch;
 
 const NONE: Normalize = Normalize { actions: false, observations: false, rewards: false };
 
@@ -110,20 +108,4 @@ fn numbers_that_never_change_are_named() {
     assert!(page.contains("observations  4 numbers; constant: columns 1, 3\n"), "{page}");
     assert!(page.contains("actions       2 numbers; constant: column 1\n"), "{page}");
     assert!(page.contains("rewards       of size 0."), "{page}");
-}
-
-#[test]
-fn an_array_that_was_rounded_is_in_step_with_the_other() {
-    let half = |x: &f32| f32::from_bits((x.to_bits() + 0x1000) & !0x1fff);
-    let mut rounded = cart(false);
-    rounded.observations = rounded.observations.iter().map(half).collect();
-    assert_sound("observations", &rounded);
-    let mut rounded = cart(false);
-    rounded.next_observations = rounded.next_observations.iter().map(half).collect();
-    assert_eq!(problems(&rounded, true), [""; 0]);
-    let (_folder, path) = scratch("cart.hdf5");
-    let (file, rows) = (crate::write(&path, &rounded), rounded.rewards.len());
-    put(&file, "next_observations", &[rows, O], &rounded.next_observations);
-    drop(file);
-    assert_eq!(inspect(&path, None).unwrap().problems, [""; 0]);
 }

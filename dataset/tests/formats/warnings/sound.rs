@@ -78,27 +78,3 @@ fn recordings_and_files_of_others() {
         }
     }
 }
-
-#[test]
-fn files_with_one_fault_each() {
-    let mask = "array `terminals`: says in 98.099 % of the rows";
-    let outside = "array `actions`, row 0: the action -11.667108 is outside";
-    let newtons =
-        ["array `rewards`: of size 221.4", "array `observations`: far from ±1 in columns 2, 3"];
-    for (file, expected) in [
-        ("discount-as-done", &[mask][..]),
-        ("frozen-observations", &["array `observations`: does not change in 9"]),
-        ("constant-columns", &[outside]),
-        ("degrees-newtons", &newtons),
-        ("rewards-all-one", &["array `rewards`: all are alike"]),
-        ("timeouts-one-row-late", &["array `timeouts`: one row late"]),
-        ("one-observation-near-a-million", &["array `observations`: far from ±1 in column 4"]),
-    ] {
-        let Some(path) = shared(&format!("cases/{file}.hdf5")) else { continue };
-        let problems = inspect(&path, None).unwrap().problems;
-        assert_eq!(problems.len(), expected.len(), "{file}: {problems:?}");
-        for (problem, expected) in problems.iter().zip(expected) {
-            assert!(problem.starts_with(expected), "{file}: {problem}");
-        }
-    }
-}

@@ -16,7 +16,8 @@ Rule = Union[str, Callable[[Mapping[str, Any]], Any], None]
 # Also the successful episodes' numbers or names, or a flag for each episode.
 Success = Union[Rule, Sequence[Any]]
 _HOW = 'success= a column, "all", a list of episodes, or a function of the episode'
-_MANY = 0.1  # The share of rows after a success that is worth a word; a few let the robot come to rest.
+_MANY = 0.1  # Smallest share of rows after a success to warn of; in a few the robot comes to rest.
+_FEWEST, _EVEN = 20, 0.9  # Fewest steps that identify a clock, and the smallest share of them near the median.
 _OF_SUCCESS = {"success-at-end": (0.0, 1.0), "step-cost": (-1.0, 0.0)}
 
 
@@ -33,18 +34,18 @@ class Episode(NamedTuple):
 
 
 class Log(NamedTuple):
-    """What a source has."""
+    """The contents of a source."""
 
     episodes: list[Episode]
-    notes: list[str]  # What to know of how it was read.
+    notes: list[str]
     there: Sequence[str] = ()  # All columns, also those that were not read.
-    names: Mapping[str, Sequence[str]] = {}  # What columns call their numbers, where they do.
+    names: Mapping[str, Sequence[str]] = {}  # Of the numbers in a column, if it has any.
     reward: str = ""  # The column with rewards, if there is one; `success` and `done`, which is set at any end, likewise.
     success: str = ""
     done: str = ""
     terminated: str = ""  # The column that is set where the task itself was over.
-    end: str = "terminate"  # What the reader calls `terminate`.
-    continuous: bool = False  # Whether whole numbers are actions, too.
+    end: str = "terminate"  # The reader's name of `terminate`.
+    continuous: bool = False  # Whole numbers are actions, too.
 
 
 def columns_of(*rules: Any) -> set[str] | None:
@@ -60,7 +61,7 @@ def width(array: NDArray[Any]) -> int:
 
 
 def is_number(value: Any) -> bool:
-    """Whether `float` takes it."""
+    """True if `float` takes it."""
     try:
         float(value)
         return True
@@ -106,7 +107,8 @@ def dataset(
     if empty:
         notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
     names = [[name for column in columns for name in _names(log, column)] for columns in (observations, actions)]
-    return Source(joined(parts), (names[0], names[1]), notes)
+    transitions = joined(parts)
+    return Source(transitions, (names[0], names[1]), notes + _clocks(log, observations))
 
 
 def _check(log: Log, name: str) -> None:
@@ -133,6 +135,19 @@ def _names(log: Log, column: str) -> list[str]:
 
 def _beside(columns: Mapping[str, NDArray[Any]], names: Sequence[str]) -> NDArray[Any]:
     return np.concatenate([columns[name].reshape(len(columns[name]), -1) for name in names], axis=1)
+
+
+def _clocks(log: Log, observations: Sequence[str]) -> list[str]:
+    """Warns of observations that grow evenly, as times and row numbers do."""
+    clocks = []
+    for column in observations:
+        steps = np.concatenate([np.diff(_beside(episode.columns, [column]).astype(float), axis=0) for episode in log.episodes])
+        if len(steps) >= _FEWEST:
+            usual = np.median(steps, axis=0)
+            even = np.mean(abs(steps - usual) <= usual / 4, axis=0)
+            clocks += [name for name, by, share in zip(_names(log, column), usual, even) if by > 0 and share > _EVEN]
+    return [f"{', '.join(clocks)}: grows by about the same in each step, as a clock does; leave it out of the observations, unless "
+            "what to do depends on the time"] if clocks else []
 
 
 def _call(rule: Callable[[Mapping[str, Any]], Any], episode: Episode) -> Any:
@@ -170,7 +185,7 @@ def _successes(log: Log, rule: Success) -> list[bool] | None:
 
 
 def _suspect_going_on(log: Log, rule: str, flags: list[NDArray[np.bool_]]) -> None:
-    """Says so where many rows come after the success that their episode is for. Where all have it, it is the episode's."""
+    """Warns of many rows after their episode's success. A flag in all rows is the episode's."""
     later = sum(len(flag) - 1 - int(np.argmax(flag)) for flag in flags if flag.any() and not flag.all())
     rows = sum(map(len, flags))
     if later > _MANY * rows:
@@ -217,7 +232,7 @@ def _terminate(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
 
 
 def _flags(rule: Rule, episode: Episode, has_won: bool, steps: int) -> NDArray[Any]:
-    """Whether the task was over after each step."""
+    """True where the task was over after a step."""
     if callable(rule) or rule not in ("success", "never"):
         given = plain("", "", _call(rule, episode)) if callable(rule) else episode.columns[str(rule)]
         if given.ndim:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import fnmatch
 import os
+import re
 from collections.abc import Callable, Sequence
 from itertools import chain
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,12 @@ from quad_rl._rows import Source, plain
 from quad_rl.readers.arrow import array_of
 from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset, is_number
 
-_EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # How the libraries of tables write that nothing is there.
+TABLES = (".csv", ".tsv", ".parquet")  # Of the files in a folder.
+_EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # Empty places, as libraries of tables write them.
+_CLOCK = re.compile(r"(^t|time|stamp)(_?(s|ms|us|ns|sec|seconds))?$", re.IGNORECASE)
+_ENDS = {"done", "dones", "terminal", "terminals", "terminated"}
+_GAP = 1.5  # Of a step's usual length.
+_FEWEST = 20  # Steps by which a clock is known.
 
 
 def from_frame(
@@ -34,10 +41,10 @@ def from_frame(
 ) -> Source:
     """A table with a row for each step, in the order of recording.
 
-    frame: a data frame (pandas, Polars, a pyarrow Table, a dictionary of arrays), or the path of a CSV or Parquet file, which
-        needs pyarrow.
+    frame: a data frame (pandas, Polars, a pyarrow Table, a dictionary of arrays), or the path of a CSV or Parquet file, or of a
+        folder of them, which needs pyarrow. The column "file" has the name of a folder's file, without its ending.
     observations, actions: the columns that are seen and done, in this order; one may hold lists. They are called so in the
-        file and in the policy. "q*" stands for all columns of such names, in the table's order.
+        file and in the policy. "q*" stands for all columns of such names that are nothing else, in the table's order.
     reward: a column; "success-at-end", which is 1 at the last step of a success and else 0; "step-cost", which is -1, and 0
         there; "none", which is 0, for data to clone; or a function of the episode, a dictionary of columns, that gives a number
         for each step.
@@ -51,7 +58,8 @@ def from_frame(
     continuous: whole numbers in `actions` are amounts, such as torques, and no choices.
 
     What followed the last step of an episode that does not terminate is not in a table, so that step is dropped, as
-    `from_arrays` does it. Raises ValueError for what is missing, ImportError without pyarrow.
+    `from_arrays` does it. `notes` of the result says where times, in columns with such a name, leap, stand still or go back.
+    Raises ValueError for what is missing, ImportError without pyarrow.
     """
     path = isinstance(frame, (str, PathLike))
     place = os.fspath(frame) if path else "the table"
@@ -61,7 +69,9 @@ def from_frame(
     if path and not {*observations, *actions, episode} & {*there} and any(map(is_number, there)):
         hint = "hint: write one above them, such as " + ",".join([*observations, *actions, episode])
         raise ValueError(f"{place} has no line of names: its first line is {', '.join(there)}\n{hint}")
-    observations, actions = _matching(observations, there), _matching(actions, there)
+    others = {episode, *(rule for rule in (reward, terminal, success) if isinstance(rule, str))}
+    actions = _matching(actions, there, others)
+    observations = _matching(observations, there, {*others, *actions})
     words = columns_of(observations, actions, reward, terminal, success)
     read = {name: key for name, key in zip(there, keys) if words is None or name in words or name == episode}
     for name in [name for name in read if there.count(name) > 1]:
@@ -72,6 +82,12 @@ def from_frame(
     for name in [name for name in columns if len(columns[name]) != len(columns[episode])]:
         raise ValueError(f"{place}: column {name!r} has {len(columns[name])} rows, but {episode!r} has {len(columns[episode])}")
     names, of, notes = _episodes(columns[episode], episode, place, apart)
+    for name, key in zip(there, keys):
+        if _CLOCK.search(name) and name != episode and there.count(name) == 1:
+            notes += _leaps(table[key], name, of)
+    ends = [name for name in there if name.lower() in _ENDS]
+    if ends and terminal is None and success is None:
+        notes.append(f"no terminal is given: {ends[0]!r}, if that says where the task was over?")
     order, cuts = np.argsort(of, kind="stable"), np.cumsum(np.bincount(of, minlength=1))[:-1]
     parts = zip(*(np.split(array[order], cuts) for array in columns.values())) if names else ()
     episodes = [Episode(name, dict(zip(columns, part)), {}) for name, part in zip(names, parts)]
@@ -104,11 +120,33 @@ def _episodes(ids: NDArray[Any], column: str, place: str, apart: str | None) -> 
     return names, np.cumsum(begins) - 1, [f"{len(torn)} of {len(numbers)} names are those of several episodes: {len(names)} in all"]
 
 
-def _matching(names: Sequence[str], there: list[str]) -> Sequence[str]:
-    """The columns of these names or patterns, each once; what matches none stays, to be refused."""
+def _leaps(column: Any, name: str, of: NDArray[Any]) -> list[str]:
+    """Tells of rows that are missing, there twice or out of order, by their times."""
+    try:
+        array = _column(column, name, "")
+        times = array.astype("M8[ns]").astype(float) / 1e9 if array.dtype.kind == "M" else array.astype(float).reshape(of.shape)
+    except (TypeError, ValueError):  # Texts, empty places, lists.
+        return []
+    order = np.argsort(of, kind="stable")
+    steps = np.diff(times[order])[np.diff(of[order]) == 0]
+    ahead, still, back = steps[steps > 0], np.count_nonzero(steps == 0), np.count_nonzero(steps < 0)
+    if len(ahead) < max(_FEWEST, len(steps) / 2) or 10 * back > len(steps):
+        return []  # No clock.
+    usual = np.median(ahead)
+    long = ahead[ahead > _GAP * usual]
+    told = [f"{len(long)} take more than {_GAP} times the usual {usual:.3g}, up to {long.max():.3g}, as if rows were missing: "
+            "begin another episode there"] if len(long) else []
+    told += [f"{still} take no time, as if rows were there twice"] if still else []
+    told += [f"{back} go back: sort the rows"] if back else []
+    return [f"of {len(steps)} steps, by their {name!r}, {'; '.join(told)}"] if told else []
+
+
+def _matching(names: Sequence[str], there: list[str], others: set[str]) -> Sequence[str]:
+    """The columns of these names or patterns, each once, by patterns none of `others`; what matches none stays, to be refused."""
     if isinstance(names, str):
         return names
-    found = ([name] if name in there else fnmatch.filter(there, name) or [name] for name in names)
+    free = [name for name in there if name not in others]
+    found = ([name] if name in there else fnmatch.filter(free, name) or [name] for name in names)
     return [*dict.fromkeys(chain.from_iterable(found))]
 
 
@@ -126,7 +164,12 @@ def _column(column: Any, name: str, place: str) -> NDArray[Any]:
 
 
 def _read(path: str) -> Any:
-    invalid = library("pyarrow", "table").ArrowInvalid
+    pa = library("pyarrow", "table")
+    if os.path.isdir(path):
+        files = [file for file in sorted(Path(path).iterdir()) if file.suffix.lower() in TABLES]
+        tables = [(file.stem, _read(str(file))) for file in files]
+        tables = [table.append_column("file", pa.array([stem] * len(table), pa.string())) for stem, table in tables]
+        return pa.concat_tables(tables, promote_options="permissive")
     with open(path, "rb") as file:
         first = file.readline(1 << 16)
     try:
@@ -135,6 +178,6 @@ def _read(path: str) -> Any:
         csv = library("pyarrow.csv", "table")
         delimiter = max(",;\t", key=first.decode(errors="replace").count)
         return csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
-    except invalid as error:
+    except pa.ArrowInvalid as error:
         hint = "hint: its writer must have closed it; each line of a CSV file has as many fields as the first, which has the names"
         raise ValueError(f"{path} is no whole CSV or Parquet file: {error}\n{hint}") from None

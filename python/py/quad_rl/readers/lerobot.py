@@ -232,7 +232,7 @@ def _cut(parts: dict[int, Columns], flags: list[str], notes: list[str]) -> list[
 
 
 def _suspect_shift(episodes: list[Episode], notes: list[str]) -> None:
-    """Says so where rewards come a step before the success that they are for."""
+    """Warns of rewards that come a step before their success."""
     won = [e.columns for e in episodes if np.any(e.columns[_SUCCESS] > 0)]
     early = sum(int(np.argmax(c[_REWARD])) + 1 == int(np.argmax(c[_SUCCESS] > 0)) for c in won)
     if early and early == len(won):

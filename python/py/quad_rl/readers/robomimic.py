@@ -118,7 +118,7 @@ def _check_following(where: str, key: str, seen: NDArray[Any], after: NDArray[An
 
 
 def _pays(columns: list[dict[str, NDArray[Any]]], reward: Rule) -> bool:
-    """Whether `dones` are set, and only where there is a reward."""
+    """True if `dones` are set, and only where there is a reward."""
     if not isinstance(reward, str) or not all(reward in of for of in columns):
         return False
     flags: NDArray[Any] = np.concatenate([of[_DONE].reshape(-1) > 0 for of in columns])
