@@ -60,7 +60,7 @@ def test_each_frame_is_seen_in_its_row(tmp_path, version):
     assert np.abs(found.observations[:, 3] - np.concatenate(GRAYS)).max() < 1.9
     after = ~found.terminals
     assert np.array_equal(found.next_observations[after], np.roll(found.observations, -1, 0)[after]) and after.sum() == 39
-    assert not any("images" in note for note in dataset.notes)
+    assert not any("streams of images" in note for note in dataset.notes)
 
 
 def test_what_cannot_be_seen_is_refused(tmp_path):
