@@ -8,6 +8,34 @@ use super::prelude::*;
 /// Largest weight of an action of the data.
 const MOST_WEIGHT: f64 = 100.0;
 
+/// The help of metrics that are equations of one algorithm.
+pub(super) struct Helps {
+    pub targets: &'static str,
+    pub value_loss: &'static str,
+    pub critic_loss: &'static str,
+    pub actor_loss: &'static str,
+    pub learning_rate: &'static str,
+}
+
+/// The help of a learning rate that always decays.
+pub(super) const COSINE: &str =
+    "The actor's learning rate; falls to 0 along a cosine, and is constant with practice.";
+
+/// The metrics of one algorithm.
+pub(super) const fn table(helps: Helps) -> [Metric; 9] {
+    metrics! {
+        target_q_mean held_out: helps.targets;
+        v_mean ["V"] held_out: "Mean over the batch of the value V(s) after its step.";
+        value_loss ["value loss"] held_out: helps.value_loss;
+        critic_loss ["critic loss"] held_out: helps.critic_loss;
+        actor_loss ["actor loss"] held_out: helps.actor_loss;
+        advantage_mean held_out: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).";
+        weight_mean held_out: "Mean over the batch of the weights in the actor's loss.";
+        clipped_share held_out: "Share of the batch, 0 to 1, whose weight is clipped at 100.";
+        learning_rate: helps.learning_rate;
+    }
+}
+
 /// The hyper-parameters that all algorithms of this kind have.
 #[derive(Clone, Deserialize)]
 pub(super) struct Common {

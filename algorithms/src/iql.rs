@@ -2,7 +2,7 @@
 //! Q-Learning"): a value function learned by expectile regression, and a Gaussian policy cloned
 //! from the data with advantages as weights. Equations are that paper's.
 
-use super::in_sample::{Common, ImplicitLosses, InSample};
+use super::in_sample::{COSINE, Common, Helps, ImplicitLosses, InSample, table};
 use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -14,17 +14,13 @@ pub(super) const DEFINITION: Definition = Definition {
     read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
 };
 
-const METRICS: &[Metric] = &metrics! {
-    target_q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).";
-    v_mean ["V"] held_out: "Mean over the batch of the value V(s) after its step.";
-    value_loss ["value loss"] held_out: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).";
-    critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (IQL's Eq. 6).";
-    actor_loss ["actor loss"] held_out: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100 (IQL's Eq. 7).";
-    advantage_mean held_out: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).";
-    weight_mean held_out: "Mean over the batch of the weights in the actor's loss.";
-    clipped_share held_out: "Share of the batch, 0 to 1, whose weight is clipped at 100.";
-    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and is constant with practice.";
-};
+const METRICS: &[Metric] = &table(Helps {
+    targets: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).",
+    value_loss: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).",
+    critic_loss: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (IQL's Eq. 6).",
+    actor_loss: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100 (IQL's Eq. 7).",
+    learning_rate: COSINE,
+});
 
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -4,7 +4,7 @@
 //! SQL, sparse Q-learning, or EQL, exponential Q-learning. Equations are that paper's; where its
 //! authors' code does something else, docs/deviations.md says what holds.
 
-use super::in_sample::{Common, ImplicitLosses, InSample, scale_down};
+use super::in_sample::{COSINE, Common, Helps, ImplicitLosses, InSample, scale_down, table};
 use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -31,17 +31,13 @@ const LARGEST_EXPONENT: f64 = 5.0;
 /// Factor of 1/α in EQL's weights.
 const SHARPER: f64 = 10.0;
 
-const METRICS: &[Metric] = &metrics! {
-    target_q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s').";
-    v_mean ["V"] held_out: "Mean over the batch of the value V(s) after its step.";
-    value_loss ["value loss"] held_out: "Mean over the batch, with δ = min_k Q̂_k(s, a) − V(s), of 1(z > 0)·z² + V(s)/α, z = 1 + δ/2α (divergence sparse), or of exp(z − M) + exp(−M)·V(s)/α, z = min(δ/α, 5) and M = max(largest z, −1) (exponential).";
-    critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)².";
-    actor_loss ["actor loss"] held_out: "Mean over the batch of −weight·log π(a|s) with weight = A (divergence sparse) or exp(10·A/α) (exponential), between 0 and 100 (IVR's Eq. 14 and 17, with its code's factors).";
-    advantage_mean held_out: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).";
-    weight_mean held_out: "Mean over the batch of the weights in the actor's loss.";
-    clipped_share held_out: "Share of the batch, 0 to 1, whose weight is clipped at 100.";
-    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and is constant with practice.";
-};
+const METRICS: &[Metric] = &table(Helps {
+    targets: "Mean over the batch of the critics' target y = r + γ·mask·V(s').",
+    value_loss: "Mean over the batch, with δ = min_k Q̂_k(s, a) − V(s), of 1(z > 0)·z² + V(s)/α, z = 1 + δ/2α (divergence sparse), or of exp(z − M) + exp(−M)·V(s)/α, z = min(δ/α, 5) and M = max(largest z, −1) (exponential).",
+    critic_loss: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)².",
+    actor_loss: "Mean over the batch of −weight·log π(a|s) with weight = A (divergence sparse) or exp(10·A/α) (exponential), between 0 and 100 (IVR's Eq. 14 and 17, with its code's factors).",
+    learning_rate: COSINE,
+});
 
 /// Divergence of the policy from the data's.
 #[derive(Clone, Copy, Deserialize)]

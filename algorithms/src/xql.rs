@@ -3,7 +3,7 @@
 //! data, β·ln E exp(Q/β), without a sample of a policy. What its authors' scripts add for single
 //! datasets is in `pairs` and `value_steps`.
 
-use super::in_sample::{Common, ImplicitLosses, InSample, scale_down};
+use super::in_sample::{Common, Helps, ImplicitLosses, InSample, scale_down, table};
 use super::prelude::*;
 
 pub(super) const DEFINITION: Definition = Definition {
@@ -18,17 +18,13 @@ pub(super) const DEFINITION: Definition = Definition {
 /// Bound of the noise on the actions that V sees.
 const LARGEST_NOISE: f64 = 0.5;
 
-const METRICS: &[Metric] = &metrics! {
-    target_q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s').";
-    v_mean ["V"] held_out: "Mean over the batch of the value V(s) after its step.";
-    value_loss ["value loss"] held_out: "Gumbel regression of V, mean over the batch of exp(z − M) − z·exp(−M) − exp(−M) with z = (min_k Q̂_k(s, a) − V(s))/beta, at most largest_exponent, and M = max(largest z, −1); before V's last step.";
-    critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of Huber's loss of y − Q_k(s, a), linear from huber on.";
-    actor_loss ["actor loss"] held_out: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100.";
-    advantage_mean held_out: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).";
-    weight_mean held_out: "Mean over the batch of the weights in the actor's loss.";
-    clipped_share held_out: "Share of the batch, 0 to 1, whose weight is clipped at 100.";
-    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and is constant with practice or if actor_rate_decays is false.";
-};
+const METRICS: &[Metric] = &table(Helps {
+    targets: "Mean over the batch of the critics' target y = r + γ·mask·V(s').",
+    value_loss: "Gumbel regression of V, mean over the batch of exp(z − M) − z·exp(−M) − exp(−M) with z = (min_k Q̂_k(s, a) − V(s))/beta, at most largest_exponent, and M = max(largest z, −1); before V's last step.",
+    critic_loss: "Mean over the batch of the sum over both critics of Huber's loss of y − Q_k(s, a), linear from huber on.",
+    actor_loss: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100.",
+    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and is constant with practice or if actor_rate_decays is false.",
+});
 
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -49,6 +49,18 @@ fn the_last_state_of_an_episode_is_no_step() {
 }
 
 #[test]
+fn an_episode_ends_at_the_goal_although_the_recording_goes_on() {
+    let mut recording = recording(&[Transition, Transition, Transition, Dropped]);
+    recording.goal = true;
+    recording.terminals[1] = true;
+    recording.ends[3] = true;
+    let transitions = transitions(recording);
+    assert_eq!(transitions.episodes(), [0..2, 2..3]);
+    assert_eq!(transitions.recorded_episodes(), transitions.episodes()[..1]);
+    assert!(transitions.next_action(1).is_none());
+}
+
+#[test]
 fn an_episode_after_one_that_reached_its_goal_is_one_of_the_recording() {
     let mut recording =
         recording(&[Transition, Transition, Dropped, Transition, Transition, Dropped]);

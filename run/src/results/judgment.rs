@@ -18,7 +18,8 @@ const LOCK: &str = "judgments.lock";
 pub struct Conditions {
     /// SHA-256 of the data.
     pub dataset: String,
-    /// The environment of the rewards.
+    /// The environment of the rewards; empty in older files.
+    #[serde(default)]
     pub environment: String,
     /// Indices of the episodes in whose first states policies are judged, in the file's order.
     pub episodes: Vec<usize>,
@@ -51,6 +52,7 @@ impl Estimate {
 #[allow(missing_docs)]
 pub struct Judgment {
     /// The folder of its run, as the reader calls it.
+    #[serde(default)]
     pub run: PathBuf,
     /// Gradient step of the snapshot.
     pub step: u64,
@@ -71,12 +73,13 @@ pub struct Judgment {
 }
 
 impl Judgment {
-    /// The judgments in a run's folder.
+    /// The judgments in a run's folder, without those of unknown environments.
     pub fn read_all(folder: &RunDir) -> Result<Vec<Self>, RunDirError> {
         if !folder.path().join(FILE).exists() {
             return Ok(Vec::new());
         }
         let mut judgments: Vec<Self> = folder.read_json(FILE)?;
+        judgments.retain(|judgment| !judgment.conditions.environment.is_empty());
         judgments.iter_mut().for_each(|judgment| judgment.run = folder.path().to_owned());
         Ok(judgments)
     }

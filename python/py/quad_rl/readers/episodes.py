@@ -17,7 +17,8 @@ Rule = Union[str, Callable[[Mapping[str, Any]], Any], None]
 Success = Union[Rule, Sequence[Any]]
 _HOW = 'success= a column, "all", a list of episodes, or a function of the episode'
 _MANY = 0.1  # Smallest share of rows after a success to warn of; in a few the robot comes to rest.
-_FEWEST, _EVEN = 20, 0.9  # Fewest steps that identify a clock, and the smallest share of them near the median.
+FEWEST = 20  # Steps by which a clock is known.
+_EVEN = 0.9  # Smallest share of them near the median.
 _OF_SUCCESS = {"success-at-end": (0.0, 1.0), "step-cost": (-1.0, 0.0)}
 
 
@@ -142,7 +143,7 @@ def _clocks(log: Log, observations: Sequence[str]) -> list[str]:
     clocks = []
     for column in observations:
         steps = np.concatenate([np.diff(_beside(episode.columns, [column]).astype(float), axis=0) for episode in log.episodes])
-        if len(steps) >= _FEWEST:
+        if len(steps) >= FEWEST:
             usual = np.median(steps, axis=0)
             even = np.mean(abs(steps - usual) <= usual / 4, axis=0)
             clocks += [name for name, by, share in zip(_names(log, column), usual, even) if by > 0 and share > _EVEN]

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from quad_rl._extras import library
 from quad_rl._rows import Source, plain
 from quad_rl.readers.arrow import array_of
-from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset, is_number
+from quad_rl.readers.episodes import FEWEST, Episode, Log, Rule, Success, columns_of, dataset, is_number
 
 TABLES = (".csv", ".tsv", ".parquet")  # Of the files in a folder.
 _EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # Empty places, as libraries of tables write them.
 _CLOCK = re.compile(r"(^t|time|stamp)(_?(s|ms|us|ns|sec|seconds))?$", re.IGNORECASE)
 _ENDS = {"done", "dones", "terminal", "terminals", "terminated"}
 _GAP = 1.5  # Of a step's usual length.
-_FEWEST = 20  # Steps by which a clock is known.
 
 
 def from_frame(
@@ -130,7 +129,7 @@ def _leaps(column: Any, name: str, of: NDArray[Any]) -> list[str]:
     order = np.argsort(of, kind="stable")
     steps = np.diff(times[order])[np.diff(of[order]) == 0]
     ahead, still, back = steps[steps > 0], np.count_nonzero(steps == 0), np.count_nonzero(steps < 0)
-    if len(ahead) < max(_FEWEST, len(steps) / 2) or 10 * back > len(steps):
+    if len(ahead) < max(FEWEST, len(steps) / 2) or 10 * back > len(steps):
         return []  # No clock.
     usual = np.median(ahead)
     long = ahead[ahead > _GAP * usual]

@@ -116,3 +116,13 @@ fn concurrent_judges_lose_no_judgment() {
     let saved = Judgment::read_all(run).unwrap();
     assert_eq!(Vec::from_iter(saved.iter().map(|one| one.step)), Vec::from_iter(0..20));
 }
+
+#[test]
+fn judgments_of_unknown_environments_do_not_count() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunDir::at(folder.path());
+    let mut written = serde_json::to_value([judgment("a", &[1.0], 10.0)]).unwrap();
+    written[0]["conditions"].as_object_mut().unwrap().remove("environment");
+    run.write_json(FILE, &written).unwrap();
+    assert_eq!(Judgment::read_all(&run).unwrap(), []);
+}
