@@ -14,6 +14,9 @@ const LARGEST: f64 = 100.0;
 const SMALLEST: f64 = 1e-3;
 /// Largest fraction of the rows that is taken for errors where it alone makes a dimension large.
 const ERRORS: f64 = 0.01;
+/// Distance of an outlier from the middle, relative to the range of nearly all rows. A normal
+/// distribution's largest of a million is at 1.
+const FAR: f32 = 10.0;
 const ROUNDING: f64 = 1e-6;
 
 pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String> {
@@ -37,11 +40,36 @@ pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String
     if !normalize.observations {
         warnings.extend(small("observations", &columns, &names.observations));
     }
+    let columns = Figures::of_columns(actions, *action_dim, |row| recording.is_step(row));
     if !normalize.actions {
-        let columns = Figures::of_columns(actions, *action_dim, |row| recording.is_step(row));
         warnings.extend(small("actions", &columns, &names.actions));
     }
+    // Outside of [-1, 1] they must be normalized.
+    let is_outside = |column: &Figures| column.min < -1.0 || column.max > 1.0;
+    if normalize.actions || columns.iter().any(is_outside) {
+        warnings.extend((0..*action_dim).find_map(|column| outliers(recording, column)));
+    }
     warnings
+}
+
+/// A few actions that alone set a column's range, which normalization maps to [-1, 1].
+fn outliers(recording: &Recording, column: usize) -> Option<String> {
+    let steps = (0..recording.rows()).filter(|&row| recording.is_step(row));
+    let values = Vec::from_iter(steps.map(|row| (row, recording.action(row)[column])));
+    let mut sorted = Vec::from_iter(values.iter().map(|(_, value)| *value));
+    sorted.sort_unstable_by(f32::total_cmp);
+    let few = (ERRORS / 2.0 * sorted.len() as f64).ceil() as usize;
+    let (low, high) = (sorted.get(few)?, sorted.get(sorted.len().checked_sub(few + 1)?)?);
+    let is_far = |value: f32| high > low && (value - (low + high) / 2.0).abs() > FAR * (high - low);
+    let far = Vec::from_iter(values.iter().filter(|(_, value)| is_far(*value)));
+    let (row, value) = **far.first()?;
+    let (array, row) = recording.place("actions", row);
+    Some(format!(
+        "array `{array}`, row {row}: {value} in {}, far from nearly all other rows{}; normalized by this range, all others become \
+         alike; leave out or repair these rows",
+        named(&[column], &recording.names.actions),
+        such_rows(far.len())
+    ))
 }
 
 /// A few rows that alone make these columns large.

@@ -78,6 +78,19 @@ fn actions_too_small_to_learn() {
 }
 
 #[test]
+fn an_action_that_alone_sets_the_range() {
+    let mut cart = cart(false);
+    cart.actions[7 * 2 + 1] = 200.0;
+    let start =
+        "array `actions`, row 7: 200 in column 1, far from nearly all other rows; normalized";
+    let normalize = Normalize { actions: true, ..NONE };
+    let warnings = training_warnings(&cart, true, normalize);
+    assert!(warnings.len() == 1 && warnings[0].starts_with(start), "{warnings:?}");
+    cart.actions[7 * 2 + 1] = 2.0;
+    assert_remedied(&cart, normalize);
+}
+
+#[test]
 fn rewards_of_a_size_that_methods_are_not_made_for() {
     let mut cart = cart(false);
     let scale = |cart: &mut Arrays, by: f32| cart.rewards.iter_mut().for_each(|x| *x *= by);
