@@ -34,7 +34,7 @@ impl AlgorithmError {
                 "`learner datasets inspect` says how long episodes are; --agent shortest_episode=1 keeps them all"
             }
             Self::NoWindow(_) => {
-                "a shorter horizon (--agent network.horizon=4, say), or longer episodes"
+                "a shorter horizon (--agent network.horizon=8, say), or longer episodes"
             }
             Self::Policy(_) | Self::Agent(_) | Self::Candle(_) => {
                 "`learner presets TASK` prints hyper-parameters that work; smaller networks and batches take less memory"

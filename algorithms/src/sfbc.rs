@@ -63,7 +63,7 @@ impl Config {
         let config: Self = read(table)?;
         let (averaged, norm) = (*config.averaged, config.actor.norm);
         let fits = averaged <= *config.candidates;
-        check("averaged", averaged, fits, "at most candidates")?;
+        check("averaged", averaged, fits, "at most agent.candidates")?;
         check("actor.norm", norm, !norm, "false: this network has no norm")?;
         Ok(config)
     }

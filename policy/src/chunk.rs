@@ -168,7 +168,11 @@ impl Policy for Chunked {
     }
 
     fn value(&self, _observations: &[f32], _actions: &[f32]) -> Result<Vec<f32>> {
-        Err(PolicyError::ValuesChunks(self.chunk.length))
+        let Chunk { history, length, .. } = self.chunk;
+        match self.choice() {
+            Some(_) => Err(PolicyError::ValuesChunks { history, length }),
+            None => Err(PolicyError::NoCritics),
+        }
     }
 }
 

@@ -42,7 +42,7 @@ fn the_pattern_with_more_letters_wins_key_by_key() {
 }
 
 #[test]
-fn a_star_stands_for_any_letters() {
+fn a_star_stands_for_any_text() {
     for (pattern, name, expected) in [
         ("a-b", "a-b", true),
         ("a-b", "a-bc", false),
