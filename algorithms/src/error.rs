@@ -68,6 +68,7 @@ pub fn in_words(error: &toml::de::Error) -> String {
     let mut message = error.to_string();
     for (types, words) in [
         (&["u64", "usize"][..], "a whole number from 0"),
+        (&["u8"], "a whole number from 0 to 255"),
         (&["u32"], "a whole number from 0 to 4294967295"),
         (&["f32", "f64"], "a number"),
         (&["a sequence"], "a list"),

@@ -366,6 +366,7 @@ fn contradictory_hyper_parameters_are_refused() {
         ("quad", toml::toml! { chunk = 0 }, "a whole number from 1"),
         ("idql", toml::toml! { chunk = 3 replan = 4 }, "agent.replan is 4, but must be at most"),
         ("fql", toml::toml! { replan = 2 }, "at most agent.chunk"),
+        ("xql", toml::toml! { random_actions = 300 }, "a whole number from 0 to 255"),
         ("iql", toml::toml! { chunk = 2 }, "iql learns single actions"),
         ("iql", toml::toml! { history = 2 }, "so agent.chunk and agent.history must be 1"),
     ] {
