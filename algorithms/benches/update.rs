@@ -1,7 +1,7 @@
 //! Gradient steps of every algorithm at Hopper's shapes, QUAD's also in parts, and the machine's
 //! peaks at these shapes, which bound them. `deploy/bench.sh` makes a table of the results.
 
-#![allow(clippy::expect_used)] // what cannot be had ends the run
+#![allow(clippy::expect_used)] // a benchmark that cannot run panics
 
 use candle_core::{Device, Result, Tensor};
 use criterion::measurement::WallTime;

@@ -42,8 +42,8 @@ impl MonteCarlo {
     }
 }
 
-/// The returns of an episode. Where each of its steps has the same reward and it does not terminate,
-/// it never reached its goal: its return is that of going on like this for ever, if that has an end.
+/// The returns of an episode. One of two or more equal rewards that does not terminate has not reached
+/// its goal: its return is that of this reward for ever, which γ < 1 makes finite.
 fn discounted(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f32> {
     let failed = rewards.len() > 1 && !terminates;
     if failed && gamma < 1.0 && rewards.iter().all(|reward| *reward == rewards[0]) {

@@ -1,4 +1,4 @@
-//! The data and settings of a run that an algorithm learns with.
+//! The context of a run, and its mini-batches as tensors.
 
 use std::sync::Arc;
 

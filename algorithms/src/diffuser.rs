@@ -68,7 +68,7 @@ impl Config {
         }
         let (replan, ValueGuidance { steps, scale, .. }) = (*config.replan_every, config.guidance);
         let fits = replan <= config.network.horizon;
-        check("replan_every", replan, fits, "at most the horizon")?;
+        check("replan_every", replan, fits, "at most agent.network.horizon")?;
         let (fits, range) = ((1..=1000).contains(&steps), "a whole number from 1 to 1000");
         check("guidance.steps", steps, fits, range)?;
         let fits = scale >= 0.0 && scale.is_finite();

@@ -34,7 +34,7 @@ impl AlgorithmError {
                 "`learner datasets inspect` says how long episodes are; --agent shortest_episode=1 keeps them all"
             }
             Self::NoWindow(_) => {
-                "a shorter horizon (--agent network.horizon=4, say), or longer episodes"
+                "a shorter horizon (--agent network.horizon=8, say), or longer episodes"
             }
             Self::Policy(_) | Self::Agent(_) | Self::Candle(_) => {
                 "`learner presets TASK` prints hyper-parameters that work; smaller networks and batches take less memory"
@@ -68,6 +68,7 @@ pub fn in_words(error: &toml::de::Error) -> String {
     let mut message = error.to_string();
     for (types, words) in [
         (&["u64", "usize"][..], "a whole number from 0"),
+        (&["u8"], "a whole number from 0 to 255"),
         (&["u32"], "a whole number from 0 to 4294967295"),
         (&["f32", "f64"], "a number"),
         (&["a sequence"], "a list"),

@@ -144,7 +144,7 @@ impl Algorithm for Fql {
         let losses = self.losses(step, indices)?;
         let [critic_loss, bc_loss, actor_loss] = &losses;
         let Networks { actor, critic, flow } = &mut self.networks;
-        // Before the critics change, of which they are a function.
+        // The policy's gradient, by the critics as they are before their step.
         let gradients = Gradients::of(&actor_loss.value)?;
         critic.soft_update(*self.config.ema_rate)?;
         critic.minimize(&critic_loss.value, adam)?;

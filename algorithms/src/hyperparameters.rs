@@ -37,14 +37,14 @@ checked!(Finite(f32), |x| x.is_finite(), "finite");
 checked!(Positive(f32), |x| x > 0.0 && x.is_finite(), "above 0 and finite");
 checked!(NotNegative(f32), |x| x >= 0.0 && x.is_finite(), "at least 0 and finite");
 checked!(
-    /// Within [0, 1]: a discount.
+    /// Within [0, 1]: a discount or a factor.
     UnitInterval(f32), |x| (0.0..=1.0).contains(&x), "in [0, 1]"
 );
 checked!(
     /// Within (0, 1]: the rate of an average.
     Rate(f32), |x| x > 0.0 && x <= 1.0, "in (0, 1]"
 );
-checked!(OpenUnit(f32), |x| x > 0.0 && x < 1.0, "between 0 and 1");
+checked!(OpenUnit(f32), |x| x > 0.0 && x < 1.0, "above 0 and below 1");
 checked!(
     /// A number of things: networks, samples, denoising steps.
     Count(usize), |x| (1..=1000).contains(&x), "a whole number from 1 to 1000"

@@ -8,7 +8,7 @@ use super::prelude::*;
 /// Largest weight of an action of the data.
 const MOST_WEIGHT: f64 = 100.0;
 
-/// The help of metrics that are equations of one algorithm.
+/// The help of the metrics whose equations differ between these algorithms.
 pub(super) struct Helps {
     pub targets: &'static str,
     pub value_loss: &'static str,

@@ -9,10 +9,12 @@
 //!   the data and settings of a run; `chunk`: several steps at a time. `prelude` has the names of
 //!   these for an algorithm's file.
 //! - `returns` of recorded episodes, `phases` of a run; `calibration`: Cal-QL's; `fqe`: the
-//!   value of a policy, by the data alone; `replay`: updates as CUDA graphs.
+//!   value of a policy, by the data alone; `replay`: updates as CUDA graphs of their `inputs`;
+//!   `pool`: threads that stay awake during an update.
 //! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
-//!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`. `fql` is the one to read first; `qc` shares
-//!   its flow, and `diffusion_policy` QUAD's noise predictor.
+//!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`, with the noise of `denoising`; `gaussian` is
+//!   a policy of several. `fql` is the one to read first; `qc` shares its flow, and
+//!   `diffusion_policy` QUAD's noise predictor.
 //!
 //! CONTRIBUTING.md says what a new algorithm needs.
 

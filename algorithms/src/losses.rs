@@ -18,8 +18,8 @@ pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
     values.max(dimension)? + (values.sum(dimension)? * 0.0)?
 }
 
-/// The mean − κ·standard deviation over the critics of constant values, `[K, B]` → `[B]`; divided by
-/// K, as in [`Aggregate::MeanMinusStd`](quad_policy::Aggregate::MeanMinusStd).
+/// The mean − κ·standard deviation over the critics of constant values, `[K, B]` → `[B]`. The
+/// variance is divided by K, as in [`Aggregate::MeanMinusStd`].
 pub(super) fn lower_bound(values: &Tensor, kappa: f32) -> Result<Tensor> {
     let (mean, variance) = mean_and_variance(values)?;
     mean - (variance.sqrt()? * f64::from(kappa))?

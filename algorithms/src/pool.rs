@@ -4,7 +4,7 @@ use rayon::Yield;
 use std::hint::spin_loop;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Between two looks for work; long enough not to disturb the thread that hands it out.
+/// Spins between two looks for work: enough not to disturb the thread that hands it out.
 const PAUSES: usize = 50;
 
 /// Runs `work` as a whole on a thread of the pool, and keeps the others looking for work meanwhile.

@@ -63,7 +63,7 @@ impl Config {
         let config: Self = read(table)?;
         let (averaged, norm) = (*config.averaged, config.actor.norm);
         let fits = averaged <= *config.candidates;
-        check("averaged", averaged, fits, "at most candidates")?;
+        check("averaged", averaged, fits, "at most agent.candidates")?;
         check("actor.norm", norm, !norm, "false: this network has no norm")?;
         Ok(config)
     }
@@ -88,7 +88,7 @@ networks! {
                 action_dim: init.context.action_dim(),
                 layers: config.actor.clone(),
             };
-            // Of the stream behind the networks'. They are a function of the seed: no state.
+            // From the stream after the networks' own: as a function of the seed, they are no state.
             let mut random = init.context.random_for(Purpose::Weights, 2);
             let draw = |generator: &mut _| ScoreShape::frequencies(generator)?.to_vec1::<f32>();
             let frequencies = random.vector("frequencies", draw)?;

@@ -270,7 +270,7 @@ fn data_without_examples_is_refused_with_a_hint() {
         ("onestep", "has a next action", "datasets inspect"),
         ("rebrac", "has a next action", "datasets inspect"),
         ("sfbc", "transitions (agent.shortest_episode)", "shortest_episode=1"),
-        ("diffuser", "plans ahead", "horizon"),
+        ("diffuser", "plans ahead", "network.horizon=8"),
     ] {
         let (definition, mut table) = variant(name);
         if name == "sfbc" {
@@ -283,7 +283,7 @@ fn data_without_examples_is_refused_with_a_hint() {
     }
 }
 
-/// Two of five transitions are the last of an episode that is cut off.
+/// Two of six transitions are the last of an episode that is cut off.
 #[test]
 fn transitions_without_a_next_action_are_left_out() {
     let arrays = Arrays {
@@ -352,9 +352,9 @@ fn each_phase_trains_its_networks() {
 #[test]
 fn contradictory_hyper_parameters_are_refused() {
     for (name, change, words) in [
-        ("sfbc", toml::toml! { averaged = 7 }, "at most candidates"),
+        ("sfbc", toml::toml! { averaged = 7 }, "at most agent.candidates"),
         ("sfbc", toml::toml! { actor.norm = true }, "actor.norm"),
-        ("diffuser", toml::toml! { replan_every = 1000 }, "at most the horizon"),
+        ("diffuser", toml::toml! { replan_every = 1000 }, "at most agent.network.horizon"),
         ("diffuser", toml::toml! { network.groups = 0 }, "agent.network.groups is 0"),
         ("quad", toml::toml! { eta.maximum = -1.0 }, "at least 0"),
         ("quad", toml::toml! { eta.initial = 1e9 }, "between eta.minimum and eta.maximum"),
@@ -366,6 +366,7 @@ fn contradictory_hyper_parameters_are_refused() {
         ("quad", toml::toml! { chunk = 0 }, "a whole number from 1"),
         ("idql", toml::toml! { chunk = 3 replan = 4 }, "agent.replan is 4, but must be at most"),
         ("fql", toml::toml! { replan = 2 }, "at most agent.chunk"),
+        ("xql", toml::toml! { random_actions = 300 }, "a whole number from 0 to 255"),
         ("iql", toml::toml! { chunk = 2 }, "iql learns single actions"),
         ("iql", toml::toml! { history = 2 }, "so agent.chunk and agent.history must be 1"),
     ] {

@@ -2,7 +2,7 @@
 //! their own.
 //!
 //! `[for."PATTERN"]` holds keys of an experiment for the tasks that fit the pattern, in which `*`
-//! stands for any letters. Of several such groups the one whose pattern has more letters wins.
+//! stands for any text. Of several such groups the one whose pattern has more letters wins.
 
 use std::collections::BTreeMap;
 
@@ -48,7 +48,7 @@ impl Values {
     }
 }
 
-/// True if a name fits a pattern, in which `*` stands for any letters.
+/// True if a name fits a pattern, in which `*` stands for any text.
 pub fn fits(pattern: &str, name: &str) -> bool {
     match pattern.split_once('*') {
         None => pattern == name,

@@ -3,7 +3,7 @@
 use crate::vectorized::vectorized;
 use serde::{Deserialize, Serialize};
 
-/// Below this, Mish and its slope are constants of some −2e-14. Smaller ones would lead to subnormal
+/// Below this, Mish and its slope are constants of about −2e-14. Smaller ones would lead to subnormal
 /// gradients, with which a CPU is ten times slower.
 const MISH_ZERO: f32 = -35.0;
 /// Above this, Mish is x and its slope 1 to the last bit of f32; keeps squares of e^x finite.

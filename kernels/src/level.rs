@@ -3,7 +3,7 @@
 
 use std::sync::LazyLock;
 
-/// Sets of instructions, each with all sets before it.
+/// Instruction sets; each includes those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Level {
     /// The instructions of every CPU of the architecture.
@@ -15,7 +15,7 @@ pub enum Level {
 }
 
 impl Level {
-    /// Name in `scores.jsonl` and in the environment variable.
+    /// Name in `scores.jsonl`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Plain if cfg!(target_arch = "x86_64") => "x86",

@@ -22,8 +22,8 @@ pub enum Matrix<'a> {
     RowMajor(&'a [f32]),
     /// The transpose of the matrix with these elements, row by row.
     TransposeOf(&'a [f32]),
-    /// The transpose of columns from an index on of the matrix with these elements, row by row, and
-    /// this many columns.
+    /// The transpose of some columns of a matrix: its elements, row by row; the first of these
+    /// columns; and the number of columns in all.
     TransposeOfColumns(&'a [f32], usize, usize),
 }
 

@@ -1,4 +1,4 @@
-//! Arithmetic of networks without gradients.
+//! The precision of forward passes without gradients.
 
 use serde::de::{self, IntoDeserializer};
 use serde::{Deserialize, Serialize};

@@ -3,8 +3,8 @@
 use crate::slices::{has_fast_implementation, read};
 use candle_core::{Result, Tensor};
 
-/// Mean of (x − y)², `[]`; y `[…]` is the same for all of a first dimension that x may have more,
-/// `[K, …]`, and a constant on a GPU.
+/// Mean of (x − y)², `[]`, for x `[…]` or `[K, …]` and y `[…]`, which K members share. On a GPU y is a
+/// constant.
 pub fn squared_error(x: &Tensor, y: &Tensor) -> Result<Tensor> {
     #[cfg(feature = "cuda")]
     if x.device().is_cuda() {
@@ -13,8 +13,8 @@ pub fn squared_error(x: &Tensor, y: &Tensor) -> Result<Tensor> {
     x.broadcast_sub(y)?.sqr()?.mean_all()
 }
 
-/// weight·E + mean(x·pull), and E, which is the mean of (x − y)²; both `[]`, as is the weight, x, y and
-/// pull of one shape. Only x has a gradient, and on a GPU only through the first.
+/// weight·E + mean(x·pull), and E = mean((x − y)²); both `[]`. The weight is `[]`; x, y and pull have
+/// one shape. Only x has a gradient, on a GPU only through the first result.
 pub fn pulled_error(
     x: &Tensor,
     y: &Tensor,

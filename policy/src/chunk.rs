@@ -13,8 +13,8 @@ use std::mem;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Chunk {
-    /// Observations that a chunk is drawn from, oldest first; before an episode's first, it is
-    /// repeated.
+    /// Number of last observations that a chunk is drawn from, oldest first. An episode's first
+    /// observation stands for those before it.
     pub history: usize,
     /// Steps h of a chunk; 1 is a single action.
     pub length: usize,
@@ -168,7 +168,11 @@ impl Policy for Chunked {
     }
 
     fn value(&self, _observations: &[f32], _actions: &[f32]) -> Result<Vec<f32>> {
-        Err(PolicyError::ValuesChunks(self.chunk.length))
+        let Chunk { history, length, .. } = self.chunk;
+        match self.choice() {
+            Some(_) => Err(PolicyError::ValuesChunks { history, length }),
+            None => Err(PolicyError::NoCritics),
+        }
     }
 }
 

@@ -13,15 +13,15 @@ pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
 pub enum PolicyError {
     #[error("the weights are not a readable safetensors file")]
     Unreadable(#[from] safetensors::SafeTensorError),
-    #[error("the file does not say what it holds (metadata `{0}`)")]
+    #[error("the file's metadata lacks `{0}`")]
     NoHeader(&'static str),
-    #[error("what the weights say about themselves is not understood: {0}")]
+    #[error("the file's header is not understood: {0}")]
     Header(#[from] serde_json::Error),
     #[error(
         "the weights were written by version {version}, and this version, {VERSION}, does not understand them: {source}"
     )]
     Version { version: String, source: serde_json::Error },
-    #[error("the weights' {field} is {value}, which is out of range")]
+    #[error("{field} is {value}, which is out of range")]
     Range { field: &'static str, value: usize },
     #[error(
         "the scaling of {what} in the file is not {columns} finite offsets and as many finite scales, none below 0"
@@ -37,8 +37,10 @@ pub enum PolicyError {
     NoCandidates,
     #[error("this policy has no critics, which would value its actions")]
     NoCritics,
-    #[error("the critics of this policy value chunks of {0} actions, not a single one")]
-    ValuesChunks(usize),
+    #[error(
+        "the critics of this policy take a history of {history} and a chunk of {length}, not one observation and one action"
+    )]
+    ValuesChunks { history: usize, length: usize },
     #[error("the rule `nearest` takes a value function, which this policy does not have")]
     NoValue,
     #[error(transparent)]
@@ -61,7 +63,9 @@ impl PolicyError {
             Self::NoCandidates | Self::NoCritics | Self::NoValue | Self::NoGuidance => {
                 "score it without --candidates, --rule, --aggregate and --guidance"
             }
-            Self::ValuesChunks(_) => "the samples of a policy come with the values of their chunks",
+            Self::ValuesChunks { .. } => {
+                "the samples of a policy come with the values of their chunks"
+            }
             Self::Temperature(_) | Self::Guidance(_) => {
                 "give another number; a file with such a number is damaged"
             }

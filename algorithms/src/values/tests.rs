@@ -42,7 +42,7 @@ fn the_pattern_with_more_letters_wins_key_by_key() {
 }
 
 #[test]
-fn a_star_stands_for_any_letters() {
+fn a_star_stands_for_any_text() {
     for (pattern, name, expected) in [
         ("a-b", "a-b", true),
         ("a-b", "a-bc", false),
@@ -102,7 +102,7 @@ fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
     }
 }
 
-/// Else it would have the rest from a network of other layers, such as its initial weights.
+/// What it does not name, such as the initial weights, would be those of the network that tasks share.
 #[test]
 fn a_group_with_another_network_names_all_of_it() {
     for definition in ALGORITHMS {

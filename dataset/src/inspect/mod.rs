@@ -17,8 +17,8 @@ use crate::tables::reward::RewardScaling;
 pub use histogram::Histogram;
 
 /// Statistics and problems of a dataset: lengths of episodes in steps, and ranges of the numbers in a
-/// column or in all. Numbers that are not finite are excluded; a statistic of
-/// no numbers is NaN, null in JSON.
+/// column or in all. Numbers that are not finite are excluded; a statistic of no numbers is NaN, null
+/// in JSON.
 #[derive(Debug, Serialize)]
 #[allow(missing_docs)] // The names say what each is.
 pub struct Inspection {

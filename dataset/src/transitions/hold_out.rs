@@ -21,7 +21,7 @@ pub enum HoldOut<'a> {
         /// Seed of the choice.
         seed: u64,
     },
-    /// Indices of episodes, from 0 in file order.
+    /// Indices of episodes in ascending order, from 0 in file order.
     Episodes(&'a [usize]),
 }
 

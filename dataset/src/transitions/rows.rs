@@ -14,9 +14,10 @@ const ACTION_LIMIT: f32 = 1.0 - 1e-5;
 /// The steps that an example covers: h in a row, fewer where the episode ends before.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Window {
-    /// Observations k ≥ 1 that are seen at a time; before the episode's first, it is repeated.
+    /// Number k ≥ 1 of observations that are seen at a time. An episode's first observation stands
+    /// for those before it.
     pub history: usize,
-    /// h ≥ 1.
+    /// Number h ≥ 1 of steps.
     pub length: usize,
     /// Discount γ of a step.
     pub gamma: f32,

@@ -10,7 +10,7 @@ const ONLINE: u64 = u64::from_be_bytes(*b"online  ");
 /// Shuffled epochs, in an order that depends on seed and epoch only. Batches may span two epochs.
 pub struct BatchSampler {
     seed: u64,
-    pass: u64,
+    epoch: u64,
     /// Permutation, of which the first `position` indices are drawn.
     order: Vec<u32>,
     position: usize,
@@ -28,13 +28,13 @@ impl BatchSampler {
         let drawn = u128::from(batches) * batch_size as u128;
         let mut sampler = Self {
             seed,
-            pass: (drawn / len as u128) as u64,
+            epoch: (drawn / len as u128) as u64,
             order: (0..len as u32).collect(),
             position: 0,
             indices: vec![0; batch_size],
             generator: ChaCha8Rng::seed_from_u64(seed ^ PURPOSE),
         };
-        sampler.start_pass();
+        sampler.start_epoch();
         for _ in 0..drawn % len as u128 {
             sampler.draw();
         }
@@ -49,9 +49,9 @@ impl BatchSampler {
         &self.indices
     }
 
-    fn start_pass(&mut self) {
+    fn start_epoch(&mut self) {
         self.generator = ChaCha8Rng::seed_from_u64(self.seed ^ PURPOSE);
-        self.generator.set_stream(self.pass);
+        self.generator.set_stream(self.epoch);
         self.order.iter_mut().zip(0..).for_each(|(place, i)| *place = i);
         self.position = 0;
     }
@@ -59,8 +59,8 @@ impl BatchSampler {
     /// One step of a Fisher–Yates shuffle, which spreads its cost over the epoch.
     fn draw(&mut self) -> u32 {
         if self.position == self.order.len() {
-            self.pass += 1;
-            self.start_pass();
+            self.epoch += 1;
+            self.start_epoch();
         }
         let chosen = self.generator.random_range(self.position..self.order.len());
         self.order.swap(self.position, chosen);
@@ -110,29 +110,29 @@ impl OnlineSampler {
 mod tests {
     use super::*;
 
-    fn passes(len: usize, seed: u64, draws: usize) -> Vec<u32> {
+    fn drawn(len: usize, seed: u64, draws: usize) -> Vec<u32> {
         let mut sampler = BatchSampler::new(len, 1, seed, 0);
         (0..draws).map(|_| sampler.draw()).collect()
     }
 
     #[test]
-    fn every_pass_draws_everything_once_in_another_order() {
-        let draws = passes(100, 3, 300);
+    fn every_epoch_draws_everything_once_in_another_order() {
+        let draws = drawn(100, 3, 300);
         let mut seen = Vec::new();
-        for pass in draws.chunks(100) {
-            let mut sorted = pass.to_vec();
+        for epoch in draws.chunks(100) {
+            let mut sorted = epoch.to_vec();
             sorted.sort_unstable();
             assert_eq!(sorted, (0..100).collect::<Vec<_>>());
-            assert_ne!(sorted, pass);
-            assert!(!seen.contains(&pass));
-            seen.push(pass);
+            assert_ne!(sorted, epoch);
+            assert!(!seen.contains(&epoch));
+            seen.push(epoch);
         }
     }
 
     #[test]
     fn a_sampler_goes_on_where_another_one_was() {
-        let all = passes(50, 7, 240);
-        assert_ne!(all, passes(50, 8, 240));
+        let all = drawn(50, 7, 240);
+        assert_ne!(all, drawn(50, 8, 240));
         for batches in [0, 1, 7, 10, 16, 20, 33] {
             let mut sampler = BatchSampler::new(50, 5, 7, batches);
             let rest: Vec<u32> = (0..25).map(|_| sampler.draw()).collect();
@@ -143,7 +143,7 @@ mod tests {
     #[test]
     fn all_first_draws_are_equally_likely() {
         let mut counts = [0; 10];
-        (0..10_000).for_each(|seed| counts[passes(10, seed, 1)[0] as usize] += 1);
+        (0..10_000).for_each(|seed| counts[drawn(10, seed, 1)[0] as usize] += 1);
         // Binomial(10000, 0.1): standard deviation 30.
         assert!(counts.iter().all(|count| (850..1150).contains(count)), "{counts:?}");
     }

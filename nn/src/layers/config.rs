@@ -23,7 +23,7 @@ pub struct MlpConfig {
     /// Layer norm (Ba et al. 2016), before each activation.
     #[serde(default)]
     pub norm: bool,
-    /// Moves the norm behind each activation.
+    /// Puts the norm after each activation instead.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub norm_after: bool,
     /// Number that the norm adds to the variance.

@@ -3,8 +3,9 @@
 use super::*;
 use crate::file::{Header, PolicyConfig};
 use crate::kinds::actor_critic::ActorCriticShape;
+use crate::kinds::diffusion::DiffusionShape;
 use crate::scaled::scaled;
-use crate::testing::{act, initial, layers, load, sample};
+use crate::testing::{act, initial, layers, load, sample, small};
 use quad_kernels::scaling::{Affine, Scaling};
 use quad_nn::{Activation, Layout, Weights};
 use rand::SeedableRng;
@@ -106,8 +107,24 @@ fn samples_are_the_first_actions_of_chunks() {
     assert!(actions.chunks(A).any(|action| action == act(&*policy, &[0.3], &[9]).unwrap()));
     let of_one = policy.with_choice(Choice::best_of(1)).unwrap();
     assert_eq!(of_one.noise(), [1, 1, 3 * A]);
-    let error = policy.value(&[0.3], &[0.0; A]).unwrap_err();
-    assert!(error.to_string().contains("chunks of 3"), "{error}");
+}
+
+#[test]
+fn a_single_action_has_no_value() {
+    let error = |policy: PolicyConfig, history, length| {
+        let chunk = Chunk { history, length, replan: 1 };
+        let policy = chunked(load(&initial(policy)).unwrap(), chunk).unwrap();
+        let (observation, action) = (policy.observation_dim(), policy.action_dim());
+        policy.value(&vec![0.3; observation], &vec![0.0; action]).unwrap_err().to_string()
+    };
+    for (history, length) in [(1, 3), (2, 1)] {
+        let error = error(config(2, 4), history, length);
+        let words = format!("a history of {history} and a chunk of {length}");
+        assert!(error.contains(&words), "{error}");
+    }
+    let (shape, choice) = (DiffusionShape { critics: 0, ..small() }, Choice::best_of(1));
+    let error = error(PolicyConfig::Diffusion { shape, choice }, 1, 2);
+    assert!(error.contains("no critics"), "{error}");
 }
 
 #[test]

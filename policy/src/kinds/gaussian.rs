@@ -19,7 +19,7 @@ const LOG_STD: &str = "log_std";
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Spread {
-    /// There is none.
+    /// No distribution: the policy always takes its mode.
     #[default]
     None,
     /// Normal with the mode as its mean and the same σ in all states, clipped to ±1.

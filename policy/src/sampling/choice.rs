@@ -54,8 +54,8 @@ pub enum Rule {
     /// The candidate whose value Q is nearest to V(s): the largest −(Q − V)² (AlignIQL).
     Nearest,
     /// The mean of several candidates drawn as in [`Self::Softmax`], without replacement (SfBC).
-    /// Values are clipped to forty temperatures above the smallest of as many largest ones, which
-    /// keeps the first draws random.
+    /// Values are clipped at forty temperatures above the smallest of the `actions` largest ones,
+    /// which keeps the first draws random.
     Average {
         /// Temperature in units of the value, above 0.
         temperature: f32,

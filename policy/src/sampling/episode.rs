@@ -54,12 +54,12 @@ impl EpisodeState {
 mod tests {
     use super::*;
 
-    /// The evaluator draws the initial state from stream 1 and the goal from stream 4.
+    /// The evaluator draws the initial state from stream 1, and a maze's goal and start from 4 and 5.
     #[test]
     fn the_noise_differs_from_streams_of_the_environment() {
         let mut noise = [0.0; 4];
         EpisodeState::new(7).fill_normal(&mut noise);
-        for stream in [0, 1, 4] {
+        for stream in [0, 1, 4, 5] {
             let mut generator = ChaCha8Rng::seed_from_u64(7);
             generator.set_stream(stream);
             let start: [f32; 4] = std::array::from_fn(|_| StandardNormal.sample(&mut generator));

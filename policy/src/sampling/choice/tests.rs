@@ -140,6 +140,8 @@ fn a_choice_out_of_range_is_refused() {
         let checked = choice.check();
         assert!(matches!(checked, Err(PolicyError::Range { .. })), "{choice:?}");
     }
+    let error = average(2, 1.0, 0).check().unwrap_err().to_string();
+    assert_eq!(error, "actions is 0, which is out of range");
     for temperature in [0.0, -1.0, f32::NAN, f32::INFINITY] {
         for choice in [softmax(2, temperature), average(2, temperature, 1)] {
             let checked = choice.check();
