@@ -21,7 +21,7 @@ from matplotlib import pyplot
 from study import Study, interval
 
 HOME = Path(__file__).parent.parent
-CHOICE = "best of 10"
+CHOICES = {"best of 10": "best of ten", "best of 1": "one sample"}
 PAIRS = [("quad", "shuffled"), ("quad", "mean"), ("quad", "dac"), ("dac", "none"), ("denoised", "dac")]
 WEIGHTS = {
     "λ = 1": "λ = 1 (DAC)",
@@ -49,21 +49,21 @@ def save(figure, file):
 def draw_pairs():
     """A dot for each pair of equal task and seed; a line for the mean's interval."""
     study = Study(SimpleNamespace(study=HOME / "studies/lambda.toml"))
-    figure, axes = pyplot.subplots(figsize=(7, 2.8), layout="constrained")
-    for row, (ours, theirs) in enumerate(PAIRS):
-        ours, theirs = (study.of_method(method, CHOICE) for method in (ours, theirs))
-        differences = {key: ours[key] - theirs[key] for key in ours if key in theirs}
-        for color, task in enumerate(("hopper", "walker2d")):
-            dots = [difference for (of, _), difference in differences.items() if of.startswith(task)]
-            label = TASKS[task] if row == 0 else None
-            axes.plot(dots, [row - 0.1 + 0.2 * color] * len(dots), "o", color=f"C{color}", alpha=0.7, label=label)
-        if len(differences) > 1:
+    figure, panels = pyplot.subplots(1, len(CHOICES), figsize=(9, 2.8), layout="constrained", sharey=True)
+    for axes, (choice, text) in zip(panels, CHOICES.items()):
+        for row, methods in enumerate(PAIRS):
+            ours, theirs = (study.of_method(method, choice) for method in methods)
+            differences = {key: ours[key] - theirs[key] for key in ours if key in theirs}
+            for color, task in enumerate(("hopper", "walker2d")):
+                dots = [difference for (of, _), difference in differences.items() if of.startswith(task)]
+                label = TASKS[task] if row == 0 else None
+                axes.plot(dots, [row - 0.1 + 0.2 * color] * len(dots), "o", color=f"C{color}", alpha=0.7, label=label)
             axes.plot(interval(list(differences.values())), [row, row], color="black")
             axes.plot(fmean(differences.values()), row, "|", color="black", markersize=12)
-    axes.axvline(0, color="gray", linewidth=0.8)
+        axes.axvline(0, color="gray", linewidth=0.8)
+        axes.set_xlabel(f"difference of normalized scores, {text}")
     axes.set_yticks(range(len(PAIRS)), [f"{ours} − {theirs}" for ours, theirs in PAIRS])
     axes.invert_yaxis()
-    axes.set_xlabel("difference of normalized scores, best of ten")
     axes.legend()
     save(figure, "lambda-pairs.svg")
 
