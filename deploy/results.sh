@@ -68,7 +68,8 @@ run() {
   task=$(task "$file")
   run=runs/results/$(basename "$file" .hdf5)/$method/$seed
   [ ! -e "$run/score.json" ] || return 0
-  if [ ! -e "$run/report.json" ]; then
+  # An interrupted run has a report, too.
+  if [ ! -e "$run/complete" ]; then
     rm -rf "$run"
     mkdir -p "$run"
     # shellcheck disable=SC2046 # Several words.
@@ -79,6 +80,7 @@ run() {
     wait "$learner" || { tail -n 5 "$run/learner.log" >&2; kill $evaluator; return 1; }
     kill $evaluator
     wait $evaluator || true
+    touch "$run/complete"
   fi
   # Their names are in the order of their steps.
   mapfile -t snapshots < <(printf '%s\n' "$run"/snapshots/*.safetensors | tail -n "$EVALUATIONS")
