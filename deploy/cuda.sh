@@ -40,7 +40,7 @@ fetch_toolkit() {
 # CUDA_ERROR_STUB_LIBRARY. The learner loads the real library when it starts.
 link_driver() {
   local driver stand_in=$TOOLKIT/lib/stubs/libcuda.so
-  driver=$(PATH=$PATH:/sbin ldconfig -p | awk '$1 == "libcuda.so.1" { print $NF; exit }')
+  driver=$(PATH=$PATH:/sbin ldconfig -p | awk '$1 == "libcuda.so.1" && !found++ { print $NF }')
   if [ -n "$driver" ]; then
     ln -sf "$driver" "$TOOLKIT/lib/libcuda.so"
   elif [ ! -e "$stand_in" ]; then

@@ -25,7 +25,10 @@ HOME = Path("runs/judged")
 def call(*command, log):
     with log.open("w") as errors:
         one = os.environ | {"RAYON_NUM_THREADS": "1"}
-        return subprocess.run(command, check=True, stdout=subprocess.PIPE, stderr=errors, text=True, env=one).stdout
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=one)
+    if done.returncode:
+        raise SystemExit(f"{command[0].name} ended with exit code {done.returncode}: {log} has its reason")
+    return done.stdout
 
 
 def train(programs, file, seed, method):
@@ -64,6 +67,9 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--programs", type=Path, default=Path("target/release"))
     given = parser.parse_args()
+    for file in given.files:
+        if not file.name.startswith((*TASKS,)):
+            parser.error(f"the name of {file} does not begin with an environment")
     jobs = [(given.programs, file, seed, method) for seed in given.seeds for file in given.files for method in METHODS]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(lambda job: train(*job), jobs))

@@ -12,6 +12,7 @@
 # A file's name begins with its environment: hopper, halfcheetah, walker2d, antmaze_umaze or antmaze_medium. Runs go to
 # runs/results. Finished runs are skipped, so the script can be interrupted. One run per core at a time, each on one thread.
 set -euo pipefail
+FROM=$PWD
 cd "$(dirname "$0")/.."
 . deploy/common.sh
 
@@ -37,6 +38,7 @@ while [ $# -gt 1 ]; do
   shift 2
 done
 if [ $# -eq 0 ] || [ -z "$seeds" ]; then usage >&2; exit 2; fi
+RECORDED=data/hopper-demo.hdf5
 
 # task FILE: the demonstration in the environment that the file's name begins with.
 task() {
@@ -66,7 +68,8 @@ run() {
   task=$(task "$file")
   run=runs/results/$(basename "$file" .hdf5)/$method/$seed
   [ ! -e "$run/score.json" ] || return 0
-  if [ ! -e "$run/report.json" ]; then
+  # An interrupted run has a report, too.
+  if [ ! -e "$run/complete" ]; then
     rm -rf "$run"
     mkdir -p "$run"
     # shellcheck disable=SC2046 # Several words.
@@ -77,6 +80,7 @@ run() {
     wait "$learner" || { tail -n 5 "$run/learner.log" >&2; kill $evaluator; return 1; }
     kill $evaluator
     wait $evaluator || true
+    touch "$run/complete"
   fi
   # Their names are in the order of their steps.
   mapfile -t snapshots < <(printf '%s\n' "$run"/snapshots/*.safetensors | tail -n "$EVALUATIONS")
@@ -91,14 +95,20 @@ export NAME BIN AGENT EVALUATIONS EPISODES CANDIDATES RAYON_NUM_THREADS=1
 
 for file; do
   task "$file" >/dev/null
+  shift
+  # Relative to the caller's folder.
+  if [ "$file" != $RECORDED ]; then
+    file=$(cd "$FROM" && realpath --canonicalize-missing --no-symlinks -- "$file")
+    [ -e "$file" ] || die "there is no $file"
+  fi
+  set -- "$@" "$file"
 done
 deploy/setup.sh
 cargo build --release --locked --package quad-learner --package quad-evaluator
 for file; do
-  if [ ! -e "$file" ] && [ "$file" = data/hopper-demo.hdf5 ]; then
+  if [ ! -e "$file" ]; then
     RAYON_NUM_THREADS=$(nproc) $BIN/evaluator collect --env hopper --out "$file"
   fi
-  [ -e "$file" ] || die "there is no $file"
 done
 
 for seed in $seeds; do

@@ -22,8 +22,8 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
     Each dictionary has, from `learner report --json`, the evaluation's `step`, `environment_steps` (of practice, else None),
     `episodes`, `complete`, `score` (mean over the episodes), `score_std`, `return` and `length`; the run's `run`, `dir`,
     `task`, `algorithm`, `variant`, `agent`, `seed`, `steps`, `normalized`, `scored_in`, `dataset_score`, `mean_last_3`,
-    `mean_last_5` and `mean_last_50000_steps`, the same in all its rows; and each setting of its `config.toml`, like `experiment.batch_size`. A run without an evaluation has one
-    row, in which the evaluation's values are None.
+    `mean_last_5` and `mean_last_50000_steps`, the same in all its rows; and each setting of its `config.toml`, like
+    `experiment.batch_size`. A run without an evaluation has one row, in which the evaluation's values are None.
 
     A learner may be writing the folders. A run that cannot be read is left out, with a warning that names it.
     """
@@ -45,8 +45,8 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
     folder: a run folder.
 
     Each dictionary has `step`. For a step in the run's metrics.jsonl, it has `seconds` (of training) and each metric as
-    `train/NAME`. For a step whose evaluation is complete, it has `evaluation/score`, `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`.
-    Steps ascend.
+    `train/NAME`. For a step whose evaluation is complete, it has `evaluation/score`, `evaluation/score_std` (if there are several
+    episodes), `evaluation/return` and `evaluation/length`. Steps ascend.
 
     A learner may be writing the folder. Raises FileNotFoundError if it holds no metrics.jsonl, RuntimeError if a file
     is invalid.
