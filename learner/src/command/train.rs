@@ -348,8 +348,8 @@ fn machine(precision: Precision) -> String {
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let name = name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
-    let (threads, arithmetic) = (rayon::current_num_threads(), precision.arithmetic());
-    format!("{name}, {threads} threads, {arithmetic}")
+    let threads = counted(rayon::current_num_threads(), "thread");
+    format!("{name}, {threads}, {}", precision.arithmetic())
 }
 
 fn run_config(

@@ -46,7 +46,7 @@ impl Online {
         step >= begin && (step - begin).is_multiple_of(self.snapshot_interval)
     }
 
-    /// The newest such step up to `step`, which is `begin` at least.
+    /// The newest gradient step up to `step`, at least `begin`, whose policy plays practice.
     pub fn newest_snapshot(&self, begin: u64, step: u64) -> u64 {
         step - (step - begin) % self.snapshot_interval
     }
