@@ -45,8 +45,8 @@ pub struct SweepArgs {
     /// Print number, name and state of each run, and start none
     #[arg(long)]
     pub list: bool,
-    /// Train only runs with this value of an axis: 'task=hopper-*', seed=0; repeatable: one of an
-    /// axis's values, and for all axes
+    /// Train only runs with this value of an axis: 'task=hopper-*', seed=0; repeatable: a run needs
+    /// one of the values given for each axis
     #[arg(long, value_name = "AXIS=VALUE", value_parser = parse_assignment)]
     pub only: Vec<Table>,
     /// Change a key in all runs: steps=200; repeatable. Runs of other settings need another DIR

@@ -12,7 +12,7 @@ use quad_runtime::{
 use tracing::{info, warn};
 
 use crate::cli::TrainArgs;
-use crate::live::{Opening, open_network};
+use crate::live::{OpeningSession, open_network};
 use crate::local_evaluators::LocalEvaluators;
 
 /// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with
@@ -54,7 +54,7 @@ impl Outside {
 
     /// Starts to open the session. If another learner on this machine has the usual port, it takes
     /// a free one.
-    pub async fn open(&mut self) -> anyhow::Result<Opening> {
+    pub async fn open(&mut self) -> anyhow::Result<OpeningSession> {
         let mut opening = open_network(&self.endpoints).await;
         if opening.is_err() && self.is_default {
             info!("another program, perhaps a learner, has port {DEFAULT_PORT}; taking a free one");

@@ -17,7 +17,7 @@ use super::display::{Display, REDRAW, evaluators};
 use super::duplicate::Incarnation;
 use super::events::Event;
 use super::metrics::Metrics;
-use super::network::{Online, Opening, Wire, go_online};
+use super::network::{Online, OpeningSession, Wire, go_online};
 use super::patience::{Patience, Verdict, advice};
 use super::threads::{STUCK, Threads};
 use crate::local_evaluators::LocalEvaluators;
@@ -78,7 +78,7 @@ struct State {
 impl MainLoop {
     /// Runs until the end, then ends the threads and the session. Call it on the main thread: the
     /// evaluators end with it.
-    pub async fn run(mut self, opening: Opening) -> Ending {
+    pub async fn run(mut self, opening: OpeningSession) -> Ending {
         let mut online = tokio::spawn(go_online(
             opening,
             self.endpoints.clone(),

@@ -30,12 +30,12 @@ pub struct Online {
 }
 
 impl Online {
-    /// Gradient steps that go with the first `rows` environment steps.
+    /// Gradient steps that may be taken with the first `rows` environment steps.
     pub fn updates_after(&self, rows: u64) -> u64 {
         rows.min(self.steps).saturating_sub(self.warmup) * u64::from(self.updates_per_step)
     }
 
-    /// Environment steps that the first `updates` gradient steps go with.
+    /// Environment steps that the first `updates` gradient steps wait for.
     pub fn rows_at(&self, updates: u64) -> u64 {
         self.warmup + updates.div_ceil(u64::from(self.updates_per_step))
     }

@@ -9,9 +9,10 @@ use quad_runtime::Hint;
 /// Compare a run's critics with true values, which the simulator gives
 ///
 /// States are drawn from new episodes of the run's policy, one from each. An action's true value is
-/// the mean of rollouts in the critics' units: from the state the action comes first, then one sample
-/// of the policy in each state, as the critics' targets have it but for ρ and `target_reduce = "max"`.
-/// Rollouts of other actions have the same noise. docs/operations.md explains the tables.
+/// the mean discounted return, in the critics' units, of rollouts that begin with the action and
+/// then take one sample of the policy in each state. The critics' targets value the same policy, up
+/// to ρ and `target_reduce = "max"`. Rollouts of a state's actions share their noise.
+/// docs/operations.md explains the tables.
 #[derive(Args, Debug)]
 pub struct ProbeArgs {
     /// Folder of a run of QUAD or one of its variants
