@@ -1,7 +1,11 @@
 //! The CPU's vector instructions in use: the widest, or fewer, to test and measure what other CPUs
 //! run.
 
+use std::env;
+use std::io::{self, Write};
 use std::sync::LazyLock;
+
+const VARIABLE: &str = "QUAD_INSTRUCTIONS";
 
 /// Instruction sets; each includes those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -19,7 +23,7 @@ impl Level {
     pub fn name(self) -> &'static str {
         match self {
             Self::Plain if cfg!(target_arch = "x86_64") => "x86",
-            Self::Plain => std::env::consts::ARCH,
+            Self::Plain => env::consts::ARCH,
             Self::Avx2 => "avx2",
             Self::Avx512 => "avx512",
         }
@@ -47,12 +51,21 @@ impl Level {
         Self::Plain
     }
 
-    /// The level of this process: the widest, or at most AVX2 with `QUAD_INSTRUCTIONS=avx2`.
+    /// The level of this process: the widest, or at most AVX2 with `QUAD_INSTRUCTIONS=avx2`. Writes
+    /// to stderr that it ignores any other value.
     pub fn in_use() -> Self {
         static IN_USE: LazyLock<Level> = LazyLock::new(|| {
-            let only_avx2 =
-                std::env::var("QUAD_INSTRUCTIONS").is_ok_and(|asked| asked == Level::Avx2.name());
-            Level::available().min(if only_avx2 { Level::Avx2 } else { Level::Avx512 })
+            let (available, only) = (Level::available(), Level::Avx2);
+            match env::var_os(VARIABLE) {
+                Some(asked) if asked == only.name() => available.min(only),
+                Some(asked) if !asked.is_empty() => {
+                    let known = only.name();
+                    let text = format!("{VARIABLE} is {asked:?}, not {known}, and is ignored");
+                    writeln!(io::stderr(), "{text}").ok();
+                    available
+                }
+                _ => available,
+            }
         });
         *IN_USE
     }

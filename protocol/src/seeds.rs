@@ -21,8 +21,8 @@ pub fn episode_seeds(run_seed: u64, step: u64, episodes: u32) -> Vec<u64> {
     iter::repeat_with(|| generator.next_u64() >> 11).filter(new).take(episodes as usize).collect()
 }
 
-/// The seed of a run's practice episode, counted from 0. No other use of a run's seed has it, but
-/// by a chance of 2⁻⁵³.
+/// The seed of a run's practice episode, counted from 0. It equals another given seed of the run with
+/// a probability of 2⁻⁵³.
 pub fn practice_seed(run_seed: u64, episode: u64) -> u64 {
     let mut generator = ChaCha8Rng::seed_from_u64(run_seed ^ PRACTICE);
     generator.set_stream(episode);

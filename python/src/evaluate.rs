@@ -10,7 +10,7 @@ use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use quad_evaluator::serve::{ServeArgs, serve};
 use quad_evaluator::sim::{Environment, EnvironmentError, Environments, Simulations, Step};
-use quad_runtime::init_logging;
+use quad_runtime::{hints, init_logging};
 
 /// Environments that Python's factory makes.
 struct PythonEnvironments {
@@ -137,7 +137,10 @@ pub fn serve_environment(
         let _logging = init_logging();
         serve(args, environments)
     });
-    served.map_err(|error| PyRuntimeError::new_err(format!("{error:#}")))
+    served.map_err(|error| {
+        let hints = String::from_iter(hints(&error).map(|hint| format!("\nhint: {hint}")));
+        PyRuntimeError::new_err(format!("{error:#}{hints}"))
+    })
 }
 
 /// Names of the environments of `evaluator serve`.

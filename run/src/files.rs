@@ -83,7 +83,8 @@ pub fn rest(file: &mut File, from: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Makes or replaces the file `target`, durably. After an error, the old file is still there.
+/// Makes or replaces the file `target`, durably. After an error, the old file is still there, unless
+/// only the folder could not be synchronized.
 pub fn replace(target: &Path, bytes: &[u8]) -> io::Result<()> {
     let partial = target.with_added_extension(format!("{:08x}.{PARTIAL}", rand::random::<u32>()));
     let mut file = File::create_new(&partial)?;

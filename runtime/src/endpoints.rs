@@ -56,6 +56,9 @@ impl SessionError {
             SessionError::NoCertificates(_) => {
                 "name their folder by --certificates DIR or QUAD_CERTIFICATES; deploy/zenoh/certificates.sh makes one"
             }
+            SessionError::NotAnEndpoint(_) => {
+                "an endpoint is a protocol, tcp or with certificates tls, a host and a port"
+            }
             SessionError::Endpoint { reason, .. } if !reason.contains("in use") => {
                 "--listen takes an address of this machine, or 0.0.0.0 for all of its addresses; --connect the router's"
             }

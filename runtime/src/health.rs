@@ -66,7 +66,7 @@ impl Heartbeat {
         self.component.limit / 4
     }
 
-    /// Reports a problem of a component that is alive, like a full disk, or its end.
+    /// Reports a problem of a component that is alive, like a full disk; `None` once it is over.
     pub fn set_problem(&self, problem: Option<String>) {
         lock(&self.component.state).problem = problem;
     }

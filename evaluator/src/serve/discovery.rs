@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use quad_protocol::{Name, keys};
-use quad_runtime::{Certificates, Endpoints, open_session};
+use quad_runtime::{Certificates, Endpoints, Hint, SessionError, open_session};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::{info, warn};
@@ -88,7 +88,7 @@ async fn watch_endpoint(
     info!(endpoint, "waiting for a learner or a router");
     let connect = vec![endpoint.clone()];
     let endpoints = Endpoints { connect, certificates, ..Endpoints::default() };
-    let session = open_session(&endpoints).await?;
+    let session = open_session(&endpoints).await.hint_of(SessionError::hint)?;
     info!(endpoint, "connected");
     let (found, declarer) = (session.clone(), session.clone());
     let callback = move |token: Sample| {

@@ -11,8 +11,8 @@
 //! - Action (8): torques of hip and ankle of legs 4, 1, 2 and 3, as fractions of 30 Nm, clipped to
 //!   ±1; held for 0.1 s.
 //!
-//! OGBench's point is a ball that observes x and y. An action (2) puts it at once as much further,
-//! as fractions of 0.2 m on each axis, without any velocity; then walls push it back for 0.1 s.
+//! OGBench's point is a ball that observes x and y. An action (2) displaces it at once, by
+//! fractions of 0.2 m on each axis, without any velocity; then walls push it back for 0.1 s.
 //!
 //! The reward of a step that reaches the goal is 1, of every other 0. Only the goal and the time
 //! limit end an episode: an ant on its back continues. A goal that is drawn lies, on each axis, at

@@ -45,8 +45,8 @@ pub struct SweepArgs {
     /// Print number, name and state of each run, and start none
     #[arg(long)]
     pub list: bool,
-    /// Train only runs with this value of an axis: 'task=hopper-*', seed=0; repeatable: one of an
-    /// axis's values, and for all axes
+    /// Train only runs with this value of an axis: 'task=hopper-*', seed=0; repeatable: a run needs
+    /// one of the values given for each axis
     #[arg(long, value_name = "AXIS=VALUE", value_parser = parse_assignment)]
     pub only: Vec<Table>,
     /// Change a key in all runs: steps=200; repeatable. Runs of other settings need another DIR
@@ -66,7 +66,7 @@ pub struct SweepArgs {
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]
     pub jobs: Option<u16>,
     /// Number of evaluators to start; they serve all runs and log to DIR/STUDY [default: one for
-    /// each core that does not train, at least one]
+    /// each core that does not train, at least one; none if no run has evaluations or practice]
     #[arg(long, value_name = "N", conflicts_with = "connect")]
     pub evaluators: Option<usize>,
     /// Use the evaluators at this Zenoh router instead, e.g. tcp/router:7447

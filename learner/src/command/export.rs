@@ -17,7 +17,7 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let (mut report, lines) = RunReport::with_scores(&args.run)?;
     let folder = RunDir::at(&args.run);
     let steps = folder.snapshots()?;
-    let best = report.best().map(|best| best.step);
+    let best = report.best_of(|step| steps.contains(&step)).map(|best| best.step);
     let (step, what) = match args.step {
         At::Step(step) => (Some(step), "after that step"),
         At::Last => (steps.last().copied(), "yet"),

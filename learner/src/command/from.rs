@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, anyhow};
+use anyhow::anyhow;
 use quad_protocol::Hash;
 use quad_run::config::{ConfigError, Experiment, Preset};
 use quad_run::folder::{Checkpoint, RunDir};
@@ -10,7 +10,7 @@ use quad_runtime::{Hint, hinted};
 use toml::Table;
 
 /// The end of a complete run.
-pub(super) struct From {
+pub(super) struct EarlierRun {
     pub checkpoint: Checkpoint,
     /// Hash of the checkpoint.
     pub hash: String,
@@ -18,11 +18,11 @@ pub(super) struct From {
     dataset_sha256: Option<String>,
 }
 
-impl From {
+impl EarlierRun {
     /// Reads the run, and makes a preset of its settings.
     ///
     /// # Errors
-    /// The run is not complete, or its algorithm cannot practice.
+    /// The run is not complete, its checkpoints were deleted, or its algorithm cannot practice.
     pub fn read(run: &Path) -> anyhow::Result<(Self, Preset)> {
         let (dir, config) = RunDir::open(run)?;
         if config.experiment.online.is_some() {
@@ -30,12 +30,18 @@ impl From {
             return Err(hinted(error, "--from takes a run of the dataset alone"));
         }
         let steps = config.experiment.steps;
-        let checkpoint = dir.newest_checkpoint()?.filter(|checkpoint| checkpoint.step == steps);
-        let checkpoint = checkpoint
-            .with_context(|| {
-                format!("the run in {} has not reached its last step, {steps}", run.display())
-            })
-            .hint("let it end first: `learner train` with its settings continues it")?;
+        let Some(checkpoint) = dir.newest_checkpoint()? else {
+            let error = anyhow!("the run in {} has no checkpoint", run.display());
+            let hint = "--from begins with a run's last one: put checkpoints/ back if it was \
+                        deleted, or let the run end";
+            return Err(hinted(error, hint));
+        };
+        if checkpoint.step != steps {
+            let error =
+                anyhow!("the run in {} has not reached its last step, {steps}", run.display());
+            let hint = "let it end first: `learner train` with its settings continues it";
+            return Err(hinted(error, hint));
+        }
         let mut own = Table::try_from(&config.experiment)?;
         let hash = Hash::of(&checkpoint.state).to_string();
         own.insert("from".to_owned(), hash.clone().into());

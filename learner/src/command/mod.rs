@@ -206,7 +206,7 @@ fn check_run(dir: &Path, about: &str, same_as: Option<&Path>) -> anyhow::Result<
     }
     if let Some(other) = same_as {
         for findings in verify::compare(dir, other)? {
-            report(&format!("with {}: ", other.display()), findings)?;
+            report(&format!("{about}with {}: ", other.display()), findings)?;
         }
     }
     Ok(all_held)

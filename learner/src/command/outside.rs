@@ -12,7 +12,7 @@ use quad_runtime::{
 use tracing::{info, warn};
 
 use crate::cli::TrainArgs;
-use crate::live::{Opening, open_network};
+use crate::live::{OpeningSession, open_network};
 use crate::local_evaluators::LocalEvaluators;
 
 /// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with
@@ -52,12 +52,14 @@ impl Outside {
         Ok(Self { endpoints, evaluators, is_default })
     }
 
-    /// Starts to open the session. If another learner on this machine has the usual port, it takes
-    /// a free one.
-    pub async fn open(&mut self) -> anyhow::Result<Opening> {
+    /// Starts to open the session. If the usual port cannot be used, as where another learner has
+    /// it, it takes a free one.
+    pub async fn open(&mut self) -> anyhow::Result<OpeningSession> {
         let mut opening = open_network(&self.endpoints).await;
         if opening.is_err() && self.is_default {
-            info!("another program, perhaps a learner, has port {DEFAULT_PORT}; taking a free one");
+            info!(
+                "cannot listen at port {DEFAULT_PORT}, perhaps as a learner does; taking a free one"
+            );
             let certificates = self.endpoints.certificates.as_ref();
             self.endpoints.listen = vec![default_endpoint(certificates, ANY_PORT)];
             opening = open_network(&self.endpoints).await;

@@ -139,8 +139,14 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     let threads = threads_asked().map_or(1, usize::from);
     let cores = available_parallelism()?.get();
     let (jobs, cores) = shares(cores, threads, args.jobs, left.len());
-    let count = args.evaluators.unwrap_or(cores);
-    let count = if args.connect.is_some() { 0 } else { count };
+    let count = match (&args.connect, args.evaluators) {
+        (Some(_), _) => 0,
+        (None, Some(count)) => count,
+        (None, None) => {
+            let is_played = left.iter().any(|(run, _)| run.experiment.needs_evaluators());
+            if is_played { cores } else { 0 }
+        }
+    };
     let mut evaluators = LocalEvaluators::new(count, cores)?;
     let datasets = obtain(&left, args.index.is_some())?;
     let mut step_seconds = BTreeMap::new();

@@ -25,7 +25,7 @@ use toml::Table;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
-use super::from::From;
+use super::from::EarlierRun;
 use super::outside::{Outside, training_threads};
 use crate::cli::TrainArgs;
 use crate::data::{LocalDataset, Source, load, warnings};
@@ -41,7 +41,7 @@ const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let (from, preset) = match &args.from {
-        Some(run) => From::read(run).map(|(from, preset)| (Some(from), preset))?,
+        Some(run) => EarlierRun::read(run).map(|(from, preset)| (Some(from), preset))?,
         None => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
     };
     let changes = args.changes();
@@ -348,8 +348,8 @@ fn machine(precision: Precision) -> String {
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let name = name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
-    let (threads, arithmetic) = (rayon::current_num_threads(), precision.arithmetic());
-    format!("{name}, {threads} threads, {arithmetic}")
+    let threads = counted(rayon::current_num_threads(), "thread");
+    format!("{name}, {threads}, {}", precision.arithmetic())
 }
 
 fn run_config(

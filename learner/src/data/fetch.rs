@@ -139,7 +139,7 @@ fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
         (None, _) => {
             "make the folder a link to one that you may write to and that has room".to_owned()
         }
-        (Some(variable), ErrorKind::StorageFull) => format!(
+        (Some(variable), ErrorKind::StorageFull | ErrorKind::QuotaExceeded) => format!(
             "make room, or name a folder on another disk in {variable}; what has arrived is kept and will be continued"
         ),
         (Some(variable), _) => format!("name a folder that you may write to in {variable}"),

@@ -12,6 +12,7 @@ use quad_protocol::{
     CodecError, Episode, EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Piece, PieceReply,
     Progress, ScoreReply, ScoreReport, episode_seeds,
 };
+use quad_run::counted;
 use quad_run::folder::SavedScores;
 use serde_json::{Value, json};
 use tracing::{debug, warn};
@@ -281,7 +282,8 @@ impl Coordinator {
         state.evaluators.tick(now);
         let expired = state.scoreboard.expire(now);
         if expired.jobs > 0 {
-            self.events.line(format!("{} jobs made no progress; they go to others", expired.jobs));
+            let jobs = counted(expired.jobs, "job");
+            self.events.line(format!("{jobs} made no progress; other evaluators get the episodes"));
         }
         self.lost(&state, &expired);
         self.metrics.evaluation.episodes_missing.set(state.scoreboard.missing().len() as i64);
@@ -311,12 +313,13 @@ impl Coordinator {
     }
 
     fn given_up(&self, state: &State, episodes: &[(u64, u64)]) {
-        const REASON: &str = "too many evaluators were lost with them or could not do them";
+        const REASON: &str = "too many evaluators were lost or failed";
         for (step, seed) in episodes {
             warn!(step, seed, "an episode is given up");
         }
         if !episodes.is_empty() {
-            self.events.line(format!("{} episodes are given up: {REASON}", episodes.len()));
+            let episodes = counted(episodes.len(), "episode");
+            self.events.line(format!("{episodes} given up: {REASON}"));
         }
         self.count(state);
     }

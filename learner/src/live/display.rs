@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanCount, HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use quad_run::counted;
 use quad_runtime::clean;
 use tracing::info;
 
@@ -125,7 +126,7 @@ impl Display {
         let mut parts = vec![evaluators(self.metrics.evaluators.present.get())];
         let pending = self.metrics.evaluation.episodes_pending.get();
         if pending > 0 {
-            parts.push(format!("{pending} episodes to score"));
+            parts.push(format!("{} to score", counted(pending as usize, "episode")));
         }
         let scores = self.scores.iter().map(|(step, mean)| format!("{mean:.1} @{step}"));
         if !self.scores.is_empty() {
@@ -135,11 +136,10 @@ impl Display {
     }
 }
 
-/// "2 evaluators".
+/// `no evaluator`, `1 evaluator`, `2 evaluators`.
 pub(super) fn evaluators(count: i64) -> String {
     match count {
         0 => "no evaluator".to_owned(),
-        1 => "1 evaluator".to_owned(),
-        _ => format!("{count} evaluators"),
+        _ => counted(count as usize, "evaluator"),
     }
 }

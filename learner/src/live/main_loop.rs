@@ -3,6 +3,7 @@
 use std::mem;
 use std::time::{Duration, Instant};
 
+use quad_run::counted;
 use quad_run::folder::RunDir;
 use quad_run::results::Spread;
 use quad_runtime::{Endpoints, Health, Heartbeat, LEAVE_WITHIN, shutdown_signal};
@@ -16,7 +17,7 @@ use super::display::{Display, REDRAW, evaluators};
 use super::duplicate::Incarnation;
 use super::events::Event;
 use super::metrics::Metrics;
-use super::network::{Online, Opening, Wire, go_online};
+use super::network::{Online, OpeningSession, Wire, go_online};
 use super::patience::{Patience, Verdict, advice};
 use super::threads::{STUCK, Threads};
 use crate::local_evaluators::LocalEvaluators;
@@ -77,7 +78,7 @@ struct State {
 impl MainLoop {
     /// Runs until the end, then ends the threads and the session. Call it on the main thread: the
     /// evaluators end with it.
-    pub async fn run(mut self, opening: Opening) -> Ending {
+    pub async fn run(mut self, opening: OpeningSession) -> Ending {
         let mut online = tokio::spawn(go_online(
             opening,
             self.endpoints.clone(),
@@ -181,9 +182,10 @@ impl MainLoop {
         let present = evaluators(self.metrics.evaluators.present.get());
         match self.threads.coordinator().pending() {
             0 => "training is done".to_owned(),
-            pending => format!(
-                "training is done; waiting for the scores of {pending} episodes ({present} here)"
-            ),
+            pending => {
+                let episodes = counted(pending, "episode");
+                format!("training is done; waiting for the scores of {episodes} ({present} here)")
+            }
         }
     }
 
@@ -257,9 +259,9 @@ fn report(event: Event, display: &mut Display) {
             let scores = Vec::from_iter(scores.iter().map(|score| score.score));
             let Some(Spread { mean, std, .. }) = Spread::of(&scores) else { return };
             display.scored(step, mean);
-            let (std, count) =
-                (std.map(|std| format!(" ± {std:.2}")).unwrap_or_default(), scores.len());
-            display.line(&format!("step {step}: score {mean:.2}{std} over {count} episodes"));
+            let std = std.map(|std| format!(" ± {std:.2}")).unwrap_or_default();
+            let episodes = counted(scores.len(), "episode");
+            display.line(&format!("step {step}: score {mean:.2}{std} over {episodes}"));
         }
         Event::TrainingEnded(_) | Event::Failed(_) => {}
     }

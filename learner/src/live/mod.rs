@@ -43,6 +43,6 @@ pub(crate) use duplicate::Incarnation;
 pub(crate) use events::Events;
 pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;
-pub(crate) use network::{Opening, open_network};
+pub(crate) use network::{OpeningSession, open_network};
 pub(crate) use page_state::PageState;
 pub(crate) use threads::{Run, STUCK, Threads};

@@ -25,11 +25,11 @@ use super::snapshots::RETRY;
 const SESSION_PATIENCE: Duration = Duration::from_secs(1);
 
 /// A Zenoh session that may still wait for a router.
-pub(crate) type Opening = JoinHandle<Result<Session, SessionError>>;
+pub(crate) type OpeningSession = JoinHandle<Result<Session, SessionError>>;
 
 /// Starts to open the session. An error at once means that it cannot work, like a port that is in
 /// use.
-pub(crate) async fn open_network(endpoints: &Endpoints) -> anyhow::Result<Opening> {
+pub(crate) async fn open_network(endpoints: &Endpoints) -> anyhow::Result<OpeningSession> {
     let endpoints = endpoints.clone();
     let mut opening = tokio::spawn(async move { open_session(&endpoints).await });
     match timeout(SESSION_PATIENCE, &mut opening).await {
@@ -49,7 +49,7 @@ pub(super) struct Online {
 /// this as a separate task: the search for another learner of the name takes seconds, and Zenoh may
 /// block a task.
 pub(super) async fn go_online(
-    opening: Opening,
+    opening: OpeningSession,
     endpoints: Endpoints,
     incarnation: Incarnation,
     services: Services,

@@ -32,7 +32,7 @@ pub struct GroupReport {
     /// Step of the last complete evaluation, if the runs are not complete.
     pub reached: Option<u64>,
     pub device: Device,
-    /// False: scores are returns.
+    /// False if scores are returns: the environment has no reference returns.
     pub normalized: bool,
     pub scored_in: String,
     /// One seed for each counted run.

@@ -7,7 +7,7 @@ use toml::{Table, Value};
 
 use super::axes::Combination;
 
-/// Merges rules by `AXIS=VALUE`: one of the values given for an axis, of all axes.
+/// Merges rules `AXIS=VALUE` into one, by which each axis has one of the values given for it.
 pub(super) fn merge(rules: &[Table]) -> Table {
     let mut merged = Table::new();
     for (key, value) in rules.iter().flat_map(tables::keys) {

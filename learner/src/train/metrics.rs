@@ -66,8 +66,8 @@ metrics! {
         rows: IntGauge("experience_rows", "Environment steps of practice that training has absorbed"),
         episodes: IntGauge("experience_episodes", "Episodes of practice that training has absorbed"),
         differences: IntCounter("practice_differences_total", "Episodes of practice that came again with other bits"),
-        episode_return: Gauge("practice_return", "Return of the newest of them"),
-        score: Gauge("practice_score", "Score of the newest of them"),
+        episode_return: Gauge("practice_return", "Return of the newest episode that training has absorbed"),
+        score: Gauge("practice_score", "Score of the newest episode that training has absorbed"),
         wait_seconds: Counter("practice_wait_seconds_total", "Time that training has waited for practice"),
     }
 }

@@ -1,4 +1,4 @@
-//! Practice in the order of its rows: which gradient steps go with them, and which snapshot plays
+//! Practice in the order of its rows: how many gradient steps they allow, and which snapshot plays
 //! the next episodes. All of it is a function of the settings and of the episodes' lengths, so that
 //! neither clocks nor the number of evaluators can change a run.
 
@@ -92,7 +92,7 @@ impl Practice {
         self.transitions.experience_len() as u64
     }
 
-    /// Gradient step up to which training goes on with the rows that it has.
+    /// The last gradient step that the rows so far allow.
     fn due(&self) -> u64 {
         self.begin + self.online.updates_after(self.rows())
     }
@@ -118,7 +118,7 @@ impl Practice {
         Ok(())
     }
 
-    /// True if gradient step `step` is the last that goes with the rows so far.
+    /// True if gradient step `step` is the last that the rows so far allow.
     pub fn is_due(&self, step: u64) -> bool {
         step == self.due()
     }

@@ -141,7 +141,7 @@ impl Training {
         Ok(Outcome::Completed)
     }
 
-    /// Absorbs practice until another gradient step goes with it. False if training is to stop.
+    /// Absorbs practice until it allows another gradient step. False if training is to stop.
     fn practice(&mut self, beat: &Heartbeat) -> Result<bool, TrainError> {
         let step = self.agent.step();
         let Some(practice) = self.practice.as_mut().filter(|practice| practice.has_begun(step))

@@ -90,6 +90,11 @@ fn a_file_has_the_score_and_judgment_of_its_own_step_and_weights() {
         assert_eq!(judgment["distance"], step as f64);
         assert!(!said.contains("WARN"), "{said}");
     }
+    // The best of the snapshots that are left.
+    let [there, away] = [run.snapshot_path(5), run.path().join("away")];
+    fs::rename(&there, &away).unwrap();
+    assert_eq!(export(&run, "best").0["step"], 10);
+    fs::rename(&away, &there).unwrap();
 
     score(&run, &[episode(5, 0), episode(10, 0), (10, 1, 20.0, "00")]);
     judge(&run, 10, 1.0, "00");

@@ -38,7 +38,7 @@ pub struct Experiment {
     /// which episodes these are.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub hold_out: f64,
-    /// Hash of the checkpoint that the run begins with, another run's after these many steps; `None`
+    /// Hash of another run's last checkpoint, from which this run continues after `steps`; `None`
     /// if it begins with step 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from: Option<String>,
@@ -57,7 +57,7 @@ pub struct Experiment {
     pub precision: Precision,
     /// Name of the learning algorithm.
     pub algorithm: String,
-    /// Practice that follows these steps; `None` without any.
+    /// Practice after `steps`; `None` without any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub online: Option<Online>,
     /// Hyper-parameters of the algorithm.
@@ -106,7 +106,7 @@ impl Experiment {
         self.steps.saturating_add(online)
     }
 
-    /// Environment steps of practice that the gradient steps up to `step` go with; `None` without
+    /// Environment steps of practice that the gradient steps up to `step` wait for; `None` without
     /// practice.
     pub fn environment_steps(&self, step: u64) -> Option<u64> {
         let online = self.online.as_ref()?;

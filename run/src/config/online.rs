@@ -30,12 +30,12 @@ pub struct Online {
 }
 
 impl Online {
-    /// Gradient steps that go with the first `rows` environment steps.
+    /// Gradient steps that may be taken with the first `rows` environment steps.
     pub fn updates_after(&self, rows: u64) -> u64 {
         rows.min(self.steps).saturating_sub(self.warmup) * u64::from(self.updates_per_step)
     }
 
-    /// Environment steps that the first `updates` gradient steps go with.
+    /// Environment steps that the first `updates` gradient steps wait for.
     pub fn rows_at(&self, updates: u64) -> u64 {
         self.warmup + updates.div_ceil(u64::from(self.updates_per_step))
     }
@@ -46,7 +46,7 @@ impl Online {
         step >= begin && (step - begin).is_multiple_of(self.snapshot_interval)
     }
 
-    /// The newest such step up to `step`, which is `begin` at least.
+    /// The newest gradient step up to `step`, at least `begin`, whose policy plays practice.
     pub fn newest_snapshot(&self, begin: u64, step: u64) -> u64 {
         step - (step - begin) % self.snapshot_interval
     }

@@ -117,6 +117,14 @@ impl Preset {
                 }
             }
         }
+        for (name, network) in experiment.agent.iter() {
+            let has_norm = network.get("norm").and_then(Value::as_bool).unwrap_or(false);
+            for unused in ["norm_after", "norm_epsilon"].map(|key| format!("agent.{name}.{key}")) {
+                if !has_norm && changed.contains(&unused) {
+                    doubts.push(format!("{unused} has no effect without agent.{name}.norm = true"));
+                }
+            }
+        }
         let of_practice = |key: &&String| key.starts_with("online.") && *key != "online.steps";
         for unused in changed.iter().filter(of_practice) {
             if experiment.online.is_none() {
@@ -195,6 +203,11 @@ mod tests {
                 "algorithm = 'ivr'\nagent = { divergence = 'sparse', alpha.exponential = 2.0 }",
                 Some("agent.alpha.exponential has no effect on a policy with divergence sparse"),
             ),
+            (
+                "agent.critic.norm_after = true",
+                Some("agent.critic.norm_after has no effect without agent.critic.norm = true"),
+            ),
+            ("agent.critic = { norm = true, norm_after = true }", None),
             (
                 "online.warmup = 100",
                 Some("online.warmup has no effect without practice (--online-steps N)"),

@@ -12,7 +12,7 @@ use crate::folder::ScoreLine;
 pub struct EvaluationReport {
     /// Gradient step of the snapshot.
     pub step: u64,
-    /// Environment steps of practice that the gradient steps up to `step` go with; absent in a run
+    /// Environment steps of practice that the gradient steps up to `step` wait for; absent in a run
     /// without any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub environment_steps: Option<u64>,

@@ -41,7 +41,7 @@ pub struct RunReport {
     /// absent if there are fewer.
     pub mean_last_3: Option<f64>,
     pub mean_last_5: Option<f64>,
-    /// Absent for runs that are not longer.
+    /// Absent for runs of 50,000 steps or fewer.
     pub mean_last_50000_steps: Option<f64>,
     /// The algorithm's summary of its metrics, such as of QUAD's λ.
     #[serde(flatten)]

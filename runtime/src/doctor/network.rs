@@ -26,7 +26,8 @@ pub fn certificates(findings: &mut Findings, folder: &Path, role: Role) -> Optio
     match &found {
         Err(error) => findings.fail("certificate", error.to_string(), error.hint()),
         Ok(soon) if soon.expire_soon() => {
-            findings.warn("certificate", soon.to_string(), "make a new one before then")
+            let hint = "make a new one before then with deploy/zenoh/certificates.sh";
+            findings.warn("certificate", soon.to_string(), hint);
         }
         Ok(good) => findings.ok("certificate", good.to_string()),
     }

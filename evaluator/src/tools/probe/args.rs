@@ -2,14 +2,17 @@
 
 use std::path::PathBuf;
 
+use anyhow::anyhow;
 use clap::{Args, ValueEnum, value_parser};
+use quad_runtime::Hint;
 
 /// Compare a run's critics with true values, which the simulator gives
 ///
 /// States are drawn from new episodes of the run's policy, one from each. An action's true value is
-/// the mean of rollouts in the critics' units: from the state the action comes first, then one sample
-/// of the policy in each state, as the critics' targets have it but for ρ and `target_reduce = "max"`.
-/// Rollouts of other actions have the same noise. docs/operations.md explains the tables.
+/// the mean discounted return, in the critics' units, of rollouts that begin with the action and
+/// then take one sample of the policy in each state. The critics' targets value the same policy, up
+/// to ρ and `target_reduce = "max"`. Rollouts of a state's actions share their noise.
+/// docs/operations.md explains the tables.
 #[derive(Args, Debug)]
 pub struct ProbeArgs {
     /// Folder of a run of QUAD or one of its variants
@@ -27,9 +30,9 @@ pub struct ProbeArgs {
     /// Most steps of a rollout. Fewer miss what an action changes later, such as a fall; more are noisier
     #[arg(long, value_name = "N", default_value = "400", value_parser = value_parser!(u32).range(1..))]
     pub length: u32,
-    /// Change of an action to either side, of which slopes are central differences
-    #[arg(long, value_name = "X", default_value = "0.1", value_parser = change)]
-    pub h: f32,
+    /// Change of an action to either side, of which slopes are central differences [default: 0.1]
+    #[arg(long, value_name = "X", value_parser = change)]
+    pub h: Option<f32>,
     /// Tables to make [default: all]
     #[arg(long, value_enum)]
     pub tables: Option<Tables>,
@@ -43,6 +46,19 @@ pub struct ProbeArgs {
     /// Print the tables as JSON
     #[arg(long)]
     pub json: bool,
+}
+
+impl ProbeArgs {
+    /// Refuses an option that only tables use which are not made.
+    pub fn check(&self) -> anyhow::Result<()> {
+        let (option, tables) = match self.tables {
+            Some(Tables::Choices) if self.h.is_some() => ("--h", "gradients"),
+            Some(Tables::Gradients) if self.dataset.is_some() => ("--dataset", "choices"),
+            _ => return Ok(()),
+        };
+        Err(anyhow!("{option} changes nothing without the tables of {tables}"))
+            .hint("leave it out, or --tables")
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

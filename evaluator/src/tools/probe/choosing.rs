@@ -84,9 +84,10 @@ impl Candidates {
         one.iter().zip(other).map(|(one, other)| (one + other) / 2.0).collect()
     }
 
-    /// Choices by one of `AGGREGATES` among `count`, in all groups of so many: the mean true value
-    /// above that of a group's mean candidate; the mean below that of its best one by one half of the
-    /// rollouts, valued by the other; and the mean distance.
+    /// Splits the candidates into groups of `count` and chooses one of each by one of `AGGREGATES`.
+    /// Means over the groups: the choice's true value above the group's mean; its true value below
+    /// that of the group's best, which one half of the rollouts finds and the other values; and its
+    /// distance.
     fn choose(&self, aggregate: usize, count: usize) -> Vec<f64> {
         let truth = self.truth();
         let in_group = |first: usize| {

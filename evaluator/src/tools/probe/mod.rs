@@ -37,8 +37,12 @@ use slopes::measure;
 use states::State;
 use subject::Probed;
 
+/// The change of an action of which slopes are taken, without `--h`.
+const CHANGE: f32 = 0.1;
+
 /// Probes the snapshot of the command line. Returns the text to print.
 pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
+    args.check()?;
     let probed = Probed::read(args)?;
     let recorded = match args.tables {
         Some(Tables::Gradients) => None,
@@ -59,8 +63,9 @@ pub(crate) fn probe(args: &ProbeArgs) -> anyhow::Result<String> {
     let Probed { oracle, actor, critics, tau, delta, .. } = &probed;
     let mut tables = Vec::new();
     if args.tables != Some(Tables::Choices) {
-        let (noisy, outside, scale) = noisy::draw((actor, critics), &observations, args.h, random)?;
-        let samples = measure(&noisy, &states, args.h, |queries| oracle.returns(queries))?;
+        let h = args.h.unwrap_or(CHANGE);
+        let (noisy, outside, scale) = noisy::draw((actor, critics), &observations, h, random)?;
+        let samples = measure(&noisy, &states, h, |queries| oracle.returns(queries))?;
         let weighting = (*tau, delta * scale * scale);
         tables.extend(mechanism(samples, states.len(), &outside, weighting));
     }
