@@ -318,7 +318,8 @@ def test_workers_end_with_their_parent(by):
         while b"ready to serve" not in process.stderr.readline():
             assert process.poll() is None
     process.send_signal(by)
-    assert process.wait(600) == (1 if by == signal.SIGKILL else 0) or process.returncode in (-by, 130, 1)
+    # A Ctrl-C may come before it waits.
+    assert process.wait(600) in ((-by,) if by == signal.SIGKILL else (0, 1, -by, 130))
     wait(lambda: all(not worker.exists() or ") Z" in worker.read_text() for worker in workers))
     os.kill(int(fork), signal.SIGKILL)
     process.stderr.close()
