@@ -1,5 +1,6 @@
 """Evaluators of environments in Python: real learners, real workers, real faults."""
 
+import atexit
 import json
 import os
 import pathlib
@@ -44,6 +45,7 @@ class Learner:
         command += ["--steps", str(steps), "--eval-interval", str(interval), "--episodes", str(episodes)]
         command += arguments
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+        atexit.register(self.process.kill)  # One that a failed test has left.
         endpoints = folder / "endpoints.json"
         wait(lambda: endpoints.exists() or self.process.poll() is not None)
         assert endpoints.exists(), self.process.stderr.read()
