@@ -105,7 +105,7 @@ install_python_packages() {
   say "installing the tests' Python packages in .deps/venv"
   try "is Debian's package python3-venv installed?" python3 -m venv "$venv"
   try "is there a network? tests/requirements.txt needs Python 3.11 or newer; this is $(python3 --version)" \
-    "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --requirement "$wanted"
+    "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --no-compile --requirement "$wanted"
   cp "$wanted" "$venv/requirements.txt"
 }
 

@@ -17,7 +17,7 @@ venv=$DEPS/python
 say "installing the wheel and python/tests/requirements.txt in .deps/python"
 try "is Debian's package python3-venv installed?" python3 -m venv --clear "$venv"
 try "is there a network? The tests need Python 3.11 or newer; this is $(python3 --version)" \
-  "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --requirement python/tests/requirements.txt dist/quad_rl-*.whl
+  "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --no-compile --requirement python/tests/requirements.txt dist/quad_rl-*.whl
 # The wheel's programs, not others that are on PATH.
 PATH="$venv/bin:$PATH" timeout --kill-after=10 1800 "$venv/bin/python" -m pytest python/tests "$@" || {
   status=$?

@@ -8,8 +8,9 @@ cd "$(dirname "$0")/.."
 deploy/setup.sh --tests
 # setup.sh unpacks Prometheus there if the machine has none.
 export PATH="$PATH:$PWD/.deps/prometheus" QUAD_REQUIRE_PEERS=1
-# Tests of the whole system start the programs.
-cargo build --release --locked --bins
+# Tests of the whole system start the programs and preload the examples. Without --examples the programs would be built without
+# the features that the tests' dependencies turn on, and half of the workspace twice.
+cargo build --release --locked --bins --examples
 cargo test --release --locked --workspace --no-run "$@"
 # Flush the build to disk first, because tests measure how long programs wait for the disk.
 sync

@@ -1,4 +1,4 @@
-"""Drives the real Gymnasium for tests/gymnasium.rs, which runs it and reads what it prints: one JSON object.
+"""Drives the real Gymnasium for sim/gymnasium.rs, which runs it and reads what it prints: one JSON object.
 
     gymnasium_reference.py model NAME MJCF   fields of the model in the file MJCF that are not those of Gymnasium's
     gymnasium_reference.py steps NAME        steps in Gymnasium from random states, one by one and in a row

@@ -25,7 +25,7 @@ QUICK = {
 def test_the_cube_from_recording_to_scores(tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disabled")
     monkeypatch.chdir(tmp_path)
-    subprocess.run([sys.executable, ROOT / "examples/cube_single.py", "ogbench", "2"], check=True, timeout=300)
+    subprocess.run([sys.executable, ROOT / "examples/cube_single.py", "ogbench", "2"], check=True, timeout=600)
     blocks = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs/python.md").read_text(), re.M | re.S)
     (block,) = [block for block in blocks if "from_ogbench(" in block]
     for there, here in QUICK.items():

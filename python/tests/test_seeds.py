@@ -48,15 +48,15 @@ def test_scores_do_not_depend_on_the_number_of_workers(package, tmp_path, monkey
     )
     dataset.save(tmp_path / "data.hdf5")
     scores = {}
-    for workers in (1, 2, 8):
+    for workers in (1, 4):
         folder, data = tmp_path / str(workers), tmp_path / "data.hdf5"
         learner = Learner(folder, data, environment="there", steps=20, episodes=EPISODES)
         with quad_rl.Evaluators("there", make(package, name), connect=learner.endpoint, workers=workers):
-            code, said = learner.end(100)
+            code, said = learner.end()
         assert code == 0, said
         scores[workers] = {score["seed"]: score["score"] for score in learner.scores()}
     assert len(set(scores[1].values())) == EPISODES
-    assert scores[1] == scores[2] == scores[8]
+    assert scores[1] == scores[4]
 
 
 class Draws(gymnasium.Env):

@@ -345,7 +345,7 @@ def test_a_library_that_is_missing_is_named_with_its_extra(module, tmp_path):
     (tmp_path / "log.csv").write_text("x,run\n1,2\n")
     extra, call = MISSING[module]
     code = f"import sys; sys.modules[{module!r}] = None; import quad_rl; quad_rl.{call}"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path).stderr
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, cwd=tmp_path).stderr
     assert "ImportError: " in said and "hint: pip install " in said and f"the extra '{extra}' of quad-rl" in said, said
 
 

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use candle_core::Device;
@@ -24,7 +25,7 @@ use super::agent::origin;
 use super::held_out::HeldOut;
 use super::output_queue::{Output, OutputQueue};
 use super::price::mean_step;
-use super::results::{Outcome, Row};
+use super::results::{Outcome, Row, TrainedPolicy};
 use super::training::{TrainError, Training};
 
 #[path = "../../../tests/fixtures/hopper.rs"]
@@ -202,6 +203,28 @@ fn a_queue_that_the_disk_does_not_empty_keeps_the_newest_checkpoint_and_all_rows
     assert!(matches!(queue.next(&beat), Some(Output::Rows(rows)) if rows.len() == 3));
     assert!(matches!(queue.next(&beat), Some(Output::Ended(Outcome::Completed))));
     assert!(queue.next(&beat).is_none());
+}
+
+/// Adds a snapshot of 150 MiB.
+fn add_large(queue: &OutputQueue, step: u64, stop: bool) {
+    let policy = TrainedPolicy { step, file: vec![0; 150 << 20], evaluate: true, practice: false };
+    queue.snapshot(policy, &AtomicBool::new(stop), &beat());
+}
+
+#[test]
+fn training_waits_only_while_many_bytes_wait_for_the_disk_and_not_after_a_stop() {
+    let queue = OutputQueue::default();
+    add_large(&queue, 1, false);
+    add_large(&queue, 2, false);
+    let waits = std::thread::scope(|scope| {
+        let third = scope.spawn(|| add_large(&queue, 3, false));
+        std::thread::sleep(Duration::from_millis(200));
+        let waits = !third.is_finished();
+        assert!(matches!(queue.next(&beat()), Some(Output::Snapshot(first)) if first.step == 1));
+        waits
+    });
+    assert!(waits, "300 MiB are too many");
+    add_large(&queue, 4, true);
 }
 
 #[test]

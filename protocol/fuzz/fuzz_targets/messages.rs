@@ -2,7 +2,7 @@
 #![no_main]
 #![allow(clippy::unwrap_used)]
 
-#[path = "../../tests/frames/mod.rs"]
+#[path = "../../tests/messages/frames.rs"]
 mod frames;
 
 use std::fs;

@@ -1,6 +1,7 @@
 //! A learner continues from what its run's folder holds, whatever has become of that.
 
 use std::fs;
+use std::path::Path;
 
 use quad_protocol::{Hash, PieceReply};
 use quad_tests::PATIENCE;
@@ -39,6 +40,39 @@ fn a_stopped_learner_resumes_at_its_step() {
     assert!(step_of(&third) < step);
     third.process.assert_said("is damaged");
     third.process.terminate(PATIENCE);
+}
+
+/// Copies a folder in the order of rsync: by name.
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    let entries = fs::read_dir(from).unwrap();
+    let mut paths = Vec::from_iter(entries.map(|entry| entry.unwrap().path()));
+    paths.sort();
+    for path in paths {
+        let target = to.join(path.file_name().unwrap());
+        if path.is_dir() {
+            copy(&path, &target);
+        } else {
+            // An old checkpoint may be gone by now.
+            fs::copy(&path, target).ok();
+        }
+    }
+}
+
+/// A back-up is made while the learner works.
+#[test]
+fn a_copy_of_a_run_at_work_continues_to_the_same_end() {
+    let scratch = Scratch::new();
+    let flags = [&LISTEN[..], &["--checkpoint-seconds", "0"]].concat();
+    let mut learner = scratch.learner_with("run", LONG, &flags);
+    let endpoint = learner.endpoint();
+    let _evaluator = scratch.evaluator("one", &endpoint);
+    learner.wait_for_scores(4 * LONG.episodes as usize);
+    copy(&learner.run_dir, &scratch.path().join("copy/run"));
+    learner.assert_completes(PATIENCE);
+    let mut copied = scratch.learner_with("copy/run", LONG, &["--listen", &endpoint]);
+    copied.assert_completes(PATIENCE);
+    copied.assert_same_as(&learner);
 }
 
 #[test]

@@ -93,7 +93,7 @@ fn five_hundred_evaluators_are_served() {
 }
 
 /// Keeps these tests to the first core; gives what starts a program on the second, its own.
-pub fn cores() -> [String; 3] {
+fn cores() -> [String; 3] {
     let me = std::process::id().to_string();
     let kept = Command::new("taskset").args(["-a", "-c", "-p", "0", &me]).status();
     assert!(kept.is_ok_and(|status| status.success()));

@@ -4,7 +4,6 @@
 use std::time::{Duration, Instant};
 
 use quad_protocol::PieceReply;
-use quad_run::folder::read_metrics;
 use quad_tests::PATIENCE;
 use quad_tests::crowd::Crowd;
 use quad_tests::made_up::{self, name};
@@ -12,8 +11,6 @@ use quad_tests::router::router;
 use quad_tests::setting::{ENDLESS, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
 use tokio::runtime::Runtime;
-
-use crate::crowds::cores;
 
 const SETTING: Setting = Setting {
     steps: 100,
@@ -78,41 +75,5 @@ fn experience_arrives_as_fast_as_it_is_written() {
         let bytes = (learner.process.peak_memory().unwrap() - alone) as f64 / last;
         eprintln!("{count} evaluators: {rate:.0} steps/s, {bytes:.0} bytes of memory each");
         assert_eq!(crowd.measured().refused, 0);
-    }
-}
-
-/// Prints how much longer a gradient step of the demonstration's size takes with practice beside it
-/// than before it, in each of five runs. The learner trains, receives, checks and writes on one
-/// core; time in which it waits for an episode does not count.
-#[test]
-#[ignore = "measures, on two cores of its own"]
-fn practice_slows_no_gradient_step() {
-    const STEPS: u64 = 3000;
-    let (scratch, launcher) = (Scratch::new(), cores());
-    let runtime = Runtime::new().unwrap();
-    let online_steps = STEPS;
-    let sizes = Setting { eval_interval: 2 * STEPS, hidden: 128, ..SETTING };
-    let setting = Setting { steps: STEPS, online_steps, ..sizes };
-    for run in ["run-1", "run-2", "run-3", "run-4", "run-5"] {
-        let endpoint = free_endpoint();
-        let mut arguments = vec!["--connect", &endpoint];
-        for change in ["online.warmup=0", "online.updates_per_step=1", "batch_size=256"] {
-            arguments.extend(["--set", change]);
-        }
-        let mut learner = scratch.learner_through(&launcher, run, setting, &arguments);
-        let _router = runtime.block_on(router(&endpoint));
-        let named = name(run);
-        let _crowd = runtime.block_on(Crowd::connect(1, Duration::ZERO, &named, &endpoint));
-        learner.process.assert_succeeds(3 * PATIENCE);
-        let lines = read_metrics(&learner.run_dir).unwrap();
-        let trained = |step: u64| {
-            let line = lines.iter().find(|line| line["step"] == step as f64).unwrap();
-            line["seconds"] - line.get("practice_wait_seconds").unwrap_or(&0.0)
-        };
-        // Without the first steps, in which the machine warms up and the first episode comes.
-        let [alone, beside] = [0, STEPS]
-            .map(|begin| (trained(begin + STEPS) - trained(begin + 500)) / (STEPS - 500) as f64);
-        let (milliseconds, slower) = (1000.0 * alone, 100.0 * (beside / alone - 1.0));
-        eprintln!("{milliseconds:.3} ms a step alone, {slower:+.1} % with practice");
     }
 }

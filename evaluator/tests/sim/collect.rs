@@ -1,5 +1,4 @@
 //! Recorded datasets: a function of the seed, and a faithful replay.
-#![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
 

@@ -1,14 +1,12 @@
 //! Lengths in a frame are not believed: decoding allocates a bounded amount of memory.
-#![allow(clippy::unwrap_used, clippy::expect_used)]
-
-mod frames;
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::fmt::Debug;
 
-use frames::{Check, each};
 use quad_protocol::*;
+
+use crate::frames::{Check, each};
 
 /// The system's allocator, which remembers the largest allocation of each thread.
 struct Watched;

@@ -1,5 +1,4 @@
 //! The environments against the real Gymnasium, which `gymnasium_reference.py` drives.
-#![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -127,7 +126,7 @@ fn planar_robots_are_gymnasiums() {
 fn the_ant_is_gymnasiums_but_for_motors_contacts_and_time_step() {
     let differ =
         ["actuator_acc0", "actuator_ctrlrange", "actuator_gear", "geom_solimp", "opt.timestep"];
-    assert_model(include_str!("../assets/ant.xml"), "ant", &differ);
+    assert_model(include_str!("../../assets/ant.xml"), "ant", &differ);
 }
 
 #[test]

@@ -1,5 +1,4 @@
 //! One message of each kind, for tests and for the fuzzer in protocol/fuzz.
-#![allow(dead_code)] // Not every test uses all of it.
 
 use std::fmt::Debug;
 

@@ -1,15 +1,14 @@
 //! Decoders survive mutated messages: each gives an error or a message that encodes as the same
 //! bytes, and never panics.
 //!
-//! `QUAD_MUTATIONS=1000000 cargo test --release --workspace --test mutations` tries as many.
-#![allow(clippy::unwrap_used, clippy::expect_used)]
+//! `QUAD_MUTATIONS=1000000 cargo test --release -p quad-protocol --test messages mutations` tries
+//! as many.
 
-mod frames;
-
-use frames::{decode_as_each, frames};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::sample::Index;
+
+use crate::frames::{decode_as_each, frames};
 
 /// The default takes a second or two.
 fn mutations() -> u32 {

@@ -1,33 +1,11 @@
-//! Our files and metrics as other programs read them: Python's safetensors, Prometheus.
+//! The pages of metrics as Prometheus reads them.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
 
-use quad_tests::setting::{ENDLESS, SHORT};
+use quad_tests::setting::ENDLESS;
 use quad_tests::system::Scratch;
-use quad_tests::{PATIENCE, http, peers};
-use serde_json::Value;
-
-#[test]
-fn python_reads_a_snapshot() {
-    let Some(python) = peers::python(&["safetensors", "numpy"]) else { return };
-    let scratch = Scratch::new();
-    let mut learner = scratch.learner_with("run", SHORT, &["--eval-interval", "0"]);
-    learner.process.assert_succeeds(PATIENCE);
-    let printed =
-        peers::run_python(&python, "snapshot_shapes.py", &[&learner.snapshot(SHORT.steps)]);
-    let shapes: Value = serde_json::from_str(&printed).unwrap();
-    // Hopper: 11 observations, 3 actions; 32 time features; 2 critics; 16 wide.
-    for (tensor, shape) in [
-        ("actor.time.0.kernel", &[16, 32][..]),
-        ("actor.trunk.0.kernel", &[46, 16]),
-        ("actor.trunk.3.bias", &[3]),
-        ("critic.0.kernel", &[2, 14, 16]),
-        ("critic.3.bias", &[2, 1]),
-    ] {
-        assert_eq!(shapes[tensor], serde_json::json!(shape), "{tensor}");
-    }
-}
+use quad_tests::{http, peers};
 
 #[test]
 fn prometheus_understands_both_metrics_pages() {

@@ -1,5 +1,4 @@
 //! Replays files of an independent implementation, up to their rounding to float32.
-#![allow(clippy::unwrap_used)]
 
 use std::path::Path;
 

@@ -1,13 +1,11 @@
 //! Messages survive the wire; damaged ones are typed errors.
-#![allow(clippy::unwrap_used, clippy::expect_used)]
-
-mod frames;
 
 use std::fmt::Debug;
 use std::io::Read;
 
-use frames::{Check, each, snapshot};
 use quad_protocol::*;
+
+use crate::frames::{Check, each, snapshot};
 
 struct Survives;
 

@@ -1,5 +1,4 @@
 //! Batches of episodes.
-#![allow(clippy::unwrap_used)]
 
 use std::collections::HashSet;
 

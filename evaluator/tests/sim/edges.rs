@@ -1,6 +1,5 @@
 //! Behavior of simulations beyond the comparison with Gymnasium: initial states, rare bounds, time
 //! limits, and values that are not finite.
-#![allow(clippy::unwrap_used)]
 
 use quad_dataset::environment::{EnvironmentSpec, all, find};
 use quad_evaluator::sim::{Simulation, Step, make};
