@@ -22,6 +22,7 @@ from study import Study, interval
 
 HOME = Path(__file__).parent.parent
 CHOICES = {"best of 10": "best of ten", "best of 1": "one sample"}
+METHODS = {"none": "cloning", "dac": "DAC", "quad": "QUAD", "mean": "mean λ", "shuffled": "shuffled λ", "denoised": "denoised"}
 PAIRS = [("quad", "shuffled"), ("quad", "mean"), ("quad", "dac"), ("dac", "none"), ("denoised", "dac")]
 WEIGHTS = {
     "λ = 1": "λ = 1 (DAC)",
@@ -47,25 +48,38 @@ def save(figure, file):
 
 
 def draw_pairs():
-    """A dot for each pair of equal task and seed; a line for the mean's interval."""
+    """The scores of all runs; then a dot for each pair of equal task and seed, and a line for the mean's interval."""
     study = Study(SimpleNamespace(study=HOME / "studies/lambda.toml"))
-    figure, panels = pyplot.subplots(1, len(CHOICES), figsize=(9, 2.8), layout="constrained", sharey=True)
+    figure, (scores, *panels) = pyplot.subplots(1, 1 + len(CHOICES), figsize=(11, 3), layout="constrained")
+    for row, method in enumerate(METHODS):
+        draw_dots(scores, row, study.of_method(method, "best of 10"))
+    rows(scores, METHODS.values(), "score, best of ten")
+    figure.legend(*scores.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     for axes, (choice, text) in zip(panels, CHOICES.items()):
         for row, methods in enumerate(PAIRS):
             ours, theirs = (study.of_method(method, choice) for method in methods)
             differences = {key: ours[key] - theirs[key] for key in ours if key in theirs}
-            for color, task in enumerate(("hopper", "walker2d")):
-                dots = [difference for (of, _), difference in differences.items() if of.startswith(task)]
-                label = TASKS[task] if row == 0 else None
-                axes.plot(dots, [row - 0.1 + 0.2 * color] * len(dots), "o", color=f"C{color}", alpha=0.7, label=label)
+            draw_dots(axes, row, differences)
             axes.plot(interval(list(differences.values())), [row, row], color="black")
             axes.plot(fmean(differences.values()), row, "|", color="black", markersize=12)
         axes.axvline(0, color="gray", linewidth=0.8)
-        axes.set_xlabel(f"difference of normalized scores, {text}")
-    axes.set_yticks(range(len(PAIRS)), [f"{ours} − {theirs}" for ours, theirs in PAIRS])
-    axes.invert_yaxis()
-    axes.legend()
+        rows(axes, [" − ".join(METHODS[method] for method in pair) for pair in PAIRS], f"difference, {text}")
+    panels[1].set_yticklabels([])
     save(figure, "lambda-pairs.svg")
+
+
+def draw_dots(axes, row, values):
+    """A dot for each value, those of a task below those of the other."""
+    for color, task in enumerate(("hopper", "walker2d")):
+        dots = [value for (of, _), value in values.items() if of.startswith(task)]
+        label = TASKS[task] if row == 0 else None
+        axes.plot(dots, [row - 0.1 + 0.2 * color] * len(dots), "o", color=f"C{color}", alpha=0.7, label=label)
+
+
+def rows(axes, names, text):
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlabel(text)
 
 
 def draw_risks(probes):
