@@ -61,7 +61,7 @@ pub struct Transitions {
     warnings: Vec<String>,
     reward: RewardScaling,
     scaling: Scaling,
-    /// Of held-out transitions: the standard units of those that are learned from.
+    /// For held-out transitions, the standard units of the training transitions.
     of_training: Option<Scaling>,
 }
 

@@ -65,7 +65,7 @@ struct Search {
     policy: LinearPolicy,
     /// The policies of all iterations; the first never moves.
     policies: Vec<LinearPolicy>,
-    /// Of the last iteration's trials.
+    /// Mean over the last iteration's trials.
     mean_return: f64,
     moments: Moments,
     random: ChaCha8Rng,
