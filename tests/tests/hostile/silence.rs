@@ -1,5 +1,6 @@
 //! A peer that reads nothing.
 
+use std::future::pending;
 use std::path::Path;
 use std::process::Command;
 use std::{env, fs};
@@ -31,6 +32,8 @@ async fn read_nothing(endpoint: &str) {
         session.get(&weights).timeout(PATIENCE).callback(drop).await.unwrap();
     }
     signal("STOP", std::process::id());
+    // A process stops a moment after the signal. Returning here would drop the token meanwhile.
+    pending().await
 }
 
 #[tokio::test(flavor = "multi_thread")]
