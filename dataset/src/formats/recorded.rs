@@ -1,3 +1,5 @@
+//! D4RL files with simulator states, as `evaluator collect` writes them, read without conversion.
+
 use std::path::Path;
 
 use crate::error::{DatasetError, Problem, RowProblem};

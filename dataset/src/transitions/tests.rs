@@ -1,3 +1,5 @@
+//! Episodes, windows, scaling and experience of transitions.
+
 use quad_kernels::scaling::Affine;
 
 use super::*;

@@ -82,7 +82,7 @@ pub(super) fn mean_step(
     for (begin, end) in &phases {
         let mut step = || {
             agent.skip_to(*begin);
-            agent.update(sampler.next_items())
+            agent.update(sampler.next_indices())
         };
         // The first step also allocates buffers.
         step()?;
