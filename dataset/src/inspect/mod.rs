@@ -57,8 +57,9 @@ pub struct Inspection {
     pub action_ranges: Vec<Range>,
     pub observation_range: Range,
     pub observation_ranges: Vec<Range>,
-    /// Fraction of the steps; so are timeouts.
+    /// Fraction of the steps after which the task ended.
     pub terminals: f64,
+    /// Fraction of the steps after which the episode was cut off.
     pub timeouts: f64,
     pub returns: Histogram,
     pub lengths: Histogram,
