@@ -17,7 +17,7 @@ pub struct Rollout<S> {
     observation_dim: usize,
     action_dim: usize,
     live: Vec<Live>,
-    /// One per live episode.
+    /// Policy state of each live episode.
     states: Vec<S>,
     /// [live, observation_dim]
     observations: Vec<f32>,
