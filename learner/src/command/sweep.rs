@@ -20,7 +20,7 @@ use super::all_readable;
 use super::train::record_hint;
 use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
-use crate::sweep::{Cost, LearnerOptions, Outcome, PlannedRun, Study, Sweep};
+use crate::sweep::{LearnerOptions, Outcome, PlannedRun, Study, StudyCost, Sweep};
 
 type Runs = Vec<(PlannedRun, State)>;
 
@@ -152,7 +152,7 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     let mut step_seconds = BTreeMap::new();
     // A single run, such as a task of an array job, starts at once and prints its own forecast.
     if args.index.is_none() {
-        let cost = Cost::measure(&left, |run| datasets[&run.experiment.dataset].as_deref())?;
+        let cost = StudyCost::measure(&left, |run| datasets[&run.experiment.dataset].as_deref())?;
         info!("{}", cost.text(jobs));
         step_seconds = cost.step_seconds;
     }
