@@ -59,7 +59,7 @@ pub struct Inspection {
     pub observation_ranges: Vec<Range>,
     /// Fraction of the steps after which the task ended.
     pub terminals: f64,
-    /// Fraction of the steps after which the episode was cut off.
+    /// Fraction of the steps after which the episode was truncated.
     pub timeouts: f64,
     pub returns: Histogram,
     pub lengths: Histogram,

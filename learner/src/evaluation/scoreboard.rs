@@ -178,7 +178,7 @@ impl Scoreboard {
         self.of_evaluations().filter(|evaluation| evaluation.pending() > 0).count()
     }
 
-    /// Step and seed of the episodes that have no score and are not handed out any more.
+    /// Step and seed of the episodes that have no score and are not handed out anymore.
     pub fn missing(&self) -> Vec<(u64, u64)> {
         let mut missing = Vec::new();
         for evaluation in self.evaluations.values() {
