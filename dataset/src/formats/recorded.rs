@@ -43,7 +43,7 @@ pub struct RecordedRows {
 }
 
 /// Known environments whose dimensions match those of the file.
-pub fn environments_of_its_sizes(
+pub fn matching_environments(
     path: impl AsRef<Path>,
 ) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
     let file = Hdf5File::open(path.as_ref())?;

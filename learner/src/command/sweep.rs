@@ -11,7 +11,7 @@ use quad_run::counted;
 use quad_run::folder::{Lock, RunDirError};
 use quad_run::status::State;
 use quad_run::table::{Style, Table};
-use quad_runtime::{Hint, SessionError, open_router, print, threads_asked, unfinished};
+use quad_runtime::{Hint, SessionError, open_router, print, requested_threads, unfinished};
 use tokio::sync::mpsc;
 use tokio::task::LocalSet;
 use tracing::{info, warn};
@@ -136,7 +136,7 @@ fn obtain(left: &Runs, is_alone: bool) -> anyhow::Result<Datasets> {
 }
 
 fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Outcome> {
-    let threads = threads_asked().map_or(1, usize::from);
+    let threads = requested_threads().map_or(1, usize::from);
     let cores = available_parallelism()?.get();
     let (jobs, cores) = shares(cores, threads, args.jobs, left.len());
     let count = match (&args.connect, args.evaluators) {
