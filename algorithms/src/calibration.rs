@@ -43,7 +43,7 @@ impl MonteCarlo {
 }
 
 /// The returns of an episode. One of two or more equal rewards that does not terminate has not reached
-/// its goal: its return is that of this reward for ever, which γ < 1 makes finite.
+/// its goal: its return is that of this reward forever, which γ < 1 makes finite.
 fn discounted(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f32> {
     let failed = rewards.len() > 1 && !terminates;
     if failed && gamma < 1.0 && rewards.iter().all(|reward| *reward == rewards[0]) {

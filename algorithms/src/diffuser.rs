@@ -50,13 +50,13 @@ struct Config {
     value_updates: Steps,
     /// EMA rate of the networks that plan.
     ema_rate: Rate,
-    /// The target networks are updated in steps whose number, from 0, is a multiple of this …
+    /// Steps between two updates of the target networks.
     ema_every: Steps,
-    /// … and are copies before this step.
+    /// Step, from 0, before which an update makes the target networks copies.
     ema_start: u64,
     guidance: ValueGuidance,
     candidates: Candidates,
-    /// Steps that it takes by one plan.
+    /// Steps that the policy takes by one plan.
     replan_every: Count,
 }
 

@@ -51,12 +51,12 @@ struct Config {
     /// EMA rate of the target critics.
     ema_rate: Rate,
     actor_ema_rate: Rate,
-    /// The target actor is updated in steps whose number, from 0, is a multiple of this …
+    /// Steps between two updates of the target actor.
     actor_ema_every: Steps,
-    /// … and at least this.
+    /// First step, from 0, in which the target actor may be updated.
     actor_ema_start: u64,
     candidates: Candidates,
-    /// Temperature of the softmax by which one of them is drawn, in units of Q.
+    /// Temperature, in units of Q, of the softmax by which the policy draws one of its candidates.
     temperature: Positive,
 }
 

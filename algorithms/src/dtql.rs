@@ -61,7 +61,7 @@ struct Config {
     cosine: bool,
     ema_rate: Rate,
     candidates: Candidates,
-    /// Temperature of the softmax by which one of them is drawn, in units of Q.
+    /// Temperature, in units of Q, of the softmax by which the policy draws one of its candidates.
     temperature: Positive,
     phases: Phases,
 }

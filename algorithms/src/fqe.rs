@@ -48,10 +48,10 @@ pub struct Units {
     pub offset: f64,
     /// The standard deviation of these returns; 1 if they are all the same.
     pub scale: f64,
-    /// The smallest possible return: the least reward for ever or, if that is less, once, as an
+    /// The smallest possible return: the least reward forever or, if that is less, once, as an
     /// episode may terminate.
     pub least: f64,
-    /// The largest possible return: the largest reward for ever or, if that is more, once.
+    /// The largest possible return: the largest reward forever or, if that is more, once.
     pub most: f64,
 }
 

@@ -36,7 +36,7 @@ struct Config {
     target: Aggregate,
     /// Weight α of the distance between the one-step policy and the flow.
     alpha: Positive,
-    /// The same in a run with practice, where it is another.
+    /// α of a run with practice, if it differs.
     online_alpha: Option<Positive>,
     /// Divide Q by its mean size in the policy's loss.
     normalize_q: bool,

@@ -15,7 +15,7 @@ const PAUSES: usize = 50;
 pub(crate) fn run_awake<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     let done = AtomicBool::new(false);
     rayon::scope(|scope| {
-        // Set however `work` ends, so that no thread looks for ever.
+        // Set however `work` ends, so that no thread looks forever.
         let _ending = SetWhenDropped(&done);
         for _ in 1..rayon::current_num_threads() {
             scope.spawn(|_| {

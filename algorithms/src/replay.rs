@@ -15,7 +15,7 @@ struct Kept<I> {
     /// The vector of which the inputs are views on a GPU.
     numbers: Tensor,
     computed: Computed,
-    /// None before the second update.
+    /// `None` before the second update.
     recording: Option<CudaGraph>,
     /// The recording reads constants that belong to this thread.
     thread: ThreadId,

@@ -283,7 +283,7 @@ fn data_without_examples_is_refused_with_a_hint() {
     }
 }
 
-/// Two of six transitions are the last of an episode that is cut off.
+/// Two of six transitions are the last of a truncated episode.
 #[test]
 fn transitions_without_a_next_action_are_left_out() {
     let arrays = Arrays {

@@ -110,6 +110,31 @@ impl ArrayProblem {
     pub(crate) fn of(self, array: &str) -> Problem {
         Problem::Array(array.to_owned(), self)
     }
+
+    fn hint(&self, array: &str) -> String {
+        let hint = match self {
+            Self::Missing(there) => return missing(array, there),
+            Self::Unreadable(source) if source.to_string().contains(NEWER) => {
+                return format!("a newer HDF5 library wrote it: {REWRITE}");
+            }
+            Self::Unreadable(_) | Self::UnreadableNpz(_) => DAMAGED,
+            Self::Group => {
+                "write what is in the group as columns of one array; in a Minari folder, observations may be a Dict of arrays, and of a Dict of Dicts `quad-convert FOLDER --out my-robot.hdf5` makes one row, with quad_rl installed"
+            }
+            Self::DiscreteActions => {
+                "store continuous actions as float32; where they leave [-1, 1], `learner train --normalize actions` scales them"
+            }
+            Self::Axes(_) => {
+                "each row is a number or a row of numbers: flatten what has more axes, and make numbers of images first, as an encoder does"
+            }
+            Self::Type(..) | Self::Rows(..) | Self::Shape(..) => ARRAYS,
+            Self::Oversized(..) => {
+                "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
+            }
+            Self::Filter(_) | Self::Elsewhere => REWRITE,
+        };
+        hint.to_owned()
+    }
 }
 
 /// Problem with rows of an array, which count from 0. The number is that of the first such row.
@@ -133,6 +158,23 @@ impl RowProblem {
         let (array, rows, problem) = (array.to_owned(), 1, self);
         Problem::Rows { array, row, rows, problem }
     }
+
+    fn hint(&self) -> &'static str {
+        match self {
+            Self::NotFinite(_) => {
+                "leave out or repair these rows: a single one would spoil every weight"
+            }
+            Self::NotBoolean(_) => {
+                "a flag is 0 or 1: of a discount, write 1 where it is 0, and else 0 (docs/data.md says what each flag means)"
+            }
+            Self::ActionOutside(_) => {
+                "`learner train --normalize actions` trains on them: it maps the least and the largest of each number to ±1, and the policy's actions back"
+            }
+            Self::Stray | Self::Leap(_) => {
+                "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for rows in any other order set the attribute `layout` as docs/data.md describes"
+            }
+        }
+    }
 }
 
 /// Remedy for a foreign format.
@@ -144,6 +186,20 @@ pub enum Load {
     Python(&'static str),
     /// Advice on getting the file that this one stands for.
     Get(&'static str),
+}
+
+impl Load {
+    fn hint(self) -> String {
+        match self {
+            Self::Convert(command) => format!(
+                "with quad_rl installed, `{command} --out my-robot.hdf5` makes a file that is read (docs/data.md)"
+            ),
+            Self::Python(advice) => format!(
+                "{advice}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
+            ),
+            Self::Get(advice) => advice.to_owned(),
+        }
+    }
 }
 
 /// The shape of an array; that of one number a row has no second axis.
@@ -179,8 +235,6 @@ fn missing(array: &str, there: &[String]) -> String {
 impl Problem {
     /// Advice on how to fix it.
     pub fn hint(&self) -> String {
-        use ArrayProblem::*;
-        use RowProblem::*;
         let hint = match self {
             Self::OtherEnvironment { claimed, is_simulated: true, .. } => {
                 return format!("choose a task in {claimed}, or another dataset");
@@ -191,21 +245,9 @@ impl Problem {
                      your own, without evaluations: --task own-data --env NAME"
                 );
             }
-            Self::Foreign(_, Load::Convert(command)) => {
-                return format!(
-                    "with quad_rl installed, `{command} --out my-robot.hdf5` makes a file that is read (docs/data.md)"
-                );
-            }
-            Self::Foreign(_, Load::Python(advice)) => {
-                return format!(
-                    "{advice}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
-                );
-            }
-            Self::Foreign(_, Load::Get(advice)) => return (*advice).to_owned(),
-            Self::Array(array, Missing(there)) => return missing(array, there),
-            Self::Array(_, Unreadable(source)) if source.to_string().contains(NEWER) => {
-                return format!("a newer HDF5 library wrote it: {REWRITE}");
-            }
+            Self::Foreign(_, load) => return load.hint(),
+            Self::Array(array, problem) => return problem.hint(array),
+            Self::Rows { problem, .. } => problem.hint(),
             Self::OtherMaze(_) => {
                 "choose one of its own tasks, such as antmaze-large-navigate-singletask-task1-v0, or another dataset"
             }
@@ -219,12 +261,7 @@ impl Problem {
             Self::UnknownFolder => {
                 "give one file, or the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0; with quad_rl installed, `quad-convert FOLDER … --episode file` makes a file of a folder of tables (docs/data.md)"
             }
-            Self::Truncated { .. }
-            | Self::DamagedHdf5(_)
-            | Self::DamagedNpz(_)
-            | Self::Array(_, Unreadable(_) | UnreadableNpz(_)) => {
-                "the file was cut off or damaged on its way: fetch or copy it again; the program that writes one of your own must close it"
-            }
+            Self::Truncated { .. } | Self::DamagedHdf5(_) | Self::DamagedNpz(_) => DAMAGED,
             Self::Locked(_) => {
                 "close it in that program; if none has it open, set HDF5_USE_FILE_LOCKING=FALSE and try again"
             }
@@ -247,38 +284,14 @@ impl Problem {
                 "unless all rewards are alike, another reward rule learns from them: --set reward=as-is"
             }
             Self::Write(_) => "check that the disk has room and the folder is writable",
-            Self::Array(_, Group) => {
-                "write what is in the group as columns of one array; in a Minari folder, observations may be a Dict of arrays, and of a Dict of Dicts `quad-convert FOLDER --out my-robot.hdf5` makes one row, with quad_rl installed"
-            }
-            Self::Array(_, DiscreteActions) => {
-                "store continuous actions as float32; where they leave [-1, 1], `learner train --normalize actions` scales them"
-            }
-            Self::Array(_, Axes(_)) => {
-                "each row is a number or a row of numbers: flatten what has more axes, and make numbers of images first, as an encoder does"
-            }
-            Self::Array(_, Type(..) | Rows(..) | Shape(..)) => ARRAYS,
-            Self::Array(_, Oversized(..)) => {
-                "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
-            }
-            Self::Array(_, Filter(_) | Elsewhere) => REWRITE,
-            Self::Rows { problem: NotFinite(_), .. } => {
-                "leave out or repair these rows: a single one would spoil every weight"
-            }
-            Self::Rows { problem: NotBoolean(_), .. } => {
-                "a flag is 0 or 1: of a discount, write 1 where it is 0, and else 0 (docs/data.md says what each flag means)"
-            }
-            Self::Rows { problem: ActionOutside(_), .. } => {
-                "`learner train --normalize actions` trains on them: it maps the least and the largest of each number to ±1, and the policy's actions back"
-            }
-            Self::Rows { problem: Stray | Leap(_), .. } => {
-                "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for rows in any other order set the attribute `layout` as docs/data.md describes"
-            }
         };
         hint.to_owned()
     }
 }
 
 const ARRAYS: &str = "docs/data.md says which arrays a file must have, and of which shape and type; all need the same number of rows";
+
+const DAMAGED: &str = "the file was cut off or damaged on its way: fetch or copy it again; the program that writes one of your own must close it";
 
 /// Number of names that are listed.
 const MOST_NAMES: usize = 8;

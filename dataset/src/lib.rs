@@ -25,7 +25,7 @@ pub use error::{ArrayProblem, DatasetError, Load, Problem, RowProblem};
 pub use formats::arrays::{Arrays, write_own};
 pub use formats::d4rl_writer::{D4rlWriter, Metadata, write_practice};
 pub use formats::hdf5_file::hdf5_library;
-pub use formats::recorded::{RecordedRows, Row, environments_of_its_sizes};
+pub use formats::recorded::{RecordedRows, Row, matching_environments};
 pub use formats::{data_file, minari_folder, recorded_environment};
 pub use inspect::{Inspection, inspect};
 pub use normalize::Normalize;

@@ -1,8 +1,10 @@
+//! Normalization of observations, actions and rewards.
+
 use quad_kernels::scaling::{Affine, Scaling};
 use serde::{Deserialize, Serialize};
 
 use crate::recording::{Recording, RowKind};
-use crate::statistics::Figures;
+use crate::statistics::Summary;
 use crate::tables::reward::RewardScaling;
 
 /// Standard deviation of float32's last bit, relative to the number.
@@ -53,13 +55,13 @@ impl Normalize {
         let is_transition = |row: usize| kinds[row] == RowKind::Transition;
         let is_step = |row: usize| recording.is_step(row);
         let states = || standard_units(observations, *observation_dim, is_transition);
-        let actions = || unit_ranges(&Figures::of_columns(actions, *action_dim, is_step));
-        let size = self.rewards.then(|| rule.size(recording) as f32);
+        let actions = || unit_ranges(&Summary::of_columns(actions, *action_dim, is_step));
+        let rms = self.rewards.then(|| rule.rms(recording) as f32);
         Scaling {
             observations: self.observations.then(states),
             actions: self.actions.then(actions),
             // All-zero rewards stay unscaled.
-            rewards: size.filter(|size| *size > 0.0),
+            rewards: rms.filter(|rms| *rms > 0.0),
         }
     }
 }
@@ -82,18 +84,18 @@ pub(crate) fn standard_units(
     width: usize,
     counts: impl Fn(usize) -> bool,
 ) -> Affine {
-    let of = |figures: &Figures| match figures.deviation <= ROUNDING * figures.size {
-        true => (figures.min as f32, 0.0),
-        false => (figures.mean as f32, figures.deviation as f32),
+    let of = |summary: &Summary| match summary.deviation <= ROUNDING * summary.rms {
+        true => (summary.min as f32, 0.0),
+        false => (summary.mean as f32, summary.deviation as f32),
     };
-    let columns = Figures::of_columns(values, width, counts);
+    let columns = Summary::of_columns(values, width, counts);
     let (offset, scale) = columns.iter().map(of).unzip();
     Affine { offset, scale }
 }
 
 /// Map of each column from its range to [-1, 1].
-fn unit_ranges(columns: &[Figures]) -> Affine {
-    let of = |Figures { min, max, .. }: &Figures| {
+fn unit_ranges(columns: &[Summary]) -> Affine {
+    let of = |Summary { min, max, .. }: &Summary| {
         (((min + max) / 2.0) as f32, ((max - min) / 2.0) as f32)
     };
     let (offset, scale) = columns.iter().map(of).unzip();

@@ -12,7 +12,7 @@ pub struct PracticeRows<'a> {
     pub actions: &'a [f32],
     /// The environment's own rewards, `n`.
     pub rewards: &'a [f32],
-    /// True if the last step terminated the task; else it was cut off.
+    /// True if the last step terminated the task; else it was truncated.
     pub terminated: bool,
 }
 

@@ -1,3 +1,5 @@
+//! Rows of a dataset in file order, whatever its format.
+
 use crate::statistics::Episode;
 
 /// Largest difference between two copies of the same observation.
@@ -125,6 +127,7 @@ impl Recording {
         returns
     }
 
+    /// Steps with a following step in their episode.
     pub(crate) fn inside(&self) -> impl Iterator<Item = usize> {
         let last = self.rows().saturating_sub(1);
         (0..last).filter(|&row| self.is_step(row) && !self.ends[row])

@@ -1,15 +1,17 @@
-/// Figures of some numbers; NaN without numbers.
+//! Summary statistics of numbers, and the lengths and returns of episodes.
+
+/// Statistics of some numbers; NaN without numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Figures {
+pub(crate) struct Summary {
     pub(crate) min: f64,
     pub(crate) mean: f64,
     pub(crate) max: f64,
     pub(crate) deviation: f64,
     /// Root mean square.
-    pub(crate) size: f64,
+    pub(crate) rms: f64,
 }
 
-impl Figures {
+impl Summary {
     pub(crate) fn of(values: &[f64]) -> Self {
         let count = values.len() as f64;
         let mean = values.iter().sum::<f64>() / count;
@@ -20,11 +22,11 @@ impl Figures {
             mean,
             max: values.iter().copied().fold(f64::NAN, f64::max),
             deviation: square_around(mean).sqrt(),
-            size: square_around(0.0).sqrt(),
+            rms: square_around(0.0).sqrt(),
         }
     }
 
-    /// Figures of each column's finite numbers in the rows that count.
+    /// Statistics of each column's finite numbers in the rows that count.
     pub(crate) fn of_columns(
         values: &[f32],
         width: usize,

@@ -13,7 +13,7 @@ use std::sync::Arc;
 const THREADS: u32 = 256;
 /// Widest layer of which a block's memory holds a tile.
 const WIDEST: usize = 512;
-/// Most layers.
+/// Largest number of layers.
 const LAYERS: usize = 65;
 
 /// Networks of dense layers, and where their weights are in a vector: from a start on, for each
@@ -31,13 +31,13 @@ pub struct Dense {
 // SAFETY: `Shape` in mlp.cu has the same fields.
 unsafe impl DeviceRepr for Dense {}
 
-/// Some columns of networks' inputs, `rows/repeat × width`: `repeat` consecutive rows are the same.
+/// Some columns of networks' inputs.
 pub struct Part<'a> {
-    /// The numbers.
+    /// Rows of the columns, `rows/repeat × width`.
     pub numbers: &'a CudaView<'a, f32>,
-    /// Columns.
+    /// Number of columns.
     pub width: usize,
-    /// Equal rows.
+    /// Number of consecutive rows that are the same.
     pub repeat: usize,
 }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 use quad_protocol::Name;
-use quad_runtime::{Hint, threads_asked};
+use quad_runtime::{Hint, requested_threads};
 use tokio::task::JoinSet;
 use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
@@ -96,7 +96,7 @@ impl LocalEvaluators {
             command.args(["--connect", endpoint]);
             hide_certificates(&mut command, endpoint);
         }
-        if threads_asked().is_none() {
+        if requested_threads().is_none() {
             let share = self.cores.div_ceil(self.count);
             command.env("RAYON_NUM_THREADS", share.to_string());
         }

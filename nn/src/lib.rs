@@ -56,7 +56,7 @@ pub use quad_kernels::activation::Activation;
 pub use quad_kernels::scaling::{Affine, Scaling};
 pub use score::dpm_solver::{ContinuousNoise, DpmSolver};
 pub use score::network::{ScoreNetwork, ScoreShape};
-pub use shape::{EnsembleShape, NoiseShape, bytes, tile_floats};
+pub use shape::{EnsembleShape, NoiseShape, f32_bytes, tile_floats};
 pub use slices::read;
 pub use statistics::{mean_and_variance, pulled_error, squared_error};
 pub use trajectory::config::{Attention, TrajectoryConfig, TrajectoryError};

@@ -75,7 +75,7 @@ pub fn tile_floats(repeat: u128, layers: &MlpConfig) -> u128 {
 }
 
 /// Bytes of this many numbers of f32, at most `u64::MAX`.
-pub fn bytes(floats: u128) -> u64 {
+pub fn f32_bytes(floats: u128) -> u64 {
     u64::try_from(4 * floats).unwrap_or(u64::MAX)
 }
 
@@ -125,7 +125,7 @@ mod tests {
     fn forty_states_of_dtql_with_all_candidates_take_megabytes() {
         let layers = MlpConfig { norm: true, ..MlpConfig::mish(&[256; 3]) };
         let critics = EnsembleShape::critics(2, (29, 8), &layers);
-        let held = bytes(critics.floats(40, 1024) - tile_floats(1024, &layers));
+        let held = f32_bytes(critics.floats(40, 1024) - tile_floats(1024, &layers));
         assert_eq!(held, 40 * 1024 * 4 * (2 * 29 + 8 + 2));
     }
 }

@@ -54,7 +54,7 @@ macro_rules! weighted {
         }
 
         impl $type {
-            /// Packs the kernels now, for a policy whose weights do not change any more.
+            /// Packs the kernels now, for a policy whose weights do not change anymore.
             pub fn packed(self) -> Result<Self> {
                 self.packing.pack(&self.$($mlp).+, &self.weights)?;
                 Ok(self)

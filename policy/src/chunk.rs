@@ -4,7 +4,7 @@ use crate::error::{PolicyError, Result, check_range};
 use crate::policy::{Policy, Samples};
 use crate::sampling::choice::Choice;
 use crate::sampling::episode::EpisodeState;
-use quad_nn::{Precision, bytes};
+use quad_nn::{Precision, f32_bytes};
 use serde::{Deserialize, Serialize};
 use std::mem;
 
@@ -116,7 +116,7 @@ impl Policy for Chunked {
     fn memory(&self, states: usize) -> u64 {
         let own = states * 2 * (self.policy.observation_dim() + self.policy.action_dim());
         let moved = states * (size_of::<EpisodeState>() + size_of::<usize>());
-        self.policy.memory(states).saturating_add(bytes(own as u128) + moved as u64)
+        self.policy.memory(states).saturating_add(f32_bytes(own as u128) + moved as u64)
     }
 
     fn observe(&self, observations: &[f32], states: &mut [EpisodeState]) {

@@ -5,7 +5,7 @@ use crate::policy::{Policy, Samples};
 use crate::sampling::choice::Choice;
 use crate::sampling::episode::EpisodeState;
 use quad_kernels::scaling::{Affine, Scaling};
-use quad_nn::{Precision, bytes};
+use quad_nn::{Precision, f32_bytes};
 use std::borrow::Cow;
 use std::sync::Arc;
 
@@ -71,7 +71,7 @@ impl Policy for Scaled {
 
     fn memory(&self, states: usize) -> u64 {
         let observations = states as u128 * self.observation_dim() as u128;
-        self.policy.memory(states).saturating_add(bytes(observations))
+        self.policy.memory(states).saturating_add(f32_bytes(observations))
     }
 
     fn observe(&self, observations: &[f32], states: &mut [EpisodeState]) {

@@ -22,7 +22,7 @@ pub struct Episode {
     pub precision: Name,
     /// Seed, length n, return and score.
     pub score: EpisodeScore,
-    /// True if the last step terminated the task; else it was cut off, and its next state has a
+    /// True if the last step terminated the task; else it was truncated, and its next state has a
     /// value.
     pub terminated: bool,
     /// `(n + 1) × o`, from the first observation to the one after the last step, in the

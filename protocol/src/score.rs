@@ -29,7 +29,7 @@ impl EpisodeScore {
     pub const LARGEST: f64 = 1e12;
 
     /// True if a return or a score is finite and no larger than [`LARGEST`](Self::LARGEST).
-    pub fn counts(value: f64) -> bool {
+    pub fn is_in_range(value: f64) -> bool {
         value.abs() <= Self::LARGEST
     }
 }

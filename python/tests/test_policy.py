@@ -220,7 +220,7 @@ state, action = [0.0] * policy.observation_size, [0.0] * policy.action_size
 def in_a_fork(call):
     child = os.fork()
     if child == 0:
-        signal.alarm(120)  # Ends a fork that waits for ever.
+        signal.alarm(120)  # Ends a fork that waits forever.
         try:
             call()
         except RuntimeError as error:

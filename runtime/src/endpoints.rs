@@ -31,7 +31,7 @@ pub struct Endpoints {
 pub enum SessionError {
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
-    /// Zenoh would try for ever to connect by an unknown protocol.
+    /// Zenoh would try forever to connect by an unknown protocol.
     #[error(
         "{0:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447"
     )]
@@ -129,7 +129,7 @@ pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> Strin
 /// Checks an endpoint from the command line and returns it unchanged: a `value_parser`.
 pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
     let is_known = text.starts_with(OPEN) || text.starts_with(PROTECTED);
-    // Zenoh takes any text for an address, and would try it for ever.
+    // Zenoh takes any text for an address, and would try it forever.
     let is_address = |(host, port): (&str, &str)| {
         !host.is_empty() && !host.contains(['/', ',']) && port.parse::<u16>().is_ok()
     };

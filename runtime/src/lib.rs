@@ -37,4 +37,4 @@ pub use progress_bar::ProgressBar;
 pub use router::open_router;
 pub use session::{open_session, reachable_at};
 pub use shutdown::{LEAVE_WITHIN, shutdown_signal};
-pub use threads::{choose_threads, threads_asked};
+pub use threads::{choose_threads, requested_threads};

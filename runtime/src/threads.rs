@@ -29,6 +29,6 @@ pub fn choose_threads() {
 }
 
 /// The user's number of rayon threads, by RAYON_NUM_THREADS; `None` if it is unset, 0 or no number.
-pub fn threads_asked() -> Option<NonZero<usize>> {
+pub fn requested_threads() -> Option<NonZero<usize>> {
     env::var("RAYON_NUM_THREADS").ok()?.parse().ok()
 }

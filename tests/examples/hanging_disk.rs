@@ -27,7 +27,7 @@ pub unsafe extern "C" fn read(file: c_int, buffer: *mut c_void, count: usize) ->
     unsafe { libc::syscall(libc::SYS_read as c_long, file, buffer, count) as isize }
 }
 
-/// Waits for ever, if it is this call and one of these files.
+/// Waits forever, if it is this call and one of these files.
 fn hang(call: &str, file: c_int) {
     let hangs = std::env::var(HANGS).unwrap_or_default();
     let Some((hanging, beginning)) = hangs.split_once(':') else { return };

@@ -123,7 +123,7 @@ def other_actions(config, state, inputs):
 
 
 def returns_of(config, inputs):
-    """Discounted returns to the ends of episodes. One of equal rewards that does not terminate goes on for ever."""
+    """Discounted returns to the ends of episodes. One of equal rewards that does not terminate goes on forever."""
     gamma, rewards, returns = config["agent"]["gamma"], inputs["rewards"], np.zeros(config["batch_size"])
     ends = np.flatnonzero((inputs["masks"] == 0) | (inputs["timeouts"] == 1)) + 1
     for start, end in zip([0, *ends], ends, strict=False):

@@ -98,14 +98,14 @@ pub(super) struct Config {
     pub ema_rate: Rate,
     /// EMA rate of ν̂² (Eq. 23), and of λ's means with guidance `mean`.
     pub nu_ema_rate: Rate,
-    /// The target actor is updated in steps whose number, from 0, is a multiple of this …
+    /// Steps between two updates of the target actor.
     pub actor_ema_every: Steps,
-    /// … and above this.
+    /// Step, from 0, after which the target actor is first updated.
     pub actor_ema_start: u64,
 }
 
 impl Config {
-    /// Reads a table of them and checks what their types do not say.
+    /// Reads an `[agent]` table and checks what the types do not say.
     pub fn read(table: &toml::Table) -> Result<Self, AgentError> {
         let config: Self = read(table)?;
         check("tau", config.tau, config.tau > 0.0, "above 0 (`inf` is allowed)")?;

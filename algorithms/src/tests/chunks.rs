@@ -18,7 +18,7 @@ fn chunked(mut table: toml::Table, chunk: i64) -> toml::Table {
     table
 }
 
-/// Rows 0 to 9 of each twenty terminate, and 10 to 19 are cut off.
+/// Rows 0 to 9 of each twenty terminate, and 10 to 19 are truncated.
 #[test]
 fn windows_beyond_the_end_of_an_episode_are_masked() {
     let mut context = context(0, &Device::Cpu);

@@ -102,7 +102,8 @@ fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
     }
 }
 
-/// What it does not name, such as the initial weights, would be those of the network that tasks share.
+/// A key that the group leaves out, such as the initial weights, would come from the network that all
+/// tasks share.
 #[test]
 fn a_group_with_another_network_names_all_of_it() {
     for definition in ALGORITHMS {

@@ -1,3 +1,5 @@
+//! One array of a dataset file, with checks of its shape.
+
 use crate::error::{ArrayProblem, Problem, RowProblem};
 
 /// N rows of numbers, read from shape N × width, or N if the width is 1. `values` is N × width.

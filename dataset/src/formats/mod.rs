@@ -1,3 +1,5 @@
+//! Readers and writers of the file formats, and the choice among the readers.
+
 mod array;
 pub(crate) mod arrays;
 mod d4rl;

@@ -1,3 +1,5 @@
+//! Reader of NumPy's npz archives that checks each array for presence, type, shape and size.
+
 use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};

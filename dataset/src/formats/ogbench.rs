@@ -1,3 +1,5 @@
+//! OGBench's npz files, as they are published or as its loader returns them.
+
 use crate::error::Problem;
 use crate::formats::npz_file::NpzFile;
 use crate::recording::{Recording, RowKind};

@@ -1,3 +1,5 @@
+//! D4RL files with simulator states, as `evaluator collect` writes them, read without conversion.
+
 use std::path::Path;
 
 use crate::error::{DatasetError, Problem, RowProblem};
@@ -41,7 +43,7 @@ pub struct RecordedRows {
 }
 
 /// Known environments whose dimensions match those of the file.
-pub fn environments_of_its_sizes(
+pub fn matching_environments(
     path: impl AsRef<Path>,
 ) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
     let file = Hdf5File::open(path.as_ref())?;

@@ -1,3 +1,5 @@
+//! Problems of a dataset that training accepts.
+
 use crate::error::RowProblem;
 use crate::formats::Source;
 use crate::normalize::Normalize;

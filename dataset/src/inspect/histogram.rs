@@ -1,3 +1,5 @@
+//! Histograms, drawn as text.
+
 use std::fmt;
 
 use serde::Serialize;

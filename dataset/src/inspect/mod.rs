@@ -1,3 +1,5 @@
+//! Summary of a dataset for its user: statistics, histograms and problems.
+
 mod findings;
 mod histogram;
 mod page;
@@ -9,7 +11,7 @@ use serde::Serialize;
 use crate::checks;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
-use crate::statistics::Figures;
+use crate::statistics::Summary;
 use crate::tables::benchmarks;
 use crate::tables::environment::{self, EnvironmentSpec};
 use crate::tables::reward::RewardScaling;
@@ -55,8 +57,9 @@ pub struct Inspection {
     pub action_ranges: Vec<Range>,
     pub observation_range: Range,
     pub observation_ranges: Vec<Range>,
-    /// Fraction of the steps; so are timeouts.
+    /// Fraction of the steps after which the task ended.
     pub terminals: f64,
+    /// Fraction of the steps after which the episode was truncated.
     pub timeouts: f64,
     pub returns: Histogram,
     pub lengths: Histogram,
@@ -75,6 +78,16 @@ pub struct Scores {
     pub max_score: f64,
 }
 
+impl Scores {
+    fn of(returns: Summary, spec: &EnvironmentSpec) -> Self {
+        Self {
+            min_score: spec.normalized_score(returns.min),
+            mean_score: spec.normalized_score(returns.mean),
+            max_score: spec.normalized_score(returns.max),
+        }
+    }
+}
+
 /// Smallest and largest of some numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[allow(missing_docs)] // The names say what each is.
@@ -85,8 +98,8 @@ pub struct Range {
 
 impl Range {
     fn of_columns(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<Self> {
-        let columns = Figures::of_columns(values, width, counts).into_iter();
-        columns.map(|Figures { min, max, .. }| Self { min, max }).collect()
+        let columns = Summary::of_columns(values, width, counts).into_iter();
+        columns.map(|Summary { min, max, .. }| Self { min, max }).collect()
     }
 
     fn constant(ranges: &[Self]) -> Vec<usize> {
@@ -121,7 +134,7 @@ pub fn inspect(
     let lengths: Vec<f64> = episodes.iter().map(|episode| episode.length as f64).collect();
     let returns: Vec<f64> =
         episodes.iter().map(|episode| episode.sum).filter(|sum| sum.is_finite()).collect();
-    let (length, sum) = (Figures::of(&lengths), Figures::of(&returns));
+    let (length, sum) = (Summary::of(&lengths), Summary::of(&returns));
     let steps: f64 = lengths.iter().sum();
     let share = |flags: &[bool]| flags.iter().filter(|&&flag| flag).count() as f64 / steps;
     let is_step = |row: usize| recording.is_step(row);
@@ -143,14 +156,10 @@ pub fn inspect(
         min_return: sum.min,
         mean_return: sum.mean,
         max_return: sum.max,
-        scores: spec.map(|spec| Scores {
-            min_score: spec.normalized_score(sum.min),
-            mean_score: spec.normalized_score(sum.mean),
-            max_score: spec.normalized_score(sum.max),
-        }),
+        scores: spec.map(|spec| Scores::of(sum, spec)),
         constant_observations: Range::constant(&observation_ranges),
         constant_actions: Range::constant(&action_ranges),
-        reward_size: RewardScaling::default().size(&recording),
+        reward_size: RewardScaling::default().rms(&recording),
         observation_names: recording.names.observations,
         action_names: recording.names.actions,
         reward_range: Range::over(&reward_ranges),

@@ -1,3 +1,5 @@
+//! The summary as text.
+
 use std::fmt;
 
 use super::{Inspection, Range};
@@ -55,6 +57,12 @@ impl fmt::Display for Inspection {
 
         write!(f, "\nreturns of the episodes\n{}", self.returns)?;
         write!(f, "\nlengths of the episodes\n{}", self.lengths)?;
+        self.write_problems(f)
+    }
+}
+
+impl Inspection {
+    fn write_problems(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.problems.is_empty() {
             return write!(f, "\nno problems found");
         }

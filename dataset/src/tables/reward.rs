@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::recording::Recording;
-use crate::statistics::Figures;
+use crate::statistics::Summary;
 
 /// Transformation of rewards before training. Statistics and scores use the recorded rewards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -45,10 +45,10 @@ impl Default for RewardScaling {
 
 impl RewardScaling {
     /// Root mean square of the training rewards; NaN without rewards.
-    pub(crate) fn size(self, recording: &Recording) -> f64 {
+    pub(crate) fn rms(self, recording: &Recording) -> f64 {
         let rewards = recording.transitions().map(|row| recording.rewards[row]);
         let rewards = rewards.map(|reward| f64::from(self.apply(reward)));
-        Figures::of(&Vec::from_iter(rewards.filter(|reward| reward.is_finite()))).size
+        Summary::of(&Vec::from_iter(rewards.filter(|reward| reward.is_finite()))).rms
     }
 
     /// The training reward.
@@ -62,7 +62,7 @@ impl RewardRule {
     pub fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
         let (subtract, times) = match self {
             Self::Locomotion => {
-                let Figures { min, max, .. } = Figures::of(returns);
+                let Summary { min, max, .. } = Summary::of(returns);
                 if min == max {
                     return None;
                 }

@@ -42,7 +42,7 @@ impl BatchSampler {
     }
 
     /// Indices of the next batch.
-    pub fn next_items(&mut self) -> &[u32] {
+    pub fn next_indices(&mut self) -> &[u32] {
         for i in 0..self.indices.len() {
             self.indices[i] = self.draw();
         }
@@ -89,7 +89,7 @@ impl OnlineSampler {
     ///
     /// # Panics
     /// If `experience` is 0, but has a share.
-    pub fn items(&mut self, step: u64, len: usize, experience: usize) -> &[u32] {
+    pub fn indices(&mut self, step: u64, len: usize, experience: usize) -> &[u32] {
         let mut generator = ChaCha8Rng::seed_from_u64(self.seed ^ ONLINE);
         generator.set_stream(step);
         let [len, all] = [len as u32, (len + experience) as u32];
@@ -151,10 +151,10 @@ mod tests {
     #[test]
     fn batches_online_depend_on_their_arguments_alone() {
         let batch = |seed, step, experience| {
-            OnlineSampler::new(64, None, seed).items(step, 1000, experience).to_vec()
+            OnlineSampler::new(64, None, seed).indices(step, 1000, experience).to_vec()
         };
         let mut sampler = OnlineSampler::new(64, None, 3);
-        let backward = [3, 2, 1].map(|step| sampler.items(step, 1000, 50).to_vec());
+        let backward = [3, 2, 1].map(|step| sampler.indices(step, 1000, 50).to_vec());
         assert_eq!(backward, [3, 2, 1].map(|step| batch(3, step, 50)));
         let others = [batch(4, 2, 50), batch(3, 2, 51), batch(3, 1, 50)];
         assert!(!others.contains(&backward[1]));
@@ -166,7 +166,7 @@ mod tests {
             let mut counts = [0; 40];
             let mut sampler = OnlineSampler::new(256, share, 7);
             for step in 0..100 {
-                for index in sampler.items(step, 30, 10) {
+                for index in sampler.indices(step, 30, 10) {
                     counts[*index as usize] += 1;
                 }
             }
@@ -177,7 +177,7 @@ mod tests {
                 assert!(part.iter().all(|n| (n - each).abs() < 150), "{share:?}: {counts:?}");
             }
         }
-        let batch = OnlineSampler::new(5, Some(0.3), 1).items(0, 30, 10).to_vec();
+        let batch = OnlineSampler::new(5, Some(0.3), 1).indices(0, 30, 10).to_vec();
         assert_eq!(batch.iter().filter(|index| **index >= 30).count(), 2, "0.3 · 5 is rounded");
     }
 }

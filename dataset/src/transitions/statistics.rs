@@ -1,6 +1,6 @@
 //! Summary statistics of a dataset.
 
-use crate::statistics::{Episode, Figures};
+use crate::statistics::{Episode, Summary};
 use crate::tables::environment::EnvironmentSpec;
 
 /// Size of a dataset and quality of its behavior policy, by the recorded rewards.
@@ -26,7 +26,7 @@ impl Statistics {
         transitions: usize,
         episodes: &[Episode],
     ) -> Self {
-        let returns = Figures::of(&Vec::from_iter(episodes.iter().map(|episode| episode.sum)));
+        let returns = Summary::of(&Vec::from_iter(episodes.iter().map(|episode| episode.sum)));
         Self {
             transitions,
             episodes: episodes.len(),

@@ -1,3 +1,5 @@
+//! Episodes, windows, scaling and experience of transitions.
+
 use quad_kernels::scaling::Affine;
 
 use super::*;
@@ -102,7 +104,7 @@ fn windows_of_steps_end_with_their_episode() {
         .concat(),
         rewards: vec![3.0, 0.5, 5.0, 5.0, 8.0],
         next_observations: vec![13.0, 2.0, 5.0, 6.0, 14.0],
-        // The third one's episode terminates, the others go on or are cut off.
+        // The third one's episode terminates, the others go on or are truncated.
         masks: vec![0.25, 0.5, 0.0, 1.0, 0.5],
         steps: vec![3, 2, 2, 1, 2],
         size: 5,

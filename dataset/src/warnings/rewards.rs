@@ -3,7 +3,7 @@
 use super::ends::MOST_AFTER_GOAL;
 use super::{percent, short};
 use crate::recording::Recording;
-use crate::statistics::Figures;
+use crate::statistics::Summary;
 use crate::tables::reward::RewardScaling;
 
 /// Relative difference that float32 critics lose: Q-values are some hundred times the rewards.
@@ -70,7 +70,7 @@ pub(super) fn after_goal(recording: &Recording) -> Option<String> {
 }
 
 pub(super) fn size(recording: &Recording) -> Option<String> {
-    let size = RewardScaling::default().size(recording);
+    let size = RewardScaling::default().rms(recording);
     let rewards = recording.transitions().map(|row| recording.rewards[row].abs());
     let largest = rewards.fold(0.0, f32::max);
     let weights = match size > LARGEST {
@@ -81,7 +81,7 @@ pub(super) fn size(recording: &Recording) -> Option<String> {
         false => return None,
     };
     let sums = recording.episodes().into_iter().map(|episode| episode.sum);
-    let returns = Figures::of(&Vec::from_iter(sums));
+    let returns = Summary::of(&Vec::from_iter(sums));
     Some(format!(
         "array `rewards`: of size {} a step (root mean square; episodes return {} to {}), where methods are made for about 1: \
          {weights}; `learner train --normalize rewards` divides them by it",

@@ -4,7 +4,7 @@ use super::{named, short};
 use crate::error::such_rows;
 use crate::normalize::Normalize;
 use crate::recording::{Recording, RowKind};
-use crate::statistics::Figures;
+use crate::statistics::Summary;
 
 /// Largest accepted root mean square of a dimension. At this size of one of a simulated cart's
 /// four, IQL's critic loss after 3,000 steps was twice that with all near 1; at three times,
@@ -24,8 +24,8 @@ pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String
         recording;
     let mut warnings = Vec::new();
     let is_transition = |row: usize| kinds[row] == RowKind::Transition;
-    let columns = Figures::of_columns(observations, *observation_dim, is_transition);
-    let is_large = |column: &Figures| (column.size > LARGEST).then_some(column.size);
+    let columns = Summary::of_columns(observations, *observation_dim, is_transition);
+    let is_large = |column: &Summary| (column.rms > LARGEST).then_some(column.rms);
     let large = most(&columns, is_large);
     let errors = large.as_ref().and_then(|(large, _)| errors(recording, large));
     let is_scaled = normalize.observations || errors.is_some();
@@ -40,12 +40,12 @@ pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String
     if !normalize.observations {
         warnings.extend(small("observations", &columns, &names.observations));
     }
-    let columns = Figures::of_columns(actions, *action_dim, |row| recording.is_step(row));
+    let columns = Summary::of_columns(actions, *action_dim, |row| recording.is_step(row));
     if !normalize.actions {
         warnings.extend(small("actions", &columns, &names.actions));
     }
     // Outside of [-1, 1] they must be normalized.
-    let is_outside = |column: &Figures| column.min < -1.0 || column.max > 1.0;
+    let is_outside = |column: &Summary| column.min < -1.0 || column.max > 1.0;
     if normalize.actions || columns.iter().any(is_outside) {
         warnings.extend((0..*action_dim).find_map(|column| outliers(recording, column)));
     }
@@ -90,9 +90,9 @@ fn errors(recording: &Recording, large: &[usize]) -> Option<String> {
     ))
 }
 
-fn small(array: &str, columns: &[Figures], names: &[String]) -> Option<String> {
-    let is_small = |Figures { size, deviation, .. }: &Figures| {
-        (*deviation < SMALLEST && *deviation > ROUNDING * size).then_some(*deviation)
+fn small(array: &str, columns: &[Summary], names: &[String]) -> Option<String> {
+    let is_small = |Summary { rms, deviation, .. }: &Summary| {
+        (*deviation < SMALLEST && *deviation > ROUNDING * rms).then_some(*deviation)
     };
     let (small, largest) = most(columns, is_small)?;
     Some(format!(
@@ -103,12 +103,9 @@ fn small(array: &str, columns: &[Figures], names: &[String]) -> Option<String> {
     ))
 }
 
-/// Columns with a figure, and the largest figure.
-fn most(
-    columns: &[Figures],
-    figure: impl Fn(&Figures) -> Option<f64>,
-) -> Option<(Vec<usize>, f64)> {
-    let found = columns.iter().enumerate().filter_map(|(i, column)| Some((i, figure(column)?)));
-    let (found, figures): (Vec<usize>, Vec<f64>) = found.unzip();
-    Some((found, figures.into_iter().reduce(f64::max)?))
+/// Columns with a value, and the largest value.
+fn most(columns: &[Summary], value: impl Fn(&Summary) -> Option<f64>) -> Option<(Vec<usize>, f64)> {
+    let found = columns.iter().enumerate().filter_map(|(i, column)| Some((i, value(column)?)));
+    let (found, values): (Vec<usize>, Vec<f64>) = found.unzip();
+    Some((found, values.into_iter().reduce(f64::max)?))
 }

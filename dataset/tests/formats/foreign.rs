@@ -267,7 +267,7 @@ fn an_archive_of_short_numbers_is_read() {
     let batch = all(&read(&path, None, RewardRule::AsIs));
     assert_eq!(batch.next_observations, [0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75]);
     assert_eq!(batch.rewards, [0.0, -3.0, -6.0, -9.0, -12.0, -15.0, -18.0]);
-    // A trajectory that ends where nothing more is to be gained is not cut off.
+    // A trajectory that ends where nothing more is to be gained is not truncated.
     for (last, terminals, timeouts) in [(0, 1.0 / 7.0, 0.0), (1, 0.0, 1.0 / 7.0)] {
         write_archive(&path, Some([1, 1, 1, 1, 1, 1, last, last]));
         let inspection = inspect(&path, None).unwrap();

@@ -24,7 +24,7 @@ use crate::metrics::Metrics;
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
 /// Time that a leaving evaluator has to deliver its scores; half of it to hand a job back.
 const LEAVE: Duration = Duration::from_secs(2);
-/// The same for an episode of practice, which has many pieces.
+/// Time that a leaving evaluator has to deliver an episode of practice, which has many pieces.
 const LEAVE_EPISODE: Duration = Duration::from_secs(6);
 /// Pause of a leaving evaluator after a learner's error.
 const RETRY: Duration = Duration::from_millis(100);

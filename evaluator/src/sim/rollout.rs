@@ -17,7 +17,7 @@ pub struct Rollout<S> {
     observation_dim: usize,
     action_dim: usize,
     live: Vec<Live>,
-    /// One per live episode.
+    /// Policy state of each live episode.
     states: Vec<S>,
     /// [live, observation_dim]
     observations: Vec<f32>,
@@ -200,7 +200,7 @@ impl Live {
 
     fn score(&mut self) -> Result<EpisodeScore, EnvironmentError> {
         let EpisodeScore { seed, episode_return, length, .. } = self.score;
-        let check = |what, value| match EpisodeScore::counts(value) {
+        let check = |what, value| match EpisodeScore::is_in_range(value) {
             true => Ok(value),
             false => Err(EnvironmentError::NotCounted { what, seed, value, length }),
         };

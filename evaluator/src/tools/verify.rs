@@ -7,8 +7,8 @@ use std::path::Path;
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::find;
 use quad_dataset::{
-    ArrayProblem, DatasetError, EnvironmentSpec, Problem, RecordedRows, Row,
-    environments_of_its_sizes, recorded_environment,
+    ArrayProblem, DatasetError, EnvironmentSpec, Problem, RecordedRows, Row, matching_environments,
+    recorded_environment,
 };
 use quad_runtime::Hint;
 use rayon::prelude::*;
@@ -92,7 +92,7 @@ pub fn environment_of(path: &Path) -> anyhow::Result<&'static EnvironmentSpec> {
         let other = || format!("{}: recorded in an unknown environment", path.display());
         return find(&name).with_context(other).hint(ENVIRONMENT);
     }
-    let fitting = environments_of_its_sizes(path).hint_of(hint)?;
+    let fitting = matching_environments(path).hint_of(hint)?;
     if let [only] = fitting[..] {
         return Ok(only);
     }

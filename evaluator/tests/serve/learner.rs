@@ -146,30 +146,7 @@ fn answer(query: &Query, state: &Mutex<State>, weights: &Snapshot) {
         locked.events.push(Event::Piece(piece.clone()));
         locked.take(piece).into_iter().for_each(|answer| reply(query, &answer));
     } else if key == keys::scores(&run) {
-        let report: ScoreReport = decode(&payload).unwrap();
-        let new = report.episodes.len() as u32;
-        locked.events.push(Event::Scores(report));
-        locked.job = None;
-        let duplicates = 0;
-        let recorded = ScoreReply::Recorded { incarnation, new, duplicates };
-        let reason = "the sums differ".to_owned();
-        let refused = |incarnation| ScoreReply::Refused { incarnation, reason };
-        match locked.behavior {
-            Behavior::Records => reply(query, &recorded),
-            Behavior::DiskFull => {
-                // The answer of a learner that is not followed does not count.
-                reply(query, &refused(99));
-                query.reply_err("No space left on device").wait().unwrap();
-            }
-            Behavior::Refuses => reply(query, &refused(incarnation)),
-            Behavior::Hangs => {
-                drop(locked);
-                while state.lock().unwrap().behavior == Behavior::Hangs {
-                    std::thread::sleep(Duration::from_millis(20));
-                }
-            }
-            _ => {}
-        }
+        answer_scores(query, state, locked, decode(&payload).unwrap());
     } else {
         match decode(&payload).unwrap() {
             JobRequest::HandBack { failed, .. } => {
@@ -191,6 +168,38 @@ fn answer(query: &Query, state: &Mutex<State>, weights: &Snapshot) {
                 }
             }
         }
+    }
+}
+
+fn answer_scores(
+    query: &Query,
+    state: &Mutex<State>,
+    mut locked: MutexGuard<State>,
+    report: ScoreReport,
+) {
+    let incarnation = locked.incarnation;
+    let new = report.episodes.len() as u32;
+    locked.events.push(Event::Scores(report));
+    locked.job = None;
+    let duplicates = 0;
+    let recorded = ScoreReply::Recorded { incarnation, new, duplicates };
+    let reason = "the sums differ".to_owned();
+    let refused = |incarnation| ScoreReply::Refused { incarnation, reason };
+    match locked.behavior {
+        Behavior::Records => reply(query, &recorded),
+        Behavior::DiskFull => {
+            // The answer of a learner that is not followed does not count.
+            reply(query, &refused(99));
+            query.reply_err("No space left on device").wait().unwrap();
+        }
+        Behavior::Refuses => reply(query, &refused(incarnation)),
+        Behavior::Hangs => {
+            drop(locked);
+            while state.lock().unwrap().behavior == Behavior::Hangs {
+                std::thread::sleep(Duration::from_millis(20));
+            }
+        }
+        _ => {}
     }
 }
 

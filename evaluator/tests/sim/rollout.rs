@@ -149,7 +149,7 @@ fn any_environment_has_its_own_scores_and_errors() {
     assert_eq!(broken, "the environment \"counter\" failed: a cable is loose");
 }
 
-/// Ends after as many steps as its seed: terminates with seed 1, is cut off with 2, and both with 3.
+/// Ends after as many steps as its seed: terminates with seed 1, is truncated with 2, both with 3.
 /// A person takes the second step.
 #[derive(Default)]
 struct Scripted([f64; 2]);

@@ -10,18 +10,18 @@ use quad_dataset::Transitions;
 use quad_run::config::RunConfig;
 use quad_runtime::print;
 
-use crate::train::Price;
+use crate::train::RunCost;
 
 pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
     let experiment = &config.experiment;
     let steps = experiment.total_steps() - experiment.schedule().start;
-    let price = Price::measure(experiment, config.run.device, transitions)?;
-    let milliseconds = price.step_seconds * 1e3;
-    let all = Duration::try_from_secs_f64((price.step_seconds * steps as f64).ceil());
+    let cost = RunCost::measure(experiment, config.run.device, transitions)?;
+    let milliseconds = cost.step_seconds * 1e3;
+    let all = Duration::try_from_secs_f64((cost.step_seconds * steps as f64).ceil());
     let all = HumanDuration(all.unwrap_or(Duration::MAX));
     let (mut grows, mut kept) = (String::new(), "snapshots and checkpoints");
     if let Some(online) = &experiment.online {
-        let bytes = HumanBytes(price.experience_bytes(online.steps));
+        let bytes = HumanBytes(cost.experience_bytes(online.steps));
         (grows, kept) =
             (format!("; experience adds {bytes}"), "snapshots, checkpoints and experience");
     }
@@ -31,7 +31,7 @@ pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> an
         path.display(),
         config.dataset.summary(),
         peak_memory().map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string()),
-        HumanBytes(price.bytes(experiment)),
+        HumanBytes(cost.bytes(experiment)),
         toml::to_string(experiment)?,
     ))
 }

@@ -7,7 +7,7 @@ use quad_dataset::environment;
 use quad_run::config::Experiment;
 use quad_runtime::{
     Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Hint, Role, SessionError,
-    certificates_folder, default_endpoint, threads_asked,
+    certificates_folder, default_endpoint, requested_threads,
 };
 use tracing::{info, warn};
 
@@ -73,7 +73,7 @@ impl Outside {
 /// core, up to a limit.
 pub(super) fn training_threads(asked: Option<NonZero<usize>>) -> usize {
     let cores = available_parallelism().map_or(1, NonZero::get);
-    let asked = asked.or_else(threads_asked);
+    let asked = asked.or_else(requested_threads);
     asked.map_or(cores.min(MOST_THREADS), NonZero::get)
 }
 

@@ -11,7 +11,7 @@ use quad_run::counted;
 use quad_run::folder::{Lock, RunDirError};
 use quad_run::status::State;
 use quad_run::table::{Style, Table};
-use quad_runtime::{Hint, SessionError, open_router, print, threads_asked, unfinished};
+use quad_runtime::{Hint, SessionError, open_router, print, requested_threads, unfinished};
 use tokio::sync::mpsc;
 use tokio::task::LocalSet;
 use tracing::{info, warn};
@@ -20,7 +20,7 @@ use super::all_readable;
 use super::train::record_hint;
 use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
-use crate::sweep::{Cost, LearnerOptions, Outcome, PlannedRun, Study, Sweep};
+use crate::sweep::{LearnerOptions, Outcome, PlannedRun, Study, StudyCost, Sweep};
 
 type Runs = Vec<(PlannedRun, State)>;
 
@@ -136,7 +136,7 @@ fn obtain(left: &Runs, is_alone: bool) -> anyhow::Result<Datasets> {
 }
 
 fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Outcome> {
-    let threads = threads_asked().map_or(1, usize::from);
+    let threads = requested_threads().map_or(1, usize::from);
     let cores = available_parallelism()?.get();
     let (jobs, cores) = shares(cores, threads, args.jobs, left.len());
     let count = match (&args.connect, args.evaluators) {
@@ -152,7 +152,7 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     let mut step_seconds = BTreeMap::new();
     // A single run, such as a task of an array job, starts at once and prints its own forecast.
     if args.index.is_none() {
-        let cost = Cost::measure(&left, |run| datasets[&run.experiment.dataset].as_deref())?;
+        let cost = StudyCost::measure(&left, |run| datasets[&run.experiment.dataset].as_deref())?;
         info!("{}", cost.text(jobs));
         step_seconds = cost.step_seconds;
     }

@@ -8,6 +8,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
 use prometheus::Registry;
+use quad_algorithms::Agent;
 use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
@@ -170,7 +171,7 @@ async fn run_to_end(
     config: &RunConfig,
     data: Split,
 ) -> anyhow::Result<(RunDir, Ending)> {
-    let (run, experiment, device) = (&config.run.name, &config.experiment, config.run.device);
+    let (run, experiment) = (&config.run.name, &config.experiment);
     let (metrics, registry) =
         Metrics::new(run, experiment.total_steps(), experiment.definition()?.metrics)?;
     let health = Health::default();
@@ -185,23 +186,10 @@ async fn run_to_end(
     let server = serve_page(args.http, path, page_state, registry).await?;
     let (o, a) = (data.training.observation_dim(), data.training.action_dim());
     let task = Task::new(&experiment.environment, o, a);
-    let mut agent = begin(experiment, device, data.training)?;
-    if let Some(Checkpoint { state, .. }) = &first {
-        let loaded =
-            agent.load(state).hint("networks stay as they are: leave out what changes them");
-        loaded.context("the last checkpoint of --from does not fit")?;
-    }
-    let held_out = data.held_out;
-    let held_out = held_out.and_then(|data| HeldOut::new(experiment, device, data, &mut agent));
+    let (agent, held_out) = begin_agent(config, data, first.as_ref())?;
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
-    let (dir, scores, mut past) = open_or_create(path, begun, args.fresh, config)?;
-    if past.checkpoint.is_none()
-        && let Some(first) = first
-    {
-        dir.write_checkpoint(&first)?;
-        past.checkpoint = Some(first);
-    }
+    let (dir, scores, past) = open_or_create(path, (begun, first), args.fresh, config)?;
     // A later start has a larger number; the low bits distinguish two that start in the same
     // millisecond.
     let number = now()? << 16 | u64::from(rand::random::<u16>());
@@ -237,6 +225,23 @@ async fn run_to_end(
     Ok((dir, main_loop.run(opening).await))
 }
 
+/// The agent, which begins with the checkpoint of `--from`, and its metrics on held-out episodes.
+fn begin_agent(
+    config: &RunConfig,
+    data: Split,
+    first: Option<&Checkpoint>,
+) -> anyhow::Result<(Agent, Option<HeldOut>)> {
+    let (experiment, device) = (&config.experiment, config.run.device);
+    let mut agent = begin(experiment, device, data.training)?;
+    if let Some(Checkpoint { state, .. }) = first {
+        let loaded =
+            agent.load(state).hint("networks stay as they are: leave out what changes them");
+        loaded.context("the last checkpoint of --from does not fit")?;
+    }
+    let held_out = data.held_out.and_then(|it| HeldOut::new(experiment, device, it, &mut agent));
+    Ok((agent, held_out))
+}
+
 /// Serves the page and the metrics of the run in a folder.
 async fn serve_page(
     address: SocketAddr,
@@ -253,19 +258,28 @@ async fn serve_page(
     Ok(server)
 }
 
+/// The run in the folder, or a new one; without a checkpoint of its own it begins with `first`.
 fn open_or_create(
     path: &Path,
-    begun: Option<ExistingRun>,
+    (begun, first): (Option<ExistingRun>, Option<Checkpoint>),
     fresh: bool,
     config: &RunConfig,
 ) -> anyhow::Result<(RunDir, Log, ResumePoint)> {
-    match begun {
-        Some(begun) if !fresh => return Ok(begun.resume(&config.experiment)?),
-        Some(begun) => begun.set_aside()?,
-        None => {}
+    let (dir, scores, mut past) = match begun {
+        Some(begun) if !fresh => begun.resume(&config.experiment)?,
+        begun => {
+            begun.map_or(Ok(()), ExistingRun::set_aside)?;
+            let (dir, scores) = RunDir::create(path, config)?;
+            (dir, scores, ResumePoint::default())
+        }
+    };
+    if past.checkpoint.is_none()
+        && let Some(first) = first
+    {
+        dir.write_checkpoint(&first)?;
+        past.checkpoint = Some(first);
     }
-    let (run_dir, scores) = RunDir::create(path, config)?;
-    Ok((run_dir, scores, ResumePoint::default()))
+    Ok((dir, scores, past))
 }
 
 /// Milliseconds since 1970.

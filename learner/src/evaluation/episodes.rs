@@ -38,7 +38,7 @@ pub(super) struct Evaluation {
     waiting: BTreeSet<usize>,
     /// Indices of the episodes that are handed out, with their jobs.
     handed_out: BTreeMap<usize, u64>,
-    /// Indices of the episodes that are not waited for any more. Their scores are still accepted.
+    /// Indices of the episodes that are not waited for anymore. Their scores are still accepted.
     given_up: BTreeSet<usize>,
 }
 
@@ -98,7 +98,7 @@ impl Evaluation {
         self.waiting.len()
     }
 
-    /// Seeds of the episodes that have no score and are not handed out any more.
+    /// Seeds of the episodes that have no score and are not handed out anymore.
     pub fn given_up(&self) -> impl Iterator<Item = u64> {
         self.given_up.iter().map(|&index| self.episodes[index].seed)
     }

@@ -17,12 +17,12 @@ use super::refusal::{Refusal, require};
 /// one for each evaluator, so that hundreds of idle ones do not keep the learner busy. A new
 /// snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
-/// The same while there is practice to play, for which training may wait.
+/// [`ASK_AGAIN`] while there is practice to play, for which training may wait.
 const ASK_FOR_PRACTICE: [Duration; 2] = [Duration::from_millis(20); 2];
-/// The same between two episodes of practice: training comes to the next one when it has learned
-/// from another, which may be short.
+/// [`ASK_AGAIN`] between two episodes of practice: training comes to the next one when it has
+/// learned from another, which may be short.
 const ASK_BETWEEN: [Duration; 2] = [Duration::from_millis(100), Duration::from_millis(20)];
-/// Time between an evaluator's progress messages, likewise.
+/// Time between an evaluator's progress messages, by the rule of [`ASK_AGAIN`].
 const PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(40)];
 /// Longest time between progress messages.
 const LONGEST_PROGRESS: Duration = Duration::from_secs(20);
@@ -178,7 +178,7 @@ impl Scoreboard {
         self.of_evaluations().filter(|evaluation| evaluation.pending() > 0).count()
     }
 
-    /// Step and seed of the episodes that have no score and are not handed out any more.
+    /// Step and seed of the episodes that have no score and are not handed out anymore.
     pub fn missing(&self) -> Vec<(u64, u64)> {
         let mut missing = Vec::new();
         for evaluation in self.evaluations.values() {

@@ -64,8 +64,8 @@ impl Scoreboard {
         let longest = task.max_episode_steps().unwrap_or(usize::MAX);
         let length_fits = (1..=longest).contains(&(score.length as usize));
         length_fits
-            && EpisodeScore::counts(score.episode_return)
-            && EpisodeScore::counts(score.score)
+            && EpisodeScore::is_in_range(score.episode_return)
+            && EpisodeScore::is_in_range(score.score)
             && (score.score - expected).abs() <= SCORE_TOLERANCE * expected.abs().max(1.0)
     }
 }

@@ -141,7 +141,7 @@ impl Evaluation<'_> {
 fn updates(fqe: &mut Fqe, sampler: &mut BatchSampler, steps: Range<u64>) -> anyhow::Result<f64> {
     let mut losses = Vec::new();
     for step in steps {
-        let metrics = fqe.update(step, sampler.next_items())?;
+        let metrics = fqe.update(step, sampler.next_indices())?;
         let loss = metrics.iter().find(|(name, _)| *name == "critic_loss");
         losses.extend(loss.map(|(_, loss)| *loss));
     }

@@ -129,7 +129,7 @@ fn of_method(method: &Method) -> MethodReport {
     }
 }
 
-/// None without a common task.
+/// `None` without a common task.
 fn compare(method: &Method, against: &Method) -> Option<Comparison> {
     let (mut tasks, mut x, mut y, mut differences) = (vec![], Runs::new(), Runs::new(), vec![]);
     for one in method {

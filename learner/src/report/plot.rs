@@ -148,7 +148,7 @@ impl Plot {
             .margin_right(36 * scale)
             .x_label_area_size(44 * scale)
             .y_label_area_size(56 * scale)
-            .build_cartesian_2d(x.clone(), y.clone())?;
+            .build_cartesian_2d(x, y)?;
         // A logarithmic axis has labels at whole powers of ten.
         let label = |x: &f64| match self.is_log {
             true if (x - x.round()).abs() > 1e-6 => String::new(),
@@ -164,20 +164,7 @@ impl Plot {
             .x_label_formatter(&label)
             .light_line_style(WHITE)
             .draw()?;
-        let dashed = |ends: [(f64, f64); 2], width| {
-            let style = REFERENCE.stroke_width(width * scale);
-            DashedLineSeries::new(ends, 6 * scale, 4 * scale, style)
-        };
-        for (name, y) in &self.references {
-            let line = dashed([(x.start, *y), (x.end, *y)], 2);
-            let drawn = chart.draw_series(line)?.label(name);
-            drawn.legend(legend(REFERENCE, scale));
-        }
-        for step in self.begins.iter().map(|step| *step as f64) {
-            chart.draw_series(dashed([(step, y.start), (step, y.end)], 1))?;
-            let at = (step, y.start + 0.04 * (y.end - y.start));
-            chart.draw_series([Text::new(" practice", at, font(13).color(&REFERENCE))])?;
-        }
+        self.draw_dashed(&mut chart, scale)?;
         for (line, color) in self.lines.iter().zip(COLORS.iter().cycle()) {
             line.draw(&mut chart, *color, scale)?;
         }
@@ -193,6 +180,30 @@ impl Plot {
             .background_style(WHITE.mix(0.8))
             .border_style(REFERENCE.mix(0.4))
             .draw()?;
+        Ok(())
+    }
+
+    /// Draws the references, and where practice begins.
+    fn draw_dashed<DB: DrawingBackend>(&self, chart: &mut Chart<DB>, scale: u32) -> Drawn
+    where
+        DB::ErrorType: 'static,
+    {
+        let (x, y) = self.limits();
+        let dashed = |ends: [(f64, f64); 2], width| {
+            let style = REFERENCE.stroke_width(width * scale);
+            DashedLineSeries::new(ends, 6 * scale, 4 * scale, style)
+        };
+        for (name, y) in &self.references {
+            let line = dashed([(x.start, *y), (x.end, *y)], 2);
+            let drawn = chart.draw_series(line)?.label(name);
+            drawn.legend(legend(REFERENCE, scale));
+        }
+        let font = ("sans-serif", 13 * scale).into_font();
+        for step in self.begins.iter().map(|step| *step as f64) {
+            chart.draw_series(dashed([(step, y.start), (step, y.end)], 1))?;
+            let at = (step, y.start + 0.04 * (y.end - y.start));
+            chart.draw_series([Text::new(" practice", at, font.color(&REFERENCE))])?;
+        }
         Ok(())
     }
 

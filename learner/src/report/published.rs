@@ -52,7 +52,7 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
         }
         table.push(row);
     }
-    let last = published::last(&groups[0].task);
+    let last = published::final_evaluations(&groups[0].task);
     let score = match select {
         Select::Last => format!("the mean of its last {last} evaluations"),
         Select::Best => "its best evaluation".to_owned(),

@@ -6,7 +6,7 @@ use quad_run::results::RunReport;
 use quad_run::results::departures::as_given;
 
 /// `learner train` with all settings that decide the outcome of the run; a comment if it goes on from
-/// another run, whose folder is not known. None if the run is of no task that this learner has, or
+/// another run, whose folder is not known. `None` if the run is of no task that this learner has, or
 /// lacks a value of its task.
 pub fn command(run: &RunReport) -> Option<String> {
     let experiment = &run.config.experiment;

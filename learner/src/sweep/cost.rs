@@ -13,13 +13,13 @@ use tracing::warn;
 
 use super::study::PlannedRun;
 use crate::data::{load, warnings};
-use crate::train::Price;
+use crate::train::RunCost;
 
 /// Further configurations are assumed to cost as much as the mean of these.
 const MAX_MEASURED: usize = 20;
 
 #[derive(Default)]
-pub(crate) struct Cost {
+pub(crate) struct StudyCost {
     /// Seconds of a gradient step, by the run's index.
     pub step_seconds: BTreeMap<usize, f64>,
     /// Remaining training time of all runs together.
@@ -29,7 +29,7 @@ pub(crate) struct Cost {
     measured: usize,
 }
 
-impl Cost {
+impl StudyCost {
     /// Measures the runs whose dataset is on this machine. A run that cannot start costs nothing;
     /// its learner will report the error.
     pub fn measure<'a>(
@@ -45,41 +45,41 @@ impl Cost {
                     warn!("{warning}");
                 }
             }
-            one_thread.install(|| Price::measure(&run.experiment, Device::Cpu, transitions))
+            one_thread.install(|| RunCost::measure(&run.experiment, Device::Cpu, transitions))
         };
-        let mut prices: BTreeMap<String, Price> = BTreeMap::new();
+        let mut costs: BTreeMap<String, RunCost> = BTreeMap::new();
         for (run, _) in runs {
             let key = configuration(run);
-            if prices.len() == MAX_MEASURED || prices.contains_key(&key) {
+            if costs.len() == MAX_MEASURED || costs.contains_key(&key) {
                 continue;
             }
-            let price = dataset(run).map(|path| measure(run, path)).transpose();
-            let price = price.unwrap_or_else(|error| {
+            let cost = dataset(run).map(|path| measure(run, path)).transpose();
+            let cost = cost.unwrap_or_else(|error| {
                 warn!("the run {} cannot begin: {error:#}", run.name);
                 None
             });
-            prices.insert(key, price.unwrap_or_default());
+            costs.insert(key, cost.unwrap_or_default());
         }
-        let known = prices.values().filter(|price| price.step_seconds > 0.0);
+        let known = costs.values().filter(|cost| cost.step_seconds > 0.0);
         let measured = known.count();
-        let mean = |value: fn(&Price) -> f64| {
-            prices.values().map(value).sum::<f64>() / measured.max(1) as f64
+        let mean = |value: fn(&RunCost) -> f64| {
+            costs.values().map(value).sum::<f64>() / measured.max(1) as f64
         };
-        let mean = Price {
-            step_seconds: mean(|price| price.step_seconds),
-            snapshot_bytes: mean(|price| price.snapshot_bytes as f64) as u64,
-            checkpoint_bytes: mean(|price| price.checkpoint_bytes as f64) as u64,
-            row_bytes: mean(|price| price.row_bytes as f64) as u64,
+        let mean = RunCost {
+            step_seconds: mean(|cost| cost.step_seconds),
+            snapshot_bytes: mean(|cost| cost.snapshot_bytes as f64) as u64,
+            checkpoint_bytes: mean(|cost| cost.checkpoint_bytes as f64) as u64,
+            row_bytes: mean(|cost| cost.row_bytes as f64) as u64,
         };
-        let mut cost = Self { measured, ..Self::default() };
+        let mut all = Self { measured, ..Self::default() };
         for (run, state) in runs {
-            let price = prices.get(&configuration(run)).copied().unwrap_or(mean);
+            let cost = costs.get(&configuration(run)).copied().unwrap_or(mean);
             let steps = run.experiment.total_steps();
-            cost.step_seconds.insert(run.index, price.step_seconds);
-            cost.seconds += price.step_seconds * (steps - state.step(steps).min(steps)) as f64;
-            cost.bytes += price.bytes(&run.experiment);
+            all.step_seconds.insert(run.index, cost.step_seconds);
+            all.seconds += cost.step_seconds * (steps - state.step(steps).min(steps)) as f64;
+            all.bytes += cost.bytes(&run.experiment);
         }
-        Ok(cost)
+        Ok(all)
     }
 
     /// The cost in words, with this many runs at a time.

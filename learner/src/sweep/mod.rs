@@ -16,7 +16,7 @@ mod rules;
 mod scheduler;
 mod study;
 
-pub(crate) use cost::Cost;
+pub(crate) use cost::StudyCost;
 pub(crate) use learner_process::LearnerOptions;
 pub(crate) use scheduler::{Outcome, Sweep};
 pub(crate) use study::{PlannedRun, Study};

@@ -54,7 +54,7 @@ impl HeldOut {
     /// Draws the batches by the seed, for a run of this many steps.
     pub(super) fn of(agent: Agent, batch_size: usize, seed: u64, steps: u64) -> Self {
         let mut sampler = BatchSampler::new(agent.dataset_len(), batch_size, seed, 0);
-        let batches = (0..BATCHES).map(|_| sampler.next_items().to_vec()).collect();
+        let batches = (0..BATCHES).map(|_| sampler.next_indices().to_vec()).collect();
         let every = steps.div_ceil(MEASUREMENTS).next_multiple_of(STEPS_PER_ROW);
         Self { agent, batches, every, has_warned: false }
     }

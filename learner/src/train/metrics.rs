@@ -81,7 +81,7 @@ pub(crate) struct TrainingMetrics {
     pub diverged: IntGauge,
     /// The algorithm's metrics, in its order.
     pub algorithm: Vec<(&'static Metric, OptionalGauge)>,
-    /// The same on held-out episodes.
+    /// The algorithm's metrics on held-out episodes, in the same order.
     held_out: Vec<OptionalGauge>,
 }
 

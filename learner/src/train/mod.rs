@@ -7,25 +7,25 @@
 //!
 //! In reading order: `training` (the loop), `practice` (the order of experience and gradient steps),
 //! `agent` and `device`, `held_out` (metrics on episodes that are kept out), `output_queue`,
-//! `metrics`, `results`. `price` estimates the cost of a run, on its caller's thread.
+//! `metrics`, `results`. `cost` estimates the cost of a run, on its caller's thread.
 
 mod agent;
+mod cost;
 pub(crate) mod device;
 mod held_out;
 mod metrics;
 mod output_queue;
 mod practice;
-mod price;
 mod results;
 #[cfg(test)]
 mod tests;
 mod training;
 
 pub(crate) use agent::{begin, origin, resume};
+pub(crate) use cost::RunCost;
 pub(crate) use held_out::HeldOut;
 pub(crate) use metrics::{PracticeMetrics, TrainingMetrics, metrics, register};
 pub(crate) use output_queue::{Output, OutputQueue};
 pub(crate) use practice::{COLUMNS, Inbox, Practice};
-pub(crate) use price::Price;
 pub(crate) use results::{Outcome, TrainedPolicy};
 pub(crate) use training::Training;

@@ -188,6 +188,6 @@ impl Practice {
     /// The rows of gradient step `step`, the first of which is 1.
     pub fn batch(&mut self, step: u64) -> &[u32] {
         let Self { transitions, sampler, .. } = self;
-        sampler.items(step, transitions.len(), transitions.experience_len())
+        sampler.indices(step, transitions.len(), transitions.experience_len())
     }
 }

@@ -22,9 +22,9 @@ use quad_runtime::{Health, Heartbeat};
 
 use super::TrainingMetrics;
 use super::agent::origin;
+use super::cost::mean_step;
 use super::held_out::HeldOut;
 use super::output_queue::{Output, OutputQueue};
-use super::price::mean_step;
 use super::results::{Outcome, Row, TrainedPolicy};
 use super::training::{TrainError, Training};
 

@@ -105,7 +105,7 @@ impl Training {
             let online = self.practice.as_mut().filter(|practice| practice.has_begun(step - 1));
             let batch = match online {
                 Some(practice) => practice.batch(step),
-                None => self.sampler.next_items(),
+                None => self.sampler.next_indices(),
             };
             let values = self.agent.update(batch).map_err(TrainError::at(step))?;
             let infinite = measured(metrics, &values).find(|(_, value)| !value.is_finite());

@@ -118,7 +118,7 @@ pub fn small(seed: u64, shift: f64) -> Run {
     run
 }
 
-/// The same with practice after 3,000 steps.
+/// The run of [`small`] with practice after 3,000 steps.
 pub fn practiced() -> Run {
     let online = toml::toml! {
         steps = 2000

@@ -23,7 +23,7 @@ pub(crate) struct Architecture {
     pub schedule: Schedule,
     /// Sinusoids of t = 0..T, `(1 + T) × 16`.
     pub features: Vec<f32>,
-    /// The same as a tensor, made when first needed.
+    /// `features` as a tensor, made when first needed.
     pub features_tensor: OnceLock<Tensor>,
     /// The coefficients of all reverse steps, made when first needed.
     #[cfg(feature = "cuda")]

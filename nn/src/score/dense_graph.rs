@@ -215,7 +215,7 @@ struct Operation {
     chunks: Pooled<Vec<Chunk>>,
 }
 
-/// Rows of a chunk.
+/// Rows of a chunk: a tile or more, so that there are at most [`CHUNKS`].
 fn chunk_len(rows: usize) -> usize {
     rows.div_ceil(CHUNKS).max(TILE)
 }

@@ -15,7 +15,7 @@ use std::sync::Arc;
 
 /// Number of random frequencies, each with a sine and a cosine of t.
 const FREQUENCIES: usize = 16;
-/// Their standard deviation.
+/// Standard deviation of the random frequencies.
 const SPREAD: f32 = 30.0;
 /// Length of the embeddings of state and time.
 const EMBEDDING: usize = 2 * FREQUENCIES;

@@ -6,7 +6,7 @@ use crate::kinds::planner::{CHUNK, DiffuserShape, Planner};
 use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Choice, Rule};
 use crate::sampling::episode::EpisodeState;
-use quad_nn::{Precision, Tensors, TrajectoryModel, TrajectoryValue, Weighted, Weights, bytes};
+use quad_nn::{Precision, Tensors, TrajectoryModel, TrajectoryValue, Weighted, Weights, f32_bytes};
 use std::sync::Arc;
 
 /// Prefixes of the tensors' names.
@@ -134,7 +134,7 @@ impl Policy for DiffuserPolicy {
         let noise = trajectory * self.shape().diffusion_steps as u128;
         let drawn = rows * (noise + 2 * self.taken() as u128 + 2);
         let observations = 2 * (states * self.shape().observation_dim) as u128;
-        bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape().floats())
+        f32_bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape().floats())
     }
 
     fn noise(&self) -> Vec<usize> {

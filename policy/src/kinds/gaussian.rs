@@ -8,7 +8,7 @@ use crate::sampling::episode::EpisodeState;
 use candle_core::{Device, Tensor};
 use quad_nn::{
     Ensemble, EnsembleShape, Init, Layout, MlpConfig, Precision, TensorSpec, Tensors, Weighted,
-    bytes, read, take,
+    f32_bytes, read, take,
 };
 use serde::{Deserialize, Serialize};
 
@@ -139,7 +139,7 @@ impl Policy for GaussianPolicy {
         let states = states as u128;
         // Actions, and what exploring draws: noise, σ and their product.
         let numbers = states * (self.observation_dim() + 6 * self.action_dim()) as u128;
-        bytes(self.shape.actor().floats(states, 1) + numbers)
+        f32_bytes(self.shape.actor().floats(states, 1) + numbers)
     }
 
     fn act(

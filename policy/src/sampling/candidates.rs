@@ -5,7 +5,7 @@ use crate::policy::{Policy, Samples};
 use crate::sampling::choice::{Choice, Rule};
 use crate::sampling::episode::EpisodeState;
 use candle_core::{Device, Tensor};
-use quad_nn::{Ensemble, NoisePredictor, Precision, bytes, read};
+use quad_nn::{Ensemble, NoisePredictor, Precision, f32_bytes, read};
 use std::sync::Arc;
 
 /// Networks that draw candidates.
@@ -164,7 +164,7 @@ impl Policy for CandidatePolicy {
         let of_guided = |(actor, critics): (&NoisePredictor, &Ensemble)| {
             actor.guided_floats(states * candidates, critics)
         };
-        bytes(sampling + of_critics + of_states + self.guided().map_or(0, of_guided))
+        f32_bytes(sampling + of_critics + of_states + self.guided().map_or(0, of_guided))
     }
 
     fn noise(&self) -> Vec<usize> {

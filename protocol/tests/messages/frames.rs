@@ -86,8 +86,7 @@ pub fn each(test: &mut impl Check) {
     test.check(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 });
     test.check(&ScoreReply::Refused { incarnation: 1, reason: text() });
     test.check(&progress);
-    let uniform = Job { practice: Some(Exploration::Uniform), ..job };
-    test.check(&JobReply::Job(uniform));
+    test.check(&JobReply::Job(Job { practice: Some(Exploration::Uniform), ..job }));
     test.check(&Episode {
         score: EpisodeScore { length: 1, ..score(1, 4.0) },
         terminated: true,

@@ -81,7 +81,7 @@ class Worker:
         self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
         assert self.process.stdin and self.process.stdout
         self._out = self.process.stdout
-        # A process that the environment has forked may hold the pipe open for ever.
+        # A process that the environment has forked may hold the pipe open forever.
         os.set_blocking(self._out.fileno(), False)
         try:
             with self.process.stdin as pipe:

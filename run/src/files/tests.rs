@@ -28,7 +28,7 @@ const ALLOWED: [(&str, &str); 13] = [
     ("dataset/src/formats/foreign.rs", "File::open(path)"),
     ("dataset/src/formats/minari.rs", "fs::read(&path)"),
     ("dataset/src/formats/foreign.rs", "fs::read(folder"),
-    // What it has just made.
+    // A file that it has just made.
     ("dataset/src/formats/new_file.rs", "File::open(&self.partial)"),
 ];
 

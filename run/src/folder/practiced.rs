@@ -14,7 +14,7 @@ use super::verify::Findings;
 /// Another evaluator plays these episodes with the same bits.
 const REPEATABLE: &str =
     "the run can be repeated bit for bit by evaluators with the same arithmetic";
-/// The same, of an environment that QUAD does not simulate.
+/// As [`REPEATABLE`], of an environment that QUAD does not simulate.
 const IF_REPEATABLE: &str = "the run can be repeated bit for bit by evaluators with the same arithmetic, if \
                              its environment repeats itself";
 /// Some episodes depend on more than weights and seed.

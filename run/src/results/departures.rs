@@ -22,7 +22,7 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     let Ok(paper) = as_given(run, has_row) else { return Vec::new() };
     let mut departures = Vec::new();
     if select == Select::Best {
-        let last = published::last(&run.task);
+        let last = published::final_evaluations(&run.task);
         let best = format!("the best evaluation of each run, not the mean of its last {last}");
         departures.push(best);
     }

@@ -150,7 +150,7 @@ pub fn seeds(task: &str) -> usize {
 
 /// Number of final evaluations averaged for a score. If nothing is published, it is that of the
 /// first source for the task's benchmark, else the QUAD paper's.
-pub fn last(task: &str) -> usize {
+pub fn final_evaluations(task: &str) -> usize {
     let benchmark = tasks::named(task).ok().and_then(|task| task.benchmark);
     let is_like = |tables: &&Tables| Some(&tables.benchmark) == benchmark.map(|known| &known.name);
     let unpublished = SOURCES.iter().find(is_like).unwrap_or(&SOURCES[0]);

@@ -65,7 +65,7 @@ impl RunReport {
     /// Mean score of the last complete evaluations, as many as the task's published figures
     /// average; absent if there are fewer.
     pub fn score(&self) -> Option<f64> {
-        match published::last(&self.task) {
+        match published::final_evaluations(&self.task) {
             3 => self.mean_last_3,
             _ => self.mean_last_5,
         }

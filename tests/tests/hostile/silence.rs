@@ -56,7 +56,7 @@ async fn a_peer_that_reads_nothing_blocks_neither_jobs_nor_snapshots() {
     let scored = eventually("the stranger has stopped", PATIENCE, || {
         fs::read_to_string(&stat).ok()?.contains(") T ").then(|| learner.scores().len())
     });
-    // Until the learner has closed the connection; the stranger itself does nothing any more.
+    // Until the learner has closed the connection; the stranger itself does nothing anymore.
     learner.process.wait_for_log("evaluator stranger has left", PATIENCE);
     let meanwhile = learner.scores().len();
     assert!(meanwhile > scored, "no evaluator was served while the stranger read nothing");

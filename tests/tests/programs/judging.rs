@@ -51,7 +51,7 @@ fn policies_are_judged_by_the_data_alone() {
         assert_eq!((&policy["unseen"], &policy["step"]), (&true.into(), &20.into()));
         assert!((0.1..3.0).contains(&policy["distance"].as_f64().unwrap()), "{policy}");
     }
-    // The episodes have rewards 0, 1, …, 48 and are cut off there.
+    // The episodes have rewards 0, 1, …, 48 and are truncated there.
     let exact: f64 = (0..49).map(|t| 0.99_f64.powi(t) * f64::from(t)).sum();
     let recorded = found["recorded"].as_f64().unwrap();
     assert!((0.5 * exact..2.0 * exact).contains(&recorded), "{recorded}, of data {exact}");

@@ -68,7 +68,7 @@ fn a_browser_compares_finished_runs() {
         let flags = ["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"];
         scratch.learner_with(&format!("runs/{name}"), SHORT, &flags).assert_completes(PATIENCE);
     }
-    // What a folder is called is text.
+    // A folder's name is shown as text.
     let runs = scratch.path().join("runs");
     std::fs::rename(runs.join("other"), runs.join("<img src=x onerror=alert(1)>")).unwrap();
     let mut command = Command::new(binary("learner"));

@@ -124,7 +124,7 @@ fn after_the_end_of_practice_no_episode_is_handed_out_and_what_was_open_is_accep
     bench.board.end_practice();
     assert_eq!(bench.job("b", 0).practice, None);
     assert_eq!(bench.board.validate_practice(0, &episode(100)), Ok(()));
-    assert_eq!(bench.board.practice(102), None, "it is not waited for any more");
+    assert_eq!(bench.board.practice(102), None, "it is not waited for anymore");
     bench.leave("a", 1);
     assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }

@@ -39,7 +39,7 @@ fn held_out_episodes_are_measured_and_not_learned_from() {
             assert_eq!(values, held_out.measure(&state).unwrap(), "{algorithm}");
 
             let mut sampler = BatchSampler::new(30, 8, 0, 0);
-            let batches = Vec::from_iter((0..4).map(|_| sampler.next_items().to_vec()));
+            let batches = Vec::from_iter((0..4).map(|_| sampler.next_indices().to_vec()));
             let mut sums = vec![0.0; values.len()];
             for batch in batches.iter().rev() {
                 let mut fresh = held_out_agent(algorithm, 8, 1.0);

@@ -116,6 +116,6 @@ fn final_evaluations_of_a_score() {
         ("cube-single-play-singletask-v0", 3),
         ("pointmaze-medium-stitch-singletask-task2-v0", 3),
     ] {
-        assert_eq!(last(task), evaluations, "{task}");
+        assert_eq!(final_evaluations(task), evaluations, "{task}");
     }
 }

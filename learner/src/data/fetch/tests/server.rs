@@ -23,7 +23,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Serves `content` on a free port: one answer per request, the last of them for ever.
+    /// Serves `content` on a free port: one answer per request, the last of them forever.
     pub fn start(content: &[u8], answers: &[Answer]) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let url = format!("http://{}/file.hdf5", listener.local_addr().unwrap());

@@ -17,7 +17,7 @@ const MARKS: u64 = 9;
 
 /// The cost of a run.
 #[derive(Clone, Copy, Default)]
-pub(crate) struct Price {
+pub(crate) struct RunCost {
     pub step_seconds: f64,
     pub snapshot_bytes: u64,
     pub checkpoint_bytes: u64,
@@ -25,7 +25,7 @@ pub(crate) struct Price {
     pub row_bytes: u64,
 }
 
-impl Price {
+impl RunCost {
     /// Measures the first steps of each phase of a run, on the threads of the calling pool.
     pub fn measure(
         experiment: &Experiment,
@@ -82,7 +82,7 @@ pub(super) fn mean_step(
     for (begin, end) in &phases {
         let mut step = || {
             agent.skip_to(*begin);
-            agent.update(sampler.next_items())
+            agent.update(sampler.next_indices())
         };
         // The first step also allocates buffers.
         step()?;
