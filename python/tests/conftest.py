@@ -1,6 +1,9 @@
 """Shared data and small policies, made once by the package's programs."""
 
 import json
+import os
+import random
+import socket
 import subprocess
 import time
 
@@ -9,6 +12,8 @@ import pytest
 
 import quad_rl
 
+# Tests have servers on this machine, which no proxy reaches.
+os.environ["no_proxy"] = ",".join(filter(None, [os.environ.get("no_proxy") or os.environ.get("NO_PROXY"), "127.0.0.1"]))
 OBSERVATION, ACTION = 11, 3  # Hopper's.
 SMALL = '{hidden=[24, 24], activation="%s", norm=%s}'
 # Each with what it is to cover: every reverse process, rule, activation; a layer norm, a scaling, a mean.
@@ -35,6 +40,15 @@ def arrays(seed=0, n=1200):
         "terminations": row % 250 == 120,
         "truncations": row % 100 == 99,
     }
+
+
+def free_endpoint():
+    """A free port, which stays free: the system itself gives ports from 32,768 on to those who want any, or who connect."""
+    while True:
+        endpoint = "127.0.0.1", random.randrange(20_000, 30_000)
+        with socket.socket() as tried:
+            if tried.connect_ex(endpoint):
+                return "tcp/{}:{}".format(*endpoint)
 
 
 def train(folder, data, *arguments, layers=True):

@@ -1,7 +1,6 @@
 """OGBench's cube of docs/python.md: recorded by examples/cube_single.py, trained, evaluated in its environment."""
 
 import re
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 import quad_rl
+from conftest import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 # Changes that make the page's example quick.
@@ -31,9 +31,7 @@ def test_the_cube_from_recording_to_scores(tmp_path, monkeypatch):
     for there, here in QUICK.items():
         assert there in block
         block = block.replace(there, here)
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        there = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+    there = free_endpoint()
     names = {"quad_rl": quad_rl, "cube": "cube-single-singletask-v0", "there": there}
     exec(compile(block, "docs/python.md", "exec"), names)
     assert [(row["step"], row["episodes"], row["length"]) for row in names["run"].scores] == [(20, 2, 200.0)]

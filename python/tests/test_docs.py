@@ -3,10 +3,11 @@
 import json
 import re
 import shutil
-import socket
 import subprocess
 import sys
 from pathlib import Path
+
+from conftest import free_endpoint
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -25,9 +26,7 @@ def test_the_examples_run(hopper_runs, tmp_path, monkeypatch):
 
 
 def test_the_cart_practices(tmp_path):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+    endpoint = free_endpoint()
     example = (DOCS / "../examples/practice.py").read_text()
     for usual, here in [
         ("workers=2", f'workers=1, connect="{endpoint}"'),

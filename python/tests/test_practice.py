@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 
 import quad_rl
+from conftest import free_endpoint
 from test_evaluate import Learner, Walk, wait
 
 ROWS = 1_000
@@ -55,7 +56,7 @@ def test_any_number_of_evaluators_and_any_kill_make_the_same_run(tmp_path, data)
         with evaluators(whole, workers):
             code, said = whole.end()
         assert code == 0, said
-    killed = learner(folders[-1], data)
+    killed = learner(folders[-1], data, listen=free_endpoint())
     log = folders[-1] / "experience.log"
     with evaluators(killed, 2) as pool:
         for kill in range(4):

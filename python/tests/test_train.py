@@ -4,7 +4,6 @@ import io
 import os
 import pathlib
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -14,9 +13,9 @@ import urllib.request
 import pytest
 
 import quad_rl
-from conftest import arrays, train
+from conftest import arrays, free_endpoint, train
 from quad_rl import _train
-from test_evaluate import Walk, children, wait
+from test_evaluate import Walk, children, has_ended, wait
 
 SMALL = {"algorithm": "iql", "agent": {"actor": {"hidden": [16]}, "critic.hidden": [16], "value.hidden": [16]}}
 
@@ -55,9 +54,7 @@ quad_rl.train(sys.argv[1], **ast.literal_eval(sys.argv[2]))
 
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
 def test_stops_with_python_and_resumes(by, data, tmp_path):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+    endpoint = free_endpoint()
     arguments = {"run_dir": str(tmp_path / "run"), "env": "walk", "steps": 40, "eval_interval": 20, "episodes": 4}
     arguments |= {"listen": endpoint, **SMALL}
     process = subprocess.Popen([sys.executable, "-c", SCRIPT, data, repr(arguments)], stderr=subprocess.PIPE, text=True)
@@ -71,7 +68,7 @@ def test_stops_with_python_and_resumes(by, data, tmp_path):
     rest = process.communicate(timeout=600)[1]
     if by == signal.SIGINT:
         assert "interrupted before the end" in rest and "\nhint: everything up to" in rest and "KeyboardInterrupt" in rest
-    wait(lambda: not pathlib.Path("/proc", learner).exists() or ") Z" in pathlib.Path("/proc", learner, "stat").read_text())
+    wait(lambda: has_ended(learner))
 
     with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=endpoint, workers=1):
         run = quad_rl.train(data, **arguments)

@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Instant;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
 
 use tempfile::{TempDir, tempdir};
 use zenoh::{Config, Session};
@@ -27,6 +28,8 @@ impl Certificates {
             &["--days", "0", "evaluator", "expired"],
         ];
         let are_made = made.iter().all(|arguments| peers::certificates(folder.path(), arguments));
+        // The expired one is valid until the second in which it was made is over.
+        sleep(Duration::from_secs(1));
         are_made.then_some(Certificates { folder })
     }
 

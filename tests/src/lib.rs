@@ -40,7 +40,7 @@ pub mod system;
 use std::time::{Duration, Instant};
 
 /// Longest wait for anything: far more than needed, unless the machine is busy.
-pub const PATIENCE: Duration = Duration::from_secs(120);
+pub const PATIENCE: Duration = Duration::from_secs(300);
 
 /// Polls until `condition` gives something; panics after `patience`.
 pub fn eventually<T>(

@@ -50,6 +50,7 @@ fn commands_print_what_their_transcripts_have() {
         .register_bin("learner", Path::new(env!("CARGO_BIN_EXE_learner")))
         .register_bin("sh", Path::new("/bin/sh"))
         .env("PATH", bin_path())
+        .env("LC_ALL", "C")
         .case(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/cli/*.trycmd"))
         .run();
 }

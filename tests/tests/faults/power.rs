@@ -138,6 +138,9 @@ fn cut_power(cuts: u64) {
     let mut gone_on = 0;
     for cut in 0..cuts {
         let mut learner = system.run_for_a_while(&mut random);
+        if cut == 1 {
+            learner.wait_for_scores(0); // However slow the machine is, something was promised.
+        }
         if cut % 2 == 1 && learner.run_dir.join("config.toml").exists() {
             learner.process.kill();
             system.promised.extend(keys_of(&learner));

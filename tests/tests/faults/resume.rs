@@ -62,10 +62,9 @@ fn copy(from: &Path, to: &Path) {
 /// A back-up is made while the learner works.
 #[test]
 fn a_copy_of_a_run_at_work_continues_to_the_same_end() {
-    let scratch = Scratch::new();
-    let flags = [&LISTEN[..], &["--checkpoint-seconds", "0"]].concat();
+    let (scratch, endpoint) = (Scratch::new(), free_endpoint());
+    let flags = ["--listen", &endpoint, "--checkpoint-seconds", "0"];
     let mut learner = scratch.learner_with("run", LONG, &flags);
-    let endpoint = learner.endpoint();
     let _evaluator = scratch.evaluator("one", &endpoint);
     learner.wait_for_scores(4 * LONG.episodes as usize);
     copy(&learner.run_dir, &scratch.path().join("copy/run"));
@@ -138,14 +137,13 @@ fn other_weights_for_a_scored_step_end_the_run() {
 fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
     let scratch = Scratch::new();
     let mut learner = scratch.learner("run", SHORT);
-    let endpoint = learner.endpoint();
-    let _evaluator = scratch.evaluator("one", &endpoint);
+    let _evaluator = scratch.evaluator("one", &learner.endpoint());
     learner.process.assert_succeeds(PATIENCE);
     let step = SHORT.eval_interval;
     let mut bytes = fs::read(learner.snapshot(step)).unwrap();
     *bytes.last_mut().unwrap() ^= 1;
     fs::write(learner.snapshot(step), bytes).unwrap();
-    let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
+    let mut learner = scratch.learner("run", SHORT);
     learner.process.assert_succeeds(PATIENCE);
     learner.process.assert_said("its file is damaged");
 
@@ -153,7 +151,7 @@ fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
     let lines = fs::read_to_string(&log).unwrap();
     let lost = lines.lines().find(|line| line.contains(&format!("\"step\":{step},"))).unwrap();
     fs::write(&log, lines.replace(&format!("{lost}\n"), "")).unwrap();
-    let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
+    let mut learner = scratch.learner("run", SHORT);
     learner.process.assert_ends(1, PATIENCE);
     learner.process.assert_said(&format!("without the snapshot of step {step}"));
     learner.process.assert_said("without the scores of 1 episode");

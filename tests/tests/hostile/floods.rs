@@ -144,7 +144,8 @@ async fn bear(each: Duration) {
     learner.assert_scores_are_distinct();
     learner.process.assert_not_said("panicked");
     evaluator.process.assert_not_said("panicked");
-    let lines = learner.process.log().lines().count();
+    // Without those of the evaluations, which are as many as training is fast.
+    let lines = learner.process.log().lines().filter(|line| !line.contains("INFO step ")).count();
     assert!(lines < 1000, "{lines} lines in the log");
 }
 

@@ -8,7 +8,7 @@ use std::{env, fs};
 use quad_protocol::keys;
 use quad_tests::made_up::{client, name};
 use quad_tests::process::{Process, signal};
-use quad_tests::setting::ENDLESS;
+use quad_tests::setting::{ENDLESS, Setting};
 use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually};
 
@@ -42,7 +42,8 @@ async fn a_peer_that_reads_nothing_blocks_neither_jobs_nor_snapshots() {
         return read_nothing(&endpoint).await;
     }
     let scratch = Scratch::new();
-    let learner = scratch.learner("run", ENDLESS);
+    // So many episodes that the evaluator never waits for training, however slow that is.
+    let learner = scratch.learner("run", Setting { episodes: 400, ..ENDLESS });
     let _evaluator = scratch.evaluator("steady", &learner.endpoint());
     learner.wait_for_scores(0);
     let mut command = Command::new(env::current_exe().unwrap());

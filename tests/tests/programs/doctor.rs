@@ -14,7 +14,9 @@ use serde_json::Value;
 
 /// The findings as text. The exit code says whether one of them fails.
 fn doctor(line: &str) -> String {
-    let output = command(line).env("D4RL_DATASET_DIR", std::env::temp_dir()).output().unwrap();
+    let mut doctor = command(line);
+    doctor.envs(["D4RL_DATASET_DIR", "HOME"].map(|folder| (folder, std::env::temp_dir())));
+    let output = doctor.output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     let failed = text.lines().any(|line| line.starts_with("FAIL  "));
     let said = String::from_utf8_lossy(&output.stderr);

@@ -28,6 +28,8 @@ fn commands_print_what_their_transcripts_have() {
         .register_bins(["learner", "evaluator"].map(|name| (name, binary(name))))
         .register_bin("sh", Path::new("/bin/sh"))
         .env("PATH", format!("{programs}:{}", env::var("PATH").unwrap()))
+        .env("LC_ALL", "C")
+        .env("HOME", scratch.path().to_str().unwrap())
         .env("NO_LOCKS", built("examples/libno_locks.so").to_str().unwrap())
         .env("TAKEN", taken.local_addr().unwrap().to_string())
         // Nothing but this machine can be reached: the proxy for everything else is a closed port.

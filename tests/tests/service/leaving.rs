@@ -107,8 +107,9 @@ async fn a_learner_that_waits_for_another_reports_failures_and_stops() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_evaluator_that_leaves_in_the_middle_of_a_job_hands_it_back() {
     let scratch = Scratch::new();
-    // It need not be finished, so it is as long as jobs can be.
-    let sizes = Setting { candidates: 1000, hidden: 256, ..ENDLESS };
+    // A job of seconds, of short steps: a leaving evaluator waits a second for the learner's answer,
+    // which needs the processor, too.
+    let sizes = Setting { candidates: 100, hidden: 256, ..ENDLESS };
     let setting = Setting { steps: 10_000_000, eval_interval: 10, episodes: 40, ..sizes };
     let learner = scratch.learner("run", setting);
     let behind = free_endpoint();

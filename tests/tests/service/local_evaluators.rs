@@ -1,6 +1,7 @@
 //! `learner train --evaluators N`: one command that starts its own evaluators.
 
 use std::fs;
+use std::path::Path;
 
 use quad_tests::learner::Learner;
 use quad_tests::process::{children, signal};
@@ -22,25 +23,35 @@ fn are_gone(processes: &[u32]) -> Option<()> {
     (!processes.iter().any(runs)).then_some(())
 }
 
+/// The line of an evaluator's log with these words, once it is there.
+fn line_of(log: &Path, words: &str) -> String {
+    eventually(words, PATIENCE, || {
+        let log = fs::read_to_string(log).ok()?;
+        log.lines().find(|line| line.contains(words)).map(str::to_owned)
+    })
+}
+
 /// The two evaluators of a learner, once there are new scores.
 fn at_work(learner: &Learner) -> Vec<u32> {
     learner.wait_for_scores(learner.scores().len());
-    let processes = children(learner.process.id());
-    assert_eq!(processes.len(), 2);
-    processes
+    let two = || Some(children(learner.process.id())).filter(|processes| processes.len() == 2);
+    eventually("there are two evaluators", PATIENCE, two)
 }
 
 #[test]
 fn two_runs_on_one_machine_need_no_ports() {
     let scratch = Scratch::new();
     let mut by_default = scratch.learner_with("default", SHORT, &[]);
-    let mut learner = scratch.learner_with("run", SHORT, &["--evaluators", "2"]);
+    let mut learner = scratch.learner_with("run", ENDLESS, &["--evaluators", "2"]);
     by_default.assert_completes(PATIENCE);
-    learner.assert_completes(PATIENCE);
-    for number in [1, 2] {
-        let log = learner.run_dir.join(format!("evaluator-{number}.log"));
-        let log = fs::read_to_string(log).unwrap();
-        assert!(log.contains("ready to serve") && log.contains("leaving"), "{log}");
+    learner.wait_for_scores(0);
+    let logs = [1, 2].map(|number| learner.run_dir.join(format!("evaluator-{number}.log")));
+    for log in &logs {
+        line_of(log, "ready to serve");
+    }
+    learner.process.terminate(PATIENCE);
+    for log in &logs {
+        line_of(log, "leaving");
     }
 }
 
@@ -81,16 +92,17 @@ async fn evaluators_of_two_learners_have_different_names() {
     let endpoint = free_endpoint();
     let _router = router(&endpoint).await;
     let start =
-        |run| scratch.learner_with(run, SHORT, &["--connect", &endpoint, "--evaluators", "1"]);
-    for mut learner in ["one", "two"].map(start) {
-        learner.assert_completes(PATIENCE);
-        learner.process.assert_not_said("two evaluators were started");
-    }
-    let names = ["one", "two"].map(|run| {
-        let log = fs::read_to_string(scratch.path().join(run).join("evaluator-1.log")).unwrap();
-        log.lines().find_map(|line| Some(line.split_once("evaluator=")?.1.to_owned())).unwrap()
+        |run| scratch.learner_with(run, ENDLESS, &["--connect", &endpoint, "--evaluators", "1"]);
+    let learners = ["one", "two"].map(start);
+    let names = learners.each_ref().map(|learner| {
+        let line = line_of(&learner.run_dir.join("evaluator-1.log"), "evaluator=");
+        line.split_once("evaluator=").unwrap().1.to_owned()
     });
     assert_ne!(names[0], names[1]);
+    for learner in &learners {
+        learner.wait_for_scores(learner.scores().len());
+        learner.process.assert_not_said("two evaluators were started");
+    }
 }
 
 /// A lab may set the variable for all users of a machine.

@@ -35,6 +35,7 @@ fn a_browser_shows_a_run_at_work() {
     let flags = ["--listen", "tcp/127.0.0.1:0", "--evaluators", "2"];
     let learner = scratch.learner_with("run", ENDLESS, &flags);
     learner.wait_for_scores(4 * ENDLESS.episodes as usize);
+    learner.wait_for_metric("evaluators", "", |there| there == 2.0);
     let page = shown(&format!("http://{}/", learner.metrics()));
     assert_has(
         &page,

@@ -62,7 +62,7 @@ fn an_evaluator_waits_for_its_learner_and_serves_the_next_one() {
 async fn scores_measured_offline_reach_the_next_incarnation() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
-    let sizes = Setting { candidates: 1000, hidden: 256, ..SHORT };
+    let sizes = Setting { candidates: 100, hidden: 256, ..SHORT };
     let setting = Setting { steps: 10, eval_interval: 10, episodes: 20, ..sizes };
     let session = router_without_scores(&endpoint, None).await;
     let mut first = scratch.learner_with("run", setting, &["--connect", &endpoint]);
@@ -117,7 +117,7 @@ async fn evaluators_behind_a_router_are_counted_as_they_come_and_leave() {
 async fn a_report_that_is_delivered_many_times_at_once_counts_once() {
     let scratch = Scratch::new();
     let slow = Disk::new(scratch.path());
-    let setting = Setting { eval_interval: 50_000, episodes: 40, ..ENDLESS };
+    let setting = Setting { eval_interval: 5000, episodes: 40, ..ENDLESS };
     let learner =
         scratch.learner_through(&slow.launcher(), "run", setting, &["--listen", "tcp/127.0.0.1:0"]);
     let (session, run) = (client(&learner.endpoint()).await, name("run"));
