@@ -93,8 +93,8 @@ impl OutputQueue {
         self.shared.1.notify_all();
     }
 
-    /// Waits for the next output; `None` once the queue is closed and empty. Snapshots go before
-    /// the checkpoint: a run that is resumed from a checkpoint does not make earlier snapshots
+    /// Waits for the next output; `None` once the queue is closed and empty. Snapshots and rows go
+    /// before the checkpoint: a run that is resumed from a checkpoint does not make earlier ones
     /// again.
     pub fn next(&self, beat: &Heartbeat) -> Option<Output> {
         let mut waiting = self.lock();
@@ -137,11 +137,11 @@ impl Waiting {
         if let Some(output) = self.snapshots.pop_front() {
             return Some(output);
         }
-        if let Some(checkpoint) = self.checkpoint.take() {
-            return Some(Output::Checkpoint(checkpoint));
-        }
         if !self.rows.is_empty() {
             return Some(Output::Rows(mem::take(&mut self.rows)));
+        }
+        if let Some(checkpoint) = self.checkpoint.take() {
+            return Some(Output::Checkpoint(checkpoint));
         }
         self.ended.take().map(Output::Ended)
     }

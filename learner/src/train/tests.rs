@@ -187,7 +187,7 @@ fn training_resumes_from_a_checkpoint_bit_for_bit() {
 }
 
 #[test]
-fn a_queue_that_the_disk_does_not_empty_keeps_the_newest_checkpoint_and_all_rows() {
+fn a_queue_that_the_disk_does_not_empty_keeps_all_rows_then_the_newest_checkpoint() {
     let (queue, beat) = (OutputQueue::default(), beat());
     let checkpoint = |step: u64| Checkpoint { step, state: vec![step as u8] };
     for step in 1..=3 {
@@ -197,10 +197,10 @@ fn a_queue_that_the_disk_does_not_empty_keeps_the_newest_checkpoint_and_all_rows
     }
     queue.ended(Outcome::Completed);
     queue.close();
+    assert!(matches!(queue.next(&beat), Some(Output::Rows(rows)) if rows.len() == 3));
     assert!(
         matches!(queue.next(&beat), Some(Output::Checkpoint(newest)) if newest == checkpoint(3))
     );
-    assert!(matches!(queue.next(&beat), Some(Output::Rows(rows)) if rows.len() == 3));
     assert!(matches!(queue.next(&beat), Some(Output::Ended(Outcome::Completed))));
     assert!(queue.next(&beat).is_none());
 }
