@@ -41,9 +41,10 @@ def test_a_table_of_any_kind_makes_the_same_transitions(tmp_path):
     frame.to_csv(tmp_path / "log.tsv", index=False, sep="\t")
     frame.to_csv(tmp_path / "semicolons.csv", index=False, sep=";")
     frame.to_parquet(tmp_path / "log.parquet", row_group_size=7)
+    exact = pa.Table.from_pandas(frame).set_column(0, "x", pa.array(frame["x"]).cast(pa.decimal128(38, 30)))
     lists = pa.Table.from_pandas(frame).append_column("both", pa.array(list(frame[["x", "v"]].to_numpy())))
     for source, changed in [(frame, {}), (tmp_path / "log.csv", {}), (str(tmp_path / "log.tsv"), {}), (tmp_path / "log.parquet", {}),
-                            (tmp_path / "semicolons.csv", {}),
+                            (tmp_path / "semicolons.csv", {}), (exact, {}),
                             ({name: column.to_numpy() for name, column in frame.items()}, {}), (lists, {"observations": ["both"]}),
                             (lists.to_pandas(), {"observations": ["both"]}),
                             (frame.sort_values(["fell", "run"], kind="stable").sort_index(level=0), {})]:
@@ -151,6 +152,15 @@ def test_a_table_that_is_still_being_written_is_named(tmp_path, name, cut):
         Dataset.from_frame(part, **COLUMNS, reward="gain", terminal="fell")
 
 
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_a_table_in_another_encoding_is_named(tmp_path, capsys, encoding):
+    table().rename(columns={"gain": "größe"}).to_csv(tmp_path / "log.csv", index=False, encoding=encoding)
+    words = [*COLUMNS["observations"], "--actions", "torque", "--episode", "run", "--reward", "größe", "--out", str(tmp_path / "out.hdf5")]
+    assert _convert.main([str(tmp_path / "log.csv"), "--observations", *words]) == 1
+    said = capsys.readouterr().err
+    assert "log.csv is no whole CSV or Parquet file: " in said and "a CSV file is in UTF-8" in said
+
+
 def test_whole_numbers_are_actions_if_they_are_said_to_be():
     frame = table().assign(torque=np.random.default_rng(0).integers(-20, 20, 60))
     asked = {**COLUMNS, "reward": "gain", "terminal": "fell"}
@@ -195,6 +205,9 @@ def test_a_folder_has_an_episode_a_file(tmp_path):
     right = Dataset.from_frame(frame.assign(v=frame["v"] + (frame["run"] == "b") / 2).sort_values("run", kind="stable"), **COLUMNS,
                                reward="gain", terminal="fell")
     assert all(map(np.array_equal, rows(read), rows(right)))
+    pd.DataFrame({"x": [1.0], "note": "calibrated"}).to_csv(tmp_path / "notes.csv", index=False)
+    with pytest.raises(ValueError, match="column 'v' is missing or has empty places in 1 of the files, such as 'notes'"):
+        Dataset.from_frame(tmp_path, **{**COLUMNS, "episode": "file"}, reward="gain", terminal="fell")
 
 
 def test_names_go_into_the_file_and_the_policy(snapshots, tmp_path):
@@ -279,10 +292,11 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys, monkeypatch):
         "--task does not apply to this source": [*log, "--reward", "gain", "--task", "pick"],
         "nothing says what is rewarded": [folder, "--observations", "observation.state"],
         "there is no nothing.csv": ["nothing.csv"],
+        "is the source itself": [tmp_path / "out.hdf5", "--observations", "object"],
         "a folder without Minari's main_data.hdf5": [tmp_path / "empty"],
         "an MCAP file, as ROS 2 records them": [tmp_path / "log.mcap"],
         "reads it as it is": [tmp_path / "maze.npz"],
-        "reads D4RL's and your own HDF5 files as they are": [tmp_path / "out.hdf5", "--observations", "object"],
+        "reads D4RL's and your own HDF5 files as they are": [tmp_path / "python.hdf5", "--observations", "object"],
         "has no rewards": ["ogbench:cube-double-play-v0"],
         "hint: put it and antmaze-giant-navigate-v0-val.npz there": ["ogbench:antmaze-giant-navigate-singletask-v0", "--folder", tmp_path],
         "OGBench has no task none-huge-singletask-v0": ["ogbench:none-huge-singletask-v0", "--folder", tmp_path],

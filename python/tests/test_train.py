@@ -34,7 +34,7 @@ def test_trains_like_the_program(data, tmp_path, capsys):
     assert " transitions of " in said[0] and said[2].startswith("page: http://") and said[-1] == "training is done"
     assert run.policy().step == run.policy(300).step == 300 and run.scores == [] and run.metrics[-1]["step"] == 300
     assert urllib.request.urlopen(run.page, timeout=600).status == 200 and run.page == run.page
-    with pytest.raises(FileNotFoundError, match="no snapshot after step 7"):
+    with pytest.raises(FileNotFoundError, match="no snapshot of step 7"):
         run.policy(7)
 
     with pytest.raises(RuntimeError, match=r"^there is a run of another configuration .*steps: 300 there, 400 here.*\nhint: "):

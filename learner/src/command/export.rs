@@ -19,7 +19,7 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let steps = folder.snapshots()?;
     let best = report.best_of(|step| steps.contains(&step)).map(|best| best.step);
     let (step, what) = match args.step {
-        At::Step(step) => (Some(step), "after that step"),
+        At::Step(step) => (Some(step), "of that step"),
         At::Last => (steps.last().copied(), "yet"),
         At::Best => (best, "with a complete evaluation"),
     };

@@ -52,8 +52,13 @@ impl EarlierRun {
         Ok((Self { checkpoint, hash, experiment, dataset_sha256 }, preset))
     }
 
-    /// Checks that the dataset is the run's, and that the checkpoint's numbers still mean the same.
+    /// Checks that there is practice, that the dataset is the run's, and that the checkpoint's
+    /// numbers still mean the same.
     pub fn check(&self, here: &Experiment, sha256: &str) -> anyhow::Result<()> {
+        if here.online.is_none() {
+            let error = anyhow!("without practice there is nothing to go on with");
+            return Err(hinted(error, "--online-steps N, above 0, says how much of it"));
+        }
         let there = &self.experiment;
         let known = self.dataset_sha256.as_deref().unwrap_or(sha256);
         let kept = [

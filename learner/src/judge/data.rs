@@ -42,10 +42,10 @@ impl Data {
     /// judged, so that all are judged in the same states.
     pub fn read(snapshots: &[Snapshot]) -> anyhow::Result<Self> {
         let first = snapshots.first().context("there is no policy to judge")?;
-        let (run, data) = (&first.config.run.name, &first.config.dataset);
+        let (run, data) = (first.folder.path().display(), &first.config.dataset);
         let environment = &first.config.experiment.environment;
-        for Snapshot { config, .. } in snapshots {
-            let (other, theirs) = (&config.run.name, &config.experiment.environment);
+        for Snapshot { folder, config, .. } in snapshots {
+            let (other, theirs) = (folder.path().display(), &config.experiment.environment);
             if config.dataset.sha256 != data.sha256 {
                 let error = anyhow!("{run} and {other} have not learned from the same data");
                 return Err(error)

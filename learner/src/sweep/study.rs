@@ -7,6 +7,7 @@ use std::slice;
 use anyhow::{Context, anyhow, ensure};
 use quad_protocol::Name;
 use quad_run::config::{ConfigError, Experiment, Preset, did_you_mean, settings, tables};
+use quad_run::counted;
 use quad_run::folder::RunDir;
 use quad_run::results::RunReport;
 use quad_run::status::State;
@@ -255,7 +256,7 @@ fn some_of(names: &[String]) -> String {
     let first = names[..names.len() - others].join(", ");
     match others {
         0 => first,
-        _ => format!("{first} and {others} others"),
+        _ => format!("{first} and {}", counted(others, "other")),
     }
 }
 

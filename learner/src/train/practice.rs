@@ -171,7 +171,7 @@ impl Practice {
         let Online { warmup, uniform_warmup, noise, .. } = self.online;
         let exploration = match uniform_warmup && self.rows() < warmup {
             true => Exploration::Uniform,
-            false => Exploration::Policy { noise },
+            false => Exploration::Policy { noise: noise as f32 },
         };
         let step = self.online.newest_snapshot(self.begin, step);
         let seed = practice_seed(self.seed, episode);

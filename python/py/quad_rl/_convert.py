@@ -49,6 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     source, out, training = given.pop("source"), given.pop("out"), given.pop("train", None)
     try:
         program = None if training is None else learner()
+        if os.path.exists(source) and os.path.exists(out) and os.path.samefile(source, out):
+            raise ValueError(f"{out} is the source itself, which the new file would replace\nhint: name another file by --out")
         dataset = _read(source, given)
         dataset.save(out)
     except (ValueError, ImportError, OSError, RuntimeError) as error:
@@ -115,7 +117,7 @@ def _reader(source: str) -> tuple[Callable[..., Dataset], str]:
             start = file.read(256)
         if start.startswith(b"\x89HDF\r\n\x1a\n"):
             return Dataset.from_robomimic, source
-        if start.startswith(b"PAR1") or b"\0" not in start:
+        if start.startswith((b"PAR1", b"\xff\xfe")) or b"\0" not in start:  # The second begins UTF-16, whose error has a hint.
             return Dataset.from_frame, source
     _quad_rl.inspect_dataset(path)  # Its error names other formats.
     raise ValueError(f"`learner train --dataset {source}` reads it as it is")

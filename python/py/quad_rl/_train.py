@@ -44,8 +44,8 @@ class Run:
         """
         snapshots = sorted((self.folder / "snapshots").glob(f"step_{'*' if step is None else f'{step:09}'}.safetensors"))
         if not snapshots:
-            after = "" if step is None else f" after step {step}"
-            raise FileNotFoundError(f"{self.folder} has no snapshot{after}")
+            which = "" if step is None else f" of step {step}"
+            raise FileNotFoundError(f"{self.folder} has no snapshot{which}")
         return _quad_rl.Policy.load(snapshots[-1], precision)
 
     @property

@@ -22,7 +22,7 @@ pub struct Online {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub share: Option<f64>,
     /// Standard deviation of the normal noise on the policy's actions, which are within [-1, 1].
-    pub noise: f32,
+    pub noise: f64,
     /// Episodes that are in play or wait while the learner learns from those before them.
     pub lag: u32,
     /// Gradient steps between two snapshots that practice is played with.
@@ -69,7 +69,7 @@ impl Online {
             return Err(ConfigError::Warmup { steps, warmup });
         }
         for (field, value) in
-            [("online.share", self.share.unwrap_or(1.0)), ("online.noise", self.noise.into())]
+            [("online.share", self.share.unwrap_or(1.0)), ("online.noise", self.noise)]
         {
             if !(0.0..=1.0).contains(&value) {
                 return Err(ConfigError::out_of_range(field, value, "from 0 to 1"));

@@ -16,6 +16,7 @@ use std::time::Instant;
 use anyhow::Context;
 use quad_dataset::environment::{all, find};
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata};
+use quad_run::counted;
 use quad_runtime::Hint;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -44,8 +45,9 @@ pub struct Summary {
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let [p50, p90, p99, max] = self.score_percentiles;
-        let (transitions, episodes, mean) = (self.transitions, self.episodes, self.mean_score);
-        write!(f, "{transitions} transitions, {episodes} episodes of {} ", self.policies)?;
+        let (transitions, mean) = (self.transitions, self.mean_score);
+        let episodes = counted(self.episodes, "episode");
+        write!(f, "{transitions} transitions, {episodes} of {} ", self.policies)?;
         writeln!(f, "policies, in {:.0} s", self.seconds)?;
         write!(f, "normalized score: mean {mean:.1}, median {p50:.1}, ")?;
         write!(f, "p90 {p90:.1}, p99 {p99:.1}, max {max:.1}")

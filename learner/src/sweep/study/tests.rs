@@ -78,6 +78,7 @@ axes = {} -> no axis
 axes = { seed = [0] } -> seed0: it needs one of task and preset
 axis = { seed = [0] } -> unknown field `axis`
 axes = { TASK, seed = [-1], agent.tua = [2] } -> hopper-demo-tua2-seed-1: |
+axes = { TASK, agent.tua = [2], seed = [0, 1, 2, 3] } -> tua2-seed2 and 1 other: algorithm quad
 axes = { task = ['hoper-demo', 'own-data'] } -> hoper-demo: there is no task|did you mean hopper-demo
 axes = { TASK, method = ['nine'] } -> no table [method.nine]|did you mean none
 axes = { TASK, steps = [5] } -> steps is an axis, and [run] has it, too

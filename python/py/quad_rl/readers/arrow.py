@@ -27,6 +27,8 @@ def array_of(column: Any, name: str, place: str) -> NDArray[Any]:
             array = array.storage
         elif pa.types.is_dictionary(array.type):
             array = array.dictionary_decode()
+        elif pa.types.is_decimal(array.type):
+            array = array.cast(pa.float64())
         elif pa.types.is_list(array.type) or pa.types.is_large_list(array.type) or pa.types.is_fixed_size_list(array.type):
             inner = array.flatten()
             each = len(inner) // max(1, len(array))

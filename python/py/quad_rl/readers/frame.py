@@ -75,6 +75,10 @@ def from_frame(
     read = {name: key for name, key in zip(there, keys) if words is None or name in words or name == episode}
     for name in [name for name in read if there.count(name) > 1]:
         raise ValueError(f"{place} has several columns {name!r}")
+    for name in read if path and os.path.isdir(place) else ():
+        files = table.filter(table[name].is_null())["file"].unique().to_pylist()
+        if files:
+            raise ValueError(f"{place}: column {name!r} is missing or has empty places in {len(files)} of the files, such as {files[0]!r}")
     columns = {name: _column(table[key], name, place) for name, key in read.items()}
     if episode not in columns:
         raise ValueError(f"{place}: there is no column {episode!r} for episodes\nhint: there are {', '.join(map(repr, there))}")
@@ -176,7 +180,10 @@ def _read(path: str) -> Any:
             return library("pyarrow.parquet", "table").read_table(path)
         csv = library("pyarrow.csv", "table")
         delimiter = max(",;\t", key=first.decode(errors="replace").count)
-        return csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
-    except pa.ArrowInvalid as error:
-        hint = "hint: its writer must have closed it; each line of a CSV file has as many fields as the first, which has the names"
+        table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=delimiter))
+        _ = table.column_names  # Decodes them.
+        return table
+    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
+        hint = ("hint: its writer must have closed it; a CSV file is in UTF-8, and each line has as many fields as the first, which has "
+                "the names")
         raise ValueError(f"{path} is no whole CSV or Parquet file: {error}\n{hint}") from None

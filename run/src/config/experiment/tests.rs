@@ -61,6 +61,10 @@ agent.candidates = 2",
             "unknown field `candidates`",
         ),
         ("algorithm = 'rlpd'\nonline.steps = 0", "0 steps without practice"),
+        (
+            "algorithm = 'iql'\nonline = { steps = 9, noise = 1.1 }",
+            "online.noise is 1.1, but must be",
+        ),
         ("algorithm = 'sfbc'\nonline.steps = 9", "sfbc learns from a dataset alone"),
         (
             "algorithm = 'dtql'\nonline = { steps = 9, updates_per_step = 1 }",
