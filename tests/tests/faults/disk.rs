@@ -53,11 +53,14 @@ async fn a_full_disk_delays_snapshots_scores_and_checkpoints_until_there_is_room
     disk.fill();
     learner.wait_for_metric("disk_trouble", "", |trouble| trouble > 0.0);
     let steps = learner.metric("gradient_steps_total", "").unwrap();
+    let scores = learner.scores().len();
     learner.process.wait_for_log("No space left on device", PATIENCE);
     assert_unwell(&learner, "the run cannot be saved");
     // By now, snapshots have been due as well.
     let later = (steps + 2.0 * setting.eval_interval as f64).min(setting.steps as f64);
     learner.wait_for_metric("gradient_steps_total", "", |now| now >= later);
+    let kept = learner.scores().len();
+    assert!(kept <= scores + 8, "{kept} scores count as kept; there was room for {scores}");
 
     disk.clear();
     learner.process.wait_for_log("the run can be saved again", PATIENCE);

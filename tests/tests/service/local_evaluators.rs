@@ -10,6 +10,9 @@ use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
 use quad_tests::{PATIENCE, eventually};
 
+/// Seconds of training, so that the evaluators are ready before the run is complete.
+const SECONDS: Setting = Setting { steps: 10_000, eval_interval: 2500, ..SHORT };
+
 fn learner(scratch: &Scratch, setting: Setting) -> Learner {
     scratch.learner_with("run", setting, &["--listen", "tcp/127.0.0.1:0", "--evaluators", "2"])
 }
@@ -42,14 +45,13 @@ fn at_work(learner: &Learner) -> Vec<u32> {
 fn two_runs_on_one_machine_need_no_ports() {
     let scratch = Scratch::new();
     let mut by_default = scratch.learner_with("default", SHORT, &[]);
-    let mut learner = scratch.learner_with("run", ENDLESS, &["--evaluators", "2"]);
+    let mut learner = scratch.learner_with("run", SECONDS, &["--evaluators", "2"]);
     by_default.assert_completes(PATIENCE);
-    learner.wait_for_scores(0);
     let logs = [1, 2].map(|number| learner.run_dir.join(format!("evaluator-{number}.log")));
     for log in &logs {
         line_of(log, "ready to serve");
     }
-    learner.process.terminate(PATIENCE);
+    learner.assert_completes(PATIENCE);
     for log in &logs {
         line_of(log, "leaving");
     }
@@ -92,15 +94,15 @@ async fn evaluators_of_two_learners_have_different_names() {
     let endpoint = free_endpoint();
     let _router = router(&endpoint).await;
     let start =
-        |run| scratch.learner_with(run, ENDLESS, &["--connect", &endpoint, "--evaluators", "1"]);
-    let learners = ["one", "two"].map(start);
+        |run| scratch.learner_with(run, SECONDS, &["--connect", &endpoint, "--evaluators", "1"]);
+    let mut learners = ["one", "two"].map(start);
     let names = learners.each_ref().map(|learner| {
         let line = line_of(&learner.run_dir.join("evaluator-1.log"), "evaluator=");
         line.split_once("evaluator=").unwrap().1.to_owned()
     });
     assert_ne!(names[0], names[1]);
-    for learner in &learners {
-        learner.wait_for_scores(learner.scores().len());
+    for learner in &mut learners {
+        learner.assert_completes(PATIENCE);
         learner.process.assert_not_said("two evaluators were started");
     }
 }
