@@ -21,8 +21,8 @@ pub(super) struct Common {
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and targets.
     actor_every: Steps,
-    /// Factor of the policy's distance to the data at the end of practice, toward which it moves
-    /// linearly from 1.
+    /// Smallest factor of the policy's distance to the data: in practice it is 1 less the share
+    /// that is over, but no less than this.
     online_cloning: UnitInterval,
 }
 
@@ -115,9 +115,9 @@ impl<R: BcRegularizer> Td3<R> {
     fn actor_losses(&self, step: u64, batch: &Minibatch) -> Result<[Tensor; 2]> {
         let actions = gaussian_mean(&self.networks.actor, &batch.observations)?;
         let q = batch.values_at(&self.networks.critic.detach(), &actions)?;
-        let last = f64::from(*self.regularizer.common().online_cloning);
+        let least = f64::from(*self.regularizer.common().online_cloning);
         let share = self.context.online_share(step).unwrap_or(0.0);
-        let cloning = 1.0 - share * (1.0 - last);
+        let cloning = least.max(1.0 - share);
         self.regularizer.actor_loss(&actions, &batch.actions, &q, cloning)
     }
 }

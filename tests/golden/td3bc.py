@@ -10,7 +10,8 @@ from implicit import CRITICS, SIZES, critic_gradient, fast_action, mean_action, 
 
 from networks import adam_step, compiled, fast_values, follow, near, random_moments, random_network, shape, single, values
 
-# The step: in every second one the policy moves, too; TD3+BC counts from 1.
+# The step: in every second one the policy moves, too; TD3+BC counts from 1. Of practice 30 % are over in `rebrac-online`, and
+# in `td3-bc-online` 70 %, when the distance to the data has its smallest factor.
 FOLDERS = {
     "td3-bc": (51, "small"),
     "td3-bc-critic": (52, "small"),
@@ -22,7 +23,7 @@ FOLDERS = {
 VARIANTS = {
     "td3-bc": {"step": 701},
     "td3-bc-critic": {"step": 700},
-    "td3-bc-online": {"step": 2301, "online_steps": 1000},
+    "td3-bc-online": {"step": 2701, "online_steps": 1000},
     "rebrac": {"step": 700},
     "rebrac-critic": {"step": 701},
     "rebrac-online": {"step": 2300, "online_steps": 1000},
@@ -50,9 +51,11 @@ def make_config(variant, size):
 
 
 def cloning_of(config):
-    """Factor of the distance to the data: with practice it moves linearly from 1."""
-    done = max(0, config["step"] - config["total_steps"]) / config.get("online_steps", 1)
-    return (1 - done) + done * config["agent"]["online_cloning"]
+    """Factor of the distance to the data, as CORL's decay_coef: what is left of practice, but no less than its smallest."""
+    if "online_steps" not in config:
+        return 1.0
+    left = (config["total_steps"] + config["online_steps"] - config["step"]) / config["online_steps"]
+    return max(config["agent"]["online_cloning"], left)
 
 
 def actor_losses(actor, critics, states, actions, weight, cloning, activation):
