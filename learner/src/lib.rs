@@ -13,8 +13,8 @@
 //! - `report` summarizes scores as tables and figures.
 //! - `judge` ranks policies without a simulator.
 //! - `train` makes gradient steps.
-//! - `evaluation` tracks which episodes wait for a score, and which evaluator has which. It does no
-//!   input or output.
+//! - `service` is the state machine of a run's evaluations and online episodes. It does no input or
+//!   output.
 //! - `data` finds or fetches the data that a run learns from.
 
 #![allow(missing_docs)]
@@ -24,7 +24,7 @@ mod children;
 pub mod cli;
 pub mod command;
 mod data;
-mod evaluation;
+mod service;
 #[cfg(test)]
 #[path = "../../run/src/fixtures.rs"]
 mod fixtures;

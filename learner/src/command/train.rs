@@ -180,9 +180,9 @@ async fn run_to_end(
         steps: experiment.total_steps(),
         metrics: metrics.clone(),
         health: health.clone(),
-        coordinator: Arc::default(),
+        carrier: Arc::default(),
     };
-    let coordinator = page_state.coordinator.clone();
+    let carrier = page_state.carrier.clone();
     let server = serve_page(args.http, path, page_state, registry).await?;
     let (o, a) = (data.training.observation_dim(), data.training.action_dim());
     let task = Task::new(&experiment.environment, o, a);
@@ -208,7 +208,7 @@ async fn run_to_end(
     };
     let (tx, events) = mpsc::unbounded_channel();
     let threads = Threads::start(run, &metrics, &health, &Events(tx))?;
-    coordinator.set(threads.coordinator().clone()).ok();
+    carrier.set(threads.carrier().clone()).ok();
     let main_loop = MainLoop {
         incarnation,
         run_dir: dir.clone(),
@@ -221,6 +221,7 @@ async fn run_to_end(
         beat: health.register("main", STUCK),
         health,
         evaluators: outside.evaluators,
+        environment: experiment.environment.clone(),
     };
     Ok((dir, main_loop.run(opening).await))
 }

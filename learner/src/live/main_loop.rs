@@ -12,19 +12,18 @@ use tokio::task::{JoinHandle, LocalSet};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{error, warn};
 
+use super::advice::advice;
 use super::disk::Writer;
-use super::display::{Display, REDRAW, evaluators};
+use super::display::{Display, REDRAW};
 use super::duplicate::Incarnation;
 use super::events::Event;
 use super::metrics::Metrics;
 use super::network::{Online, OpeningSession, Wire, go_online};
-use super::patience::{Patience, Verdict, advice};
 use super::threads::{STUCK, Threads};
 use crate::local_evaluators::LocalEvaluators;
+use crate::service::{End, Input, Order};
 use crate::train::Outcome;
 
-/// Number of evaluations without scores from which on the evaluators are called slow.
-const BEHIND: usize = 3;
 /// Time limit for closing the session, if the network hangs.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// After this time a failed run gives up output that waits for the disk: the disk may be in
@@ -57,6 +56,8 @@ pub(crate) struct MainLoop {
     /// Reports that this loop is alive. It is not if a full pipe blocks its output.
     pub beat: Heartbeat,
     pub evaluators: LocalEvaluators,
+    /// The environment in which evaluators run the policies.
+    pub environment: String,
 }
 
 /// The state of the run, as far as the loop knows.
@@ -69,10 +70,8 @@ struct State {
     reachable_at: Vec<String>,
     /// Threads whose disk hangs, as reported.
     hanging: Vec<Writer>,
-    reported_behind: bool,
     /// Seconds that training has waited for practice.
     waited: f64,
-    patience: Patience,
 }
 
 impl MainLoop {
@@ -135,23 +134,17 @@ impl MainLoop {
                     // The stop came during the last step; the run does not wait for scores.
                     Event::TrainingEnded(_) if state.interrupted => return Ending::Interrupted,
                     Event::TrainingEnded(Outcome::Completed) => {
-                        (state.trained, state.patience) = (true, Patience::default());
-                        self.display.line(&self.trained());
+                        state.trained = true;
+                        self.threads.carrier().carry(Input::Trained);
                     }
-                    event => {
-                        let published = matches!(event, Event::Published { .. });
-                        report(event, &mut self.display);
-                        if published && !state.reported_behind {
-                            state.reported_behind = self.report_if_behind();
-                        }
-                    }
+                    event => report(event, &mut self.display),
                 },
                 _ = ticker.tick() => {
-                    if let Verdict::GiveUp = self.tick(state) {
-                        return Ending::Unscored;
-                    }
-                    if state.trained && self.threads.coordinator().pending() == 0 {
-                        return Ending::Complete;
+                    match self.tick(state) {
+                        Some(End::Complete) => return Ending::Complete,
+                        Some(End::Unscored) => return Ending::Unscored,
+                        Some(End::OtherWeights(error)) => return Ending::Failed(error.into()),
+                        None => {}
                     }
                 }
                 () = &mut shutdown, if !state.interrupted => {
@@ -173,61 +166,36 @@ impl MainLoop {
             .line(&format!("run {run} is at {zenoh}, its metrics at http://{metrics}/metrics"));
         state.reachable_at = online.reachable_at;
         state.wire = Some(online.wire);
-        let events = self.threads.coordinator().events.clone();
+        let events = self.threads.carrier().events.clone();
         let report = move |line| events.line(line);
         self.evaluators.start(&state.reachable_at, self.run_dir.path(), run.as_str(), report)
     }
 
-    fn trained(&self) -> String {
-        let present = evaluators(self.metrics.evaluators.present.get());
-        match self.threads.coordinator().pending() {
-            0 => "training is done".to_owned(),
-            pending => {
-                let episodes = counted(pending, "episode");
-                format!("training is done; waiting for the scores of {episodes} ({present} here)")
-            }
-        }
-    }
-
-    /// Reports once that the evaluators are slower than the training. A run without any reports
-    /// that elsewhere.
-    fn report_if_behind(&self) -> bool {
-        let waiting = self.threads.coordinator().evaluations_pending();
-        let is_behind = waiting >= BEHIND && self.metrics.evaluators.present.get() > 0;
-        if is_behind {
-            self.display.line(&format!(
-                "the evaluators are slower than the training, which does not wait for them: {waiting} evaluations have no \
-                 score yet; more evaluators or a longer --eval-interval end the run sooner"
-            ));
-        }
-        is_behind
-    }
-
-    fn tick(&mut self, state: &mut State) -> Verdict {
+    fn tick(&mut self, state: &mut State) -> Option<End> {
         self.beat.alive();
-        self.threads.coordinator().tick();
         self.watch_disk(&mut state.hanging);
         self.display.tick(Instant::now());
         let waited = self.metrics.practice.wait_seconds.get();
-        let waits = state.trained || mem::replace(&mut state.waited, waited) < waited;
-        let any_may_fit = self.threads.coordinator().any_may_fit();
-        let verdict = state.patience.check(any_may_fit || !waits, Instant::now());
-        if let Verdict::Advise = verdict {
-            let advice = match state.reachable_at.first() {
-                None => format!(
-                    "no router has answered at {} yet; {} for it",
-                    self.endpoints.connect.join(", "),
-                    if state.trained { "the scores wait" } else { "practice waits" }
-                ),
-                Some(endpoint) => {
-                    let environment = self.threads.coordinator().environment();
-                    advice(environment, endpoint, self.evaluators.log())
-                }
-            };
-            self.display.line(&advice);
+        let training_waits = mem::replace(&mut state.waited, waited) < waited;
+        for order in self.threads.carrier().tick(training_waits) {
+            match order {
+                Order::Advise => self.display.line(&self.advice(state)),
+                Order::End(end) => return Some(end),
+                _ => {}
+            }
         }
-        // Training waits for practice as long as it takes.
-        if state.trained { verdict } else { Verdict::Wait }
+        None
+    }
+
+    fn advice(&self, state: &State) -> String {
+        match state.reachable_at.first() {
+            None => format!(
+                "no router has answered at {} yet; {} for it",
+                self.endpoints.connect.join(", "),
+                if state.trained { "the scores wait" } else { "practice waits" }
+            ),
+            Some(endpoint) => advice(&self.environment, endpoint, self.evaluators.log()),
+        }
     }
 
     /// A thread that writes and has not reported for long waits for the disk.

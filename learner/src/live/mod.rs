@@ -12,26 +12,25 @@
 //!   `duplicate` looks for another learner of the same name.
 //! - `snapshots` is the thread that writes the output of training, and publishes snapshots through
 //!   `weights`.
-//! - `services` assigns each kind of message to a pool of threads or to the thread `scores`, which
-//!   writes scores. `requests` are queries that wait for their answer.
-//! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`.
+//! - `carrier` brings messages and time to the service, and does what it orders; `services` calls it
+//!   on threads that may wait. `results` is the thread that writes scores and experience, of which
+//!   `experience` is what the run has at the start. `requests` are queries that wait for their answer.
 //! - `metrics` are for Prometheus; `disk` reports a disk that refuses writes; `display` is the
-//!   terminal, `page_state` the state for the page.
+//!   terminal, `advice` a line of it, `page_state` the state for the page.
 
-mod coordinator;
+mod advice;
+mod carrier;
 mod disk;
 mod display;
 mod duplicate;
-mod evaluators;
 mod events;
 mod experience;
 mod main_loop;
 mod metrics;
 mod network;
 mod page_state;
-mod patience;
 mod requests;
-mod scores;
+mod results;
 mod services;
 mod snapshots;
 mod spawn;

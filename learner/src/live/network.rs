@@ -123,7 +123,7 @@ impl Wire {
         let token = liveliness.declare_token(keys::live_learner(run, incarnation.number));
         let token = token.await.map_err(zenoh)?;
         // Of two learners that start at once, neither may have seen the other.
-        duplicate::watch(&session, incarnation, &services.coordinator().events).await?;
+        duplicate::watch(&session, incarnation, &services.carrier.events).await?;
         Ok(Self { session, _token: token })
     }
 

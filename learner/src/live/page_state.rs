@@ -6,7 +6,7 @@ use quad_protocol::Name;
 use quad_runtime::Health;
 use serde_json::{Value, json};
 
-use super::coordinator::Coordinator;
+use super::carrier::Carrier;
 use super::metrics::Metrics;
 
 /// A handle to the state. Clones share it.
@@ -17,7 +17,7 @@ pub(crate) struct PageState {
     pub metrics: Metrics,
     pub health: Health,
     /// Set once the threads run.
-    pub coordinator: Arc<OnceLock<Coordinator>>,
+    pub carrier: Arc<OnceLock<Carrier>>,
 }
 
 impl PageState {
@@ -38,7 +38,7 @@ impl PageState {
             "episodes_pending": self.metrics.evaluation.episodes_pending.get(),
             "practice": practice,
             "problems": self.health.problems(),
-            "evaluators": self.coordinator.get().map(Coordinator::evaluators).unwrap_or_default(),
+            "evaluators": self.carrier.get().map(Carrier::evaluators).unwrap_or_default(),
         })
     }
 }

@@ -9,13 +9,13 @@ use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use super::metrics::Metrics;
-use crate::evaluation::Refusal;
 
 /// Largest message to the learner, bytes; a score report of the largest job has 1.4 KB. A learner
 /// that listens receives no fragmented messages, which begin at 32,700 bytes at the earliest.
 const MOST_BYTES: usize = 30 * 1024;
 
 /// A query and its message.
+#[derive(Debug)]
 pub(super) struct Request {
     query: Query,
     payload: ZBytes,
@@ -60,7 +60,7 @@ impl Request {
         self.send_error(&why.to_string());
     }
 
-    fn send_error(self, text: &str) {
+    pub fn send_error(self, text: &str) {
         if let Err(error) = self.query.reply_err(text).wait() {
             debug!(%error, "an error could not be sent");
         }
@@ -85,18 +85,10 @@ pub(super) enum NotAccepted {
     Oversized,
     #[error("the message cannot be read: {0}")]
     Codec(#[from] CodecError),
-    #[error("refused: {0}")]
-    Refused(#[from] Refusal),
-    #[error("there are too many evaluators")]
-    Crowd,
     #[error("there is no snapshot of that step")]
     NoSnapshot,
     #[error("the snapshot cannot be read: {0:#}")]
     Unreadable(anyhow::Error),
-    #[error("training has not come to the episode again since the learner's start, try again")]
-    NotYet,
-    #[error("it could not be saved, try again: {0}")]
-    NotSaved(String),
 }
 
 impl NotAccepted {
@@ -106,12 +98,8 @@ impl NotAccepted {
             Self::Empty => "empty",
             Self::Oversized => "oversized",
             Self::Codec(error) => error.label(),
-            Self::Refused(refusal) => refusal.label(),
-            Self::Crowd => "too_many_evaluators",
             Self::NoSnapshot => "unknown_step",
             Self::Unreadable(_) => "unreadable_snapshot",
-            Self::NotYet => "not_open_yet",
-            Self::NotSaved(_) => "not_saved",
         }
     }
 }

@@ -1,17 +1,14 @@
 //! Assigns each kind of message to the thread that answers it.
 
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-
-use quad_protocol::{JobRequest, Piece, Progress, ScoreReport, encode, keys};
+use quad_protocol::{CodecError, JobRequest, Message, keys};
 use tracing::debug;
-use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SampleKind};
 
-use super::coordinator::Coordinator;
+use super::carrier::Carrier;
 use super::requests::{NotAccepted, Request, read};
-use super::scores::Delivery;
 use super::spawn::Pool;
 use super::weights::Weights;
+use crate::service::Input;
 
 /// Threads that answer claims. Evaluators ask again if the queue is full.
 const ANSWER_THREADS: usize = 4;
@@ -21,106 +18,85 @@ const MOST_WAITING: usize = 1024;
 
 #[derive(Clone)]
 pub(super) struct Services {
+    pub carrier: Carrier,
     pub weights: Weights,
-    /// The queue of the thread `scores`.
-    pub deliveries: SyncSender<Delivery>,
     answers: Pool,
     weights_answers: Pool,
 }
 
 impl Services {
-    /// Starts the threads that answer. Returns the queue that the thread `scores` must read.
-    pub fn start(weights: Weights) -> std::io::Result<(Self, Receiver<Delivery>)> {
-        let events = &weights.coordinator.events;
-        let (deliveries, rx) = sync_channel(MOST_WAITING);
+    /// Starts the threads that answer.
+    pub fn start(carrier: Carrier, weights: Weights) -> std::io::Result<Self> {
+        let events = &carrier.events;
         let answers = Pool::start("answers", ANSWER_THREADS, MOST_WAITING, events)?;
         let weights_answers = Pool::start("weights", WEIGHTS_THREADS, MOST_WAITING, events)?;
-        Ok((Self { weights, deliveries, answers, weights_answers }, rx))
+        Ok(Self { carrier, weights, answers, weights_answers })
     }
 
-    pub fn coordinator(&self) -> &Coordinator {
-        &self.weights.coordinator
-    }
-
-    pub fn job(&self, request: Request) {
-        let coordinator = self.coordinator().clone();
-        self.answer(&self.answers, request, move |request| {
-            let message = request.message::<JobRequest>();
-            let message = message.inspect_err(|why| coordinator.unread_claim(why))?;
-            Ok(encode(&coordinator.job(&message))?.into())
+    pub fn job(&self, mut request: Request) {
+        let carrier = self.carrier.clone();
+        self.give(&self.answers, move || match request.message::<JobRequest>() {
+            Ok(message) => drop(carrier.carry(Input::Job(request, message))),
+            Err(why) => {
+                request.reject(&why, &carrier.metrics);
+                if let NotAccepted::Codec(error @ CodecError::Version { .. }) = why {
+                    carrier.carry(Input::OtherVersion(error));
+                }
+            }
         });
     }
 
-    pub fn scores(&self, mut request: Request) {
-        match request.message::<ScoreReport>() {
-            Ok(report) => {
-                self.coordinator().extend_lease(&report.evaluator, report.incarnation, report.job);
-                self.deliver(Delivery::Scores(request, report));
-            }
-            Err(why) => self.answer(&self.answers, request, |_| Err(why)),
-        }
+    pub fn scores(&self, request: Request) {
+        self.deliver(request, Input::Scores);
     }
 
-    pub fn experience(&self, mut request: Request) {
-        match request.message::<Piece>() {
-            Ok(piece) => {
-                self.coordinator().extend_lease(&piece.evaluator, piece.incarnation, piece.job);
-                self.deliver(Delivery::Piece(request, piece));
-            }
-            Err(why) => self.answer(&self.answers, request, |_| Err(why)),
-        }
+    pub fn experience(&self, request: Request) {
+        self.deliver(request, Input::Piece);
     }
 
-    fn deliver(&self, delivery: Delivery) {
-        self.count_busy(self.deliveries.try_send(delivery).is_ok());
+    fn deliver<M: Message>(&self, mut request: Request, input: fn(Request, M) -> Input<Request>) {
+        match request.message() {
+            Ok(message) => self.carrier.deliver(input(request, message)),
+            Err(why) => {
+                let metrics = self.carrier.metrics.clone();
+                self.give(&self.answers, move || request.reject(&why, &metrics));
+            }
+        }
     }
 
     pub fn weights(&self, request: Request) {
-        let weights = self.weights.clone();
-        self.answer(&self.weights_answers, request, move |request| {
-            weights.snapshot(keys::step_of(request.key()).ok_or(NotAccepted::NoSnapshot)?)
+        let (carrier, weights) = (self.carrier.clone(), self.weights.clone());
+        self.give(&self.weights_answers, move || {
+            let step = keys::step_of(request.key()).ok_or(NotAccepted::NoSnapshot);
+            match step.and_then(|step| weights.snapshot(step, carrier.weights(step))) {
+                Ok(bytes) => request.send(bytes),
+                Err(why) => request.reject(&why, &carrier.metrics),
+            }
         });
     }
 
-    fn answer(
-        &self,
-        pool: &Pool,
-        mut request: Request,
-        work: impl FnOnce(&mut Request) -> Result<ZBytes, NotAccepted> + Send + 'static,
-    ) {
-        let metrics = self.coordinator().metrics.clone();
-        self.count_busy(pool.give(move || match work(&mut request) {
-            Ok(bytes) => request.send(bytes),
-            Err(why) => request.reject(&why, &metrics),
-        }));
-    }
-
     /// Without an answer the evaluator asks again.
-    fn count_busy(&self, accepted: bool) {
-        if !accepted {
-            self.coordinator().metrics.reject("busy");
+    fn give(&self, pool: &Pool, work: impl FnOnce() + Send + 'static) {
+        if !pool.give(work) {
+            self.carrier.metrics.reject("busy");
         }
     }
 
     pub fn progress(&self, sample: &Sample) {
-        let progress = read::<Progress>(sample.payload());
-        self.count_rejected(progress.and_then(|progress| {
-            self.coordinator().progress(&progress).map_err(NotAccepted::Refused)
-        }));
+        match read(sample.payload()) {
+            Ok(progress) => drop(self.carrier.carry(Input::Progress(progress))),
+            Err(why) => {
+                debug!(%why, "a message was not accepted");
+                self.carrier.metrics.reject(why.label());
+            }
+        }
     }
 
     pub fn evaluator(&self, token: &Sample) {
         let Some(evaluator) = keys::evaluator_of(token.key_expr().as_str()) else { return };
-        match token.kind() {
-            SampleKind::Put => self.count_rejected(self.coordinator().joined(evaluator)),
-            SampleKind::Delete => self.coordinator().left(&evaluator),
-        }
-    }
-
-    fn count_rejected(&self, result: Result<(), NotAccepted>) {
-        if let Err(why) = result {
-            debug!(%why, "a message was not accepted");
-            self.coordinator().metrics.reject(why.label());
-        }
+        self.carrier.carry(match token.kind() {
+            SampleKind::Put => Input::Joined(evaluator),
+            SampleKind::Delete => Input::Left(evaluator),
+        });
     }
 }

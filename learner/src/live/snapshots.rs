@@ -10,13 +10,13 @@ use quad_run::folder::{Checkpoint, Log, RunDirError};
 use quad_runtime::{Heartbeat, hinted};
 use tracing::debug;
 
-use super::coordinator::Coordinator;
+use super::carrier::Carrier;
 use super::disk::DiskStatus;
 use super::events::Event;
 use super::metrics::unix_time;
 use super::weights::Weights;
-use crate::evaluation::{Opening, OtherWeights};
-use crate::train::{Outcome, Output, OutputQueue, TrainedPolicy};
+use crate::service::{Input, Opening, OtherWeights};
+use crate::train::{Output, OutputQueue, TrainedPolicy};
 
 /// Pause after the disk has refused a write.
 pub(super) const RETRY: Duration = Duration::from_secs(2);
@@ -32,6 +32,7 @@ pub(super) struct Snapshots {
     /// `metrics.jsonl`.
     pub rows: Log,
     pub weights: Weights,
+    pub carrier: Carrier,
     /// Snapshots of earlier processes, by step: training may reach their steps again.
     pub known: BTreeMap<u64, Hash>,
     pub disk: DiskStatus,
@@ -62,22 +63,13 @@ impl Snapshots {
         Ok(())
     }
 
-    fn coordinator(&self) -> &Coordinator {
-        &self.weights.coordinator
-    }
-
     fn save(&mut self, output: &Output) -> anyhow::Result<()> {
         match output {
             Output::Snapshot(policy) => self.snapshot(policy)?,
             Output::Practice(opening) => self.open_practice(opening)?,
             Output::Checkpoint(checkpoint) => self.checkpoint(checkpoint)?,
             Output::Rows(rows) => self.rows.append(rows)?,
-            Output::Ended(outcome) => {
-                if *outcome == Outcome::Completed {
-                    self.coordinator().end_practice();
-                }
-                self.coordinator().events.send(Event::TrainingEnded(*outcome));
-            }
+            Output::Ended(outcome) => self.carrier.events.send(Event::TrainingEnded(*outcome)),
         }
         Ok(())
     }
@@ -86,7 +78,7 @@ impl Snapshots {
     fn snapshot(&mut self, trained: &TrainedPolicy) -> anyhow::Result<()> {
         let &TrainedPolicy { step, ref file, evaluate, practice } = trained;
         let hash = Hash::of(file);
-        let metrics = &self.weights.coordinator.metrics.evaluation;
+        let metrics = &self.carrier.metrics.evaluation;
         metrics.snapshot_bytes.set(file.len() as i64);
         match self.known.get(&step) {
             None => self.weights.run_dir.write_snapshot(step, file)?,
@@ -101,9 +93,9 @@ impl Snapshots {
         }
         if evaluate {
             // The jobs must exist first: evaluators claim one as soon as the snapshot arrives.
-            self.coordinator().open(step, hash)?;
+            self.carrier.open(step, hash)?;
             metrics.snapshots_published.inc();
-            self.coordinator().events.send(Event::Published { step });
+            self.carrier.events.send(Event::Published { step });
         }
         if evaluate || practice {
             self.weights.publish(step, hash, file.clone())?;
@@ -117,7 +109,7 @@ impl Snapshots {
             let error = anyhow!("the snapshot of step {step}, which is to practice, is missing");
             return Err(hinted(error, NO_SNAPSHOT));
         };
-        self.coordinator().open_practice(opening, *hash);
+        self.carrier.carry(Input::Opened(*opening, *hash));
         Ok(())
     }
 
@@ -125,7 +117,7 @@ impl Snapshots {
         self.weights.run_dir.write_checkpoint(checkpoint)?;
         let Checkpoint { step, state } = checkpoint;
         debug!(step, bytes = state.len(), "checkpoint");
-        let disk = &self.coordinator().metrics.disk;
+        let disk = &self.carrier.metrics.disk;
         disk.checkpoint_step.set(i64::try_from(*step).unwrap_or(i64::MAX));
         disk.checkpoint_bytes.set(state.len() as i64);
         disk.checkpoint_timestamp.set(unix_time());

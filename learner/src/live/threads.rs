@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use quad_algorithms::Agent;
 use quad_dataset::{BatchSampler, Task, Transitions};
@@ -12,19 +12,21 @@ use quad_run::config::{Experiment, RunConfig};
 use quad_run::folder::{Log, ResumePoint, RunDir};
 use quad_runtime::{Health, Hint};
 
-use super::coordinator::Coordinator;
+use super::carrier::Carrier;
 use super::disk::{DiskStatus, Writer};
 use super::duplicate::Incarnation;
 use super::events::Events;
 use super::experience::{Experience, OTHER_FOLDER};
 use super::metrics::Metrics;
-use super::scores::{Delivery, Scores};
+use super::results::Results;
 use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
 use super::weights::Weights;
-use crate::evaluation::Rules;
-use crate::train::{HeldOut, OutputQueue, Practice, Training, origin, resume};
+use crate::service::{Rules, Service};
+use crate::train::{
+    HeldOut, Inbox, OutputQueue, Practice, PracticeMetrics, Training, origin, resume,
+};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when
 /// hundreds wait.
@@ -59,7 +61,7 @@ pub(crate) struct Threads {
     stop: Arc<AtomicBool>,
     training: JoinHandle<()>,
     snapshots: JoinHandle<()>,
-    scores: JoinHandle<()>,
+    results: JoinHandle<()>,
 }
 
 impl Threads {
@@ -79,29 +81,32 @@ impl Threads {
         }
         let transitions = agent.transitions().clone();
         let rules = rules(&incarnation, experiment, run.task, &transitions);
-        let coordinator = Coordinator::new(rules, earlier, metrics.clone(), events.clone());
+        let online = open_practice(dir, experiment, step, transitions, &metrics.practice)?;
+        let (practice, experience, inbox) = match online {
+            Some((practice, experience, inbox)) => (Some(practice), Some(experience), Some(inbox)),
+            None => (None, None, None),
+        };
+        let (experience, episodes) = experience.map(|it| (it.log, it.episodes)).unzip();
+        let service = Service::new(rules, earlier, &episodes.unwrap_or_default(), Instant::now());
+        let carrier = Carrier::new(service, metrics.clone(), events.clone(), inbox);
         let schedule = experiment.schedule();
         for (&step, &hash) in known.iter().filter(|(step, _)| schedule.is_evaluated(**step)) {
-            coordinator.open(step, hash)?;
+            carrier.open(step, hash)?;
         }
-        let weights = Weights::new(incarnation, dir.clone(), coordinator.clone());
-        let (services, deliveries) = Services::start(weights.clone())?;
+        let weights = Weights::new(incarnation, dir.clone());
+        let services = Services::start(carrier.clone(), weights.clone())?;
 
         let disk = |writer| DiskStatus::new(writer, metrics.disk_trouble(writer), events.clone());
-        let disk_of_scores = disk(Writer::Scores);
-        let practice = open_practice(dir, experiment, step, transitions, &coordinator)?;
-        let (practice, experience) = practice.unzip();
-        let scores =
-            Scores { log: run.scores, deliveries, coordinator, disk: disk_of_scores, experience };
-        let writer = Writer::Scores.thread();
-        let beat = health.register(writer, STUCK);
-        let scores = spawn_alive(writer, events, beat, move |beat| scores.run(beat))?;
+        let (writer, scores) = (Writer::Scores, run.scores);
+        let results = Results { scores, experience, carrier: carrier.clone(), disk: disk(writer) };
+        let beat = health.register(writer.thread(), STUCK);
+        let results = spawn_alive(writer.thread(), events, beat, move |beat| results.run(beat))?;
 
         metrics.training.gradient_steps.inc_by(step);
         let (rows, seconds_before) = dir.metrics_log(step)?;
         let queue = OutputQueue::default();
-        let snapshots =
-            Snapshots { queue: queue.clone(), rows, weights, known, disk: disk(Writer::Snapshots) };
+        let disk = disk(Writer::Snapshots);
+        let snapshots = Snapshots { queue: queue.clone(), rows, weights, carrier, known, disk };
         let writer = Writer::Snapshots.thread();
         let beat = health.register(writer, STUCK);
         let snapshots = spawn_alive(writer, events, beat, move |beat| snapshots.run(beat))?;
@@ -124,12 +129,12 @@ impl Threads {
         };
         let beat = health.register("training", TRAINING_STUCK);
         let training = spawn_alive("training", events, beat, move |beat| training.run(beat))?;
-        Ok(Self { services, queue, stop, training, snapshots, scores })
+        Ok(Self { services, queue, stop, training, snapshots, results })
     }
 
-    /// The shared state of jobs and scores.
-    pub fn coordinator(&self) -> &Coordinator {
-        self.services.coordinator()
+    /// The run's state of jobs and results.
+    pub fn carrier(&self) -> &Carrier {
+        &self.services.carrier
     }
 
     /// Asks training to end after its current step.
@@ -144,8 +149,8 @@ impl Threads {
         self.training.join().ok();
         self.queue.close();
         self.snapshots.join().ok();
-        self.services.deliveries.send(Delivery::End).ok();
-        self.scores.join().ok();
+        self.services.carrier.close();
+        self.results.join().ok();
     }
 }
 
@@ -167,21 +172,24 @@ fn rules(
     }
 }
 
-/// Practice of a run after gradient step `step`, with the experience that the run has; `None` in a
-/// run without any.
+/// Practice of a run after gradient step `step`, with the experience that the run has, and the inbox
+/// of more.
+type Online = (Practice, Experience, Inbox);
+
+/// `None` in a run without online steps.
 fn open_practice(
     dir: &RunDir,
     experiment: &Experiment,
     step: u64,
     transitions: Arc<Transitions>,
-    coordinator: &Coordinator,
-) -> anyhow::Result<Option<(Practice, Experience)>> {
+    metrics: &PracticeMetrics,
+) -> anyhow::Result<Option<Online>> {
     let (inbox, recorded) = mpsc::channel();
-    let metrics = coordinator.metrics.practice.clone();
-    let Some(mut practice) = Practice::new(experiment, transitions, recorded, metrics) else {
+    let Some(mut practice) = Practice::new(experiment, transitions, recorded, metrics.clone())
+    else {
         return Ok(None);
     };
-    let experience = Experience::open(dir, experiment, inbox, coordinator)?;
+    let experience = Experience::open(dir, experiment, &inbox)?;
     practice.resume(step).hint(OTHER_FOLDER)?;
-    Ok(Some((practice, experience)))
+    Ok(Some((practice, experience, inbox)))
 }

@@ -10,7 +10,6 @@ use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 
-use super::coordinator::Coordinator;
 use super::duplicate::Incarnation;
 use super::requests::NotAccepted;
 
@@ -19,7 +18,6 @@ use super::requests::NotAccepted;
 pub(super) struct Weights {
     incarnation: Incarnation,
     pub run_dir: RunDir,
-    pub coordinator: Coordinator,
     /// Set once the learner is online.
     session: Arc<OnceLock<Session>>,
     /// The newest snapshot with its step, ready to send; older ones come from the disk.
@@ -27,9 +25,9 @@ pub(super) struct Weights {
 }
 
 impl Weights {
-    pub fn new(incarnation: Incarnation, run_dir: RunDir, coordinator: Coordinator) -> Self {
+    pub fn new(incarnation: Incarnation, run_dir: RunDir) -> Self {
         let (session, newest) = (Arc::default(), Arc::default());
-        Self { incarnation, run_dir, coordinator, session, newest }
+        Self { incarnation, run_dir, session, newest }
     }
 
     /// Sets the session, so that later snapshots are published.
@@ -57,13 +55,14 @@ impl Weights {
         Ok(())
     }
 
-    /// The snapshot of a step, for an evaluator that asks.
-    pub fn snapshot(&self, step: u64) -> Result<ZBytes, NotAccepted> {
+    /// The snapshot of a step, for an evaluator that asks. `hash` is its hash, if its episodes are
+    /// run.
+    pub fn snapshot(&self, step: u64, hash: Option<Hash>) -> Result<ZBytes, NotAccepted> {
         let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone();
         if let Some((_, bytes)) = newest.filter(|(newest, _)| *newest == step) {
             return Ok(bytes);
         }
-        let hash = self.coordinator.weights(step).ok_or(NotAccepted::NoSnapshot)?;
+        let hash = hash.ok_or(NotAccepted::NoSnapshot)?;
         self.read(step, hash).map_err(NotAccepted::Unreadable)
     }
 

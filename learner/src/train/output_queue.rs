@@ -14,7 +14,7 @@ use quad_run::folder::Checkpoint;
 use quad_runtime::Heartbeat;
 
 use super::results::{Outcome, Row, TrainedPolicy};
-use crate::evaluation::Opening;
+use crate::service::Opening;
 
 /// Most bytes of snapshots that wait for the disk: forty of the paper's size.
 const MOST_BYTES: usize = 256 << 20;

@@ -15,7 +15,7 @@ use quad_run::config::{Experiment, Online};
 use quad_runtime::Heartbeat;
 
 use super::metrics::PracticeMetrics;
-use crate::evaluation::Opening;
+use crate::service::Opening;
 
 /// Interval at which training checks for a stop while it waits for an episode.
 const POLL: Duration = Duration::from_millis(100);

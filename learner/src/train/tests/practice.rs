@@ -7,7 +7,7 @@ use quad_protocol::{Episode, Exploration, Hash, Name, practice_seed};
 use quad_run::config::{Experiment, Online};
 
 use super::*;
-use crate::evaluation::Opening;
+use crate::service::Opening;
 use crate::train::{Inbox, Practice, PracticeMetrics};
 
 /// Rows of the episodes.

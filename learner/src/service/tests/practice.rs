@@ -3,7 +3,7 @@
 use quad_protocol::{Episode, Exploration};
 
 use super::*;
-use crate::evaluation::{Opening, PracticeEpisode};
+use crate::service::{Opening, PracticeEpisode};
 
 const EXPLORATION: Exploration = Exploration::Policy { noise: 0.1 };
 

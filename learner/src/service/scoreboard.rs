@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
-use quad_protocol::{Episode, EpisodeScore, Hash, Job, Message, Name, Progress, ScoreReport};
+use quad_protocol::{Episode, EpisodeScore, Hash, Job, Message, Name, Progress, ScoreReport, episode_seeds};
 use quad_run::folder::SavedScores;
 
 use super::episodes::{Evaluation, Key};
@@ -118,6 +118,17 @@ impl Scoreboard {
         let complete = evaluation.scores();
         self.evaluations.insert(Key::Evaluation(step), evaluation);
         Ok(complete)
+    }
+
+    /// Opens the evaluation of a snapshot with the seeds of the run; see
+    /// [`add_evaluation`](Self::add_evaluation).
+    pub fn open(
+        &mut self,
+        step: u64,
+        weights: Hash,
+    ) -> Result<Option<Vec<EpisodeScore>>, OtherWeights> {
+        let seeds = episode_seeds(self.rules.seed, step, self.rules.episodes);
+        self.add_evaluation(step, weights, &seeds)
     }
 
     /// Opens an episode of practice.

@@ -24,6 +24,8 @@ pub(crate) enum Refusal {
         "the episode with seed {0} has observations or actions of another size, or is too long"
     )]
     Rows(u64),
+    #[error("there are too many evaluators")]
+    Crowd,
 }
 
 impl Refusal {
@@ -40,6 +42,7 @@ impl Refusal {
             Self::Episode(_) => "impossible_episode",
             Self::Practice(_) => "unknown_practice",
             Self::Rows(_) => "impossible_rows",
+            Self::Crowd => "too_many_evaluators",
         }
     }
 }

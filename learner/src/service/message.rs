@@ -1,0 +1,134 @@
+//! Messages and events that the service takes, and what it orders.
+
+use std::sync::Arc;
+
+use quad_protocol::{
+    CodecError, Episode, EpisodeScore, Hash, JobReply, JobRequest, Name, Piece, PieceReply,
+    Progress, ScoreReply, ScoreReport,
+};
+use quad_run::folder::ScoreLine;
+
+use super::outcomes::{Opening, OtherWeights};
+use super::refusal::Refusal;
+
+/// A message or an event. `Q` is a query, by which its answer finds the way back.
+#[derive(Debug)]
+pub(crate) enum Input<Q> {
+    Job(Q, JobRequest),
+    /// Queued until [`Input::Flush`].
+    Scores(Q, ScoreReport),
+    /// Queued until [`Input::Flush`].
+    Piece(Q, Piece),
+    Progress(Progress),
+    Joined(Name),
+    Left(Name),
+    /// A message of another version of the protocol.
+    OtherVersion(CodecError),
+    /// A snapshot to evaluate is on the disk.
+    Snapshot { step: u64, weights: Hash },
+    /// An online episode may be played, with a snapshot that is on the disk.
+    Opened(Opening, Hash),
+    /// All gradient steps are made, and their output is on the disk.
+    Trained,
+    /// The disk is free for what is queued.
+    Flush,
+    /// A frame that [`Order::Decode`] gave out, and its episode.
+    Decoded(Frame<Q>, Result<Box<Episode>, CodecError>),
+    /// Results of the last [`Order::Append`]: of scores and of experience.
+    Appended([Result<(), String>; 2]),
+    /// Some time has passed, in which training may have waited for an online episode.
+    Tick { training_waits: bool },
+}
+
+/// Work for the caller, to be done in this order.
+#[derive(Debug)]
+pub(crate) enum Order<Q> {
+    Reply(Q, Answer),
+    /// Verify and decode a frame, which takes long, and return it as [`Input::Decoded`].
+    Decode(Frame<Q>),
+    /// Append to `scores.jsonl` and `experience.log`, durably, and report as [`Input::Appended`].
+    Append { scores: Vec<ScoreLine>, frames: Vec<Arc<Vec<u8>>> },
+    /// An episode with this number is on the disk; training takes it in the order of numbers.
+    Learn { number: u64, episode: Box<Episode> },
+    /// An evaluation is complete; if `earlier`, an earlier incarnation has completed it.
+    Evaluated { step: u64, scores: Vec<EpisodeScore>, earlier: bool },
+    /// A line for the user.
+    Tell(String),
+    /// Advise the user to start an evaluator.
+    Advise,
+    /// Show an evaluator's totals.
+    Show(Progress),
+    /// Show an evaluator's totals no longer.
+    Forget(Name),
+    Count(Count),
+    End(End),
+}
+
+/// An event that is counted.
+#[derive(Debug, PartialEq)]
+pub(crate) enum Count {
+    /// Jobs by outcome.
+    Jobs(&'static str, usize),
+    /// A message that was not accepted, by reason.
+    Rejected(&'static str),
+    Scores { new: usize, duplicates: u32 },
+    /// An online episode came again with other bits.
+    Difference,
+}
+
+/// An end of the run.
+#[derive(Debug, PartialEq)]
+pub(crate) enum End {
+    /// Training is complete, and every episode has a score or was given up.
+    Complete,
+    /// Training is complete, but no evaluator came that may have the run's environment.
+    Unscored,
+    OtherWeights(OtherWeights),
+}
+
+/// The frame of an online episode, whole.
+#[derive(Debug)]
+pub(crate) struct Frame<Q> {
+    /// The query that brought the last piece.
+    pub query: Q,
+    pub seed: u64,
+    /// Number of the episode.
+    pub number: u64,
+    /// Hash of the bytes, as claimed.
+    pub hash: Hash,
+    pub bytes: Arc<Vec<u8>>,
+}
+
+#[derive(Debug)]
+pub(crate) enum Answer {
+    Job(JobReply),
+    Scores(ScoreReply),
+    Piece(PieceReply),
+    /// The evaluator is to try it again.
+    TryAgain(TryAgain),
+}
+
+/// A reason for which a delivery is not acknowledged yet.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum TryAgain {
+    #[error("training has not come to the episode again since the learner's start, try again")]
+    NotYet,
+    #[error("it could not be saved, try again: {0}")]
+    NotSaved(String),
+}
+
+impl TryAgain {
+    /// The reason as a metric's label.
+    pub fn label(&self) -> &'static str {
+        match self {
+            Self::NotYet => "not_open_yet",
+            Self::NotSaved(_) => "not_saved",
+        }
+    }
+}
+
+impl<Q> Order<Q> {
+    pub(super) fn rejected(refusal: Refusal) -> Self {
+        Self::Count(Count::Rejected(refusal.label()))
+    }
+}

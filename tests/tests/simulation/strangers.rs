@@ -1,0 +1,65 @@
+//! Well-formed nonsense: messages that no evaluator of ours sends.
+
+use quad_protocol::{
+    EpisodeScore, Hash, JobRequest, Piece, ScoreReport, episode_seeds, practice_seed,
+};
+use rand::Rng;
+
+use crate::arithmetic::precision;
+use crate::world::{Query, World, name};
+
+/// A message with names, numbers and hashes that may be those of the run.
+pub fn query(world: &mut World) -> Query {
+    let settings = &world.settings;
+    let (steps, episodes) = (settings.schedule.steps, settings.episodes);
+    let rng = &mut world.rng;
+    let evaluator = match rng.random_bool(0.5) {
+        true => name(&format!("e{}", rng.random_range(0..3))),
+        false => name(&format!("stranger-{}", rng.random_range(0..5))),
+    };
+    let step = rng.random_range(0..=steps);
+    let (incarnation, job) = (world.learner.incarnation, rng.random_range(0..20));
+    match rng.random_range(0..6) {
+        0 => {
+            let environments = vec![["robot", "other"][rng.random_range(0..2)].to_owned()];
+            let evaluator = name(&format!("stranger-{}", rng.random_range(0..5)));
+            Query::Job(JobRequest::Claim { evaluator, attempt: rng.random(), environments })
+        }
+        1 => {
+            let evaluator = name(&format!("stranger-{}", rng.random_range(0..5)));
+            Query::Job(JobRequest::HandBack { evaluator, job, failed: Some("nonsense".to_owned()) })
+        }
+        2 | 3 => {
+            // Of other weights, or of seeds that are not the run's.
+            let known = world.disk.snapshots.get(&step).copied();
+            let weights = known.filter(|_| rng.random_bool(0.5));
+            let seeds = match weights {
+                Some(_) => episode_seeds(1, step, episodes),
+                None => episode_seeds(0, step, episodes),
+            };
+            let score = |seed| EpisodeScore { seed, episode_return: 7.0, length: 1, score: 7.0 };
+            Query::Scores(ScoreReport {
+                evaluator,
+                run: name("run"),
+                incarnation,
+                job,
+                step,
+                weights: weights.unwrap_or_else(|| Hash::of(b"guessed")),
+                precision: precision(0),
+                episodes: seeds.into_iter().map(score).collect(),
+            })
+        }
+        _ => {
+            let bytes = vec![7; rng.random_range(1..200)];
+            let length = rng.random_range(bytes.len()..2000) as u32;
+            let offset = rng.random_range(0..=length - bytes.len() as u32);
+            let whole = rng.random_bool(0.5);
+            let length = if whole { bytes.len() as u32 } else { length };
+            let hash = if whole { Hash::of(&bytes) } else { Hash::of(b"guessed") };
+            let seed = practice_seed(0, rng.random_range(0..6));
+            let offset = if whole { 0 } else { offset };
+            let run = name("run");
+            Query::Piece(Piece { evaluator, run, incarnation, job, seed, hash, length, offset, bytes })
+        }
+    }
+}
