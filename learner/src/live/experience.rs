@@ -3,10 +3,10 @@
 //! A piece is small, since a learner takes no larger messages. There are as many episodes in
 //! pieces as the run has open, and none is longer than the environment allows.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 
 use anyhow::Context;
-use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode, practice_seed};
+use quad_protocol::{Episode, Hash, Piece, PieceReply, practice_seed};
 use quad_run::config::Experiment;
 use quad_run::folder::{ExperienceLog, RunDir};
 use quad_runtime::{Heartbeat, Hint};
@@ -15,7 +15,7 @@ use tracing::warn;
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
 use super::requests::{NotAccepted, Request};
-use crate::evaluation::PracticeEpisode;
+use crate::evaluation::{Added, Pieces, PracticeEpisode};
 use crate::train::Inbox;
 
 /// The hint of a checkpoint or log without the other.
@@ -27,12 +27,8 @@ pub(super) struct Experience {
     log: ExperienceLog,
     inbox: Inbox,
     coordinator: Coordinator,
-    /// The first bytes of frames, and the hashes of the whole, by seed.
-    partial: BTreeMap<u64, (Hash, Vec<u8>)>,
+    pieces: Pieces,
 }
-
-/// The last piece's request, the number and the episode, which is complete.
-type Whole = (Request, u64, Episode);
 
 impl Experience {
     /// Opens the run's log, and puts what it has into the inbox. An episode that is not there may
@@ -61,7 +57,7 @@ impl Experience {
         }
         let error = "experience.log has episodes of another run";
         episodes.is_empty().then_some(()).context(error).hint(OTHER_FOLDER)?;
-        Ok(Self { log, inbox, coordinator: coordinator.clone(), partial: BTreeMap::new() })
+        Ok(Self { log, inbox, coordinator: coordinator.clone(), pieces: Pieces::default() })
     }
 
     /// Answers each piece. Episodes that are complete are written together first.
@@ -71,11 +67,13 @@ impl Experience {
         disk: &mut DiskStatus,
         beat: &Heartbeat,
     ) {
+        self.pieces.begin();
+        // The last piece's request, the number and the episode.
         let mut whole = Vec::new();
         for (request, piece) in pieces {
-            match self.add(&piece, &whole) {
-                Ok(Added::Reply(reply)) => request.reply(&reply),
-                Ok(Added::Whole(number, episode)) => whole.push((request, number, episode)),
+            match self.add(&piece) {
+                Ok(Received::Reply(reply)) => request.reply(&reply),
+                Ok(Received::Whole(number, episode)) => whole.push((request, number, episode)),
                 Err(why @ NotAccepted::NotYet) => request.reject(&why, &self.coordinator.metrics),
                 Err(why) => refuse(request, &why, &self.coordinator),
             }
@@ -83,13 +81,13 @@ impl Experience {
         if whole.is_empty() {
             return;
         }
-        let partial = whole.iter().filter_map(|(_, _, it)| self.partial.get(&it.score.seed));
-        match self.log.append(partial.map(|(_, frame)| frame.as_slice())) {
+        let seeds = whole.iter().map(|(_, _, episode)| episode.score.seed);
+        match self.log.append(seeds.filter_map(|seed| self.pieces.frame(seed))) {
             Ok(()) => {
                 disk.accepted(beat);
                 for (request, number, episode) in whole {
                     let seed = episode.score.seed;
-                    let Some((hash, _)) = self.partial.remove(&seed) else { continue };
+                    let Some(hash) = self.pieces.remove(seed) else { continue };
                     // Training may have ended.
                     self.inbox.send((number, episode)).ok();
                     request.reply(&self.coordinator.record_practice(seed, hash));
@@ -107,7 +105,7 @@ impl Experience {
         }
     }
 
-    fn add(&mut self, piece: &Piece, whole: &[Whole]) -> Result<Added, NotAccepted> {
+    fn add(&mut self, piece: &Piece) -> Result<Received, NotAccepted> {
         let incarnation = self.coordinator.incarnation();
         let seed = piece.seed;
         let number = match self.coordinator.practice(piece)? {
@@ -121,40 +119,18 @@ impl Experience {
                         "an episode was played again with other bits; the first delivery counts"
                     );
                 }
-                return Ok(Added::Reply(PieceReply::Recorded { incarnation, duplicate: true }));
+                return Ok(Received::Reply(PieceReply::Recorded { incarnation, duplicate: true }));
             }
         };
-        let at = |offset: usize| {
-            let offset = offset as u32;
-            Ok(Added::Reply(PieceReply::Continue { incarnation, offset }))
-        };
-        // Another evaluator's last piece came just before.
-        if whole.iter().any(|(_, other, _)| *other == number) {
-            return at(piece.offset as usize);
-        }
-        let none = || (piece.hash, Vec::new());
-        let (hash, bytes) = self.partial.entry(seed).or_insert_with(none);
-        let offset = piece.offset as usize;
-        if *hash != piece.hash {
-            if offset > 0 {
-                return at(0);
+        match self.pieces.add(piece)? {
+            Added::Continue(offset) => {
+                Ok(Received::Reply(PieceReply::Continue { incarnation, offset }))
             }
-            (*hash, *bytes) = none();
+            Added::Whole(episode) => {
+                self.coordinator.validate_practice(number, &episode)?;
+                Ok(Received::Whole(number, episode))
+            }
         }
-        if offset == bytes.len() {
-            bytes.extend_from_slice(&piece.bytes);
-        }
-        if bytes.len() < piece.length as usize {
-            return at(bytes.len());
-        }
-        let found = Hash::of(bytes);
-        if found != piece.hash {
-            bytes.clear();
-            return Err(CodecError::Hash { claimed: piece.hash, found }.into());
-        }
-        let episode: Episode = decode(bytes)?;
-        self.coordinator.validate_practice(number, &episode)?;
-        Ok(Added::Whole(number, episode))
     }
 }
 
@@ -165,7 +141,7 @@ pub(super) fn refuse(request: Request, why: &NotAccepted, coordinator: &Coordina
     request.reply(&PieceReply::Refused { incarnation, reason });
 }
 
-enum Added {
+enum Received {
     Reply(PieceReply),
     Whole(u64, Episode),
 }
