@@ -134,7 +134,7 @@ impl MainLoop {
                     // The stop came during the last step; the run does not wait for scores.
                     Event::TrainingEnded(_) if state.interrupted => return Ending::Interrupted,
                     Event::TrainingEnded(Outcome::Completed) => {
-                        state.patience = Patience { trained: true, ..Patience::default() };
+                        state.patience = Patience::after_training();
                         self.display.line(&self.trained());
                     }
                     event => {

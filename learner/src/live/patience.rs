@@ -28,6 +28,11 @@ pub(super) enum Verdict {
 }
 
 impl Patience {
+    /// From the end of training on.
+    pub fn after_training() -> Self {
+        Self { trained: true, ..Self::default() }
+    }
+
     pub fn check(&mut self, any_evaluator: bool, now: Instant) -> Verdict {
         if any_evaluator {
             *self = Self { trained: self.trained, ..Self::default() };
@@ -84,8 +89,7 @@ mod tests {
     #[test]
     fn an_evaluator_that_comes_starts_the_time_anew() {
         use Verdict::{Advise, GiveUp, Wait};
-        let patience = Patience { trained: true, ..Patience::default() };
-        let (mut patience, begin) = (patience, Instant::now());
+        let (mut patience, begin) = (Patience::after_training(), Instant::now());
         let mut check = |any, seconds| patience.check(any, begin + Duration::from_secs(seconds));
         assert_eq!([0, 9, 10, 11, 599].map(|s| check(false, s)), [Wait, Wait, Advise, Wait, Wait]);
         assert_eq!(check(true, 599), Wait);
@@ -100,7 +104,7 @@ mod tests {
             [0, 10, 600, 86_400].map(&mut check),
             [Verdict::Wait, Verdict::Advise, Verdict::Wait, Verdict::Wait]
         );
-        patience = Patience { trained: true, ..Patience::default() };
+        patience = Patience::after_training();
         let verdicts = [86_400, 87_000]
             .map(|seconds| patience.check(false, begin + Duration::from_secs(seconds)));
         assert_eq!(verdicts, [Verdict::Wait, Verdict::GiveUp]);

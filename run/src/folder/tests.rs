@@ -4,10 +4,13 @@ use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
+use quad_protocol::encode;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::{ExistingRun, Log, RunDir, RunDirError};
+use super::experience::tests::episode;
+use super::{Checkpoint, ExistingRun, Log, RunDir, RunDirError};
+use crate::config::resolve;
 use crate::fixtures::{config, line};
 
 /// A new run in a temporary folder.
@@ -57,6 +60,27 @@ fn a_run_that_begins_or_resumes_is_no_longer_marked_as_failed() {
     let existing = ExistingRun::open(&path, false).unwrap().unwrap();
     existing.resume(&config("a", 0).experiment).unwrap();
     assert_eq!(run.failure(), None);
+}
+
+#[test]
+fn a_snapshot_that_is_not_the_one_that_has_practiced_is_damaged() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, mut config) = (folder.path().join("a"), config("a", 0));
+    let online = "online = { steps = 4, warmup = 0, lag = 2 }".parse().unwrap();
+    config.experiment.online = resolve("hopper-demo", &online).unwrap().online;
+    config.experiment.steps = 10;
+    let (run, log) = RunDir::create(&path, &config).unwrap();
+    drop(log);
+    run.write_checkpoint(&Checkpoint { step: 10, state: Vec::new() }).unwrap();
+    let frame = encode(&episode(1)).unwrap();
+    run.experience_log().unwrap().0.append([&*frame]).unwrap();
+    for (file, is_good) in [(&b"weights"[..], true), (b"damaged", false)] {
+        run.write_snapshot(10, file).unwrap();
+        let existing = ExistingRun::open(&path, false).unwrap().unwrap();
+        let (_, _, point) = existing.resume(&config.experiment).unwrap();
+        assert_eq!(point.snapshots.contains_key(&10), is_good);
+        assert_eq!(run.snapshots().unwrap(), if is_good { vec![10] } else { vec![] });
+    }
 }
 
 #[test]

@@ -81,7 +81,7 @@ fn a_torn_append_is_cut_off_from_its_first_damaged_record_on() {
     assert_eq!(read_experience(run.path()).unwrap(), [1, 2, 3, 4, 5, 6].map(episode));
     let length = bytes.len() / 3;
     for (torn, kept) in [(3, 3), (4, 4), (5, 5)] {
-        for range in [0..1, 10..60, length - 1..length, 0..length] {
+        for range in [0..1, 10..60, length - 20..length, 0..length] {
             let mut damaged = whole.clone();
             damaged[torn * length..][range].fill(0);
             fs::write(&path, damaged).unwrap();
