@@ -24,7 +24,6 @@ mod children;
 pub mod cli;
 pub mod command;
 mod data;
-mod service;
 #[cfg(test)]
 #[path = "../../run/src/fixtures.rs"]
 mod fixtures;
@@ -33,5 +32,6 @@ mod live;
 mod local_evaluators;
 mod page;
 mod report;
+pub mod service;
 mod sweep;
 mod train;

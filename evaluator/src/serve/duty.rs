@@ -18,7 +18,7 @@ const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)
 /// Most characters of a reason that the evaluator sends; the learner accepts no large messages.
 const MAX_REASON_LEN: usize = 1000;
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Duty {
     state: State,
     /// Number of the claim that has no answer yet.
@@ -51,26 +51,57 @@ enum State {
 /// What an evaluator is to do in a run.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Step {
-    Claim { attempt: u64 },
+    Claim {
+        attempt: u64,
+    },
     Play(Job),
     Scores(ScoreReport),
     Piece(Piece),
     /// To the learner process with this incarnation.
-    HandBack { job: u64, incarnation: u64, failed: Option<String> },
+    HandBack {
+        job: u64,
+        incarnation: u64,
+        failed: Option<String>,
+    },
 }
 
 /// An event for logs and metrics.
 #[derive(Debug, PartialEq)]
 pub enum Note {
     Scored(ScoreReport, [u32; 2]),
-    Practiced { step: u64, seed: u64, rows: u64, duplicate: bool },
+    Practiced {
+        step: u64,
+        seed: u64,
+        rows: u64,
+        duplicate: bool,
+    },
     /// Scores of this step wait until the learner has trained to it again.
-    Early { step: u64 },
+    Early {
+        step: u64,
+    },
     /// Results of this step are dropped, for this reason.
-    Abandoned { step: u64, reason: String },
+    Abandoned {
+        step: u64,
+        reason: String,
+    },
 }
 
 impl Duty {
+    /// The duty in a run that is due now, before it has followed a learner.
+    pub fn new(now: Instant) -> Self {
+        Self {
+            state: State::Idle,
+            attempt: None,
+            early: Early::default(),
+            again: None,
+            delivered_again: false,
+            incarnation: 0,
+            turn: Turn::new(now),
+            in_turn: false,
+            leaving: false,
+        }
+    }
+
     /// True if there are results to deliver, or a job to hand back.
     pub fn owes(&self) -> bool {
         !matches!(self.state, State::Idle) || !self.early.is_empty() || self.again.is_some()

@@ -21,8 +21,9 @@
 
 mod client;
 mod connection;
-mod delivery;
+pub mod delivery;
 mod discovery;
+pub mod duty;
 mod evaluate;
 mod exploration;
 #[cfg(test)]
@@ -30,7 +31,7 @@ pub(crate) mod fixtures;
 mod job;
 mod policy;
 mod query;
-mod scheduler;
+pub mod scheduler;
 mod snapshot;
 mod worker;
 

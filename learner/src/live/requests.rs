@@ -16,7 +16,7 @@ const MOST_BYTES: usize = 30 * 1024;
 
 /// A query and its message.
 #[derive(Debug)]
-pub(super) struct Request {
+pub(crate) struct Request {
     query: Query,
     payload: ZBytes,
 }

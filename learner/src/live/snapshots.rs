@@ -67,6 +67,7 @@ impl Snapshots {
         match output {
             Output::Snapshot(policy) => self.snapshot(policy)?,
             Output::Practice(opening) => self.open_practice(opening)?,
+            Output::Waits(episode) => drop(self.carrier.carry(Input::Waits(*episode))),
             Output::Checkpoint(checkpoint) => self.checkpoint(checkpoint)?,
             Output::Rows(rows) => self.rows.append(rows)?,
             Output::Ended(outcome) => self.carrier.events.send(Event::TrainingEnded(*outcome)),

@@ -167,6 +167,7 @@ fn rules(
         seed: experiment.seed,
         dims: (transitions.observation_dim(), transitions.action_dim()),
         episodes: experiment.episodes,
+        schedule: experiment.schedule(),
         job_episodes: JOB_EPISODES,
         lease: LEASE,
     }

@@ -1,14 +1,14 @@
 //! Deliveries: score reports, and online episodes in pieces. They wait for the disk, are checked,
 //! written together, and then acknowledged.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::sync::Arc;
+use std::collections::{BTreeSet, VecDeque};
 
 use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, ScoreReply, ScoreReport};
 use quad_run::folder::ScoreLine;
 
 use super::message::{Answer, Count, End, Frame, Order, TryAgain};
 use super::outcomes::PracticeEpisode;
+use super::pieces::{Added, Pieces};
 use super::refusal::Refusal;
 use super::service::Service;
 use super::validate::Validated;
@@ -21,11 +21,8 @@ const MOST_TOGETHER: usize = 256;
 #[derive(Debug)]
 pub(super) struct Deliveries<Q> {
     arrived: VecDeque<Arrival<Q>>,
-    /// Claimed hash and first bytes of frames, by seed. There are as many as the run has open
-    /// episodes, and none is longer than the environment allows.
-    partial: BTreeMap<u64, (Hash, Vec<u8>)>,
-    /// Seeds of the whole frames that are decoded or written.
-    whole: BTreeSet<u64>,
+    pieces: Pieces,
+    /// Number of frames that are decoded.
     decoding: usize,
     /// What is written, or about to be.
     writing: Vec<Writing<Q>>,
@@ -48,8 +45,7 @@ impl<Q> Default for Deliveries<Q> {
     fn default() -> Self {
         Self {
             arrived: VecDeque::new(),
-            partial: BTreeMap::new(),
-            whole: BTreeSet::new(),
+            pieces: Pieces::default(),
             decoding: 0,
             writing: Vec::new(),
             appending: false,
@@ -101,13 +97,18 @@ impl<Q> Service<Q> {
     fn report(&mut self, query: Q, report: ScoreReport) {
         match self.board.validate(&report) {
             // All of its scores are on the disk.
-            Ok(validated) if validated.new.is_empty() => self.acknowledge(query, &report, &validated),
+            Ok(validated) if validated.new.is_empty() => {
+                self.acknowledge(query, &report, &validated)
+            }
             Ok(validated) => {
                 self.deliveries.writing.push(Writing::Scores(query, report, validated));
             }
             Err(refusal) => {
-                let (incarnation, reason) = (self.rules.incarnation, refusal.to_string());
-                let reply = Answer::Scores(ScoreReply::Refused { incarnation, reason });
+                let incarnation = self.rules.incarnation;
+                let reply = Answer::Scores(match refusal {
+                    Refusal::NotYet => ScoreReply::NotYet { incarnation },
+                    _ => ScoreReply::Refused { incarnation, reason: refusal.to_string() },
+                });
                 self.orders.extend([Order::rejected(refusal), Order::Reply(query, reply)]);
             }
         }
@@ -115,49 +116,31 @@ impl<Q> Service<Q> {
 
     fn add_piece(&mut self, query: Q, piece: &Piece) {
         let incarnation = self.rules.incarnation;
-        let resume = |offset: usize| {
-            let offset = offset as u32;
-            Answer::Piece(PieceReply::Continue { incarnation, offset })
-        };
-        let seed = piece.seed;
-        let number = match self.board.practice_of(piece) {
+        let Piece { seed, hash, .. } = *piece;
+        let number = match self.board.practice(piece) {
             Ok(PracticeEpisode::Open { episode }) => episode,
             Ok(PracticeEpisode::NotYet) => return self.try_again(query, TryAgain::NotYet),
-            Ok(PracticeEpisode::Recorded(hash)) => {
-                if hash != piece.hash {
+            Ok(PracticeEpisode::Recorded(recorded)) => {
+                if hash != recorded {
                     self.orders.push(Order::Count(Count::Difference));
                 }
                 let reply = PieceReply::Recorded { incarnation, duplicate: true };
                 return self.orders.push(Order::Reply(query, Answer::Piece(reply)));
             }
-            Err(refusal) => return self.refuse_episode(query, refusal.label(), &refusal.to_string()),
-        };
-        let offset = piece.offset as usize;
-        // The last piece of another evaluator has come just before.
-        if self.deliveries.whole.contains(&seed) {
-            return self.orders.push(Order::Reply(query, resume(offset)));
-        }
-        let none = || (piece.hash, Vec::new());
-        let (hash, bytes) = self.deliveries.partial.entry(seed).or_insert_with(none);
-        if *hash != piece.hash {
-            if offset > 0 {
-                return self.orders.push(Order::Reply(query, resume(0)));
+            Err(refusal) => {
+                return self.refuse_episode(query, refusal.label(), &refusal.to_string());
             }
-            (*hash, *bytes) = none();
+        };
+        match self.deliveries.pieces.add(piece) {
+            Added::Continue(offset) => {
+                let reply = PieceReply::Continue { incarnation, offset };
+                self.orders.push(Order::Reply(query, Answer::Piece(reply)));
+            }
+            Added::Whole(bytes) => {
+                self.deliveries.decoding += 1;
+                self.orders.push(Order::Decode(Frame { query, seed, number, hash, bytes }));
+            }
         }
-        if offset == bytes.len() {
-            bytes.extend_from_slice(&piece.bytes);
-        }
-        if bytes.len() < piece.length as usize {
-            let answer = resume(bytes.len());
-            return self.orders.push(Order::Reply(query, answer));
-        }
-        let bytes = Arc::new(std::mem::take(bytes));
-        self.deliveries.partial.remove(&seed);
-        self.deliveries.whole.insert(seed);
-        self.deliveries.decoding += 1;
-        let hash = piece.hash;
-        self.orders.push(Order::Decode(Frame { query, seed, number, hash, bytes }));
     }
 
     /// Checks a decoded episode. After the last one everything is written.
@@ -174,7 +157,7 @@ impl<Q> Service<Q> {
     }
 
     fn drop_frame(&mut self, frame: Frame<Q>, label: &'static str, reason: &str) {
-        self.deliveries.whole.remove(&frame.seed);
+        self.deliveries.pieces.remove(frame.seed);
         self.refuse_episode(frame.query, label, reason);
     }
 
@@ -222,19 +205,20 @@ impl<Q> Service<Q> {
                     Ok(()) => self.acknowledge(query, &report, &validated),
                     Err(error) => self.try_again(query, TryAgain::NotSaved(error.clone())),
                 },
-                Writing::Episode(frame, episode) => {
-                    self.deliveries.whole.remove(&frame.seed);
-                    match &experience {
-                        Ok(()) => self.recorded(frame, episode),
-                        Err(error) => self.try_again(frame.query, TryAgain::NotSaved(error.clone())),
+                Writing::Episode(frame, episode) => match &experience {
+                    Ok(()) => self.recorded(frame, episode),
+                    Err(error) => {
+                        self.deliveries.pieces.give_back(frame.seed, frame.bytes);
+                        self.try_again(frame.query, TryAgain::NotSaved(error.clone()));
                     }
-                }
+                },
             }
         }
     }
 
     fn recorded(&mut self, frame: Frame<Q>, episode: Box<Episode>) {
         let Frame { query, seed, number, hash, .. } = frame;
+        self.deliveries.pieces.remove(seed);
         let jobs = self.board.record_practice(seed, hash);
         let incarnation = self.rules.incarnation;
         let reply = PieceReply::Recorded { incarnation, duplicate: false };
@@ -268,18 +252,5 @@ impl<Q> Service<Q> {
             Ok(None) => {}
             Err(error) => self.orders.push(Order::End(End::OtherWeights(error))),
         }
-    }
-}
-
-impl super::scoreboard::Scoreboard {
-    /// The online episode of a piece, if the run has it and it is not too long.
-    fn practice_of(&self, piece: &Piece) -> Result<PracticeEpisode, Refusal> {
-        if piece.run != self.rules.run {
-            return Err(Refusal::Run);
-        }
-        if piece.length as usize > self.rules.longest_frame() {
-            return Err(Refusal::Rows(piece.seed));
-        }
-        self.practice(piece.seed).ok_or(Refusal::Practice(piece.seed))
     }
 }

@@ -13,7 +13,7 @@ use super::refusal::Refusal;
 
 /// A message or an event. `Q` is a query, by which its answer finds the way back.
 #[derive(Debug)]
-pub(crate) enum Input<Q> {
+pub enum Input<Q> {
     Job(Q, JobRequest),
     /// Queued until [`Input::Flush`].
     Scores(Q, ScoreReport),
@@ -25,9 +25,14 @@ pub(crate) enum Input<Q> {
     /// A message of another version of the protocol.
     OtherVersion(CodecError),
     /// A snapshot to evaluate is on the disk.
-    Snapshot { step: u64, weights: Hash },
+    Snapshot {
+        step: u64,
+        weights: Hash,
+    },
     /// An online episode may be played, with a snapshot that is on the disk.
     Opened(Opening, Hash),
+    /// Training waits for the online episode with this number from now on.
+    Waits(u64),
     /// All gradient steps are made, and their output is on the disk.
     Trained,
     /// The disk is free for what is queued.
@@ -37,21 +42,33 @@ pub(crate) enum Input<Q> {
     /// Results of the last [`Order::Append`]: of scores and of experience.
     Appended([Result<(), String>; 2]),
     /// Some time has passed, in which training may have waited for an online episode.
-    Tick { training_waits: bool },
+    Tick {
+        training_waits: bool,
+    },
 }
 
 /// Work for the caller, to be done in this order.
 #[derive(Debug)]
-pub(crate) enum Order<Q> {
+pub enum Order<Q> {
     Reply(Q, Answer),
     /// Verify and decode a frame, which takes long, and return it as [`Input::Decoded`].
     Decode(Frame<Q>),
     /// Append to `scores.jsonl` and `experience.log`, durably, and report as [`Input::Appended`].
-    Append { scores: Vec<ScoreLine>, frames: Vec<Arc<Vec<u8>>> },
+    Append {
+        scores: Vec<ScoreLine>,
+        frames: Vec<Arc<Vec<u8>>>,
+    },
     /// An episode with this number is on the disk; training takes it in the order of numbers.
-    Learn { number: u64, episode: Box<Episode> },
+    Learn {
+        number: u64,
+        episode: Box<Episode>,
+    },
     /// An evaluation is complete; if `earlier`, an earlier incarnation has completed it.
-    Evaluated { step: u64, scores: Vec<EpisodeScore>, earlier: bool },
+    Evaluated {
+        step: u64,
+        scores: Vec<EpisodeScore>,
+        earlier: bool,
+    },
     /// A line for the user.
     Tell(String),
     /// Advise the user to start an evaluator.
@@ -66,19 +83,22 @@ pub(crate) enum Order<Q> {
 
 /// An event that is counted.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Count {
+pub enum Count {
     /// Jobs by outcome.
     Jobs(&'static str, usize),
     /// A message that was not accepted, by reason.
     Rejected(&'static str),
-    Scores { new: usize, duplicates: u32 },
+    Scores {
+        new: usize,
+        duplicates: u32,
+    },
     /// An online episode came again with other bits.
     Difference,
 }
 
 /// An end of the run.
 #[derive(Debug, PartialEq)]
-pub(crate) enum End {
+pub enum End {
     /// Training is complete, and every episode has a score or was given up.
     Complete,
     /// Training is complete, but no evaluator came that may have the run's environment.
@@ -88,7 +108,7 @@ pub(crate) enum End {
 
 /// The frame of an online episode, whole.
 #[derive(Debug)]
-pub(crate) struct Frame<Q> {
+pub struct Frame<Q> {
     /// The query that brought the last piece.
     pub query: Q,
     pub seed: u64,
@@ -100,7 +120,7 @@ pub(crate) struct Frame<Q> {
 }
 
 #[derive(Debug)]
-pub(crate) enum Answer {
+pub enum Answer {
     Job(JobReply),
     Scores(ScoreReply),
     Piece(PieceReply),
@@ -110,7 +130,7 @@ pub(crate) enum Answer {
 
 /// A reason for which a delivery is not acknowledged yet.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum TryAgain {
+pub enum TryAgain {
     #[error("training has not come to the episode again since the learner's start, try again")]
     NotYet,
     #[error("it could not be saved, try again: {0}")]

@@ -14,16 +14,19 @@
 //!
 //! In reading order: `service`, `message` (what it takes and orders), `deliveries` (from their
 //! arrival to their acknowledgment), `scoreboard` (episodes and jobs), `outcomes` (its arguments and
-//! results), `episodes` (one evaluation), `open_job` (a job and its lease), `validate` (checks of
-//! results), `refusal`, `evaluators`, `patience`.
+//! results), `episodes` (one evaluation), `open_job` (a job and its lease), `pieces` (episodes
+//! that arrive in pieces), `validate` (checks of results), `refusal`, `evaluators`, `patience`;
+//! `online_schedule` is training's, of online episodes and gradient steps.
 
 mod deliveries;
 mod episodes;
 mod evaluators;
 mod message;
+mod online_schedule;
 mod open_job;
 mod outcomes;
 mod patience;
+mod pieces;
 mod refusal;
 mod scoreboard;
 #[allow(clippy::module_inception)]
@@ -32,8 +35,8 @@ mod service;
 mod tests;
 mod validate;
 
-pub(crate) use message::{Answer, Count, End, Frame, Input, Order};
-pub(crate) use outcomes::{Opening, OtherWeights};
-pub(crate) use refusal::Refusal;
-pub(crate) use scoreboard::Rules;
-pub(crate) use service::{Connected, Service};
+pub use message::{Answer, Count, End, Frame, Input, Order, TryAgain};
+pub use online_schedule::OnlineSchedule;
+pub use outcomes::{Opening, OtherWeights};
+pub use scoreboard::Rules;
+pub use service::{Connected, Gauges, Service};

@@ -27,8 +27,7 @@ impl OnlineSchedule {
     /// The schedule of a run with this seed, before its first episode.
     pub fn new(online: Online, begin: u64, seed: u64) -> Self {
         let lag = u64::from(online.lag);
-        let mut schedule =
-            Self { online, begin, seed, episodes: 0, rows: 0, openings: Vec::new() };
+        let mut schedule = Self { online, begin, seed, episodes: 0, rows: 0, openings: Vec::new() };
         (0..lag).for_each(|episode| schedule.open(episode, begin));
         schedule
     }

@@ -7,7 +7,7 @@ use quad_protocol::{EpisodeScore, Exploration, Hash, Job, Name};
 /// Retrained weights differ from the scored ones.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("the weights of step {step} are {found}, but {scored} were scored before")]
-pub(crate) struct OtherWeights {
+pub struct OtherWeights {
     pub step: u64,
     /// Hash of the retrained weights.
     pub found: Hash,
@@ -25,7 +25,7 @@ pub(crate) struct Recorded {
 
 /// An episode of practice that evaluators may play.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Opening {
+pub struct Opening {
     /// Number of the episode, from 0: experience enters the buffer in this order.
     pub episode: u64,
     /// Gradient step of the snapshot that acts.

@@ -26,13 +26,12 @@ const MOST_SHARED_NAMES: usize = 100;
 /// A run's evaluations and online episodes, from their opening to the acknowledgment of their
 /// results.
 #[derive(Debug)]
-pub(crate) struct Service<Q> {
+pub struct Service<Q> {
     pub(super) rules: Arc<Rules>,
     pub(super) board: Scoreboard,
     evaluators: Evaluators,
     pub(super) deliveries: Deliveries<Q>,
     patience: Patience,
-    trained: bool,
     told: Told,
     pub(super) orders: Vec<Order<Q>>,
     begin: Instant,
@@ -50,7 +49,7 @@ struct Told {
 
 /// Numbers for gauges.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Gauges {
+pub struct Gauges {
     pub evaluators: usize,
     /// Episodes of evaluations that have no score, but may still get one.
     pub pending: usize,
@@ -60,7 +59,7 @@ pub(crate) struct Gauges {
 
 /// A connected evaluator and its job.
 #[derive(Debug)]
-pub(crate) struct Connected<'a> {
+pub struct Connected<'a> {
     pub name: &'a Name,
     /// True if it has the run's environment.
     pub fits: bool,
@@ -93,7 +92,6 @@ impl<Q> Service<Q> {
             evaluators: Evaluators::new(now),
             deliveries: Deliveries::default(),
             patience: Patience::default(),
-            trained: false,
             told: Told::default(),
             orders: Vec::new(),
             begin: now,
@@ -137,6 +135,7 @@ impl<Q> Service<Q> {
                 }
                 self.board.open_practice(&opening, weights);
             }
+            Input::Waits(episode) => self.board.wait_for_practice(episode, now),
             Input::Trained => self.trained(),
             Input::Flush => self.flush(),
             Input::Decoded(frame, episode) => self.decoded(frame, episode),
@@ -151,7 +150,9 @@ impl<Q> Service<Q> {
     }
 
     fn count_jobs(&mut self, outcome: &'static str, count: usize) {
-        self.orders.push(Order::Count(Count::Jobs(outcome, count)));
+        if count > 0 {
+            self.orders.push(Order::Count(Count::Jobs(outcome, count)));
+        }
     }
 
     /// Answers a claim or a hand-back.
@@ -258,8 +259,11 @@ impl<Q> Service<Q> {
 
     fn trained(&mut self) {
         self.board.end_practice();
-        (self.trained, self.patience) = (true, Patience::default());
-        let present = counted(self.evaluators.count(), "evaluator");
+        self.patience = Patience::after_training();
+        let present = match self.evaluators.count() {
+            0 => "no evaluator".to_owned(),
+            count => counted(count, "evaluator"),
+        };
         self.tell(match self.board.pending() {
             0 => "training is done".to_owned(),
             pending => {
@@ -278,15 +282,13 @@ impl<Q> Service<Q> {
             self.tell(format!("{jobs} made no progress; other evaluators get the episodes"));
         }
         self.lost(&expired);
-        if self.trained && self.board.pending() == 0 {
+        if self.patience.trained && self.board.pending() == 0 {
             return self.orders.push(Order::End(End::Complete));
         }
-        let waits = self.trained || training_waits;
+        let waits = self.patience.trained || training_waits;
         match self.patience.check(self.evaluators.any_may_fit() || !waits, now) {
             Verdict::Wait => {}
             Verdict::Advise => self.orders.push(Order::Advise),
-            // Training waits for an online episode as long as it takes.
-            Verdict::GiveUp if !self.trained => {}
             Verdict::GiveUp => self.orders.push(Order::End(End::Unscored)),
         }
     }

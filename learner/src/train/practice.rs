@@ -1,21 +1,19 @@
-//! Practice in the order of its rows: how many gradient steps they allow, and which snapshot plays
-//! the next episodes. All of it is a function of the settings and of the episodes' lengths, so that
-//! neither clocks nor the number of evaluators can change a run.
+//! Practice on the thread of training: its episodes enter the buffer in the order and at the steps
+//! that [`OnlineSchedule`] says.
 
 use std::collections::BTreeMap;
-use std::mem;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender};
 use std::time::{Duration, Instant};
 
 use quad_dataset::{OnlineSampler, PracticeRows, Transitions};
-use quad_protocol::{Episode, Exploration, practice_seed};
-use quad_run::config::{Experiment, Online};
+use quad_protocol::Episode;
+use quad_run::config::Experiment;
 use quad_runtime::Heartbeat;
 
 use super::metrics::PracticeMetrics;
-use crate::service::Opening;
+use crate::service::{OnlineSchedule, Opening};
 
 /// Interval at which training checks for a stop while it waits for an episode.
 const POLL: Duration = Duration::from_millis(100);
@@ -32,14 +30,7 @@ pub(crate) type Inbox = Sender<(u64, Episode)>;
 
 /// The practice of a run.
 pub(crate) struct Practice {
-    online: Online,
-    /// Gradient steps before practice.
-    begin: u64,
-    seed: u64,
-    /// Episodes absorbed.
-    episodes: u64,
-    /// Episodes that are open and still to be announced.
-    openings: Vec<Opening>,
+    schedule: OnlineSchedule,
     recorded: Receiver<(u64, Episode)>,
     /// Recorded episodes that are not absorbed yet, by number.
     waiting: BTreeMap<u64, Episode>,
@@ -70,48 +61,26 @@ impl Practice {
         let online = experiment.online.clone()?;
         let (seed, begin) = (experiment.seed, experiment.steps);
         let sampler = OnlineSampler::new(experiment.batch_size as usize, online.share, seed);
-        let lag = online.lag;
         metrics.target.set(i64::try_from(online.steps).unwrap_or(i64::MAX));
-        let mut practice = Self {
-            online,
-            begin,
-            seed,
-            episodes: 0,
-            openings: Vec::new(),
-            recorded,
-            waiting: BTreeMap::new(),
-            transitions,
-            sampler,
-            metrics,
-        };
-        (0..u64::from(lag)).for_each(|episode| practice.open(episode, begin));
-        Some(practice)
-    }
-
-    fn rows(&self) -> u64 {
-        self.transitions.experience_len() as u64
-    }
-
-    /// The last gradient step that the rows so far allow.
-    fn due(&self) -> u64 {
-        self.begin + self.online.updates_after(self.rows())
+        let (schedule, waiting) = (OnlineSchedule::new(online, begin, seed), BTreeMap::new());
+        Some(Self { schedule, recorded, waiting, transitions, sampler, metrics })
     }
 
     /// True from the first gradient step of practice on.
     pub fn has_begun(&self, step: u64) -> bool {
-        step >= self.begin
+        self.schedule.has_begun(step)
     }
 
     /// True if practice may be played with the policy after this gradient step.
     pub fn is_snapshot(&self, step: u64) -> bool {
-        self.online.is_snapshot(self.begin, step)
+        self.schedule.is_snapshot(step)
     }
 
     /// Absorbs the episodes that a checkpoint of this step has learned from.
     pub fn resume(&mut self, step: u64) -> Result<(), PracticeError> {
         self.waiting.extend(self.recorded.try_iter());
-        while self.has_begun(step) && self.due() < step {
-            let number = self.episodes;
+        while self.has_begun(step) && self.schedule.due() < step {
+            let number = self.schedule.next_episode();
             let episode = self.waiting.remove(&number).ok_or(PracticeError::Missing(number))?;
             self.absorb(&episode)?;
         }
@@ -120,7 +89,7 @@ impl Practice {
 
     /// True if gradient step `step` is the last that the rows so far allow.
     pub fn is_due(&self, step: u64) -> bool {
-        step == self.due()
+        step == self.schedule.due()
     }
 
     /// Waits for the next episode and absorbs it. False if training is to `stop`.
@@ -130,7 +99,7 @@ impl Practice {
         beat: &Heartbeat,
     ) -> Result<bool, PracticeError> {
         while !stop.load(Ordering::Relaxed) {
-            if let Some(episode) = self.waiting.remove(&self.episodes) {
+            if let Some(episode) = self.waiting.remove(&self.schedule.next_episode()) {
                 return self.absorb(&episode).map(|()| true);
             }
             beat.alive();
@@ -144,44 +113,35 @@ impl Practice {
     /// Episodes that are open since the last call and not recorded yet.
     pub fn take_openings(&mut self) -> Vec<Opening> {
         self.waiting.extend(self.recorded.try_iter());
-        let is_open =
-            |it: &Opening| it.episode >= self.episodes && !self.waiting.contains_key(&it.episode);
-        mem::take(&mut self.openings).into_iter().filter(is_open).collect()
+        let mut openings = self.schedule.take_openings();
+        openings.retain(|opening| !self.waiting.contains_key(&opening.episode));
+        openings
+    }
+
+    /// The next episode, unless it is recorded.
+    pub fn awaited(&self) -> Option<u64> {
+        Some(self.schedule.next_episode()).filter(|next| !self.waiting.contains_key(next))
     }
 
     fn absorb(&mut self, episode: &Episode) -> Result<(), PracticeError> {
-        let (number, step, metrics) = (self.episodes, self.due(), &self.metrics);
+        let (number, metrics) = (self.schedule.next_episode(), &self.metrics);
         let Episode { observations, actions, rewards, terminated, score, .. } = episode;
         let rows = PracticeRows { observations, actions, rewards, terminated: *terminated };
         let added = self.transitions.add_episode(rows);
         added.map_err(|source| PracticeError::Rows { number, source })?;
-        metrics.rows.set(i64::try_from(self.rows()).unwrap_or(i64::MAX));
+        self.schedule.absorb(rewards.len() as u64);
+        metrics.rows.set(i64::try_from(self.schedule.rows()).unwrap_or(i64::MAX));
         metrics.episodes.inc();
         metrics.episode_return.set(score.episode_return);
         metrics.score.set(score.score);
-        self.episodes += 1;
-        if self.rows() < self.online.steps {
-            self.open(number + u64::from(self.online.lag), step);
-        }
         Ok(())
-    }
-
-    /// Opens an episode at this gradient step.
-    fn open(&mut self, episode: u64, step: u64) {
-        let Online { warmup, uniform_warmup, noise, .. } = self.online;
-        let exploration = match uniform_warmup && self.rows() < warmup {
-            true => Exploration::Uniform,
-            false => Exploration::Policy { noise: noise as f32 },
-        };
-        let step = self.online.newest_snapshot(self.begin, step);
-        let seed = practice_seed(self.seed, episode);
-        self.openings.push(Opening { episode, step, seed, exploration });
     }
 
     /// Numbers for a line of `metrics.jsonl`.
     pub fn row(&self) -> Vec<(&'static str, f64)> {
         let metrics = &self.metrics;
-        let values = [self.rows() as f64, metrics.episode_return.get(), metrics.wait_seconds.get()];
+        let values =
+            [self.schedule.rows() as f64, metrics.episode_return.get(), metrics.wait_seconds.get()];
         COLUMNS.iter().map(|(name, _)| *name).zip(values).collect()
     }
 

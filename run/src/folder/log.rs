@@ -4,7 +4,8 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use tracing::warn;
 
 use super::error::{RunDirError, content, io_error};
 use super::lock::Lock;
@@ -26,12 +27,13 @@ pub struct Log {
 }
 
 impl Log {
-    /// Opens or creates a file of lines and cuts off an incomplete line at its end. A log with a
-    /// lock is durable.
+    /// Opens or creates a file of lines and cuts off an append at its end that was not completed. A
+    /// log with a lock is durable.
     pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
         let mut file = files::append(&path).map_err(io_error("open", &path))?;
         let text = files::rest(&mut file, 0).map_err(io_error("read", &path))?;
-        let log = Self::cut(path, file, complete_lines(&text) as u64, lock.is_some())?;
+        let length = if lock.is_some() { whole_lines(&text) } else { complete_lines(&text) };
+        let log = Self::cut(path, file, length as u64, lock.is_some())?;
         Ok(Self { _lock: lock, ..log })
     }
 
@@ -42,6 +44,11 @@ impl Log {
         length: u64,
         durable: bool,
     ) -> Result<Self, RunDirError> {
+        let end = file.metadata().map_err(io_error("read", &path))?.len();
+        if durable && end > length {
+            let (path, dropped) = (path.display(), end - length);
+            warn!("{path}: the last write was not completed; its {dropped} bytes are dropped");
+        }
         let mut log = Self { path, file, length, torn: true, durable, _lock: None };
         // Lines that a killed process did not synchronize count from now on.
         log.mend()
@@ -60,7 +67,9 @@ impl Log {
     pub fn append<T: Serialize>(&mut self, lines: &[T]) -> Result<(), RunDirError> {
         let mut text = Vec::new();
         for line in lines {
-            serde_json::to_writer(&mut text, line)
+            let position = Position { after: self.durable.then_some(self.length) };
+            let line = Line { line, position };
+            serde_json::to_writer(&mut text, &line)
                 .map_err(|error| content(&self.path, None, error))?;
             text.push(b'\n');
         }
@@ -126,6 +135,43 @@ pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
     lines.truncate(complete_lines(&lines));
     *read += lines.len() as u64;
     Ok(lines)
+}
+
+/// The part of a line that is the log's own.
+#[derive(Serialize, Deserialize)]
+struct Position {
+    /// Bytes of a durable log that were on the disk before the line's append.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    after: Option<u64>,
+}
+
+/// A line as it is written.
+#[derive(Serialize)]
+struct Line<'a, T> {
+    #[serde(flatten)]
+    line: &'a T,
+    #[serde(flatten)]
+    position: Position,
+}
+
+/// Length of the lines of a durable log, bytes, without those of an append that a power cut has
+/// torn: any part of it may be missing. Damage before the last append counts as lines.
+pub(super) fn whole_lines(text: &[u8]) -> usize {
+    let complete = complete_lines(text);
+    let (mut end, mut damaged) = (0, None);
+    for line in text[..complete].split_inclusive(|&byte| byte == b'\n') {
+        match serde_json::from_slice::<Position>(line) {
+            Ok(Position { after }) => {
+                let synchronized = after.unwrap_or(end as u64);
+                if damaged.is_some_and(|start| start < synchronized) {
+                    return complete;
+                }
+            }
+            Err(_) => drop(damaged.get_or_insert(end as u64)),
+        }
+        end += line.len();
+    }
+    damaged.map_or(complete, |start| start as usize)
 }
 
 /// Length of the complete lines, bytes.

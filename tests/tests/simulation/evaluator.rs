@@ -47,11 +47,12 @@ struct Playing {
 
 impl EvaluatorProcess {
     pub fn new(world: &mut World, number: usize) -> Self {
+        let now = world.instant();
         let rng = &mut world.rng;
         let kind = if world.settings.faults.other_bits { rng.random_range(0..2) } else { 0 };
         Self {
             name: name(&format!("e{number}")),
-            duty: Duty::default(),
+            duty: Duty::new(now),
             epoch: 1,
             alive: true,
             incarnations: BTreeSet::new(),
@@ -90,11 +91,9 @@ impl World {
         if evaluator.alive {
             return;
         }
-        let (epoch, name) = (evaluator.epoch + 1, evaluator.name.clone());
-        let fresh = EvaluatorProcess::new(self, number);
-        // Its user may have given it the name.
-        let name = if self.rng.random_bool(0.5) { name } else { fresh.name.clone() };
-        self.evaluators[number] = EvaluatorProcess { epoch, name, ..fresh };
+        let epoch = evaluator.epoch + 1;
+        // With its old name, as if its user had given it one.
+        self.evaluators[number] = EvaluatorProcess { epoch, ..EvaluatorProcess::new(self, number) };
         self.announce_evaluator(number);
         self.tell_evaluator_of_learner(number);
     }
@@ -130,7 +129,10 @@ impl World {
         if evaluator.leaves_at.is_some_and(|at| now >= at) {
             return self.crash_evaluator(number);
         }
-        if evaluator.query.is_some() || evaluator.playing.is_some() || evaluator.incarnations.is_empty() {
+        if evaluator.query.is_some()
+            || evaluator.playing.is_some()
+            || evaluator.incarnations.is_empty()
+        {
             return;
         }
         let step = match evaluator.duty.next(random) {
@@ -211,7 +213,9 @@ impl World {
                 duty.claimed(reply, spread, now);
                 Vec::new()
             }
-            Some(Reply::Scores(reply)) if reply.incarnation() == followed => duty.scored(reply, now),
+            Some(Reply::Scores(reply)) if reply.incarnation() == followed => {
+                duty.scored(reply, now)
+            }
             Some(Reply::Piece(reply)) if reply.incarnation() == followed => {
                 duty.sent(reply, now).unwrap_or_else(|_| {
                     duty.unanswered(now);
@@ -242,7 +246,9 @@ impl World {
             Note::Early { .. } => {}
             Note::Abandoned { step, reason } => {
                 self.record(|| format!("results of step {step} are abandoned: {reason}"));
-                if reason.contains("refused") {
+                // Training has come to all that it needs.
+                let needless = self.trained && reason.contains("no practice episode");
+                if reason.contains("refused") && !needless {
                     return Err(format!("results of step {step} are refused: {reason}"));
                 }
             }
@@ -280,7 +286,8 @@ impl World {
         playing.done += 1;
         if playing.done < playing.steps {
             let (job, done, pause) = (&playing.job, playing.done, evaluator.environment_step);
-            let progress = Progress { steps_done: done, ..Progress::new(job, evaluator.name.clone()) };
+            let progress =
+                Progress { steps_done: done, ..Progress::new(job, evaluator.name.clone()) };
             self.send(Event::Progress(progress), Some(number));
             self.after(pause, Event::Played(number, epoch));
             return Ok(());

@@ -1,15 +1,11 @@
 //! A learner's process: the service, the threads around it, and its death and return.
 
-use std::collections::{BTreeMap, VecDeque};
-use std::sync::Arc;
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use quad_dataset::Task;
-use quad_learner::service::{Answer, End, Frame, Input, Order, Rules, Service};
-use quad_protocol::{
-    CodecError, Episode, Hash, JobReply, PieceReply, ScoreReply, decode,
-};
-use quad_run::folder::ScoreLine;
+use quad_learner::service::{Answer, Frame, Input, Order, Rules, Service};
+use quad_protocol::{CodecError, Episode, Hash, decode};
 use rand::Rng;
 
 use crate::arithmetic::ACTION_DIM;
@@ -102,7 +98,7 @@ impl World {
         {
             let (some, others) = (self.rng.random_range(0..=scores.len()), frames.len());
             let others = self.rng.random_range(0..=others);
-            self.disk.append(&scores[..some], &frames[..others]);
+            drop(self.disk.append(&scores[..some], &frames[..others]));
         }
         self.tell_evaluators_of_learner();
     }
@@ -127,7 +123,9 @@ impl World {
 
     /// Gives the service something, and does what it orders.
     pub fn carry(&mut self, input: Input<Sender>) -> Result<(), String> {
-        self.record(|| format!("learner: {input:?}"));
+        if !matches!(input, Input::Tick { .. } | Input::Flush) {
+            self.record(|| format!("learner: {input:?}"));
+        }
         let now = self.instant();
         let Some(alive) = &mut self.learner.alive else { return Ok(()) };
         let orders = alive.service.handle(input, now);
@@ -138,7 +136,9 @@ impl World {
     }
 
     fn carry_out(&mut self, order: Order<Sender>) -> Result<(), String> {
-        self.record(|| format!("learner orders {order:?}"));
+        if !matches!(order, Order::Count(_) | Order::Show(_)) {
+            self.record(|| format!("learner orders {order:?}"));
+        }
         match order {
             Order::Reply(to, Answer::Job(reply)) => self.answer(to, Reply::Job(reply)),
             Order::Reply(to, Answer::Scores(reply)) => self.answer(to, Reply::Scores(reply)),
@@ -163,7 +163,9 @@ impl World {
                 for score in scores {
                     let on_disk = self.disk.score(step, score.seed);
                     if on_disk != Some(score) {
-                        return Err(format!("{score:?} of step {step} counts; on disk: {on_disk:?}"));
+                        return Err(format!(
+                            "{score:?} of step {step} counts; on disk: {on_disk:?}"
+                        ));
                     }
                 }
             }
@@ -252,10 +254,8 @@ impl World {
         else {
             return Ok(());
         };
-        let writes = matches!(
-            alive.outputs.front(),
-            Some(Output::Snapshot { .. } | Output::Checkpoint(_))
-        );
+        let writes =
+            matches!(alive.outputs.front(), Some(Output::Snapshot { .. } | Output::Checkpoint(_)));
         if writes && self.disk.fails {
             self.after(RETRY, Event::Written(epoch));
             return Ok(());
@@ -281,7 +281,10 @@ impl World {
             }
             Some(Output::Waits(episode)) => self.carry(Input::Waits(episode))?,
             Some(Output::Checkpoint(state)) => self.disk.checkpoint = Some(state),
-            Some(Output::Ended) => self.carry(Input::Trained)?,
+            Some(Output::Ended) => {
+                self.trained = true;
+                self.carry(Input::Trained)?;
+            }
             None => {}
         }
         self.write_output();

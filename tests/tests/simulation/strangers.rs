@@ -59,7 +59,17 @@ pub fn query(world: &mut World) -> Query {
             let seed = practice_seed(0, rng.random_range(0..6));
             let offset = if whole { 0 } else { offset };
             let run = name("run");
-            Query::Piece(Piece { evaluator, run, incarnation, job, seed, hash, length, offset, bytes })
+            Query::Piece(Piece {
+                evaluator,
+                run,
+                incarnation,
+                job,
+                seed,
+                hash,
+                length,
+                offset,
+                bytes,
+            })
         }
     }
 }

@@ -18,7 +18,11 @@ pub struct State {
 
 #[derive(Debug)]
 pub enum Output {
-    Snapshot { step: u64, weights: Hash, evaluate: bool },
+    Snapshot {
+        step: u64,
+        weights: Hash,
+        evaluate: bool,
+    },
     Opening(Opening),
     /// Training waits for this episode.
     Waits(u64),
@@ -67,9 +71,11 @@ impl Training {
             told_waiting: None,
             begun: false,
         };
-        while training.schedule.as_ref().is_some_and(|it| {
-            it.has_begun(state.step) && it.due() < state.step
-        }) {
+        while training
+            .schedule
+            .as_ref()
+            .is_some_and(|it| it.has_begun(state.step) && it.due() < state.step)
+        {
             if !training.absorb() {
                 return Err("the log lacks an episode that its checkpoint has learned from".into());
             }

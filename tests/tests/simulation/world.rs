@@ -61,10 +61,10 @@ pub enum Event {
     Answer(Sender, Reply),
     Timeout(Sender),
     Progress(Progress),
-    /// The learner sees that an evaluator is there, or not.
-    Token(Name, bool),
+    /// The learner sees whether an evaluator is there.
+    Token(usize),
     /// An evaluator sees the learners that are there.
-    Learners(usize, u32, BTreeSet<u64>),
+    Learners(usize, u32),
     Turn(usize, u32),
     Played(usize, u32),
     Train(u32),
@@ -121,6 +121,7 @@ pub struct World {
     pub disk: Disk,
     pub acknowledged_scores: BTreeSet<(u64, u64)>,
     pub acknowledged_episodes: BTreeSet<u64>,
+    pub trained: bool,
     pub ended: Option<End>,
     pub trace: Option<Vec<String>>,
 }
@@ -147,6 +148,7 @@ impl World {
             disk: Disk::default(),
             acknowledged_scores: BTreeSet::new(),
             acknowledged_episodes: BTreeSet::new(),
+            trained: false,
             ended: None,
             trace: traced.then(Vec::new),
         };
@@ -183,9 +185,16 @@ impl World {
             Event::Answer(to, reply) => return self.answered(to, Some(reply)),
             Event::Timeout(to) => return self.answered(to, None),
             Event::Progress(progress) => return self.carry(Input::Progress(progress)),
-            Event::Token(evaluator, true) => return self.carry(Input::Joined(evaluator)),
-            Event::Token(evaluator, false) => return self.carry(Input::Left(evaluator)),
-            Event::Learners(number, epoch, seen) => self.sees_learners(number, epoch, seen),
+            Event::Token(number) => {
+                let evaluator = &self.evaluators[number];
+                let (name, here) = (evaluator.name.clone(), evaluator.alive && !evaluator.cut);
+                return self.token(name, here);
+            }
+            Event::Learners(number, epoch) => {
+                let here = self.learner.alive.is_some() && !self.evaluators[number].cut;
+                let seen = BTreeSet::from_iter(here.then_some(self.learner.incarnation));
+                self.sees_learners(number, epoch, seen);
+            }
             Event::Turn(number, epoch) => self.turn(number, epoch),
             Event::Played(number, epoch) => return self.played(number, epoch),
             Event::Train(epoch) => return self.train(epoch),
@@ -237,6 +246,10 @@ impl World {
         Ok(())
     }
 
+    fn token(&mut self, evaluator: Name, here: bool) -> Result<(), String> {
+        self.carry(if here { Input::Joined(evaluator) } else { Input::Left(evaluator) })
+    }
+
     fn schedule_faults(&mut self) {
         for number in 0..self.evaluators.len() {
             self.again(|it| it.evaluator_crashes, Event::CrashEvaluator(number));
@@ -262,8 +275,9 @@ impl World {
         let query = strangers::query(self);
         self.query(Sender::STRANGER, query)?;
         if self.rng.random_bool(0.2) {
-            let (name, here) = (name(&format!("stranger-{}", self.rng.random_range(0..5))), self.rng.random());
-            return self.happen(Event::Token(name, here));
+            let (name, here) =
+                (name(&format!("stranger-{}", self.rng.random_range(0..5))), self.rng.random());
+            return self.token(name, here);
         }
         Ok(())
     }
@@ -316,13 +330,11 @@ impl World {
     /// Shows an evaluator which learners are there.
     pub fn tell_evaluator_of_learner(&mut self, number: usize) {
         let evaluator = &self.evaluators[number];
-        let here = self.learner.alive.is_some() && !evaluator.cut;
-        let seen = BTreeSet::from_iter(here.then_some(self.learner.incarnation));
-        let (event, pause) = (Event::Learners(number, evaluator.epoch, seen), match here {
+        let pause = match self.learner.alive.is_some() && !evaluator.cut {
             true => Duration::from_millis(self.rng.random_range(1..100)),
             false => NOTICED.mul_f64(self.rng.random()),
-        });
-        self.after(pause, event);
+        };
+        self.after(pause, Event::Learners(number, self.evaluators[number].epoch));
     }
 
     pub fn tell_evaluators_of_learner(&mut self) {
@@ -336,10 +348,7 @@ impl World {
     }
 
     pub fn announce_evaluator_after(&mut self, number: usize, pause: Duration) {
-        let evaluator = &self.evaluators[number];
-        let here = evaluator.alive && !evaluator.cut;
-        let event = Event::Token(evaluator.name.clone(), here);
-        self.after(pause, event);
+        self.after(pause, Event::Token(number));
     }
 
     /// Cuts an evaluator off from the learner, or ends that.
