@@ -135,9 +135,13 @@ impl Recording {
 
     /// True if the following row is the next step of the episode and starts in `row`'s next state.
     pub(crate) fn goes_on(&self, row: usize) -> bool {
-        let ends = self.ends[row] || self.terminals[row];
+        !self.terminals[row] && self.recording_goes_on(row)
+    }
+
+    /// [`Self::goes_on`], also after a success that does not end the recorded episode.
+    pub(crate) fn recording_goes_on(&self, row: usize) -> bool {
         let are_steps = self.is_step(row) && self.is_step(row + 1);
-        are_steps && !ends && !(self.next_observations.is_some() && self.jumps(row))
+        are_steps && !self.ends[row] && !(self.next_observations.is_some() && self.jumps(row))
     }
 
     /// True if `following`, the next transition after `row`, starts in its next state.

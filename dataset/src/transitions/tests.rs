@@ -118,6 +118,28 @@ fn windows_of_steps_end_with_their_episode() {
     assert_eq!(batch.rewards, [3.0, 4.0, 8.0]);
 }
 
+/// As OGBench's data, and as QC's authors cut it: windows from before, in and after a success.
+#[test]
+fn windows_go_over_a_success_that_does_not_end_the_episode() {
+    let mut recording = recording(&[Transition, Transition, Transition, Transition, LastState]);
+    (recording.terminals[1], recording.ends[3]) = (true, true);
+    let transitions = transitions(recording);
+    assert_eq!(transitions.episodes(), [0..2, 2..4]);
+    let mut batch = Batch::default();
+    let window = Window { history: 2, length: 3, gamma: 0.5 };
+    transitions.gather_windows(&[0, 1, 2], window, &mut batch);
+    let expected = Batch {
+        observations: vec![0.0, 0.0, 0.0, 1.0, 1.0, 2.0],
+        actions: [[0.0, 0.01, 0.02], [0.01, 0.02, 0.03], [0.02, 0.03, 0.03]].concat(),
+        rewards: vec![1.0, 2.75, 3.5],
+        next_observations: vec![2.0, 3.0, 3.0, 4.0, 3.0, 4.0],
+        masks: vec![0.0, 0.0, 0.5],
+        steps: vec![3, 3, 2],
+        size: 3,
+    };
+    assert_eq!(batch, expected);
+}
+
 #[test]
 fn standard_units_are_of_the_rows_that_are_learned_from() {
     let units = transitions(d4rl()).standard_units();
