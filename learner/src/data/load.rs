@@ -8,18 +8,25 @@ use quad_dataset::{
 };
 use quad_run::config::Experiment;
 use quad_runtime::Hint;
+use toml::Value;
 
-/// Reads a file or folder of transitions for an experiment. Fewer transitions than a batch are an
-/// error: a batch never holds one twice while there are others.
-pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
+/// Reads a file or folder of transitions for an experiment. A run that has begun has `held_out`
+/// episodes. Fewer transitions than a batch are an error: a batch never holds one twice while there
+/// are others.
+pub fn load(
+    path: &Path,
+    experiment: &Experiment,
+    held_out: Option<&[usize]>,
+) -> anyhow::Result<Split> {
+    let chunk = experiment.agent.get("chunk").and_then(Value::as_integer).unwrap_or(1);
     let options = ReadOptions {
         environment: environment::find(&experiment.environment).ok(),
         task: benchmarks::relabeling(&experiment.environment),
         reward: experiment.reward,
         normalize: experiment.normalize,
+        chunk: chunk as usize,
     };
-    let (fraction, seed) = (experiment.hold_out, experiment.seed);
-    let hold_out = HoldOut::Fraction { fraction, seed };
+    let hold_out = held_out.map_or(HoldOut::Fraction(experiment.hold_out), HoldOut::Episodes);
     let result = Transitions::read_split(path, &options, hold_out).hint_of(DatasetError::hint);
     let path = path.display();
     let split = result.with_context(|| format!("cannot learn from {path}"))?;

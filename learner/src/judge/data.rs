@@ -1,6 +1,5 @@
 //! The dataset by which policies are judged: episodes to train on, and held-out ones.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow};
@@ -38,8 +37,8 @@ pub(super) struct Data {
 }
 
 impl Data {
-    /// Reads the dataset of these snapshots. Every episode that one of their runs has held out is
-    /// judged, so that all are judged in the same states.
+    /// Reads the dataset of these snapshots. They are judged in the episodes that every run with
+    /// held-out episodes has held out.
     pub fn read(snapshots: &[Snapshot]) -> anyhow::Result<Self> {
         let first = snapshots.first().context("there is no policy to judge")?;
         let (run, data) = (first.folder.path().display(), &first.config.dataset);
@@ -67,15 +66,16 @@ impl Data {
             let error = anyhow!("{path} is not the data that {run} has learned from");
             return Err(error).hint("put a copy of that file in its place");
         }
-        let held_out = snapshots.iter().flat_map(|snapshot| &snapshot.held_out);
-        let episodes = Vec::from_iter(BTreeSet::from_iter(held_out.copied()));
-        let mut hold_out = HoldOut::Episodes(&episodes);
-        if episodes.is_empty() {
-            warn!(
-                "no run has held out episodes (--hold-out), so the policies are judged in some that they have learned from"
-            );
-            hold_out = HoldOut::Fraction { fraction: HELD_OUT, seed: 0 };
-        }
+        let episodes = shared(snapshots)?;
+        let hold_out = match &episodes {
+            Some(episodes) => HoldOut::Episodes(episodes),
+            None => {
+                warn!(
+                    "no run has held out episodes (--hold-out), so the policies are judged in some that they have learned from"
+                );
+                HoldOut::Fraction(HELD_OUT)
+            }
+        };
         let options = ReadOptions {
             environment: environment::find(environment).ok(),
             task: benchmarks::relabeling(environment),
@@ -88,7 +88,9 @@ impl Data {
     }
 
     fn of(split: Split, sha256: String, environment: String) -> anyhow::Result<Self> {
-        let held_out = split.held_out.context("no episode is held out")?;
+        let held_out = split.held_out.context("no episode is left to judge policies in").hint(
+            "record more: they are judged in other episodes than those from which values are learned",
+        )?;
         let episodes = held_out.recorded_episodes();
         let starts = Vec::from_iter(episodes.iter().map(|episode| episode.start));
         // At even distances.
@@ -148,6 +150,18 @@ impl Data {
         }
         distance(&recorded, actions, self.held_out.action_dim())
     }
+}
+
+/// The episodes that these runs have held out, if any has; those of older runs depend on their seed.
+fn shared(snapshots: &[Snapshot]) -> anyhow::Result<Option<Vec<usize>>> {
+    let held_out = snapshots.iter().map(|it| &it.held_out).filter(|it| !it.is_empty());
+    let Some(shared) = held_out.cloned().reduce(|a, b| &a & &b) else { return Ok(None) };
+    if shared.is_empty() {
+        return Err(anyhow!("no episode is held out by all of these runs")).hint(
+            "judge them apart; runs that begin now hold out the same episodes, whatever their seed",
+        );
+    }
+    Ok(Some(Vec::from_iter(shared)))
 }
 
 /// Root mean square distance of a policy's actions `[n, a]` from the data's, in standard deviations
