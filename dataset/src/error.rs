@@ -129,6 +129,9 @@ impl ArrayProblem {
             Self::Axes(_) => {
                 "each row is a number or a row of numbers: flatten what has more axes, and make numbers of images first, as an encoder does"
             }
+            Self::Rows(found, _) | Self::Shape(found, _) if matches!(found[..], [rows, columns] if rows < columns) => {
+                TRANSPOSED
+            }
             Self::Type(..) | Self::Rows(..) | Self::Shape(..) => ARRAYS,
             Self::Oversized(..) => {
                 "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
@@ -298,6 +301,9 @@ impl Problem {
 }
 
 const ARRAYS: &str = "docs/data.md says which arrays a file must have, and of which shape and type; all need the same number of rows";
+
+const TRANSPOSED: &str = "a row of the array is a step: are rows and columns swapped, as by MATLAB? this swaps them in your file: python -c \
+    \"import h5py; f = h5py.File('FILE', 'r+'); [(f.pop(n), f.create_dataset(n, data=x)) for n, x in [(n, f[n][()].T) for n in f]]\"";
 
 const DAMAGED: &str = "the file was cut off or damaged on its way: fetch or copy it again; the program that writes one of your own must close it";
 

@@ -38,7 +38,11 @@ impl SameState {
         let quarter = distances.len() / 4;
         if !distances.is_empty() {
             let (_, quartile, _) = distances.select_nth_unstable_by(quarter, f64::total_cmp);
-            same.tolerance = (QUARTILES * *quartile).clamp(LEAST, MOST);
+            same.tolerance = match *quartile < MOST {
+                true => (QUARTILES * *quartile).clamp(LEAST, MOST),
+                // Rows out of order, of which none leads to the next.
+                false => LEAST,
+            };
         }
         same
     }

@@ -19,6 +19,8 @@ const SMALLEST_SHARE: usize = 4;
 const EXCEPTION: usize = 10;
 /// Minimum ratio of a missed reset's squared step to those beside it.
 const ALONE: f64 = 4.0;
+/// Inverse of the largest fraction of steps as long as a reset, if resets are visible.
+const COMMON: usize = 4;
 /// Largest displacement of a maze robot in a step of 0.1 s, meters.
 const LONGEST_STEP: f32 = 1.0;
 
@@ -106,18 +108,19 @@ fn unmarked(recording: &Recording) -> Vec<usize> {
     resets.sort_unstable_by(f64::total_cmp);
     let limit = resets[resets.len() / 4];
     let is_inside = |row: usize| recording.is_step(row) && !recording.ends[row];
-    let is_missed = |&row: &usize| {
-        let beside =
-            [row - 1, row + 1].map(|row| if is_inside(row) { lengths[row] } else { [0.0; 2] });
-        let is_alone = |i: usize| beside.iter().all(|other| lengths[row][i] > ALONE * other[i]);
-        // A crash comes right before an end.
-        lengths[row][0] >= limit && is_inside(row + 1) && is_alone(0) && is_alone(1)
+    let is_alone = |row: usize| {
+        let beside = [row - 1, row + 1].into_iter().filter(|&row| is_inside(row));
+        beside
+            .flat_map(|other| (0..2).map(move |i| (i, other)))
+            .all(|(i, other)| lengths[row][i] > ALONE * lengths[other][i])
     };
-    let last = lengths.len().saturating_sub(1);
-    let missed =
-        Vec::from_iter(recording.inside().filter(|row| (1..last).contains(row)).filter(is_missed));
-    match missed.len() >= FEWEST && missed.len() * EXCEPTION >= ends.len() {
-        true => missed,
+    let mut leaps = Vec::from_iter(recording.inside().filter(|&row| lengths[row][0] >= limit));
+    let is_visible = leaps.len() * COMMON <= recording.inside().count();
+    let last = lengths.len() - 1;
+    // A crash comes right before an end.
+    leaps.retain(|&row| (1..last).contains(&row) && is_inside(row + 1) && is_alone(row));
+    match is_visible && leaps.len() >= FEWEST && leaps.len() * EXCEPTION >= ends.len() {
+        true => leaps,
         false => Vec::new(),
     }
 }

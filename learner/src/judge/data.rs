@@ -1,5 +1,6 @@
 //! The dataset by which policies are judged: episodes to train on, and held-out ones.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow};
@@ -66,7 +67,7 @@ impl Data {
             let error = anyhow!("{path} is not the data that {run} has learned from");
             return Err(error).hint("put a copy of that file in its place");
         }
-        let episodes = shared(snapshots)?;
+        let episodes = shared(snapshots.iter().map(|snapshot| &snapshot.held_out))?;
         let hold_out = match &episodes {
             Some(episodes) => HoldOut::Episodes(episodes),
             None => {
@@ -81,6 +82,7 @@ impl Data {
             task: benchmarks::relabeling(environment),
             reward: RewardRule::AsIs,
             normalize: Normalize { actions: true, observations: true, rewards: false },
+            ..ReadOptions::default()
         };
         let split = Transitions::read_split(&dataset.path, &options, hold_out)
             .hint_of(DatasetError::hint)?;
@@ -153,8 +155,10 @@ impl Data {
 }
 
 /// The episodes that these runs have held out, if any has; those of older runs depend on their seed.
-fn shared(snapshots: &[Snapshot]) -> anyhow::Result<Option<Vec<usize>>> {
-    let held_out = snapshots.iter().map(|it| &it.held_out).filter(|it| !it.is_empty());
+fn shared<'a>(
+    held_out: impl Iterator<Item = &'a BTreeSet<usize>>,
+) -> anyhow::Result<Option<Vec<usize>>> {
+    let held_out = held_out.filter(|episodes| !episodes.is_empty());
     let Some(shared) = held_out.cloned().reduce(|a, b| &a & &b) else { return Ok(None) };
     if shared.is_empty() {
         return Err(anyhow!("no episode is held out by all of these runs")).hint(
@@ -227,6 +231,19 @@ mod tests {
             let found = distance(data, policy, action_dim);
             assert!((found - expected).abs() < 1e-6, "{found} is not {expected}");
         }
+    }
+
+    #[test]
+    fn runs_are_judged_in_the_episodes_that_all_have_held_out() {
+        let sets = |sets: &[&[usize]]| -> Vec<BTreeSet<usize>> {
+            sets.iter().map(|set| set.iter().copied().collect()).collect()
+        };
+        let shared = |of: &[&[usize]]| shared(sets(of).iter());
+        assert_eq!(shared(&[&[], &[]]).unwrap(), None);
+        assert_eq!(shared(&[&[7, 3], &[3, 5, 7], &[]]).unwrap(), Some(vec![3, 7]));
+        // Older runs drew theirs by the seed.
+        let error = shared(&[&[1], &[2]]).unwrap_err();
+        assert_eq!(error.to_string(), "no episode is held out by all of these runs");
     }
 
     #[test]
