@@ -42,3 +42,50 @@ pub fn load(
 pub fn warnings(path: &Path, transitions: &Transitions) -> impl Iterator<Item = String> {
     transitions.warnings().iter().map(move |warning| format!("{}: {warning}", path.display()))
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use quad_dataset::{Arrays, Names, write_own};
+    use quad_run::config::Preset;
+    use tempfile::tempdir;
+
+    use super::*;
+
+    /// Twenty episodes of ten steps.
+    fn arrays() -> Arrays {
+        let rows = 200;
+        let wave = |row: usize| (row as f32).sin();
+        Arrays {
+            observation_dim: 1,
+            action_dim: 1,
+            observations: (0..rows).map(wave).collect(),
+            actions: (0..rows).map(|row| 0.9 * wave(2 * row)).collect(),
+            rewards: (0..rows).map(wave).collect(),
+            next_observations: (1..=rows).map(wave).collect(),
+            terminals: vec![false; rows],
+            timeouts: (1..=rows).map(|row| row % 10 == 0).collect(),
+        }
+    }
+
+    #[test]
+    fn all_seeds_hold_out_the_same_episodes_and_a_run_that_has_begun_its_own() {
+        let folder = tempdir().unwrap();
+        let path = folder.path().join("own.hdf5");
+        write_own(&path, arrays(), Names::default()).unwrap();
+        let preset = Preset::read("own-data").unwrap();
+        let held_out = |seed: u64, begun| {
+            let changes = format!(
+                "algorithm = 'qc'\nenvironment = 'robot'\nbatch_size = 8\nhold_out = 0.2\nseed = {seed}\nagent.chunk = 11"
+            );
+            let experiment = preset.resolve(&changes.parse().unwrap()).unwrap();
+            let split = load(&path, &experiment, begun).unwrap();
+            let warnings = Vec::from_iter(warnings(&path, &split.training));
+            assert!(warnings.len() == 1 && warnings[0].contains("the longest 10"), "{warnings:?}");
+            split.episodes
+        };
+        let episodes = held_out(1, None);
+        assert_eq!((episodes.len(), &held_out(2, None)), (4, &episodes));
+        assert_eq!(held_out(2, Some(&[3, 5])), [3, 5], "as an older version chose them");
+    }
+}
