@@ -208,7 +208,8 @@ pub(crate) mod tests {
 
     impl Recording {
         pub(crate) fn store_next(&mut self, next: Vec<f32>) {
-            self.same_state = SameState::of(&self.observations, Some(&next), self.observation_dim);
+            self.same_state =
+                SameState::between(&self.observations, Some(&next), self.observation_dim);
             self.next_observations = Some(next);
         }
     }

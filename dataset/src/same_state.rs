@@ -15,8 +15,9 @@ const MOST: f64 = 0.5;
 const QUARTILES: f64 = 20.0;
 
 impl SameState {
-    /// Of observations before and after each row's step, both N × `width`, if the latter are stored.
-    pub(crate) fn of(
+    /// Measures observations before and after each row's step, both N × `width`, if the latter are
+    /// stored.
+    pub(crate) fn between(
         observations: &[f32],
         next_observations: Option<&[f32]>,
         width: usize,
@@ -78,7 +79,7 @@ mod tests {
                 state = [state[0] + 0.1 * reset, state[1] - 0.1 * reset];
             }
         }
-        let same = SameState::of(&observations, Some(&next_observations), 2);
+        let same = SameState::between(&observations, Some(&next_observations), 2);
         let differs = |row: &usize| {
             let (next, start) = (2 * row, 2 * row + 2);
             same.differ(&next_observations[next..next + 2], &observations[start..start + 2])

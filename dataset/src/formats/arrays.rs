@@ -61,7 +61,7 @@ impl Arrays {
             action_dim: a,
             kinds: vec![RowKind::Transition; rows],
             ends: ends.collect(),
-            same_state: SameState::of(&self.observations, Some(&self.next_observations), o),
+            same_state: SameState::between(&self.observations, Some(&self.next_observations), o),
             observations: self.observations,
             actions: self.actions,
             rewards: self.rewards,

@@ -53,7 +53,7 @@ pub(super) fn read(
     let stored = stored.then(|| file.table("next_observations", rows, observations.width));
     let unused_next_observations: Option<Vec<f32>> = stored.transpose()?;
     let mut recording = Recording {
-        same_state: SameState::of(
+        same_state: SameState::between(
             &observations.values,
             unused_next_observations.as_deref(),
             observations.width,

@@ -39,7 +39,7 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
     });
     let kind = |&last: &bool| if last { RowKind::LastState } else { RowKind::Transition };
     Ok(Recording {
-        same_state: SameState::of(
+        same_state: SameState::between(
             &observations.values,
             next_observations.as_deref(),
             observation_dim,

@@ -21,12 +21,10 @@ const ENOUGH: usize = 20_000;
 
 /// All that is doubtful in the whole recording, for whatever program reads it.
 pub(crate) fn warnings(recording: &Recording, run: &ReadOptions) -> Vec<String> {
-    let of_ends = of_ends(recording);
     let outside = checks::actions_outside(recording).filter(|_| !run.normalize.actions);
     let outside = outside.map(|problem| format!("{problem}; {}", problem.hint()));
-    let of_lengths = lengths::chunks(recording, run.chunk);
-    let doubts = recording.doubts.iter().cloned();
-    let doubts = doubts.chain(of_ends).chain(of_lengths).chain(outside);
+    let doubts = recording.doubts.iter().cloned().chain(of_ends(recording));
+    let doubts = doubts.chain(lengths::chunks(recording, run.chunk)).chain(outside);
     doubts.chain(of_numbers(recording, run)).collect()
 }
 

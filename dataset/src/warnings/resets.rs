@@ -88,16 +88,13 @@ pub(super) fn missed(recording: &Recording) -> Option<String> {
     let leaps = recording.inside().filter(|row| recording.goal && leap(row));
     let leaps = leaps.map(|row| (row, RowProblem::Leap(LONGEST_STEP)));
     let problem = checks::first(recording, "observations", leaps).or_else(|| {
-        let resets = unmarked(recording);
-        checks::first(
-            recording,
-            "observations",
-            resets.into_iter().map(|row| (row, RowProblem::Reset)),
-        )
+        let resets = unmarked(recording).into_iter().map(|row| (row, RowProblem::Reset));
+        checks::first(recording, "observations", resets)
     })?;
     Some(format!("{problem}; are timeouts missing, or out of step with the resets?"))
 }
 
+/// Rows whose step is as long as those at ends, far longer than those beside it, and rarely so.
 fn unmarked(recording: &Recording) -> Vec<usize> {
     let (ends, lengths) = (ends(recording), lengths(recording));
     // A sensor slower than control leaps, too.
@@ -108,12 +105,10 @@ fn unmarked(recording: &Recording) -> Vec<usize> {
     resets.sort_unstable_by(f64::total_cmp);
     let limit = resets[resets.len() / 4];
     let is_inside = |row: usize| recording.is_step(row) && !recording.ends[row];
-    let is_alone = |row: usize| {
-        let beside = [row - 1, row + 1].into_iter().filter(|&row| is_inside(row));
-        beside
-            .flat_map(|other| (0..2).map(move |i| (i, other)))
-            .all(|(i, other)| lengths[row][i] > ALONE * lengths[other][i])
+    let is_longer = |row: usize, beside: usize| {
+        !is_inside(beside) || (0..2).all(|i| lengths[row][i] > ALONE * lengths[beside][i])
     };
+    let is_alone = |row: usize| is_longer(row, row - 1) && is_longer(row, row + 1);
     let mut leaps = Vec::from_iter(recording.inside().filter(|&row| lengths[row][0] >= limit));
     let is_visible = leaps.len() * COMMON <= recording.inside().count();
     let last = lengths.len() - 1;

@@ -1,6 +1,8 @@
 use std::path::Path;
 
-use quad_dataset::{Arrays, HoldOut, Names, RewardRule, Transitions, inspect, write_own};
+use quad_dataset::{
+    Arrays, HoldOut, Inspection, Names, RewardRule, Transitions, inspect, write_own,
+};
 use tempfile::tempdir;
 
 use crate::{all, assert_error, assert_refused, options, peers, peers_in, read, scratch, try_read};
@@ -157,8 +159,8 @@ fn names_that_place_no_number_are_refused() {
     std::fs::write(&path, bytes).unwrap();
     let message = "has the name \"y\" for columns 0, 1";
     assert_refused(&path, None, message, "one of its own");
-    let found = inspect(&path, None).unwrap();
-    assert!(found.refused && found.problems[0].contains(message), "{:?}", found.problems);
+    let Inspection { refused, problems, .. } = inspect(&path, None).unwrap();
+    assert!(refused && problems[0].contains(message), "{problems:?}");
 }
 
 #[test]

@@ -238,7 +238,7 @@ mod tests {
         let sets = |sets: &[&[usize]]| -> Vec<BTreeSet<usize>> {
             sets.iter().map(|set| set.iter().copied().collect()).collect()
         };
-        let shared = |of: &[&[usize]]| shared(sets(of).iter());
+        let shared = |held_out: &[&[usize]]| shared(sets(held_out).iter());
         assert_eq!(shared(&[&[], &[]]).unwrap(), None);
         assert_eq!(shared(&[&[7, 3], &[3, 5, 7], &[]]).unwrap(), Some(vec![3, 7]));
         // Older runs drew theirs by the seed.

@@ -1,4 +1,6 @@
-use quad_dataset::{Arrays, HoldOut, Names, ReadOptions, Transitions, inspect, write_own};
+use quad_dataset::{
+    Arrays, HoldOut, Inspection, Names, ReadOptions, Transitions, inspect, write_own,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -55,10 +57,10 @@ fn without_timeouts(arrays: &Arrays) -> (usize, Vec<String>) {
     let file = hdf5::File::open_rw(&path).unwrap();
     file.unlink("timeouts").unwrap();
     drop(file);
-    let found = inspect(&path, None).unwrap();
+    let Inspection { episodes, problems, .. } = inspect(&path, None).unwrap();
     let transitions = Transitions::read(&path, &ReadOptions::default()).unwrap();
-    assert_eq!(transitions.warnings(), found.problems);
-    (found.episodes, found.problems)
+    assert_eq!(transitions.warnings(), problems);
+    (episodes, problems)
 }
 
 #[test]
@@ -112,8 +114,8 @@ fn ends_that_d3rlpy_wrote() {
     let ends = cart.terminals.iter().zip(&cart.timeouts).map(|(a, b)| f32::from(*a || *b));
     put(&file, "episode_terminals", &[cart.rewards.len()], &Vec::from_iter(ends));
     drop(file);
-    let found = inspect(&path, None).unwrap();
-    assert_eq!((found.episodes, found.problems), (30, Vec::new()));
+    let Inspection { episodes, problems, .. } = inspect(&path, None).unwrap();
+    assert_eq!((episodes, problems), (30, Vec::new()));
 }
 
 #[test]
