@@ -170,14 +170,13 @@ mod tests {
     fn episodes_are_kept_out_whole() {
         let episodes = [0..2, 2..4, 4..6, 6..7];
         assert_eq!(whole().rows_of_episodes(), episodes);
-        for number in 0..4 {
+        for (number, rows) in episodes.iter().enumerate() {
             let all = whole();
             let place = all.observations.as_ptr();
             let (training, held_out, out) = all.hold_out(HoldOut::Episodes(&[number]));
             let held_out = held_out.unwrap();
             assert_eq!(out, [number]);
             assert_eq!(training.observations.as_ptr(), place, "a copy takes as much memory again");
-            let rows = &episodes[number];
             let (own, others): (Vec<usize>, _) = (0..7).partition(|row| rows.contains(row));
             // Rewards and observations equal row indices; one more row, a final state, may follow.
             for (part, rows) in [(&held_out, own), (&training, others)] {
