@@ -39,6 +39,8 @@ pub struct ReadOptions {
     pub reward: RewardRule,
     /// Columns to normalize. Actions that are not normalized must be within [-1, 1].
     pub normalize: Normalize,
+    /// Steps of a chunk that will be learned; 0 if that is not known.
+    pub chunk: usize,
 }
 
 /// Transitions for training: those of a dataset, in recorded order, and experience that grows.
@@ -67,7 +69,7 @@ pub struct Transitions {
 
 /// Training and validation transitions.
 pub struct Split {
-    /// Training transitions; statistics, scaling and warnings are of these alone.
+    /// Training transitions; statistics and scaling are of these alone, warnings of the whole file.
     pub training: Transitions,
     /// Validation transitions, scaled like the training ones; `None` if no episode is held out.
     pub held_out: Option<Transitions>,
@@ -114,7 +116,12 @@ impl Transitions {
     ) -> Result<Split, Problem> {
         let environment = options.environment;
         checks::accept(&recording, environment, options.normalize.actions)?;
+        let mut warnings = warnings::warnings(&recording, options);
         let (recording, held_out, episodes) = recording.hold_out(hold_out);
+        if matches!(hold_out, HoldOut::Fraction(fraction) if fraction > 0.0 && episodes.is_empty())
+        {
+            warnings.push("a single episode: none is held out".to_owned());
+        }
         if recording.transitions().next().is_none() {
             return Err(Problem::NoTransitions(recording.rows()));
         }
@@ -123,7 +130,6 @@ impl Transitions {
         let scaling = options.normalize.scaling(&recording, rewards);
         let new = |recording| Self::new(recording, environment, rewards, scaling.clone());
         let mut held_out = held_out.map(new).filter(|held_out| held_out.len() > 0);
-        let warnings = warnings::warnings(&recording, options.normalize, options.reward);
         let mut training = new(recording);
         training.warnings = warnings;
         if let Some(held_out) = &mut held_out {

@@ -76,7 +76,7 @@ fn an_episode_after_one_that_reached_its_goal_is_one_of_the_recording() {
 #[test]
 fn rows_with_next_observations_of_their_own_follow_one_another_where_these_say_so() {
     let mut recording = recording(&[Transition; 4]);
-    recording.next_observations = Some(vec![1.0, 9.0, 3.0, 4.0]);
+    recording.store_next(vec![1.0, 9.0, 3.0, 4.0]);
     let transitions = transitions(recording);
     assert_eq!(transitions.episodes(), [0..2, 2..4]);
     assert_eq!((transitions.next_action(1), transitions.next_action(3)), (None, None));

@@ -14,6 +14,8 @@ pub(super) struct EarlierRun {
     pub checkpoint: Checkpoint,
     /// Hash of the checkpoint.
     pub hash: String,
+    /// Episodes that it has not learned from.
+    pub held_out: Vec<usize>,
     experiment: Experiment,
     dataset_sha256: Option<String>,
 }
@@ -49,7 +51,8 @@ impl EarlierRun {
         own.insert("hold_out".to_owned(), config.experiment.hold_out.into());
         let preset = Preset::of_run(&config, own).hint_of(ConfigError::hint)?;
         let (experiment, dataset_sha256) = (config.experiment, config.dataset.sha256);
-        Ok((Self { checkpoint, hash, experiment, dataset_sha256 }, preset))
+        let held_out = config.dataset.held_out;
+        Ok((Self { checkpoint, hash, held_out, experiment, dataset_sha256 }, preset))
     }
 
     /// Checks that there is practice, that the dataset is the run's, and that the checkpoint's
@@ -67,8 +70,6 @@ impl EarlierRun {
             ("reward", there.reward == here.reward),
             ("normalize", there.normalize == here.normalize),
             ("hold_out", there.hold_out == here.hold_out),
-            // It draws the episodes that are held out.
-            ("seed", there.seed == here.seed || here.hold_out == 0.0),
         ];
         let Some((key, _)) = kept.iter().find(|(_, is_kept)| !is_kept) else { return Ok(()) };
         let error = anyhow!("the run of --from has learned with another value of {key}");

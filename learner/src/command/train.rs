@@ -73,7 +73,9 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &dataset.sha256))?;
 
     start_pool(args.threads)?;
-    let data = load(&dataset.path, &experiment)?;
+    let held_out = begun.as_ref().and_then(ExistingRun::held_out);
+    let held_out = held_out.or(from.as_ref().map(|from| &*from.held_out));
+    let data = load(&dataset.path, &experiment, held_out)?;
     for warning in warnings(&dataset.path, &data.training) {
         warn!("{warning}");
     }

@@ -12,7 +12,6 @@ mod data;
 mod evaluation;
 mod snapshots;
 
-use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -80,7 +79,7 @@ fn judge_all(
             conditions: conditions.clone(),
             estimate: estimate(&curves, &evaluation.units),
             distance: data.distance(&actions.compared),
-            unseen: snapshot.held_out == BTreeSet::from_iter(data.episodes.iter().copied()),
+            unseen: data.episodes.iter().all(|episode| snapshot.held_out.contains(episode)),
             behavior: behavior.clone(),
             recorded,
         };

@@ -39,7 +39,7 @@ impl StudyCost {
         let one_thread = ThreadPoolBuilder::new().num_threads(1).build()?;
         let mut told = BTreeSet::new();
         let mut measure = |run: &PlannedRun, path: &Path| {
-            let transitions = load(path, &run.experiment)?.training;
+            let transitions = load(path, &run.experiment, None)?.training;
             for warning in warnings(path, &transitions) {
                 if told.insert(warning.clone()) {
                     warn!("{warning}");

@@ -11,7 +11,7 @@ use quad_algorithms::{
     Agent, Algorithm, Context, Definition, Measured, Metric, Reporting, StateDict,
 };
 use quad_dataset::{
-    Arrays, BatchSampler, Normalize, ReadOptions, RewardRule, Transitions, Window, environment,
+    Arrays, BatchSampler, ReadOptions, RewardRule, Transitions, Window, environment,
 };
 use quad_nn::Tensors;
 use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision, Spread};
@@ -57,9 +57,8 @@ fn transitions() -> Transitions {
     write_hopper(&path, 2, 50);
     let options = ReadOptions {
         environment: Some(hopper),
-        task: None,
         reward: RewardRule::Locomotion,
-        normalize: Normalize::default(),
+        ..ReadOptions::default()
     };
     Transitions::read(&path, &options).unwrap()
 }

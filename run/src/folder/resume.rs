@@ -59,6 +59,11 @@ impl ExistingRun {
         Ok(Some(Self { dir, config, scores }))
     }
 
+    /// Episodes that the run has not learned from, unless it is to be set aside.
+    pub fn held_out(&self) -> Option<&[usize]> {
+        Some(&self.config.as_ref()?.dataset.held_out)
+    }
+
     /// Checks that the run has the settings of `config`, unless it is to be set aside.
     pub fn check_same_config(&self, config: &RunConfig) -> Result<(), RunDirError> {
         let Some(begun) = &self.config else { return Ok(()) };
