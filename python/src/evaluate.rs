@@ -72,6 +72,10 @@ impl PythonEnvironment {
 }
 
 impl Environment for PythonEnvironment {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
     fn allow_interventions(&mut self) {
         self.practice = true;
     }
@@ -85,9 +89,9 @@ impl Environment for PythonEnvironment {
         self.observe(|environment| {
             let action = PyArray1::from_slice(environment.py(), action);
             let stepped = environment.call_method1("step", (action,))?;
-            let (observed, reward, terminated, truncated, taken): (_, _, _, _, Option<Vec<f32>>) =
+            let (observed, reward, terminated, truncated, intervention, clipped) =
                 stepped.extract()?;
-            Ok((observed, Step { reward, terminated, truncated, intervention: taken }))
+            Ok((observed, Step { reward, terminated, truncated, intervention, clipped }))
         })
     }
 
