@@ -29,7 +29,7 @@ pub use formats::recorded::{RecordedRows, Row, matching_environments};
 pub use formats::{data_file, minari_folder, recorded_environment};
 pub use inspect::{Inspection, inspect};
 pub use normalize::Normalize;
-pub use practice::{FarNumber, PracticeRows};
+pub use practice::PracticeRows;
 pub use recording::Names;
 pub use tables::catalog::NamedDataset;
 pub use tables::environment::{EnvironmentSpec, UnknownEnvironment};

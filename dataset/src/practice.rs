@@ -1,8 +1,6 @@
 //! Episodes of practice, and those that are left out: a number far outside the dataset's range, such
 //! as a sensor's 1e30, would end training.
 
-use std::fmt;
-
 use crate::error::{ArrayProblem, Problem};
 use crate::recording::{Names, Recording, RowKind};
 use crate::warnings::named;
@@ -58,23 +56,7 @@ impl PracticeRows<'_> {
     }
 }
 
-/// A number of practice far outside its column's range in the dataset.
-#[derive(Clone, Debug, PartialEq)]
-pub struct FarNumber {
-    /// Array, row and column; a row of observations comes before the step of that number.
-    place: String,
-    value: f32,
-    /// The column's smallest and largest number in the dataset.
-    range: Range,
-}
-
-impl fmt::Display for FarNumber {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { place, value, range: [low, high] } = self;
-        write!(f, "{place}: {value:e}, far outside the dataset's range of {low} to {high}")
-    }
-}
-
+/// Smallest and largest number of a column.
 type Range = [f32; 2];
 
 /// Ranges of a dataset's columns.
@@ -98,8 +80,8 @@ impl Ranges {
     }
 
     /// The first number of an episode further from the range of its column than [`FAR`] times its
-    /// width, if any.
-    pub(crate) fn far(&self, episode: &PracticeRows<'_>, names: &Names) -> Option<FarNumber> {
+    /// width, if any, in words. A row of observations comes before the step of that number.
+    pub(crate) fn far(&self, episode: &PracticeRows<'_>, names: &Names) -> Option<String> {
         [
             ("observations", episode.observations, &self.observations, &*names.observations),
             ("actions", episode.actions, &self.actions, &*names.actions),
@@ -110,15 +92,19 @@ impl Ranges {
             let far = |index: usize| is_far(ranges[index % ranges.len()], numbers[index]);
             let index = (0..numbers.len()).find(|index| far(*index))?;
             let (row, column) = (index / ranges.len(), index % ranges.len());
-            let place = format!("array `{array}`, row {row}, {}", named(&[column], names));
-            Some(FarNumber { place, value: numbers[index], range: ranges[column] })
+            let (value, [low, high]) = (numbers[index], ranges[column]);
+            Some(format!(
+                "array `{array}`, row {row}, {}: {value:e}, far outside the dataset's range of {low} to {high}",
+                named(&[column], names)
+            ))
         })
     }
 }
 
 fn ranges(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<Range> {
     let mut ranges = vec![[f32::INFINITY, f32::NEG_INFINITY]; width];
-    for (_, values) in values.chunks_exact(width).enumerate().filter(|(row, _)| counts(*row)) {
+    for (_, values) in values.chunks_exact(width.max(1)).enumerate().filter(|(row, _)| counts(*row))
+    {
         for (range, &value) in ranges.iter_mut().zip(values) {
             *range = [range[0].min(value), range[1].max(value)];
         }

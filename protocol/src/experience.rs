@@ -174,6 +174,8 @@ mod tests {
     use super::*;
     use crate::codec::{decode, encode};
 
+    type Spoil = fn(&mut Episode);
+
     fn episode() -> Episode {
         Episode {
             score: EpisodeScore { seed: 7, episode_return: 3.0, length: 2, score: 3.0 },
@@ -204,7 +206,7 @@ mod tests {
     fn episodes_that_contradict_themselves_are_refused() {
         assert_eq!(decode::<Episode>(&encode(&episode()).unwrap()).unwrap(), episode());
         assert_eq!(episode().dims(), (2, 1));
-        let broken: [fn(&mut Episode); 8] = [
+        let broken: [Spoil; 8] = [
             |it| it.rewards.clear(),
             |it| it.score.length = 3,
             |it| it.observations.truncate(5),
@@ -227,7 +229,7 @@ mod tests {
 
     #[test]
     fn a_number_that_is_not_finite_is_refused_by_array_row_and_number() {
-        let broken: [(fn(&mut Episode), &str); 3] = [
+        let broken: [(Spoil, &str); 3] = [
             (|it| it.observations[3] = f32::INFINITY, "`observations`, row 1: number 1 is inf"),
             (|it| it.actions[1] = f32::NAN, "`actions`, row 1: number 0 is NaN"),
             (|it| it.rewards[0] = f32::NAN, "`rewards`, row 0: number 0 is NaN"),

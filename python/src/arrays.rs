@@ -129,12 +129,10 @@ fn stacked<'py>(
         return Err(PyValueError::new_err(error));
     }
     let (mut found, mut lacking) = (Vec::new(), Vec::new());
-    for (place, column) in names.iter().enumerate() {
-        if names[..place].contains(column) {
-            return Err(PyValueError::new_err(format!(
-                "{name} is a dictionary, but the policy's data has several columns {column:?}\nhint: give its numbers in its order"
-            )));
-        }
+    if let Some((_, column)) = names.iter().enumerate().find(|(i, it)| names[..*i].contains(it)) {
+        return Err(PyValueError::new_err(format!(
+            "{name} is a dictionary, but the policy's data has several columns {column:?}\nhint: give its numbers in its order"
+        )));
     }
     for name in names {
         match numbers.get_item(name)? {

@@ -235,6 +235,10 @@ def test_names_go_into_the_file_and_the_policy(snapshots, tmp_path):
             policy.act(wrong)
     with pytest.raises(ValueError, match="is a dictionary, but the policy's data has no names\nhint: "):
         Policy.load(snapshots["iql"]).act({"x": 1.0})
+    twice = Policy.from_bytes(snapshot.read_bytes().replace(b'[\\"x\\",\\"v\\"]', b'[\\"x\\",\\"x\\"]'))
+    assert twice.observation_names == ["x", "x"]
+    with pytest.raises(ValueError, match="is a dictionary, but the policy's data has several columns \"x\"\nhint: give its numbers in its order"):
+        twice.act({"x": 1.0})
     for act in (policy.act, policy.begin(list(range(180))).act, policy.sample):
         with pytest.raises(ValueError, match="has the columns v, x, but the policy takes, in this order, x, v"):
             act(frame[["v", "x"]])

@@ -15,7 +15,7 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::formats::arrays::Arrays;
 use crate::normalize::{self, Normalize};
-use crate::practice::{FarNumber, PracticeRows, Ranges};
+use crate::practice::{PracticeRows, Ranges};
 use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
 use crate::tables::maze::MazeTask;
@@ -210,8 +210,8 @@ impl Transitions {
 
     /// Adds an episode of practice. Its rewards and numbers are transformed as the dataset's were,
     /// and actions beyond its range clipped; anything else that a dataset would be refused for is an
-    /// error. Leaves out an episode with a number far outside the dataset's range, and returns that.
-    pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<Option<FarNumber>, Problem> {
+    /// error. Leaves out an episode with a number far outside the dataset's range, and names it.
+    pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<Option<String>, Problem> {
         let recording = episode.recording(self.observation_dim(), self.action_dim())?;
         checks::accept(&recording, None, true)?;
         let far = self.ranges.far(&episode, self.names());

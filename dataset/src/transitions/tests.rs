@@ -191,7 +191,7 @@ fn an_episode_with_a_number_far_outside_the_dataset_s_range_is_left_out() {
     let transitions = transitions(recording);
     let add = |observations: &[f32], actions: &[f32], rewards: &[f32]| {
         let episode = PracticeRows { observations, actions, rewards, terminated: true };
-        transitions.add_episode(episode).unwrap().map(|far| far.to_string())
+        transitions.add_episode(episode).unwrap()
     };
     let range = "far outside the dataset's range of";
     for (far, expected) in [
@@ -216,7 +216,7 @@ fn an_episode_with_a_number_far_outside_the_dataset_s_range_is_left_out() {
     }
     assert_eq!(transitions.experience_len(), 0);
     assert_eq!(add(&[-5999.0, 6005.0], &[60.0], &[6005.0]), None);
-    assert_eq!((transitions.experience_len(), transitions.experience_episodes()), (1, vec![5..6]));
+    assert_eq!((transitions.experience_len(), transitions.experience_episodes().len()), (1, 1));
 }
 
 #[test]
