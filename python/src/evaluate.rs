@@ -1,6 +1,6 @@
 //! Environments in Python, served like `evaluator serve` serves its own.
 //!
-//! The objects of `quad_rl/_worker.py` make, reset and step environments.
+//! The objects of `quad_rl/_worker.py` and `_environment.py` make, reset and step environments.
 
 use std::path::PathBuf;
 use std::sync::Arc;

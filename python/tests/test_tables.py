@@ -265,11 +265,9 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys, monkeypatch):
     assert convert(*log, "--reward", "step-cost", "--success", "a", "b")[0] == 0
     assert "1 of 3 episodes are successes" in convert(*log, "--reward", "step-cost", "--success", "a")[1]
     (tmp_path / "folder").mkdir()
-    for name in ("1", "2", "007"):
-        table().to_csv(tmp_path / f"folder/{name}.csv", index=False)
+    [table().to_csv(tmp_path / f"folder/{name}.csv", index=False) for name in ("1", "2", "007")]
     files = [tmp_path / "folder", *log[1:-1], "file", "--reward", "step-cost", "--success"]
-    for names, count in (["1", "2"], 2), (["007"], 1), (["1"], 1):
-        assert f"{count} of 3 episodes are successes" in convert(*files, *names)[1]
+    assert all(f"{len(names)} of 3 episodes are successes" in convert(*files, *names)[1] for names in (["1", "2"], ["007"], ["1"]))
     assert "episodes that are not there: ['7']" in convert(*files, "7", "1")[1]
     with h5py.File(tmp_path / "demo.hdf5", "w") as file:
         seen = np.random.default_rng(0).uniform(-1, 1, (10, 5))
