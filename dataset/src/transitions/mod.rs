@@ -15,7 +15,7 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::formats::arrays::Arrays;
 use crate::normalize::{self, Normalize};
-use crate::practice::PracticeRows;
+use crate::practice::{PracticeRows, Ranges};
 use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
 use crate::tables::maze::MazeTask;
@@ -60,6 +60,8 @@ pub struct Transitions {
     /// True after the goal was reached in the recorded episode.
     past_goal: Vec<bool>,
     statistics: Statistics,
+    /// In the source's units.
+    ranges: Ranges,
     warnings: Vec<String>,
     reward: RewardScaling,
     scaling: Scaling,
@@ -145,10 +147,12 @@ impl Transitions {
         scaling: Scaling,
     ) -> Self {
         let (episodes, past_goal) = (recording.episodes(), recording.past_goal());
+        let ranges = Ranges::new(&recording);
         let dataset = Rows::new(recording, reward, &scaling);
         Self {
             experience: RwLock::new(dataset.none()),
             past_goal,
+            ranges,
             statistics: Statistics::new(environment, dataset.len(), &episodes),
             warnings: Vec::new(),
             dataset,
@@ -212,13 +216,16 @@ impl Transitions {
 
     /// Adds an episode of practice. Its rewards and numbers are transformed as the dataset's were,
     /// and actions beyond its range clipped; anything else that a dataset would be refused for is an
-    /// error.
-    pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<(), Problem> {
+    /// error. Leaves out an episode with a number far outside the dataset's range, and names it.
+    pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<Option<String>, Problem> {
         let recording = episode.recording(self.observation_dim(), self.action_dim())?;
         checks::accept(&recording, None, true)?;
-        let rows = Rows::new(recording, self.reward, &self.scaling);
-        self.experience.write().unwrap_or_else(PoisonError::into_inner).extend(&rows);
-        Ok(())
+        let far = self.ranges.far(&episode, self.names());
+        if far.is_none() {
+            let rows = Rows::new(recording, self.reward, &self.scaling);
+            self.experience.write().unwrap_or_else(PoisonError::into_inner).extend(&rows);
+        }
+        Ok(far)
     }
 
     /// Number of transitions of experience.

@@ -204,3 +204,57 @@ fn experience_that_a_dataset_would_be_refused_for_is_refused() {
     }
     assert_eq!(transitions.experience_len(), 0);
 }
+
+#[test]
+fn an_episode_with_a_number_far_outside_the_dataset_s_range_is_left_out() {
+    // Observations and rewards from 0 to 6, actions from 0 to 0.06.
+    let mut recording = d4rl();
+    recording.names.observations = vec!["elbow".to_owned()];
+    let transitions = transitions(recording);
+    let add = |observations: &[f32], actions: &[f32], rewards: &[f32]| {
+        let episode = PracticeRows { observations, actions, rewards, terminated: true };
+        transitions.add_episode(episode).unwrap()
+    };
+    let range = "far outside the dataset's range of";
+    for (far, expected) in [
+        (
+            add(&[0.0, 0.0, 1e30], &[0.0; 2], &[0.0; 2]),
+            format!("`observations`, row 2, column 0 (elbow): 1e30, {range} 0 to 6"),
+        ),
+        (
+            add(&[-6001.0, 0.0], &[0.0], &[0.0]),
+            format!("`observations`, row 0, column 0 (elbow): -6.001e3, {range} 0 to 6"),
+        ),
+        (
+            add(&[0.0; 2], &[61.0], &[0.0]),
+            format!("`actions`, row 0, column 0: 6.1e1, {range} 0 to 0.06"),
+        ),
+        (
+            add(&[0.0; 3], &[0.0; 2], &[0.0, 6007.0]),
+            format!("`rewards`, row 1, column 0: 6.007e3, {range} 0 to 6"),
+        ),
+    ] {
+        assert_eq!(far, Some(format!("array {expected}")));
+    }
+    assert_eq!(transitions.experience_len(), 0);
+    assert_eq!(add(&[-5999.0, 6005.0], &[60.0], &[6005.0]), None);
+    assert_eq!((transitions.experience_len(), transitions.experience_episodes().len()), (1, 1));
+}
+
+#[test]
+fn a_column_that_hardly_moved_may_move_in_practice() {
+    let mut recording = d4rl();
+    for (row, value) in recording.observations.iter_mut().enumerate() {
+        *value = 20.0 + 1e-4 * row as f32;
+    }
+    recording.rewards.fill(0.0);
+    let transitions = transitions(recording);
+    let is_left_out = |observation: f32, reward: f32| {
+        let observations = &[20.0, observation];
+        let episode =
+            PracticeRows { observations, actions: &[0.0], rewards: &[reward], terminated: true };
+        transitions.add_episode(episode).unwrap().is_some()
+    };
+    assert!(!is_left_out(-50.0, 999.0));
+    assert!(is_left_out(21_000.0, 0.0) && is_left_out(20.0, -1001.0));
+}

@@ -1,6 +1,7 @@
 //! Practice in the order of its rows: how many gradient steps they allow, and which snapshot plays
 //! the next episodes. All of it is a function of the settings and of the episodes' lengths, so that
-//! neither clocks nor the number of evaluators can change a run.
+//! neither clocks nor the number of evaluators can change a run. An episode that is left out counts
+//! as one without rows.
 
 use std::collections::BTreeMap;
 use std::mem;
@@ -13,6 +14,7 @@ use quad_dataset::{OnlineSampler, PracticeRows, Transitions};
 use quad_protocol::{Episode, Exploration, practice_seed};
 use quad_run::config::{Experiment, Online};
 use quad_runtime::Heartbeat;
+use tracing::warn;
 
 use super::metrics::PracticeMetrics;
 use crate::evaluation::Opening;
@@ -154,11 +156,19 @@ impl Practice {
         let Episode { observations, actions, rewards, terminated, score, .. } = episode;
         let rows = PracticeRows { observations, actions, rewards, terminated: *terminated };
         let added = self.transitions.add_episode(rows);
-        added.map_err(|source| PracticeError::Rows { number, source })?;
-        metrics.rows.set(i64::try_from(self.rows()).unwrap_or(i64::MAX));
-        metrics.episodes.inc();
-        metrics.episode_return.set(score.episode_return);
-        metrics.score.set(score.score);
+        if let Some(far) = added.map_err(|source| PracticeError::Rows { number, source })? {
+            warn!(
+                episode = number,
+                seed = score.seed,
+                "training leaves out an episode of practice: {far}"
+            );
+            metrics.left_out.inc();
+        } else {
+            metrics.rows.set(i64::try_from(self.rows()).unwrap_or(i64::MAX));
+            metrics.episodes.inc();
+            metrics.episode_return.set(score.episode_return);
+            metrics.score.set(score.score);
+        }
         self.episodes += 1;
         if self.rows() < self.online.steps {
             self.open(number + u64::from(self.online.lag), step);
