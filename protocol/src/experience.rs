@@ -83,6 +83,9 @@ impl Message for Episode {
         if !observations.len().is_multiple_of(n + 1) || !actions.len().is_multiple_of(n) {
             return malformed("an episode's arrays have different lengths");
         }
+        if observations.is_empty() || actions.is_empty() {
+            return malformed("an episode has no observations or no actions");
+        }
         let sorted = interventions.is_sorted_by(|a, b| a < b);
         if !sorted || interventions.last().is_some_and(|&last| last as usize >= n) {
             return malformed("an episode's interventions are not among its steps");
@@ -195,11 +198,13 @@ mod tests {
     fn episodes_that_contradict_themselves_are_refused() {
         assert_eq!(decode::<Episode>(&encode(&episode()).unwrap()).unwrap(), episode());
         assert_eq!(episode().dims(), (2, 1));
-        let broken: [fn(&mut Episode); 7] = [
+        let broken: [fn(&mut Episode); 9] = [
             |it| it.rewards.clear(),
             |it| it.score.length = 3,
             |it| it.observations.truncate(5),
             |it| it.actions.push(0.0),
+            |it| it.observations.clear(),
+            |it| it.actions.clear(),
             |it| it.interventions = vec![2],
             |it| it.interventions = vec![1, 1],
             |it| it.rewards[0] = f32::NAN,
