@@ -135,7 +135,8 @@ pub fn serve_environment(
 ) -> PyResult<()> {
     let precision =
         precision.parse().map_err(|error| PyValueError::new_err(format!("precision: {error}")))?;
-    let args = ServeArgs { connect, certificates, http: None, name: None, precision };
+    let http_hosts = Vec::new();
+    let args = ServeArgs { connect, certificates, http: None, http_hosts, name: None, precision };
     let environments = Arc::new(PythonEnvironments { name, sizes, factory: Arc::new(factory) });
     let served = py.detach(|| {
         let _logging = init_logging();

@@ -174,6 +174,9 @@ pub struct PageArgs {
     /// Address of the page; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address, default_value = "127.0.0.1:8080")]
     pub http: SocketAddr,
+    /// Further names of that address
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    pub http_hosts: Vec<String>,
 }
 
 #[derive(Debug, Args)]

@@ -24,12 +24,7 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
         At::Best => (best, "with a complete evaluation"),
     };
     let (run, name) = (args.run.display(), args.out.display());
-    let out = args.out.canonicalize().ok();
-    let is_out = |step: &u64| folder.snapshot_path(*step).canonicalize().ok() == out;
-    if out.is_some() && steps.iter().any(is_out) {
-        return Err(anyhow!("{name} is a snapshot, which the run's scores name by its hash"))
-            .hint("choose another file by --out");
-    }
+    RunDir::refuse_own_file(&args.out)?;
     let Some(step) = step.filter(|step| steps.contains(step)) else {
         let named = Vec::from_iter(steps.iter().map(u64::to_string)).join(", ");
         let hint = match steps.is_empty() {

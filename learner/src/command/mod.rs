@@ -1,6 +1,7 @@
 //! The learner's commands, from the parsed command line to the exit code. All of them run on the
 //! main thread.
 
+mod dataset_hints;
 mod doctor;
 mod dry_run;
 mod export;
@@ -26,7 +27,9 @@ use quad_run::folder::verify::{self, Findings};
 use quad_run::folder::{RunDirError, practiced};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
-use quad_runtime::{Hint, hinted, json, print, stay_in_background, unfinished};
+use quad_runtime::{
+    Hint, hinted, json, print, stay_in_background, unfinished, unfinished_at_signal,
+};
 use serde::Serialize;
 use tokio::runtime::{Builder, Runtime};
 use tracing::{info, warn};
@@ -43,6 +46,9 @@ const DAMAGED: &str = "put a copy of the damaged file in its place; a line of sc
                        is scored again";
 
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
+    if matches!(cli.command, Command::Train(_) | Command::Sweep(_)) {
+        unfinished_at_signal();
+    }
     let done = match &cli.command {
         Command::Train(args) => train::train(args),
         Command::Sweep(args) => sweep::sweep(args),

@@ -3,15 +3,34 @@
 
 use std::env;
 use std::fs::{self, File};
+use std::net::TcpListener;
 use std::os::unix::fs::symlink;
 use std::path::Path;
 
+use quad_dataset::{Arrays, Names, write_own};
 use quad_protocol::{Episode, EpisodeScore, Hash, Name, encode, episode_seeds};
 use quad_run::folder::RunDir;
 use serde_json::{Value, json};
 
 use crate::run::{HOPPER, Run, TASKS, complete, paper, practiced, small, write_all, write_study};
 use crate::write_dataset;
+
+/// A study whose run diverges at its last step: one observation is too large for the square of a
+/// gradient.
+const DIVERGES: &str = "about = 'x'
+[run]
+task = 'own-data'
+environment = 'far'
+dataset = 'far.hdf5'
+algorithm = 'td3-bc'
+hold_out = 0
+steps = 20
+batch_size = 8
+agent.actor.hidden = [8]
+agent.critic.hidden = [8]
+[axes]
+seed = [0]
+";
 
 /// A study of which some runs cannot begin.
 const STUDY: &str = "about = 'x'
@@ -39,10 +58,14 @@ fn commands_print_what_their_transcripts_have() {
     env::set_current_dir(folder.path()).unwrap();
     write_dataset(Path::new("data.hdf5"));
     fs::write("study.toml", STUDY).unwrap();
+    fs::write("diverges.toml", DIVERGES).unwrap();
+    write_far(Path::new("far.hdf5"));
     write_reported();
     write_published();
     write_studies();
     let _at_work = write_listed();
+    // Where this fails, another program has the port.
+    let _usual_port = TcpListener::bind("127.0.0.1:7447");
     write_verified();
     write_practiced();
     write_foreign();
@@ -53,6 +76,24 @@ fn commands_print_what_their_transcripts_have() {
         .env("LC_ALL", "C")
         .case(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/cli/*.trycmd"))
         .run();
+}
+
+/// A dataset of which one observation is far from all others.
+fn write_far(path: &Path) {
+    let numbers = |count: usize| Vec::from_iter((0..count).map(|i| (i as f32).sin() / 2.0));
+    let mut observations = numbers(200);
+    observations[0] = 1e12;
+    let arrays = Arrays {
+        observation_dim: 2,
+        action_dim: 1,
+        next_observations: numbers(202).split_off(2),
+        observations,
+        actions: numbers(100),
+        rewards: vec![1.0; 100],
+        terminals: vec![false; 100],
+        timeouts: (1..=100).map(|row| row % 25 == 0).collect(),
+    };
+    write_own(path, arrays, Names::default()).unwrap();
 }
 
 /// The search path with the learner, for pipes.
@@ -274,6 +315,15 @@ fn write_practiced() {
         };
         log.append([&*encode(&episode).unwrap()]).unwrap();
     }
+    // Another user's file, of an episode without observations.
+    Run::new("hopper-demo", 5).write("practice/foreign");
+    let (mut log, _) = RunDir::at(Path::new("practice/foreign")).experience_log().unwrap();
+    let score = EpisodeScore { seed: 0, episode_return: 1.0, length: 1, score: 1.0 };
+    let (actions, rewards) = (vec![0.5; 3], vec![1.0]);
+    let precision = Name::new("f32").unwrap();
+    let empty =
+        Episode { score, actions, rewards, ..Episode::new(20, Hash::of(b""), precision, 0) };
+    log.append([&*encode(&empty).unwrap()]).unwrap();
 }
 
 /// The runs of foreign.trycmd.

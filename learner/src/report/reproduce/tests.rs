@@ -27,7 +27,7 @@ fn experiment_of(command: &str) -> Experiment {
         panic!("{command}")
     };
     assert!(train.run_dir.as_ref().is_some_and(|dir| dir.ends_with("it's a run")), "{command}");
-    Preset::read(train.preset()).unwrap().resolve(&train.changes()).unwrap()
+    Preset::read(train.preset()).unwrap().resolve(&train.changes().unwrap()).unwrap()
 }
 
 #[test]
