@@ -20,7 +20,7 @@ pub(super) struct Snapshot {
     /// BLAKE3 of the file.
     pub weights: String,
     pub policy: Box<dyn Policy>,
-    /// See [`quad_run::results::Judgment`].
+    /// Why it acts otherwise in an episode than it is judged.
     pub caveat: Option<String>,
     /// Episodes that the run has not trained on.
     pub held_out: BTreeSet<usize>,
