@@ -38,9 +38,9 @@ pub(super) struct Data {
 }
 
 impl Data {
-    /// Reads the dataset of these snapshots. They are judged in the episodes that every run with
-    /// held-out episodes has held out.
-    pub fn read(snapshots: &[Snapshot]) -> anyhow::Result<Self> {
+    /// Reads the data of these snapshots, from `dataset` if it is there. They are judged in the episodes
+    /// that every run with held-out episodes has held out.
+    pub fn read(snapshots: &[Snapshot], dataset: Option<&str>) -> anyhow::Result<Self> {
         let first = snapshots.first().context("there is no policy to judge")?;
         let (run, data) = (first.folder.path().display(), &first.config.dataset);
         let environment = &first.config.experiment.environment;
@@ -57,15 +57,15 @@ impl Data {
                     .hint("judge them apart: values of different rewards do not compare");
             }
         }
-        let source = Source::Path(data.path.clone());
+        let source = dataset.map_or_else(|| Ok(Source::Path(data.path.clone())), Source::parse)?;
         let hint = format!(
-            "put the data of the run {run} back; a relative path is below the folder where `learner train` was started"
+            "name the data of the run {run} by --dataset; a relative path in the run is below the folder where `learner train` was started"
         );
         let dataset = source.obtain().hint(hint)?;
         if data.sha256.is_some() && data.sha256 != Some(dataset.sha256.clone()) {
             let path = dataset.path.display();
             let error = anyhow!("{path} is not the data that {run} has learned from");
-            return Err(error).hint("put a copy of that file in its place");
+            return Err(error).hint("name a copy of that file by --dataset");
         }
         let episodes = shared(snapshots.iter().map(|snapshot| &snapshot.held_out))?;
         let hold_out = match &episodes {
@@ -89,7 +89,7 @@ impl Data {
         Self::of(split, dataset.sha256, environment.clone())
     }
 
-    fn of(split: Split, sha256: String, environment: String) -> anyhow::Result<Self> {
+    pub(super) fn of(split: Split, sha256: String, environment: String) -> anyhow::Result<Self> {
         let held_out = split.held_out.context("no episode is left to judge policies in").hint(
             "record more: they are judged in other episodes than those from which values are learned",
         )?;

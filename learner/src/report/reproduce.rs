@@ -20,7 +20,7 @@ pub fn command(run: &RunReport) -> Option<String> {
         ));
     }
     let preset = as_given(run, false).ok()?;
-    let mut words = vec!["learner train --task".to_owned(), quoted(&run.task)];
+    let mut words = vec!["learner train --task".to_owned(), quoted(&run.config.run.task)];
     let mut push = |flag: &str, value: &str| words.extend([flag.to_owned(), quoted(value)]);
     push("--algorithm", &run.algorithm);
     if let Some(dataset) = &experiment.dataset {

@@ -12,7 +12,10 @@ use quad_protocol::{Episode, EpisodeScore, Hash, Name, encode, episode_seeds};
 use quad_run::folder::RunDir;
 use serde_json::{Value, json};
 
-use crate::run::{HOPPER, Run, TASKS, complete, paper, practiced, small, write_all, write_study};
+use crate::export::judge;
+use crate::run::{
+    HOPPER, Run, TASKS, complete, fallen, paper, practiced, small, write_all, write_study,
+};
 use crate::write_dataset;
 
 /// A study whose run diverges at its last step: one observation is too large for the square of a
@@ -106,6 +109,7 @@ fn bin_path() -> String {
 fn write_reported() {
     small(3, 0.0).write("report/one");
     practiced().write("report/practiced");
+    fallen().write("report/fallen");
     let (mut complete, mut stopped) = (small(0, 0.0), small(1, 0.0));
     complete.score(6000, 0, 12.0, "00");
     complete.write("report/stopped/a");
@@ -141,6 +145,11 @@ fn write_reported() {
     let mut last = Run::new("hopper-demo", 0).sizes(100_000, 10_000, 1);
     (1..=10).for_each(|n| last.score(10_000 * n, 0, n as f64, "00"));
     last.write("report/last");
+    // Of these 50,000, practice has 10,000.
+    let online = practiced().config["experiment"]["online"].clone();
+    let online = last.set("experiment.steps", 90_000).set("experiment.online", online);
+    let online = online.set("experiment.online.steps", 5500);
+    online.write("report/short-practice");
     write_all("report/goals", paper("antmaze-umaze-v0", 100_000, |_| 50.0));
 }
 
@@ -213,6 +222,18 @@ fn write_studies() {
         "pairs",
         pairs.map(|(guidance, seed, score)| guided(Run::new(TASKS[0], seed), guidance, score)),
     );
+    // Two robots, one of them with two logs.
+    let own = |environment, sha256: &str, guidance, score| {
+        let run = Run::new("own-data", 0).set("experiment.environment", environment);
+        guided(run.set("dataset.sha256", sha256.repeat(8)), guidance, score)
+    };
+    let logs = [
+        own("reach", "12ab34cd", "quad", 1.0),
+        own("reach", "12ab34cd", "dac", 2.0),
+        own("reach", "56ef78ab", "quad", 3.0),
+        own("push", "12ab34cd", "dac", 100.0),
+    ];
+    write_all("own", logs);
     let robot = Run::new(TASKS[0], 0)
         .set("experiment.environment", "my-robot")
         .set("run.preset", "my-robot");
@@ -277,10 +298,14 @@ fn write_verified() {
         }
     }
     // As with `--eval-interval 0`: no evaluations, only snapshots.
-    for name in ["alone", "alike", "flipped", "none"] {
+    for name in ["alone", "alike", "flipped", "none", "judged", "judged-flipped"] {
         Run::new("hopper-demo", 4).sizes(15, 0, 3).write(format!("verify/{name}"));
         let mut snapshot = [7; 100];
-        snapshot[50] ^= u8::from(name == "flipped");
+        if name.starts_with("judged") {
+            let weights = Hash::of(&snapshot).to_string();
+            judge(&RunDir::at(Path::new("verify").join(name).as_path()), 15, 1.0, &weights);
+        }
+        snapshot[50] ^= u8::from(name.ends_with("flipped"));
         if name != "none" {
             let path = format!("verify/{name}/snapshots/step_000000015.safetensors");
             fs::write(path, snapshot).unwrap();
