@@ -1,7 +1,5 @@
 //! Results of a job, which the evaluator owes to the learner until they are acknowledged.
 
-use std::collections::VecDeque;
-
 use quad_protocol::{
     CodecError, Episode, EpisodeScore, Hash, Job, Message, Name, Piece, ScoreReport, encode,
 };
@@ -10,38 +8,6 @@ use quad_protocol::{
 pub enum Owed {
     Scores(ScoreReport),
     Episode(Parcel),
-}
-
-/// Scores of snapshots that a learner, back at an earlier step, is still to train again.
-#[derive(Default)]
-pub struct Early(VecDeque<ScoreReport>);
-
-impl Early {
-    /// Most reports, of some kilobytes each.
-    const MOST: usize = 64;
-
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-
-    /// Keeps a report. If there are too many, returns the one that was kept for longest.
-    pub fn keep(&mut self, report: ScoreReport) -> Option<ScoreReport> {
-        self.0.push_back(report);
-        if self.0.len() > Self::MOST { self.0.pop_front() } else { None }
-    }
-
-    /// The report that was not delivered for longest.
-    pub fn next(&mut self) -> Option<ScoreReport> {
-        self.0.pop_front()
-    }
-
-    /// A report with scores of the evaluation that a job is a part of.
-    pub fn next_like(&mut self, job: &Job) -> Option<ScoreReport> {
-        let is_like =
-            |report: &ScoreReport| (report.step, report.weights) == (job.step, job.weights);
-        let index = self.0.iter().position(is_like).filter(|_| job.practice.is_none());
-        self.0.remove(index?)
-    }
 }
 
 /// A practice episode on its way to the learner.
@@ -108,38 +74,5 @@ impl Parcel {
             true => Ok(()),
             false => Err(format!("it wants the episode with seed {seed} from byte {offset} again")),
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use quad_protocol::Exploration;
-
-    use super::super::fixtures::job;
-    use super::*;
-
-    fn report(step: u64) -> ScoreReport {
-        let [by, precision] = ["one", "f32"].map(|name| Name::new(name).unwrap());
-        ScoreReport { step, ..ScoreReport::new(&job(), by, precision, Vec::new()) }
-    }
-
-    #[test]
-    fn early_scores_take_turns_and_go_first_when_their_evaluation_has_a_job() {
-        let mut early = Early::default();
-        (0..Early::MOST as u64).for_each(|step| assert!(early.keep(report(step)).is_none()));
-        let oldest = early.keep(report(1000)).unwrap();
-        assert_eq!(oldest.step, 0, "they are bounded");
-        let first = early.next().unwrap();
-        assert_eq!(first.step, 1);
-        early.keep(first);
-
-        let like = |step, weights: &[u8]| Job { step, weights: Hash::of(weights), ..job() };
-        assert!(early.next_like(&like(7, b"others")).is_none());
-        let practice = Some(Exploration::Uniform);
-        assert!(early.next_like(&Job { practice, ..like(7, b"") }).is_none());
-        assert_eq!(early.next_like(&like(7, b"")).unwrap().step, 7);
-        assert!(early.next_like(&like(7, b"")).is_none(), "it was taken");
-        assert_eq!(std::iter::from_fn(|| early.next()).last().unwrap().step, 1);
-        assert!(early.is_empty());
     }
 }

@@ -13,13 +13,11 @@
 //! is an argument, so tests have a clock of their own.
 //!
 //! In reading order: `scoreboard`, `outcomes` (its arguments and results), `episodes` (one
-//! evaluation), `open_job` (a job and its lease), `pieces` (practice episodes that arrive in pieces),
-//! `validate` (checks of reports), `refusal`.
+//! evaluation), `open_job` (a job and its lease), `validate` (checks of reports), `refusal`.
 
 mod episodes;
 mod open_job;
 mod outcomes;
-mod pieces;
 mod refusal;
 mod scoreboard;
 #[cfg(test)]
@@ -27,7 +25,6 @@ mod tests;
 mod validate;
 
 pub(crate) use outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, PracticeEpisode};
-pub(crate) use pieces::{Added, Pieces};
 pub(crate) use refusal::Refusal;
 pub(crate) use scoreboard::{Rules, Scoreboard};
 pub(crate) use validate::Validated;

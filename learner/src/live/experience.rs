@@ -3,10 +3,10 @@
 //! A piece is small, since a learner takes no larger messages. There are as many episodes in
 //! pieces as the run has open, and none is longer than the environment allows.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use anyhow::Context;
-use quad_protocol::{Episode, Hash, Piece, PieceReply, practice_seed};
+use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, decode, practice_seed};
 use quad_run::config::Experiment;
 use quad_run::folder::{ExperienceLog, RunDir};
 use quad_runtime::{Heartbeat, Hint};
@@ -15,7 +15,7 @@ use tracing::warn;
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
 use super::requests::{NotAccepted, Request};
-use crate::evaluation::{Added, Pieces, PracticeEpisode};
+use crate::evaluation::PracticeEpisode;
 use crate::train::Inbox;
 
 /// The hint of a checkpoint or log without the other.
@@ -27,8 +27,12 @@ pub(super) struct Experience {
     log: ExperienceLog,
     inbox: Inbox,
     coordinator: Coordinator,
-    pieces: Pieces,
+    /// The first bytes of frames, and the hashes of the whole, by seed.
+    partial: BTreeMap<u64, (Hash, Vec<u8>)>,
 }
+
+/// The last piece's request, the number and the episode, which is complete.
+type Whole = (Request, u64, Episode);
 
 impl Experience {
     /// Opens the run's log, and puts what it has into the inbox. An episode that is not there may
@@ -57,7 +61,7 @@ impl Experience {
         }
         let error = "experience.log has episodes of another run";
         episodes.is_empty().then_some(()).context(error).hint(OTHER_FOLDER)?;
-        Ok(Self { log, inbox, coordinator: coordinator.clone(), pieces: Pieces::default() })
+        Ok(Self { log, inbox, coordinator: coordinator.clone(), partial: BTreeMap::new() })
     }
 
     /// Answers each piece. Episodes that are complete are written together first.
@@ -67,13 +71,13 @@ impl Experience {
         disk: &mut DiskStatus,
         beat: &Heartbeat,
     ) {
-        self.pieces.begin();
-        // The last piece's request, the number and the episode.
         let mut whole = Vec::new();
         for (request, piece) in pieces {
-            match self.add(&piece) {
-                Ok(Received::Reply(reply)) => request.reply(&reply),
-                Ok(Received::Whole(number, episode)) => whole.push((request, number, episode)),
+            match self
+                .add(&piece, |number| whole.iter().any(|(_, other, _): &Whole| *other == number))
+            {
+                Ok(Added::Reply(reply)) => request.reply(&reply),
+                Ok(Added::Whole(number, episode)) => whole.push((request, number, episode)),
                 Err(why @ NotAccepted::NotYet) => request.reject(&why, &self.coordinator.metrics),
                 Err(why) => refuse(request, &why, &self.coordinator),
             }
@@ -81,13 +85,13 @@ impl Experience {
         if whole.is_empty() {
             return;
         }
-        let seeds = whole.iter().map(|(_, _, episode)| episode.score.seed);
-        match self.log.append(seeds.filter_map(|seed| self.pieces.frame(seed))) {
+        let partial = whole.iter().filter_map(|(_, _, it)| self.partial.get(&it.score.seed));
+        match self.log.append(partial.map(|(_, frame)| frame.as_slice())) {
             Ok(()) => {
                 disk.accepted(beat);
                 for (request, number, episode) in whole {
                     let seed = episode.score.seed;
-                    let Some(hash) = self.pieces.remove(seed) else { continue };
+                    let Some((hash, _)) = self.partial.remove(&seed) else { continue };
                     // Training may have ended.
                     self.inbox.send((number, episode)).ok();
                     request.reply(&self.coordinator.record_practice(seed, hash));
@@ -105,7 +109,8 @@ impl Experience {
         }
     }
 
-    fn add(&mut self, piece: &Piece) -> Result<Received, NotAccepted> {
+    /// Adds a piece; `is_whole` tells of the episodes that are to be written with it.
+    fn add(&mut self, piece: &Piece, is_whole: impl Fn(u64) -> bool) -> Result<Added, NotAccepted> {
         let incarnation = self.coordinator.incarnation();
         let seed = piece.seed;
         let number = match self.coordinator.practice(piece)? {
@@ -119,18 +124,40 @@ impl Experience {
                         "an episode was played again with other bits; the first delivery counts"
                     );
                 }
-                return Ok(Received::Reply(PieceReply::Recorded { incarnation, duplicate: true }));
+                return Ok(Added::Reply(PieceReply::Recorded { incarnation, duplicate: true }));
             }
         };
-        match self.pieces.add(piece)? {
-            Added::Continue(offset) => {
-                Ok(Received::Reply(PieceReply::Continue { incarnation, offset }))
-            }
-            Added::Whole(episode) => {
-                self.coordinator.validate_practice(number, &episode)?;
-                Ok(Received::Whole(number, episode))
-            }
+        let at = |offset: usize| {
+            let offset = offset as u32;
+            Ok(Added::Reply(PieceReply::Continue { incarnation, offset }))
+        };
+        // Another evaluator's last piece came just before.
+        if is_whole(number) {
+            return at(piece.offset as usize);
         }
+        let none = || (piece.hash, Vec::new());
+        let (hash, bytes) = self.partial.entry(seed).or_insert_with(none);
+        let offset = piece.offset as usize;
+        if *hash != piece.hash {
+            if offset > 0 {
+                return at(0);
+            }
+            (*hash, *bytes) = none();
+        }
+        if offset == bytes.len() {
+            bytes.extend_from_slice(&piece.bytes);
+        }
+        if bytes.len() < piece.length as usize {
+            return at(bytes.len());
+        }
+        let found = Hash::of(bytes);
+        if found != piece.hash {
+            bytes.clear();
+            return Err(CodecError::Hash { claimed: piece.hash, found }.into());
+        }
+        let episode: Episode = decode(bytes)?;
+        self.coordinator.validate_practice(number, &episode)?;
+        Ok(Added::Whole(number, episode))
     }
 }
 
@@ -141,7 +168,10 @@ pub(super) fn refuse(request: Request, why: &NotAccepted, coordinator: &Coordina
     request.reply(&PieceReply::Refused { incarnation, reason });
 }
 
-enum Received {
+enum Added {
     Reply(PieceReply),
     Whole(u64, Episode),
 }
+
+#[cfg(test)]
+mod tests;

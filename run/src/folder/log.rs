@@ -158,20 +158,18 @@ struct Line<'a, T> {
 /// torn: any part of it may be missing. Damage before the last append counts as lines.
 pub(super) fn whole_lines(text: &[u8]) -> usize {
     let complete = complete_lines(text);
-    let (mut end, mut damaged) = (0, None);
+    let (mut end, mut damaged) = (0, complete);
     for line in text[..complete].split_inclusive(|&byte| byte == b'\n') {
         match serde_json::from_slice::<Position>(line) {
-            Ok(Position { after }) => {
-                let synchronized = after.unwrap_or(end as u64);
-                if damaged.is_some_and(|start| start < synchronized) {
-                    return complete;
-                }
+            Ok(Position { after }) if after.unwrap_or(end as u64) > damaged as u64 => {
+                return complete;
             }
-            Err(_) => drop(damaged.get_or_insert(end as u64)),
+            Ok(_) => {}
+            Err(_) => damaged = damaged.min(end),
         }
         end += line.len();
     }
-    damaged.map_or(complete, |start| start as usize)
+    damaged
 }
 
 /// Length of the complete lines, bytes.
