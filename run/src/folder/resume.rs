@@ -121,7 +121,7 @@ impl ResumePoint {
             let online = experiment.online.as_ref();
             online.is_some_and(|online| online.is_snapshot(experiment.steps, at))
         };
-        let mut played = BTreeMap::new();
+        let mut played = BTreeSet::new();
         if experiment.online.is_some() {
             let episodes = read_experience(dir.path())?;
             played.extend(episodes.iter().map(|episode| (episode.step, episode.weights)));
@@ -135,7 +135,7 @@ impl ResumePoint {
             }
             let is_other = |hash: &Hash| {
                 scored.is_some_and(|scored| scored.weights != hash.to_string())
-                    || played.get(&at).is_some_and(|played| played != hash)
+                    || played.iter().any(|(step, _)| *step == at) && !played.contains(&(at, *hash))
             };
             match dir.read_snapshot(at).map(|file| Hash::of(&file)) {
                 Ok(hash) if is_other(&hash) => {
