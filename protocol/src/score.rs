@@ -68,6 +68,8 @@ impl ScoreReport {
 pub enum ScoreReply {
     /// The scores are on the learner's disk. Duplicates were delivered before and count once.
     Recorded { incarnation: u64, new: u32, duplicates: u32 },
+    /// Training has not come to the step since the learner's start: deliver the scores again later.
+    NotYet { incarnation: u64 },
     /// The scores are permanently refused.
     Refused { incarnation: u64, reason: String },
 }
@@ -76,7 +78,9 @@ impl ScoreReply {
     /// The incarnation of the learner that answers.
     pub fn incarnation(&self) -> u64 {
         match self {
-            Self::Recorded { incarnation, .. } | Self::Refused { incarnation, .. } => *incarnation,
+            Self::Recorded { incarnation, .. }
+            | Self::NotYet { incarnation }
+            | Self::Refused { incarnation, .. } => *incarnation,
         }
     }
 }

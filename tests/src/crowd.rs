@@ -160,7 +160,7 @@ impl Member {
             .map(|episode| (report.step, episode.seed, report.weights.to_string()));
         match answer {
             ScoreReply::Recorded { .. } => measured.acknowledged.extend(scores),
-            ScoreReply::Refused { .. } => measured.refused += 1,
+            ScoreReply::NotYet { .. } | ScoreReply::Refused { .. } => measured.refused += 1,
         }
     }
 

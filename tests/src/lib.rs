@@ -58,6 +58,12 @@ pub fn eventually<T>(
     }
 }
 
+/// Tries what a busy machine may keep from happening within a program's own time limits; panics if
+/// it never happens.
+pub fn in_some_try(what: &str, attempt: impl FnMut(usize) -> bool) {
+    assert!((0..5).any(attempt), "not in five tries: {what}");
+}
+
 /// The size of a test, from an environment variable.
 pub fn number(variable: &str, default: u64) -> u64 {
     std::env::var(variable).map_or(default, |text| text.parse().expect("a number"))

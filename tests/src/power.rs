@@ -1,20 +1,26 @@
-//! A disk after a power cut, at worst: it holds only what was synchronized.
+//! A disk after a power cut, at worst: it holds what was synchronized, and any part of what was not.
 //!
-//! A file has the contents of its last fsync, a folder the entries of its own last fsync, and an
+//! A file has the contents of its last fsync and some pages of what was appended since, a folder the entries of its own last fsync, and an
 //! entry that was never synchronized itself is empty. examples/power_cut.rs, preloaded into a
 //! program, keeps such a [`Disk`] up to date.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
+use rand::Rng;
+
 use crate::process::preload;
 
 /// Variables with the two folders, for the preloaded library.
 const FOLDER: &str = "QUAD_TESTS_DISK";
 const KEPT: &str = "QUAD_TESTS_DISK_KEPT";
+
+/// Bytes that a disk writes at once.
+const PAGE: usize = 512;
 
 /// A folder, and beside it what a power cut would leave of it.
 pub struct Disk {
@@ -63,9 +69,11 @@ impl Disk {
     }
 
     /// Leaves in the folder what a power cut would leave. All of that is durable from then on.
-    pub fn cut_power(&self) {
+    pub fn cut_power(&self, random: &mut impl Rng) {
         let restored = self.folder.with_extension("restored");
-        self.restore(&identity(&self.folder).unwrap(), &restored).unwrap();
+        let paths = self.paths().into_iter();
+        let paths = paths.map(|path| (identity(&path).unwrap(), path)).collect();
+        self.restore(&identity(&self.folder).unwrap(), &restored, &paths, random).unwrap();
         fs::remove_dir_all(&self.folder).unwrap();
         fs::rename(&restored, &self.folder).unwrap();
         fs::remove_dir_all(&self.kept).unwrap();
@@ -74,19 +82,30 @@ impl Disk {
 
     fn keep_all(&self) {
         fs::create_dir(&self.kept).unwrap();
-        let mut folders = vec![self.folder.clone()];
-        while let Some(folder) = folders.pop() {
-            self.keep(&folder).unwrap();
-            for path in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
-                match path.is_dir() {
-                    true => folders.push(path),
-                    false => self.keep(&path).unwrap(),
-                }
-            }
-        }
+        self.paths().iter().for_each(|path| self.keep(path).unwrap());
     }
 
-    fn restore(&self, folder: &str, target: &Path) -> io::Result<()> {
+    /// All folders and files, each folder before what is in it.
+    fn paths(&self) -> Vec<PathBuf> {
+        let mut paths = vec![self.folder.clone()];
+        let mut next = 0;
+        while let Some(path) = paths.get(next).cloned() {
+            if path.is_dir() {
+                paths.extend(fs::read_dir(path).unwrap().map(|entry| entry.unwrap().path()));
+            }
+            next += 1;
+        }
+        paths
+    }
+
+    /// Makes a folder, of this identity, as it is after the cut; `paths` are those before it.
+    fn restore(
+        &self,
+        folder: &str,
+        target: &Path,
+        paths: &BTreeMap<String, PathBuf>,
+        random: &mut impl Rng,
+    ) -> io::Result<()> {
         fs::create_dir(target)?;
         // One that was never synchronized has no entries.
         for line in fs::read_to_string(self.kept.join(folder)).unwrap_or_default().lines() {
@@ -95,13 +114,31 @@ impl Disk {
             let (kind, identity, path) = (word(), word(), target.join(word()));
             let kept = self.kept.join(identity);
             match kind {
-                "folder" => self.restore(identity, &path)?,
-                _ if kept.exists() => drop(fs::copy(kept, path)?),
+                "folder" => self.restore(identity, &path, paths, random)?,
+                _ if kept.exists() => {
+                    let written = paths.get(identity).map(fs::read).transpose()?;
+                    fs::write(path, torn(fs::read(kept)?, &written.unwrap_or_default(), random))?;
+                }
                 _ => drop(File::create(path)?),
             }
         }
         Ok(())
     }
+}
+
+/// The contents of a file that has been `written` since it was `kept`: what was appended is there up
+/// to some byte, without some of its pages.
+fn torn(mut kept: Vec<u8>, written: &[u8], random: &mut impl Rng) -> Vec<u8> {
+    let begin = kept.len();
+    if written.starts_with(&kept) {
+        kept.extend(&written[begin..random.random_range(begin..=written.len())]);
+        for (number, page) in kept.chunks_mut(PAGE).enumerate().skip(begin / PAGE) {
+            if random.random_bool(0.5) {
+                page[begin.saturating_sub(number * PAGE)..].fill(0);
+            }
+        }
+    }
+    kept
 }
 
 fn entry_line(entry: &fs::DirEntry) -> io::Result<String> {

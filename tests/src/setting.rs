@@ -24,8 +24,9 @@ pub const SHORT: Setting = Setting {
     seed: 1,
     online_steps: 0,
 };
-/// A run that is still training when its test is over.
-pub const ENDLESS: Setting = Setting { steps: 100_000_000, eval_interval: 500, ..SHORT };
+/// A run that is still training when its test is over. The disk keeps up with its snapshots: a
+/// learner that stops writes those that wait.
+pub const ENDLESS: Setting = Setting { steps: 100_000_000, eval_interval: 2000, ..SHORT };
 /// An endless run without a snapshot to evaluate before the test is over.
 pub const IDLE: Setting = Setting { eval_interval: 50_000_000, ..ENDLESS };
 

@@ -129,13 +129,18 @@ impl Evaluator {
     }
 }
 
-/// A free port, where it must be known before its owner starts. It stays free: the system itself
-/// gives ports from 32,768 on to those who want any, or who connect.
+/// A free port, where it must be known before its owner starts, or between two owners. It stays
+/// free: the system itself gives ports from 32,768 on to those who want any, or who connect, and of
+/// a hundred others a test's process has the first as long as it runs.
 pub fn free_port() -> u16 {
+    static FIRST: LazyLock<(u16, TcpListener)> = LazyLock::new(|| {
+        let mut hundreds = (0..100).map(|n| 20_000 + (std::process::id() + n) as u16 % 100 * 100);
+        let listen = |first| Some((first, TcpListener::bind(("127.0.0.1", first)).ok()?));
+        hundreds.find_map(listen).expect("fewer than a hundred tests run at once")
+    });
     static NEXT: AtomicU16 = AtomicU16::new(0);
-    let first = 20_000 + (std::process::id() % 100) as u16 * 100;
     loop {
-        let port = first + NEXT.fetch_add(1, Relaxed) % 100;
+        let port = FIRST.0 + 1 + NEXT.fetch_add(1, Relaxed) % 99;
         if TcpListener::bind(("127.0.0.1", port)).is_ok() {
             return port;
         }

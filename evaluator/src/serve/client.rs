@@ -1,6 +1,6 @@
 //! An evaluator's side of one run: jobs claimed, results owed, the learner process followed.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -14,7 +14,7 @@ use zenoh::liveliness::LivelinessToken;
 
 use super::connection::{ANSWER_TIMEOUT, Connection};
 use super::delivery::{Owed, Parcel};
-use super::discovery::Found;
+use super::discovery::{Found, RunKey};
 use super::query::{QueryError, blocking};
 use super::scheduler::Turn;
 use super::snapshot::{Listener, Snapshots};
@@ -28,6 +28,8 @@ const LEAVE: Duration = Duration::from_secs(2);
 const LEAVE_EPISODE: Duration = Duration::from_secs(6);
 /// Pause of a leaving evaluator after a learner's error.
 const RETRY: Duration = Duration::from_millis(100);
+/// Most jobs whose scores are kept for a step that the learner is to train to again.
+const MOST_EARLY: usize = 64;
 /// Most characters of a reason that the evaluator sends; the learner accepts no large messages.
 const MAX_REASON_LEN: usize = 1000;
 
@@ -42,12 +44,15 @@ struct Claimed {
 }
 
 pub struct RunClient {
+    key: RunKey,
     pub connection: Connection,
     snapshots: Snapshots,
     listener: Listener,
     /// Number of the claim that has no answer yet.
     attempt: Option<u64>,
     claimed: Option<Claimed>,
+    /// Jobs whose scores the learner takes when it has trained to their step again.
+    early: VecDeque<Claimed>,
     pub turn: Turn,
     /// Time of the learner's disappearance.
     pub gone: Option<Instant>,
@@ -58,27 +63,29 @@ pub struct RunClient {
 impl RunClient {
     /// Subscribes to the run's snapshots and announces the evaluator in the run.
     pub async fn attach(
-        run: Name,
+        key: RunKey,
         found: &Found,
         evaluator: Name,
         snapshots: Snapshots,
         metrics: Metrics,
     ) -> anyhow::Result<RunClient> {
-        let session = found.session.clone();
+        let (session, run) = (found.session.clone(), key.1.clone());
         let listener =
-            Listener::start(&session, run.clone(), snapshots.clone(), metrics.clone()).await;
+            Listener::start(&session, key.clone(), snapshots.clone(), metrics.clone()).await;
         let listener =
             listener.with_context(|| format!("cannot listen to the snapshots of run {run}"))?;
-        let (declarer, key) = (session.clone(), keys::live_evaluator(&run, &evaluator));
-        let token = blocking(move || declarer.liveliness().declare_token(key).wait()).await;
+        let (declarer, live) = (session.clone(), keys::live_evaluator(&run, &evaluator));
+        let token = blocking(move || declarer.liveliness().declare_token(live).wait()).await;
         let _token =
             token.with_context(|| format!("cannot announce this evaluator in run {run}"))?;
         let mut client = RunClient {
+            key,
             connection: Connection { run, evaluator, session, metrics, incarnation: 0 },
             snapshots,
             listener,
             attempt: None,
             claimed: None,
+            early: VecDeque::new(),
             turn: Turn::new(Instant::now()),
             gone: None,
             last_warning: String::new(),
@@ -162,7 +169,7 @@ impl RunClient {
     /// The snapshot that `job` names: the published one or, if the evaluator missed it, a requested
     /// one.
     pub async fn snapshot(&self, job: &Job) -> anyhow::Result<Arc<Snapshot>> {
-        match self.snapshots.get(job) {
+        match self.snapshots.get(&self.key, job) {
             Some(snapshot) => Ok(snapshot),
             None => Ok(Arc::new(self.connection.snapshot(job).await?)),
         }
@@ -170,6 +177,11 @@ impl RunClient {
 
     pub fn has_job(&self) -> bool {
         self.claimed.is_some()
+    }
+
+    /// True if there are results to deliver, or a job to hand back.
+    pub fn owes(&self) -> bool {
+        self.has_job() || !self.early.is_empty()
     }
 
     /// Keeps the results of the claimed job for delivery.
@@ -191,20 +203,40 @@ impl RunClient {
             return self.hand_back(timeout).await;
         };
         let (run, step) = (&connection.run, job.step);
-        let refused = match owed {
+        let answer = match owed {
             Owed::Scores(report) => deliver_scores(connection, report, timeout).await?,
             Owed::Episode(parcel) => deliver_episode(connection, step, parcel, timeout).await?,
         };
-        let Some(refused) = refused else {
-            self.claimed = None;
-            self.last_warning.clear();
-            self.turn = Turn::new(Instant::now());
-            return Ok(());
-        };
-        warn!(%run, step, "the learner {refused}");
-        connection.metrics.job("abandoned");
-        self.return_job(Some(format!("it {refused}")));
-        self.hand_back(timeout).await
+        if let Answer::Refused(refused) = answer {
+            warn!(%run, step, "the learner {refused}");
+            connection.metrics.job("abandoned");
+            self.return_job(Some(format!("it {refused}")));
+            return self.hand_back(timeout).await;
+        }
+        let claimed = self.claimed.take();
+        if let Answer::NotYet = answer {
+            debug!(%run, step, "the scores wait until the learner has trained to that step again");
+            self.early.extend(claimed);
+            if self.early.len() > MOST_EARLY {
+                self.early.pop_front();
+                connection.metrics.job("abandoned");
+            }
+        }
+        self.last_warning.clear();
+        self.turn = Turn::new(Instant::now());
+        Ok(())
+    }
+
+    /// Takes up a job again whose scores came too early. False if there is none.
+    pub fn take_early(&mut self) -> bool {
+        self.claimed = self.early.pop_front();
+        self.has_job()
+    }
+
+    /// True if this evaluator has scores of the evaluation that `job` is a part of.
+    pub fn has_scores_like(&self, job: &Job) -> bool {
+        let early = |kept: &Claimed| (kept.job.step, kept.job.weights) == (job.step, job.weights);
+        job.practice.is_none() && self.early.iter().any(early)
     }
 
     /// Hands back the claimed job, which this evaluator could not run; if there is no answer,
@@ -271,20 +303,28 @@ impl RunClient {
     /// Stops serving the run, and drops results that were not acknowledged.
     pub fn give_up(self) {
         let Connection { run, metrics, .. } = &self.connection;
-        self.snapshots.forget(run);
-        if let Some(Claimed { job, owed: Some(_), .. }) = &self.claimed {
+        self.snapshots.forget(&self.key);
+        let claimed = self.claimed.filter(|claimed| claimed.owed.is_some());
+        for Claimed { job, .. } in claimed.into_iter().chain(self.early) {
             warn!(%run, step = job.step, "the learner did not return; its results are dropped");
             metrics.job("abandoned");
         }
     }
 }
 
-/// Delivers scores. Returns the refusal of a learner that refuses them.
+/// A learner's last word on results.
+enum Answer {
+    Recorded,
+    NotYet,
+    /// With the reason.
+    Refused(String),
+}
+
 async fn deliver_scores(
     connection: &Connection,
     report: &ScoreReport,
     timeout: Duration,
-) -> Result<Option<String>, QueryError> {
+) -> Result<Answer, QueryError> {
     let Connection { run, metrics, .. } = connection;
     let delivered = connection.deliver(keys::scores(run), report, timeout, ScoreReply::incarnation);
     Ok(match delivered.await? {
@@ -295,19 +335,22 @@ async fn deliver_scores(
             let step = report.step;
             info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
             metrics.job("scored");
-            None
+            Answer::Recorded
         }
-        ScoreReply::Refused { reason, .. } => Some(format!("refused the scores: {reason}")),
+        ScoreReply::NotYet { .. } => Answer::NotYet,
+        ScoreReply::Refused { reason, .. } => {
+            Answer::Refused(format!("refused the scores: {reason}"))
+        }
     })
 }
 
-/// Delivers an episode in pieces. Returns the refusal of a learner that refuses it.
+/// Delivers an episode in pieces.
 async fn deliver_episode(
     connection: &Connection,
     step: u64,
     parcel: &mut Parcel,
     timeout: Duration,
-) -> Result<Option<String>, QueryError> {
+) -> Result<Answer, QueryError> {
     let (Connection { run, metrics, .. }, seed) = (connection, parcel.seed());
     loop {
         let (key, piece) = (keys::experience(run), parcel.piece());
@@ -321,10 +364,11 @@ async fn deliver_episode(
                 info!(%run, step, seed, rows, duplicate, "an episode of practice delivered");
                 metrics.practice_rows.inc_by(rows);
                 metrics.job("practiced");
-                return Ok(None);
+                return Ok(Answer::Recorded);
             }
             PieceReply::Refused { reason, .. } => {
-                return Ok(Some(format!("refused the episode with seed {seed}: {reason}")));
+                let refused = format!("refused the episode with seed {seed}: {reason}");
+                return Ok(Answer::Refused(refused));
             }
         }
     }

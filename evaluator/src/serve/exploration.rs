@@ -41,14 +41,18 @@ pub fn explore(
 mod tests {
     use candle_core::{DType, Device, Tensor};
     use quad_nn::Layout;
-    use quad_policy::{Affine, Header, MlpConfig, PolicyConfig, Precision, Scaling, load_policy};
+    use quad_policy::{
+        Affine, Header, MlpConfig, PolicyConfig, Precision, Scaling, Spread, load_policy,
+    };
     use serde_json::json;
 
     use super::*;
 
-    /// A policy whose action is 0 in the network's units.
-    fn policy(scaling: Option<Scaling>) -> Box<dyn Policy> {
-        let shape = json!({"observation_dim": 1, "action_dim": 2, "actor": MlpConfig::mish(&[1])});
+    /// A policy whose mode is 0 in the network's units; σ is 1, unless there is no spread.
+    fn policy(spread: Spread, scaling: Option<Scaling>) -> Box<dyn Policy> {
+        let actor = MlpConfig::mish(&[1]);
+        let shape =
+            json!({"observation_dim": 1, "action_dim": 2, "actor": actor, "spread": spread});
         let policy = json!({"kind": "gaussian", "shape": shape});
         let policy: PolicyConfig = serde_json::from_value(policy).unwrap();
         let zeros = |layout: &Layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu);
@@ -71,15 +75,17 @@ mod tests {
     #[test]
     fn actions_are_drawn_as_the_rule_says_in_the_network_s_units_and_for_each_episode_alone() {
         let actions_scale = Affine { offset: vec![10.0, -1.0], scale: vec![4.0, 0.5] };
-        let plain = policy(None);
-        let scaled = policy(Some(Scaling { actions: Some(actions_scale), ..Scaling::default() }));
+        let scaling = Scaling { actions: Some(actions_scale), ..Scaling::default() };
         let seeds = Vec::from_iter(0..2000);
         // Shares of actions within ±0.4 and within ±0.9.
-        for (rule, shares) in [
-            (Exploration::Uniform, [0.4, 0.9]),
-            (Exploration::Policy { noise: 0.4 }, [0.6827, 0.9756]),
-            (Exploration::Policy { noise: 0.0 }, [1.0, 1.0]),
+        let noise = |noise| Exploration::Policy { noise };
+        for (rule, spread, shares) in [
+            (Exploration::Uniform, Spread::None, [0.4, 0.9]),
+            (noise(0.4), Spread::None, [0.6827, 0.9756]),
+            (noise(0.0), Spread::None, [1.0, 1.0]),
+            (noise(0.0), Spread::Shared, [0.3108, 0.6319]),
         ] {
+            let [plain, scaled] = [None, Some(scaling.clone())].map(|it| policy(spread, it));
             let drawn = actions(rule, &*plain, &seeds);
             assert!(drawn.iter().all(|action| (-1.0..=1.0).contains(action)));
             for (limit, expected) in [0.4, 0.9].into_iter().zip(shares) {
@@ -89,7 +95,7 @@ mod tests {
                 assert!((inside - expected).abs() < 0.02, "{rule:?}: {inside} within {limit}");
                 assert!((above - (1.0 - expected) / 2.0).abs() < 0.02, "{rule:?}: {above}");
             }
-            let explores = rule != Exploration::Policy { noise: 0.0 };
+            let explores = (rule, spread) != (noise(0.0), Spread::None);
             assert_eq!(drawn[..2] != drawn[2..4], explores, "each step draws anew");
 
             let others = actions(rule, &*plain, &[1999, 5]);

@@ -11,6 +11,7 @@ use zenoh::pubsub::Subscriber;
 use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
+use super::discovery::RunKey;
 use super::query::blocking;
 use crate::metrics::Metrics;
 
@@ -30,31 +31,32 @@ pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
 #[derive(Clone, Default)]
 pub struct Snapshots {
     /// In the order of arrival.
-    kept: Arc<Mutex<VecDeque<Arc<Snapshot>>>>,
+    kept: Arc<Mutex<VecDeque<(RunKey, Arc<Snapshot>)>>>,
     arrived: Arc<Notify>,
 }
 
 impl Snapshots {
     /// Replaces the run's last snapshot. If memory is short, drops the oldest ones.
-    fn keep(&self, snapshot: Snapshot) {
-        self.forget(&snapshot.run);
+    fn keep(&self, run: &RunKey, snapshot: Snapshot) {
+        self.forget(run);
         let mut kept = self.lock();
-        kept.push_back(Arc::new(snapshot));
-        let mut bytes: usize = kept.iter().map(|kept| kept.file.len()).sum();
+        kept.push_back((run.clone(), Arc::new(snapshot)));
+        let mut bytes: usize = kept.iter().map(|(_, kept)| kept.file.len()).sum();
         while bytes > MAX_BYTES {
-            bytes -= kept.pop_front().map_or(0, |oldest| oldest.file.len());
+            bytes -= kept.pop_front().map_or(0, |(_, oldest)| oldest.file.len());
         }
         drop(kept);
         self.arrived.notify_one();
     }
 
-    pub fn forget(&self, run: &Name) {
-        self.lock().retain(|snapshot| snapshot.run != *run);
+    pub fn forget(&self, run: &RunKey) {
+        self.lock().retain(|(kept, _)| kept != run);
     }
 
-    pub fn get(&self, job: &Job) -> Option<Arc<Snapshot>> {
+    pub fn get(&self, run: &RunKey, job: &Job) -> Option<Arc<Snapshot>> {
         let kept = self.lock();
-        kept.iter().find(|kept| is_named_by(job, kept)).cloned()
+        let named = kept.iter().find(|(owner, kept)| owner == run && is_named_by(job, kept));
+        named.map(|(_, kept)| kept.clone())
     }
 
     /// Waits for the next snapshot of any run.
@@ -62,7 +64,7 @@ impl Snapshots {
         self.arrived.notified().await;
     }
 
-    fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<Snapshot>>> {
+    fn lock(&self) -> MutexGuard<'_, VecDeque<(RunKey, Arc<Snapshot>)>> {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -83,34 +85,34 @@ struct State {
 }
 
 impl Listener {
-    /// Subscribes to `quad/<run>/weights` and keeps the snapshots of the [followed](Self::follow)
+    /// Subscribes to the run's `quad/<run>/weights` and keeps the snapshots of the [followed](Self::follow)
     /// learner in `snapshots`.
     ///
     /// Zenoh's receiving thread also decodes and verifies, for milliseconds in which it receives no
     /// other message.
     pub async fn start(
         session: &Session,
-        run: Name,
+        key: RunKey,
         snapshots: Snapshots,
         metrics: Metrics,
     ) -> anyhow::Result<Listener> {
         let state = Arc::new(State::default());
-        let (session, key, shared) = (session.clone(), keys::weights(&run), state.clone());
-        let callback = move |sample: Sample| match read(&sample, &run, &shared) {
+        let (session, weights, shared) = (session.clone(), keys::weights(&key.1), state.clone());
+        let callback = move |sample: Sample| match read(&sample, &key.1, &shared) {
             Ok(snapshot) => {
                 metrics.snapshots_received.inc();
-                debug!(%run, step = snapshot.step, "weights arrived");
+                debug!(run = %key.1, step = snapshot.step, "weights arrived");
                 shared.has_news.store(true, Relaxed);
-                snapshots.keep(snapshot);
+                snapshots.keep(&key, snapshot);
             }
             Err((label, problem)) => {
                 metrics.rejected(label);
                 if label != OTHER_INCARNATION && !shared.warned.swap(true, Relaxed) {
-                    warn!(%run, "ignored a bad snapshot (further ones are only counted): {problem}");
+                    warn!(run = %key.1, "ignored a bad snapshot (further ones are only counted): {problem}");
                 }
             }
         };
-        let declare = move || session.declare_subscriber(key).callback(callback).wait();
+        let declare = move || session.declare_subscriber(weights).callback(callback).wait();
         let _subscriber = blocking(declare).await?;
         Ok(Listener { state, _subscriber })
     }
@@ -151,29 +153,30 @@ mod tests {
     #[test]
     fn keeps_the_newest_snapshot_of_each_run_within_the_memory_limit() {
         let snapshots = Snapshots::default();
-        let keep = |run: &str, step, bytes| {
-            let mut snapshot = snapshot(vec![0; bytes]);
-            (snapshot.run, snapshot.step) = (Name::new(run).unwrap(), step);
-            snapshots.keep(snapshot);
-            Vec::from_iter(snapshots.lock().iter().map(|kept| kept.step))
+        let key = |endpoint, run: &str| (endpoint, Name::new(run).unwrap());
+        let keep = |endpoint, run: &str, step, bytes| {
+            snapshots.keep(&key(endpoint, run), Snapshot { step, ..snapshot(vec![0; bytes]) });
+            Vec::from_iter(snapshots.lock().iter().map(|(_, kept)| kept.step))
         };
-        assert_eq!(keep("one", 1, MAX_BYTES / 3), [1]);
-        assert_eq!(keep("other", 2, MAX_BYTES / 3), [1, 2]);
+        assert_eq!(keep(0, "one", 1, MAX_BYTES / 3), [1]);
+        assert_eq!(keep(1, "one", 2, MAX_BYTES / 3), [1, 2], "another learner's run of the name");
         // It replaces the run's last one.
-        assert_eq!(keep("one", 3, MAX_BYTES / 3), [2, 3]);
+        assert_eq!(keep(0, "one", 3, MAX_BYTES / 3), [2, 3]);
         // The oldest makes room.
-        assert_eq!(keep("large", 4, MAX_BYTES / 2), [3, 4]);
-        snapshots.forget(&Name::new("one").unwrap());
-        assert_eq!(keep("large", 5, 0), [5]);
+        assert_eq!(keep(0, "large", 4, MAX_BYTES / 2), [3, 4]);
+        snapshots.forget(&key(1, "one"));
+        snapshots.forget(&key(0, "one"));
+        assert_eq!(keep(0, "large", 5, 0), [5]);
     }
 
     #[test]
     fn a_job_gets_exactly_the_snapshot_that_it_names() {
         let snapshots = Snapshots::default();
-        snapshots.keep(snapshot(b"policy".to_vec()));
-        let mut named = job();
-        named.weights = Hash::of(b"policy");
-        assert!(snapshots.get(&named).is_some());
+        let run = (0, job().run);
+        snapshots.keep(&run, snapshot(b"policy".to_vec()));
+        let named = Job { weights: Hash::of(b"policy"), ..job() };
+        assert!(snapshots.get(&run, &named).is_some());
+        assert!(snapshots.get(&(1, job().run), &named).is_none());
         let others: [fn(&mut Job); 4] = [
             |job| job.run = Name::new("other").unwrap(),
             |job| job.incarnation = 2,
@@ -183,7 +186,7 @@ mod tests {
         for change in others {
             let mut other = named.clone();
             change(&mut other);
-            assert!(snapshots.get(&other).is_none(), "{other:?}");
+            assert!(snapshots.get(&run, &other).is_none(), "{other:?}");
         }
     }
 }

@@ -75,7 +75,7 @@ impl Worker {
                 return false;
             }
             let gone = now - *client.gone.get_or_insert(now);
-            !client.has_job() || gone >= KEEP_RESULTS
+            !client.owes() || gone >= KEEP_RESULTS
         };
         for (_, client) in self.clients.extract_if(.., is_over) {
             client.give_up();
@@ -90,7 +90,7 @@ impl Worker {
                 continue;
             }
             let Evaluator { name, metrics, .. } = &self.evaluator;
-            let (run, snapshots) = (key.1.clone(), self.snapshots.clone());
+            let (run, snapshots) = (key.clone(), self.snapshots.clone());
             match RunClient::attach(run, &learner, name.clone(), snapshots, metrics.clone()).await {
                 Ok(client) => drop(self.clients.insert(key, client)),
                 Err(error) => warn!("{error:#}"),
@@ -128,7 +128,14 @@ impl Worker {
 /// Runs one job, if the last one is acknowledged, and delivers its results.
 async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
     if !client.has_job() {
+        if client.take_early() {
+            client.deliver(ANSWER_TIMEOUT).await?;
+        }
         let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };
+        if client.has_scores_like(&job) {
+            // Its evaluation has opened: they go first. What they leave of the job comes again.
+            return Ok(client.deliver(ANSWER_TIMEOUT).await?);
+        }
         match evaluator.evaluate(&job, client).await {
             Ok(owed) => client.keep(owed),
             Err(error) => {

@@ -61,6 +61,8 @@ pub enum Behavior {
     /// Leaves claims without an answer.
     IgnoresClaims,
     Refuses,
+    /// Is to train to the step of the scores again.
+    IsEarlier,
     /// Leaves the first job that is handed back without an answer.
     LosesHandBack,
     /// Loses the beginning of an episode when it gets the third piece, once.
@@ -179,8 +181,8 @@ fn answer_scores(
 ) {
     let incarnation = locked.incarnation;
     let new = report.episodes.len() as u32;
+    locked.job.take_if(|job| job.id == report.job);
     locked.events.push(Event::Scores(report));
-    locked.job = None;
     let duplicates = 0;
     let recorded = ScoreReply::Recorded { incarnation, new, duplicates };
     let reason = "the sums differ".to_owned();
@@ -193,6 +195,7 @@ fn answer_scores(
             query.reply_err("No space left on device").wait().unwrap();
         }
         Behavior::Refuses => reply(query, &refused(incarnation)),
+        Behavior::IsEarlier => reply(query, &ScoreReply::NotYet { incarnation }),
         Behavior::Hangs => {
             drop(locked);
             while state.lock().unwrap().behavior == Behavior::Hangs {

@@ -10,8 +10,11 @@ pub(crate) enum Refusal {
     Job,
     #[error("the job is not further than before")]
     NotAdvanced,
-    #[error("there is no evaluation of that step")]
+    #[error("the run has no evaluation of that step")]
     Step,
+    /// The only one that is not final.
+    #[error("training has not come to that step since the learner's start")]
+    NotYet,
     #[error("the evaluation of that step is about other weights")]
     Weights,
     #[error("seed {0} is not in the evaluation, or twice in the report")]
@@ -35,6 +38,7 @@ impl Refusal {
             Self::Job => "unknown_job",
             Self::NotAdvanced => "not_advanced",
             Self::Step => "unknown_step",
+            Self::NotYet => "not_open_yet",
             Self::Weights => "unknown_weights",
             Self::Seed(_) => "unknown_seed",
             Self::Episode(_) => "impossible_episode",

@@ -1,11 +1,13 @@
 //! All evaluations of a run.
 
 use std::collections::{BTreeMap, HashMap};
+use std::ops::RangeBounds;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
 use quad_protocol::{Episode, EpisodeScore, Hash, Job, Message, Name, Progress, ScoreReport};
+use quad_run::config::Schedule;
 use quad_run::folder::SavedScores;
 
 use super::episodes::{Evaluation, Key};
@@ -29,8 +31,8 @@ const LONGEST_PROGRESS: Duration = Duration::from_secs(20);
 /// Time after which an evaluator without the run's environment asks again.
 const DOES_NOT_FIT: Duration = Duration::from_secs(10);
 
-/// After this time, an evaluator without work gets the practice episode that the learner waits for
-/// once more: the first answer counts.
+/// A practice episode for which training has waited for this time goes to a second evaluator: the
+/// first answer counts.
 const STRAGGLER: Duration = Duration::from_secs(20);
 
 /// Constants of all evaluations of a run.
@@ -46,6 +48,7 @@ pub(crate) struct Rules {
     pub dims: (usize, usize),
     /// Episodes per evaluation.
     pub episodes: u32,
+    pub schedule: Schedule,
     /// Most episodes in one job: while as many evaluators as there are could share them, and if
     /// many more wait.
     pub job_episodes: [usize; 2],
@@ -72,7 +75,9 @@ pub(crate) struct Scoreboard {
     /// Scores of an earlier incarnation, by step, whose evaluation is not open yet.
     earlier: BTreeMap<u64, SavedScores>,
     /// Practice episodes by seed.
-    practice: HashMap<u64, PracticeEpisode>,
+    pub(super) practice: HashMap<u64, PracticeEpisode>,
+    /// Number of the practice episode that training waits for, and since when.
+    awaited: Option<(u64, Instant)>,
     practice_ended: bool,
 }
 
@@ -87,6 +92,7 @@ impl Scoreboard {
             next_job: 1,
             earlier,
             practice: HashMap::new(),
+            awaited: None,
             practice_ended: false,
         }
     }
@@ -139,9 +145,9 @@ impl Scoreboard {
         self.practice.retain(|_, practice| *practice != PracticeEpisode::NotYet);
     }
 
-    /// The practice episode with this seed, if the run has it.
-    pub fn practice(&self, seed: u64) -> Option<PracticeEpisode> {
-        self.practice.get(&seed).copied()
+    /// Records that training waits for this practice episode from `now` on.
+    pub fn wait_for_practice(&mut self, episode: u64, now: Instant) {
+        self.awaited = Some((episode, now));
     }
 
     /// Records a practice episode, whose frame has this hash, as delivered. Returns the number of
@@ -208,15 +214,12 @@ impl Scoreboard {
             open.asked_again = true;
             return wait;
         }
-        let few = self.rules.job_episodes[0];
-        let (id, most) = (self.next_job, self.job_episodes(present));
-        let handed_out = self.evaluations.range_mut(first..).find_map(|(&key, evaluation)| {
-            let seeds = evaluation.hand_out(id, [few, most], now);
-            (!seeds.is_empty()).then_some((key, seeds))
-        });
-        let Some((key, seeds)) = handed_out.or_else(|| self.straggler(first, id, now)) else {
-            return wait;
-        };
+        let id = self.next_job;
+        let practice = self.hand_out(first..Key::Evaluation(0), present, now);
+        let handed_out = practice
+            .or_else(|| self.straggler(id, now))
+            .or_else(|| self.hand_out(Key::Evaluation(0).., present, now));
+        let Some((key, seeds)) = handed_out else { return wait };
         let Evaluation { step, weights, practice, .. } = &self.evaluations[&key];
         self.next_job += 1;
         let progress = interval(present, PROGRESS);
@@ -249,13 +252,27 @@ impl Scoreboard {
         Claimed::Job { job, again: false }
     }
 
-    /// The practice episode that the learner waits for, if its only evaluator takes long.
-    fn straggler(&mut self, first: Key, job: u64, now: Instant) -> Option<(Key, Vec<u64>)> {
-        let (&key, evaluation) = self.evaluations.range_mut(first..).next()?;
-        let mut players = self.jobs.values().filter(|open| open.key == key);
-        let alone = (players.next(), players.next());
-        let (Key::Practice(_), (Some(only), None)) = (key, alone) else { return None };
-        (now >= only.handed_out + STRAGGLER).then(|| (key, evaluation.hand_out_again(job)))
+    /// Hands out the first waiting episodes in this range with the next job.
+    fn hand_out(
+        &mut self,
+        keys: impl RangeBounds<Key>,
+        present: usize,
+        now: Instant,
+    ) -> Option<(Key, Vec<u64>)> {
+        let limits = [self.rules.job_episodes[0], self.job_episodes(present)];
+        self.evaluations.range_mut(keys).find_map(|(&key, evaluation)| {
+            let seeds = evaluation.hand_out(self.next_job, limits, now);
+            (!seeds.is_empty()).then_some((key, seeds))
+        })
+    }
+
+    /// The practice episode that training has waited for too long, if one evaluator plays it.
+    fn straggler(&mut self, job: u64, now: Instant) -> Option<(Key, Vec<u64>)> {
+        let (episode, _) = self.awaited.filter(|(_, since)| now >= *since + STRAGGLER)?;
+        let key = Key::Practice(episode);
+        let players = self.jobs.values().filter(|open| open.key == key).count();
+        let evaluation = self.evaluations.get_mut(&key).filter(|_| players == 1)?;
+        Some((key, evaluation.hand_out_again(job)))
     }
 
     /// Most episodes of a job: half of an evaluator's share of those that wait, so that none is

@@ -2,9 +2,10 @@
 
 use std::collections::BTreeSet;
 
-use quad_protocol::{Episode, EpisodeScore, ScoreReport};
+use quad_protocol::{Episode, EpisodeScore, Piece, ScoreReport};
 
 use super::episodes::Key;
+use super::outcomes::PracticeEpisode;
 use super::refusal::{Refusal, require};
 use super::scoreboard::Scoreboard;
 
@@ -27,7 +28,8 @@ impl Scoreboard {
     pub fn validate(&self, report: &ScoreReport) -> Result<Validated, Refusal> {
         require(report.run == self.rules.run, Refusal::Run)?;
         let evaluation = self.evaluations.get(&Key::Evaluation(report.step));
-        let evaluation = evaluation.ok_or(Refusal::Step)?;
+        let is_due = self.rules.schedule.is_evaluated(report.step);
+        let evaluation = evaluation.ok_or(if is_due { Refusal::NotYet } else { Refusal::Step })?;
         require(evaluation.weights == report.weights, Refusal::Weights)?;
         let mut validated = Validated { new: Vec::new(), duplicates: 0 };
         let mut seen = BTreeSet::new();
@@ -38,6 +40,14 @@ impl Scoreboard {
             if is_scored { validated.duplicates += 1 } else { validated.new.push(*score) }
         }
         Ok(validated)
+    }
+
+    /// The practice episode of a piece, if the run has it and it is not too long.
+    pub fn practice(&self, piece: &Piece) -> Result<PracticeEpisode, Refusal> {
+        require(piece.run == self.rules.run, Refusal::Run)?;
+        let fits = piece.length as usize <= self.rules.longest_frame();
+        require(fits, Refusal::Rows(piece.seed))?;
+        self.practice.get(&piece.seed).copied().ok_or(Refusal::Practice(piece.seed))
     }
 
     /// Checks the episode of practice with this number against its opening. Changes nothing, as

@@ -127,6 +127,11 @@ impl Coordinator {
         self.lock().scoreboard.expect_practice(seed);
     }
 
+    /// Records that training waits for this practice episode from now on.
+    pub fn wait_for_practice(&self, episode: u64) {
+        self.lock().scoreboard.wait_for_practice(episode, Instant::now());
+    }
+
     /// Ends practice: evaluators get no more of its episodes.
     pub fn end_practice(&self) {
         self.lock().scoreboard.end_practice();
@@ -139,13 +144,7 @@ impl Coordinator {
 
     /// The practice episode of a piece, if the run has it and it is not too long.
     pub(super) fn practice(&self, piece: &Piece) -> Result<PracticeEpisode, Refusal> {
-        if piece.run != self.rules.run {
-            return Err(Refusal::Run);
-        }
-        if piece.length as usize > self.rules.longest_frame() {
-            return Err(Refusal::Rows(piece.seed));
-        }
-        self.lock().scoreboard.practice(piece.seed).ok_or(Refusal::Practice(piece.seed))
+        self.lock().scoreboard.practice(piece)
     }
 
     /// Checks the episode of practice with this number. Changes nothing.

@@ -73,7 +73,9 @@ impl Experience {
     ) {
         let mut whole = Vec::new();
         for (request, piece) in pieces {
-            match self.add(&piece, &whole) {
+            match self
+                .add(&piece, |number| whole.iter().any(|(_, other, _): &Whole| *other == number))
+            {
                 Ok(Added::Reply(reply)) => request.reply(&reply),
                 Ok(Added::Whole(number, episode)) => whole.push((request, number, episode)),
                 Err(why @ NotAccepted::NotYet) => request.reject(&why, &self.coordinator.metrics),
@@ -107,7 +109,8 @@ impl Experience {
         }
     }
 
-    fn add(&mut self, piece: &Piece, whole: &[Whole]) -> Result<Added, NotAccepted> {
+    /// Adds a piece; `is_whole` tells of the episodes that are to be written with it.
+    fn add(&mut self, piece: &Piece, is_whole: impl Fn(u64) -> bool) -> Result<Added, NotAccepted> {
         let incarnation = self.coordinator.incarnation();
         let seed = piece.seed;
         let number = match self.coordinator.practice(piece)? {
@@ -129,7 +132,7 @@ impl Experience {
             Ok(Added::Reply(PieceReply::Continue { incarnation, offset }))
         };
         // Another evaluator's last piece came just before.
-        if whole.iter().any(|(_, other, _)| *other == number) {
+        if is_whole(number) {
             return at(piece.offset as usize);
         }
         let none = || (piece.hash, Vec::new());
@@ -169,3 +172,6 @@ enum Added {
     Reply(PieceReply),
     Whole(u64, Episode),
 }
+
+#[cfg(test)]
+mod tests;

@@ -62,7 +62,6 @@ pub(crate) struct MainLoop {
 /// The state of the run, as far as the loop knows.
 #[derive(Default)]
 struct State {
-    trained: bool,
     interrupted: bool,
     wire: Option<Wire>,
     /// Endpoints for evaluators; empty until the run is online.
@@ -135,7 +134,7 @@ impl MainLoop {
                     // The stop came during the last step; the run does not wait for scores.
                     Event::TrainingEnded(_) if state.interrupted => return Ending::Interrupted,
                     Event::TrainingEnded(Outcome::Completed) => {
-                        (state.trained, state.patience) = (true, Patience::default());
+                        state.patience = Patience::after_training();
                         self.display.line(&self.trained());
                     }
                     event => {
@@ -150,13 +149,13 @@ impl MainLoop {
                     if let Verdict::GiveUp = self.tick(state) {
                         return Ending::Unscored;
                     }
-                    if state.trained && self.threads.coordinator().pending() == 0 {
+                    if state.patience.trained && self.threads.coordinator().pending() == 0 {
                         return Ending::Complete;
                     }
                 }
                 () = &mut shutdown, if !state.interrupted => {
                     state.interrupted = true;
-                    if state.trained {
+                    if state.patience.trained {
                         return Ending::Interrupted;
                     }
                     self.display.line("stopping after this gradient step");
@@ -209,7 +208,7 @@ impl MainLoop {
         self.watch_disk(&mut state.hanging);
         self.display.tick(Instant::now());
         let waited = self.metrics.practice.wait_seconds.get();
-        let waits = state.trained || mem::replace(&mut state.waited, waited) < waited;
+        let waits = state.patience.trained || mem::replace(&mut state.waited, waited) < waited;
         let any_may_fit = self.threads.coordinator().any_may_fit();
         let verdict = state.patience.check(any_may_fit || !waits, Instant::now());
         if let Verdict::Advise = verdict {
@@ -217,7 +216,7 @@ impl MainLoop {
                 None => format!(
                     "no router has answered at {} yet; {} for it",
                     self.endpoints.connect.join(", "),
-                    if state.trained { "the scores wait" } else { "practice waits" }
+                    if state.patience.trained { "the scores wait" } else { "practice waits" }
                 ),
                 Some(endpoint) => {
                     let environment = self.threads.coordinator().environment();
@@ -226,8 +225,7 @@ impl MainLoop {
             };
             self.display.line(&advice);
         }
-        // Training waits for practice as long as it takes.
-        if state.trained { verdict } else { Verdict::Wait }
+        verdict
     }
 
     /// A thread that writes and has not reported for long waits for the disk.

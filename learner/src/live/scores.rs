@@ -81,9 +81,11 @@ impl Scores {
                 Ok(validated) => validated,
                 Err(refusal) => {
                     self.coordinator.metrics.reject(refusal.label());
-                    let (incarnation, reason) =
-                        (self.coordinator.incarnation(), refusal.to_string());
-                    request.reply(&ScoreReply::Refused { incarnation, reason });
+                    let incarnation = self.coordinator.incarnation();
+                    request.reply(&match refusal {
+                        Refusal::NotYet => ScoreReply::NotYet { incarnation },
+                        _ => ScoreReply::Refused { incarnation, reason: refusal.to_string() },
+                    });
                     continue;
                 }
             };

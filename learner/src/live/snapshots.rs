@@ -70,6 +70,7 @@ impl Snapshots {
         match output {
             Output::Snapshot(policy) => self.snapshot(policy)?,
             Output::Practice(opening) => self.open_practice(opening)?,
+            Output::Waits(episode) => self.coordinator().wait_for_practice(*episode),
             Output::Checkpoint(checkpoint) => self.checkpoint(checkpoint)?,
             Output::Rows(rows) => self.rows.append(rows)?,
             Output::Ended(outcome) => {

@@ -162,6 +162,7 @@ fn rules(
         seed: experiment.seed,
         dims: (transitions.observation_dim(), transitions.action_dim()),
         episodes: experiment.episodes,
+        schedule: experiment.schedule(),
         job_episodes: JOB_EPISODES,
         lease: LEASE,
     }

@@ -28,6 +28,8 @@ pub(crate) enum Output {
     Snapshot(TrainedPolicy),
     /// Practice that may be played with a snapshot before.
     Practice(Opening),
+    /// Training waits for this episode of practice.
+    Waits(u64),
     Checkpoint(Checkpoint),
     Rows(Vec<Row>),
     /// Comes after all other output.
@@ -65,6 +67,12 @@ impl OutputQueue {
     /// Adds an episode of practice.
     pub fn practice(&self, opening: Opening) {
         self.lock().snapshots.push_back(Output::Practice(opening));
+        self.shared.1.notify_all();
+    }
+
+    /// Tells that training waits for this episode of practice from now on.
+    pub fn waits(&self, episode: u64) {
+        self.lock().snapshots.push_back(Output::Waits(episode));
         self.shared.1.notify_all();
     }
 

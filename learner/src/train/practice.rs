@@ -151,6 +151,11 @@ impl Practice {
         mem::take(&mut self.openings).into_iter().filter(is_open).collect()
     }
 
+    /// The next episode, unless it is recorded.
+    pub fn awaited(&self) -> Option<u64> {
+        (!self.waiting.contains_key(&self.episodes)).then_some(self.episodes)
+    }
+
     fn absorb(&mut self, episode: &Episode) -> Result<(), PracticeError> {
         let (number, step, metrics) = (self.episodes, self.due(), &self.metrics);
         let Episode { observations, actions, rewards, terminated, score, .. } = episode;

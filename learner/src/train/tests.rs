@@ -131,7 +131,9 @@ fn run(agent: Agent, held_out: Option<HeldOut>, schedule: Schedule, stop: bool) 
             Output::Snapshot(policy) => trained.snapshots.push((policy.step, policy.evaluate)),
             Output::Checkpoint(checkpoint) => trained.checkpoint = Some(checkpoint),
             Output::Rows(rows) => trained.rows.extend(rows),
-            Output::Practice(_) | Output::Ended(_) => panic!("the loop does not send this"),
+            Output::Practice(_) | Output::Waits(_) | Output::Ended(_) => {
+                panic!("the loop does not send this")
+            }
         }
     }
     trained

@@ -159,6 +159,9 @@ impl Training {
             if !practice.is_due(step) {
                 return Ok(true);
             }
+            if let Some(episode) = practice.awaited() {
+                self.queue.waits(episode);
+            }
             if !practice.absorb_next(&self.stop, beat)? {
                 return Ok(false);
             }

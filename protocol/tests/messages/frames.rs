@@ -84,6 +84,7 @@ pub fn each(test: &mut impl Check) {
     test.check(&JobReply::Wait { incarnation: 2, milliseconds: 10 });
     test.check(&JobReply::HandedBack { incarnation: 2, accepted: true });
     test.check(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 });
+    test.check(&ScoreReply::NotYet { incarnation: 1 });
     test.check(&ScoreReply::Refused { incarnation: 1, reason: text() });
     test.check(&progress);
     test.check(&JobReply::Job(Job { practice: Some(Exploration::Uniform), ..job }));

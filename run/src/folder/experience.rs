@@ -1,7 +1,9 @@
 //! Experience on disk: `experience.log`.
 //!
 //! A record is the length of a frame (u32, little-endian), its BLAKE3 hash and the frame: an
-//! [`Episode`] as its evaluator has delivered it.
+//! [`Episode`] as its evaluator has delivered it. Each record but the first of one append has its hash
+//! inverted: a damaged record after which no append begins may be of the last one, torn by a power
+//! cut.
 
 use std::fs::File;
 use std::io::{self, BufReader, ErrorKind, Read};
@@ -31,8 +33,10 @@ impl ExperienceLog {
     ) -> Result<(), RunDirError> {
         let mut bytes = Vec::new();
         for frame in frames {
+            let hash = *Hash::of(frame).bytes();
+            let stored = if bytes.is_empty() { hash } else { inverted(hash) };
             bytes.extend((frame.len() as u32).to_le_bytes());
-            bytes.extend(Hash::of(frame).bytes());
+            bytes.extend(stored);
             bytes.extend(frame);
         }
         self.0.append_bytes(&bytes)
@@ -61,22 +65,26 @@ pub fn read_experience(folder: &Path) -> Result<Vec<Episode>, RunDirError> {
     Ok(records.into_iter().map(|(_, episode)| episode).collect())
 }
 
-/// The complete records, and their length in bytes. A damaged one is an error, unless it may be an
-/// incomplete one at the end.
+fn inverted(hash: [u8; 32]) -> [u8; 32] {
+    hash.map(|byte| !byte)
+}
+
+/// The complete records, and their length in bytes. A damaged one is an error, unless it may be of
+/// the last append.
 fn complete_records(
     path: &Path,
     file: &mut File,
 ) -> Result<(Vec<(Hash, Episode)>, u64), RunDirError> {
     let (mut records, mut length) = (Vec::new(), 0);
     let mut reader = BufReader::new(&*file);
-    while let Some((hash, frame)) = next(&mut reader).map_err(io_error("read", path))? {
+    while let Some((hash, frame, _)) = next(&mut reader).map_err(io_error("read", path))? {
         let broken = |error| content(path, None, format!("record {}: {error}", records.len() + 1));
         records.push((hash, decode_kept(&frame).map_err(broken)?));
         length += (HEADER + frame.len()) as u64;
     }
     let rest = files::rest(file, length).map_err(io_error("read", path))?;
-    let is_record = |start: usize| next(&mut &rest[start..]).is_ok_and(|found| found.is_some());
-    if (1..rest.len()).any(is_record) {
+    let begins = |start: usize| matches!(next(&mut &rest[start..]), Ok(Some((.., true))));
+    if (1..rest.len()).any(begins) {
         let number = records.len() + 1;
         let reason =
             format!("record {number}, at byte {length}, is damaged, but one after it is complete");
@@ -85,8 +93,8 @@ fn complete_records(
     Ok((records, length))
 }
 
-/// The next frame and its hash, if its record is complete.
-fn next(reader: &mut impl Read) -> io::Result<Option<(Hash, Vec<u8>)>> {
+/// The hash and the frame of the next record, if it is complete, and whether it begins an append.
+fn next(reader: &mut impl Read) -> io::Result<Option<(Hash, Vec<u8>, bool)>> {
     let mut begin = [0; HEADER + BEGIN.len()];
     match reader.read_exact(&mut begin) {
         Err(error) if error.kind() == ErrorKind::UnexpectedEof => return Ok(None),
@@ -101,8 +109,10 @@ fn next(reader: &mut impl Read) -> io::Result<Option<(Hash, Vec<u8>)>> {
     let length = u32::from_le_bytes([a, b, c, d]) as usize;
     reader.take(length.saturating_sub(BEGIN.len()) as u64).read_to_end(&mut frame)?;
     let hash = Hash::of(&frame);
-    let is_complete = frame.len() == length && hash.bytes()[..] == begin[4..HEADER];
-    Ok(is_complete.then_some((hash, frame)))
+    let stored = &begin[4..HEADER];
+    let begins = hash.bytes() == stored;
+    let is_complete = frame.len() == length && (begins || inverted(*hash.bytes()) == stored);
+    Ok(is_complete.then_some((hash, frame, begins)))
 }
 
 #[cfg(test)]

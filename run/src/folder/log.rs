@@ -4,7 +4,9 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::de::IgnoredAny;
+use serde::{Deserialize, Serialize};
+use tracing::warn;
 
 use super::error::{RunDirError, content, io_error};
 use super::lock::Lock;
@@ -26,12 +28,13 @@ pub struct Log {
 }
 
 impl Log {
-    /// Opens or creates a file of lines and cuts off an incomplete line at its end. A log with a
-    /// lock is durable.
+    /// Opens or creates a file of lines and cuts off an append at its end that was not completed. A
+    /// log with a lock is durable.
     pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
         let mut file = files::append(&path).map_err(io_error("open", &path))?;
         let text = files::rest(&mut file, 0).map_err(io_error("read", &path))?;
-        let log = Self::cut(path, file, complete_lines(&text) as u64, lock.is_some())?;
+        let length = if lock.is_some() { whole_lines(&text) } else { complete_lines(&text) };
+        let log = Self::cut(path, file, length as u64, lock.is_some())?;
         Ok(Self { _lock: lock, ..log })
     }
 
@@ -42,6 +45,11 @@ impl Log {
         length: u64,
         durable: bool,
     ) -> Result<Self, RunDirError> {
+        let end = file.metadata().map_err(io_error("read", &path))?.len();
+        if durable && end > length {
+            let (path, dropped) = (path.display(), end - length);
+            warn!("{path}: the last write was not completed; its {dropped} bytes are dropped");
+        }
         let mut log = Self { path, file, length, torn: true, durable, _lock: None };
         // Lines that a killed process did not synchronize count from now on.
         log.mend()
@@ -60,7 +68,8 @@ impl Log {
     pub fn append<T: Serialize>(&mut self, lines: &[T]) -> Result<(), RunDirError> {
         let mut text = Vec::new();
         for line in lines {
-            serde_json::to_writer(&mut text, line)
+            let after = self.durable.then_some(self.length);
+            serde_json::to_writer(&mut text, &Line { fields: line, after })
                 .map_err(|error| content(&self.path, None, error))?;
             text.push(b'\n');
         }
@@ -126,6 +135,34 @@ pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
     lines.truncate(complete_lines(&lines));
     *read += lines.len() as u64;
     Ok(lines)
+}
+
+/// A line with its place.
+#[derive(Serialize, Deserialize)]
+struct Line<T> {
+    #[serde(flatten)]
+    fields: T,
+    /// Bytes of a durable log that were on the disk before the line's append.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    after: Option<u64>,
+}
+
+/// Length of the lines of a durable log, bytes, without those of an append that a power cut has
+/// torn: any part of it may be missing. Damage before the last append counts as lines.
+pub(super) fn whole_lines(text: &[u8]) -> usize {
+    let complete = complete_lines(text);
+    let (mut end, mut damaged) = (0, complete);
+    for line in text[..complete].split_inclusive(|&byte| byte == b'\n') {
+        match serde_json::from_slice::<Line<IgnoredAny>>(line) {
+            Ok(Line { after, .. }) if after.unwrap_or(end as u64) > damaged as u64 => {
+                return complete;
+            }
+            Ok(_) => {}
+            Err(_) => damaged = damaged.min(end),
+        }
+        end += line.len();
+    }
+    damaged
 }
 
 /// Length of the complete lines, bytes.

@@ -9,6 +9,7 @@ use tracing::{info, warn};
 
 use super::checkpoints::Checkpoint;
 use super::error::RunDirError;
+use super::experience::read_experience;
 use super::lines::ScoreLine;
 use super::log::Log;
 use super::run_dir::RunDir;
@@ -125,6 +126,11 @@ impl ResumePoint {
             let online = experiment.online.as_ref();
             online.is_some_and(|online| online.is_snapshot(experiment.steps, at))
         };
+        let mut played = BTreeSet::new();
+        if experiment.online.is_some() {
+            let episodes = read_experience(dir.path())?;
+            played.extend(episodes.iter().map(|episode| (episode.step, episode.weights)));
+        }
         let is_needed = |at: &u64| schedule.is_evaluated(*at) || practice(*at);
         for at in dir.snapshots()?.into_iter().filter(is_needed) {
             let scored = point.scores.get(&at);
@@ -132,10 +138,14 @@ impl ResumePoint {
             if at > step && scored.is_none() {
                 continue;
             }
+            let is_other = |hash: &Hash| {
+                scored.is_some_and(|scored| scored.weights != hash.to_string())
+                    || played.iter().any(|(step, _)| *step == at) && !played.contains(&(at, *hash))
+            };
             match dir.read_snapshot(at).map(|file| Hash::of(&file)) {
-                Ok(hash) if scored.is_some_and(|scored| scored.weights != hash.to_string()) => {
+                Ok(hash) if is_other(&hash) => {
                     warn!(
-                        "the snapshot of step {at} is not the one that was scored: its file is damaged"
+                        "the snapshot of step {at} is not the one that was scored or that has practiced: its file is damaged"
                     );
                     dir.mark_damaged(at)?;
                 }

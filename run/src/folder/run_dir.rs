@@ -24,7 +24,7 @@ use super::checkpoints::{Checkpoint, Checkpoints};
 use super::error::{CREATE, RunDirError, content, io_error};
 use super::lines::{RunEndpoints, ScoreLine};
 use super::lock::Lock;
-use super::log::Log;
+use super::log::{Log, whole_lines};
 use crate::config::RunConfig;
 use crate::files;
 
@@ -296,16 +296,16 @@ impl RunDir {
         Ok((log, seconds))
     }
 
-    /// Reads the complete lines of `scores.jsonl`; a missing file has none.
+    /// Reads the whole lines of `scores.jsonl`; a missing file has none.
     pub fn read_scores(&self) -> Result<Vec<ScoreLine>, RunDirError> {
         let path = self.path.join(SCORES);
         let text = files::optional(files::read_text(&path)).map_err(io_error("read", &path))?;
         let text = text.unwrap_or_default();
-        let complete = text.rfind('\n').map_or("", |end| &text[..end]);
+        let whole = &text[..whole_lines(text.as_bytes())];
         let parse = |(index, line): (usize, &str)| {
             serde_json::from_str(line).map_err(|error| content(&path, Some(index + 1), error))
         };
-        complete.lines().enumerate().map(parse).collect()
+        whole.lines().enumerate().map(parse).collect()
     }
 
     /// The error for contradictory lines of `scores.jsonl`.

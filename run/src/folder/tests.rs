@@ -4,10 +4,13 @@ use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
+use quad_protocol::encode;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::{ExistingRun, Log, RunDir, RunDirError};
+use super::experience::tests::episode;
+use super::{Checkpoint, ExistingRun, Log, RunDir, RunDirError};
+use crate::config::resolve;
 use crate::fixtures::{config, line};
 
 /// A new run in a temporary folder.
@@ -63,6 +66,27 @@ fn a_run_that_begins_or_resumes_is_no_longer_marked_as_failed() {
 }
 
 #[test]
+fn a_snapshot_that_is_not_the_one_that_has_practiced_is_damaged() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, mut config) = (folder.path().join("a"), config("a", 0));
+    let online = "online = { steps = 4, warmup = 0, lag = 2 }".parse().unwrap();
+    config.experiment.online = resolve("hopper-demo", &online).unwrap().online;
+    config.experiment.steps = 10;
+    let (run, log) = RunDir::create(&path, &config).unwrap();
+    drop(log);
+    run.write_checkpoint(&Checkpoint { step: 10, state: Vec::new() }).unwrap();
+    let frame = encode(&episode(1)).unwrap();
+    run.experience_log().unwrap().0.append([&*frame]).unwrap();
+    for (file, is_good) in [(&b"weights"[..], true), (b"damaged", false)] {
+        run.write_snapshot(10, file).unwrap();
+        let existing = ExistingRun::open(&path, false).unwrap().unwrap();
+        let (_, _, point) = existing.resume(&config.experiment).unwrap();
+        assert_eq!(point.snapshots.contains_key(&10), is_good);
+        assert_eq!(run.snapshots().unwrap(), if is_good { vec![10] } else { vec![] });
+    }
+}
+
+#[test]
 fn metrics_after_the_resumed_step_are_cut_off() {
     let (_folder, path, run, _log) = new_run();
     let row = |step: u64| json!({ "step": step, "seconds": step as f64 / 10.0, "eta": 1.0 });
@@ -95,10 +119,55 @@ fn scores_survive_and_an_incomplete_line_is_cut_off() {
         let seeds = run.read_scores().unwrap().into_iter().map(|line| line.seed);
         assert_eq!(Vec::from_iter(seeds), [1, 2, 3]);
     }
+}
 
-    fs::write(&path, text + "\n").unwrap();
+/// After a power cut, a later part of what was not synchronized may be there without an earlier.
+#[test]
+fn a_torn_append_of_scores_is_dropped_and_damage_before_it_is_an_error() {
+    let (_folder, path, run, mut log) = new_run();
+    let path = path.join("scores.jsonl");
+    log.append(&[line(1, 1, 0.1), line(1, 2, 0.2)]).unwrap();
+    let first = fs::read(&path).unwrap().len();
+    log.append(&[line(2, 3, 0.3), line(2, 4, 0.4), line(2, 5, 0.5)]).unwrap();
+    drop(log);
+    let whole = fs::read(&path).unwrap();
+    let length = (whole.len() - first) / 3;
+    let zeroed = |start: usize, end: usize| {
+        let mut bytes = whole.clone();
+        bytes[start..end].fill(0);
+        fs::write(&path, &bytes).unwrap();
+    };
+    for (start, end, kept) in [
+        (first, first + 9, 2),
+        (first + length - 1, first + length, 2), // The end of a line.
+        (first + length + 20, whole.len() - length, 3),
+        (whole.len() - 1, whole.len(), 4),
+        (first, whole.len(), 2),
+    ] {
+        zeroed(start, end);
+        assert_eq!(run.read_scores().unwrap().len(), kept);
+        run.score_log().unwrap().append(&[line(3, 6, 0.6)]).unwrap();
+        let seeds = run.read_scores().unwrap().into_iter().map(|line| line.seed);
+        assert_eq!(Vec::from_iter(seeds), Vec::from_iter((1..=kept as u64).chain([6])));
+    }
+
+    zeroed(5, 9);
+    drop(run.score_log().unwrap());
+    assert_eq!(fs::read(&path).unwrap().len(), whole.len());
     let error = run.read_scores().unwrap_err().to_string();
-    assert!(error.contains("scores.jsonl, line 3"), "{error}");
+    assert!(error.contains("scores.jsonl, line 1"), "{error}");
+}
+
+/// Each line of an older log was on the disk before the next append.
+#[test]
+fn damage_between_lines_without_a_position_is_an_error() {
+    let (_folder, path, run, log) = new_run();
+    drop(log);
+    let text = |seed| serde_json::to_string(&line(1, seed, 0.1)).unwrap();
+    let lines = [text(1), "{".to_owned(), text(2), String::new()].join("\n");
+    fs::write(path.join("scores.jsonl"), lines).unwrap();
+    let error = run.read_scores().unwrap_err().to_string();
+    assert!(error.contains("scores.jsonl, line 2"), "{error}");
 }
 
 /// Another user who made the folder could link to any file of the user who trains there.

@@ -78,11 +78,11 @@ impl System {
     }
 
     /// Cuts the power; what was promised must be left.
-    fn cut_power(&mut self, learner: &mut Learner) {
+    fn cut_power(&mut self, learner: &mut Learner, random: &mut ChaCha8Rng) {
         learner.process.kill();
         let folders = ["snapshots", "checkpoints"];
         let before = folders.map(|folder| learner.files(folder));
-        self.disk.cut_power();
+        self.disk.cut_power(random);
 
         // One thread writes these, a file after the other: only the last one may be on its way.
         for (mut before, folder) in before.into_iter().zip(folders) {
@@ -139,7 +139,11 @@ fn cut_power(cuts: u64) {
     for cut in 0..cuts {
         let mut learner = system.run_for_a_while(&mut random);
         if cut == 1 {
-            learner.wait_for_scores(0); // However slow the machine is, something was promised.
+            // However slow the machine is, something was promised, and there is a checkpoint.
+            learner.wait_for_scores(0);
+            eventually("there is a checkpoint", PATIENCE, || {
+                learner.files("checkpoints").pop_first()
+            });
         }
         if cut % 2 == 1 && learner.run_dir.join("config.toml").exists() {
             learner.process.kill();
@@ -147,7 +151,7 @@ fn cut_power(cuts: u64) {
             learner = system.learner();
             learner.process.wait_for_log("continues after step", PATIENCE);
         }
-        system.cut_power(&mut learner);
+        system.cut_power(&mut learner, &mut random);
         let log = learner.process.log();
         let goes_on = |text| log.contains(text);
         gone_on += u64::from(goes_on("continues after step") && !goes_on("continues after step 0"));

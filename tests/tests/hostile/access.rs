@@ -2,6 +2,7 @@
 //! learner that listens itself.
 
 use std::path::PathBuf;
+use std::time::Instant;
 
 use quad_protocol::keys;
 use quad_tests::PATIENCE;
@@ -17,7 +18,7 @@ use zenoh::sample::SampleKind;
 pub const HOST: &str = "127.0.0.1";
 /// For so many seconds a certificate is valid that a program is to come in with, and to be sent
 /// away with.
-const BRIEF: u64 = 20;
+const BRIEF: u64 = 40;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_with_practice_completes_through_the_shipped_router() {
@@ -57,9 +58,13 @@ async fn a_listening_learner_checks_certificates() {
         [(None, "peer sent no certificates"), (Some("expired"), "certificate expired")]
     {
         let folder = name.map(|name| certificates.of(name));
-        let session = connect(&endpoint, &authority, folder.as_deref()).await;
-        assert!(session.is_err(), "{name:?} came in");
-        learner.process.wait_for_log(reason, PATIENCE);
+        let deadline = Instant::now() + PATIENCE;
+        // A busy machine may take longer than an attempt does.
+        while !learner.process.log().contains(reason) {
+            let session = connect(&endpoint, &authority, folder.as_deref()).await;
+            assert!(session.is_err(), "{name:?} came in");
+            assert!(Instant::now() < deadline, "{reason:?} is not said");
+        }
     }
 
     let folder = certificates.argument("evaluator");
@@ -73,9 +78,10 @@ async fn a_listening_learner_checks_certificates() {
     let brief = come_in(&endpoint, &authority, &certificates.of("brief")).await;
     let key = keys::live_evaluator(&name("run"), &name("brief"));
     let _token = brief.liveliness().declare_token(key).await.unwrap();
-    for count in [2.0, 1.0] {
-        learner.wait_for_metric("evaluators", "", |there| there == count);
+    for said in ["evaluator brief is here", "evaluator brief has left"] {
+        learner.process.wait_for_log(said, PATIENCE);
     }
+    learner.wait_for_metric("evaluators", "", |there| there == 1.0);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -11,6 +11,7 @@ use tokio::time::{sleep, timeout};
 use zenoh::Session;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::pubsub::Subscriber;
+use zenoh::qos::CongestionControl;
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::Sample;
 
@@ -42,6 +43,11 @@ async fn next(samples: &Subscriber<FifoChannelHandler<Sample>>) -> String {
             return sample.key_expr().to_string();
         }
     }
+}
+
+/// Sends once, where a busy machine would else drop it.
+async fn put(session: &Session, key: &str) {
+    session.put(key, "words").congestion_control(CongestionControl::Block).await.unwrap();
 }
 
 /// Sends until it arrives: before, the router does not know of those who listen.
@@ -98,13 +104,13 @@ async fn only_learners_publish_weights_and_only_evaluators_report_progress() {
     // A session hears itself whatever it may do, so listener and receiver put nothing.
     for key in ["progress/e", "jobs", "scores", "weights/1", "live/learner", "*", "**", "weights"] {
         for session in [&monitor, &evaluator, &learner] {
-            session.put(format!("quad/run/{key}"), "words").await.unwrap();
+            put(session, &format!("quad/run/{key}")).await;
         }
     }
     evaluator.put("quad/run/progress/e", vec![0; 5000]).await.unwrap();
     // A router may limit how many are passed on in a second.
     sleep(LULL).await;
-    evaluator.put("quad/run/progress/last", "words").await.unwrap();
+    put(&evaluator, "quad/run/progress/last").await;
     let mut keys = until(&heard, "quad/run/progress/last").await;
     while !keys.iter().any(|key| key == "quad/run/weights") {
         keys.extend(until(&heard, "quad/run/weights").await);

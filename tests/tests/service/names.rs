@@ -40,7 +40,8 @@ async fn one_of_two_learners_with_one_name_stops() {
 fn two_evaluators_with_one_name_cause_one_warning() {
     let scratch = Scratch::new();
     // Jobs of seconds, so that one of them has a job whenever the other one asks.
-    let learner = scratch.learner("run", Setting { candidates: 500, hidden: 256, ..ENDLESS });
+    let learner = scratch
+        .learner("run", Setting { eval_interval: 500, candidates: 500, hidden: 256, ..ENDLESS });
     let folders = [Scratch::new(), Scratch::new()];
     let _both = folders.each_ref().map(|folder| folder.evaluator("twin", &learner.endpoint()));
     learner.process.wait_for_log("--name twin", PATIENCE);

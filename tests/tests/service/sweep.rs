@@ -11,7 +11,8 @@ use quad_tests::setting::{SHORT, Setting};
 use quad_tests::system::{Scratch, free_port};
 use quad_tests::{PATIENCE, eventually};
 
-const SETTING: Setting = Setting { steps: 3000, eval_interval: 1000, ..SHORT };
+/// Long enough for a run to be killed in the middle of it.
+const SETTING: Setting = Setting { steps: 12_000, eval_interval: 4000, ..SHORT };
 const RUNS: [&str; 4] = ["none-seed0", "quad-seed0", "none-seed1", "quad-seed1"];
 /// Without evaluators no run is complete before its sweep is told to end, however fast it trains.
 const UNSCORED: [&str; 2] = ["--evaluators", "0"];
@@ -96,7 +97,6 @@ fn a_sweep_resumes_and_a_failed_run_ends_no_other() {
     study.wait_for(RUNS[1]);
     sweep.signal("INT");
     sweep.assert_ends(75, PATIENCE);
-    sweep.assert_said("the same command continues");
     assert_eq!(study.states()[3], "not begun");
 
     let mut sweep = study.sweep(&["--jobs", "2"]);
@@ -128,14 +128,14 @@ fn shards_and_indices_train_parts_of_a_study() {
     study.wait_for(RUNS[0]);
     assert_stops(&study, sweep);
     let state = &study.states()[0];
-    assert!(state.ends_with("of 3000 steps") || state == "trained, not all scored", "{state}");
+    assert!(state.ends_with("of 12000 steps") || state == "trained, not all scored", "{state}");
 }
 
 #[test]
 fn runs_with_other_settings_are_refused() {
     let study = Study::new();
     study.sweep(&["--index", "0"]).assert_succeeds(PATIENCE);
-    study.scratch.preset("tiny", Setting { steps: 4000, ..SETTING });
+    study.scratch.preset("tiny", Setting { steps: 16_000, ..SETTING });
     let mut sweep = study.sweep(&[]);
     sweep.assert_ends(1, PATIENCE);
     sweep.assert_said("has a run of other settings than the study's: steps");
@@ -216,8 +216,8 @@ fn a_stopped_sweep_exits_with_75_whatever_hangs() {
     signal("KILL", child_of(&sweep, RUNS[1]));
     study.wait_for(RUNS[2]);
     assert_stops(&study, sweep);
-    let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
-    for said in ["received SIGTERM", "the same command continues"] {
-        assert!(log.contains(said), "{log}");
-    }
+    eventually("the sweep has told its learner to end", PATIENCE, || {
+        let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
+        log.contains("received SIGTERM").then_some(())
+    });
 }

@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
+use quad_run::config::Schedule;
 use quad_run::folder::SavedScores;
 
 use super::{Claim, Claimed, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated};
@@ -45,6 +46,7 @@ impl Bench {
             seed: 5,
             dims: (11, 3),
             episodes: 7,
+            schedule: Schedule { start: 0, steps: 3500, eval_interval: 1000 },
             job_episodes: [5, 20],
             lease: LEASE,
         };

@@ -1,6 +1,6 @@
 //! Tests of practice.
 
-use quad_protocol::{Episode, Exploration};
+use quad_protocol::{Episode, Exploration, Piece};
 
 use super::*;
 use crate::evaluation::{Opening, PracticeEpisode};
@@ -28,6 +28,38 @@ fn episode(seed: u64) -> Episode {
     }
 }
 
+/// What the learner knows of the first piece of an episode.
+fn known(bench: &Bench, seed: u64) -> Result<PracticeEpisode, Refusal> {
+    bench.board.practice(&piece(seed))
+}
+
+fn piece(seed: u64) -> Piece {
+    Piece {
+        evaluator: name("a"),
+        run: name("run"),
+        incarnation: INCARNATION,
+        job: 1,
+        seed,
+        hash: hash(7),
+        length: 1,
+        offset: 0,
+        bytes: vec![0],
+    }
+}
+
+#[test]
+fn a_piece_of_another_run_or_of_a_frame_that_is_too_long_is_refused() {
+    let bench = bench();
+    let mut piece = piece(100);
+    // Of the longest episode: a thousand steps and a state, each of 16 numbers.
+    piece.length = 1001 * 16 * 4 + 1024;
+    assert_eq!(bench.board.practice(&piece), Ok(PracticeEpisode::Open { episode: 0 }));
+    piece.length += 1;
+    assert_eq!(bench.board.practice(&piece), Err(Refusal::Rows(100)));
+    piece.run = name("other");
+    assert_eq!(bench.board.practice(&piece), Err(Refusal::Run));
+}
+
 #[test]
 fn practice_goes_first_one_episode_a_job_in_the_order_of_their_numbers() {
     let mut bench = bench();
@@ -50,32 +82,30 @@ fn an_episode_is_played_until_it_is_recorded_and_counts_once() {
         bench.hand_back("a", &job, Some(100 * failure)).unwrap();
     }
     let job = bench.job("a", 10_000);
-    assert_eq!(bench.board.practice(100), Some(PracticeEpisode::Open { episode: 0 }));
+    assert_eq!(known(&bench, 100), Ok(PracticeEpisode::Open { episode: 0 }));
     assert_eq!(bench.board.record_practice(100, hash(7)), 1);
-    assert_eq!(bench.board.practice(100), Some(PracticeEpisode::Recorded(hash(7))));
+    assert_eq!(known(&bench, 100), Ok(PracticeEpisode::Recorded(hash(7))));
     assert_eq!(bench.hand_back("a", &job, None), None, "the job is done");
     assert_eq!(bench.job("a", 10_001).seeds, [101]);
-    assert_eq!(bench.board.practice(102), None);
+    assert_eq!(known(&bench, 102), Err(Refusal::Practice(102)));
 }
 
+/// Evaluations wait as well: more than the evaluators can do.
 #[test]
-fn the_episode_that_the_learner_waits_for_goes_to_a_second_evaluator_if_the_first_is_slow() {
-    let mut bench = Bench::new();
-    bench.present = 4;
-    bench.board.open_practice(&opening(0), hash(500));
+fn an_episode_for_which_training_has_waited_goes_to_a_second_evaluator() {
+    let mut bench = bench();
     let slow = bench.job("slow", 0);
-    for evaluator in ["a", "b", "c"] {
-        // They have all that waits.
-        while let Claimed::Job { job, .. } = bench.claim(evaluator, 1, 0) {
-            assert_eq!(job.practice, None);
-            bench.deliver(&full_report(&job, evaluator)).unwrap();
-        }
-    }
-    bench.progress(&progress(&slow, "slow", 5), 15).unwrap();
-    assert!(matches!(bench.claim("a", 2, 19), Claimed::Wait(_)));
-    let second = bench.job("a", 20);
+    bench.board.wait_for_practice(1, bench.at(0));
+    assert_eq!(bench.job("other", 0).seeds, [101]);
+    bench.board.record_practice(101, hash(8));
+    bench.progress(&progress(&slow, "slow", 5), 95).unwrap();
+    assert_eq!(bench.job("a", 95).practice, None, "training does not wait for it");
+    bench.leave("a", 95);
+    bench.board.wait_for_practice(0, bench.at(100));
+    assert_eq!(bench.job("a", 119).practice, None);
+    let second = bench.job("b", 120);
     assert_eq!((&second.seeds, second.practice), (&slow.seeds, slow.practice));
-    assert!(matches!(bench.claim("b", 2, 60), Claimed::Wait(_)), "two are enough");
+    assert_eq!(bench.job("c", 160).practice, None, "two are enough");
     assert_eq!(bench.board.record_practice(100, hash(7)), 2);
 }
 
@@ -124,7 +154,8 @@ fn after_the_end_of_practice_no_episode_is_handed_out_and_what_was_open_is_accep
     bench.board.end_practice();
     assert_eq!(bench.job("b", 0).practice, None);
     assert_eq!(bench.board.validate_practice(0, &episode(100)), Ok(()));
-    assert_eq!(bench.board.practice(102), None, "it is not waited for anymore");
+    let refused = Err(Refusal::Practice(102));
+    assert_eq!(known(&bench, 102), refused, "it is not waited for anymore");
     bench.leave("a", 1);
     assert_ne!(bench.job("c", 1).practice, Some(EXPLORATION), "training has ended");
 }

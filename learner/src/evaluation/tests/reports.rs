@@ -22,6 +22,17 @@ fn scores_complete_jobs_and_evaluations_and_count_once() {
     assert_eq!(bench.job("a", 1).step, 2000, "the next evaluation");
 }
 
+/// A learner that is back at an earlier step makes the snapshot again.
+#[test]
+fn scores_that_come_before_their_evaluation_count_once_it_is_open() {
+    let mut bench = Bench::new();
+    let job = Job { step: 3000, weights: hash(3000), seeds: vec![21, 22], ..bench.job("a", 0) };
+    let early = full_report(&job, "a");
+    assert_eq!(bench.deliver(&early), Err(Refusal::NotYet));
+    bench.board.add_evaluation(3000, hash(3000), &[21, 22, 23]).unwrap();
+    assert_eq!(bench.deliver(&early), Ok((2, 0, 0)));
+}
+
 /// The job may be of an earlier incarnation of the learner, of another evaluator, or forgotten.
 #[test]
 fn a_report_of_any_job_counts_if_step_weights_and_seeds_fit() {
@@ -60,7 +71,9 @@ fn a_report_that_fits_no_evaluation_is_refused() {
     };
     for (bad, refusal) in [
         (changed(|report| report.run = name("other")), Refusal::Run),
-        (changed(|report| report.step = 3000), Refusal::Step),
+        (changed(|report| report.step = 3500), Refusal::NotYet),
+        (changed(|report| report.step = 1500), Refusal::Step),
+        (changed(|report| report.step = 4000), Refusal::Step),
         (changed(|report| report.step = 2000), Refusal::Weights),
         (changed(|report| report.weights = hash(2000)), Refusal::Weights),
         (changed(|report| report.episodes = vec![score(11, 0.0)]), Refusal::Seed(11)),

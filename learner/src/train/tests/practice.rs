@@ -10,8 +10,8 @@ use super::*;
 use crate::evaluation::Opening;
 use crate::train::{Inbox, Practice, PracticeMetrics};
 
-/// Rows of the episodes.
-const LENGTHS: [usize; 7] = [3, 4, 2, 6, 1, 9, 5];
+/// Rows of the episodes; the first two are exactly the warm-up.
+const LENGTHS: [usize; 7] = [3, 2, 5, 5, 1, 9, 5];
 const BEGIN: u64 = 10;
 
 /// 20 environment steps with two gradient steps each, after a warm-up of 5.
@@ -90,13 +90,13 @@ fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
     assert!(!stopped.unwrap(), "a wait can be ended");
     let (openings, _) = train(&mut practice, &inbox, &episodes(), BEGIN);
     let noise = Exploration::Policy { noise: 0.1 };
-    // After 3, 7, 9, 15 and 16 rows, gradient steps 10, 14, 18, 30 and 32 are due.
+    // After 3, 5, 10, 15 and 16 rows, gradient steps 10, 10, 20, 30 and 32 are due.
     let expected = [
         (0, 10, Exploration::Uniform),
         (1, 10, Exploration::Uniform),
         (2, 10, Exploration::Uniform),
         (3, 10, noise),
-        (4, 14, noise),
+        (4, 10, noise),
         (5, 18, noise),
         (6, 30, noise),
     ];
@@ -150,5 +150,15 @@ fn an_episode_with_a_glitch_counts_as_one_without_rows_also_after_a_restart() {
             (vec![], rest),
             "from step {from}"
         );
+    }
+}
+
+#[test]
+fn the_next_episode_is_waited_for_until_it_is_recorded() {
+    let (mut practice, inbox) = practice(&[]);
+    for (number, awaited) in [(1, Some(0)), (0, None)] {
+        inbox.send((number, episode(LENGTHS[number as usize]))).unwrap();
+        practice.take_openings();
+        assert_eq!(practice.awaited(), awaited);
     }
 }

@@ -31,8 +31,9 @@ fn recorded() -> (TempDir, RunDir, PathBuf, Vec<u8>) {
     assert_eq!(read_experience(run.path()).unwrap(), []);
     let (mut log, records) = run.experience_log().unwrap();
     assert_eq!(records, []);
-    log.append([&*frame(1)]).unwrap();
-    log.append([&*frame(2), &*frame(3)]).unwrap();
+    for seed in 1..=3 {
+        log.append([&*frame(seed)]).unwrap();
+    }
     let path = run.path().join("experience.log");
     let bytes = fs::read(&path).unwrap();
     (folder, run, path, bytes)
@@ -67,6 +68,28 @@ fn a_damaged_record_before_another_one_is_an_error() {
         assert!(error.hint().contains("a copy of the file"));
         assert!(read_experience(run.path()).is_err());
         assert_eq!(fs::read(&path).unwrap(), damaged);
+    }
+}
+
+/// After a power cut, a later part of what was not synchronized may be there without an earlier.
+#[test]
+fn a_torn_append_is_cut_off_from_its_first_damaged_record_on() {
+    let (_folder, run, path, bytes) = recorded();
+    let mut log = run.experience_log().unwrap().0;
+    log.append([4, 5, 6].map(frame).iter().map(Vec::as_slice)).unwrap();
+    let whole = fs::read(&path).unwrap();
+    assert_eq!(read_experience(run.path()).unwrap(), [1, 2, 3, 4, 5, 6].map(episode));
+    let length = bytes.len() / 3;
+    for (torn, kept) in [(3, 3), (4, 4), (5, 5)] {
+        for range in [0..1, 10..60, length - 20..length, 0..length] {
+            let mut damaged = whole.clone();
+            damaged[torn * length..][range].fill(0);
+            fs::write(&path, damaged).unwrap();
+            let episodes = Vec::from_iter((1..=kept).map(episode));
+            assert_eq!(read_experience(run.path()).unwrap(), episodes);
+            drop(run.experience_log().unwrap());
+            assert_eq!(fs::read(&path).unwrap().len(), kept as usize * length);
+        }
     }
 }
 
