@@ -125,7 +125,9 @@ pub struct InspectArgs {
 }
 
 #[derive(Debug, Args)]
-#[command(after_help = "The exit code is 1 if a promise has not held.")]
+#[command(
+    after_help = "The exit code is 1 if a promise has not held, or there was nothing to check."
+)]
 pub struct VerifyArgs {
     /// Folders of complete runs
     #[arg(value_name = "DIR", required = true)]
