@@ -272,7 +272,9 @@ impl Scoreboard {
         let key = Key::Practice(episode);
         let players = self.jobs.values().filter(|open| open.key == key).count();
         let evaluation = self.evaluations.get_mut(&key).filter(|_| players == 1)?;
-        Some((key, evaluation.hand_out_again(job)))
+        let seeds = evaluation.hand_out_again(job);
+        // It may rest, because a second evaluator has failed.
+        (!seeds.is_empty()).then_some((key, seeds))
     }
 
     /// Most episodes of a job: half of an evaluator's share of those that wait, so that none is

@@ -110,6 +110,20 @@ fn an_episode_for_which_training_has_waited_goes_to_a_second_evaluator() {
 }
 
 #[test]
+fn an_episode_that_rests_is_not_handed_out_although_one_evaluator_still_plays_it() {
+    let mut bench = bench();
+    bench.job("slow", 0);
+    assert_eq!(bench.job("other", 0).seeds, [101]);
+    bench.board.wait_for_practice(0, bench.at(0));
+    for second in 20..24 {
+        let job = bench.job("a", second);
+        assert_eq!(job.seeds, [100]);
+        bench.hand_back("a", &job, Some(second)).unwrap();
+    }
+    assert_eq!(bench.job("a", 24).practice, None);
+}
+
+#[test]
 fn only_episodes_that_fit_their_opening_are_accepted() {
     let bench = bench();
     let check = |change: fn(&mut Episode)| {
