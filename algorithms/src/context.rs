@@ -144,8 +144,7 @@ pub struct Minibatch {
     pub rewards: Tensor,
     /// s', `[B, o]`: the state after a window.
     pub next_observations: Tensor,
-    /// 0 where the episode terminated, else 1, times γ for each step of a window after the first;
-    /// `[B]`.
+    /// 0 where a step of a window is terminal, else 1, times γ for each step after the first; `[B]`.
     pub masks: Tensor,
     /// With chunks: 1 for actions within the episode, else 0; `[B, a]`.
     pub within: Option<Tensor>,

@@ -22,7 +22,7 @@ const EMA_POWER: f32 = 0.75;
 const LEAST_EMA_RATE: f32 = 1e-4;
 
 const METRICS: &[Metric] = &metrics! {
-    bc_loss ["BC loss"] held_out: "Mean over batch and numbers of a chunk of (ε − ε_θ(a^t, s, t))², 0 for actions beyond the end of an episode (Diffusion Policy's Eq. 5). A network that always outputs 0 has loss 1.";
+    bc_loss ["BC loss"] held_out: "Mean over batch and numbers of a chunk of (ε − ε_θ(a^t, s, t))² (Diffusion Policy's Eq. 5); beyond the end of an episode its last action is repeated. A network that always outputs 0 has loss 1.";
     learning_rate: "The learning rate; rises in the first updates, then falls to 0 along a cosine.";
 };
 
@@ -68,8 +68,10 @@ impl Cloning {
         Ok(Self { config, context, shape, networks })
     }
 
+    /// Copies of an episode's last action are learned, too: they may be executed.
     fn loss(&self, step: u64, indices: &[u32]) -> Result<Loss> {
-        let (batch, actor) = (self.context.batch(indices)?, &self.networks.actor);
+        let batch = Minibatch { within: None, ..self.context.batch(indices)? };
+        let actor = &self.networks.actor;
         let random = self.context.random(step);
         let noise =
             Sampler { random, batch_size: indices.len(), shape: &self.shape, actor }.denoising()?;

@@ -36,8 +36,6 @@ struct Config {
     target: Aggregate,
     /// Weight α of the distance between the one-step policy and the flow.
     alpha: Positive,
-    /// α of a run with practice, if it differs.
-    online_alpha: Option<Positive>,
     /// Divide Q by its mean size in the policy's loss.
     normalize_q: bool,
     /// Euler steps of the flow.
@@ -85,9 +83,7 @@ impl Fql {
         let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
         let bc_loss = flow_loss(&self.networks.flow, &batch, &start, &times)?;
         let [distill_loss, q_loss] = self.actor_losses(&batch, &policy_noise)?;
-        let with_practice = self.config.online_alpha.filter(|_| self.context.online_steps > 0);
-        let alpha = f64::from(*with_practice.unwrap_or(self.config.alpha));
-        let actor_loss = ((&distill_loss * alpha)? + &q_loss)?;
+        let actor_loss = ((&distill_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         let actor_loss = Loss::new("actor_loss", actor_loss).with("distill_loss", distill_loss);
         Ok([critic_loss, Loss::new("bc_loss", bc_loss), actor_loss.with("q_loss", q_loss)])
     }

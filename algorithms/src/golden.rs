@@ -12,7 +12,7 @@ use super::definition::{Definition, Metric};
 use super::state_dict::StateDict;
 use super::{ALGORITHMS, Hyperparameters};
 use candle_core::{D, DType, Device, Tensor};
-use quad_dataset::{Arrays, Transitions, Window};
+use quad_dataset::{Arrays, ReadOptions, Transitions, Window};
 use quad_nn::{
     NoisePredictor, NoiseShape, Precision, Reverse, Scaling, Tensors, Weights, open_gpu,
 };
@@ -87,6 +87,20 @@ fn episode((o, a): (usize, usize), n: usize) -> Arrays {
     }
 }
 
+/// The rows of a golden folder as episodes that may go on after a success, read as OGBench's are.
+fn episodes(golden: &Golden) -> Transitions {
+    let name = format!("golden-{}-{:?}.npz", std::process::id(), std::thread::current().id());
+    let path = std::env::temp_dir().join(name);
+    let arrays =
+        ["observations", "actions", "rewards", "next_observations", "masks", "ends"].map(|name| {
+            (if name == "ends" { "terminals" } else { name }, golden.input(name, &Device::Cpu))
+        });
+    Tensor::write_npz(&arrays, &path).unwrap();
+    let transitions = Transitions::read(&path, &ReadOptions::default());
+    std::fs::remove_file(path).unwrap();
+    transitions.unwrap()
+}
+
 /// The transitions of a golden folder's batch, and their indices: each is an episode, unless the
 /// folder says where episodes end; with next actions, a second transition follows.
 fn transitions(golden: &Golden) -> Transitions {
@@ -94,6 +108,9 @@ fn transitions(golden: &Golden) -> Transitions {
     if !golden.inputs.contains_key("observations") {
         return Transitions::of(episode((o, a), 2 * golden.count("/agent/network/horizon")))
             .unwrap();
+    }
+    if golden.inputs.contains_key("ends") {
+        return episodes(golden);
     }
     let numbers = |name: &str| numbers(golden, name);
     let given = |name: &str| golden.inputs.contains_key(name).then(|| numbers(name));

@@ -2,7 +2,8 @@
 //! their own.
 //!
 //! `[for."PATTERN"]` holds keys of an experiment for the tasks that fit the pattern, in which `*`
-//! stands for any text. Of several such groups the one whose pattern has more letters wins.
+//! stands for any text; but only a pattern with OGBench's [`MARK`] fits its tasks. Of several such
+//! groups the one whose pattern has more letters wins.
 
 use std::collections::BTreeMap;
 
@@ -10,6 +11,9 @@ use serde::Deserialize;
 use toml::{Table, Value};
 
 use crate::Definition;
+
+/// In the name of each of OGBench's tasks, and of no other's.
+const MARK: &str = "-singletask-";
 
 /// The file of one algorithm.
 #[derive(Debug, Deserialize)]
@@ -38,13 +42,25 @@ impl Values {
 
     /// Keys of an experiment for a task; without one, what all tasks share.
     pub fn for_task(&self, task: Option<&str>) -> Table {
-        let of_task = |pattern: &str| task.is_some_and(|task| fits(pattern, task));
-        let mut groups: Vec<_> =
-            self.groups.iter().filter(|(pattern, _)| of_task(pattern)).collect();
-        groups.sort_by_key(|(pattern, _)| letters(pattern));
+        let groups = task.map_or_else(Vec::new, |task| self.groups_for(task));
         let mut table = self.shared.clone();
         groups.into_iter().for_each(|(_, keys)| merge(&mut table, keys.clone()));
         table
+    }
+
+    /// The pattern of the group that wins for a task, if one has it.
+    pub fn group_for(&self, task: &str) -> Option<&str> {
+        self.groups_for(task).pop().map(|(pattern, _)| &**pattern)
+    }
+
+    /// The groups of a task, the winning one last.
+    fn groups_for(&self, task: &str) -> Vec<(&String, &Table)> {
+        let is_for =
+            |pattern: &str| fits(pattern, task) && pattern.contains(MARK) == task.contains(MARK);
+        let mut groups: Vec<_> =
+            self.groups.iter().filter(|(pattern, _)| is_for(pattern)).collect();
+        groups.sort_by_key(|(pattern, _)| letters(pattern));
+        groups
     }
 }
 

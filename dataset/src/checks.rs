@@ -1,8 +1,10 @@
 //! Checks that refuse a dataset before training.
 
 use crate::error::{Problem, RowProblem};
+use crate::formats::arrays::{ACTION_NAMES, OBSERVATION_NAMES};
 use crate::recording::Recording;
 use crate::tables::environment::EnvironmentSpec;
+use crate::warnings::named;
 
 /// Distance outside [-1, 1] that rounding explains; such actions are clipped.
 const ACTION_TOLERANCE: f32 = 1e-3;
@@ -39,6 +41,9 @@ pub(crate) fn problems(
             problems.push(Problem::Width(array, found, environment, expected));
         }
     }
+    let names = &recording.names;
+    problems.extend(wrong_name(OBSERVATION_NAMES, &names.observations));
+    problems.extend(wrong_name(ACTION_NAMES, &names.actions));
     let next_observations = recording.next_observations.as_deref().unwrap_or_default();
     for (column, values, width) in [
         ("observations", &*recording.observations, o),
@@ -59,6 +64,16 @@ pub(crate) fn problems(
         problems.push(Problem::Endless(rows));
     }
     problems
+}
+
+/// The first name that is empty, has control characters, or is that of several columns.
+fn wrong_name(attribute: &'static str, names: &[String]) -> Option<Problem> {
+    let same = |name: &String| (0..names.len()).filter(|i| names[*i] == *name).collect::<Vec<_>>();
+    let is_wrong = |name: &&String| {
+        name.trim().is_empty() || name.contains(char::is_control) || same(name).len() > 1
+    };
+    let name = names.iter().find(is_wrong)?;
+    Some(Problem::Name(attribute, name.clone(), named(&same(name), &[])))
 }
 
 /// Rows whose stored next observation is not the following row's, and true if they are refused.

@@ -53,6 +53,8 @@ pub enum Problem {
     UnknownLayout(String),
     #[error("the attribute `{0}` has {1} texts for {2} numbers")]
     Names(&'static str, usize, usize),
+    #[error("the attribute `{0}` has the name {1:?} for {2}")]
+    Name(&'static str, String, String),
     #[error("array `{0}` {1}")]
     Array(String, #[source] ArrayProblem),
     #[error("array `{array}`, row {row}: {problem}{}", such_rows(*.rows))]
@@ -127,6 +129,9 @@ impl ArrayProblem {
             Self::Axes(_) => {
                 "each row is a number or a row of numbers: flatten what has more axes, and make numbers of images first, as an encoder does"
             }
+            Self::Rows(found, _) | Self::Shape(found, _) if matches!(found[..], [rows, columns] if rows < columns) => {
+                TRANSPOSED
+            }
             Self::Type(..) | Self::Rows(..) | Self::Shape(..) => ARRAYS,
             Self::Oversized(..) => {
                 "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
@@ -151,6 +156,8 @@ pub enum RowProblem {
     Stray,
     #[error("the next place is more than {0} m away, though the episode goes on")]
     Leap(f32),
+    #[error("the next state is as far away as after a reset, though the episode goes on")]
+    Reset,
 }
 
 impl RowProblem {
@@ -170,7 +177,7 @@ impl RowProblem {
             Self::ActionOutside(_) => {
                 "`learner train --normalize actions` trains on them: it maps the least and the largest of each number to ±1, and the policy's actions back"
             }
-            Self::Stray | Self::Leap(_) => {
+            Self::Stray | Self::Leap(_) | Self::Reset => {
                 "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for rows in any other order set the attribute `layout` as docs/data.md describes"
             }
         }
@@ -274,6 +281,10 @@ impl Problem {
             Self::UnknownLayout(_) | Self::Names(..) => {
                 "see docs/data.md for what the attribute means"
             }
+            Self::Name(..) => {
+                "numbers find their places on a robot by name: give each column one of its own, such as left_gripper and right_gripper, \
+                 that is not empty and without control characters"
+            }
             Self::Endless(_) => {
                 "set `timeouts` to 1 at the last row of each episode that did not terminate"
             }
@@ -290,6 +301,9 @@ impl Problem {
 }
 
 const ARRAYS: &str = "docs/data.md says which arrays a file must have, and of which shape and type; all need the same number of rows";
+
+const TRANSPOSED: &str = "a row of the array is a step: are rows and columns swapped, as by MATLAB? this swaps them in your file: python -c \
+    \"import h5py; f = h5py.File('FILE', 'r+'); [(f.pop(n), f.create_dataset(n, data=x)) for n, x in [(n, f[n][()].T) for n in f]]\"";
 
 const DAMAGED: &str = "the file was cut off or damaged on its way: fetch or copy it again; the program that writes one of your own must close it";
 

@@ -16,6 +16,7 @@ mod inspect;
 mod normalize;
 mod practice;
 mod recording;
+mod same_state;
 mod statistics;
 mod tables;
 mod transitions;

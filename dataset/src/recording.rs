@@ -1,8 +1,9 @@
 //! Rows of a dataset in file order, whatever its format.
 
+use crate::same_state::SameState;
 use crate::statistics::Episode;
 
-/// Largest difference between two copies of the same observation.
+/// Distance at which the locomotion rule's source (IQL, Kostrikov et al. 2021) ends a trajectory.
 const SAME_OBSERVATION: f64 = 1e-6;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,6 +38,8 @@ pub(crate) struct Recording {
     pub next_observations: Option<Vec<f32>>,
     /// N × o, stored in a D4RL file and used only for checks.
     pub unused_next_observations: Option<Vec<f32>>,
+    /// Compares next observations of either kind with the following row's observation.
+    pub same_state: SameState,
     pub kinds: Vec<RowKind>,
     /// True where the mask is 0, so that the critics do not bootstrap.
     pub terminals: Vec<bool>,
@@ -50,6 +53,8 @@ pub(crate) struct Recording {
     pub names: Names,
     /// First row and group path of each part, if the file has one group per episode.
     pub parts: Vec<(usize, String)>,
+    /// Doubts of the reader: what it takes for granted of arrays that the source lacks.
+    pub doubts: Vec<String>,
 }
 
 impl Recording {
@@ -135,9 +140,13 @@ impl Recording {
 
     /// True if the following row is the next step of the episode and starts in `row`'s next state.
     pub(crate) fn goes_on(&self, row: usize) -> bool {
-        let ends = self.ends[row] || self.terminals[row];
+        !self.terminals[row] && self.recording_goes_on(row)
+    }
+
+    /// [`Self::goes_on`], also after a success that does not end the recorded episode.
+    pub(crate) fn recording_goes_on(&self, row: usize) -> bool {
         let are_steps = self.is_step(row) && self.is_step(row + 1);
-        are_steps && !ends && !(self.next_observations.is_some() && self.jumps(row))
+        are_steps && !self.ends[row] && !(self.next_observations.is_some() && self.jumps(row))
     }
 
     /// True if `following`, the next transition after `row`, starts in its next state.
@@ -146,15 +155,18 @@ impl Recording {
             return self.next_observations.is_none() || !self.jumps(row);
         }
         let (start, next) = (self.observation(following), self.observation(row + 1));
-        !differ(start, next)
+        let square: f64 = start.iter().zip(next).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+        square.sqrt() <= SAME_OBSERVATION
     }
 
-    /// True if a row's stored next observation differs from the following row's observation.
+    /// True if a row's stored next observation is not the state in which the following row starts.
     pub(crate) fn jumps(&self, row: usize) -> bool {
         let unused = self.unused_next_observations.as_ref();
         let stored = self.next_observations.as_ref().or(unused);
         let stored = stored.filter(|_| row + 1 < self.rows());
-        stored.is_some_and(|stored| differ(self.row_of(stored, row), self.observation(row + 1)))
+        stored.is_some_and(|stored| {
+            self.same_state.differ(self.row_of(stored, row), self.observation(row + 1))
+        })
     }
 
     /// Appends a final state to all columns but the observations.
@@ -176,13 +188,9 @@ impl Recording {
     }
 }
 
-fn differ(a: &[f32], b: &[f32]) -> bool {
-    let square: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-    square.sqrt() > SAME_OBSERVATION
-}
-
 #[cfg(test)]
 pub(crate) mod tests {
+    use super::RowKind::{Dropped, Transition};
     use super::*;
 
     /// Observation, action × 100 and reward of each row are its index.
@@ -202,9 +210,17 @@ pub(crate) mod tests {
         }
     }
 
+    impl Recording {
+        pub(crate) fn store_next(&mut self, next: Vec<f32>) {
+            self.same_state =
+                SameState::between(&self.observations, Some(&next), self.observation_dim);
+            self.next_observations = Some(next);
+        }
+    }
+
     #[test]
     fn rows_are_found_again_in_their_part() {
-        let mut recording = recording(&[RowKind::Transition; 6]);
+        let mut recording = recording(&[Transition; 6]);
         let found = |recording: &Recording| recording.place("rewards", 4);
         assert_eq!(found(&recording), ("rewards".to_owned(), 4));
         recording.parts = vec![(0, "episode_0".to_owned()), (3, "episode_1".to_owned())];
@@ -213,9 +229,18 @@ pub(crate) mod tests {
 
     #[test]
     fn a_trajectory_ends_where_a_stored_next_observation_is_not_the_next_row_s() {
-        let mut recording = recording(&[RowKind::Transition; 4]);
+        let mut recording = recording(&[Transition; 4]);
         assert_eq!(recording.trajectory_returns(), [6.0]);
-        recording.next_observations = Some(vec![1.0, 9.0, 3.0, 4.0]);
+        recording.store_next(vec![1.0, 9.0, 3.0, 4.0]);
         assert_eq!(recording.trajectory_returns(), [1.0, 5.0]);
+    }
+
+    #[test]
+    fn a_trajectory_goes_on_through_a_dropped_row_that_is_the_state_of_the_next() {
+        let mut recording = recording(&[Transition, Dropped, Transition, Dropped]);
+        for (start, expected) in [(1.0, &[2.0][..]), (1.0001, &[0.0, 2.0])] {
+            recording.observations[2] = start;
+            assert_eq!(recording.trajectory_returns(), expected, "{start}");
+        }
     }
 }

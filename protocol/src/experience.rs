@@ -83,13 +83,22 @@ impl Message for Episode {
         if !observations.len().is_multiple_of(n + 1) || !actions.len().is_multiple_of(n) {
             return malformed("an episode's arrays have different lengths");
         }
+        let (o, a) = self.dims();
+        if o == 0 || a == 0 {
+            return malformed("an episode's observations or actions have no numbers");
+        }
         let sorted = interventions.is_sorted_by(|a, b| a < b);
         if !sorted || interventions.last().is_some_and(|&last| last as usize >= n) {
             return malformed("an episode's interventions are not among its steps");
         }
-        let mut numbers = observations.iter().chain(actions).chain(rewards);
-        if !numbers.all(|number| number.is_finite()) {
-            return malformed("a number of an episode is not finite");
+        for (array, numbers, width) in
+            [("observations", observations, o), ("actions", actions, a), ("rewards", rewards, 1)]
+        {
+            if let Some(place) = numbers.iter().position(|number| !number.is_finite()) {
+                let (row, column, value) = (place / width, place % width, numbers[place]);
+                let number = format!("`{array}`, row {row}: number {column} is {value}");
+                return malformed(&format!("an episode has a number that is not finite: {number}"));
+            }
         }
         Ok(())
     }
@@ -165,6 +174,8 @@ mod tests {
     use super::*;
     use crate::codec::{decode, encode};
 
+    type Spoil = fn(&mut Episode);
+
     fn episode() -> Episode {
         Episode {
             score: EpisodeScore { seed: 7, episode_return: 3.0, length: 2, score: 3.0 },
@@ -195,14 +206,15 @@ mod tests {
     fn episodes_that_contradict_themselves_are_refused() {
         assert_eq!(decode::<Episode>(&encode(&episode()).unwrap()).unwrap(), episode());
         assert_eq!(episode().dims(), (2, 1));
-        let broken: [fn(&mut Episode); 7] = [
+        let broken: [Spoil; 8] = [
             |it| it.rewards.clear(),
             |it| it.score.length = 3,
             |it| it.observations.truncate(5),
             |it| it.actions.push(0.0),
             |it| it.interventions = vec![2],
             |it| it.interventions = vec![1, 1],
-            |it| it.rewards[0] = f32::NAN,
+            |it| it.observations.clear(),
+            |it| it.actions.clear(),
         ];
         for spoil in broken {
             let mut episode = episode();
@@ -212,6 +224,21 @@ mod tests {
                 matches!(decode::<Episode>(&frame), Err(CodecError::Malformed(_))),
                 "{episode:?}"
             );
+        }
+    }
+
+    #[test]
+    fn a_number_that_is_not_finite_is_refused_by_array_row_and_number() {
+        let broken: [(Spoil, &str); 3] = [
+            (|it| it.observations[3] = f32::INFINITY, "`observations`, row 1: number 1 is inf"),
+            (|it| it.actions[1] = f32::NAN, "`actions`, row 1: number 0 is NaN"),
+            (|it| it.rewards[0] = f32::NAN, "`rewards`, row 0: number 0 is NaN"),
+        ];
+        for (spoil, expected) in broken {
+            let mut episode = episode();
+            spoil(&mut episode);
+            let error = decode::<Episode>(&encode(&episode).unwrap()).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
         }
     }
 }

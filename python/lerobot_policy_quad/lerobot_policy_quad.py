@@ -8,20 +8,13 @@ import quad_rl
 import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
-from quad_rl._lerobot import inputs
+from quad_rl._lerobot import act, inputs, places
 from quad_rl.readers.lerobot import names_of
 from quad_rl.readers.video import column
 
 
 def _untrainable(*_, **__):
     raise NotImplementedError("LeRobot cannot train policies of QUAD\nhint: quad_rl.train, then quad_rl.export_lerobot")
-
-
-def _places(wanted: list[str], there: list[str]) -> list[int]:
-    missing = [name for name in wanted if name not in there]
-    if missing:
-        raise ValueError(f"there is no column {', '.join(missing)}\nhint: there are {', '.join(there)}")
-    return [there.index(name) for name in wanted]
 
 
 @PreTrainedConfig.register_subclass("quad")
@@ -51,13 +44,14 @@ class QuadPolicy(PreTrainedPolicy):
     @classmethod
     def _load_as_safetensor(cls, model, model_file, map_location, strict):
         model.policy = policy = quad_rl.Policy.load(model_file)
+        features = inputs(policy, model._dataset)
         wanted = policy.observation_names or [*map(str, range(policy.observation_size))]
         done = policy.action_names or [*map(str, range(policy.action_size))]
-        model._seen = {name: model._called(name, [wanted[place] for place in places]) for name, places in inputs(policy).items()}
+        model._seen = {name: model._called(name, [wanted[i] for i in columns]) for name, columns in features.items()}
         model._encoders = {name: model._encoder(name, names[0]) for name, names in model._seen.items() if "image" in name}
-        model._observations = _places(wanted, sum(model._seen.values(), []))
+        model._observations = places(wanted, sum(model._seen.values(), []))
         called = model._called("action", done)
-        model._actions, _ = _places(called, done), _places(done, called)
+        model._actions, _ = places(called, done), places(done, called)
         model.reset()
         return model
 
@@ -95,7 +89,7 @@ class QuadPolicy(PreTrainedPolicy):
             parts.append(np.asarray(numbers, np.float32).reshape(len(numbers), -1))
             if parts[-1].shape[1] != len(names):
                 raise ValueError(f"{feature} has {parts[-1].shape[1]} numbers, not {len(names)}: {', '.join(names)}")
-        return np.concatenate(parts, axis=1)[:, self._observations]
+        return np.concatenate(parts, axis=1)
 
     def _begin(self, count: int) -> quad_rl.Episodes:
         seed = int(torch.randint(2**31, ()))
@@ -106,7 +100,7 @@ class QuadPolicy(PreTrainedPolicy):
         rows = self._rows(batch)
         if self._episodes is None or len(self._episodes) != len(rows):
             self._episodes = self._begin(len(rows))
-        return torch.from_numpy(self._episodes.act(rows)[:, self._actions])
+        return torch.from_numpy(act(self._episodes, rows, self._observations, self._actions))
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, torch.Tensor], **_) -> torch.Tensor:
@@ -115,5 +109,5 @@ class QuadPolicy(PreTrainedPolicy):
         if chunk["history"] > 1:
             raise ValueError("the policy sees several observations, and a batch has one\nhint: train it with --agent history=1")
         episodes = self._begin(len(rows))  # The first call draws the chunk that the others execute.
-        actions = [episodes.act(rows)[:, self._actions] for _ in range(chunk["replan"])]
+        actions = [act(episodes, rows, self._observations, self._actions) for _ in range(chunk["replan"])]
         return torch.from_numpy(np.stack(actions, axis=1))

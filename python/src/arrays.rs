@@ -129,6 +129,11 @@ fn stacked<'py>(
         return Err(PyValueError::new_err(error));
     }
     let (mut found, mut lacking) = (Vec::new(), Vec::new());
+    if let Some((_, column)) = names.iter().enumerate().find(|(i, it)| names[..*i].contains(it)) {
+        return Err(PyValueError::new_err(format!(
+            "{name} is a dictionary, but the policy's data has several columns {column:?}\nhint: give its numbers in its order"
+        )));
+    }
     for name in names {
         match numbers.get_item(name)? {
             Some(number) => found.push(number),

@@ -1,6 +1,6 @@
 //! Environments in Python, served like `evaluator serve` serves its own.
 //!
-//! The objects of `quad_rl/_worker.py` make, reset and step environments.
+//! The objects of `quad_rl/_worker.py` and `_environment.py` make, reset and step environments.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -72,6 +72,10 @@ impl PythonEnvironment {
 }
 
 impl Environment for PythonEnvironment {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
     fn allow_interventions(&mut self) {
         self.practice = true;
     }
@@ -85,9 +89,9 @@ impl Environment for PythonEnvironment {
         self.observe(|environment| {
             let action = PyArray1::from_slice(environment.py(), action);
             let stepped = environment.call_method1("step", (action,))?;
-            let (observed, reward, terminated, truncated, taken): (_, _, _, _, Option<Vec<f32>>) =
+            let (observed, reward, terminated, truncated, intervention, clipped) =
                 stepped.extract()?;
-            Ok((observed, Step { reward, terminated, truncated, intervention: taken }))
+            Ok((observed, Step { reward, terminated, truncated, intervention, clipped }))
         })
     }
 
@@ -131,7 +135,8 @@ pub fn serve_environment(
 ) -> PyResult<()> {
     let precision =
         precision.parse().map_err(|error| PyValueError::new_err(format!("precision: {error}")))?;
-    let args = ServeArgs { connect, certificates, http: None, name: None, precision };
+    let http_hosts = Vec::new();
+    let args = ServeArgs { connect, certificates, http: None, http_hosts, name: None, precision };
     let environments = Arc::new(PythonEnvironments { name, sizes, factory: Arc::new(factory) });
     let served = py.detach(|| {
         let _logging = init_logging();

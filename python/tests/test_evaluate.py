@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 
 import quad_rl
-from quad_rl import _worker
 
-OBSERVATION, ACTION = 11, 3
+OBSERVATION = 11
 SMALL = ["--agent", "actor.hidden=[16]", "--agent", "critic.hidden=[16]", "--agent", "critics=2", "--set", "batch_size=16"]
 
 
@@ -156,44 +155,6 @@ def test_a_nan_reward_is_reported_at_once_and_counts_as_an_attempt(tmp_path, dat
     assert re.search(r"could not do a job .* the return of the episode with seed \d+ is NaN after 5 steps", said), said
 
 
-@pytest.mark.parametrize("success", [float("nan"), 0.5, {"task": False}])
-def test_refuses_a_success_that_is_not_boolean(success):
-    made = _worker.WrappedEnvironment(Walk(), "success")
-    made.info = {"success": np.True_}
-    assert made.score(0.0) == 100.0
-    made.info = {"is_success": success}
-    with pytest.raises(_worker.EnvironmentFailed, match="neither true nor false"):
-        made.score(0.0)
-
-
-def test_an_intervention_replaces_the_action():
-    class Held(Walk):
-        def step(self, action):
-            *stepped, info = super().step(action)
-            return *stepped, {**info, "intervention": held}
-
-    made = _worker.WrappedEnvironment(Held(), "return")
-    made.reset(1)
-    for held, expected in (None, None), (np.array([[0.5], [1.0], [0.25]]), [0.5, 1.0, 0.25]), ([1, 0, -1], [1.0, 0.0, -1.0]):
-        assert made.step(np.zeros(ACTION, np.float32))[4] == expected
-    for held in [0.5], [np.nan, 0, 0]:
-        with pytest.raises(_worker.EnvironmentFailed, match="must be 3 finite numbers"):
-            made.step(np.zeros(ACTION, np.float32))
-
-
-def test_reset_says_which_episodes_are_practice():
-    class Told(Walk):
-        def reset(self, seed=None, options=None):
-            self.options = options
-            return super().reset(seed)
-
-    made = _worker.WrappedEnvironment(Told(), "return")
-    for practice, options in (True, {"practice": True}), (False, None):
-        made.reset(1, practice)
-        assert made.environment.options == options
-    _worker.WrappedEnvironment(Walk(), "return").reset(1, True)
-
-
 def test_killed_workers_restart_and_lose_no_score(tmp_path, data):
     # One pool for two runs: Python's workers have one environment, the programs' evaluators the other.
     ours = Learner(tmp_path / "ours", data, steps=3000)
@@ -218,9 +179,9 @@ def test_killed_workers_restart_and_lose_no_score(tmp_path, data):
         assert program.wait(600) == 0
 
 
-def run(script):
+def run(script, *arguments):
     """Runs a script that must end, however long its forked children sleep."""
-    ended = subprocess.run([sys.executable, "-c", script], cwd=pathlib.Path(__file__).parent, capture_output=True, timeout=600)
+    ended = subprocess.run([sys.executable, "-c", script, *map(str, arguments)], cwd=pathlib.Path(__file__).parent, capture_output=True, timeout=600)
     assert ended.returncode == 0, ended.stderr.decode()
 
 
@@ -348,7 +309,31 @@ def test_refuses_invalid_arguments():
     refused(RuntimeError, "SystemExit: no license", "walk", lambda seed: sys.exit("no license"), workers=1)
     refused(RuntimeError, "before it had an environment .exit code 3.", "walk", lambda seed: os._exit(3), workers=1)
     refused(RuntimeError, "No module named|doesn't exist|NameNotFound", "walk", "NoSuch-v0", workers=1)
-    refused(RuntimeError, "Box", "walk", "CartPole-v1", workers=1)
+    refused(RuntimeError, 'the environment "walk": actions must be a box of floats', "walk", "CartPole-v1", workers=1)
+
+
+FORM = """
+import subprocess, sys
+import quad_rl, test_evaluate
+
+class Old(test_evaluate.Walk):
+    def step(self, action):
+        return super().step(action)[:4]
+
+learner = test_evaluate.Learner(test_evaluate.pathlib.Path(sys.argv[1]), sys.argv[2], steps=20)
+try:
+    with quad_rl.Evaluators("walk", lambda seed: Old(), connect=learner.endpoint, workers=1):
+        learner.process.wait()
+except RuntimeError as error:
+    assert 'the environment "walk": step must return' in str(error), error
+    assert learner.process.poll() is None
+    sys.exit(0)
+sys.exit("it went on")
+"""
+
+
+def test_an_old_environment_without_spaces_ends_the_program_that_waits_for_it(tmp_path, data):
+    run(FORM, tmp_path / "run", data)
 
 
 def test_a_failure_to_connect_is_reported():

@@ -224,3 +224,29 @@ def test_names_may_be_given_by_their_places(tmp_path):
     (folder / "meta/info.json").write_text(json.dumps(info))
     dataset = Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all")
     assert dataset.action_names == ["action.pan", "action.lift"]
+
+
+def test_episodes_that_meta_does_not_list_are_left_out_and_splits_are_told(tmp_path):
+    folder = write(tmp_path / "data", episodes(), "v2.1")
+    listed = (folder / "meta/episodes.jsonl").read_text().splitlines(keepends=True)
+    (folder / "meta/episodes.jsonl").write_text("".join(listed[1:4]))
+    info = json.loads((folder / "meta/info.json").read_text()) | {"total_episodes": 3, "splits": {"train": "0:2", "val": "2:3"}}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    dataset = Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all")
+    assert len(dataset) == 6 + 7 + 8
+    told = "\n".join(dataset.notes)
+    assert "3 of 6 episodes dropped: meta/episodes does not list them, as if they were taken out (episode 0, 4, 5)" in told
+    assert "meta/info.json has splits (train 0:2, val 2:3); all are read" in told and "their rows are in no file" not in told
+
+
+def test_names_that_repeat_get_their_keys_or_are_refused(tmp_path):
+    folder = write(tmp_path / "data", episodes())
+    for names, called in ({"left": ["j"], "right": ["j"]}, ["action.left.j", "action.right.j"]), (["g", "g"], None):
+        info = json.loads((folder / "meta/info.json").read_text())
+        info["features"]["action"]["names"] = names
+        (folder / "meta/info.json").write_text(json.dumps(info))
+        if called:
+            assert Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all").action_names == called
+        else:
+            with pytest.raises(ValueError, match="several numbers of an observation or an action are called 'action.g'\nhint: "):
+                Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all")

@@ -27,8 +27,8 @@ def learner(folder, data, **arguments):
     return Learner(folder, data, *practice, interval=500, episodes=2, **arguments)
 
 
-def evaluators(learner, workers):
-    return quad_rl.Evaluators("walk", lambda seed: Fall(), connect=learner.endpoint, workers=workers)
+def evaluators(learner, workers, environment=Fall):
+    return quad_rl.Evaluators("walk", lambda seed: environment(), connect=learner.endpoint, workers=workers)
 
 
 def checkpoint(folder):
@@ -79,3 +79,43 @@ def test_any_number_of_evaluators_and_any_kill_make_the_same_run(tmp_path, data)
         assert all(first[1][key] == episodes[key] for key in common)
     verified = subprocess.run(["learner", "verify", str(folders[-1])], capture_output=True, text=True, timeout=600)
     assert verified.returncode == 0 and "bit for bit by evaluators with the same arithmetic" in verified.stdout, verified
+
+
+class Glitches(Fall):
+    """In some episodes of practice it diverges, in some a sensor gives 1e30 once. Its space is narrower than the data's actions."""
+
+    def reset(self, seed=None, options=None):
+        self.glitch = seed % 4 if options else 0
+        return super().reset(seed)
+
+    def step(self, action):
+        observation, *rest = super().step(np.clip(action, -0.5, 0.5))
+        if self.steps >= 2 and self.glitch:
+            observation = observation.copy()
+            observation[3] = {1: np.nan, 2: 1e30, 3: observation[3]}[self.glitch]
+        return observation, *rest
+
+
+class Narrow(Glitches):
+    action_space = type("Box", (), {"shape": (3,), "low": np.float32([-0.5] * 3), "high": np.float32([0.5] * 3), "dtype": np.dtype("f4")})()
+
+
+def test_glitches_of_a_simulator_end_nothing_and_the_actions_taken_are_kept(tmp_path, data):
+    run = learner(tmp_path / "run", data, listen=free_endpoint())
+    with evaluators(run, 2, Narrow):
+        log = run.folder / "experience.log"
+        wait(lambda: log.exists() and log.stat().st_size > 10_000)
+        run.process.kill()
+        run.end()
+        run = learner(run.folder, data, listen=run.endpoint)
+        code, said = run.end()
+    assert code == 0, said
+    assert "training leaves out an episode of practice: array `observations`, row 2, column 3: 1e30, far outside the dataset's range" in said
+    undisturbed = learner(tmp_path / "undisturbed", data)
+    with evaluators(undisturbed, 1, Narrow):
+        code, said = undisturbed.end()
+    assert code == 0 and checkpoint(run.folder) == checkpoint(undisturbed.folder), said
+    episodes = [np.frombuffer(rows, np.float32).reshape(-1, 11 + 3 + 1) for rows in experience(run.folder).values()]
+    actions = np.concatenate(episodes)[:, 11:14]
+    assert np.abs(actions).max() == 0.5 and np.isclose(np.abs(actions), 0.5).mean() > 0.2
+    assert any(len(rows) == 1 for rows in episodes), "they end before NaN"

@@ -86,7 +86,7 @@ def test_concurrent_episodes_draw_like_single_ones():
             rows += [observation, [mass, mass]]
         return np.array(rows)
 
-    factory, action = _worker.Factory(lambda seed: gymnasium.wrappers.ClipAction(Draws()), "return"), np.zeros(2)
+    factory, action = _worker.Factory(lambda seed: gymnasium.wrappers.ClipAction(Draws()), "return", pytest.fail), np.zeros(2)
     for seeds in ([0, 1, 2], [2, 7], [1]):  # Environments serve again.
         made = [factory.make(9) for _ in seeds]
         rows = [[one.reset(seed)] for one, seed in zip(made, seeds)]

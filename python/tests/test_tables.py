@@ -235,6 +235,10 @@ def test_names_go_into_the_file_and_the_policy(snapshots, tmp_path):
             policy.act(wrong)
     with pytest.raises(ValueError, match="is a dictionary, but the policy's data has no names\nhint: "):
         Policy.load(snapshots["iql"]).act({"x": 1.0})
+    twice = Policy.from_bytes(snapshot.read_bytes().replace(b'[\\"x\\",\\"v\\"]', b'[\\"x\\",\\"x\\"]'))
+    assert twice.observation_names == ["x", "x"]
+    with pytest.raises(ValueError, match="is a dictionary, but the policy's data has several columns \"x\"\nhint: give its numbers in its order"):
+        twice.act({"x": 1.0})
     for act in (policy.act, policy.begin(list(range(180))).act, policy.sample):
         with pytest.raises(ValueError, match="has the columns v, x, but the policy takes, in this order, x, v"):
             act(frame[["v", "x"]])
@@ -260,6 +264,11 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys, monkeypatch):
     assert convert(*log, "--reward", "gain", "--terminal", "fell")[0] == 0
     assert convert(*log, "--reward", "step-cost", "--success", "a", "b")[0] == 0
     assert "1 of 3 episodes are successes" in convert(*log, "--reward", "step-cost", "--success", "a")[1]
+    (tmp_path / "folder").mkdir()
+    [table().to_csv(tmp_path / f"folder/{name}.csv", index=False) for name in ("1", "2", "007")]
+    files = [tmp_path / "folder", *log[1:-1], "file", "--reward", "step-cost", "--success"]
+    assert all(f"{len(names)} of 3 episodes are successes" in convert(*files, *names)[1] for names in (["1", "2"], ["007"], ["1"]))
+    assert "episodes that are not there: ['7']" in convert(*files, "7", "1")[1]
     with h5py.File(tmp_path / "demo.hdf5", "w") as file:
         seen = np.random.default_rng(0).uniform(-1, 1, (10, 5))
         file["data/demo_0/obs/object"], file["data/demo_0/next_obs/object"], file["data/demo_0/actions"] = seen[:-1, 2:], seen[1:, 2:], seen[1:, :2]

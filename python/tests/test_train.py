@@ -45,6 +45,29 @@ def test_trains_like_the_program(data, tmp_path, capsys):
         quad_rl.train(data, run_dir=tmp_path / "other", color=7, fresh=False)
 
 
+def test_the_run_keeps_the_data_that_it_has_learned_from(tmp_path):
+    def kept(folder):
+        return sorted(path.name for path in folder.glob("dataset-*.hdf5"))
+
+    first, other = (quad_rl.Dataset.from_arrays(**arrays(seed)) for seed in (0, 1))
+    run = quad_rl.train(first, run_dir=tmp_path / "run", steps=2, **SMALL)
+    (name,) = kept(run.folder)
+    data = run.folder / name
+    assert f'"{data}"' in (run.folder / "config.toml").read_text()
+    first.save(tmp_path / "same.hdf5")
+    assert data.read_bytes() == (tmp_path / "same.hdf5").read_bytes()
+    quad_rl.train(first, run_dir=run.folder, steps=2, **SMALL)
+    with pytest.raises(RuntimeError, match="another configuration"):
+        quad_rl.train(other, run_dir=run.folder, steps=2, **SMALL)
+    assert kept(run.folder) == [name]
+    quad_rl.train(other, run_dir=run.folder, steps=2, fresh=True, **SMALL)
+    (name,) = kept(run.folder)
+    assert name != data.name and name in (run.folder / "config.toml").read_text()
+    with pytest.raises(RuntimeError, match="unexpected argument"):
+        quad_rl.train(first, run_dir=tmp_path / "refused", color=7)
+    assert not (tmp_path / "refused").exists()
+
+
 SCRIPT = """
 import ast, sys
 import quad_rl

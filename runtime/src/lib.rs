@@ -36,5 +36,5 @@ pub use metrics_server::{ListenError, MetricsServer, parse_address, serve_metric
 pub use progress_bar::ProgressBar;
 pub use router::open_router;
 pub use session::{open_session, reachable_at};
-pub use shutdown::{LEAVE_WITHIN, shutdown_signal};
+pub use shutdown::{LEAVE_WITHIN, shutdown_signal, unfinished_at_signal};
 pub use threads::{choose_threads, requested_threads};

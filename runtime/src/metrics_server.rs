@@ -74,13 +74,14 @@ impl Drop for MetricsServer {
 /// format; `/healthz` with `ok`, or with status 503 and a line for each problem; and the program's
 /// own `pages`.
 ///
-/// A request must name this machine by an address, as `localhost` or, if other machines can ask, by
-/// its own name, alone or with a domain that this machine searches.
+/// A request must name this machine by an address, as `localhost`, as one of `hosts` or, if other
+/// machines can ask, by its own name, alone or with a domain that this machine searches.
 ///
 /// The server cuts off clients that send or read slowly, or hold idle connections; they cost a
 /// bounded amount of memory.
 pub async fn serve_metrics(
     address: SocketAddr,
+    hosts: &[String],
     registry: Registry,
     health: Health,
     pages: Router,
@@ -89,12 +90,13 @@ pub async fn serve_metrics(
     let listener = TcpListener::bind(address).await.map_err(refused)?;
     let address = listener.local_addr().map_err(refused)?;
     let metrics = get(metrics).with_state(registry);
-    let own_names: Arc<[String]> = if address.ip().is_loopback() {
-        Arc::default()
-    } else {
+    let mut names = hosts.to_vec();
+    if !address.ip().is_loopback() {
         let read = |path| fs::read_to_string(path).unwrap_or_default();
-        own_names(read("/proc/sys/kernel/hostname").trim(), &read("/etc/resolv.conf")).into()
-    };
+        names
+            .extend(own_names(read("/proc/sys/kernel/hostname").trim(), &read("/etc/resolv.conf")));
+    }
+    let own_names = Arc::<[String]>::from(names);
     let router = Router::new()
         .route("/metrics", metrics)
         .route("/healthz", get(healthz).with_state(health))
@@ -155,7 +157,7 @@ async fn refuse_other_names(
     if request.headers().get(header::HOST).is_none_or(|name| is_ours(name.as_bytes())) {
         return next.run(request).await;
     }
-    let hint = "ask for this machine by its address, or as localhost on the machine itself\n";
+    let hint = "ask for this machine by its address, or as localhost on the machine itself; --http-hosts adds names\n";
     (StatusCode::FORBIDDEN, hint).into_response()
 }
 

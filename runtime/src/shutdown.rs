@@ -1,6 +1,7 @@
 //! The signals that end a process.
 
 use std::future::poll_fn;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
@@ -17,6 +18,31 @@ pub const LEAVE_WITHIN: Duration = Duration::from_secs(9);
 const SAME: Duration = Duration::from_millis(500);
 /// Time for the thread that writes the log.
 const LAST_WORDS: Duration = Duration::from_millis(100);
+
+/// True once a [`shutdown_signal`] takes the signals.
+static IS_TAKEN: AtomicBool = AtomicBool::new(false);
+
+/// Until the first [`shutdown_signal`], its signals end the process at once with exit code 75. Call
+/// it where the work begins that the same command continues.
+pub fn unfinished_at_signal() {
+    extern "C" fn leave(_: libc::c_int) {
+        if !IS_TAKEN.load(Ordering::Relaxed) {
+            // SAFETY: a handler may end the process so.
+            #[allow(unsafe_code)]
+            unsafe {
+                libc::_exit(UNFINISHED.into())
+            }
+        }
+    }
+    let handler: extern "C" fn(libc::c_int) = leave;
+    for (_, kind) in kinds() {
+        // SAFETY: the handler does only what one may do.
+        #[allow(unsafe_code)]
+        unsafe {
+            libc::signal(kind.as_raw_value(), handler as libc::sighandler_t);
+        }
+    }
+}
 
 /// Becomes ready at the first signal to end after this call, even before a task awaits it: SIGINT
 /// (Ctrl-C), SIGTERM, SIGHUP (the end of a terminal's session), or SIGUSR1 (what Slurm's `--signal`
@@ -78,21 +104,29 @@ async fn first_of(signals: &mut [(&'static str, Signal)]) -> &'static str {
 /// Sets handlers. A signal whose handler cannot be set keeps its default action: it ends the process.
 fn listen() -> Vec<(&'static str, Signal)> {
     let mut prepared = Vec::new();
-    for (name, kind, may_be_ignored) in [
-        ("SIGINT", SignalKind::interrupt(), false),
-        ("SIGTERM", SignalKind::terminate(), false),
-        ("SIGHUP", SignalKind::hangup(), true),
-        ("SIGUSR1", SignalKind::user_defined1(), true),
-    ] {
-        if may_be_ignored && is_ignored(kind) {
-            continue;
-        }
+    for (name, kind) in kinds() {
         match signal(kind) {
             Ok(signal) => prepared.push((name, signal)),
             Err(error) => warn!("cannot prepare for a clean shutdown by {name}: {error}"),
         }
     }
+    // A handler set before is called first.
+    IS_TAKEN.store(true, Ordering::Relaxed);
     prepared
+}
+
+/// The signals to end, without those that the process is to ignore.
+fn kinds() -> impl Iterator<Item = (&'static str, SignalKind)> {
+    let kinds = [
+        ("SIGINT", SignalKind::interrupt(), false),
+        ("SIGTERM", SignalKind::terminate(), false),
+        ("SIGHUP", SignalKind::hangup(), true),
+        ("SIGUSR1", SignalKind::user_defined1(), true),
+    ];
+    let heeded = |(name, kind, may_be_ignored): (_, SignalKind, bool)| {
+        (!may_be_ignored || !is_ignored(kind)).then_some((name, kind))
+    };
+    kinds.into_iter().filter_map(heeded)
 }
 
 /// True if the process ignores a signal, as `nohup` makes it ignore SIGHUP.

@@ -14,11 +14,15 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const ANY_PORT: SocketAddr =
     SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
 
+fn hosts() -> [String; 1] {
+    ["learner.lab.svc.cluster.local".to_owned()]
+}
+
 async fn server(health: Health) -> (MetricsServer, IntGauge) {
     let registry = Registry::new();
     let gauge = IntGauge::new("quad_test_apples", "Apples in the test.").unwrap();
     registry.register(Box::new(gauge.clone())).unwrap();
-    (serve_metrics(ANY_PORT, registry, health, Router::new()).await.unwrap(), gauge)
+    (serve_metrics(ANY_PORT, &hosts(), registry, health, Router::new()).await.unwrap(), gauge)
 }
 
 /// Head and body of a response.
@@ -63,8 +67,10 @@ async fn requests_for_another_host_are_refused() {
         assert!(head.starts_with("http/1.1 403"), "{head}");
         assert!(body.starts_with("ask for this machine"), "{body}");
     }
-    let host = format!("localhost:{}", server.address.port());
-    assert_eq!(get_as(server.address, host, "/healthz").await.1, "ok\n");
+    for name in ["localhost", "Learner.lab.svc.cluster.local"] {
+        let host = format!("{name}:{}", server.address.port());
+        assert_eq!(get_as(server.address, host, "/healthz").await.1, "ok\n");
+    }
 }
 
 #[tokio::test]
@@ -84,7 +90,8 @@ async fn unhealthy_components_have_a_line_each() {
 /// A server with a page that never answers, and a connection that asks for it.
 async fn slow_server() -> (MetricsServer, impl Fn() -> TcpStream) {
     let never = Router::new().route("/never", routing::get(std::future::pending::<()>));
-    let server = serve_metrics(ANY_PORT, Registry::new(), Health::default(), never).await.unwrap();
+    let server = serve_metrics(ANY_PORT, &[], Registry::new(), Health::default(), never);
+    let server = server.await.unwrap();
     let address = server.address;
     (server, move || send(address, "GET /never HTTP/1.1\r\nHost: localhost\r\n\r\n"))
 }
@@ -135,6 +142,7 @@ async fn a_hundred_waiting_connections_keep_no_client_out() {
 async fn an_address_in_use_is_an_error() {
     let (server, _) = server(Health::default()).await;
     let (address, health) = (server.address, Health::default());
-    let error = serve_metrics(address, Registry::new(), health, Router::new()).await.unwrap_err();
+    let error = serve_metrics(address, &[], Registry::new(), health, Router::new());
+    let error = error.await.unwrap_err();
     assert_eq!(error.to_string(), format!("cannot listen at {address}"));
 }

@@ -21,12 +21,13 @@ AGENT = {
     "candidates": 10,
 }
 HIDDEN = {"narrow": 5, "small": 7, "hopper": 256}  # the actor's
-FOLDERS = {"align-iql": (20, "small"), "idql": (53, "small")}
+FOLDERS = {"align-iql": (20, "small"), "idql": (53, "small"), "idql-online": (66, "small")}
 
 
 def make_config(variant, size):
     networks = implicit.value_networks(size) | {"actor": shape([HIDDEN[size]] * 3, "silu")}
-    return implicit.make_config(variant, size, networks | AGENT | RATES)
+    online = {"step": 2300, "online_steps": 1000} if variant == "idql-online" else {}
+    return implicit.make_config(variant.removesuffix("-online"), size, networks | AGENT | RATES) | online
 
 
 @compiled
@@ -69,10 +70,10 @@ def update(config, state, inputs):
     _, alpha_bar = schedule(agent["diffusion_steps"])
     s, a, t, epsilon = (inputs[name] for name in ("observations", "actions", "t", "epsilon"))
 
-    # The actor, which only clones.
+    # The actor, which only clones; with practice it stays where it is, and its average follows.
     noisy = np.sqrt(alpha_bar[t])[:, None] * a + np.sqrt(1 - alpha_bar[t])[:, None] * epsilon
     loss, gradients = bc_gradient(state["actor"], s, noisy, t, epsilon, agent["actor"]["activation"])
-    rate = decayed(agent["actor_learning_rate"], config)
+    rate = decayed(agent["actor_learning_rate"], config, online=0.0)
     out = {"noisy_actions": noisy, "bc_loss": loss}
     out |= adam_step(state, "actor", gradients, rate, step, agent["weight_decay"])
     out["target_actor"] = follow(state["target_actor"], out["actor"], agent["actor_ema_rate"])

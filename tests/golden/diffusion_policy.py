@@ -1,4 +1,6 @@
-"""One update of Diffusion Policy (Chi et al. 2023): cloning by a noise predictor on the cosine schedule, and its EMA."""
+"""One update of Diffusion Policy (Chi et al. 2023): cloning by a noise predictor on the cosine schedule, and its EMA. Of chunks it
+clones all actions, also the copies beyond the end of an episode.
+"""
 
 import math
 
@@ -7,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffusion import fast_noise, predict_noise, random_predictor, repeated
+from fql import joined, width, windows
 from networks import adam_step, compiled, configuration, follow, near, random_batch, random_moments, shape, single
 
 SIZES = {
@@ -16,13 +19,15 @@ SIZES = {
 }
 # Large rates, so that a mistake in an optimizer or an average is far larger than float32's rounding.
 AGENT = {"diffusion_steps": 6, "learning_rate": 0.02, "warmup": 50, "weight_decay": 0.5}
-FOLDERS = {"diffusion-policy": (60, "small"), "diffusion-policy-warmup": (61, "small")}
-STEPS = {"diffusion-policy": 700, "diffusion-policy-warmup": 30}
+FOLDERS = {"diffusion-policy": (60, "small"), "diffusion-policy-chunks": (61, "small")}
+# The second is in the warm-up.
+STEPS = {"diffusion-policy": 700, "diffusion-policy-chunks": 30}
 
 
 def make_config(variant, size):
-    networks = {"actor": shape([SIZES[size]["hidden"]] * 3)}
-    return configuration("diffusion-policy", SIZES[size]["batch_size"], STEPS[variant], networks | AGENT)
+    agent = {"actor": shape([SIZES[size]["hidden"]] * 3)} | AGENT
+    chunk = {"chunk": 3, "replan": 2} if variant == "diffusion-policy-chunks" else {}
+    return configuration("diffusion-policy", SIZES[size]["batch_size"], STEPS[variant], agent | chunk)
 
 
 def schedule(steps):
@@ -43,7 +48,7 @@ def update(config, state, inputs):
     """All that must come out, and nothing else."""
     agent, step = config["agent"], config["step"]
     _, alpha_bar = schedule(agent["diffusion_steps"])
-    s, a, t, epsilon = (inputs[name] for name in ("observations", "actions", "t", "epsilon"))
+    (s, t, epsilon), a = (inputs[name] for name in ("observations", "t", "epsilon")), windows(config, inputs)[0]
     noisy = np.sqrt(alpha_bar[t])[:, None] * a + np.sqrt(1 - alpha_bar[t])[:, None] * epsilon
     loss, gradients = bc_gradient(state["actor"], s, noisy, t, epsilon, agent["actor"]["activation"])
     rises, falls = step / agent["warmup"], (step - agent["warmup"]) / (config["total_steps"] - agent["warmup"])
@@ -69,14 +74,14 @@ def act(config, state, inputs):
 
 
 def random_state(config, rng):
-    actor = random_predictor(rng, config["observation_dim"], config["action_dim"], config["agent"]["actor"])
+    actor = random_predictor(rng, config["observation_dim"], width(config), config["agent"]["actor"])
     return {"actor": actor, "target_actor": near(rng, actor)} | random_moments(rng, "actor", actor)
 
 
 def random_inputs(config, rng, size):
-    o, a, b, n = config["observation_dim"], config["action_dim"], config["batch_size"], SIZES[size]["select"]
-    steps = config["agent"]["diffusion_steps"]
-    return random_batch(rng, config) | {
+    o, a, b, n = config["observation_dim"], width(config), config["batch_size"], SIZES[size]["select"]
+    steps, batch = config["agent"]["diffusion_steps"], random_batch(rng, config)
+    return (joined(batch) if "chunk" in config["agent"] else batch) | {
         "t": rng.permutation(np.arange(b) % steps + 1),
         "epsilon": single(rng.normal(size=(b, a))),
         "select_observations": single(rng.normal(size=(n, o))),

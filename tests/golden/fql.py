@@ -13,7 +13,7 @@ from networks import random_network, shape, single, values
 CRITICS = 2
 FOLDERS = {"fql": (56, "small"), "fql-normalized": (57, "small"), "fql-chunks": (58, "small"), "qc": (59, "small")}
 VARIANTS = {"fql": 700, "fql-normalized": 701, "fql-chunks": 702, "qc": 703}
-ONE_STEP = ("alpha", "online_alpha", "normalize_q")  # of FQL alone
+ONE_STEP = ("alpha", "normalize_q")  # of FQL alone
 SIZES = {
     "narrow": {"hidden": 5, "batch_size": 23, "select": 3},
     "small": {"hidden": 11, "batch_size": 24, "select": 6},
@@ -22,7 +22,6 @@ SIZES = {
 AGENT = {
     "gamma": 0.99,
     "alpha": 3.0,
-    "online_alpha": 5.0,
     "flow_steps": 10,
     "learning_rate": 0.02,
     "ema_rate": 0.05,
@@ -37,13 +36,12 @@ def make_config(variant, size):
         "critic": shape([hidden, hidden - 1], "gelu", True) | {"norm_after": True},
     }
     own = {"target": "min" if normalized else "mean", "normalize_q": normalized}
-    online = {"online_steps": 1000} if normalized else {}
     chunk = {"chunk": 3} if variant in ("fql-chunks", "qc") else {}
     agent = networks | AGENT | own | chunk
     if variant == "qc":
         agent = {name: value for name, value in agent.items() if name not in ONE_STEP}
     name = "qc" if variant == "qc" else "fql"
-    return configuration(name, SIZES[size]["batch_size"], VARIANTS[variant], agent) | online
+    return configuration(name, SIZES[size]["batch_size"], VARIANTS[variant], agent)
 
 
 def width(config):
@@ -98,27 +96,39 @@ actor_gradient = compiled(jax.value_and_grad(actor_loss, has_aux=True))
 
 def windows(config, inputs):
     """The chunk from each row on, for rows of several episodes: its actions, the last of the episode over and over once it
-    is over; where they are within the episode; its discounted rewards; the state after it; and what that is discounted by.
+    is over; where they are within the episode; its discounted rewards; the state after it; and what that is discounted by. As
+    QC's authors cut it, it goes over a success, after which nothing is expected of the state at its end.
     """
     agent, chunks = config["agent"], []
+    gamma = agent.get("gamma", 1.0)
     if agent.get("chunk", 1) == 1:
         within = np.ones_like(inputs["actions"])
-        return inputs["actions"], within, inputs["rewards"], inputs["next_observations"], agent["gamma"] * inputs["masks"]
+        return inputs["actions"], within, inputs["rewards"], inputs["next_observations"], gamma * inputs["masks"]
     for row in range(config["batch_size"]):
         rows = [row]
-        while len(rows) < agent.get("chunk", 1) and inputs["masks"][rows[-1]] > 0.5 and inputs["timeouts"][rows[-1]] < 0.5:
+        while len(rows) < agent["chunk"] and inputs["ends"][rows[-1]] < 0.5:
             rows.append(rows[-1] + 1)
-        n, missing = len(rows), agent.get("chunk", 1) - len(rows)
+        n, missing = len(rows), agent["chunk"] - len(rows)
         chunks.append(
             (
                 inputs["actions"][rows + [rows[-1]] * missing].ravel(),
                 np.repeat([1.0] * n + [0.0] * missing, config["action_dim"]),
-                sum(agent["gamma"] ** i * inputs["rewards"][rows[i]] for i in range(n)),
+                sum(gamma**i * inputs["rewards"][rows[i]] for i in range(n)),
                 inputs["next_observations"][rows[-1]],
-                agent["gamma"] ** n * inputs["masks"][rows[-1]],
+                gamma**n * inputs["masks"][rows].min(),
             )
         )
     return [np.array(column) for column in zip(*chunks, strict=True)]
+
+
+def joined(inputs):
+    """The rows as episodes of up to seven, each of which leads to the next one. Every fourth is a success, which ends few."""
+    rows = np.arange(len(inputs["masks"]))
+    inputs["ends"] = np.isin(rows % 17, (3, 8, 15, 16)).astype(float)
+    inputs["ends"][-1] = 1
+    goes_on = np.flatnonzero(inputs["ends"] == 0)
+    inputs["next_observations"][goes_on] = inputs["observations"][goes_on + 1]
+    return inputs
 
 
 def reduced(agent, q):
@@ -168,12 +178,11 @@ def update(config, state, inputs):
         for name, gradient in gradients.items():
             out |= adam_step(state, name, gradient, agent["learning_rate"], step)
         return out, next_actions
-    alpha = agent["online_alpha" if "online_steps" in config else "alpha"]
     led = flow_actions(config, state["flow"], s, inputs["policy_noise"])
     taken = fast_one_step(state["actor"], s, inputs["policy_noise"], activation)
 
     out["flow_actions"] = np.clip(led, -1, 1)
-    given = state["critic"], s, inputs["policy_noise"], out["flow_actions"], (alpha, agent["normalize_q"])
+    given = state["critic"], s, inputs["policy_noise"], out["flow_actions"], (agent["alpha"], agent["normalize_q"])
     (out["actor_loss"], parts), of_actor = actor_gradient(state["actor"], *given, activation, critic_activation)
     out["distill_loss"], out["q_loss"] = parts
     for name, gradient in (gradients | {"actor": of_actor}).items():
@@ -226,11 +235,7 @@ def random_inputs(config, rng, size):
         del inputs["policy_noise"]
         inputs["next_noise"] = single(rng.normal(size=(b * agent["candidates"], a)))
     if "chunk" in agent:
-        # Episodes of up to four rows, each of which leads to the next.
-        inputs["timeouts"] = np.isin(np.arange(b) % 17, (2, 8, 16)) * inputs["masks"]
-        inputs["timeouts"][-1] = inputs["masks"][-1]
-        goes_on = (inputs["masks"] == 1) & (inputs["timeouts"] == 0)
-        inputs["next_observations"][goes_on] = inputs["observations"][1:][goes_on[:-1]]
+        inputs = joined(inputs)
     return inputs | {
         "times": single(rng.uniform(size=b)),
         "select_observations": single(rng.normal(size=(n, o))),

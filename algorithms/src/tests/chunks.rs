@@ -91,6 +91,7 @@ fn actions_beyond_the_end_of_an_episode_do_not_decide_lambda() {
     assert_eq!(state["nu_squared"].to_vec1::<f32>().unwrap(), [0.0]);
 }
 
+/// But in Diffusion Policy, which executes them.
 #[test]
 fn actions_beyond_the_end_of_an_episode_are_not_cloned() {
     let context = single_steps();
@@ -111,7 +112,9 @@ fn actions_beyond_the_end_of_an_episode_are_not_cloned() {
             assert_eq!(last.len(), 1, "{name}: {last:?}");
             let moments: Vec<f32> = last[0].1.flatten_all().unwrap().to_vec1().unwrap();
             let (learned, beyond) = moments.split_at(DIMS.1);
-            assert!(learned.iter().all(|x| *x > 0.0) && beyond.iter().all(|x| *x == 0.0), "{name}");
+            let clones_copies = name == "diffusion-policy";
+            assert!(learned.iter().all(|x| *x > 0.0), "{name}");
+            assert!(beyond.iter().all(|x| (*x > 0.0) == clones_copies), "{name}");
         }
     }
 }

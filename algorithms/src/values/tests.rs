@@ -23,6 +23,10 @@ fn values() -> Values {
         agent.rate = 3
         [for."antmaze-*-demo"]
         seed = 4
+        [for."antmaze-*-v0"]
+        agent.rate = 4
+        [for."*-singletask-*"]
+        seed = 5
     };
     file.try_into().unwrap()
 }
@@ -33,7 +37,9 @@ fn the_pattern_with_more_letters_wins_key_by_key() {
         (None, 1, 0, 1.0),
         (Some("hopper-medium-v2"), 1, 0, 1.0),
         (Some("hopper-demo"), 2, 2, 1.0),
-        (Some("antmaze-umaze-v0"), 3, 0, 3.0),
+        (Some("antmaze-umaze-v0"), 3, 0, 4.0),
+        // OGBench's, none of D4RL's.
+        (Some("antmaze-giant-stitch-singletask-v0"), 1, 5, 1.0),
         (Some("antmaze-umaze-demo"), 3, 4, 3.0),
     ] {
         let expected = toml! { steps = steps seed = seed agent = { rate = rate, width = 8 } };
@@ -85,9 +91,8 @@ fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
     for definition in ALGORITHMS {
         let values = Values::of(definition);
         for task in tasks() {
-            let groups: Vec<_> =
-                values.groups.iter().filter(|(pattern, _)| fits(pattern, &task)).collect();
-            let keys: Vec<_> = groups
+            let keys: Vec<_> = values
+                .groups_for(&task)
                 .iter()
                 .flat_map(|(pattern, table)| {
                     keys(table).into_iter().map(|key| (letters(pattern), key))

@@ -9,12 +9,13 @@ use crate::error::{ArrayProblem, DatasetError, Problem};
 use crate::formats::hdf5_file::Hdf5File;
 use crate::formats::new_file::{Column, NewFile, text};
 use crate::recording::{Names, Recording, RowKind};
+use crate::same_state::SameState;
 
 /// Value of the root attribute `layout` that distinguishes this layout from D4RL's.
 pub(super) const LAYOUT: &str = "transitions";
 
-const OBSERVATION_NAMES: &str = "observation_names";
-const ACTION_NAMES: &str = "action_names";
+pub(crate) const OBSERVATION_NAMES: &str = "observation_names";
+pub(crate) const ACTION_NAMES: &str = "action_names";
 
 /// N transitions in memory, ordered by episode.
 #[derive(Clone, Debug, Default)]
@@ -60,6 +61,7 @@ impl Arrays {
             action_dim: a,
             kinds: vec![RowKind::Transition; rows],
             ends: ends.collect(),
+            same_state: SameState::between(&self.observations, Some(&self.next_observations), o),
             observations: self.observations,
             actions: self.actions,
             rewards: self.rewards,
@@ -73,7 +75,7 @@ impl Arrays {
 }
 
 /// Reads the custom layout. Terminals and timeouts end an episode; without `timeouts`, so does a
-/// next observation that differs from the following row's observation.
+/// next observation that is not the state in which the following row starts.
 pub(super) fn read_own(file: &Hdf5File) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);

@@ -3,13 +3,15 @@
 use crate::error::Problem;
 use crate::formats::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
+use crate::same_state::SameState;
 use crate::tables::environment::EnvironmentSpec;
 
 /// Reads a file as D4RL's `qlearning_dataset` does: the next observation is the following row's,
 /// and timeouts and the last row make no transition. A terminal row's next observation belongs to
 /// another episode, but its mask is 0.
 ///
-/// Missing `timeouts` follow from the environment's time limit. Stored `next_observations` serve
+/// Missing `timeouts` follow from `episode_terminals`, which d3rlpy 1 wrote in their place, or from
+/// the environment's time limit. Stored `next_observations` serve
 /// only to check the order of the rows, and to know goals at which the episode ended.
 pub(super) fn read(
     file: &Hdf5File,
@@ -19,10 +21,23 @@ pub(super) fn read(
     let rows = observations.rows();
     let actions = file.actions("actions")?.of_rows(rows)?;
     let terminals = file.flags("terminals", rows)?;
-    let timeouts = match (file.has("timeouts"), environment) {
-        (true, _) => file.flags("timeouts", rows)?,
-        (false, Some(environment)) => derive_timeouts(&terminals, environment.max_episode_steps),
-        (false, None) => vec![false; rows],
+    let mut doubts = Vec::new();
+    let timeouts = if file.has("timeouts") {
+        file.flags("timeouts", rows)?
+    } else if file.has("episode_terminals") {
+        let ends = file.flags("episode_terminals", rows)?;
+        ends.into_iter().zip(&terminals).map(|(end, terminal)| end && !terminal).collect()
+    } else {
+        let (timeouts, end) = match environment {
+            Some(spec) => {
+                let limit = spec.max_episode_steps;
+                let end = format!("after the {limit} steps of {}", spec.name);
+                (derive_timeouts(&terminals, limit), end)
+            }
+            None => (vec![false; rows], "at a terminal alone".to_owned()),
+        };
+        doubts.push(format!("no array `timeouts`: an episode is taken to end {end}"));
+        timeouts
     };
     // The recording continues after the goal: only timeouts end an episode.
     let is_maze = environment.is_some_and(|environment| environment.maze.is_some());
@@ -36,8 +51,13 @@ pub(super) fn read(
     };
     let stored = file.has("next_observations");
     let stored = stored.then(|| file.table("next_observations", rows, observations.width));
-    let unused_next_observations = stored.transpose()?;
+    let unused_next_observations: Option<Vec<f32>> = stored.transpose()?;
     let mut recording = Recording {
+        same_state: SameState::between(
+            &observations.values,
+            unused_next_observations.as_deref(),
+            observations.width,
+        ),
         observation_dim: observations.width,
         action_dim: actions.width,
         observations: observations.values,
@@ -50,6 +70,7 @@ pub(super) fn read(
         terminal_array: "terminals",
         timeouts,
         goal,
+        doubts,
         ..Recording::default()
     };
     for row in 0..rows {

@@ -103,14 +103,6 @@ impl Source {
         Err(Problem::OtherEnvironment { claimed, expected, is_simulated })
     }
 
-    pub(crate) fn lacks_timeouts(&self) -> bool {
-        matches!(self, Self::D4rl(file) if !file.has("timeouts"))
-    }
-
-    pub(crate) fn lacks_masks(&self) -> bool {
-        matches!(self, Self::OgBench(file) if file.has("rewards") && !file.has("masks"))
-    }
-
     /// Reads all rows. `environment` gives the time limit and goal of a D4RL file; `task` replaces
     /// rewards and masks.
     pub(crate) fn read(

@@ -3,6 +3,7 @@
 use crate::error::Problem;
 use crate::formats::npz_file::NpzFile;
 use crate::recording::{Recording, RowKind};
+use crate::same_state::SameState;
 use crate::tables::maze::MazeTask;
 
 /// Reads a file of OGBench. `terminals` mark the end of a trajectory; the mask is 0 only where
@@ -20,7 +21,7 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
     };
     let stored = file.has("next_observations");
     let stored = stored.then(|| file.table("next_observations", rows, observation_dim));
-    let next_observations = stored.transpose()?;
+    let next_observations: Option<Vec<f32>> = stored.transpose()?;
     let last_states: Vec<bool> = match (&next_observations, file.has("valids")) {
         (Some(_), _) => vec![false; rows],
         (None, true) => file.flags("valids", rows)?.into_iter().map(|valid| !valid).collect(),
@@ -32,8 +33,17 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
         None => !last_states[row] && terminals.get(row + 1) == Some(&true) && last_states[row + 1],
     };
     let ends: Vec<bool> = (0..rows).map(is_last).collect();
+    let lacks_masks = file.has("rewards") && !file.has("masks");
+    let doubt = lacks_masks.then(|| {
+        "no array `masks`: no step counts as terminal, as `terminals` are the ends of OGBench's trajectories".to_owned()
+    });
     let kind = |&last: &bool| if last { RowKind::LastState } else { RowKind::Transition };
     Ok(Recording {
+        same_state: SameState::between(
+            &observations.values,
+            next_observations.as_deref(),
+            observation_dim,
+        ),
         observation_dim,
         action_dim: actions.width,
         observations: observations.values,
@@ -48,6 +58,7 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
         timeouts: (0..rows).map(|row| ends[row] && masks[row]).collect(),
         ends,
         next_observations,
+        doubts: doubt.into_iter().collect(),
         ..Recording::default()
     })
 }

@@ -1,6 +1,5 @@
 //! Summary of a dataset for its user: statistics, histograms and problems.
 
-mod findings;
 mod histogram;
 mod page;
 
@@ -8,13 +7,14 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::checks;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::statistics::Summary;
 use crate::tables::benchmarks;
 use crate::tables::environment::{self, EnvironmentSpec};
-use crate::tables::reward::RewardScaling;
+use crate::tables::reward::{RewardRule, RewardScaling};
+use crate::transitions::ReadOptions;
+use crate::{checks, warnings};
 
 pub use histogram::Histogram;
 
@@ -123,12 +123,16 @@ pub fn inspect(
     let mut source = Source::open(path)?;
     let claimed = source.environment();
     let spec = environment.or_else(|| environment::find(claimed.as_deref()?).ok());
-    let recording = source.read(spec, spec.and_then(|spec| benchmarks::relabeling(&spec.name)))?;
+    let reward = spec.map_or(RewardRule::AsIs, |spec| spec.reward);
+    let task = spec.and_then(|spec| benchmarks::relabeling(&spec.name));
+    let recording = source.read(spec, task)?;
 
     let other = environment.and_then(|environment| source.check_environment(environment).err());
     let refused: Vec<Problem> =
         other.into_iter().chain(checks::problems(&recording, spec)).collect();
-    let findings = findings::findings(&source, &recording, spec);
+    let doubts = warnings::warnings(&recording, &ReadOptions { reward, ..ReadOptions::default() });
+
+    let with_hint = |problem: &Problem| format!("{problem}; {}", problem.hint());
 
     let episodes = recording.episodes();
     let lengths: Vec<f64> = episodes.iter().map(|episode| episode.length as f64).collect();
@@ -172,6 +176,6 @@ pub fn inspect(
         returns: Histogram::of(&returns),
         lengths: Histogram::of(&lengths),
         refused: !refused.is_empty(),
-        problems: refused.iter().map(Problem::to_string).chain(findings).collect(),
+        problems: refused.iter().map(with_hint).chain(doubts).collect(),
     })
 }

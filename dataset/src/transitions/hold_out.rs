@@ -8,19 +8,15 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::recording::{Recording, RowKind};
 
-/// Distinguishes this random stream from others of the run's seed.
-const PURPOSE: u64 = u64::from_be_bytes(*b"hold out");
+/// Seed of the choice. All runs on the same data hold out the same episodes, so that judging
+/// compares them; a larger fraction adds to those of a smaller one.
+const SEED: u64 = u64::from_be_bytes(*b"hold out");
 
 /// Episodes that are kept out of training.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum HoldOut<'a> {
-    /// Random fraction of the episodes.
-    Fraction {
-        /// Fraction between 0 (none) and 1.
-        fraction: f64,
-        /// Seed of the choice.
-        seed: u64,
-    },
+    /// Fraction of the episodes between 0 (none) and 1, by their number alone.
+    Fraction(f64),
     /// Indices of episodes in ascending order, from 0 in file order.
     Episodes(&'a [usize]),
 }
@@ -31,12 +27,12 @@ impl HoldOut<'_> {
 
 /// Indices in ascending order. A fraction above 0 leaves at least one episode on each side.
 pub(crate) fn chosen(hold_out: HoldOut<'_>, episodes: usize) -> Vec<usize> {
-    let (fraction, seed) = match hold_out {
-        HoldOut::Fraction { fraction, seed } => (fraction, seed),
+    let fraction = match hold_out {
+        HoldOut::Fraction(fraction) => fraction,
         HoldOut::Episodes(numbers) => return numbers.to_vec(),
     };
     let mut numbers = Vec::from_iter(0..episodes);
-    numbers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed ^ PURPOSE));
+    numbers.shuffle(&mut ChaCha8Rng::seed_from_u64(SEED));
     let count = (fraction * episodes as f64).round() as usize;
     let count = count.max(usize::from(fraction > 0.0));
     numbers.truncate(count.min(episodes.saturating_sub(1)));
@@ -107,6 +103,7 @@ impl Recording {
             observation_dim: self.observation_dim,
             action_dim: self.action_dim,
             next_observations: self.next_observations.as_ref().map(|_| Vec::new()),
+            same_state: self.same_state.clone(),
             terminal_array: self.terminal_array,
             goal: self.goal,
             names: self.names.clone(),
@@ -155,8 +152,6 @@ fn keep<T: Copy>(column: &mut Vec<T>, width: usize, kept: &[Range<usize>]) {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
     use super::*;
     use crate::recording::tests::recording;
 
@@ -175,16 +170,13 @@ mod tests {
     fn episodes_are_kept_out_whole() {
         let episodes = [0..2, 2..4, 4..6, 6..7];
         assert_eq!(whole().rows_of_episodes(), episodes);
-        let mut seen = BTreeSet::new();
-        for seed in 0..20 {
-            let hold_out = HoldOut::Fraction { fraction: 0.25, seed };
+        for (number, rows) in episodes.iter().enumerate() {
             let all = whole();
             let place = all.observations.as_ptr();
-            let (training, held_out, out) = all.hold_out(hold_out);
-            let (number, held_out) = (&out[0], held_out.unwrap());
-            assert_eq!(out.len(), 1);
+            let (training, held_out, out) = all.hold_out(HoldOut::Episodes(&[number]));
+            let held_out = held_out.unwrap();
+            assert_eq!(out, [number]);
             assert_eq!(training.observations.as_ptr(), place, "a copy takes as much memory again");
-            let rows = &episodes[*number];
             let (own, others): (Vec<usize>, _) = (0..7).partition(|row| rows.contains(row));
             // Rewards and observations equal row indices; one more row, a final state, may follow.
             for (part, rows) in [(&held_out, own), (&training, others)] {
@@ -198,18 +190,21 @@ mod tests {
             let is_there =
                 |(first, name): &(usize, String)| training.rewards[*first].to_string() == *name;
             assert!(training.parts.len() == 3 && training.parts.iter().all(is_there));
-            let again = whole().hold_out(HoldOut::Episodes(&out));
-            assert_eq!(again.0.rewards, training.rewards);
-            seen.insert(*number);
         }
-        assert_eq!(seen.len(), 4, "by the seed");
     }
 
     #[test]
-    fn one_episode_is_left_to_learn_from() {
-        let count =
-            |(fraction, episodes)| chosen(HoldOut::Fraction { fraction, seed: 0 }, episodes).len();
-        let counts = [(0.0, 10), (0.1, 10), (0.01, 10), (0.9, 2), (0.5, 1)].map(count);
-        assert_eq!(counts, [0, 1, 1, 1, 0]);
+    fn the_nearest_number_is_held_out_and_one_episode_left_to_learn_from() {
+        let count = |(fraction, episodes)| chosen(HoldOut::Fraction(fraction), episodes).len();
+        let counts =
+            [(0.0, 10), (0.1, 10), (0.1, 16), (0.29, 9), (0.01, 10), (0.9, 2), (0.5, 1)].map(count);
+        assert_eq!(counts, [0, 1, 2, 3, 1, 1, 0]);
+    }
+
+    #[test]
+    fn a_larger_fraction_holds_out_those_of_a_smaller_one_too() {
+        let [few, many] = [0.1, 0.3].map(|fraction| chosen(HoldOut::Fraction(fraction), 100));
+        assert!(few.iter().all(|episode| many.contains(episode)), "{few:?} are not of {many:?}");
+        assert_ne!(few, Vec::from_iter(0..10), "not the first of the file");
     }
 }

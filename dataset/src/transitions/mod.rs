@@ -15,7 +15,7 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::formats::arrays::Arrays;
 use crate::normalize::{self, Normalize};
-use crate::practice::PracticeRows;
+use crate::practice::{PracticeRows, Ranges};
 use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
 use crate::tables::maze::MazeTask;
@@ -39,6 +39,8 @@ pub struct ReadOptions {
     pub reward: RewardRule,
     /// Columns to normalize. Actions that are not normalized must be within [-1, 1].
     pub normalize: Normalize,
+    /// Steps of a chunk that will be learned; 0 if that is not known.
+    pub chunk: usize,
 }
 
 /// Transitions for training: those of a dataset, in recorded order, and experience that grows.
@@ -58,6 +60,8 @@ pub struct Transitions {
     /// True after the goal was reached in the recorded episode.
     past_goal: Vec<bool>,
     statistics: Statistics,
+    /// In the source's units.
+    ranges: Ranges,
     warnings: Vec<String>,
     reward: RewardScaling,
     scaling: Scaling,
@@ -67,7 +71,7 @@ pub struct Transitions {
 
 /// Training and validation transitions.
 pub struct Split {
-    /// Training transitions; statistics, scaling and warnings are of these alone.
+    /// Training transitions; statistics and scaling are of these alone, warnings of the whole file.
     pub training: Transitions,
     /// Validation transitions, scaled like the training ones; `None` if no episode is held out.
     pub held_out: Option<Transitions>,
@@ -114,7 +118,12 @@ impl Transitions {
     ) -> Result<Split, Problem> {
         let environment = options.environment;
         checks::accept(&recording, environment, options.normalize.actions)?;
+        let mut warnings = warnings::warnings(&recording, options);
         let (recording, held_out, episodes) = recording.hold_out(hold_out);
+        if matches!(hold_out, HoldOut::Fraction(fraction) if fraction > 0.0 && episodes.is_empty())
+        {
+            warnings.push("a single episode: none is held out".to_owned());
+        }
         if recording.transitions().next().is_none() {
             return Err(Problem::NoTransitions(recording.rows()));
         }
@@ -123,7 +132,6 @@ impl Transitions {
         let scaling = options.normalize.scaling(&recording, rewards);
         let new = |recording| Self::new(recording, environment, rewards, scaling.clone());
         let mut held_out = held_out.map(new).filter(|held_out| held_out.len() > 0);
-        let warnings = warnings::warnings(&recording, options.normalize, options.reward);
         let mut training = new(recording);
         training.warnings = warnings;
         if let Some(held_out) = &mut held_out {
@@ -139,10 +147,12 @@ impl Transitions {
         scaling: Scaling,
     ) -> Self {
         let (episodes, past_goal) = (recording.episodes(), recording.past_goal());
+        let ranges = Ranges::new(&recording);
         let dataset = Rows::new(recording, reward, &scaling);
         Self {
             experience: RwLock::new(dataset.none()),
             past_goal,
+            ranges,
             statistics: Statistics::new(environment, dataset.len(), &episodes),
             warnings: Vec::new(),
             dataset,
@@ -206,13 +216,16 @@ impl Transitions {
 
     /// Adds an episode of practice. Its rewards and numbers are transformed as the dataset's were,
     /// and actions beyond its range clipped; anything else that a dataset would be refused for is an
-    /// error.
-    pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<(), Problem> {
+    /// error. Leaves out an episode with a number far outside the dataset's range, and names it.
+    pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<Option<String>, Problem> {
         let recording = episode.recording(self.observation_dim(), self.action_dim())?;
         checks::accept(&recording, None, true)?;
-        let rows = Rows::new(recording, self.reward, &self.scaling);
-        self.experience.write().unwrap_or_else(PoisonError::into_inner).extend(&rows);
-        Ok(())
+        let far = self.ranges.far(&episode, self.names());
+        if far.is_none() {
+            let rows = Rows::new(recording, self.reward, &self.scaling);
+            self.experience.write().unwrap_or_else(PoisonError::into_inner).extend(&rows);
+        }
+        Ok(far)
     }
 
     /// Number of transitions of experience.

@@ -11,7 +11,8 @@ use crate::tables::reward::RewardScaling;
 /// Bound at which actions are clipped, within the range of tanh policies.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
 
-/// The steps that an example covers: h in a row, fewer where the episode ends before.
+/// The steps that an example covers: h in a row, fewer where the recorded episode ends before. A
+/// success that does not end it, as in OGBench's data, is passed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Window {
     /// Number k ≥ 1 of observations that are seen at a time. An episode's first observation stands
@@ -33,13 +34,13 @@ impl Window {
 pub struct Batch {
     /// s_{t−k+1} … s_t, B × k·o.
     pub observations: Vec<f32>,
-    /// a_t … a_{t+h−1}, B × h·a. After the n-th, which is the episode's last, it is repeated.
+    /// a_t … a_{t+h−1}, B × h·a. After the n-th, where the episode ends, that is repeated.
     pub actions: Vec<f32>,
     /// Σ γ^i·r_{t+i} over the n steps, B.
     pub rewards: Vec<f32>,
     /// s_{t+n−k+1} … s_{t+n}, B × k·o.
     pub next_observations: Vec<f32>,
-    /// 0 where the episode terminated, else γ^(n−1), which is 1 for a transition; B.
+    /// 0 where one of the n steps is terminal, else γ^(n−1), which is 1 for a transition; B.
     pub masks: Vec<f32>,
     /// n, B.
     pub steps: Vec<usize>,
@@ -68,13 +69,15 @@ pub(super) struct Rows {
     pub recording: Recording,
     /// Rows that start a transition.
     pub starts: Vec<u32>,
+    /// [`Recording::recording_goes_on`] of each row.
     goes_on: Vec<bool>,
 }
 
 impl Rows {
     pub fn new(mut recording: Recording, of_rewards: RewardScaling, scaling: &Scaling) -> Self {
         let starts = Vec::from_iter(recording.transitions().map(|row| row as u32));
-        let goes_on = Vec::from_iter((0..recording.rows()).map(|row| recording.goes_on(row)));
+        let goes_on =
+            Vec::from_iter((0..recording.rows()).map(|row| recording.recording_goes_on(row)));
         normalize::apply(scaling, &mut recording);
         recording.unused_next_observations = None;
         for action in &mut recording.actions {
@@ -107,14 +110,23 @@ impl Rows {
     }
 
     pub fn next(&self, index: u32) -> Option<u32> {
+        self.following(index).filter(|_| !self.terminates(index))
+    }
+
+    /// The next transition of the recorded episode, also after a success.
+    fn following(&self, index: u32) -> Option<u32> {
         let row = self.starts[index as usize];
         let is_next = self.starts.get(index as usize + 1) == Some(&(row + 1));
         (is_next && self.goes_on[row as usize]).then_some(index + 1)
     }
 
+    fn terminates(&self, index: u32) -> bool {
+        self.recording.terminals[self.starts[index as usize] as usize]
+    }
+
     pub fn next_action(&self, index: u32) -> Option<&[f32]> {
         let row = self.starts[index as usize] as usize;
-        self.goes_on[row].then(|| self.recording.action(row + 1))
+        (self.goes_on[row] && !self.terminates(index)).then(|| self.recording.action(row + 1))
     }
 
     pub fn episodes(&self) -> Vec<Range<u32>> {
@@ -132,7 +144,7 @@ impl Rows {
     /// The transition at `index` after the `length` − 1 that come before it, the first of an episode
     /// as often as it takes.
     fn history(&self, index: u32, length: usize) -> impl Iterator<Item = u32> {
-        let leads_on = |back: &u32| *back <= index && self.next(index - back).is_some();
+        let leads_on = |back: &u32| *back <= index && self.following(index - back).is_some();
         let before = (1..length as u32).take_while(leads_on).count() as u32;
         (0..length as u32).rev().map(move |back| index - back.min(before))
     }
@@ -146,10 +158,12 @@ impl Rows {
         batch.actions.extend_from_slice(all.action(row(index)));
         let (mut last, mut reward, mut discount, mut steps) =
             (index, all.rewards[row(index)], 1.0, 1);
+        let mut terminated = self.terminates(index);
         for _ in 1..window.length {
-            if let Some(next) = self.next(last) {
+            if let Some(next) = self.following(last) {
                 discount *= window.gamma;
                 reward += discount * all.rewards[row(next)];
+                terminated |= self.terminates(next);
                 (last, steps) = (next, steps + 1);
             }
             batch.actions.extend_from_slice(all.action(row(last)));
@@ -159,7 +173,7 @@ impl Rows {
             batch.next_observations.extend_from_slice(all.observation(row(seen)));
         }
         batch.next_observations.extend_from_slice(all.next_observation(row(last)));
-        batch.masks.push(if all.terminals[row(last)] { 0.0 } else { discount });
+        batch.masks.push(if terminated { 0.0 } else { discount });
         batch.steps.push(steps);
     }
 }

@@ -76,7 +76,7 @@ fn an_episode_after_one_that_reached_its_goal_is_one_of_the_recording() {
 #[test]
 fn rows_with_next_observations_of_their_own_follow_one_another_where_these_say_so() {
     let mut recording = recording(&[Transition; 4]);
-    recording.next_observations = Some(vec![1.0, 9.0, 3.0, 4.0]);
+    recording.store_next(vec![1.0, 9.0, 3.0, 4.0]);
     let transitions = transitions(recording);
     assert_eq!(transitions.episodes(), [0..2, 2..4]);
     assert_eq!((transitions.next_action(1), transitions.next_action(3)), (None, None));
@@ -116,6 +116,28 @@ fn windows_of_steps_end_with_their_episode() {
     let next = [[11.0, 12.0, 13.0], [3.0, 4.0, 5.0], [12.0, 13.0, 14.0]].concat();
     assert_eq!((batch.observations, batch.next_observations), (of_three, next));
     assert_eq!(batch.rewards, [3.0, 4.0, 8.0]);
+}
+
+/// As OGBench's data, and as QC's authors cut it: windows from before, in and after a success.
+#[test]
+fn windows_go_over_a_success_that_does_not_end_the_episode() {
+    let mut recording = recording(&[Transition, Transition, Transition, Transition, LastState]);
+    (recording.terminals[1], recording.ends[3]) = (true, true);
+    let transitions = transitions(recording);
+    assert_eq!(transitions.episodes(), [0..2, 2..4]);
+    let mut batch = Batch::default();
+    let window = Window { history: 2, length: 3, gamma: 0.5 };
+    transitions.gather_windows(&[0, 1, 2], window, &mut batch);
+    let expected = Batch {
+        observations: vec![0.0, 0.0, 0.0, 1.0, 1.0, 2.0],
+        actions: [[0.0, 0.01, 0.02], [0.01, 0.02, 0.03], [0.02, 0.03, 0.03]].concat(),
+        rewards: vec![1.0, 2.75, 3.5],
+        next_observations: vec![2.0, 3.0, 3.0, 4.0, 3.0, 4.0],
+        masks: vec![0.0, 0.0, 0.5],
+        steps: vec![3, 3, 2],
+        size: 3,
+    };
+    assert_eq!(batch, expected);
 }
 
 #[test]
@@ -181,4 +203,58 @@ fn experience_that_a_dataset_would_be_refused_for_is_refused() {
         assert!(problem.contains(expected), "{problem}");
     }
     assert_eq!(transitions.experience_len(), 0);
+}
+
+#[test]
+fn an_episode_with_a_number_far_outside_the_dataset_s_range_is_left_out() {
+    // Observations and rewards from 0 to 6, actions from 0 to 0.06.
+    let mut recording = d4rl();
+    recording.names.observations = vec!["elbow".to_owned()];
+    let transitions = transitions(recording);
+    let add = |observations: &[f32], actions: &[f32], rewards: &[f32]| {
+        let episode = PracticeRows { observations, actions, rewards, terminated: true };
+        transitions.add_episode(episode).unwrap()
+    };
+    let range = "far outside the dataset's range of";
+    for (far, expected) in [
+        (
+            add(&[0.0, 0.0, 1e30], &[0.0; 2], &[0.0; 2]),
+            format!("`observations`, row 2, column 0 (elbow): 1e30, {range} 0 to 6"),
+        ),
+        (
+            add(&[-6001.0, 0.0], &[0.0], &[0.0]),
+            format!("`observations`, row 0, column 0 (elbow): -6.001e3, {range} 0 to 6"),
+        ),
+        (
+            add(&[0.0; 2], &[61.0], &[0.0]),
+            format!("`actions`, row 0, column 0: 6.1e1, {range} 0 to 0.06"),
+        ),
+        (
+            add(&[0.0; 3], &[0.0; 2], &[0.0, 6007.0]),
+            format!("`rewards`, row 1, column 0: 6.007e3, {range} 0 to 6"),
+        ),
+    ] {
+        assert_eq!(far, Some(format!("array {expected}")));
+    }
+    assert_eq!(transitions.experience_len(), 0);
+    assert_eq!(add(&[-5999.0, 6005.0], &[60.0], &[6005.0]), None);
+    assert_eq!((transitions.experience_len(), transitions.experience_episodes().len()), (1, 1));
+}
+
+#[test]
+fn a_column_that_hardly_moved_may_move_in_practice() {
+    let mut recording = d4rl();
+    for (row, value) in recording.observations.iter_mut().enumerate() {
+        *value = 20.0 + 1e-4 * row as f32;
+    }
+    recording.rewards.fill(0.0);
+    let transitions = transitions(recording);
+    let is_left_out = |observation: f32, reward: f32| {
+        let observations = &[20.0, observation];
+        let episode =
+            PracticeRows { observations, actions: &[0.0], rewards: &[reward], terminated: true };
+        transitions.add_episode(episode).unwrap().is_some()
+    };
+    assert!(!is_left_out(-50.0, 999.0));
+    assert!(is_left_out(21_000.0, 0.0) && is_left_out(20.0, -1001.0));
 }

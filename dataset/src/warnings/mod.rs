@@ -4,39 +4,49 @@
 mod copied;
 mod ends;
 mod late;
+mod lengths;
 mod resets;
 mod rest;
 mod rewards;
 mod sizes;
 mod unwritten;
 
-use crate::normalize::Normalize;
+use crate::checks;
 use crate::recording::Recording;
 use crate::tables::reward::RewardRule;
+use crate::transitions::ReadOptions;
 
 /// Number of evenly spaced rows that are sampled.
 const ENOUGH: usize = 20_000;
 
-pub(crate) fn warnings(
-    recording: &Recording,
-    normalize: Normalize,
-    rule: RewardRule,
-) -> Vec<String> {
-    [of_ends(recording), of_numbers(recording, normalize, rule)].concat()
+/// All that is doubtful in the whole recording, for whatever program reads it.
+pub(crate) fn warnings(recording: &Recording, run: &ReadOptions) -> Vec<String> {
+    let outside = checks::actions_outside(recording).filter(|_| !run.normalize.actions);
+    let outside = outside.map(|problem| format!("{problem}; {}", problem.hint()));
+    let doubts = recording.doubts.iter().cloned().chain(of_ends(recording));
+    let doubts = doubts.chain(lengths::chunks(recording, run.chunk)).chain(outside);
+    doubts.chain(of_numbers(recording, run)).collect()
 }
 
-pub(crate) fn of_ends(recording: &Recording) -> Vec<String> {
-    match ends::meaning(recording) {
-        Some(warning) => vec![warning],
-        None => resets::out_of_step(recording),
+fn of_ends(recording: &Recording) -> Vec<String> {
+    if let Some(warning) = ends::meaning(recording).or_else(|| lengths::single_steps(recording)) {
+        return vec![warning];
     }
+    let mut warnings = resets::out_of_step(recording);
+    if warnings.is_empty() {
+        warnings.extend(match checks::strays(recording) {
+            Some((problem, is_refused)) => {
+                (!is_refused).then(|| format!("{problem}; is a timeout missing?"))
+            }
+            None => resets::missed(recording),
+        });
+    }
+    warnings.extend(lengths::time_limit(recording));
+    warnings
 }
 
-pub(crate) fn of_numbers(
-    recording: &Recording,
-    normalize: Normalize,
-    rule: RewardRule,
-) -> Vec<String> {
+fn of_numbers(recording: &Recording, run: &ReadOptions) -> Vec<String> {
+    let (normalize, rule) = (run.normalize, run.reward);
     let copied = copied::actions(recording);
     let rest = rest::observations(recording);
     let is_other = copied.is_some() || rest.is_some();

@@ -1,8 +1,11 @@
-//! Flags one row before or after the reset they should mark.
+//! Flags one row before or after the reset they should mark, and resets that no flag marks.
 //!
 //! Resets are among the longest steps, with each dimension scaled by its root mean square step.
 //! Near a correct flag, the longest of three neighboring steps is the flag's.
 
+use super::rest;
+use crate::checks;
+use crate::error::RowProblem;
 use crate::recording::{Recording, RowKind};
 
 /// Candidates for resets per end of an episode.
@@ -14,18 +17,28 @@ const FEWEST: usize = 5;
 const SMALLEST_SHARE: usize = 4;
 /// Inverse of the largest fraction of resets exactly at a flag.
 const EXCEPTION: usize = 10;
+/// Minimum ratio of a missed reset's squared step to those beside it.
+const ALONE: f64 = 4.0;
+/// Inverse of the largest fraction of steps as long as a reset, if resets are visible.
+const COMMON: usize = 4;
+/// Largest displacement of a maze robot in a step of 0.1 s, meters.
+const LONGEST_STEP: f32 = 1.0;
 
-pub(crate) fn out_of_step(recording: &Recording) -> Vec<String> {
+/// Rows after which a reset is expected.
+fn ends(recording: &Recording) -> Vec<usize> {
     let is_last = |row: usize| recording.kinds[row] == RowKind::LastState;
     // Groups per episode cannot be shifted; a final state ends its episode, not the row before.
     let inner = 1..recording.rows().saturating_sub(2);
     let inner = inner.filter(|row| recording.parts.is_empty() && !is_last(row + 1));
-    let ends = inner.filter(|&row| recording.ends[row] || is_last(row));
-    let ends: Vec<usize> = ends.collect();
+    inner.filter(|&row| recording.ends[row] || is_last(row)).collect()
+}
+
+pub(super) fn out_of_step(recording: &Recording) -> Vec<String> {
+    let ends = ends(recording);
     if ends.is_empty() {
         return Vec::new();
     }
-    let lengths = lengths(recording);
+    let lengths = Vec::from_iter(lengths(recording).into_iter().map(|[length, _]| length));
     let longest = (CANDIDATES * ends.len()).min(lengths.len() / STEPS_BETWEEN_RESETS);
     let mut sorted = lengths.clone();
     sorted.sort_unstable_by(f64::total_cmp);
@@ -65,8 +78,51 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
     })
 }
 
-/// Squared length of each step, with each dimension scaled by its root mean square step.
-fn lengths(recording: &Recording) -> Vec<f64> {
+/// Steps inside episodes that are as long as those at their ends, and alone so.
+pub(super) fn missed(recording: &Recording) -> Option<String> {
+    let leap = |&row: &usize| {
+        let (from, to) = (recording.observation(row), recording.observation(row + 1));
+        let apart = from.iter().zip(to).take(2).map(|(from, to)| (to - from).powi(2));
+        apart.sum::<f32>().sqrt() > LONGEST_STEP
+    };
+    let leaps = recording.inside().filter(|row| recording.goal && leap(row));
+    let leaps = leaps.map(|row| (row, RowProblem::Leap(LONGEST_STEP)));
+    let problem = checks::first(recording, "observations", leaps).or_else(|| {
+        let resets = unmarked(recording).into_iter().map(|row| (row, RowProblem::Reset));
+        checks::first(recording, "observations", resets)
+    })?;
+    Some(format!("{problem}; are timeouts missing, or out of step with the resets?"))
+}
+
+/// Rows whose step is as long as those at ends, far longer than those beside it, and rarely so.
+fn unmarked(recording: &Recording) -> Vec<usize> {
+    let (ends, lengths) = (ends(recording), lengths(recording));
+    // A sensor slower than control leaps, too.
+    if ends.len() < FEWEST || rest::observations(recording).is_some() {
+        return Vec::new();
+    }
+    let mut resets = Vec::from_iter(ends.iter().map(|&row| lengths[row][0]));
+    resets.sort_unstable_by(f64::total_cmp);
+    let limit = resets[resets.len() / 4];
+    let is_inside = |row: usize| recording.is_step(row) && !recording.ends[row];
+    let is_longer = |row: usize, beside: usize| {
+        !is_inside(beside) || (0..2).all(|i| lengths[row][i] > ALONE * lengths[beside][i])
+    };
+    let is_alone = |row: usize| is_longer(row, row - 1) && is_longer(row, row + 1);
+    let mut leaps = Vec::from_iter(recording.inside().filter(|&row| lengths[row][0] >= limit));
+    let is_visible = leaps.len() * COMMON <= recording.inside().count();
+    let last = lengths.len() - 1;
+    // A crash comes right before an end.
+    leaps.retain(|&row| (1..last).contains(&row) && is_inside(row + 1) && is_alone(row));
+    match is_visible && leaps.len() >= FEWEST && leaps.len() * EXCEPTION >= ends.len() {
+        true => leaps,
+        false => Vec::new(),
+    }
+}
+
+/// Squared length of each step, with each dimension scaled by its root mean square step: of all
+/// dimensions, and of all but the one that moves most, which may be an angle that wraps around.
+fn lengths(recording: &Recording) -> Vec<[f64; 2]> {
     let square = |row: usize, i: usize| {
         let (from, to) = (recording.observation(row)[i], recording.observation(row + 1)[i]);
         let square = (f64::from(to) - f64::from(from)).powi(2);
@@ -76,7 +132,11 @@ fn lengths(recording: &Recording) -> Vec<f64> {
     let mean = |i: usize| steps.clone().map(|row| square(row, i)).sum::<f64>() / steps.len() as f64;
     let moving = (0..recording.observation_dim).map(|i| (i, mean(i)));
     let moving = Vec::from_iter(moving.filter(|(_, mean)| *mean > 0.0));
-    let length = |row| moving.iter().map(|&(i, mean)| square(row, i) / mean).sum();
+    let length = |row| {
+        let scaled = moving.iter().map(|&(i, mean)| square(row, i) / mean);
+        let (sum, most) = scaled.fold((0.0, 0.0), |(sum, most), x| (sum + x, f64::max(most, x)));
+        [sum, sum - most]
+    };
     steps.clone().map(length).collect()
 }
 

@@ -131,6 +131,15 @@ fn an_array_that_is_not_what_it_must_be() {
 }
 
 #[test]
+fn rows_and_columns_that_are_swapped() {
+    let (_folder, path) = subject();
+    replace(&path, "actions", &[3, ROWS], &[0.5f32; ROWS * 3]);
+    assert_refused(&path, Some(hopper()), "but must have 20 rows", "f[n][()].T");
+    replace(&path, "actions", &[ROWS + 1, 3], &[0.5f32; (ROWS + 1) * 3]);
+    assert_refused(&path, Some(hopper()), "but must have 20 rows", "docs/data.md");
+}
+
+#[test]
 fn a_number_that_is_not_what_it_must_be() {
     let mut unknown = [0.5f32; ROWS * 11];
     unknown[7 * 11 + 3] = f32::NAN;

@@ -1,6 +1,6 @@
-use quad_dataset::{Arrays, RewardRule, environment, inspect};
+use quad_dataset::{Arrays, RewardRule, Transitions, environment, inspect};
 
-use crate::{hopper, peers, read, scratch, steps, write, written};
+use crate::{hopper, options, peers, read, scratch, steps, write, written};
 
 fn robot() -> Arrays {
     let row = |row: usize| Vec::from_iter((0..10).map(|i| i == row));
@@ -67,16 +67,17 @@ fn everything_that_is_wrong_is_named_at_once() {
     (robot.actions[4], robot.rewards[8]) = (7.5, f32::NAN);
     write(&path, &robot);
     let inspection = inspect(&path, Some(hopper())).unwrap();
-    assert_eq!(
-        inspection.problems,
-        [
-            "`observations` has 3 numbers a row, but `hopper` has 11",
-            "`actions` has 2 numbers a row, but `hopper` has 3",
-            "array `observations`, row 5: NaN is not a finite float32 (2 such rows)",
-            "array `rewards`, row 8: NaN is not a finite float32",
-            "array `actions`, row 2: the action 7.5 is outside [-1, 1]; `learner train --normalize actions` trains on it",
-        ]
-    );
+    let expected = [
+        "`observations` has 3 numbers a row, but `hopper` has 11; choose a dataset of that environment",
+        "`actions` has 2 numbers a row, but `hopper` has 3; choose",
+        "array `observations`, row 5: NaN is not a finite float32 (2 such rows); leave out or repair",
+        "array `rewards`, row 8: NaN is not a finite float32; leave",
+        "array `actions`, row 2: the action 7.5 is outside [-1, 1]; `learner train --normalize actions` trains on them",
+    ];
+    assert_eq!(inspection.problems.len(), expected.len());
+    for (problem, start) in inspection.problems.iter().zip(expected) {
+        assert!(problem.starts_with(start), "{problem}, not {start}");
+    }
     assert!(inspection.refused && inspection.to_string().contains("training refuses this dataset"));
     let returns = (inspection.mean_return, inspection.max_return);
     assert_eq!(returns, (14.0, 22.0), "the third episode has no return");
@@ -89,7 +90,8 @@ fn an_empty_file_is_described_too() {
     write(&path, &steps(0, 3, 2));
     let inspection = inspect(&path, None).unwrap();
     assert_eq!((inspection.transitions, inspection.episodes, inspection.refused), (0, 0, true));
-    assert_eq!(inspection.problems[0], "0 rows, of which none makes a transition");
+    let [problem] = &inspection.problems[..] else { panic!("{:?}", inspection.problems) };
+    assert!(problem.starts_with("0 rows, of which none makes a transition; record more"));
     assert!(serde_json::to_value(&inspection).unwrap()["mean_return"].is_null());
     assert!(inspection.to_string().contains("0 rows"));
 }
@@ -101,6 +103,8 @@ fn missing_timeouts_and_observations_that_do_not_follow() {
     for (variant, problem) in [("v0", v0), ("v1", v1)] {
         let Some((_folder, path)) = written("generate", variant, "d4rl.hdf5") else { return };
         assert_eq!(inspect(&path, Some(hopper())).unwrap().problems, [problem]);
+        let options = options(Some(hopper()), hopper().reward);
+        assert_eq!(Transitions::read(&path, &options).unwrap().warnings(), [problem]);
     }
     let (_folder, path) = scratch("antmaze.hdf5");
     let umaze = environment::find("antmaze-umaze").unwrap();
@@ -111,5 +115,19 @@ fn missing_timeouts_and_observations_that_do_not_follow() {
     let inspection = inspect(&path, Some(umaze)).unwrap();
     assert_eq!(inspection.scores.unwrap().mean_score, 80.0);
     let [problem] = &inspection.problems[..] else { panic!("{:?}", inspection.problems) };
+    let options = options(Some(umaze), umaze.reward);
+    assert_eq!(Transitions::read(&path, &options).unwrap().warnings(), inspection.problems);
     assert!(problem.contains("more than 1 m away") && problem.contains("out of step"), "{problem}");
+}
+
+#[test]
+fn what_ends_an_endless_episode_is_said() {
+    let (_folder, path) = scratch("long.hdf5");
+    let mut endless = robot();
+    endless.terminals.fill(false);
+    endless.timeouts.fill(false);
+    write(&path, &endless);
+    let problems = inspect(&path, None).unwrap().problems;
+    let hint = "one endless episode; set `timeouts` to 1 at the last row of each episode";
+    assert!(problems[0].contains(hint), "{problems:?}");
 }

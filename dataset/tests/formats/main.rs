@@ -8,8 +8,7 @@ use hdf5::H5Type;
 use ndarray::ArrayViewD;
 use quad_dataset::benchmarks::relabeling;
 use quad_dataset::{
-    Arrays, Batch, DatasetError, EnvironmentSpec, Normalize, ReadOptions, RewardRule, Transitions,
-    environment,
+    Arrays, Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Transitions, environment,
 };
 use tempfile::{TempDir, tempdir};
 
@@ -49,7 +48,7 @@ fn scratch(name: &str) -> (TempDir, PathBuf) {
 
 fn options(environment: Environment, reward: RewardRule) -> ReadOptions {
     let task = environment.and_then(|environment| relabeling(&environment.name));
-    ReadOptions { environment, task, reward, normalize: Normalize::default() }
+    ReadOptions { environment, task, reward, ..ReadOptions::default() }
 }
 
 fn read(path: &Path, environment: Environment, reward: RewardRule) -> Transitions {

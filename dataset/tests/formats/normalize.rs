@@ -65,11 +65,16 @@ fn rows_that_are_not_learned_from_do_not_count() {
     let mut arrays = steps(4, 1, 1);
     arrays.observations = vec![0.0, 100.0, 2.0, 77.0];
     arrays.timeouts[1] = true;
+    arrays.actions = vec![0.0, -30.0, 10.0, 50.0];
     write(&path, &arrays);
     let options = ReadOptions { normalize: BOTH, ..ReadOptions::default() };
     let transitions = Transitions::read(&path, &options).unwrap();
     let affine = transitions.scaling().observations.clone().unwrap();
     assert_eq!((affine.offset, affine.scale), (vec![1.0], vec![1.0]));
+    // Critics see the actions of the timeout and of the last row, as those that follow.
+    let affine = transitions.scaling().actions.clone().unwrap();
+    assert_eq!((affine.offset, affine.scale), (vec![10.0], vec![40.0]));
+    assert_eq!(transitions.next_action(0).unwrap(), [-1.0 + 1e-5]);
 }
 
 #[test]

@@ -1,6 +1,8 @@
 use std::path::Path;
 
-use quad_dataset::{Arrays, HoldOut, Names, RewardRule, Transitions, inspect, write_own};
+use quad_dataset::{
+    Arrays, HoldOut, Inspection, Names, RewardRule, Transitions, inspect, write_own,
+};
 use tempfile::tempdir;
 
 use crate::{all, assert_error, assert_refused, options, peers, peers_in, read, scratch, try_read};
@@ -122,6 +124,43 @@ fn arrays_are_written_and_read_again() {
     write_own(&path, small, few).unwrap();
     let message = "the attribute `observation_names` has 2 texts for 3 numbers";
     assert_refused(&path, None, message, "docs/data.md");
+}
+
+#[test]
+fn names_that_place_no_number_are_refused() {
+    let (folder, path) = scratch("own.hdf5");
+    let small = Arrays { actions: vec![0.25; 12], ..arrays() };
+    for (names, message) in [
+        (["x", "g", "g"], "the attribute `observation_names` has the name \"g\" for columns 1, 2"),
+        (["x", " ", "z"], "the attribute `observation_names` has the name \" \" for column 1"),
+        (
+            ["x", "y", "a\nb"],
+            "the attribute `observation_names` has the name \"a\\nb\" for column 2",
+        ),
+    ] {
+        let observations = names.map(str::to_owned).to_vec();
+        let names = Names { observations, actions: Vec::new() };
+        let error = write_own(&path, small.clone(), names).unwrap_err();
+        assert_error(&error, message, "one of its own, such as left_gripper and right_gripper");
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    // One name may be of an observation and of an action.
+    let names = |name: &str| vec!["x".to_owned(), name.to_owned()];
+    let own = Names {
+        observations: [names("y"), names("z")].concat()[1..].to_vec(),
+        actions: names("y"),
+    };
+    write_own(&path, small, own).unwrap();
+    try_read(&path, None).unwrap();
+    // Of a program that does not check them.
+    let mut bytes = std::fs::read(&path).unwrap();
+    let place = bytes.windows(2).rposition(|bytes| bytes == b"x\0").unwrap();
+    bytes[place] = b'y';
+    std::fs::write(&path, bytes).unwrap();
+    let message = "has the name \"y\" for columns 0, 1";
+    assert_refused(&path, None, message, "one of its own");
+    let Inspection { refused, problems, .. } = inspect(&path, None).unwrap();
+    assert!(refused && problems[0].contains(message), "{problems:?}");
 }
 
 #[test]

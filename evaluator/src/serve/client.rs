@@ -1,6 +1,6 @@
 //! An evaluator's side of one run: jobs claimed, results owed, the learner process followed.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -13,7 +13,7 @@ use zenoh::Wait;
 use zenoh::liveliness::LivelinessToken;
 
 use super::connection::{ANSWER_TIMEOUT, Connection};
-use super::delivery::{Early, Owed, Parcel};
+use super::delivery::{Owed, Parcel};
 use super::discovery::{Found, RunKey};
 use super::query::{QueryError, blocking};
 use super::scheduler::Turn;
@@ -28,6 +28,8 @@ const LEAVE: Duration = Duration::from_secs(2);
 const LEAVE_EPISODE: Duration = Duration::from_secs(6);
 /// Pause of a leaving evaluator after a learner's error.
 const RETRY: Duration = Duration::from_millis(100);
+/// Most jobs whose scores are kept for a step that the learner is to train to again.
+const MOST_EARLY: usize = 64;
 /// Most characters of a reason that the evaluator sends; the learner accepts no large messages.
 const MAX_REASON_LEN: usize = 1000;
 
@@ -49,7 +51,8 @@ pub struct RunClient {
     /// Number of the claim that has no answer yet.
     attempt: Option<u64>,
     claimed: Option<Claimed>,
-    early: Early,
+    /// Jobs whose scores the learner takes when it has trained to their step again.
+    early: VecDeque<Claimed>,
     pub turn: Turn,
     /// Time of the learner's disappearance.
     pub gone: Option<Instant>,
@@ -82,7 +85,7 @@ impl RunClient {
             listener,
             attempt: None,
             claimed: None,
-            early: Early::default(),
+            early: VecDeque::new(),
             turn: Turn::new(Instant::now()),
             gone: None,
             last_warning: String::new(),
@@ -210,43 +213,30 @@ impl RunClient {
             self.return_job(Some(format!("it {refused}")));
             return self.hand_back(timeout).await;
         }
-        // The job of scores that come too early was of an earlier process.
-        if let (Answer::NotYet, Some(Claimed { owed: Some(Owed::Scores(report)), .. })) =
-            (answer, self.claimed.take())
-        {
-            info!(%run, step, "the learner is to train to that step again; the scores wait for it");
-            self.keep_early(report);
+        let claimed = self.claimed.take();
+        if let Answer::NotYet = answer {
+            debug!(%run, step, "the scores wait until the learner has trained to that step again");
+            self.early.extend(claimed);
+            if self.early.len() > MOST_EARLY {
+                self.early.pop_front();
+                connection.metrics.job("abandoned");
+            }
         }
         self.last_warning.clear();
         self.turn = Turn::new(Instant::now());
         Ok(())
     }
 
-    /// Delivers a report that came too early: one of `job`'s evaluation, or else the next. False
-    /// if there is none.
-    pub async fn deliver_early(&mut self, job: Option<&Job>) -> Result<bool, QueryError> {
-        let report = match job {
-            Some(job) => self.early.next_like(job),
-            None => self.early.next(),
-        };
-        let Some(report) = report else { return Ok(false) };
-        let answer = deliver_scores(&self.connection, &report, ANSWER_TIMEOUT).await;
-        match &answer {
-            Ok(Answer::Recorded) => {}
-            Ok(Answer::Refused(refused)) => {
-                warn!(run = %report.run, step = report.step, "the learner {refused}");
-                self.connection.metrics.job("abandoned");
-            }
-            Ok(Answer::NotYet) | Err(_) => self.keep_early(report),
-        }
-        answer.map(|_| true)
+    /// Takes up a job again whose scores came too early. False if there is none.
+    pub fn take_early(&mut self) -> bool {
+        self.claimed = self.early.pop_front();
+        self.has_job()
     }
 
-    fn keep_early(&mut self, report: ScoreReport) {
-        if let Some(oldest) = self.early.keep(report) {
-            warn!(run = %oldest.run, step = oldest.step, "too many scores wait for the learner; the oldest are dropped");
-            self.connection.metrics.job("abandoned");
-        }
+    /// True if this evaluator has scores of the evaluation that `job` is a part of.
+    pub fn has_scores_like(&self, job: &Job) -> bool {
+        let early = |kept: &Claimed| (kept.job.step, kept.job.weights) == (job.step, job.weights);
+        job.practice.is_none() && self.early.iter().any(early)
     }
 
     /// Hands back the claimed job, which this evaluator could not run; if there is no answer,
@@ -311,13 +301,12 @@ impl RunClient {
     }
 
     /// Stops serving the run, and drops results that were not acknowledged.
-    pub fn give_up(mut self) {
+    pub fn give_up(self) {
         let Connection { run, metrics, .. } = &self.connection;
         self.snapshots.forget(&self.key);
         let claimed = self.claimed.filter(|claimed| claimed.owed.is_some());
-        let early = std::iter::from_fn(|| self.early.next()).map(|report| report.step);
-        for step in claimed.map(|claimed| claimed.job.step).into_iter().chain(early) {
-            warn!(%run, step, "the learner did not return; its results are dropped");
+        for Claimed { job, .. } in claimed.into_iter().chain(self.early) {
+            warn!(%run, step = job.step, "the learner did not return; its results are dropped");
             metrics.job("abandoned");
         }
     }

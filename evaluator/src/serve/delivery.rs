@@ -1,7 +1,5 @@
 //! Results of a job, which the evaluator owes to the learner until they are acknowledged.
 
-use std::collections::VecDeque;
-
 use quad_protocol::{
     CodecError, Episode, EpisodeScore, Hash, Job, Message, Name, Piece, ScoreReport, encode,
 };
@@ -114,38 +112,5 @@ impl Parcel {
             true => Ok(()),
             false => Err(format!("it wants the episode with seed {seed} from byte {offset} again")),
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use quad_protocol::Exploration;
-
-    use super::super::fixtures::job;
-    use super::*;
-
-    fn report(step: u64) -> ScoreReport {
-        let [by, precision] = ["one", "f32"].map(|name| Name::new(name).unwrap());
-        ScoreReport { step, ..ScoreReport::new(&job(), by, precision, Vec::new()) }
-    }
-
-    #[test]
-    fn early_scores_take_turns_and_go_first_when_their_evaluation_has_a_job() {
-        let mut early = Early::default();
-        (0..Early::MOST as u64).for_each(|step| assert!(early.keep(report(step)).is_none()));
-        let oldest = early.keep(report(1000)).unwrap();
-        assert_eq!(oldest.step, 0, "they are bounded");
-        let first = early.next().unwrap();
-        assert_eq!(first.step, 1);
-        early.keep(first);
-
-        let like = |step, weights: &[u8]| Job { step, weights: Hash::of(weights), ..job() };
-        assert!(early.next_like(&like(7, b"others")).is_none());
-        let practice = Some(Exploration::Uniform);
-        assert!(early.next_like(&Job { practice, ..like(7, b"") }).is_none());
-        assert_eq!(early.next_like(&like(7, b"")).unwrap().step, 7);
-        assert!(early.next_like(&like(7, b"")).is_none(), "it was taken");
-        assert_eq!(std::iter::from_fn(|| early.next()).last().unwrap().step, 1);
-        assert!(early.is_empty());
     }
 }

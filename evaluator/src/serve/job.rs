@@ -154,6 +154,7 @@ fn run(
 #[cfg(test)]
 mod tests {
     use std::sync::Mutex;
+    use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
     use quad_policy::{DiffusionShape, MlpConfig, Precision, load_policy};
     use quad_protocol::{Exploration, Name, decode};
@@ -161,7 +162,7 @@ mod tests {
     use super::super::delivery::Owed;
     use super::super::fixtures::{self, file};
     use super::*;
-    use crate::sim::{Environment, EnvironmentError, Simulations};
+    use crate::sim::{Environment, EnvironmentError, Simulations, Step};
 
     fn job(episodes: u64) -> Job {
         let mut job = fixtures::job();
@@ -228,6 +229,66 @@ mod tests {
         let error = run_for(&renamed, &job, Duration::ZERO).unwrap_err();
         let too_long = JobError::TooLong.to_string();
         assert_eq!(error.to_string(), too_long);
+    }
+
+    /// Counts the episodes in which a person may act.
+    #[derive(Default)]
+    struct Watched(Arc<AtomicU32>);
+
+    impl Environments for Watched {
+        fn names(&self) -> Vec<String> {
+            vec!["my-robot".to_owned()]
+        }
+
+        fn sizes(&self, _: &str) -> Option<(usize, usize)> {
+            None
+        }
+
+        fn make(&self, name: &str, _: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+            Ok(Box::new(OneStep { name: name.to_owned(), allowed: self.0.clone() }))
+        }
+    }
+
+    struct OneStep {
+        name: String,
+        allowed: Arc<AtomicU32>,
+    }
+
+    impl Environment for OneStep {
+        fn name(&self) -> &str {
+            &self.name
+        }
+
+        fn allow_interventions(&mut self) {
+            self.allowed.fetch_add(1, Relaxed);
+        }
+
+        fn reset(&mut self, _: u64) -> Result<(), EnvironmentError> {
+            Ok(())
+        }
+
+        fn step(&mut self, _: &[f32]) -> Result<Step, EnvironmentError> {
+            Ok(Step { truncated: true, ..Step::default() })
+        }
+
+        fn observation(&self) -> &[f64] {
+            &[0.0; 11]
+        }
+
+        fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+            Ok(episode_return)
+        }
+    }
+
+    #[test]
+    fn an_environment_is_told_of_practice_in_which_a_person_may_act() {
+        let watched = Watched::default();
+        let mut job = job(1);
+        for (practice, allowed) in [(None, 0), (Some(Exploration::Uniform), 1)] {
+            job.practice = practice;
+            run_for(&watched, &job, Job::LONGEST).unwrap();
+            assert_eq!(watched.0.load(Relaxed), allowed);
+        }
     }
 
     #[test]

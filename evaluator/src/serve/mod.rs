@@ -86,6 +86,9 @@ pub struct ServeArgs {
     /// Address of /metrics and /healthz; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address)]
     pub http: Option<SocketAddr>,
+    /// Further names of that address, such as a service's: evaluator,evaluator.lab.svc.cluster.local
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    pub http_hosts: Vec<String>,
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
     pub name: Option<Name>,
@@ -130,7 +133,8 @@ async fn serve_until_stopped(
     let mut server = None;
     if let Some(address) = args.http {
         let (registry, health) = (metrics.registry.clone(), health.clone());
-        let serving = serve_metrics(address, registry, health, Default::default()).await;
+        let hosts = &args.http_hosts;
+        let serving = serve_metrics(address, hosts, registry, health, Default::default()).await;
         let serving = serving.hint_of(ListenError::hint)?;
         info!("metrics at http://{}/metrics", serving.address);
         server = Some(serving);

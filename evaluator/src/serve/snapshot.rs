@@ -27,11 +27,13 @@ pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
     (run, incarnation, step, hash) == (&job.run, &job.incarnation, &job.step, &job.weights)
 }
 
+type Kept = VecDeque<(RunKey, Arc<Snapshot>)>;
+
 /// The newest snapshot of each run, as far as memory allows. Clones share them.
 #[derive(Clone, Default)]
 pub struct Snapshots {
     /// In the order of arrival.
-    kept: Arc<Mutex<VecDeque<(RunKey, Arc<Snapshot>)>>>,
+    kept: Arc<Mutex<Kept>>,
     arrived: Arc<Notify>,
 }
 
@@ -64,7 +66,7 @@ impl Snapshots {
         self.arrived.notified().await;
     }
 
-    fn lock(&self) -> MutexGuard<'_, VecDeque<(RunKey, Arc<Snapshot>)>> {
+    fn lock(&self) -> MutexGuard<'_, Kept> {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -128,10 +128,12 @@ impl Worker {
 /// Runs one job, if the last one is acknowledged, and delivers its results.
 async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
     if !client.has_job() {
-        client.deliver_early(None).await?;
+        if client.take_early() {
+            client.deliver(ANSWER_TIMEOUT).await?;
+        }
         let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };
-        if client.deliver_early(Some(&job)).await? {
-            // What is left of it comes back with the next claim.
+        if client.has_scores_like(&job) {
+            // Its evaluation has opened: they go first. What they leave of the job comes again.
             return Ok(client.deliver(ANSWER_TIMEOUT).await?);
         }
         match evaluator.evaluate(&job, client).await {

@@ -13,9 +13,13 @@ pub struct Step {
     pub truncated: bool,
     /// The action that a person took in place of the given one, as long as that.
     pub intervention: Option<Vec<f32>>,
+    /// The given action within the environment's limits, if it lies beyond them.
+    pub clipped: Option<Vec<f32>>,
 }
 
 pub trait Environment: Send {
+    fn name(&self) -> &str;
+
     /// Says before [`reset`](Self::reset) that the episode is practice, in which a person may act.
     fn allow_interventions(&mut self) {}
 
@@ -62,6 +66,19 @@ pub enum EnvironmentError {
          `reset` gets options={{\"practice\": True}}"
     )]
     Intervention(u64),
+    #[error(
+        "the environment \"{name}\" gave {array}[{index}] = {value} after step {step} of the episode with seed {seed}: does its \
+         simulation diverge, or a sensor fail?"
+    )]
+    Unusable {
+        name: String,
+        array: &'static str,
+        index: usize,
+        value: f64,
+        /// Steps before it; 0 after a reset.
+        step: u32,
+        seed: u64,
+    },
     /// No learner would count the episode.
     #[error(
         "the {what} of the episode with seed {seed} is {value} after {length} steps, not a finite number up to {:e}",

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::{Episode, EpisodeScore, Hash, Name};
 use rayon::prelude::*;
+use tracing::warn;
 
 use super::environment::{Environment, EnvironmentError};
 
@@ -74,7 +75,7 @@ impl<S> Rollout<S> {
     }
 
     /// Records the episodes, which have just started, as experience with the snapshot of this step
-    /// and hash, by a policy with this arithmetic.
+    /// and hash, by a policy with this arithmetic. They end before a step that cannot be learned from.
     pub fn recording(mut self, step: u64, weights: Hash, precision: &Name) -> Self {
         for live in &mut self.live {
             let seed = live.score.seed;
@@ -115,8 +116,9 @@ impl<S> Rollout<S> {
 
     fn observe(&mut self) -> Result<(), EnvironmentError> {
         self.observations.clear();
-        for Live { environment, .. } in &self.live {
-            self.observations.extend(observe(&**environment, self.observation_dim)?);
+        for live in &self.live {
+            self.observations.extend(observe(&*live.environment, self.observation_dim)?);
+            live.check_observation()?;
         }
         Ok(())
     }
@@ -130,8 +132,11 @@ impl<S> Rollout<S> {
                 let score = episode.score()?;
                 if let Some(record) = &mut episode.record {
                     record.score = score;
-                    let last = observe(&*episode.environment, self.observation_dim)?;
-                    record.observations.extend(last);
+                    // Before a step that was cut off, it is there already.
+                    if record.observations.len() == record.rewards.len() * self.observation_dim {
+                        let last = observe(&*episode.environment, self.observation_dim)?;
+                        record.observations.extend(last);
+                    }
                 }
                 self.ended.push((episode.index, score, episode.record));
             }
@@ -176,18 +181,24 @@ impl Live {
             record.observations.extend(observation.iter().map(|&value| value as f32));
         }
         let step = self.environment.step(action)?;
+        self.score.length += 1;
+        if self.record.is_some()
+            && let Err(error) = self.check(step.reward)
+        {
+            return self.cut_off(error);
+        }
         if let Some(record) = &mut self.record {
             if step.intervention.is_some() {
-                record.interventions.push(self.score.length);
+                record.interventions.push(self.score.length - 1);
             }
-            record.actions.extend(step.intervention.as_deref().unwrap_or(action));
+            let taken = step.intervention.as_deref().or(step.clipped.as_deref());
+            record.actions.extend(taken.unwrap_or(action));
             record.rewards.push(step.reward as f32);
             record.terminated = step.terminated;
         } else if step.intervention.is_some() {
             return Err(EnvironmentError::Intervention(self.score.seed));
         }
         self.score.episode_return += step.reward;
-        self.score.length += 1;
         // A sum that is not finite stays so.
         let is_finite = self.score.episode_return.is_finite();
         // A longer one could not be delivered.
@@ -196,6 +207,38 @@ impl Live {
             self.record.is_some() && self.score.length as usize >= Episode::most_steps(sizes);
         self.ended = step.terminated || step.truncated || !is_finite || is_full;
         Ok(())
+    }
+
+    /// Ends the episode before its last step, as truncated; fails if it has no other.
+    fn cut_off(&mut self, error: EnvironmentError) -> Result<(), EnvironmentError> {
+        self.score.length -= 1;
+        if self.score.length == 0 {
+            return Err(error);
+        }
+        warn!("an episode of practice is cut off before its last step: {error}");
+        self.ended = true;
+        Ok(())
+    }
+
+    /// Refuses what a step gave if no learner could learn from it.
+    fn check(&self, reward: f64) -> Result<(), EnvironmentError> {
+        let is_usable = (reward as f32).is_finite()
+            && EpisodeScore::is_in_range(self.score.episode_return + reward);
+        is_usable.then_some(()).ok_or_else(|| self.unusable("reward", 0, reward))?;
+        self.check_observation()
+    }
+
+    fn check_observation(&self) -> Result<(), EnvironmentError> {
+        let numbers = self.environment.observation();
+        match numbers.iter().position(|&number| !(number as f32).is_finite()) {
+            Some(index) => Err(self.unusable("observation", index, numbers[index])),
+            None => Ok(()),
+        }
+    }
+
+    fn unusable(&self, array: &'static str, index: usize, value: f64) -> EnvironmentError {
+        let (name, step) = (self.environment.name().to_owned(), self.score.length);
+        EnvironmentError::Unusable { name, array, index, value, step, seed: self.score.seed }
     }
 
     fn score(&mut self) -> Result<EpisodeScore, EnvironmentError> {

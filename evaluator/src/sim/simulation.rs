@@ -107,7 +107,10 @@ impl Simulation {
             true => self.task.judge(from, &self.physics),
             false => (0.0, true),
         };
-        Step { reward, terminated, truncated, intervention: None }
+        let is_beyond = action.iter().any(|value| value.abs() > 1.0);
+        let clipped =
+            is_beyond.then(|| action.iter().map(|value| value.clamp(-1.0, 1.0)).collect());
+        Step { reward, terminated, truncated, clipped, ..Step::default() }
     }
 
     /// Simulated time of a step, seconds.
@@ -146,6 +149,10 @@ impl Simulation {
 
 /// With D4RL's normalized score.
 impl Environment for Simulation {
+    fn name(&self) -> &str {
+        &self.spec.name
+    }
+
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
         self.reset(seed);
         Ok(())

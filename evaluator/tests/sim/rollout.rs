@@ -6,7 +6,7 @@ use quad_dataset::environment::find;
 use quad_evaluator::sim::{
     Environment, EnvironmentError, Environments, Rollout, Simulations, Step, make,
 };
-use quad_protocol::{Episode, EpisodeScore, Hash, Name};
+use quad_protocol::{Episode, EpisodeScore, Hash, Message, Name};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -95,6 +95,10 @@ struct Counter {
 }
 
 impl Environment for Counter {
+    fn name(&self) -> &str {
+        "counter"
+    }
+
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
         self.state = [0.0, seed as f64];
         Ok(())
@@ -155,6 +159,10 @@ fn any_environment_has_its_own_scores_and_errors() {
 struct Scripted([f64; 2]);
 
 impl Environment for Scripted {
+    fn name(&self) -> &str {
+        "scripted"
+    }
+
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
         self.0 = [seed as f64, 0.0];
         Ok(())
@@ -165,7 +173,8 @@ impl Environment for Scripted {
         let [seed, steps] = self.0;
         let (reward, terminated) = (steps / 4.0, steps == seed && seed != 2.0);
         let intervention = (steps == 2.0).then(|| vec![action[0] + 90.0]);
-        Ok(Step { reward, terminated, truncated: steps == seed && seed != 1.0, intervention })
+        let truncated = steps == seed && seed != 1.0;
+        Ok(Step { reward, terminated, truncated, intervention, clipped: None })
     }
 
     fn observation(&self) -> &[f64] {
@@ -244,4 +253,99 @@ fn returns_and_scores_that_do_not_count_are_errors_as_soon_as_they_are_known() {
     }
     let largest = count(1e12 - 7.0, 1.0).unwrap();
     assert_eq!(largest[0].score, 1e12);
+}
+
+/// Observes 1 and its number of steps, and pays that; from step `at` on it gives `value` in one of them.
+#[derive(Clone, Copy)]
+struct Diverging {
+    at: u32,
+    pays: bool,
+    value: f64,
+    state: [f64; 2],
+}
+
+impl Environment for Diverging {
+    fn name(&self) -> &str {
+        "diverging"
+    }
+
+    fn reset(&mut self, _: u64) -> Result<(), EnvironmentError> {
+        let bad = self.at == 0 && !self.pays;
+        self.state = [1.0, if bad { self.value } else { 0.0 }];
+        Ok(())
+    }
+
+    fn step(&mut self, _: &[f32]) -> Result<Step, EnvironmentError> {
+        let steps = self.state[1] + 1.0;
+        let given = if steps >= f64::from(self.at) { self.value } else { steps };
+        let reward = if self.pays { given } else { steps };
+        self.state[1] = if self.pays { steps } else { given };
+        Ok(Step { reward, truncated: steps == 9.0, ..Step::default() })
+    }
+
+    fn observation(&self) -> &[f64] {
+        &self.state
+    }
+
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+        Ok(episode_return)
+    }
+}
+
+fn diverge(environment: Diverging, practice: bool) -> Result<Option<Episode>, EnvironmentError> {
+    let make = || Ok(Box::new(environment) as Box<dyn Environment>);
+    let mut rollout = Rollout::new(make, (2, 1), &[7], |_| ())?;
+    if practice {
+        rollout = rollout.recording(0, Hash::of(b""), &Name::new("f32").unwrap());
+    }
+    while !rollout.is_done() {
+        rollout.step(|_, _, _| Ok::<_, EnvironmentError>(()))?;
+    }
+    Ok(rollout.into_records().remove(0).1)
+}
+
+#[test]
+fn practice_ends_before_a_step_that_cannot_be_learned_from() {
+    for (pays, value) in [
+        (false, f64::NAN),
+        (false, f64::NEG_INFINITY),
+        (false, 1e39),
+        (true, f64::NAN),
+        (true, 1e39),
+        (true, 1e13),
+    ] {
+        let environment = Diverging { at: 3, pays, value, state: [0.0; 2] };
+        let episode = diverge(environment, true).unwrap().unwrap();
+        assert_eq!(episode.observations, [1.0, 0.0, 1.0, 1.0, 1.0, 2.0]);
+        assert_eq!((&*episode.rewards, episode.terminated), (&[1.0, 2.0][..], false));
+        assert_eq!((episode.score.length, episode.score.episode_return), (2, 3.0));
+        episode.verify().unwrap();
+
+        let name = if pays { "reward[0]" } else { "observation[1]" };
+        let error = diverge(Diverging { at: 1, ..environment }, true).unwrap_err().to_string();
+        let expected = format!("\"diverging\" gave {name} = {value} after step 1 of the episode");
+        assert!(error.contains(&expected), "{error}");
+    }
+    let nan = Diverging { at: 0, pays: false, value: f64::NAN, state: [0.0; 2] };
+    for practice in [true, false] {
+        for at in if practice { 0..=0 } else { 0..=5 } {
+            let error = diverge(Diverging { at, ..nan }, practice).unwrap_err().to_string();
+            let expected =
+                format!("observation[1] = NaN after step {at} of the episode with seed 7");
+            assert!(error.contains(&expected), "{error}");
+        }
+    }
+}
+
+#[test]
+fn an_episode_has_the_actions_that_were_taken() {
+    let make = || Simulations.make("hopper", 0);
+    let mut rollout = Rollout::new(make, (11, 3), &[7], |_| ()).unwrap();
+    rollout = rollout.recording(0, Hash::of(b""), &Name::new("f32").unwrap());
+    while !rollout.is_done() {
+        let act = |actions: &mut [f32]| actions.copy_from_slice(&[1.5, -0.25, -2.0]);
+        rollout.step(|_, _, actions| Ok::<_, EnvironmentError>(act(actions))).unwrap();
+    }
+    let episode = rollout.into_records().remove(0).1.unwrap();
+    assert!(episode.actions.chunks_exact(3).all(|action| action == [1.0, -0.25, -1.0]));
 }

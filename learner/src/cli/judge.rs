@@ -22,6 +22,9 @@ pub struct JudgeArgs {
     /// RUN/snapshots/step_000020000.safetensors; all of runs on the same data
     #[arg(value_name = "RUN|SNAPSHOT", required = true)]
     pub policies: Vec<PathBuf>,
+    /// The data that the runs have learned from, if it is not where they found it
+    #[arg(long, value_name = "FILE|NAME")]
+    pub dataset: Option<String>,
     /// Discount γ of the values, from 0 to below 1
     #[arg(long, value_name = "X", default_value_t = 0.99, value_parser = parse_discount)]
     pub gamma: f32,

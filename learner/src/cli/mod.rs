@@ -125,7 +125,9 @@ pub struct InspectArgs {
 }
 
 #[derive(Debug, Args)]
-#[command(after_help = "The exit code is 1 if a promise has not held.")]
+#[command(
+    after_help = "The exit code is 1 if a promise has not held, or there was nothing to check."
+)]
 pub struct VerifyArgs {
     /// Folders of complete runs
     #[arg(value_name = "DIR", required = true)]
@@ -174,6 +176,9 @@ pub struct PageArgs {
     /// Address of the page; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address, default_value = "127.0.0.1:8080")]
     pub http: SocketAddr,
+    /// Further names of that address
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    pub http_hosts: Vec<String>,
 }
 
 #[derive(Debug, Args)]

@@ -4,11 +4,12 @@ use std::net::SocketAddr;
 use std::num::NonZero;
 use std::path::PathBuf;
 
+use anyhow::anyhow;
 use clap::{Args, value_parser};
 use quad_policy::Precision;
 use quad_run::config::Device;
 use quad_run::config::tables::{self, parse_assignment};
-use quad_runtime::{parse_address, parse_endpoint};
+use quad_runtime::{Hint, parse_address, parse_endpoint};
 use toml::{Table, Value};
 
 use super::{TaskName, algorithm_names, parse_preset};
@@ -55,7 +56,7 @@ pub struct TrainArgs {
     /// A file (`evaluator collect` records one), a name of `learner datasets list` (fetched if it
     /// is missing), or minari:ID [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
-    dataset: Option<String>,
+    dataset: Vec<String>,
     /// Normalize some of these: actions from their least and largest value to ±1, observations to
     /// mean 0 and standard deviation 1, rewards to a mean square of 1; the policy still takes and
     /// gives the data's own units
@@ -66,7 +67,8 @@ pub struct TrainArgs {
     #[arg(long, value_name = "SHARE", value_parser = parse_share)]
     hold_out: Option<f64>,
     /// Folder of the run; its last part names the run. If it contains a run of the same
-    /// configuration, that run continues [default: runs/TASK-VARIANT-seedSEED]
+    /// configuration, that run continues [default: runs/TASK-VARIANT-seedSEED,
+    /// runs/TASK-VARIANT-online-seedSEED with practice after --steps, runs/RUN-online with --from]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
     /// Seconds between two checkpoints; a crash loses at most the training since the last one. The
@@ -81,8 +83,8 @@ pub struct TrainArgs {
     #[arg(long)]
     pub dry_run: bool,
     /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines
-    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; a free port if that one is
-    /// taken, or with --eval-interval 0]
+    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; a free port if nothing is
+    /// evaluated, or if that one is taken and the learner starts evaluators]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]
     pub listen: Option<String>,
     /// Join a Zenoh router instead, at which evaluators are found, e.g. tcp/router:7447
@@ -105,6 +107,9 @@ pub struct TrainArgs {
     /// Address of the page, /metrics and /healthz; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address, default_value = "127.0.0.1:0")]
     pub http: SocketAddr,
+    /// Further names of that address, such as a service's: learner,learner.lab.svc.cluster.local
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    pub http_hosts: Vec<String>,
     /// Train on the CPU, or on the first Nvidia GPU (with a learner that deploy/cuda.sh has built)
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
@@ -153,7 +158,15 @@ impl TrainArgs {
 
     /// The values that the command line changes: `--agent` overrides `--set`, and other flags
     /// override both.
-    pub fn changes(&self) -> Table {
+    ///
+    /// # Errors
+    /// There are several datasets.
+    pub fn changes(&self) -> anyhow::Result<Table> {
+        if self.dataset.len() > 1 {
+            let names = self.dataset.join(" and ");
+            return Err(anyhow!("a run learns from one dataset, not from {names}"))
+                .hint("`quad-convert FOLDER --out FILE` makes one of a folder's files");
+        }
         let mut changes = Table::new();
         for change in self.set.iter().chain(&self.agent) {
             tables::merge(&mut changes, change.clone());
@@ -167,7 +180,7 @@ impl TrainArgs {
         for (key, value) in [
             ("algorithm", self.algorithm.clone().map(Value::from)),
             ("environment", self.env.clone().map(Value::from)),
-            ("dataset", self.dataset.clone().map(Value::from)),
+            ("dataset", self.dataset.first().cloned().map(Value::from)),
             ("normalize", normalize.map(Value::from)),
             ("hold_out", self.hold_out.map(Value::from)),
             ("steps", flags.steps.map(Value::from)),
@@ -178,7 +191,7 @@ impl TrainArgs {
         ] {
             changes.extend(value.map(|value| (key.to_owned(), value)));
         }
-        changes
+        Ok(changes)
     }
 }
 

@@ -26,11 +26,14 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     locks(&mut findings, &args.run_dir);
     for benchmark in benchmarks::all() {
         let Some(variable) = &benchmark.cache.variable else { continue };
-        let hint = format!("{variable} chooses another folder");
+        let hint =
+            format!("{variable} chooses another folder for datasets that are fetched by name");
+        let mut checks = Findings::default();
         match data::cache::folder(benchmark) {
-            Ok(folder) => doctor::folder(&mut findings, "datasets", &folder, &hint),
-            Err(error) => findings.warn("datasets", format!("{error:#}"), &hint),
+            Ok(folder) => doctor::folder(&mut checks, "datasets", &folder, &hint),
+            Err(error) => checks.warn("datasets", format!("{error:#}"), &hint),
         }
+        findings.append_unneeded(checks);
     }
     let folder = certificates_folder(args.certificates.clone());
     let certificates =

@@ -6,16 +6,16 @@ use std::path::Path;
 use std::time::Duration;
 
 use indicatif::{HumanBytes, HumanDuration};
-use quad_dataset::Transitions;
+use quad_dataset::Split;
 use quad_run::config::RunConfig;
 use quad_runtime::print;
 
 use crate::train::RunCost;
 
-pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
+pub fn estimate(path: &Path, config: &RunConfig, data: Split) -> anyhow::Result<()> {
     let experiment = &config.experiment;
     let steps = experiment.total_steps() - experiment.schedule().start;
-    let cost = RunCost::measure(experiment, config.run.device, transitions)?;
+    let cost = RunCost::measure(experiment, config.run.device, data)?;
     let milliseconds = cost.step_seconds * 1e3;
     let all = Duration::try_from_secs_f64((cost.step_seconds * steps as f64).ceil());
     let all = HumanDuration(all.unwrap_or(Duration::MAX));

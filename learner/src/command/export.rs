@@ -1,11 +1,15 @@
 //! `learner export`: a policy's file with its data, score and settings in the header.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Context, anyhow};
 use quad_policy::{Header, PolicyError, read_tensors};
-use quad_protocol::{Hash, Origin};
+use quad_protocol::{Hash, Origin, practice_seed};
+use quad_run::config::Experiment;
 use quad_run::files;
-use quad_run::folder::RunDir;
+use quad_run::folder::{RunDir, read_experience};
 use quad_run::results::RunReport;
+use quad_run::results::statistics::mean;
 use quad_runtime::{Hint, print};
 use serde_json::{Value, json};
 use tracing::warn;
@@ -18,18 +22,15 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let folder = RunDir::at(&args.run);
     let steps = folder.snapshots()?;
     let best = report.best_of(|step| steps.contains(&step)).map(|best| best.step);
+    let practices = report.config.experiment.practice_begins().is_some();
     let (step, what) = match args.step {
         At::Step(step) => (Some(step), "of that step"),
         At::Last => (steps.last().copied(), "yet"),
+        At::Best if practices => (best, "with a complete evaluation since practice began"),
         At::Best => (best, "with a complete evaluation"),
     };
     let (run, name) = (args.run.display(), args.out.display());
-    let out = args.out.canonicalize().ok();
-    let is_out = |step: &u64| folder.snapshot_path(*step).canonicalize().ok() == out;
-    if out.is_some() && steps.iter().any(is_out) {
-        return Err(anyhow!("{name} is a snapshot, which the run's scores name by its hash"))
-            .hint("choose another file by --out");
-    }
+    RunDir::refuse_own_file(&args.out)?;
     let Some(step) = step.filter(|step| steps.contains(step)) else {
         let named = Vec::from_iter(steps.iter().map(u64::to_string)).join(", ");
         let hint = match steps.is_empty() {
@@ -52,7 +53,8 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
         report.evaluations.retain(|it| it.step != step);
     }
     report.judgments.retain(|it| it.weights == weights);
-    let about = about(&report, step, args.license.as_deref());
+    let practiced = practiced(&folder, &report.config.experiment, step)?;
+    let about = about(&report, step, args.license.as_deref(), practiced);
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
     files::replace(&args.out, &exported)
         .with_context(|| format!("cannot export to {name}"))
@@ -61,7 +63,28 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     print(&format!("{name}: {run} @ {step}, {bytes} bytes"))
 }
 
-fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
+/// Size and mean return of the episodes of practice that the policy of a step has learned from; null
+/// without any.
+fn practiced(folder: &RunDir, experiment: &Experiment, step: u64) -> anyhow::Result<Value> {
+    let rows = experiment.environment_steps(step).unwrap_or(0);
+    let played = read_experience(folder.path())?;
+    let by_seed = BTreeMap::from_iter(played.iter().map(|it| (it.score.seed, it)));
+    // Training takes them by their number.
+    let in_order = (0..).map_while(|number| by_seed.get(&practice_seed(experiment.seed, number)));
+    let (mut returns, mut before) = (Vec::new(), 0);
+    for episode in in_order {
+        if before >= rows {
+            break;
+        }
+        returns.push(episode.score.episode_return);
+        before += episode.rewards.len() as u64;
+    }
+    let practiced =
+        json!({ "transitions": rows, "episodes": returns.len(), "mean_return": mean(&returns) });
+    Ok(if rows > 0 { practiced } else { Value::Null })
+}
+
+fn about(report: &RunReport, step: u64, license: Option<&str>, practiced: Value) -> Value {
     let (data, experiment) = (&report.config.dataset, &report.config.experiment);
     let name = experiment.dataset.clone().unwrap_or_default();
     let entry = Source::parse(&name).ok().and_then(|source| source.entry());
@@ -90,17 +113,51 @@ fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
             "episodes": data.episodes,
             "held_out": data.held_out,
             "mean_return": data.mean_return,
+            "practice": practiced,
         },
         "score": score,
-        "judgment": report.judgments.iter().find(|judgment| judgment.step == step),
+        // Of several, the newest.
+        "judgment": report.judgments.iter().rfind(|judgment| judgment.step == step),
     })
 }
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
+    use quad_protocol::{Episode, EpisodeScore, Name, encode};
+
     use super::*;
     use crate::fixtures::config;
+
+    #[test]
+    fn a_file_counts_the_practice_that_its_policy_has_learned_from() {
+        let scratch = tempfile::tempdir().unwrap();
+        let folder = RunDir::at(scratch.path());
+        let mut experiment = config("run", 3).experiment;
+        experiment.steps = 20;
+        let online = json!({ "steps": 9, "updates_per_step": 1, "warmup": 0, "uniform_warmup": false,
+            "noise": 0.0, "lag": 2, "snapshot_interval": 1 });
+        experiment.online = Some(serde_json::from_value(online).unwrap());
+        let (mut log, _) = folder.experience_log().unwrap();
+        for (number, episode_return) in [(1, 20.0), (0, 10.0), (2, 90.0)] {
+            let (seed, precision) = (practice_seed(3, number), Name::new("f32").unwrap());
+            let played = Episode::new(20, Hash::of(b""), precision, seed);
+            let episode = Episode {
+                score: EpisodeScore { episode_return, length: 3, ..played.score },
+                observations: vec![0.0; 4],
+                actions: vec![0.0; 3],
+                rewards: vec![0.0; 3],
+                ..played
+            };
+            log.append([&*encode(&episode).unwrap()]).unwrap();
+        }
+        for (step, rows, episodes, mean) in [(21, 1, 1, 10.0), (24, 4, 2, 15.0), (29, 9, 3, 40.0)] {
+            let expected =
+                json!({ "transitions": rows, "episodes": episodes, "mean_return": mean });
+            assert_eq!(practiced(&folder, &experiment, step).unwrap(), expected);
+        }
+        assert_eq!(practiced(&folder, &experiment, 20).unwrap(), Value::Null);
+    }
 
     #[test]
     fn the_license_option_overrides_the_datasets_license() {
@@ -109,7 +166,7 @@ mod tests {
         config.experiment.dataset = Some("hopper-medium-v2".to_owned());
         RunDir::create(&folder.path().join("run"), &config).unwrap();
         let report = RunReport::scored(&folder.path().join("run")).unwrap();
-        let license = |named| about(&report, 20, named)["data"]["license"].clone();
+        let license = |named| about(&report, 20, named, Value::Null)["data"]["license"].clone();
         assert_eq!(license(Some("mine")), "mine");
         assert!(license(None).as_str().is_some_and(|own| own != "mine"));
     }

@@ -10,6 +10,7 @@ use quad_runtime::{Hint, print};
 use crate::cli::ExportDataArgs;
 
 pub fn export(args: &ExportDataArgs) -> anyhow::Result<()> {
+    RunDir::refuse_own_file(&args.out)?;
     let (folder, config) = RunDir::open(&args.run)?;
     let played = read_experience(folder.path())?;
     let Some(last) = played.last() else {

@@ -1,21 +1,67 @@
 //! `learner train --from RUN`: the run whose last checkpoint another run begins with.
 
-use std::path::Path;
+use std::path::{Path, PathBuf, absolute};
 
 use anyhow::anyhow;
 use quad_protocol::Hash;
-use quad_run::config::{ConfigError, Experiment, Preset};
+use quad_run::config::{ConfigError, Experiment, Preset, RunConfig};
 use quad_run::folder::{Checkpoint, RunDir};
 use quad_runtime::{Hint, hinted};
 use toml::Table;
+use tracing::info;
 
 /// The end of a complete run.
 pub(super) struct EarlierRun {
     pub checkpoint: Checkpoint,
-    /// Hash of the checkpoint.
-    pub hash: String,
+    /// Episodes that it has not learned from.
+    pub held_out: Vec<usize>,
     experiment: Experiment,
     dataset_sha256: Option<String>,
+}
+
+/// The usual folder of a run that begins with the end of another.
+pub(super) fn usual_folder(source: &Path) -> PathBuf {
+    let source = absolute(source).unwrap_or_default();
+    let name = source.file_name().unwrap_or_default().to_string_lossy();
+    Path::new("runs").join(format!("{name}-online"))
+}
+
+/// Reads the run `source`, and makes a preset of its settings. A run that has begun in `folder` goes
+/// on without `source`, by its own settings and checkpoint.
+pub(super) fn read(
+    source: &Path,
+    folder: &Path,
+    fresh: bool,
+) -> anyhow::Result<(Option<EarlierRun>, Preset)> {
+    if let [Ok(there), Ok(here)] = [source, folder].map(Path::canonicalize)
+        && there == here
+    {
+        let error = anyhow!("{} cannot begin with itself", folder.display());
+        return Err(hinted(error, "the new run has a folder of its own: name it by --run-dir"));
+    }
+    match (EarlierRun::read(source), begun(folder).filter(|_| !fresh)) {
+        (Ok((run, preset)), _) => Ok((Some(run), preset)),
+        (Err(error), Some(preset)) => {
+            info!("{} goes on without the run of --from: {error:#}", folder.display());
+            Ok((None, preset))
+        }
+        (Err(error), None) => Err(error),
+    }
+}
+
+/// The settings of a run that another's end began, if it has a checkpoint.
+fn begun(folder: &Path) -> Option<Preset> {
+    let (dir, config) = RunDir::open(folder).ok()?;
+    config.experiment.from.as_ref().and(dir.checkpoint_step().ok()?)?;
+    preset(&config, Table::new()).ok()
+}
+
+fn preset(config: &RunConfig, changes: Table) -> anyhow::Result<Preset> {
+    let mut own = Table::try_from(&config.experiment)?;
+    // A share of 0 is not in the table, but the task may have another.
+    own.insert("hold_out".to_owned(), config.experiment.hold_out.into());
+    own.extend(changes);
+    Preset::of_run(config, own).hint_of(ConfigError::hint)
 }
 
 impl EarlierRun {
@@ -23,7 +69,7 @@ impl EarlierRun {
     ///
     /// # Errors
     /// The run is not complete, its checkpoints were deleted, or its algorithm cannot practice.
-    pub fn read(run: &Path) -> anyhow::Result<(Self, Preset)> {
+    fn read(run: &Path) -> anyhow::Result<(Self, Preset)> {
         let (dir, config) = RunDir::open(run)?;
         if config.experiment.online.is_some() {
             let error = anyhow!("the run in {} has practiced already", run.display());
@@ -42,14 +88,11 @@ impl EarlierRun {
             let hint = "let it end first: `learner train` with its settings continues it";
             return Err(hinted(error, hint));
         }
-        let mut own = Table::try_from(&config.experiment)?;
         let hash = Hash::of(&checkpoint.state).to_string();
-        own.insert("from".to_owned(), hash.clone().into());
-        // A share of 0 is not in the table, but the task may have another.
-        own.insert("hold_out".to_owned(), config.experiment.hold_out.into());
-        let preset = Preset::of_run(&config, own).hint_of(ConfigError::hint)?;
+        let preset = preset(&config, Table::from_iter([("from".to_owned(), hash.into())]))?;
         let (experiment, dataset_sha256) = (config.experiment, config.dataset.sha256);
-        Ok((Self { checkpoint, hash, experiment, dataset_sha256 }, preset))
+        let held_out = config.dataset.held_out;
+        Ok((Self { checkpoint, held_out, experiment, dataset_sha256 }, preset))
     }
 
     /// Checks that there is practice, that the dataset is the run's, and that the checkpoint's
@@ -67,8 +110,6 @@ impl EarlierRun {
             ("reward", there.reward == here.reward),
             ("normalize", there.normalize == here.normalize),
             ("hold_out", there.hold_out == here.hold_out),
-            // It draws the episodes that are held out.
-            ("seed", there.seed == here.seed || here.hold_out == 0.0),
         ];
         let Some((key, _)) = kept.iter().find(|(_, is_kept)| !is_kept) else { return Ok(()) };
         let error = anyhow!("the run of --from has learned with another value of {key}");

@@ -1,6 +1,7 @@
 //! The learner's commands, from the parsed command line to the exit code. All of them run on the
 //! main thread.
 
+mod dataset_hints;
 mod doctor;
 mod dry_run;
 mod export;
@@ -26,7 +27,9 @@ use quad_run::folder::verify::{self, Findings};
 use quad_run::folder::{RunDirError, practiced};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
-use quad_runtime::{Hint, hinted, json, print, stay_in_background, unfinished};
+use quad_runtime::{
+    Hint, hinted, json, print, stay_in_background, unfinished, unfinished_at_signal,
+};
 use serde::Serialize;
 use tokio::runtime::{Builder, Runtime};
 use tracing::{info, warn};
@@ -42,7 +45,13 @@ use crate::report::{Report, draw_all, write_html};
 const DAMAGED: &str = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode \
                        is scored again";
 
+const NOTHING: &str = "nothing is checked: the run has no evaluations, and neither `learner judge` nor practice has \
+                       kept the hash of a snapshot; --same-as OTHER compares it with another run";
+
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
+    if matches!(cli.command, Command::Train(_) | Command::Sweep(_)) {
+        unfinished_at_signal();
+    }
     let done = match &cli.command {
         Command::Train(args) => train::train(args),
         Command::Sweep(args) => sweep::sweep(args),
@@ -194,9 +203,10 @@ fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
 
 /// Prints what holds of a run. True if everything does.
 fn check_run(dir: &Path, about: &str, same_as: Option<&Path>) -> anyhow::Result<bool> {
-    let mut all_held = true;
+    let (mut all_held, mut checked) = (true, 0);
     let mut report = |about: &str, findings: Findings| {
         all_held &= findings.all_held();
+        checked += findings.expected;
         print(&format!("{about}{findings}"))
     };
     report(about, verify::verify(dir)?)?;
@@ -209,7 +219,10 @@ fn check_run(dir: &Path, about: &str, same_as: Option<&Path>) -> anyhow::Result<
             report(&format!("{about}with {}: ", other.display()), findings)?;
         }
     }
-    Ok(all_held)
+    if checked == 0 {
+        print(&format!("{about}{NOTHING}"))?;
+    }
+    Ok(all_held && checked > 0)
 }
 
 fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
@@ -229,7 +242,8 @@ fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
 
 fn rank(args: &JudgeArgs) -> anyhow::Result<()> {
     let (steps, seeds) = (args.steps, args.seeds);
-    let ranking = judge(&args.policies, args.gamma, Budget { steps, seeds })?;
+    let (dataset, budget) = (args.dataset.as_deref(), Budget { steps, seeds });
+    let ranking = judge(&args.policies, dataset, args.gamma, budget)?;
     let blocks = ranking.blocks().map(|block| block.render(Style::Text));
     show(args.json, &ranking, || blocks.join("\n"))
 }

@@ -25,6 +25,8 @@ pub(super) struct Outside {
     pub evaluators: LocalEvaluators,
     /// True if the command line names no endpoint.
     is_default: bool,
+    /// True if the learner starts evaluators, which know the endpoint.
+    has_evaluators: bool,
 }
 
 impl Outside {
@@ -49,19 +51,26 @@ impl Outside {
             None => (0, cores),
         };
         let evaluators = LocalEvaluators::new(count, share)?;
-        Ok(Self { endpoints, evaluators, is_default })
+        Ok(Self { endpoints, evaluators, is_default, has_evaluators: count > 0 })
     }
 
     /// Starts to open the session. If the usual port cannot be used, as where another learner has
-    /// it, it takes a free one.
+    /// it, a learner that starts evaluators takes a free one.
     pub async fn open(&mut self) -> anyhow::Result<OpeningSession> {
         let mut opening = open_network(&self.endpoints).await;
         if opening.is_err() && self.is_default {
+            let endpoint = |port| default_endpoint(self.endpoints.certificates.as_ref(), port);
+            if !self.has_evaluators {
+                let another = endpoint(DEFAULT_PORT + 1);
+                return opening.hint(format!(
+                    "where another learner has the port, evaluators without --connect serve that one: give this one \
+                     --listen {another}, and its evaluators --connect {another} (in Python connect=\"{another}\")"
+                ));
+            }
             info!(
                 "cannot listen at port {DEFAULT_PORT}, perhaps as a learner does; taking a free one"
             );
-            let certificates = self.endpoints.certificates.as_ref();
-            self.endpoints.listen = vec![default_endpoint(certificates, ANY_PORT)];
+            self.endpoints.listen = vec![endpoint(ANY_PORT)];
             opening = open_network(&self.endpoints).await;
         }
         let hint = "join a router with --connect, or listen with --listen";

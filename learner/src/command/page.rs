@@ -15,7 +15,9 @@ pub fn show(args: &PageArgs) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(async {
         let page = routes(args.runs.clone(), None);
-        let server = serve_metrics(args.http, Default::default(), Health::default(), page).await;
+        let server =
+            serve_metrics(args.http, &args.http_hosts, Default::default(), Health::default(), page);
+        let server = server.await;
         let server = server.hint_of(ListenError::hint)?;
         info!("page: http://{}/ shows the runs in {folder}; Ctrl-C ends it", server.address);
         shutdown_signal(LEAVE_WITHIN).await;

@@ -17,7 +17,7 @@ use tokio::task::LocalSet;
 use tracing::{info, warn};
 
 use super::all_readable;
-use super::train::record_hint;
+use super::dataset_hints::record_hint;
 use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
 use crate::sweep::{LearnerOptions, Outcome, PlannedRun, Study, StudyCost, Sweep};
@@ -181,7 +181,8 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
         let work = async {
             evaluators.start(std::slice::from_ref(&endpoint), &logs, study, report)?;
             let (folder, waiting) = (folder.to_owned(), VecDeque::from(left));
-            let options = LearnerOptions { threads, endpoint, http: args.http };
+            let http_hosts = args.http_hosts.clone();
+            let options = LearnerOptions { threads, endpoint, http: args.http, http_hosts };
             let sweep = Sweep { folder, waiting, jobs, options, evaluators, lines, step_seconds };
             anyhow::Ok(sweep.run().await)
         };

@@ -1,6 +1,5 @@
 //! `learner train`, from the parsed command line to the report.
 
-use std::net::SocketAddr;
 use std::num::NonZero;
 use std::path::Path;
 use std::sync::Arc;
@@ -25,8 +24,9 @@ use tokio::time::timeout;
 use toml::Table;
 use tracing::{debug, info, warn};
 
+use super::dataset_hints::{convert_hint, record_hint};
 use super::dry_run;
-use super::from::EarlierRun;
+use super::from;
 use super::outside::{Outside, training_threads};
 use crate::cli::TrainArgs;
 use crate::data::{LocalDataset, Source, load, warnings};
@@ -41,13 +41,14 @@ use crate::train::{HeldOut, begin, device};
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
-    let (from, preset) = match &args.from {
-        Some(run) => EarlierRun::read(run).map(|(from, preset)| (Some(from), preset))?,
-        None => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
+    let named = args.run_dir.clone().or_else(|| args.from.as_deref().map(from::usual_folder));
+    let (from, preset) = match (&args.from, &named) {
+        (Some(source), Some(path)) => from::read(source, path, args.fresh)?,
+        _ => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
     };
-    let changes = args.changes();
+    let changes = args.changes()?;
     let experiment = preset.resolve(&changes).hint_of(ConfigError::hint)?;
-    if experiment.from.as_ref() != from.as_ref().map(|from| &from.hash) {
+    if experiment.from.is_some() && (args.from.is_none() || changes.contains_key("from")) {
         return Err(anyhow!("the key `from` names a checkpoint, which is not there"))
             .hint("leave it out: --from RUN sets it, and begins with the run's last checkpoint");
     }
@@ -59,11 +60,10 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let source = Source::parse(dataset)?;
     source.check_environment(&experiment.environment)?;
     let (variant, seed) = (experiment.variant()?, experiment.seed);
-    let usual = || match from {
-        Some(_) => Path::new("runs").join(label),
-        None => Path::new("runs").join(format!("{label}-{variant}-seed{seed}")),
-    };
-    let path = args.run_dir.clone().unwrap_or_else(usual);
+    // With and without practice these are two runs.
+    let online = experiment.practice_begins().map_or("", |_| "-online");
+    let usual = || Path::new("runs").join(format!("{label}-{variant}{online}-seed{seed}"));
+    let path = named.unwrap_or_else(usual);
     let name = run_name(&path)?;
     let begun = ExistingRun::open(&path, args.fresh)?;
     let outside = Outside::new(args, &experiment)?;
@@ -73,7 +73,9 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &dataset.sha256))?;
 
     start_pool(args.threads)?;
-    let data = load(&dataset.path, &experiment)?;
+    let held_out = begun.as_ref().and_then(ExistingRun::held_out);
+    let held_out = held_out.or(from.as_ref().map(|from| &*from.held_out));
+    let data = load(&dataset.path, &experiment, held_out)?;
     for warning in warnings(&dataset.path, &data.training) {
         warn!("{warning}");
     }
@@ -84,7 +86,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     announce(&config, &preset, &changes, &source)?;
     debug!("{config:?}");
     if args.dry_run {
-        return dry_run::estimate(&path, &config, data.training);
+        return dry_run::estimate(&path, &config, data);
     }
 
     let runtime = super::runtime()?;
@@ -135,34 +137,6 @@ fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
         .hint("choose fewer by --threads or RAYON_NUM_THREADS")
 }
 
-/// A hint for a run without a dataset, of a benchmark whose files lack the rewards.
-fn convert_hint(preset: &Preset) -> Option<String> {
-    let (task, benchmark) = (preset.task_name(), preset.task?.benchmark?);
-    let (name, converter) = (&benchmark.name, benchmark.converter.as_ref()?);
-    Some(format!(
-        "its rewards come from {name}'s simulator: with quad_rl and {converter} installed, `quad-convert {converter}:{task} --out \
-         FILE` makes a file for --dataset FILE"
-    ))
-}
-
-/// A hint for any other run whose dataset is not named, or not there.
-pub(super) fn record_hint(experiment: &Experiment) -> String {
-    let (name, file) = (&experiment.environment, experiment.dataset.as_deref());
-    let advice = match file {
-        None => "name a file by --dataset FILE",
-        Some(_) => "check the path",
-    };
-    let can_record = environment::find(name).is_ok_and(|spec| spec.maze.is_none());
-    let other = match can_record {
-        true => {
-            let file = file.unwrap_or("FILE");
-            format!("`evaluator collect --env {name} --out {file}` records one")
-        }
-        false => "docs/data.md says what it may be".to_owned(),
-    };
-    format!("{advice}; {other}")
-}
-
 async fn run_to_end(
     args: &TrainArgs,
     mut outside: Outside,
@@ -183,7 +157,7 @@ async fn run_to_end(
         carrier: Arc::default(),
     };
     let carrier = page_state.carrier.clone();
-    let server = serve_page(args.http, path, page_state, registry).await?;
+    let server = serve_page(args, path, page_state, registry).await?;
     let (o, a) = (data.training.observation_dim(), data.training.action_dim());
     let task = Task::new(&experiment.environment, o, a);
     let (agent, held_out) = begin_agent(config, data, first.as_ref())?;
@@ -245,7 +219,7 @@ fn begin_agent(
 
 /// Serves the page and the metrics of the run in a folder.
 async fn serve_page(
-    address: SocketAddr,
+    args: &TrainArgs,
     path: &Path,
     state: PageState,
     registry: Registry,
@@ -253,7 +227,7 @@ async fn serve_page(
     let health = state.health.clone();
     let live = Arc::new(move || state.to_json());
     let page = page::routes(path.to_owned(), Some(live));
-    let server = serve_metrics(address, registry, health, page).await;
+    let server = serve_metrics(args.http, &args.http_hosts, registry, health, page).await;
     let server = server.hint_of(ListenError::hint)?;
     info!("page: http://{}/", server.address);
     Ok(server)

@@ -60,7 +60,8 @@ impl Fetcher {
         let progress = ProgressBar::of_bytes();
         let mut refusals = String::new();
         for address in self.addresses(dataset) {
-            progress.say(&format!("fetching {} from {address}", dataset.name));
+            let shown = without_password(&address);
+            progress.say(&format!("fetching {} from {shown}", dataset.name));
             match self.fetch_from(&address, dataset, &mut partial, &progress) {
                 Ok(sha256) => {
                     partial.finish(&path).map_err(local)?;
@@ -71,7 +72,7 @@ impl Fetcher {
                 Err(Failure::Local(error)) => return Err(local(error)),
                 Err(Failure::Passing(reason) | Failure::Lasting(reason)) => {
                     progress.say(&reason);
-                    refusals += &format!("\n  {address}: {reason}");
+                    refusals += &format!("\n  {shown}: {reason}");
                 }
             }
         }
@@ -123,6 +124,14 @@ impl Fetcher {
             std::thread::sleep(self.pause);
         }
     }
+}
+
+/// An address to be shown, without what stands before an `@`: a user's name and password.
+fn without_password(address: &str) -> String {
+    let Some((before, host)) = address.rsplit_once('@') else { return address.to_owned() };
+    let scheme =
+        before.split_once("://").map_or(String::new(), |(scheme, _)| scheme.to_owned() + "://");
+    format!("{scheme}…@{host}")
 }
 
 /// SHA-256 of the fetched file, which is deleted if it is not the dataset's.

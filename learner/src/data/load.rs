@@ -8,18 +8,25 @@ use quad_dataset::{
 };
 use quad_run::config::Experiment;
 use quad_runtime::Hint;
+use toml::Value;
 
-/// Reads a file or folder of transitions for an experiment. Fewer transitions than a batch are an
-/// error: a batch never holds one twice while there are others.
-pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
+/// Reads a file or folder of transitions for an experiment. A run that has begun has `held_out`
+/// episodes. Fewer transitions than a batch are an error: a batch never holds one twice while there
+/// are others.
+pub fn load(
+    path: &Path,
+    experiment: &Experiment,
+    held_out: Option<&[usize]>,
+) -> anyhow::Result<Split> {
+    let chunk = experiment.agent.get("chunk").and_then(Value::as_integer).unwrap_or(1);
     let options = ReadOptions {
         environment: environment::find(&experiment.environment).ok(),
         task: benchmarks::relabeling(&experiment.environment),
         reward: experiment.reward,
         normalize: experiment.normalize,
+        chunk: chunk as usize,
     };
-    let (fraction, seed) = (experiment.hold_out, experiment.seed);
-    let hold_out = HoldOut::Fraction { fraction, seed };
+    let hold_out = held_out.map_or(HoldOut::Fraction(experiment.hold_out), HoldOut::Episodes);
     let result = Transitions::read_split(path, &options, hold_out).hint_of(DatasetError::hint);
     let path = path.display();
     let split = result.with_context(|| format!("cannot learn from {path}"))?;
@@ -34,4 +41,51 @@ pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
 /// Suspicious properties of the transitions at `path`, a sentence each.
 pub fn warnings(path: &Path, transitions: &Transitions) -> impl Iterator<Item = String> {
     transitions.warnings().iter().map(move |warning| format!("{}: {warning}", path.display()))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use quad_dataset::{Arrays, Names, write_own};
+    use quad_run::config::Preset;
+    use tempfile::tempdir;
+
+    use super::*;
+
+    /// Twenty episodes of ten steps.
+    fn arrays() -> Arrays {
+        let rows = 200;
+        let wave = |row: usize| (row as f32).sin();
+        Arrays {
+            observation_dim: 1,
+            action_dim: 1,
+            observations: (0..rows).map(wave).collect(),
+            actions: (0..rows).map(|row| 0.9 * wave(2 * row)).collect(),
+            rewards: (0..rows).map(wave).collect(),
+            next_observations: (1..=rows).map(wave).collect(),
+            terminals: vec![false; rows],
+            timeouts: (1..=rows).map(|row| row % 10 == 0).collect(),
+        }
+    }
+
+    #[test]
+    fn all_seeds_hold_out_the_same_episodes_and_a_run_that_has_begun_its_own() {
+        let folder = tempdir().unwrap();
+        let path = folder.path().join("own.hdf5");
+        write_own(&path, arrays(), Names::default()).unwrap();
+        let preset = Preset::read("own-data").unwrap();
+        let held_out = |seed: u64, begun| {
+            let changes = format!(
+                "algorithm = 'qc'\nenvironment = 'robot'\nbatch_size = 8\nhold_out = 0.2\nseed = {seed}\nagent.chunk = 11"
+            );
+            let experiment = preset.resolve(&changes.parse().unwrap()).unwrap();
+            let split = load(&path, &experiment, begun).unwrap();
+            let warnings = Vec::from_iter(warnings(&path, &split.training));
+            assert!(warnings.len() == 1 && warnings[0].contains("the longest 10"), "{warnings:?}");
+            split.episodes
+        };
+        let episodes = held_out(1, None);
+        assert_eq!((episodes.len(), &held_out(2, None)), (4, &episodes));
+        assert_eq!(held_out(2, Some(&[3, 5])), [3, 5], "as an older version chose them");
+    }
 }

@@ -115,7 +115,11 @@ fn append(
 
 fn network(error: Error) -> Failure {
     use Error::{BadUri, Http, Tls, TooManyRedirects};
-    let reason = error.to_string();
+    let reason = match &error {
+        // Its text has the whole address, also a password.
+        BadUri(_) => "this is no address of a file".to_owned(),
+        error => error.to_string(),
+    };
     match error {
         BadUri(_) | Http(_) | Tls(_) | TooManyRedirects => Failure::Lasting(reason),
         _ => Failure::Passing(reason),

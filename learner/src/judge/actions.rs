@@ -82,6 +82,7 @@ fn scaled(scaling: &Scaling, mut actions: Vec<f32>) -> Vec<f32> {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
+    use quad_dataset::{Arrays, Split, Transitions};
     use quad_policy::{Affine, EpisodeState, PolicyError, Precision};
 
     use super::*;
@@ -114,6 +115,33 @@ mod tests {
             actions.copy_from_slice(observations);
             Ok(())
         }
+    }
+
+    #[test]
+    fn a_policy_acts_in_the_states_that_each_use_needs() {
+        let transitions = |offset: f32| {
+            let states =
+                |from: usize| (from..from + 8).map(|i| (offset + i as f32) / 20.0).collect();
+            let actions = vec![0.0; 8];
+            Transitions::of(Arrays {
+                observation_dim: 2,
+                action_dim: 2,
+                observations: states(0),
+                actions,
+                rewards: vec![1.0; 4],
+                next_observations: states(2),
+                terminals: vec![false, false, false, true],
+                timeouts: vec![false; 4],
+            })
+            .unwrap()
+        };
+        let (training, held_out) = (transitions(0.0), Some(transitions(10.0)));
+        let split = Split { training, held_out, episodes: vec![1] };
+        let data = Data::of(split, String::new(), String::new()).unwrap();
+        let actions = Actions::of(&Echo, &data).unwrap();
+        assert_eq!(actions.next, [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45]);
+        assert_eq!(actions.first, [0.5, 0.55]);
+        assert_eq!(actions.compared, [0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85]);
     }
 
     #[test]

@@ -38,9 +38,9 @@ pub(super) struct Data {
 }
 
 impl Data {
-    /// Reads the dataset of these snapshots. Every episode that one of their runs has held out is
-    /// judged, so that all are judged in the same states.
-    pub fn read(snapshots: &[Snapshot]) -> anyhow::Result<Self> {
+    /// Reads the data of these snapshots, from `dataset` if it is there. They are judged in the episodes
+    /// that every run with held-out episodes has held out.
+    pub fn read(snapshots: &[Snapshot], dataset: Option<&str>) -> anyhow::Result<Self> {
         let first = snapshots.first().context("there is no policy to judge")?;
         let (run, data) = (first.folder.path().display(), &first.config.dataset);
         let environment = &first.config.experiment.environment;
@@ -57,38 +57,42 @@ impl Data {
                     .hint("judge them apart: values of different rewards do not compare");
             }
         }
-        let source = Source::Path(data.path.clone());
+        let source = dataset.map_or_else(|| Ok(Source::Path(data.path.clone())), Source::parse)?;
         let hint = format!(
-            "put the data of the run {run} back; a relative path is below the folder where `learner train` was started"
+            "name the data of the run {run} by --dataset; a relative path in the run is below the folder where `learner train` was started"
         );
         let dataset = source.obtain().hint(hint)?;
         if data.sha256.is_some() && data.sha256 != Some(dataset.sha256.clone()) {
             let path = dataset.path.display();
             let error = anyhow!("{path} is not the data that {run} has learned from");
-            return Err(error).hint("put a copy of that file in its place");
+            return Err(error).hint("name a copy of that file by --dataset");
         }
-        let held_out = snapshots.iter().flat_map(|snapshot| &snapshot.held_out);
-        let episodes = Vec::from_iter(BTreeSet::from_iter(held_out.copied()));
-        let mut hold_out = HoldOut::Episodes(&episodes);
-        if episodes.is_empty() {
-            warn!(
-                "no run has held out episodes (--hold-out), so the policies are judged in some that they have learned from"
-            );
-            hold_out = HoldOut::Fraction { fraction: HELD_OUT, seed: 0 };
-        }
+        let episodes = shared(snapshots.iter().map(|snapshot| &snapshot.held_out))?;
+        let hold_out = match &episodes {
+            Some(episodes) => HoldOut::Episodes(episodes),
+            None => {
+                warn!(
+                    "no run has held out episodes (--hold-out), so the policies are judged in some that they have learned from"
+                );
+                HoldOut::Fraction(HELD_OUT)
+            }
+        };
         let options = ReadOptions {
             environment: environment::find(environment).ok(),
             task: benchmarks::relabeling(environment),
             reward: RewardRule::AsIs,
             normalize: Normalize { actions: true, observations: true, rewards: false },
+            ..ReadOptions::default()
         };
         let split = Transitions::read_split(&dataset.path, &options, hold_out)
             .hint_of(DatasetError::hint)?;
         Self::of(split, dataset.sha256, environment.clone())
     }
 
-    fn of(split: Split, sha256: String, environment: String) -> anyhow::Result<Self> {
-        let held_out = split.held_out.context("no episode is held out")?;
+    pub(super) fn of(split: Split, sha256: String, environment: String) -> anyhow::Result<Self> {
+        let held_out = split.held_out.context("no episode is left to judge policies in").hint(
+            "record more: they are judged in other episodes than those from which values are learned",
+        )?;
         let episodes = held_out.recorded_episodes();
         let starts = Vec::from_iter(episodes.iter().map(|episode| episode.start));
         // At even distances.
@@ -148,6 +152,20 @@ impl Data {
         }
         distance(&recorded, actions, self.held_out.action_dim())
     }
+}
+
+/// The episodes that these runs have held out, if any has; those of older runs depend on their seed.
+fn shared<'a>(
+    held_out: impl Iterator<Item = &'a BTreeSet<usize>>,
+) -> anyhow::Result<Option<Vec<usize>>> {
+    let held_out = held_out.filter(|episodes| !episodes.is_empty());
+    let Some(shared) = held_out.cloned().reduce(|a, b| &a & &b) else { return Ok(None) };
+    if shared.is_empty() {
+        return Err(anyhow!("no episode is held out by all of these runs")).hint(
+            "judge them apart; runs that begin now hold out the same episodes, whatever their seed",
+        );
+    }
+    Ok(Some(Vec::from_iter(shared)))
 }
 
 /// Root mean square distance of a policy's actions `[n, a]` from the data's, in standard deviations
@@ -213,6 +231,19 @@ mod tests {
             let found = distance(data, policy, action_dim);
             assert!((found - expected).abs() < 1e-6, "{found} is not {expected}");
         }
+    }
+
+    #[test]
+    fn runs_are_judged_in_the_episodes_that_all_have_held_out() {
+        let sets = |sets: &[&[usize]]| -> Vec<BTreeSet<usize>> {
+            sets.iter().map(|set| set.iter().copied().collect()).collect()
+        };
+        let shared = |held_out: &[&[usize]]| shared(sets(held_out).iter());
+        assert_eq!(shared(&[&[], &[]]).unwrap(), None);
+        assert_eq!(shared(&[&[7, 3], &[3, 5, 7], &[]]).unwrap(), Some(vec![3, 7]));
+        // Older runs drew theirs by the seed.
+        let error = shared(&[&[1], &[2]]).unwrap_err();
+        assert_eq!(error.to_string(), "no episode is held out by all of these runs");
     }
 
     #[test]

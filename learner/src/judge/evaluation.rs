@@ -177,7 +177,53 @@ pub(super) fn estimate(curves: &[LearningCurve], units: &Units) -> Estimate {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
+    use quad_dataset::{Arrays, Split, Transitions};
+
     use super::*;
+    use crate::judge::data::gather;
+
+    /// Episodes of two steps, whose states are 0 and 1 and whose rewards are their actions, which are
+    /// 0 on average.
+    fn rewarding(episodes: usize) -> Transitions {
+        let rows = 2 * episodes;
+        let actions = Vec::from_iter((0..rows).map(|row| (row as f32 * 2.4).sin()));
+        Transitions::of(Arrays {
+            observation_dim: 1,
+            action_dim: 1,
+            observations: [0.0, 1.0].repeat(episodes),
+            rewards: actions.clone(),
+            actions,
+            next_observations: [1.0, 2.0].repeat(episodes),
+            terminals: [false, true].repeat(episodes),
+            timeouts: vec![false; rows],
+        })
+        .unwrap()
+    }
+
+    /// It acts by 0.8 in the first state and by -0.4 in the second, so its value is 0.8 - 0.4 γ.
+    #[test]
+    fn a_policy_has_its_own_value_not_the_behaviors() {
+        let (training, held_out) = (rewarding(24), Some(rewarding(8)));
+        let split = Split { training, held_out, episodes: Vec::from_iter(0..8) };
+        let data = Data::of(split, String::new(), String::new()).unwrap();
+        let config = FqeConfig::with_discount(0.5).unwrap();
+        let units = Units::of(&data.context(0), 0.5);
+        let budget = Budget { steps: 200, seeds: 1 };
+        let evaluation = Evaluation { config, units, data: &data, budget };
+        let (behavior, curves): (Vec<_>, Vec<_>) =
+            evaluation.of_behavior().unwrap().into_iter().unzip();
+        let value = |curves: &[LearningCurve]| estimate(curves, &units).values[0];
+        assert!(value(&curves).abs() < 0.2, "{} of the behavior", value(&curves));
+        let act = |states: &[f32]| Vec::from_iter(states.iter().map(|state| 0.8 - 1.2 * state));
+        let training = gather(&data.training, &Vec::from_iter(0..48));
+        let actions = Actions {
+            next: act(&training.next_observations),
+            first: act(&data.first.observations),
+            compared: act(&data.compared.observations),
+        };
+        let policy = value(&evaluation.of_policy(&actions, &behavior).unwrap());
+        assert!((policy - 0.6).abs() < 0.2, "{policy} of the policy");
+    }
 
     #[test]
     fn estimates_that_have_not_converged_are_doubted() {

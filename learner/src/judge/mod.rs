@@ -12,7 +12,6 @@ mod data;
 mod evaluation;
 mod snapshots;
 
-use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -30,10 +29,17 @@ use snapshots::Snapshot;
 
 /// Judges the last snapshots of runs, or single snapshots. Judgments that the folders have under
 /// the same conditions are not computed again.
-pub(crate) fn judge(paths: &[PathBuf], gamma: f32, budget: Budget) -> anyhow::Result<Ranking> {
+///
+/// `dataset`: the data of the runs, if it is not where they have learned from it.
+pub(crate) fn judge(
+    paths: &[PathBuf],
+    dataset: Option<&str>,
+    gamma: f32,
+    budget: Budget,
+) -> anyhow::Result<Ranking> {
     let config = FqeConfig::with_discount(gamma)?;
     let snapshots = snapshots::find(paths)?;
-    let data = Data::read(&snapshots)?;
+    let data = Data::read(&snapshots, dataset)?;
     let conditions = Conditions {
         dataset: data.sha256.clone(),
         environment: data.environment.clone(),
@@ -46,7 +52,8 @@ pub(crate) fn judge(paths: &[PathBuf], gamma: f32, budget: Budget) -> anyhow::Re
     for snapshot in &snapshots {
         let mut known = Judgment::read_all(&snapshot.folder)?.into_iter();
         match known.find(|it| it.weights == snapshot.weights && it.conditions == conditions) {
-            Some(known) => judgments.push(known),
+            // An older file has no caveats.
+            Some(known) => judgments.push(Judgment { caveat: snapshot.caveat.clone(), ..known }),
             None => remaining.push(snapshot),
         }
     }
@@ -80,7 +87,8 @@ fn judge_all(
             conditions: conditions.clone(),
             estimate: estimate(&curves, &evaluation.units),
             distance: data.distance(&actions.compared),
-            unseen: snapshot.held_out == BTreeSet::from_iter(data.episodes.iter().copied()),
+            unseen: data.episodes.iter().all(|episode| snapshot.held_out.contains(episode)),
+            caveat: snapshot.caveat.clone(),
             behavior: behavior.clone(),
             recorded,
         };

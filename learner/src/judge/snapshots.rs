@@ -7,9 +7,9 @@ use anyhow::anyhow;
 use quad_policy::{Chunk, Header, Policy, PolicyError, Precision, load_policy};
 use quad_protocol::{Hash, Origin};
 use quad_run::config::RunConfig;
+use quad_run::counted;
 use quad_run::folder::{RunDir, walk};
 use quad_runtime::Hint;
-use tracing::warn;
 
 const HELP: &str = "what can be judged is the folder of a run, or a snapshot in it, like RUN/snapshots/step_000020000.safetensors";
 
@@ -20,6 +20,8 @@ pub(super) struct Snapshot {
     /// BLAKE3 of the file.
     pub weights: String,
     pub policy: Box<dyn Policy>,
+    /// Why it acts otherwise in an episode than it is judged.
+    pub caveat: Option<String>,
     /// Episodes that the run has not trained on.
     pub held_out: BTreeSet<usize>,
 }
@@ -68,6 +70,19 @@ fn of_file(path: &Path) -> anyhow::Result<Snapshot> {
     }
 }
 
+/// An episode's first observation stands for those before it, and a chunk begins there.
+fn caveat(&Chunk { history, replan, .. }: &Chunk) -> Option<String> {
+    let mut acts = Vec::new();
+    if history > 1 {
+        acts.push(format!("sees {}", counted(history, "observation")));
+    }
+    if replan > 1 {
+        acts.push(format!("executes {}", counted(replan, "action")) + " of a chunk");
+    }
+    let acts = (!acts.is_empty()).then(|| acts.join(" and "))?;
+    Some(format!("judged as if each state were an episode's first, but it {acts}"))
+}
+
 impl Snapshot {
     fn read(folder: RunDir, step: u64) -> anyhow::Result<Self> {
         let config = folder.read_config()?;
@@ -80,15 +95,8 @@ impl Snapshot {
         let (policy, chunk) = load()
             .map_err(|error: PolicyError| anyhow!("{} is not a policy: {error}", path.display()))
             .hint(HELP)?;
-        let Chunk { history, replan, .. } = chunk;
-        if history > 1 || replan > 1 {
-            warn!(
-                "{} is judged as if each state were an episode's first, but it sees {history} observations and executes {replan} \
-                 actions of a chunk",
-                path.display()
-            );
-        }
         Ok(Self {
+            caveat: caveat(&chunk),
             step,
             weights: Hash::of(&file).to_string(),
             policy,

@@ -78,7 +78,7 @@ pub(super) fn read<M: Message>(payload: &ZBytes) -> Result<M, NotAccepted> {
 
 /// A reason not to accept a message.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum NotAccepted {
+pub(crate) enum NotAccepted {
     #[error("the message is empty")]
     Empty,
     #[error("the message is too large")]

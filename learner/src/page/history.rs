@@ -1,6 +1,6 @@
 //! The metrics of a run over its steps, averaged to as many rows as a chart can show.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::PathBuf;
 
@@ -42,9 +42,9 @@ impl History {
         Self { path, stride: 1, ..Self::default() }
     }
 
-    /// Reads the file's new lines. A resumed learner repeats the steps since its checkpoint: they
-    /// replace the earlier ones.
-    pub fn refresh(&mut self) -> io::Result<()> {
+    /// Reads the metrics of these names in the file's new lines. A resumed learner repeats the steps
+    /// since its checkpoint: they replace the earlier ones.
+    pub fn refresh(&mut self, metrics: &BTreeSet<String>) -> io::Result<()> {
         let bytes = new_lines(&self.path, &mut self.offset)?;
         for line in bytes.split(|byte| *byte == b'\n') {
             let line: Result<BTreeMap<String, Option<f64>>, _> = serde_json::from_slice(line);
@@ -55,7 +55,7 @@ impl History {
                 self.lines = self.stride;
             }
             // Later training phases have other metrics.
-            for name in line.keys() {
+            for name in line.keys().filter(|name| metrics.contains(*name)) {
                 if !self.names.contains(name) {
                     self.names.push(name.clone());
                 }

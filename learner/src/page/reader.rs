@@ -1,6 +1,6 @@
 //! Reads run folders for the page.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::slice;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use quad_run::status::list;
 use serde_json::{Value, json};
 
 use super::history::History;
-use crate::train::COLUMNS;
+use crate::train::{COLUMNS, held_out_name};
 
 const RUN_LIFETIME: Duration = Duration::from_secs(1);
 const LIST_LIFETIME: Duration = Duration::from_secs(5);
@@ -105,8 +105,10 @@ impl RunPage {
         if self.started != config.run.started {
             *self = Self { started: config.run.started, ..Self::of(&self.dir) };
         }
-        self.history.refresh()?;
         let metrics = config.experiment.definition()?.metrics;
+        let mut names = BTreeSet::from(COLUMNS.map(|(name, _)| name.to_owned()));
+        names.extend(metrics.iter().flat_map(|it| [it.name.to_owned(), held_out_name(it)]));
+        self.history.refresh(&names)?;
         let practice = config.experiment.online.iter().flat_map(|_| COLUMNS);
         let metrics = metrics.iter().map(|it| (it.name, it.help)).chain(practice);
         let metrics = metrics.map(|(name, help)| json!({ "name": name, "help": help }));

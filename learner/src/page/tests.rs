@@ -18,7 +18,7 @@ use crate::fixtures::{config, line};
 async fn get(root: &Path, paths: &[&str]) -> Vec<(String, String)> {
     let pages = routes(root.to_owned(), None);
     let any_port = ([127, 0, 0, 1], 0).into();
-    let server = serve_metrics(any_port, Default::default(), Health::default(), pages).await;
+    let server = serve_metrics(any_port, &[], Default::default(), Health::default(), pages).await;
     let server = server.unwrap();
     let mut answers = Vec::new();
     for path in paths {

@@ -49,7 +49,11 @@ pub fn all(report: &Report) -> Vec<(String, Plot)> {
     }
     let mut plots = vec![("profile".to_owned(), profiles(report))];
     for (task, groups) in &by_task {
-        plots.push((curve_name(task), curves(task, groups)));
+        let mut name = curve_name(task);
+        while plots.iter().any(|(taken, _)| *taken == name) {
+            name.push('-');
+        }
+        plots.push((name, curves(task, groups)));
     }
     for Definition { name, report, .. } in ALGORITHMS {
         let Some(axis) = report.axis else { continue };
@@ -195,5 +199,62 @@ fn over_on_task(axis: Axis, task: &str, groups: &[&GroupReport]) -> Plot {
         y: groups.first().map_or("", |group| group.measure()),
         lines,
         ..Plot::default()
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use quad_run::folder::RunDir;
+    use quad_run::results::Select;
+
+    use super::*;
+    use crate::fixtures::{config, line};
+
+    #[test]
+    fn curves_are_means_over_runs_of_means_over_episodes() {
+        let folder = tempfile::tempdir().unwrap();
+        for (seed, scores) in [(0, [[1.0, 3.0], [10.0, 20.0]]), (1, [[5.0, 7.0], [1.0, 2.0]])] {
+            let run = folder.path().join(seed.to_string());
+            let (_, mut log) = RunDir::create(&run, &config("r", seed)).unwrap();
+            for (step, scores) in [2000, 4000].into_iter().zip(scores) {
+                let lines =
+                    scores.into_iter().zip(1..).map(|(score, seed)| line(step, seed, score));
+                log.append(&Vec::from_iter(lines)).unwrap();
+            }
+        }
+        let read = |path: &str| {
+            let report = Report::read(&[folder.path().join(path)], Select::Last).unwrap();
+            let (_, plot) = all(&report).remove(0);
+            let points = plot.lines[0].points.iter();
+            let points = points.map(|(x, y)| (*x, y.value, y.high.unwrap() - y.value));
+            (plot.references, Vec::from_iter(points))
+        };
+        let mean = vec![("dataset mean 10.7".to_owned(), 10.7)];
+        // Of two runs, an interval is from one to the other.
+        assert_eq!(read(""), (mean.clone(), vec![(2000.0, 4.0, 2.0), (4000.0, 8.25, 6.75)]));
+        let deviations = [2.0, 50.0].map(f64::sqrt);
+        let alone = vec![(2000.0, 2.0, deviations[0]), (4000.0, 15.0, deviations[1])];
+        let (references, points) = read("0");
+        assert_eq!(references, mean);
+        for (point, expected) in points.iter().zip(&alone) {
+            assert_eq!((point.0, point.1), (expected.0, expected.1));
+            assert!((point.2 - expected.2).abs() < 1e-9, "{points:?}");
+        }
+    }
+
+    #[test]
+    fn tasks_whose_names_have_the_same_letters_have_two_figures() {
+        let folder = tempfile::tempdir().unwrap();
+        for (seed, task) in ["a b", "a/b"].into_iter().enumerate() {
+            let mut config = config("r", seed as u64);
+            config.run.task = task.to_owned();
+            let run = folder.path().join(seed.to_string());
+            let (_, mut log) = RunDir::create(&run, &config).unwrap();
+            log.append(&[line(2000, 1, 1.0), line(2000, 2, 1.0)]).unwrap();
+        }
+        let report = Report::read(&[folder.path().to_owned()], Select::Last).unwrap();
+        let names = Vec::from_iter(all(&report).into_iter().map(|(name, _)| name));
+        assert_eq!(names, ["curve-a-b", "curve-a-b-"]);
     }
 }

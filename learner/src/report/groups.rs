@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use quad_dataset::{GoalDraw, environment};
 use quad_run::config::Device;
-use quad_run::config::settings::{self, Settings, differences};
+use quad_run::config::settings::{self, Settings, differences_in_brief};
 use quad_run::counted;
 use quad_run::results::departures::{as_given, departures};
 use quad_run::results::published::{self, Published};
@@ -17,7 +17,11 @@ use serde::Serialize;
 /// scores may differ.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GroupReport {
+    /// Unlike for unlike environments or data.
     pub task: String,
+    /// The task after `--task`.
+    #[serde(skip)]
+    pub named: String,
     pub algorithm: String,
     /// The kind of guidance for QUAD, such as `quad`, `dac` and `none`, or another algorithm's
     /// name.
@@ -148,7 +152,7 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
         let earlier = groups[..index].iter();
         for other in earlier.filter(|other| other.variant == one.variant) {
             let other_task = one.task() != other.task();
-            let keys = differences(&one.settings, &other.settings)
+            let keys = differences_in_brief(&one.settings, &other.settings)
                 .filter(|key| !(other_task && one.is_preset(key) && other.is_preset(key)));
             differing.entry(one.variant).or_default().extend(keys);
         }
@@ -164,7 +168,7 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
         let mut differs = BTreeSet::new();
         for other in &groups {
             if other.task() == group.task() && other.variant[0] == group.variant[0] {
-                differs.extend(differences(&group.settings, &other.settings));
+                differs.extend(differences_in_brief(&group.settings, &other.settings));
             }
         }
         let differs = differs.into_iter().map(|key| group.setting(key)).collect();
@@ -209,7 +213,7 @@ fn report(
     };
     let first = runs[0];
     let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
-    let published = published::scores(&first.task);
+    let published = published::scores(&first.config.run.task);
     let environment = environment::find(&first.config.experiment.environment);
     let maze = environment.ok().and_then(|known| known.maze);
     let has_one_goal = maze.is_some_and(|maze| maze.draw == GoalDraw::EachInstance);
@@ -223,6 +227,7 @@ fn report(
     };
     GroupReport {
         task: first.task.clone(),
+        named: first.config.run.task.clone(),
         algorithm: first.algorithm.clone(),
         variant: first.variant.clone(),
         method,

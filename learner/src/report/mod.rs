@@ -8,10 +8,10 @@
 //! standard deviation. With `--select best`, a run's best evaluation counts instead, and the report
 //! says so. A run that is not complete has no score.
 //!
-//! In reading order: `groups` groups runs that differ only in their seed; `methods` aggregates them
-//! over tasks; `published` makes published tables with our scores; `summary` is the whole report;
-//! `figures` are its plots, which `plot` draws; `html` is the report as one file, with the commands
-//! of `reproduce`.
+//! In reading order: `tasks` tells tasks of one name apart; `groups` groups runs that differ only in
+//! their seed; `methods` aggregates them over tasks; `published` makes published tables with our
+//! scores; `summary` is the whole report; `figures` are its plots, which `plot` draws; `html` is the
+//! report as one file, with the commands of `reproduce`.
 
 mod figures;
 mod groups;
@@ -21,6 +21,7 @@ mod plot;
 mod published;
 mod reproduce;
 mod summary;
+mod tasks;
 
 pub(crate) use figures::{draw_all, learning_curve};
 pub(crate) use html::write as write_html;

@@ -14,7 +14,7 @@ type Score<'a> = (&'a str, &'a Published);
 /// nothing without such runs.
 pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
     let in_table =
-        |group: &&GroupReport| published::tables(&group.task, &group.algorithm).contains(&name);
+        |group: &&GroupReport| published::tables(&group.named, &group.algorithm).contains(&name);
     let groups = Vec::from_iter(groups.iter().filter(in_table));
     if groups.is_empty() {
         return Vec::new();
@@ -52,7 +52,7 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
         }
         table.push(row);
     }
-    let last = published::final_evaluations(&groups[0].task);
+    let last = published::final_evaluations(&groups[0].named);
     let score = match select {
         Select::Last => format!("the mean of its last {last} evaluations"),
         Select::Best => "its best evaluation".to_owned(),

@@ -1,7 +1,10 @@
 //! The command that reproduces a run.
 
+use std::collections::BTreeSet;
+
 use quad_run::config::settings::{self, differences};
 use quad_run::config::tables::parse_assignment;
+use quad_run::config::{ConfigError, Experiment, resolve};
 use quad_run::results::RunReport;
 use quad_run::results::departures::as_given;
 
@@ -17,7 +20,7 @@ pub fn command(run: &RunReport) -> Option<String> {
         ));
     }
     let preset = as_given(run, false).ok()?;
-    let mut words = vec!["learner train --task".to_owned(), quoted(&run.task)];
+    let mut words = vec!["learner train --task".to_owned(), quoted(&run.config.run.task)];
     let mut push = |flag: &str, value: &str| words.extend([flag.to_owned(), quoted(value)]);
     push("--algorithm", &run.algorithm);
     if let Some(dataset) = &experiment.dataset {
@@ -26,8 +29,11 @@ pub fn command(run: &RunReport) -> Option<String> {
     if experiment.environment != preset.environment {
         push("--env", &experiment.environment);
     }
-    let [ours, theirs] = [experiment, &preset].map(settings::of_experiment);
-    for key in differences(&ours, &theirs) {
+    // What follows from practice is compared with the values for practice.
+    let practiced = with_practice(experiment, &run.config.run.task).ok()?;
+    let [ours, theirs, practiced] = [experiment, &preset, &practiced].map(settings::of_experiment);
+    let keys = differences(&ours, &theirs).chain(differences(&ours, &practiced));
+    for key in keys.collect::<BTreeSet<_>>() {
         match (key.as_str(), ours.get(key)) {
             ("environment" | "seed", _) => {}
             // A share of 0 is not among the settings, but the task may have another.
@@ -41,6 +47,13 @@ pub fn command(run: &RunReport) -> Option<String> {
     push("--seed", &run.seed.to_string());
     push("--run-dir", &run.dir.to_string_lossy());
     Some(words.join(" "))
+}
+
+/// The values of an experiment's algorithm for a task with as much practice.
+fn with_practice(experiment: &Experiment, task: &str) -> Result<Experiment, ConfigError> {
+    let algorithm = experiment.algorithm.as_str();
+    let steps = experiment.online.as_ref().map_or(0, |online| online.steps) as i64;
+    resolve(task, &toml::toml! { algorithm = algorithm online.steps = steps })
 }
 
 /// `KEY=VALUE`, without quotes where they can be omitted.

@@ -14,7 +14,7 @@ use tracing::warn;
 
 use super::groups::{self, GroupReport};
 use super::methods::{self, Comparison, MethodReport};
-use super::published;
+use super::{published, tasks};
 
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Report {
@@ -61,6 +61,7 @@ impl Report {
             // Fails with the reason.
             RunReport::read(dirs.first().unwrap_or(&paths[0]))?;
         }
+        tasks::tell_apart(&mut runs);
         let groups = groups::groups(&runs, select);
         let (study, comparisons) = methods::aggregate(&groups);
         let named = paths.iter().cloned().collect();
@@ -126,7 +127,8 @@ impl Report {
                 it.seeds.len().to_string() + &goals.unwrap_or_default()
             }),
             ("scored in", Left, |it| {
-                it.scored_in.clone() + if it.normalized { "" } else { " (returns)" }
+                let unit = (!it.normalized).then(|| format!(" ({}s)", it.measure()));
+                it.scored_in.clone() + &unit.unwrap_or_default()
             }),
         ];
         match self.select {

@@ -279,7 +279,7 @@ impl Scoreboard {
         })
     }
 
-    /// The practice episode that training has waited for for long, if one evaluator plays it.
+    /// The practice episode that training has waited for too long, if one evaluator plays it.
     fn straggler(&mut self, job: u64, now: Instant) -> Option<(Key, Vec<u64>)> {
         let (episode, _) = self.awaited.filter(|(_, since)| now >= *since + STRAGGLER)?;
         let key = Key::Practice(episode);

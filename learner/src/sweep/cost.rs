@@ -39,13 +39,13 @@ impl StudyCost {
         let one_thread = ThreadPoolBuilder::new().num_threads(1).build()?;
         let mut told = BTreeSet::new();
         let mut measure = |run: &PlannedRun, path: &Path| {
-            let transitions = load(path, &run.experiment)?.training;
-            for warning in warnings(path, &transitions) {
+            let data = load(path, &run.experiment, None)?;
+            for warning in warnings(path, &data.training) {
                 if told.insert(warning.clone()) {
                     warn!("{warning}");
                 }
             }
-            one_thread.install(|| RunCost::measure(&run.experiment, Device::Cpu, transitions))
+            one_thread.install(|| RunCost::measure(&run.experiment, Device::Cpu, data))
         };
         let mut costs: BTreeMap<String, RunCost> = BTreeMap::new();
         for (run, _) in runs {

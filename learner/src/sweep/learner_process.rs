@@ -31,6 +31,7 @@ pub(crate) struct LearnerOptions {
     pub endpoint: String,
     /// Address of the page, for a single learner.
     pub http: Option<SocketAddr>,
+    pub http_hosts: Vec<String>,
 }
 
 #[derive(Clone)]
@@ -102,6 +103,7 @@ impl LearnerProcess {
         if let Some(address) = options.http {
             command.args(["--http", &address.to_string()]);
         }
+        command.args(options.http_hosts.iter().map(|host| format!("--http-hosts={host}")));
         for (key, value) in tables::keys(&run.changes) {
             command.args(["--set", &format!("{key}={value}")]);
         }

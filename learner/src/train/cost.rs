@@ -3,14 +3,19 @@
 use std::time::{Duration, Instant};
 
 use quad_algorithms::{Agent, AlgorithmError};
-use quad_dataset::{BatchSampler, Transitions};
+use quad_dataset::{BatchSampler, Split};
 use quad_run::config::{Device, Experiment};
 use quad_run::folder::Checkpoint;
 
 use super::agent::{begin, origin};
+use super::held_out::HeldOut;
 
 /// Time of the measurement, of all phases together.
 const MEASURED: Duration = Duration::from_secs(1);
+
+/// Timed steps of a phase are a multiple of this: some updates come at each second, fifth or
+/// twentieth step.
+const CYCLE: u64 = 20;
 
 /// Bytes of an environment step in memory beside its numbers: its place, and marks of its end.
 const MARKS: u64 = 9;
@@ -26,24 +31,26 @@ pub(crate) struct RunCost {
 }
 
 impl RunCost {
-    /// Measures the first steps of each phase of a run, on the threads of the calling pool.
-    pub fn measure(
-        experiment: &Experiment,
-        device: Device,
-        transitions: Transitions,
-    ) -> anyhow::Result<Self> {
-        let numbers = transitions.observation_dim() + transitions.action_dim() + 1;
-        let mut agent = begin(experiment, device, transitions)?;
+    /// Measures the first steps of each phase of a run, on the threads of the calling pool, with all
+    /// that a run has in memory.
+    pub fn measure(experiment: &Experiment, device: Device, data: Split) -> anyhow::Result<Self> {
+        let numbers = data.training.observation_dim() + data.training.action_dim() + 1;
+        let mut agent = begin(experiment, device, data.training)?;
+        let held_out = data.held_out;
+        let held_out = held_out.and_then(|it| HeldOut::new(experiment, device, it, &mut agent));
         let mut sampler = BatchSampler::new(
             agent.dataset_len(),
             experiment.batch_size as usize,
             experiment.seed,
             0,
         );
+        let step_seconds = mean_step(&mut agent, &mut sampler, experiment.total_steps())?;
+        let state = agent.save()?;
+        held_out.map(|mut held_out| held_out.measure(&state)).transpose()?;
         Ok(Self {
-            step_seconds: mean_step(&mut agent, &mut sampler, experiment.total_steps())?,
+            step_seconds,
             snapshot_bytes: agent.policy(origin(experiment))?.len() as u64,
-            checkpoint_bytes: agent.save()?.len() as u64,
+            checkpoint_bytes: state.len() as u64,
             row_bytes: (numbers * size_of::<f32>()) as u64,
         })
     }
@@ -80,18 +87,21 @@ pub(super) fn mean_step(
     let phases = Vec::from_iter(phases.filter(|(begin, end)| begin < end));
     let mut seconds = 0.0;
     for (begin, end) in &phases {
+        agent.skip_to(*begin);
         let mut step = || {
-            agent.skip_to(*begin);
+            if agent.step() == *end {
+                agent.skip_to(*begin);
+            }
             agent.update(sampler.next_indices())
         };
         // The first step also allocates buffers.
         step()?;
         let (start, mut done) = (Instant::now(), 0);
         while done == 0 || start.elapsed() < MEASURED / phases.len() as u32 {
-            step()?;
-            done += 1;
+            (0..CYCLE).try_for_each(|_| step().map(drop))?;
+            done += CYCLE;
         }
-        seconds += start.elapsed().as_secs_f64() / f64::from(done) * (end - begin) as f64;
+        seconds += start.elapsed().as_secs_f64() / done as f64 * (end - begin) as f64;
     }
     Ok(seconds / steps as f64)
 }

@@ -65,6 +65,7 @@ metrics! {
         target: IntGauge("experience_rows_target", "Environment steps of practice that this run will do"),
         rows: IntGauge("experience_rows", "Environment steps of practice that training has absorbed"),
         episodes: IntGauge("experience_episodes", "Episodes of practice that training has absorbed"),
+        left_out: IntCounter("practice_left_out_total", "Episodes of practice with a number far outside the dataset's range"),
         differences: IntCounter("practice_differences_total", "Episodes of practice that came again with other bits"),
         episode_return: Gauge("practice_return", "Return of the newest episode that training has absorbed"),
         score: Gauge("practice_score", "Score of the newest episode that training has absorbed"),

@@ -27,5 +27,5 @@ pub(crate) use held_out::HeldOut;
 pub(crate) use metrics::{PracticeMetrics, TrainingMetrics, metrics, register};
 pub(crate) use output_queue::{Output, OutputQueue};
 pub(crate) use practice::{COLUMNS, Inbox, Practice};
-pub(crate) use results::{Outcome, TrainedPolicy};
+pub(crate) use results::{Outcome, TrainedPolicy, held_out_name};
 pub(crate) use training::Training;

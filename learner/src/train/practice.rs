@@ -1,5 +1,5 @@
 //! Practice on the thread of training: its episodes enter the buffer in the order and at the steps
-//! that [`OnlineSchedule`] says.
+//! that [`OnlineSchedule`] says. An episode that is left out counts as one without rows.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,6 +11,7 @@ use quad_dataset::{OnlineSampler, PracticeRows, Transitions};
 use quad_protocol::Episode;
 use quad_run::config::Experiment;
 use quad_runtime::Heartbeat;
+use tracing::warn;
 
 use super::metrics::PracticeMetrics;
 use crate::service::{OnlineSchedule, Opening};
@@ -128,12 +129,21 @@ impl Practice {
         let Episode { observations, actions, rewards, terminated, score, .. } = episode;
         let rows = PracticeRows { observations, actions, rewards, terminated: *terminated };
         let added = self.transitions.add_episode(rows);
-        added.map_err(|source| PracticeError::Rows { number, source })?;
-        self.schedule.absorb(rewards.len() as u64);
-        metrics.rows.set(i64::try_from(self.schedule.rows()).unwrap_or(i64::MAX));
-        metrics.episodes.inc();
-        metrics.episode_return.set(score.episode_return);
-        metrics.score.set(score.score);
+        let far = added.map_err(|source| PracticeError::Rows { number, source })?;
+        self.schedule.absorb(if far.is_some() { 0 } else { rewards.len() as u64 });
+        if let Some(far) = far {
+            warn!(
+                episode = number,
+                seed = score.seed,
+                "training leaves out an episode of practice: {far}"
+            );
+            metrics.left_out.inc();
+        } else {
+            metrics.rows.set(i64::try_from(self.schedule.rows()).unwrap_or(i64::MAX));
+            metrics.episodes.inc();
+            metrics.episode_return.set(score.episode_return);
+            metrics.score.set(score.score);
+        }
         Ok(())
     }
 

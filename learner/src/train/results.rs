@@ -53,7 +53,7 @@ impl Serialize for Row {
 }
 
 /// The name of a metric on held-out episodes.
-pub(super) fn held_out_name(metric: &Metric) -> String {
+pub(crate) fn held_out_name(metric: &Metric) -> String {
     format!("held_out_{}", metric.name)
 }
 

@@ -97,7 +97,8 @@ impl Training {
         }
         while self.agent.step() < steps {
             if !self.practice(beat)? {
-                self.save_state(self.agent.step())?;
+                let (checkpoint, _) = self.checkpoint(self.agent.step())?;
+                self.queue.checkpoint(checkpoint);
                 return Ok(Outcome::Stopped);
             }
             let begin = Instant::now();
@@ -120,6 +121,11 @@ impl Training {
 
             let is_last = step == steps;
             let stopped = !is_last && self.stop.load(Ordering::Relaxed);
+            // Checks the whole state: what has diverged leaves neither a row nor a snapshot.
+            let checkpoint = match is_last || stopped || updated >= next_checkpoint {
+                true => Some(self.checkpoint(step)?),
+                false => None,
+            };
             if step.is_multiple_of(STEPS_PER_ROW) || is_last || stopped {
                 let seconds = self.seconds_before + start.elapsed().as_secs_f64();
                 let (values, held_out) = (means.take(), self.measure_held_out(step, is_last)?);
@@ -130,8 +136,8 @@ impl Training {
             if is_last || self.schedule.is_evaluated(step) || self.practices_with(step) {
                 self.save_policy(step, beat)?;
             }
-            if is_last || stopped || updated >= next_checkpoint {
-                let pause = TRAINING_PER_SAVING * self.save_state(step)?;
+            if let Some((checkpoint, pause)) = checkpoint {
+                self.queue.checkpoint(checkpoint);
                 next_checkpoint = Instant::now() + self.checkpoint_every.max(pause);
             }
             if stopped {
@@ -194,13 +200,16 @@ impl Training {
         Ok(())
     }
 
-    /// Returns the time that it took to copy the state, in which nothing was trained.
-    fn save_state(&mut self, step: u64) -> Result<Duration, TrainError> {
+    /// Copies the state, in which time nothing is trained. Also returns the least time until the
+    /// next copy.
+    ///
+    /// # Errors
+    /// A number of the state is not finite.
+    fn checkpoint(&mut self, step: u64) -> Result<(Checkpoint, Duration), TrainError> {
         let begin = Instant::now();
         let state = self.agent.save().map_err(TrainError::at(step))?;
         let took = begin.elapsed();
         self.metrics.saving_seconds.inc_by(took.as_secs_f64());
-        self.queue.checkpoint(Checkpoint { step, state });
-        Ok(took)
+        Ok((Checkpoint { step, state }, TRAINING_PER_SAVING * took))
     }
 }

@@ -39,7 +39,7 @@ fn score(run: &RunDir, episodes: &[(u64, u64, f64, &str)]) {
     fs::write(run.path().join("scores.jsonl"), lines).unwrap();
 }
 
-fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
+pub fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
     let estimate = Estimate { values: vec![1.0, 1.0], doubts: Vec::new() };
     let judgment = Judgment {
         run: run.path().to_owned(),
@@ -56,10 +56,29 @@ fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
         estimate: estimate.clone(),
         distance,
         unseen: true,
+        caveat: Some("it executes 2 actions".to_owned()),
         behavior: estimate,
         recorded: 1.0,
     };
     judgment.save(run).unwrap();
+}
+
+#[test]
+fn a_judge_takes_the_data_of_a_run_from_where_it_is_now() {
+    let folder = tempfile::tempdir().unwrap();
+    let (run, _) = train(folder.path());
+    let [data, other] = ["data.hdf5", "other.hdf5"].map(|name| folder.path().join(name));
+    fs::remove_file(data).unwrap();
+    crate::hopper::write_hopper(&other, 3, 50);
+    let judged = |flags: &str| {
+        let output = learner(&format!("judge {} {flags}", run.path().display()));
+        assert_eq!(output.status.code(), Some(1));
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let said = judged("");
+    assert!(said.contains("hint: name the data of the run"), "{said}");
+    let said = judged(&format!("--dataset {}", other.display()));
+    assert!(said.contains("is not the data that"), "{said}");
 }
 
 /// Score and judgment in the file, and the text for the user.
@@ -88,6 +107,7 @@ fn a_file_has_the_score_and_judgment_of_its_own_step_and_weights() {
         assert_eq!(score["score"]["mean"], expected);
         assert_eq!(score["complete"], true);
         assert_eq!(judgment["distance"], step as f64);
+        assert_eq!(judgment["caveat"], "it executes 2 actions");
         assert!(!said.contains("WARN"), "{said}");
     }
     // The best of the snapshots that are left.

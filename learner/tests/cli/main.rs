@@ -7,6 +7,7 @@ mod foreign;
 mod hopper;
 mod report;
 mod run;
+mod signals;
 mod transcripts;
 
 use std::path::Path;

@@ -132,6 +132,13 @@ pub fn practiced() -> Run {
     small(0, 0.0).set("experiment.steps", 3000).set("experiment.online", online)
 }
 
+/// The run of [`practiced`], but best before practice.
+pub fn fallen() -> Run {
+    let mut run = practiced();
+    run.scores[4..6].iter_mut().for_each(|line| line["score"] = json!(50.0));
+    run
+}
+
 /// Four runs of one of the paper's tasks, with a score of each evaluation up to `last`.
 pub fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
     let run = |seed| {

@@ -3,15 +3,37 @@
 
 use std::env;
 use std::fs::{self, File};
+use std::net::TcpListener;
 use std::os::unix::fs::symlink;
 use std::path::Path;
 
+use quad_dataset::{Arrays, Names, write_own};
 use quad_protocol::{Episode, EpisodeScore, Hash, Name, encode, episode_seeds};
 use quad_run::folder::RunDir;
 use serde_json::{Value, json};
 
-use crate::run::{HOPPER, Run, TASKS, complete, paper, practiced, small, write_all, write_study};
+use crate::export::judge;
+use crate::run::{
+    HOPPER, Run, TASKS, complete, fallen, paper, practiced, small, write_all, write_study,
+};
 use crate::write_dataset;
+
+/// A study whose run diverges at its last step: one observation is too large for the square of a
+/// gradient.
+const DIVERGES: &str = "about = 'x'
+[run]
+task = 'own-data'
+environment = 'far'
+dataset = 'far.hdf5'
+algorithm = 'td3-bc'
+hold_out = 0
+steps = 20
+batch_size = 8
+agent.actor.hidden = [8]
+agent.critic.hidden = [8]
+[axes]
+seed = [0]
+";
 
 /// A study of which some runs cannot begin.
 const STUDY: &str = "about = 'x'
@@ -39,10 +61,14 @@ fn commands_print_what_their_transcripts_have() {
     env::set_current_dir(folder.path()).unwrap();
     write_dataset(Path::new("data.hdf5"));
     fs::write("study.toml", STUDY).unwrap();
+    fs::write("diverges.toml", DIVERGES).unwrap();
+    write_far(Path::new("far.hdf5"));
     write_reported();
     write_published();
     write_studies();
     let _at_work = write_listed();
+    // Where this fails, another program has the port.
+    let _usual_port = TcpListener::bind("127.0.0.1:7447");
     write_verified();
     write_practiced();
     write_foreign();
@@ -55,6 +81,24 @@ fn commands_print_what_their_transcripts_have() {
         .run();
 }
 
+/// A dataset of which one observation is far from all others.
+fn write_far(path: &Path) {
+    let numbers = |count: usize| Vec::from_iter((0..count).map(|i| (i as f32).sin() / 2.0));
+    let mut observations = numbers(200);
+    observations[0] = 1e12;
+    let arrays = Arrays {
+        observation_dim: 2,
+        action_dim: 1,
+        next_observations: numbers(202).split_off(2),
+        observations,
+        actions: numbers(100),
+        rewards: vec![1.0; 100],
+        terminals: vec![false; 100],
+        timeouts: (1..=100).map(|row| row % 25 == 0).collect(),
+    };
+    write_own(path, arrays, Names::default()).unwrap();
+}
+
 /// The search path with the learner, for pipes.
 fn bin_path() -> String {
     let folder = Path::new(env!("CARGO_BIN_EXE_learner")).parent().unwrap();
@@ -65,6 +109,7 @@ fn bin_path() -> String {
 fn write_reported() {
     small(3, 0.0).write("report/one");
     practiced().write("report/practiced");
+    fallen().write("report/fallen");
     let (mut complete, mut stopped) = (small(0, 0.0), small(1, 0.0));
     complete.score(6000, 0, 12.0, "00");
     complete.write("report/stopped/a");
@@ -100,6 +145,11 @@ fn write_reported() {
     let mut last = Run::new("hopper-demo", 0).sizes(100_000, 10_000, 1);
     (1..=10).for_each(|n| last.score(10_000 * n, 0, n as f64, "00"));
     last.write("report/last");
+    // Of these 50,000, practice has 10,000.
+    let online = practiced().config["experiment"]["online"].clone();
+    let online = last.set("experiment.steps", 90_000).set("experiment.online", online);
+    let online = online.set("experiment.online.steps", 5500);
+    online.write("report/short-practice");
     write_all("report/goals", paper("antmaze-umaze-v0", 100_000, |_| 50.0));
 }
 
@@ -172,6 +222,18 @@ fn write_studies() {
         "pairs",
         pairs.map(|(guidance, seed, score)| guided(Run::new(TASKS[0], seed), guidance, score)),
     );
+    // Two robots, one of them with two logs.
+    let own = |environment, sha256: &str, guidance, score| {
+        let run = Run::new("own-data", 0).set("experiment.environment", environment);
+        guided(run.set("dataset.sha256", sha256.repeat(8)), guidance, score)
+    };
+    let logs = [
+        own("reach", "12ab34cd", "quad", 1.0),
+        own("reach", "12ab34cd", "dac", 2.0),
+        own("reach", "56ef78ab", "quad", 3.0),
+        own("push", "12ab34cd", "dac", 100.0),
+    ];
+    write_all("own", logs);
     let robot = Run::new(TASKS[0], 0)
         .set("experiment.environment", "my-robot")
         .set("run.preset", "my-robot");
@@ -236,10 +298,14 @@ fn write_verified() {
         }
     }
     // As with `--eval-interval 0`: no evaluations, only snapshots.
-    for name in ["alone", "alike", "flipped", "none"] {
+    for name in ["alone", "alike", "flipped", "none", "judged", "judged-flipped"] {
         Run::new("hopper-demo", 4).sizes(15, 0, 3).write(format!("verify/{name}"));
         let mut snapshot = [7; 100];
-        snapshot[50] ^= u8::from(name == "flipped");
+        if name.starts_with("judged") {
+            let weights = Hash::of(&snapshot).to_string();
+            judge(&RunDir::at(Path::new("verify").join(name).as_path()), 15, 1.0, &weights);
+        }
+        snapshot[50] ^= u8::from(name.ends_with("flipped"));
         if name != "none" {
             let path = format!("verify/{name}/snapshots/step_000000015.safetensors");
             fs::write(path, snapshot).unwrap();
@@ -274,6 +340,15 @@ fn write_practiced() {
         };
         log.append([&*encode(&episode).unwrap()]).unwrap();
     }
+    // Another user's file, of an episode without observations.
+    Run::new("hopper-demo", 5).write("practice/foreign");
+    let (mut log, _) = RunDir::at(Path::new("practice/foreign")).experience_log().unwrap();
+    let score = EpisodeScore { seed: 0, episode_return: 1.0, length: 1, score: 1.0 };
+    let (actions, rewards) = (vec![0.5; 3], vec![1.0]);
+    let precision = Name::new("f32").unwrap();
+    let empty =
+        Episode { score, actions, rewards, ..Episode::new(20, Hash::of(b""), precision, 0) };
+    log.append([&*encode(&empty).unwrap()]).unwrap();
 }
 
 /// The runs of foreign.trycmd.

@@ -84,8 +84,8 @@ def _print(text: str) -> None:
 
 def _read(source: str, given: dict[str, Any]) -> Dataset:
     read, place = _reader(source)
-    if "success" in given:
-        given["success"] = _success(given["success"])
+    if len(given.get("success", ())) == 1:
+        given["success"] = given["success"][0]
     known = inspect.signature(read).parameters
     for name in given.keys() - known.keys():
         options = ", ".join(f"--{name}" for name in [*known][1:] if name != "features")  # Functions are Python's.
@@ -121,8 +121,3 @@ def _reader(source: str) -> tuple[Callable[..., Dataset], str]:
             return Dataset.from_frame, source
     _quad_rl.inspect_dataset(path)  # Its error names other formats.
     raise ValueError(f"`learner train --dataset {source}` reads it as it is")
-
-
-def _success(words: list[str]) -> Any:
-    listed = [int(word) if word.isdigit() else word for word in words]
-    return words[0] if listed == words[:1] else listed

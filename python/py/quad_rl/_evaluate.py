@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -28,7 +29,8 @@ _LEAVE = 12.0
 class Evaluators:
     """Worker processes that evaluate a learner's policies in an environment of yours, until `stop()`.
 
-    As a context manager, it stops them at the end of the block:
+    As a context manager, it stops them at the end of the block. If they fail, it interrupts the block as Ctrl-C does, and raises
+    their error:
 
         with quad_rl.Evaluators("my-robot", lambda seed: MyEnv(), workers=2):
             subprocess.run(["learner", "train", ...])
@@ -62,6 +64,8 @@ class Evaluators:
         payload = [json.dumps(sys.path, default=str).encode(), cloudpickle.dumps(task)]  # Some add a Path to it.
         self._process = os.getpid()
         self._stopping = threading.Event()
+        # True in a block of the main thread, which may wait for a learner that waits for these workers.
+        self._interrupts = False
         self._error: Exception | None = None
         self._workers: list[Worker] = []
         self._watcher = threading.Thread(target=self._watch, daemon=True)
@@ -84,6 +88,8 @@ class Evaluators:
             except (RuntimeError, OSError) as error:
                 self._error = error
                 self._stopping.set()
+                if self._interrupts:
+                    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
     def wait(self) -> None:
         """Waits until Ctrl-C, or `stop()` in another thread, stops the workers.
@@ -114,11 +120,13 @@ class Evaluators:
             worker.wait(until)
 
     def __enter__(self) -> Evaluators:
+        self._interrupts = threading.current_thread() is threading.main_thread()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._interrupts = False
         self.stop()
         if self._error is not None:
             raise self._error
@@ -139,8 +147,9 @@ def evaluate(name: str, environment: str | Callable[[int], Any], **arguments: An
         of returns that score 0 and 100.
     precision: arithmetic of the policy, "f32" or "bf16".
 
-    An error of the environment is logged, reported to the learner in one line, and counts as a failed attempt of the job.
-    Raises ValueError for invalid arguments, RuntimeError if the environment cannot be made.
+    Each worker tries its environment first: a reset and, if it has an `action_space`, a step by the action 0. An error of the
+    environment is logged, reported to the learner in one line, and counts as a failed attempt of the job. Raises ValueError for
+    invalid arguments, RuntimeError if the environment cannot be made, fails this trial, or returns what Gymnasium's do not.
     """
     Evaluators(name, environment, **arguments).wait()
 

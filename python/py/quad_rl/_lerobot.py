@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from quad_rl._quad_rl import Policy
 
-_FEATURE = re.compile(r"observation\.(images\.)?[^.\[]+")
+# `images` and `states` are the beginnings of several features, such as `observation.states.joint_state`.
+_FEATURE = re.compile(r"observation\.((images|states)\.)?[^.\[]+")
 # LeRobot's programs set values of steps by these names. Nothing is normalized, as the policy itself scales.
 _DEVICE = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
 _RENAME = {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}}
@@ -31,15 +37,41 @@ A policy of QUAD, for LeRobot with the plugin `lerobot_policy_quad`. It sees {se
 """
 
 
-def inputs(policy: Policy) -> dict[str, list[int]]:
+def inputs(policy: Policy, features: Iterable[str] = ()) -> dict[str, list[int]]:
     """The features of LeRobot's that a policy sees, with the places of their numbers in an observation.
 
-    Where names are others than `Dataset.from_lerobot` gives, or none, all are the robot's state.
+    features: those of the robot, if they are known. Where names are others than `Dataset.from_lerobot` gives, or none, all are
+        the robot's state.
     """
-    found = [match.group() for match in map(_FEATURE.match, policy.observation_names) if match]
+    longest_first = sorted((name for name in features if name.startswith("observation.")), key=len, reverse=True)
+    found = []
+    for column in policy.observation_names:
+        match = _FEATURE.match(column)
+        known = next((name for name in longest_first if column == name or column.startswith((f"{name}.", f"{name}["))), None)
+        found += [known] if known else [match.group()] if match else []
     if len(found) < policy.observation_size:
         found = ["observation.state"] * policy.observation_size
     return {name: [place for place, other in enumerate(found) if other == name] for name in dict.fromkeys(found)}
+
+
+def places(wanted: list[str], there: list[str]) -> list[int]:
+    """Where each wanted column is among those that are there. Names that several columns have say nothing of their places."""
+    if wanted == there:
+        return [*range(len(there))]
+    missing = [name for name in wanted if name not in there]
+    if missing:
+        raise ValueError(f"there is no column {', '.join(missing)}\nhint: there are {', '.join(there)}")
+    for name in [name for name in there if name in wanted and max(there.count(name), wanted.count(name)) > 1]:
+        hint = "hint: give each its own name in the robot's features, in the policy's data, or in the same order in both"
+        raise ValueError(f"there are several columns {name}, which cannot be told apart\n{hint}")
+    return [there.index(name) for name in wanted]
+
+
+def act(episodes: Any, rows: NDArray[np.float32], seen: list[int], done: list[int]) -> NDArray[np.float32]:
+    """Actions of `Policy.begin`'s episodes in the robot's order: number i of an action is the policy's number `done[i]`, and number
+    i of the policy's observation is number `seen[i]` of a row."""
+    actions: NDArray[np.float32] = episodes.act(rows[:, seen])[:, done]
+    return actions
 
 
 def export_lerobot(policy: Policy | str | PathLike[str], folder: str | PathLike[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -13,6 +14,7 @@ import sysconfig
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -100,7 +102,7 @@ def train(
 ) -> Run:
     """Runs `learner train` to the end of training and its evaluations, and shows its progress.
 
-    dataset: an argument of `--dataset`, or a Dataset, which is passed as a temporary file.
+    dataset: an argument of `--dataset`, or a Dataset, which the run's folder keeps as a file.
     run_dir: folder of the run. If it contains a run of the same configuration, that run continues.
     algorithm, steps, online_steps, normalize, task: as in `learner train --help`.
     options: any other option, with _ for -: `eval_interval=5000`, `fresh=True`. A dictionary repeats an option:
@@ -111,11 +113,9 @@ def train(
     """
     own = {"task": task, "algorithm": algorithm, "steps": steps, "online_steps": online_steps, "normalize": normalize}
     own["run_dir"] = os.fspath(run_dir)
-    with tempfile.TemporaryDirectory() as folder:
+    with ExitStack() as stack:
         if isinstance(dataset, Dataset):
-            path = Path(folder, "dataset.hdf5")
-            dataset.save(path)
-            dataset = path
+            dataset = stack.enter_context(_kept(dataset, Path(run_dir)))
         display = _Display()
         process = _start("train", f"--dataset={os.fspath(dataset)}", *_flags(own | options))
         error: list[str] = []
@@ -134,6 +134,28 @@ def train(
     if code != 0:
         raise _error(code, error)
     return Run(run_dir)
+
+
+@contextmanager
+def _kept(dataset: Dataset, folder: Path) -> Iterator[Path]:
+    """The data as a file in a run's folder, which stays there if a run begins with it. Other data has another name."""
+    with tempfile.TemporaryDirectory() as temporary:
+        saved = Path(temporary, "dataset.hdf5")
+        dataset.save(saved)
+        path = folder / f"dataset-{hashlib.sha256(saved.read_bytes()).hexdigest()[:12]}.hdf5"
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.move(saved, path)
+    try:
+        yield path
+    finally:
+        config = folder / "config.toml"
+        if config.exists() and path.name in config.read_text(encoding="utf-8"):
+            if not path.exists():  # With `fresh`, the learner has renamed the folder in which it was.
+                dataset.save(path)
+        else:
+            path.unlink(missing_ok=True)
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
 
 
 class _Display:

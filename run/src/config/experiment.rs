@@ -173,6 +173,19 @@ impl Experiment {
     pub(super) fn check(&mut self) -> Result<(), ConfigError> {
         self.online.take_if(|online| online.steps == 0);
         self.check_ranges()?;
+        let is_odd = |c: char| c.is_whitespace() || c.is_control();
+        if self.environment.is_empty() || self.environment.contains(is_odd) {
+            let name = format!("{:?}", self.environment);
+            return Err(ConfigError::out_of_range("environment", name, "a name without spaces"));
+        }
+        // Less of a batch is rounded to no row.
+        let least = 0.5 / f64::from(self.batch_size);
+        if let Some(share) = self.online.as_ref().and_then(|online| online.share)
+            && share < least
+        {
+            let range = format!("from {least} to 1, for a row of experience in each batch");
+            return Err(ConfigError::out_of_range("online.share", share, &range));
+        }
         let (steps, interval) = (self.total_steps(), self.eval_interval);
         let evaluations = self.schedule().evaluations();
         if evaluations > MOST_EVALUATIONS {

@@ -17,13 +17,15 @@ fn lacks(values: &Values, task: &Task) -> bool {
 
 /// A warning about a task for which an algorithm's authors give no values.
 pub fn not_given(definition: &Definition, task: &Task) -> Option<String> {
-    let instead = match task.values_of() {
-        own if own == task.name => "its general values are used".to_owned(),
-        other => format!("those for {other} are used"),
+    let values = Values::of(definition);
+    let instead = match (task.values_of(), values.group_for(&task.name)) {
+        (other, _) if other != task.name => format!("those for {other} are used"),
+        (_, Some(group)) => format!("those for {group} are used"),
+        _ => "its general values are used".to_owned(),
     };
     let (algorithm, name) = (definition.name, &task.name);
     let warning = format!("{algorithm}'s authors give no values for {name}; {instead}");
-    lacks(&Values::of(definition), task).then_some(warning)
+    lacks(&values, task).then_some(warning)
 }
 
 /// Finds an algorithm by name.

@@ -62,20 +62,25 @@ impl Preset {
         self.task.map_or(&self.label, |task| &task.name)
     }
 
-    /// Merges the algorithm's values for the task, the task's keys, the file's and `changes`, the
-    /// later over the earlier, and checks them.
+    /// Merges the algorithm's values for the task, the task's keys, the algorithm's for a run with
+    /// practice, the file's keys and `changes`, the later over the earlier, and checks them.
     pub fn resolve(&self, changes: &Table) -> Result<Experiment, ConfigError> {
         let definition = self.algorithm(changes)?;
         let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
         let can_practice = table.contains_key("online");
+        let with_practice = table.remove("with_practice");
         let mut of_task = self.task.map_or_else(Table::new, |task| task.keys.clone());
         // An algorithm that learns from practice alone does so in each task.
         if table.get("steps") == Some(&Value::Integer(0)) {
             of_task.remove("steps");
         }
-        for keys in [&of_task, &self.own] {
-            merge(&mut table, keys.clone());
+        merge(&mut table, of_task);
+        if let Some(Value::Table(values)) = with_practice
+            && [changes, &self.own].into_iter().find_map(practice_steps).is_some_and(|n| n > 0)
+        {
+            merge(&mut table, values);
         }
+        merge(&mut table, self.own.clone());
         check_places(&table, changes)?;
         merge(&mut table, changes.clone());
         table.insert("algorithm".to_owned(), definition.name.into());
@@ -152,6 +157,11 @@ impl Preset {
     }
 }
 
+/// The environment steps of practice that keys name.
+fn practice_steps(keys: &Table) -> Option<i64> {
+    keys.get("online")?.get("steps")?.as_integer()
+}
+
 /// Refuses a change above `[agent]` to a key that `table` has below it, and the reverse.
 fn check_places(table: &Table, changes: &Table) -> Result<(), ConfigError> {
     let agent = |table: &Table| table.get("agent").and_then(Value::as_table).cloned();
@@ -186,6 +196,27 @@ pub fn resolve(preset: &str, changes: &Table) -> Result<Experiment, ConfigError>
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The algorithm's values with practice apply to the whole run, and the user's over them.
+    #[test]
+    fn a_run_with_practice_has_values_of_its_own() {
+        let task = "humanoidmaze-medium-navigate-singletask-v0";
+        for (changes, alpha) in [
+            ("", 30.0),
+            ("online.steps = 0", 30.0),
+            ("online.steps = 9", 100.0),
+            ("online.steps = 9\nagent.alpha = 7", 7.0),
+        ] {
+            let changes: Table = format!("algorithm = 'fql'\n{changes}").parse().unwrap();
+            let experiment = resolve(task, &changes).unwrap();
+            assert_eq!(experiment.agent["alpha"].as_float(), Some(alpha), "{changes}");
+        }
+        let changes: Table = "algorithm = 'cql'\nonline.steps = 9".parse().unwrap();
+        let experiment = resolve("antmaze-medium-play-v2", &changes).unwrap();
+        assert_eq!((experiment.steps, experiment.episodes), (1_000_000, 20));
+        assert_eq!(experiment.agent["threshold"].as_float(), Some(0.8));
+        assert_eq!(experiment.agent["phases"]["cloning"].as_integer(), Some(0));
+    }
 
     #[test]
     fn doubts_name_changes_without_effect_and_an_actor_that_does_not_move() {

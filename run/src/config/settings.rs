@@ -45,3 +45,14 @@ pub fn differences<'a>(a: &'a Settings, b: &'a Settings) -> impl Iterator<Item =
     let keys = a.keys().chain(b.keys().filter(|key| !a.contains_key(*key)));
     keys.filter(|key| a.get(*key) != b.get(*key))
 }
+
+/// The keys at which two settings differ; of practice that only one of them has, its steps alone.
+pub fn differences_in_brief<'a>(
+    a: &'a Settings,
+    b: &'a Settings,
+) -> impl Iterator<Item = &'a String> {
+    const STEPS: &str = "online.steps";
+    let both_practice = a.contains_key(STEPS) == b.contains_key(STEPS);
+    differences(a, b)
+        .filter(move |key| both_practice || *key == STEPS || !key.starts_with("online."))
+}

@@ -76,6 +76,11 @@ impl Checkpoints {
         unreadable.map_or(Ok(None), Err)
     }
 
+    /// The step of the newest checkpoint, by its file's name.
+    pub fn newest_step(&self) -> Result<Option<u64>, RunDirError> {
+        Ok(self.files()?.first().and_then(|path| step(path)))
+    }
+
     /// The files of all checkpoints, the newest first.
     fn files(&self) -> Result<Vec<PathBuf>, RunDirError> {
         let entries = files::optional(fs::read_dir(&self.folder));

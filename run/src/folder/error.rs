@@ -13,6 +13,8 @@ pub(super) const CREATE: &str = "create";
 pub enum RunDirError {
     #[error("there is already a run in {0}")]
     Occupied(PathBuf),
+    #[error("{0} is one of a run's own files")]
+    Own(PathBuf),
     #[error("another learner is at work in {0}")]
     InUse(PathBuf),
     /// The file system has no locks, and the file names another host.
@@ -38,6 +40,7 @@ impl RunDirError {
             Self::Occupied(_) => {
                 "give the command again to continue that run, or choose another folder by --run-dir"
             }
+            Self::Own(_) => "choose another file by --out",
             Self::Gone(_) => "put it back, and give the command again to continue; or begin anew",
             Self::Claimed(_) => {
                 "wait for the end of that learner; if it is gone, as with its host, remove that file"

@@ -77,18 +77,13 @@ fn complete_records(
 ) -> Result<(Vec<(Hash, Episode)>, u64), RunDirError> {
     let (mut records, mut length) = (Vec::new(), 0);
     let mut reader = BufReader::new(&*file);
-    while let Some(Record { hash, frame, .. }) =
-        next(&mut reader).map_err(io_error("read", path))?
-    {
+    while let Some((hash, frame, _)) = next(&mut reader).map_err(io_error("read", path))? {
         let broken = |error| content(path, None, format!("record {}: {error}", records.len() + 1));
         records.push((hash, decode_kept(&frame).map_err(broken)?));
         length += (HEADER + frame.len()) as u64;
     }
     let rest = files::rest(file, length).map_err(io_error("read", path))?;
-    let begins = |start: usize| {
-        let record = next(&mut &rest[start..]);
-        record.is_ok_and(|record| record.is_some_and(|record| record.begins))
-    };
+    let begins = |start: usize| matches!(next(&mut &rest[start..]), Ok(Some((.., true))));
     if (1..rest.len()).any(begins) {
         let number = records.len() + 1;
         let reason =
@@ -98,15 +93,8 @@ fn complete_records(
     Ok((records, length))
 }
 
-struct Record {
-    hash: Hash,
-    frame: Vec<u8>,
-    /// True for the first record of an append.
-    begins: bool,
-}
-
-/// The next record, if it is complete.
-fn next(reader: &mut impl Read) -> io::Result<Option<Record>> {
+/// The hash and the frame of the next record, if it is complete, and whether it begins an append.
+fn next(reader: &mut impl Read) -> io::Result<Option<(Hash, Vec<u8>, bool)>> {
     let mut begin = [0; HEADER + BEGIN.len()];
     match reader.read_exact(&mut begin) {
         Err(error) if error.kind() == ErrorKind::UnexpectedEof => return Ok(None),
@@ -124,7 +112,7 @@ fn next(reader: &mut impl Read) -> io::Result<Option<Record>> {
     let stored = &begin[4..HEADER];
     let begins = hash.bytes() == stored;
     let is_complete = frame.len() == length && (begins || inverted(*hash.bytes()) == stored);
-    Ok(is_complete.then_some(Record { hash, frame, begins }))
+    Ok(is_complete.then_some((hash, frame, begins)))
 }
 
 #[cfg(test)]

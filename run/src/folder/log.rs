@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use tracing::warn;
 
@@ -67,9 +68,8 @@ impl Log {
     pub fn append<T: Serialize>(&mut self, lines: &[T]) -> Result<(), RunDirError> {
         let mut text = Vec::new();
         for line in lines {
-            let position = Position { after: self.durable.then_some(self.length) };
-            let line = Line { line, position };
-            serde_json::to_writer(&mut text, &line)
+            let after = self.durable.then_some(self.length);
+            serde_json::to_writer(&mut text, &Line { fields: line, after })
                 .map_err(|error| content(&self.path, None, error))?;
             text.push(b'\n');
         }
@@ -137,41 +137,32 @@ pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
     Ok(lines)
 }
 
-/// The part of a line that is the log's own.
+/// A line with its place.
 #[derive(Serialize, Deserialize)]
-struct Position {
+struct Line<T> {
+    #[serde(flatten)]
+    fields: T,
     /// Bytes of a durable log that were on the disk before the line's append.
     #[serde(skip_serializing_if = "Option::is_none")]
     after: Option<u64>,
-}
-
-/// A line as it is written.
-#[derive(Serialize)]
-struct Line<'a, T> {
-    #[serde(flatten)]
-    line: &'a T,
-    #[serde(flatten)]
-    position: Position,
 }
 
 /// Length of the lines of a durable log, bytes, without those of an append that a power cut has
 /// torn: any part of it may be missing. Damage before the last append counts as lines.
 pub(super) fn whole_lines(text: &[u8]) -> usize {
     let complete = complete_lines(text);
-    let (mut end, mut damaged) = (0, None);
+    let (mut end, mut damaged) = (0, complete);
     for line in text[..complete].split_inclusive(|&byte| byte == b'\n') {
-        match serde_json::from_slice::<Position>(line) {
-            Ok(Position { after }) => {
-                let synchronized = after.unwrap_or(end as u64);
-                if damaged.is_some_and(|start| start < synchronized) {
-                    return complete;
-                }
+        match serde_json::from_slice::<Line<IgnoredAny>>(line) {
+            Ok(Line { after, .. }) if after.unwrap_or(end as u64) > damaged as u64 => {
+                return complete;
             }
-            Err(_) => drop(damaged.get_or_insert(end as u64)),
+            Ok(_) => {}
+            Err(_) => damaged = damaged.min(end),
         }
         end += line.len();
     }
-    damaged.map_or(complete, |start| start as usize)
+    damaged
 }
 
 /// Length of the complete lines, bytes.

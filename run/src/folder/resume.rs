@@ -60,6 +60,11 @@ impl ExistingRun {
         Ok(Some(Self { dir, config, scores }))
     }
 
+    /// Episodes that the run has not learned from, unless it is to be set aside.
+    pub fn held_out(&self) -> Option<&[usize]> {
+        Some(&self.config.as_ref()?.dataset.held_out)
+    }
+
     /// Checks that the run has the settings of `config`, unless it is to be set aside.
     pub fn check_same_config(&self, config: &RunConfig) -> Result<(), RunDirError> {
         let Some(begun) = &self.config else { return Ok(()) };
@@ -121,7 +126,7 @@ impl ResumePoint {
             let online = experiment.online.as_ref();
             online.is_some_and(|online| online.is_snapshot(experiment.steps, at))
         };
-        let mut played = BTreeMap::new();
+        let mut played = BTreeSet::new();
         if experiment.online.is_some() {
             let episodes = read_experience(dir.path())?;
             played.extend(episodes.iter().map(|episode| (episode.step, episode.weights)));
@@ -135,7 +140,7 @@ impl ResumePoint {
             }
             let is_other = |hash: &Hash| {
                 scored.is_some_and(|scored| scored.weights != hash.to_string())
-                    || played.get(&at).is_some_and(|played| played != hash)
+                    || played.iter().any(|(step, _)| *step == at) && !played.contains(&(at, *hash))
             };
             match dir.read_snapshot(at).map(|file| Hash::of(&file)) {
                 Ok(hash) if is_other(&hash) => {

@@ -34,6 +34,8 @@ const SCORES: &str = "scores.jsonl";
 pub(super) const EXPERIENCE: &str = "experience.log";
 const FAILED: &str = "failed";
 const SNAPSHOTS: &str = "snapshots";
+/// Files and folders that a run needs to continue and to be verified.
+const OWN: [&str; 6] = [CONFIG, SCORES, EXPERIENCE, "metrics.jsonl", SNAPSHOTS, "checkpoints"];
 
 /// The folder of one run.
 #[derive(Clone, Debug)]
@@ -47,21 +49,25 @@ impl RunDir {
         path.join(CONFIG).exists()
     }
 
+    /// Refuses to let a command write its result over a file that a learner needs.
+    pub fn refuse_own_file(out: &Path) -> Result<(), RunDirError> {
+        let Ok(file) = out.canonicalize() else { return Ok(()) };
+        let mut runs = file.ancestors().skip(1).take(2).filter(|folder| Self::is_occupied(folder));
+        let is_own = runs.any(|run| OWN.iter().any(|name| file.starts_with(run.join(name))));
+        if is_own { Err(RunDirError::Own(out.to_owned())) } else { Ok(()) }
+    }
+
     /// Makes the folder, locks it and saves the configuration. Also returns `scores.jsonl`, which
     /// holds the lock.
     pub fn create(path: &Path, config: &RunConfig) -> Result<(Self, Log), RunDirError> {
-        let occupied = || RunDirError::Occupied(path.to_owned());
-        if Self::is_occupied(path) {
-            return Err(occupied());
-        }
         let run = Self::at(path);
         let snapshots = path.join(SNAPSHOTS);
         files::create_folder(&snapshots).map_err(io_error(CREATE, &snapshots))?;
-        // Of two learners that begin at once, only one gets the lock. Scores and experience without
+        // Of two learners that begin at once, the other is refused by the lock. Scores and experience without
         // a configuration are not those of the new run.
         let scores = run.score_log()?;
         if Self::is_occupied(path) || !scores.is_empty() || path.join(EXPERIENCE).exists() {
-            return Err(occupied());
+            return Err(RunDirError::Occupied(path.to_owned()));
         }
         run.clear_failure()?;
         let target = path.join(CONFIG);
@@ -250,6 +256,11 @@ impl RunDir {
     pub fn write_checkpoint(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
         self.make_folder("checkpoints")?;
         Checkpoints::of_run(&self.path).save(checkpoint)
+    }
+
+    /// The gradient step of the newest training state, which may be damaged.
+    pub fn checkpoint_step(&self) -> Result<Option<u64>, RunDirError> {
+        Checkpoints::of_run(&self.path).newest_step()
     }
 
     /// The newest training state that is not damaged.

@@ -28,11 +28,14 @@ fn create(path: &Path, seed: u64) -> Result<(RunDir, Log), RunDirError> {
 #[test]
 fn of_two_learners_that_begin_at_once_one_is_refused() {
     let (_folder, path, _run, log) = new_run();
+    // The other is further, and has written its configuration, or not yet.
+    assert!(matches!(create(&path, 1), Err(RunDirError::InUse(used)) if used == path));
     fs::remove_file(path.join("config.toml")).unwrap();
     assert!(matches!(create(&path, 1), Err(RunDirError::InUse(used)) if used == path));
     assert!(!RunDir::is_occupied(&path));
     drop(log);
     create(&path, 1).unwrap();
+    assert!(matches!(create(&path, 1), Err(RunDirError::Occupied(_))));
 }
 
 #[test]

@@ -7,9 +7,11 @@ use std::path::Path;
 use quad_protocol::{Hash, episode_seeds};
 
 use super::error::RunDirError;
+use super::experience::read_experience;
 use super::lines::ScoreLine;
 use super::run_dir::RunDir;
 use crate::config::settings;
+use crate::results::Judgment;
 
 /// Listed findings of one kind; further ones are only counted.
 const LISTED: usize = 5;
@@ -64,12 +66,16 @@ impl fmt::Display for Findings {
 }
 
 /// Checks that each episode of each evaluation of a run is scored exactly once, with the weights
-/// that are on disk.
+/// that are on disk; of a run without evaluations, its snapshots.
 pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let (dir, config) = RunDir::open(path)?;
     let experiment = &config.experiment;
     let schedule = experiment.schedule();
     let expected = schedule.evaluations().saturating_mul(experiment.episodes.into());
+    let scores = dir.read_scores()?;
+    if expected == 0 && scores.is_empty() {
+        return verify_snapshots(&dir);
+    }
     let mut found = Findings::new("episodes are scored", expected);
     let mut hashes: BTreeMap<u64, Option<String>> = BTreeMap::new();
     let planned = |step| match schedule.is_evaluated(step) {
@@ -78,7 +84,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     };
     let mut left: BTreeMap<u64, BTreeSet<u64>> = BTreeMap::new();
     let mut seen = BTreeSet::new();
-    for line in dir.read_scores()? {
+    for line in scores {
         let (step, seed) = (line.step, line.seed);
         let name = named((step, seed));
         let read = || hash(&dir, step).ok().map(|hash| hash.to_string());
@@ -110,6 +116,29 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     Ok(found)
 }
 
+/// Compares snapshots with the hashes that judgments and practice name.
+fn verify_snapshots(dir: &RunDir) -> Result<Findings, RunDirError> {
+    let mut hashes: BTreeMap<u64, BTreeSet<String>> = BTreeMap::new();
+    let judged = Judgment::read_all(dir)?.into_iter().map(|it| (it.step, it.weights));
+    let played = read_experience(dir.path())?.into_iter();
+    for (step, hash) in judged.chain(played.map(|it| (it.step, it.weights.to_string()))) {
+        hashes.entry(step).or_default().insert(hash);
+    }
+    let mut findings = Findings::new("snapshots have the recorded hash", 0);
+    for step in dir.snapshots()? {
+        let Some(recorded) = hashes.get(&step) else { continue };
+        findings.expected += 1;
+        match *recorded == BTreeSet::from([hash(dir, step)?.to_string()]) {
+            true => findings.found += 1,
+            false => findings.add(
+                "judged or played with other weights than are on disk",
+                format!("step {step}"),
+            ),
+        }
+    }
+    Ok(findings)
+}
+
 fn named((step, seed): (u64, u64)) -> String {
     format!("step {step}, seed {seed}")
 }
@@ -127,7 +156,7 @@ pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> 
     let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
     let mut found = Findings::new("episodes are compared", ours.len() as u64);
     let [a, b] = [&config, &other_config].map(settings::of_run);
-    for key in settings::differences(&a, &b) {
+    for key in settings::differences_in_brief(&a, &b) {
         found.add("settings that differ", key.clone());
     }
     for (key, line) in &ours {

@@ -8,7 +8,7 @@ use quad_dataset::catalog;
 use super::published;
 use super::report::RunReport;
 use super::selection::Select;
-use crate::config::settings::{self, Settings, differences};
+use crate::config::settings::{self, Settings, differences_in_brief};
 use crate::config::{self, ConfigError, Experiment, hyperparameters, tasks};
 
 /// Lists the differences between runs that differ only in their seed and their authors' settings.
@@ -16,13 +16,13 @@ use crate::config::{self, ConfigError, Experiment, hyperparameters, tasks};
 pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<String> {
     let Some(run) = runs.first() else { return Vec::new() };
     let ours = &run.config.experiment;
-    let Ok(task) = tasks::named(&run.task) else { return Vec::new() };
+    let Ok(task) = tasks::named(&run.config.run.task) else { return Vec::new() };
     // The authors' variant applies if they publish scores of it.
     let has_row = !published::methods(&run.algorithm, &run.variant).is_empty();
     let Ok(paper) = as_given(run, has_row) else { return Vec::new() };
     let mut departures = Vec::new();
     if select == Select::Best {
-        let last = published::final_evaluations(&run.task);
+        let last = published::final_evaluations(&run.config.run.task);
         let best = format!("the best evaluation of each run, not the mean of its last {last}");
         departures.push(best);
     }
@@ -33,7 +33,7 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
         departures.push(format!("dataset is {name}, not {theirs}"));
     }
     let (ours, paper) = (without_seed(ours), without_seed(&paper));
-    let keys: BTreeSet<&String> = differences(&ours, &paper).collect();
+    let keys: BTreeSet<&String> = differences_in_brief(&ours, &paper).collect();
     for key in keys {
         let value =
             |settings: &'_ Settings| settings.get(key).map_or("absent", String::as_str).to_owned();
@@ -45,7 +45,7 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     let incomplete = runs.iter().filter(|run| !run.is_complete());
     let least = incomplete.min_by_key(|run| run.evaluations_complete());
     departures.extend(least.map(|run| run.how_complete()));
-    let seeds = published::seeds(&run.task);
+    let seeds = published::seeds(&run.config.run.task);
     if runs.len() < seeds {
         departures.push(format!("{} of {seeds} seeds", runs.len()));
     }
@@ -61,7 +61,7 @@ pub fn as_given(run: &RunReport, of_variant: bool) -> Result<Experiment, ConfigE
         let agent = of_key(known.key, run.variant.as_str().into());
         asked.insert("agent".to_owned(), agent.into());
     }
-    config::resolve(&run.task, &asked)
+    config::resolve(&run.config.run.task, &asked)
 }
 
 fn without_seed(experiment: &Experiment) -> Settings {

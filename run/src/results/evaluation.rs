@@ -30,6 +30,12 @@ pub struct EvaluationReport {
 }
 
 impl EvaluationReport {
+    /// True if it makes its run's score: it is complete and, in a run with practice, of a policy that
+    /// has practiced.
+    pub fn counts(&self) -> bool {
+        self.complete && self.environment_steps != Some(0)
+    }
+
     /// Summarizes the episodes of the snapshot at `step`; `None` without episodes.
     pub(super) fn new(step: u64, episodes: &[&ScoreLine], experiment: &Experiment) -> Option<Self> {
         let values = |of: fn(&ScoreLine) -> f64| Vec::from_iter(episodes.iter().map(|it| of(it)));

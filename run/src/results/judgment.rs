@@ -65,6 +65,9 @@ pub struct Judgment {
     pub distance: f64,
     /// True if its training had none of the judged episodes.
     pub unseen: bool,
+    /// Why it acts otherwise in an episode than it is judged, in a sentence; absent in older files.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub caveat: Option<String>,
     /// The value of the behavior that recorded the data, estimated like the policy's.
     pub behavior: Estimate,
     /// The behavior's value by the data: the mean discounted return of the judged episodes. The rest
@@ -84,8 +87,8 @@ impl Judgment {
         Ok(judgments)
     }
 
-    /// Saves the judgment in the folder and replaces an earlier one of the same step. Waits for other
-    /// processes that save one.
+    /// Saves the judgment in the folder and replaces an earlier one of the same step under the same
+    /// conditions, or of other weights. Waits for other processes that save one.
     pub fn save(&self, folder: &RunDir) -> Result<(), RunDirError> {
         let path = folder.path().join(LOCK);
         let _lock = loop {
@@ -95,10 +98,22 @@ impl Judgment {
             }
         };
         let mut judgments = Self::read_all(folder)?;
-        judgments.retain(|earlier| earlier.step != self.step);
+        judgments.retain(|earlier| {
+            let is_same = earlier.weights == self.weights && earlier.conditions != self.conditions;
+            earlier.step != self.step || is_same
+        });
         judgments.push(self.clone());
         judgments.sort_by_key(|judgment| judgment.step);
         folder.write_json(FILE, &judgments)
+    }
+
+    fn doubts(&self) -> String {
+        let mut doubts = self.estimate.doubts.clone();
+        if !self.unseen {
+            doubts.push("has learned from some of these episodes".to_owned());
+        }
+        doubts.extend(self.caveat.clone());
+        doubts.join("; ")
     }
 }
 
@@ -162,13 +177,9 @@ impl Ranking {
                 true => rank.to_string(),
                 false => "-".to_owned(),
             };
-            let mut doubts = estimate.doubts.clone();
-            if !judgment.unseen {
-                doubts.push("has learned from some of these episodes".to_owned());
-            }
             let name = format!("{} @ {}", judgment.run.display(), judgment.step);
             let (value, distance) = (value(estimate), format!("{:.2}", judgment.distance));
-            push([&rank, &name, &value, &distance, &doubts.join("; ")]);
+            push([&rank, &name, &value, &distance, &judgment.doubts()]);
         }
         let doubts = self.behavior.doubts.join("; ");
         let (estimated, recorded) = (value(&self.behavior), format!("{:.2}", self.recorded));

@@ -56,19 +56,17 @@ impl RunReport {
             EvaluationReport::new(step, &episodes, experiment)
         };
         let evaluations: Vec<_> = by_step.into_iter().filter_map(evaluate).collect();
-        // Means of policies from before practice and after it would be of neither.
-        let begins = experiment.practice_begins().unwrap_or(0);
-        let complete: Vec<_> =
-            evaluations.iter().filter(|e| e.complete && e.step > begins).collect();
+        let counted = Vec::from_iter(evaluations.iter().filter(|it| it.counts()));
         let mean = |evaluations: &[&EvaluationReport]| {
             let scores = Vec::from_iter(evaluations.iter().map(|e| e.score.mean));
             Spread::of(&scores).map(|spread| spread.mean)
         };
-        let last = |count: usize| mean(&complete[complete.len().checked_sub(count)?..]);
+        let last = |count: usize| mean(&counted[counted.len().checked_sub(count)?..]);
+        let begins = experiment.practice_begins().unwrap_or(0);
         let final_steps =
-            experiment.total_steps().checked_sub(FINAL_STEPS).filter(|start| *start > 0);
+            experiment.total_steps().checked_sub(FINAL_STEPS).filter(|start| *start > begins);
         let in_final_steps =
-            |start| mean(&complete[complete.partition_point(|e| e.step <= start)..]);
+            |start| mean(&counted[counted.partition_point(|it| it.step <= start)..]);
         let normalized = environment::find(&experiment.environment).is_ok();
         let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
         Ok(Self {

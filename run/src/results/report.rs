@@ -18,7 +18,8 @@ use crate::config::RunConfig;
 pub struct RunReport {
     pub dir: PathBuf,
     pub run: String,
-    /// The task, or the name of a user's file that names no task.
+    /// The task, or the name of a user's file that names no task; where a report has several such
+    /// tasks, also the environment and the data.
     pub task: String,
     pub algorithm: String,
     /// The variant of the algorithm, such as QUAD's guidance `quad`, `dac` or `none`; else the
@@ -41,7 +42,7 @@ pub struct RunReport {
     /// absent if there are fewer.
     pub mean_last_3: Option<f64>,
     pub mean_last_5: Option<f64>,
-    /// Absent for runs of 50,000 steps or fewer.
+    /// Absent for runs of 50,000 steps or fewer, with practice of those after it has begun.
     pub mean_last_50000_steps: Option<f64>,
     /// The algorithm's summary of its metrics, such as of QUAD's λ.
     #[serde(flatten)]
@@ -65,7 +66,7 @@ impl RunReport {
     /// Mean score of the last complete evaluations, as many as the task's published figures
     /// average; absent if there are fewer.
     pub fn score(&self) -> Option<f64> {
-        match published::final_evaluations(&self.task) {
+        match published::final_evaluations(&self.config.run.task) {
             3 => self.mean_last_3,
             _ => self.mean_last_5,
         }
@@ -76,14 +77,14 @@ impl RunReport {
         self.episodes_missing == 0
     }
 
-    /// The complete evaluation with the largest score.
+    /// The evaluation with the largest score, of those that count.
     pub fn best(&self) -> Option<&EvaluationReport> {
         self.best_of(|_| true)
     }
 
-    /// The best complete evaluation of the steps for which `is_one` holds; the last of equal ones.
+    /// The best evaluation that counts of the steps for which `is_one` holds; the last of equal ones.
     pub fn best_of(&self, is_one: impl Fn(u64) -> bool) -> Option<&EvaluationReport> {
-        let chosen = self.complete().filter(|evaluation| is_one(evaluation.step));
+        let chosen = self.evaluations.iter().filter(|it| it.counts() && is_one(it.step));
         chosen.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
     }
 

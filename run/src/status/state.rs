@@ -22,7 +22,7 @@ pub enum State {
     Begun(u64),
     /// Gradient steps done before the learner failed.
     Failed(u64),
-    /// All steps are done and all episodes scored.
+    /// All steps are done and all episodes scored, and no learner has failed since.
     Complete,
     /// A file in the folder is damaged.
     Unreadable,
@@ -32,13 +32,15 @@ impl State {
     /// State of the run of a report.
     pub fn of(report: &RunReport) -> Result<Self, RunDirError> {
         let (dir, experiment) = (RunDir::at(&report.dir), &report.config.experiment);
-        let trained = experiment.eval_interval > 0
-            || dir.snapshots()?.last() == Some(&experiment.total_steps());
+        let last = experiment.total_steps();
+        // All checkpoints of a complete run may be deleted.
+        let trained = dir.checkpoint_step()?.is_none_or(|step| step == last)
+            && (experiment.eval_interval > 0 || dir.snapshots()?.last() == Some(&last));
         let step = || rows(dir.path()).last().map_or(0, |row| row.step);
-        Ok(match (report.is_complete() && trained, dir.failure()) {
-            (true, _) => Self::Complete,
-            (false, Some(_)) => Self::Failed(step()),
-            (false, None) => Self::Begun(step()),
+        Ok(match (dir.failure(), report.is_complete() && trained) {
+            (Some(_), _) => Self::Failed(step()),
+            (None, true) => Self::Complete,
+            (None, false) => Self::Begun(step()),
         })
     }
 
@@ -118,3 +120,6 @@ fn rows(dir: &Path) -> Vec<Row> {
     let lines = bytes.split(|byte| *byte == b'\n');
     lines.filter_map(|line| serde_json::from_slice(line).ok()).collect()
 }
+
+#[cfg(test)]
+mod tests;

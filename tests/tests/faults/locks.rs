@@ -2,10 +2,10 @@
 
 use std::fs;
 
+use quad_tests::PATIENCE;
 use quad_tests::process::preload;
 use quad_tests::setting::{ENDLESS, SHORT};
 use quad_tests::system::Scratch;
-use quad_tests::{PATIENCE, eventually};
 
 use crate::disk::LISTEN;
 
@@ -20,6 +20,8 @@ fn without_file_locks_a_folder_has_one_learner() {
     let mut first = start(&scratch);
     let _evaluator = scratch.evaluator("one", &first.endpoint());
     first.wait_for_scores(0);
+    let claim = folder.join("scores.host");
+    assert!(claim.exists());
     let mut second = start(&beside);
     second.process.assert_ends(75, PATIENCE);
     second.process.assert_said("another learner is at work in");
@@ -32,7 +34,6 @@ fn without_file_locks_a_folder_has_one_learner() {
     next.process.kill();
 
     // Of another host this one knows nothing.
-    let claim = folder.join("scores.host");
     fs::write(&claim, "elsewhere\n").unwrap();
     let mut third = start(&scratch);
     third.process.assert_ends(1, PATIENCE);
@@ -45,8 +46,6 @@ fn a_learner_that_ends_takes_its_claim_back() {
     let scratch = Scratch::new();
     let flags = [&LISTEN[..], &["--evaluators", "1"]].concat();
     let mut learner = scratch.learner_through(&preload("no_locks"), "run", SHORT, &flags);
-    let claim = learner.run_dir.join("scores.host");
-    eventually("it has a claim", PATIENCE, || claim.exists().then_some(()));
     learner.assert_completes(PATIENCE);
-    assert!(!claim.exists());
+    assert!(!learner.run_dir.join("scores.host").exists());
 }

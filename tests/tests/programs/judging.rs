@@ -38,9 +38,11 @@ fn policies_are_judged_by_the_data_alone() {
     let all = scratch.path().join("runs");
     let short = "--steps 200";
 
-    let (_, log) = judge(&[&quad], short);
+    let (found, log) = judge(&[&quad], short);
     assert!(log.contains("judging takes about"), "{log}");
-    assert!(log.contains("sees 1 observations and executes 2 actions of a chunk"), "{log}");
+    let caveat =
+        "judged as if each state were an episode's first, but it executes 2 actions of a chunk";
+    assert_eq!(found["policies"][0]["caveat"], caveat);
     let (found, _) = judge(&[&all], short);
     let policies = found["policies"].as_array().unwrap();
     assert_eq!(policies.len(), 2);
@@ -59,6 +61,11 @@ fn policies_are_judged_by_the_data_alone() {
     let (again, log) = judge(&[&all], short);
     assert!(!log.contains("judging"), "nothing is computed twice: {log}");
     assert_eq!(again, found);
+    let [data, moved] = ["robot.hdf5", "moved.hdf5"].map(|name| scratch.path().join(name));
+    fs::rename(&data, &moved).unwrap();
+    let (here, _) = judge(&[&iql], &format!("--steps 100 --dataset {}", moved.display()));
+    assert_eq!(here["conditions"]["dataset"], found["conditions"]["dataset"]);
+    fs::rename(&moved, &data).unwrap();
     for (flags, key, value) in [
         ("--steps 200 --gamma 0.5", "gamma", Value::from(0.5)),
         ("--steps 200 --seeds 3", "seeds", 3.into()),
@@ -80,7 +87,7 @@ fn policies_are_judged_by_the_data_alone() {
     let text = succeeds(&format!("learner report {} --html {}", all.display(), html.display()));
     for text in [text, fs::read_to_string(html).unwrap()] {
         assert!(text.contains("a ranking, not a score"), "{text}");
-        assert!(text.contains("behavior, as recorded"), "{text}");
+        assert!(text.contains("behavior, as recorded") && text.contains("of a chunk"), "{text}");
     }
 }
 

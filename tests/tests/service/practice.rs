@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_protocol::{Hash, Job, PieceReply};
+use quad_protocol::PieceReply;
 use quad_tests::PATIENCE;
 use quad_tests::crowd::Crowd;
 use quad_tests::made_up::{self, name};
@@ -48,28 +48,6 @@ async fn a_run_without_practice_refuses_an_episode_of_an_earlier_run_of_its_name
     let job = made_up::claim_eventually(&session, &run, "late").await;
     let answer = made_up::deliver_practice(&session, &job, "late").await;
     assert!(matches!(answer, PieceReply::Refused { .. }), "{answer:?}");
-}
-
-/// As when an evaluator that was thought to be lost delivers after all.
-#[tokio::test(flavor = "multi_thread")]
-async fn an_episode_that_was_played_twice_counts_once_and_other_bits_are_told() {
-    let (scratch, run) = (Scratch::new(), name("run"));
-    let learner = scratch.learner("run", Setting { steps: 10, ..SETTING });
-    let session = made_up::client(&learner.endpoint()).await;
-    let job = made_up::claim_eventually(&session, &run, "first").await;
-    assert!(job.practice.is_some());
-    for (evaluator, known, differs) in
-        [("first", false, false), ("second", true, false), ("third", true, true)]
-    {
-        let weights = if differs { Hash::of(b"other bits") } else { job.weights };
-        let played = Job { weights, ..job.clone() };
-        let answer = made_up::deliver_practice(&session, &played, evaluator).await;
-        let PieceReply::Recorded { duplicate, .. } = answer else { panic!("{answer:?}") };
-        assert_eq!(duplicate, known, "{evaluator}");
-        let differences = learner.metric("practice_differences_total", "").unwrap();
-        assert_eq!(differences, f64::from(u8::from(differs)), "{evaluator}");
-    }
-    learner.process.wait_for_log("was played again with other bits", PATIENCE);
 }
 
 /// Prints the environment steps per second that a learner takes in while it trains nothing.

@@ -1,4 +1,6 @@
+mod cases;
 mod ends;
+mod lengths;
 mod numbers;
 mod rows;
 mod sound;

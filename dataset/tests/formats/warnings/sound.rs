@@ -67,6 +67,7 @@ fn recordings_and_files_of_others() {
         ("data/antmaze_umaze.hdf5", "antmaze-umaze"),
         ("data/antmaze_umaze_direct.hdf5", "antmaze-umaze"),
         ("data/antmaze_medium_play.hdf5", "antmaze-medium"),
+        ("data/antmaze_medium_direct.hdf5", "antmaze-medium"),
         ("fixtures/hopper_fixture-v2.hdf5", "hopper"),
         ("cases/sound.hdf5", ""),
         ("cases/sound-d4rl.hdf5", ""),

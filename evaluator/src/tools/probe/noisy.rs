@@ -81,3 +81,41 @@ pub fn normal(shape: (usize, usize, usize), random: &mut impl Rng) -> Result<Ten
     let numbers = random.sample_iter::<f32, _>(StandardNormal).take(shape.0 * shape.1 * shape.2);
     Tensor::from_vec(numbers.collect(), shape, &Device::Cpu)
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use quad_policy::{DiffusionPolicy, DiffusionShape, Precision, read_tensors};
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::serve::fixtures::{file, smallest};
+
+    /// The predicted noise is 0.
+    #[test]
+    fn each_reverse_step_draws_noise_of_its_own() {
+        let steps = 4;
+        let shape = DiffusionShape { diffusion_steps: steps, ..smallest() };
+        let mut tensors = read_tensors(&file("hopper", shape.clone(), 1)).unwrap();
+        let networks = DiffusionPolicy::networks(&shape, &mut tensors, Precision::F32).unwrap();
+        let (actor, critics) = (networks.0, networks.1.unwrap());
+        let observations = Tensor::zeros((1, 11), DType::F32, &Device::Cpu).unwrap();
+        let random = || ChaCha8Rng::seed_from_u64(3);
+        let (drawn, ..) = draw((&actor, &critics), &observations, 0.1, &mut random()).unwrap();
+
+        let noise = normal((steps, CHAINS, 3), &mut random()).unwrap();
+        let mut fresh = (0..steps).map(|index| noise.get(index).unwrap());
+        let (mut actions, mut compared) = (fresh.next().unwrap(), 0);
+        for t in (1..=steps).rev() {
+            let rows: Vec<Vec<f32>> = actions.to_vec2().unwrap();
+            for noisy in drawn.iter().filter(|noisy| noisy.t == t) {
+                assert!(rows.contains(&noisy.action), "t = {t}");
+                compared += 1;
+            }
+            let (epsilon, z) = (actions.zeros_like().unwrap(), fresh.next());
+            actions = actor.schedule().reverse(t, &actions, &epsilon, z.as_ref()).unwrap();
+        }
+        assert!(compared > 1, "{compared} actions");
+    }
+}

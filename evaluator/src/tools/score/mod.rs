@@ -15,6 +15,7 @@ use tracing::{info, warn};
 pub(crate) use args::ScoreArgs;
 use results::{Scored, table};
 pub(crate) use subject::Subject;
+use subject::once_each;
 
 /// Episodes per batch. The limit bounds memory; a larger batch is hardly faster.
 const BATCH: usize = 16;
@@ -24,7 +25,7 @@ pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
     if !args.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
-    let read = args.snapshots.iter().map(|path| Subject::read(path, args));
+    let read = once_each(&args.snapshots).map(|path| Subject::read(path, args));
     let subjects = read.collect::<anyhow::Result<Vec<_>>>()?;
     info!("policies to score: {}", subjects.len());
     let subjects: Vec<Subject> = subjects.into_iter().flatten().collect();

@@ -1,5 +1,6 @@
 //! A saved policy, and the episodes to score it on.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -159,8 +160,14 @@ fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
     match args.candidates.as_slice() {
         [] if !asked => Vec::new(),
         [] => vec![with(own.candidates)],
-        several => several.iter().copied().map(with).collect(),
+        several => once_each(several).copied().map(with).collect(),
     }
+}
+
+/// The values without later duplicates, which a table has no place for.
+pub fn once_each<T: Ord>(values: &[T]) -> impl Iterator<Item = &T> {
+    let mut seen = BTreeSet::new();
+    values.iter().filter(move |value| seen.insert(*value))
 }
 
 fn has_one_critic(policy: &PolicyConfig) -> bool {
@@ -179,6 +186,7 @@ mod tests {
     use std::fs;
 
     use quad_policy::{Aggregate, DiffusionShape, Rule};
+    use quad_protocol::episode_seeds;
 
     use super::*;
     use crate::serve::fixtures::{file, smallest};
@@ -191,11 +199,30 @@ mod tests {
         let with = |candidates| Choice { candidates, ..own };
         args.candidates = vec![1, 10];
         assert_eq!(choices(&args, Some(own)), [with(1), with(10)]);
+        args.candidates = vec![10, 1, 10, 1];
+        assert_eq!(choices(&args, Some(own)), [with(10), with(1)]);
         own.rule = Rule::Softmax { temperature: 0.5 };
         (args.candidates, args.rule) = (Vec::new(), Some(own.rule));
         assert_eq!(choices(&args, Some(own)), [own]);
         (own.guidance, args.rule, args.guidance) = (0.5, None, Some(2.0));
         assert_eq!(choices(&args, Some(own)), [Choice { guidance: 2.0, ..own }]);
+    }
+
+    #[test]
+    fn options_replace_the_file_s_episodes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("policy.safetensors");
+        fs::write(&path, file("hopper", smallest(), 1)).unwrap();
+        let played = |seed, episodes| {
+            let args = ScoreArgs { seed, episodes, ..ScoreArgs::default() };
+            let subject = &Subject::read(&path, &args).unwrap()[0];
+            let scores = crate::tools::score::measure(subject).unwrap().episodes;
+            Vec::from_iter(scores.iter().map(|episode| episode.seed))
+        };
+        // The file has seed 1, step 1 and two episodes.
+        assert_eq!(played(None, None), episode_seeds(1, 1, 2));
+        assert_eq!(played(Some(9), None), episode_seeds(9, 1, 2));
+        assert_eq!(played(None, Some(1)), episode_seeds(1, 1, 1));
     }
 
     #[test]

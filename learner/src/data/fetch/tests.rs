@@ -237,3 +237,23 @@ fn offline_the_error_names_the_addresses() {
     assert!(error.contains("refused"), "{error}");
     assert!(files(&folder).is_empty());
 }
+
+#[test]
+fn a_password_in_an_address_is_not_shown() {
+    for (address, shown) in [
+        ("http://user:secret@127.0.0.1:9/folder", "http://…@127.0.0.1:9/folder"),
+        ("http://user:se/cret@127.0.0.1:9", "http://…@127.0.0.1:9"),
+        ("user:secret@127.0.0.1:9/folder", "…@127.0.0.1:9/folder"),
+        ("ftp://user:secret@127.0.0.1:9", "ftp://…@127.0.0.1:9"),
+        ("http://127.0.0.1:9", "http://127.0.0.1:9"),
+    ] {
+        assert_eq!(without_password(address), shown);
+        let folder = TempDir::new().unwrap();
+        let mut fetcher = fetcher(60);
+        fetcher.mirror = Some(address.to_owned());
+        let error = fetcher.fetch(&dataset(&[]), folder.path()).unwrap_err();
+        let text = format!("{error:?}");
+        assert!(text.contains(&format!("\n  {shown}/file.hdf5: ")), "{text}");
+        assert!(!text.contains("cret"), "{text}");
+    }
+}

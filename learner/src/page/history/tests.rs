@@ -21,10 +21,11 @@ fn lines(numbers: impl IntoIterator<Item = u64>) -> String {
 fn history(contents: &[String]) -> History {
     let folder = tempfile::tempdir().unwrap();
     let mut history = History::of(folder.path().join("metrics.jsonl"));
-    history.refresh().unwrap();
+    let metrics = BTreeSet::from(["eta", "loss", "held_out_loss"].map(str::to_owned));
+    history.refresh(&metrics).unwrap();
     for text in contents {
         fs::write(&history.path, text).unwrap();
-        history.refresh().unwrap();
+        history.refresh(&metrics).unwrap();
     }
     history
 }

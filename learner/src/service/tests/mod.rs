@@ -1,5 +1,6 @@
 //! Tests of the scoreboard under a simulated clock.
 
+mod deliveries;
 mod jobs;
 mod leases;
 mod practice;
@@ -13,10 +14,28 @@ use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
 use quad_run::config::Schedule;
 use quad_run::folder::SavedScores;
 
-use super::{Claim, Claimed, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated};
+use super::outcomes::{Claim, Claimed, Lost, OtherWeights};
+use super::refusal::Refusal;
+use super::scoreboard::{Rules, Scoreboard};
+use super::validate::Validated;
 
 const LEASE: Duration = Duration::from_secs(10);
 const INCARNATION: u64 = 77;
+
+/// Rules of a run with evaluations of so many episodes.
+fn rules(episodes: u32) -> Rules {
+    Rules {
+        run: name("run"),
+        incarnation: INCARNATION,
+        task: quad_dataset::environment::find("hopper").unwrap().into(),
+        seed: 5,
+        dims: (11, 3),
+        episodes,
+        schedule: Schedule { start: 0, steps: 3500, eval_interval: 1000 },
+        job_episodes: [5, 20],
+        lease: LEASE,
+    }
+}
 
 struct Bench {
     board: Scoreboard,
@@ -39,18 +58,7 @@ impl Bench {
 
     /// A scoreboard of a later incarnation of the run.
     fn after(earlier: BTreeMap<u64, SavedScores>) -> Self {
-        let rules = Rules {
-            run: name("run"),
-            incarnation: INCARNATION,
-            task: quad_dataset::environment::find("hopper").unwrap().into(),
-            seed: 5,
-            dims: (11, 3),
-            episodes: 7,
-            schedule: Schedule { start: 0, steps: 3500, eval_interval: 1000 },
-            job_episodes: [5, 20],
-            lease: LEASE,
-        };
-        let mut board = Scoreboard::new(Arc::new(rules), earlier);
+        let mut board = Scoreboard::new(Arc::new(rules(7)), earlier);
         board.add_evaluation(2000, hash(2000), &Vec::from_iter(11..=17)).unwrap();
         board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
         Self { board, present: 2, start: Instant::now(), completed: None }

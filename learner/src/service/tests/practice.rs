@@ -1,9 +1,8 @@
 //! Tests of practice.
 
-use quad_protocol::{Episode, Exploration, Piece, encode};
+use quad_protocol::{Episode, Exploration, Piece};
 
 use super::super::outcomes::{Opening, PracticeEpisode};
-use super::super::pieces::{Added, Pieces};
 use super::*;
 
 const EXPLORATION: Exploration = Exploration::Policy { noise: 0.1 };
@@ -31,51 +30,27 @@ fn episode(seed: u64) -> Episode {
 
 /// What the learner knows of the first piece of an episode.
 fn known(bench: &Bench, seed: u64) -> Result<PracticeEpisode, Refusal> {
-    bench.board.practice(&pieces(&episode(seed), 200)[0])
+    bench.board.practice(&piece(seed))
 }
 
-/// The frame of an episode in pieces of so many bytes at most.
-fn pieces(episode: &Episode, most: usize) -> Vec<Piece> {
-    let frame = encode(episode).unwrap();
-    let piece = |(number, bytes): (usize, &[u8])| Piece {
+fn piece(seed: u64) -> Piece {
+    Piece {
         evaluator: name("a"),
         run: name("run"),
         incarnation: INCARNATION,
         job: 1,
-        seed: episode.score.seed,
-        hash: Hash::of(&frame),
-        length: frame.len() as u32,
-        offset: (number * most) as u32,
-        bytes: bytes.to_vec(),
-    };
-    frame.chunks(most).enumerate().map(piece).collect()
-}
-
-#[test]
-fn an_episode_is_whole_once_in_a_batch_and_again_if_it_was_not_written() {
-    let mut frames = Pieces::default();
-    let [first, last] = pieces(&episode(100), 200).try_into().unwrap();
-    let whole = || Ok(Added::Whole(episode(100)));
-    assert_eq!(frames.add(&last), Ok(Added::Continue(0)), "the beginning is missing");
-    assert_eq!(frames.add(&first), Ok(Added::Continue(200)));
-    assert_eq!(frames.add(&last), whole());
-    let other = Episode { rewards: vec![2.0, 1.0], ..episode(100) };
-    let [other, _] = pieces(&other, 200).try_into().unwrap();
-    // Another evaluator has played it, too.
-    for (piece, offset) in [(&last, 200), (&first, 0), (&other, 0)] {
-        assert_eq!(frames.add(piece), Ok(Added::Continue(offset)));
+        seed,
+        hash: hash(7),
+        length: 1,
+        offset: 0,
+        bytes: vec![0],
     }
-    assert_eq!(frames.frame(100).unwrap(), [&*first.bytes, &last.bytes].concat());
-    frames.begin();
-    assert_eq!(frames.add(&last), whole());
-    assert_eq!(frames.remove(100), Some(last.hash));
-    assert_eq!(frames.add(&last), Ok(Added::Continue(0)));
 }
 
 #[test]
 fn a_piece_of_another_run_or_of_a_frame_that_is_too_long_is_refused() {
     let bench = bench();
-    let mut piece = pieces(&episode(100), 200).remove(0);
+    let mut piece = piece(100);
     // Of the longest episode: a thousand steps and a state, each of 16 numbers.
     piece.length = 1001 * 16 * 4 + 1024;
     assert_eq!(bench.board.practice(&piece), Ok(PracticeEpisode::Open { episode: 0 }));
@@ -132,6 +107,20 @@ fn an_episode_for_which_training_has_waited_goes_to_a_second_evaluator() {
     assert_eq!((&second.seeds, second.practice), (&slow.seeds, slow.practice));
     assert_eq!(bench.job("c", 160).practice, None, "two are enough");
     assert_eq!(bench.board.record_practice(100, hash(7)), 2);
+}
+
+#[test]
+fn an_episode_that_rests_is_not_handed_out_although_one_evaluator_still_plays_it() {
+    let mut bench = bench();
+    bench.job("slow", 0);
+    assert_eq!(bench.job("other", 0).seeds, [101]);
+    bench.board.wait_for_practice(0, bench.at(0));
+    for second in 20..24 {
+        let job = bench.job("a", second);
+        assert_eq!(job.seeds, [100]);
+        bench.hand_back("a", &job, Some(second)).unwrap();
+    }
+    assert_eq!(bench.job("a", 24).practice, None);
 }
 
 #[test]

@@ -41,12 +41,16 @@ fn episode(rows: usize) -> Episode {
     }
 }
 
-/// Practice whose first `recorded` episodes have come.
-fn practice(recorded: usize) -> (Practice, Inbox) {
+fn episodes() -> Vec<Episode> {
+    LENGTHS.map(episode).to_vec()
+}
+
+/// Practice whose first episodes have come.
+fn practice(recorded: &[Episode]) -> (Practice, Inbox) {
     let metrics = PracticeMetrics::new(&prometheus::Registry::new()).unwrap();
     let (inbox, episodes) = mpsc::channel();
-    for (number, rows) in (0..).zip(&LENGTHS[..recorded]) {
-        inbox.send((number, episode(*rows))).unwrap();
+    for (number, episode) in (0..).zip(recorded) {
+        inbox.send((number, episode.clone())).unwrap();
     }
     let transitions = Arc::new(transitions());
     (Practice::new(&experiment(), transitions, episodes, metrics).unwrap(), inbox)
@@ -54,13 +58,18 @@ fn practice(recorded: usize) -> (Practice, Inbox) {
 
 /// Trains from a gradient step to the end. Episodes come as late as they may. Returns the openings
 /// and the batches.
-fn train(practice: &mut Practice, inbox: &Inbox, from: u64) -> (Vec<Opening>, Vec<Vec<u32>>) {
+fn train(
+    practice: &mut Practice,
+    inbox: &Inbox,
+    episodes: &[Episode],
+    from: u64,
+) -> (Vec<Opening>, Vec<Vec<u32>>) {
     let (mut openings, mut batches, stop) = (Vec::new(), Vec::new(), AtomicBool::new(false));
     for step in from..experiment().total_steps() {
         loop {
             for opening in practice.take_openings() {
                 let number = opening.episode;
-                inbox.send((number, episode(LENGTHS[number as usize]))).unwrap();
+                inbox.send((number, episodes[number as usize].clone())).unwrap();
                 openings.push(opening);
             }
             if !practice.is_due(step) {
@@ -75,11 +84,11 @@ fn train(practice: &mut Practice, inbox: &Inbox, from: u64) -> (Vec<Opening>, Ve
 
 #[test]
 fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
-    let (mut practice, inbox) = practice(0);
+    let (mut practice, inbox) = practice(&[]);
     assert!(!practice.has_begun(BEGIN - 1) && practice.has_begun(BEGIN));
     let stopped = practice.absorb_next(&AtomicBool::new(true), &beat());
     assert!(!stopped.unwrap(), "a wait can be ended");
-    let (openings, _) = train(&mut practice, &inbox, BEGIN);
+    let (openings, _) = train(&mut practice, &inbox, &episodes(), BEGIN);
     let noise = Exploration::Policy { noise: 0.1 };
     // After 3, 5, 10, 15 and 16 rows, gradient steps 10, 10, 20, 30 and 32 are due.
     let expected = [
@@ -100,21 +109,53 @@ fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
 
 #[test]
 fn practice_continues_from_any_step_as_if_it_had_not_stopped() {
-    let (mut whole, inbox) = practice(0);
-    let (_, batches) = train(&mut whole, &inbox, BEGIN);
+    let episodes = episodes();
+    let (mut whole, inbox) = practice(&[]);
+    let (_, batches) = train(&mut whole, &inbox, &episodes, BEGIN);
     for from in BEGIN..experiment().total_steps() {
-        let (mut resumed, inbox) = practice(LENGTHS.len());
+        let (mut resumed, inbox) = practice(&episodes);
         resumed.resume(from).unwrap();
         let rest = batches[(from - BEGIN) as usize..].to_vec();
-        assert_eq!(train(&mut resumed, &inbox, from), (vec![], rest), "from step {from}");
+        assert_eq!(
+            train(&mut resumed, &inbox, &episodes, from),
+            (vec![], rest),
+            "from step {from}"
+        );
     }
-    let (mut resumed, _) = practice(1);
+    let (mut resumed, _) = practice(&episodes[..1]);
     assert!(resumed.resume(experiment().total_steps()).is_err(), "experience is missing");
 }
 
 #[test]
+fn an_episode_with_a_glitch_counts_as_one_without_rows_also_after_a_restart() {
+    let (mut sound, inbox) = practice(&[]);
+    let (_, expected) = train(&mut sound, &inbox, &episodes(), BEGIN);
+    let mut glitch = episode(8);
+    glitch.observations[40] = 1e30;
+    // In the warm-up, between gradient steps, and two in a row.
+    let places = [0, 4, 6, 7];
+    let mut episodes = episodes();
+    places.iter().for_each(|place| episodes.insert(*place, glitch.clone()));
+
+    let (mut whole, inbox) = practice(&[]);
+    let (openings, batches) = train(&mut whole, &inbox, &episodes, BEGIN);
+    assert_eq!(batches, expected);
+    assert_eq!(Vec::from_iter(openings.iter().map(|it| it.episode)), Vec::from_iter(0..11));
+    for from in BEGIN..experiment().total_steps() {
+        let (mut resumed, inbox) = practice(&episodes);
+        resumed.resume(from).unwrap();
+        let rest = expected[(from - BEGIN) as usize..].to_vec();
+        assert_eq!(
+            train(&mut resumed, &inbox, &episodes, from),
+            (vec![], rest),
+            "from step {from}"
+        );
+    }
+}
+
+#[test]
 fn the_next_episode_is_waited_for_until_it_is_recorded() {
-    let (mut practice, inbox) = practice(0);
+    let (mut practice, inbox) = practice(&[]);
     for (number, awaited) in [(1, Some(0)), (0, None)] {
         inbox.send((number, episode(LENGTHS[number as usize]))).unwrap();
         practice.take_openings();

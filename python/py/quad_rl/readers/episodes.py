@@ -108,6 +108,9 @@ def dataset(
     if empty:
         notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
     names = [[name for column in columns for name in _names(log, column)] for columns in (observations, actions)]
+    for several in [name for of_array in names for name in of_array if of_array.count(name) > 1][:1]:
+        hint = "hint: each number needs its own, by which policies and robots find it; rename it in the source (LeRobot: meta/info.json)"
+        raise ValueError(f"several numbers of an observation or an action are called {several!r}\n{hint}")
     transitions = joined(parts)
     return Source(transitions, (names[0], names[1]), notes + _clocks(log, observations))
 
@@ -160,7 +163,8 @@ def _successes(log: Log, rule: Success) -> list[bool] | None:
     rule = log.success or None if rule is None else rule
     if rule is None:
         return None
-    if isinstance(rule, str) and rule in names and rule not in log.episodes[0].columns:
+    by_text = {_text(name): name for name in names}
+    if isinstance(rule, str) and rule in by_text and rule not in log.episodes[0].columns:
         rule = [rule]
     if callable(rule):
         return [bool(_call(rule, episode)) for episode in log.episodes]
@@ -176,13 +180,17 @@ def _successes(log: Log, rule: Success) -> list[bool] | None:
         if len(listed) != len(names):
             raise ValueError(f"success has {len(listed)} flags, but there are {len(names)} episodes\nhint: list their numbers")
         return [bool(flag) for flag in listed]
-    chosen = {*listed}
+    chosen = {by_text.get(name, name) if isinstance(name, str) else name for name in listed}
     if len({*names}) < len(names):
         raise ValueError('success lists names, of which some are those of several episodes\nhint: success= a column, or "all"')
     strangers = chosen - {*names}
     if strangers:
         raise ValueError(f"success names episodes that are not there: {[*strangers][:5]} ({len(strangers)} such)")
     return [name in chosen for name in names]
+
+
+def _text(name: Any) -> str:
+    return str(int(name)) if isinstance(name, float) and name.is_integer() else str(name)
 
 
 def _suspect_going_on(log: Log, rule: str, flags: list[NDArray[np.bool_]]) -> None:

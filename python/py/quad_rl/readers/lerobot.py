@@ -162,6 +162,15 @@ def _whole(
     parts = zip(*(np.split(array[order], first[1:]) for array in columns.values()))
     there = {int(number): dict(zip(columns, part)) for number, part in zip(numbers, parts)}
     kept, longer, total = {}, [], max(int(info.get("total_episodes", 0)), len(there))
+    unlisted = [str(number) for number in there if rows and number not in rows]
+    there = {number: part for number, part in there.items() if str(number) not in unlisted}
+    if unlisted:
+        some = ", ".join(unlisted[:5]) + (", …" if len(unlisted) > 5 else "")
+        notes.append(f"{len(unlisted)} of {total} episodes dropped: meta/episodes does not list them, as if they were taken out (episode {some})")
+        total -= len(unlisted)
+    splits = info.get("splits") or {}
+    if len(splits) > 1:
+        notes.append(f"meta/info.json has splits ({', '.join(f'{name} {part}' for name, part in splits.items())}); all are read")
     for number, part in there.items():
         frames, row = part["frame_index"].reshape(-1), rows.get(number, {})
         of_all = {name: value for name, value in row.items()
@@ -207,11 +216,14 @@ def _of_task(root: Path, parts: dict[int, Columns], task: str | None, notes: lis
 
 
 def names_of(names: Any) -> list[str]:
-    """LeRobot has a list, a list in a dictionary, the place of each name, or nothing."""
+    """LeRobot has a list, lists in a dictionary, the place of each name, or nothing. Names that several lists have, as those of two
+    arms, get their keys: `left.j0`."""
     if isinstance(names, Mapping):
         if all(isinstance(place, int) for place in names.values()):
             return sorted(names, key=lambda name: int(names[name]))
-        return [name for part in names.values() for name in names_of(part)]
+        pairs = [(key, name) for key, part in names.items() for name in names_of(part)]
+        plain = [name for _, name in pairs]
+        return plain if len({*plain}) == len(plain) else [f"{key}.{name}" for key, name in pairs]
     return [str(name) for name in names or ()]
 
 

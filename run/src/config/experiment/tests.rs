@@ -33,6 +33,17 @@ fn critics_converge_within_a_demonstration() {
 }
 
 #[test]
+fn gradient_steps_wait_for_each_environment_step_that_they_have_begun() {
+    let online = "steps = 10
+online = { steps = 9, warmup = 4, updates_per_step = 3 }";
+    let experiment = resolve("own-data", &format!("algorithm = 'iql'\n{online}").parse().unwrap());
+    let experiment = experiment.unwrap();
+    let rows = [0, 10, 11, 13, 14, 25].map(|step| experiment.environment_steps(step));
+    assert_eq!(rows, [0, 0, 5, 5, 6, 9].map(Some));
+    assert_eq!(experiment.total_steps(), 25);
+}
+
+#[test]
 fn errors_name_the_problem() {
     for (changes, words) in [
         ("tua = 3", "unknown field `tua`, expected one of `environment`"),
@@ -65,6 +76,17 @@ agent.candidates = 2",
             "algorithm = 'iql'\nonline = { steps = 9, noise = 1.1 }",
             "online.noise is 1.1, but must be",
         ),
+        (
+            "algorithm = 'iql'\nonline = { steps = 9, warmup = 0, share = 0.0019 }",
+            "online.share is 0.0019, but must be from 0.001953125 to 1, for a row of experience in each batch",
+        ),
+        (
+            "algorithm = 'iql'\nonline = { steps = 9, warmup = 0, share = 0.0 }",
+            "online.share is 0, but must be from",
+        ),
+        ("environment = ''", "environment is \"\", but must be a name"),
+        ("environment = 'a/b c'", "environment is \"a/b c\", but must be a name"),
+        ("environment = \"a\\u001b\"", "environment is"),
         ("algorithm = 'sfbc'\nonline.steps = 9", "sfbc learns from a dataset alone"),
         (
             "algorithm = 'dtql'\nonline = { steps = 9, updates_per_step = 1 }",

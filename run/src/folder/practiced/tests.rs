@@ -18,13 +18,21 @@ fn verified(episodes: &[Episode]) -> (String, &'static str) {
 }
 
 fn verified_in(environment: &str, episodes: &[Episode]) -> (String, &'static str) {
+    verified_with(environment, episodes, Some(b"weights"))
+}
+
+fn verified_with(
+    environment: &str,
+    episodes: &[Episode],
+    snapshot: Option<&[u8]>,
+) -> (String, &'static str) {
     let folder = tempfile::tempdir().unwrap();
     let mut config = config("a", 0);
     config.experiment.environment = environment.to_owned();
     let online = "online = { steps = 4, warmup = 0, lag = 2 }".parse().unwrap();
     config.experiment.online = resolve("hopper-demo", &online).unwrap().online;
     let (run, _) = RunDir::create(&folder.path().join("a"), &config).unwrap();
-    run.write_snapshot(10, b"weights").unwrap();
+    snapshot.into_iter().for_each(|file| run.write_snapshot(10, file).unwrap());
     let frames = Vec::from_iter(episodes.iter().map(|episode| encode(episode).unwrap()));
     run.experience_log().unwrap().0.append(frames.iter().map(Vec::as_slice)).unwrap();
     let (findings, promise) = practiced(run.path()).unwrap().unwrap();
@@ -51,6 +59,13 @@ fn what_is_missing_or_strange_is_named() {
     let of_another = missing.replace("\n", "\nno episode of this run (1): step 10, seed 1\n");
     assert_eq!(with(1), of_another);
     assert_eq!(with(seed), format!("{missing}\nrecorded twice (1): step 10, seed {seed}"));
+}
+
+#[test]
+fn a_snapshot_that_was_deleted_as_it_may_be_takes_no_promise_back() {
+    let episodes = episodes();
+    let all = "4 of 4 environment steps are recorded".to_owned();
+    assert_eq!(verified_with("hopper", &episodes, None), (all, REPEATABLE));
 }
 
 #[test]

@@ -28,6 +28,7 @@ fn judgment(run: &str, values: &[f64], behavior: f64) -> Judgment {
         estimate: estimate(values),
         distance: 1.0,
         unseen: true,
+        caveat: None,
         behavior: estimate(&[behavior, behavior]),
         recorded: 10.0,
     }
@@ -93,7 +94,7 @@ fn other_conditions_have_another_ranking() {
 }
 
 #[test]
-fn a_judgment_replaces_an_earlier_one_of_its_step() {
+fn a_judgment_replaces_an_earlier_one_of_its_step_and_conditions() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunDir::at(folder.path());
     for (step, value) in [(40, 1.0), (20, 2.0), (40, 3.0)] {
@@ -102,6 +103,32 @@ fn a_judgment_replaces_an_earlier_one_of_its_step() {
     let saved = Judgment::read_all(&run).unwrap();
     let values = saved.iter().map(|one| (one.step, one.estimate.values[0]));
     assert_eq!(Vec::from_iter(values), [(20, 2.0), (40, 3.0)]);
+
+    let steps = || Vec::from_iter(Judgment::read_all(&run).unwrap().iter().map(|one| one.step));
+    let mut other = saved[1].clone();
+    other.conditions.gamma = 0.9;
+    other.save(&run).unwrap();
+    assert_eq!(steps(), [20, 40, 40]);
+    // The snapshot was made again.
+    other.weights = "00".to_owned();
+    other.save(&run).unwrap();
+    assert_eq!(steps(), [20, 40]);
+}
+
+#[test]
+fn a_caveat_stands_beside_a_rank_and_older_files_have_none() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunDir::at(folder.path());
+    save(&run, 20, 1.0);
+    let mut file: serde_json::Value = run.read_json(FILE).unwrap();
+    assert_eq!(file[0].as_object_mut().unwrap().remove("caveat"), None);
+    let mut judged = pair([8.0, 10.0], [12.0, 14.0], 10.0);
+    judged[1].caveat = Some("it executes 2 actions of a chunk".to_owned());
+    judged[1].save(&run).unwrap();
+    assert_eq!(Judgment::read_all(&run).unwrap()[0].caveat, judged[1].caveat);
+    let text = Ranking::of(judged)[0].blocks().map(|block| block.render(Style::Text)).concat();
+    let line = text.lines().find(|line| line.contains("a chunk")).unwrap();
+    assert!(line.starts_with("   1  b @ 20 "), "{text}");
 }
 
 #[test]
