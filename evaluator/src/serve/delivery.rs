@@ -1,5 +1,7 @@
 //! Results of a job, which the evaluator owes to the learner until they are acknowledged.
 
+use std::collections::VecDeque;
+
 use quad_protocol::{
     CodecError, Episode, EpisodeScore, Hash, Job, Message, Name, Piece, ScoreReport, encode,
 };

@@ -13,8 +13,8 @@
 //!
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
 //! - `worker`: the main loop, which serves the runs in turn; `scheduler`: chooses the next run.
-//! - `client`: the evaluator's state in one run; `connection`: its requests to the learner; `query`:
-//!   a request.
+//! - `duty`: the state machine of one run, without input or output: jobs claimed, results kept;
+//!   `client`: does what it says; `connection`: requests to the learner; `query`: a request.
 //! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy from one.
 //! - `evaluate`: one job, from its policy to its results; `job`: all of its episodes, as one batch;
 //!   `exploration`: the actions of practice; `delivery`: the results, as they are delivered.

@@ -9,7 +9,6 @@ use tokio::task::JoinSet;
 use tracing::warn;
 
 use super::client::RunClient;
-use super::connection::ANSWER_TIMEOUT;
 use super::discovery::{RunKey, Runs};
 use super::evaluate::Evaluator;
 use super::scheduler;
@@ -58,7 +57,7 @@ impl Worker {
             self.evaluator.metrics.runs.set(self.clients.len() as i64);
             let clients = self.clients.iter();
             let connected = clients.filter(|(_, client)| client.gone.is_none());
-            let turns = connected.map(|(key, client)| (key, &client.turn));
+            let turns = connected.map(|(key, client)| (key, client.turn()));
             match scheduler::next(turns, Instant::now()).cloned() {
                 Some(key) => self.take_turn(&key).await,
                 None => self.wait().await?,
@@ -101,7 +100,7 @@ impl Worker {
     /// Waits until a run is due, runs come or go, or a new snapshot promises work.
     async fn wait(&mut self) -> anyhow::Result<()> {
         let due = self.clients.values().map(|client| match client.gone {
-            None => client.turn.ready_at,
+            None => client.turn().ready_at,
             Some(since) => since + KEEP_RESULTS,
         });
         let latest = Instant::now() + self.evaluator.beat.interval();
@@ -115,36 +114,11 @@ impl Worker {
     }
 
     async fn take_turn(&mut self, key: &RunKey) {
-        let Some(client) = self.clients.get_mut(key) else { return };
-        if let Err(error) = serve(client, &mut self.evaluator).await {
-            client.back_off(&error);
-            if let Some(learner) = self.found.borrow().get(key) {
-                client.follow_next(&learner.incarnations);
-            }
+        let learner = self.found.borrow().get(key).cloned();
+        if let (Some(client), Some(learner)) = (self.clients.get_mut(key), learner) {
+            client.take_turn(&mut self.evaluator, &learner.incarnations).await;
         }
     }
-}
-
-/// Runs one job, if the last one is acknowledged, and delivers its results.
-async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
-    if !client.has_job() {
-        if client.take_early() {
-            client.deliver(ANSWER_TIMEOUT).await?;
-        }
-        let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };
-        if client.has_scores_like(&job) {
-            // Its evaluation has opened: they go first. What they leave of the job comes again.
-            return Ok(client.deliver(ANSWER_TIMEOUT).await?);
-        }
-        match evaluator.evaluate(&job, client).await {
-            Ok(owed) => client.keep(owed),
-            Err(error) => {
-                client.fail(&format!("{error:#}")).await;
-                return Err(error.context(format!("a job of step {} failed", job.step)));
-            }
-        }
-    }
-    Ok(client.deliver(ANSWER_TIMEOUT).await?)
 }
 
 #[cfg(test)]
