@@ -95,6 +95,7 @@ mod tests {
             {
                 assert_eq!(ends(reset, noise, unit), expected, "{reset}, {noise}, {unit}");
             }
+            assert_eq!(ends(1.2, 0.2, unit), expected, "a reset of a step is none of the noise");
             assert_eq!(ends(0.001, 0.0, unit), [0; 0], "no reset, but rounding");
         }
     }

@@ -163,6 +163,13 @@ mod tests {
         let act = |policy: &dyn Policy, observations| act(policy, observations, &[4, 5]).unwrap();
         let taken = act(&*scaled, &users);
         assert_close(&taken, &to_user(&act(&*plain, &ours)));
+        let explored = |policy: &dyn Policy, observations| {
+            let mut actions = [0.0; 4];
+            let mut states = [4, 5].map(|seed| policy.begin(seed));
+            policy.explore(observations, &mut states, &mut actions).unwrap();
+            actions
+        };
+        assert_close(&explored(&*scaled, &users), &to_user(&explored(&*plain, &ours)));
         let expected = sample(&*plain, &ours, &[4, 5]).unwrap();
         let samples = sample(&*scaled, &users, &[4, 5]).unwrap();
         assert_close(&samples.actions, &to_user(&expected.actions));

@@ -19,6 +19,11 @@ def test_refuses_a_success_that_is_not_boolean(success):
         made.score(0.0)
 
 
+def test_references_score_0_and_100():
+    made = _worker.WrappedEnvironment(Walk(), (-20.0, 30.0))
+    assert [made.score(total) for total in (-20.0, 5.0, 30.0)] == [0.0, 50.0, 100.0]
+
+
 def test_an_intervention_replaces_the_action():
     class Held(Walk):
         def step(self, action):
@@ -105,6 +110,8 @@ def test_the_action_taken_is_the_clipped_one_and_a_narrow_space_is_told_once(cap
         assert beyond.clipped == np.float32([0.1, -0.3, 0.3]).tolist() == np.float32(made.environment.action).tolist()
     told = capfd.readouterr().err
     assert told.count("action_space is narrower") == 1 and "number 2 of an action is 0.9, and 0.3 is taken" in told
+    made.bounds = np.float32([-2, 0, -0.5]), np.float32([2, 1, 0.5])
+    assert made.step(np.float32([5, -5, 5])).clipped == [2.0, 0.0, 0.5] == made.environment.action.tolist(), "in its own units"
 
 
 def test_an_environment_of_another_form_is_told_before_the_first_job():

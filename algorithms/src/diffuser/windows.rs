@@ -124,3 +124,42 @@ impl Windows {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+    use quad_dataset::{Arrays, Window};
+    use quad_nn::Precision;
+
+    use super::*;
+
+    #[test]
+    fn a_window_has_the_discounted_rewards_to_the_end_of_its_episode() {
+        let transitions = Transitions::of(Arrays {
+            observation_dim: 1,
+            action_dim: 1,
+            observations: vec![0.0, 1.0, 2.0, 0.0, 1.0, 2.0],
+            actions: vec![0.0; 6],
+            rewards: vec![1.0, 2.0, 4.0, 1.0, 2.0, 4.0],
+            next_observations: vec![1.0, 2.0, 3.0, 1.0, 2.0, 3.0],
+            terminals: vec![false, false, true, false, false, false],
+            timeouts: vec![false, false, false, false, false, true],
+        });
+        let context = Context {
+            transitions: Arc::new(transitions.unwrap()),
+            batch_size: 1,
+            total_steps: 1,
+            online_steps: 0,
+            window: Window::ONE,
+            seed: 0,
+            precision: Precision::F32,
+            device: Device::Cpu,
+            golden: None,
+        };
+        let windows = Windows::new(&context, 2, 0.5, 8.0).unwrap().windows;
+        let windows = windows.iter().map(|window| (window.first, window.length, window.value));
+        // The episode that is cut off has full windows alone.
+        let expected = [(0, 2, 1.0), (1, 2, 0.0), (2, 1, -4.0), (3, 2, 3.0), (4, 2, 4.0)];
+        assert_eq!(Vec::from_iter(windows), expected);
+    }
+}

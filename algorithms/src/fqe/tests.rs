@@ -36,21 +36,26 @@ fn golden_update() {
 fn the_behavior_is_evaluated_on_transitions_with_a_next_action() {
     // Two episodes of three steps with a reward of 1 each: one terminates, of the other nothing is
     // known after the cut.
-    let transitions = Transitions::of(Arrays {
-        observation_dim: 1,
-        action_dim: 1,
-        observations: vec![0.0, 0.1, 0.2, -0.1, -0.2, -0.3],
-        actions: vec![0.1, 0.2, 0.3, -0.1, -0.2, -0.3],
-        rewards: vec![1.0; 6],
-        next_observations: vec![0.1, 0.2, 0.3, -0.2, -0.3, -0.4],
-        terminals: vec![false, false, true, false, false, false],
-        timeouts: vec![false, false, false, false, false, true],
-    });
-    let context = Context {
-        transitions: Arc::new(transitions.unwrap()),
+    let transitions = |reward: f32| {
+        Transitions::of(Arrays {
+            observation_dim: 1,
+            action_dim: 1,
+            observations: vec![0.0, 0.1, 0.2, -0.1, -0.2, -0.3],
+            actions: vec![0.1, 0.2, 0.3, -0.1, -0.2, -0.3],
+            rewards: vec![reward; 6],
+            next_observations: vec![0.1, 0.2, 0.3, -0.2, -0.3, -0.4],
+            terminals: vec![false, false, true, false, false, false],
+            timeouts: vec![false, false, false, false, false, true],
+        })
+    };
+    let context = |reward| Context {
+        transitions: Arc::new(transitions(reward).unwrap()),
         golden: None,
         ..context(&goldens("fqe")[0], &Device::Cpu)
     };
+    let costs = Units::of(&context(-1.0), 0.5);
+    assert_eq!((costs.least, costs.most), (-2.0, -1.0));
+    let context = context(1.0);
     let units = Units::of(&context, 0.5);
     assert_eq!((units.least, units.most, units.offset), (1.0, 2.0, (1.75 + 1.5 + 1.0) / 3.0));
     let fqe = Fqe::of_behavior(FqeConfig::with_discount(0.5).unwrap(), units, context).unwrap();

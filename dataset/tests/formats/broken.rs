@@ -177,6 +177,9 @@ fn actions_that_rounding_puts_outside_the_unit_box() {
     let (_folder, path) = subject();
     replace(&path, "actions", &[ROWS, 3], &[1.0009f32; ROWS * 3]);
     assert!(try_read(&path, Some(hopper())).is_ok());
+    replace(&path, "actions", &[ROWS, 3], &[1.002f32; ROWS * 3]);
+    let message = format!("the action 1.002 is outside [-1, 1] ({ROWS} such rows)");
+    refused(&path, &format!("array `actions`, row 0: {message}"));
 }
 
 #[test]

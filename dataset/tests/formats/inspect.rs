@@ -50,7 +50,10 @@ fn figures_are_those_of_training() {
     assert_eq!(ours, (statistics.transitions, statistics.episodes, false));
     let ours = [inspection.min_return, inspection.mean_return, inspection.max_return];
     assert_eq!(ours, [statistics.return_min, statistics.return_mean, statistics.return_max]);
-    assert_eq!(inspection.scores.as_ref().map(|scores| scores.mean_score), statistics.score_mean);
+    let expected = ours.map(|episode_return| hopper().normalized_score(episode_return));
+    let scores = inspection.scores.as_ref().unwrap();
+    assert_eq!([scores.min_score, scores.mean_score, scores.max_score], expected);
+    assert_eq!(statistics.score_mean, Some(scores.mean_score));
     assert_eq!(inspection.problems, [""; 0]);
     let text = inspection.to_string();
     let figures = ["transitions   21\n", "score  ", "####"];

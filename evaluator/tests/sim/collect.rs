@@ -52,6 +52,16 @@ fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
     let total: f64 = rows.iter().map(|row| row.reward).sum();
     let expected = hopper().normalized_score(total / episodes as f64);
     assert!((summary.mean_score - expected).abs() < 1e-3, "{expected}");
+    let (mut best, mut episode_return) = (f64::NEG_INFINITY, 0.0);
+    for i in 0..transitions {
+        episode_return += rows.row(i).reward;
+        if is_end(i) {
+            best = best.max(hopper().normalized_score(episode_return));
+            episode_return = 0.0;
+        }
+    }
+    let percentiles = summary.score_percentiles;
+    assert!(percentiles.is_sorted() && (percentiles[3] - best).abs() < 1e-3, "{percentiles:?}");
 
     assert_eq!(environment_of(&path).unwrap(), hopper());
     let report = verify(&path, hopper()).unwrap();

@@ -92,7 +92,8 @@ fn infinite_actions_are_clipped() {
     let (mut one, mut other) = (simulation("hopper"), simulation("hopper"));
     one.reset(0);
     other.reset(0);
-    let step = one.step(&[5.0, f32::NEG_INFINITY, f32::INFINITY]);
+    let mut step = one.step(&[5.0, f32::NEG_INFINITY, f32::INFINITY]);
+    assert_eq!(step.clipped.take(), Some(vec![1.0, -1.0, 1.0]));
     assert_eq!(step, other.step(&[1.0, -1.0, 1.0]));
     assert_eq!(one.observation(), other.observation());
 }

@@ -170,4 +170,19 @@ mod tests {
         assert_eq!(license(Some("mine")), "mine");
         assert!(license(None).as_str().is_some_and(|own| own != "mine"));
     }
+
+    #[test]
+    fn a_file_says_what_its_data_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut config = config("run", 0);
+        let (data, experiment) = (&mut config.dataset, &mut config.experiment);
+        (data.min_return, data.mean_return, data.max_return) = (1.0, 2.0, 3.0);
+        (data.transitions, data.episodes, data.held_out) = (90, 9, vec![4]);
+        (data.sha256, experiment.dataset) = (Some("ab".to_owned()), Some("my.hdf5".to_owned()));
+        RunDir::create(&folder.path().join("run"), &config).unwrap();
+        let report = RunReport::scored(&folder.path().join("run")).unwrap();
+        let expected = json!({ "name": "my.hdf5", "sha256": "ab", "license": "mine", "transitions": 90,
+            "episodes": 9, "held_out": [4], "mean_return": 2.0, "practice": null });
+        assert_eq!(about(&report, 20, Some("mine"), Value::Null)["data"], expected);
+    }
 }

@@ -280,4 +280,27 @@ mod tests {
         let expected = (2.0 + 2.0 + 2.0 + 2.0 + 2.0 + after / 4.0) / 2.0;
         assert!((recorded - expected).abs() < 1e-4, "{recorded}, {expected}");
     }
+
+    #[test]
+    fn states_to_compare_in_are_from_all_held_out_episodes() {
+        let numbered = |rows: usize| {
+            let row = |row: usize| row as f32;
+            Transitions::of(Arrays {
+                observation_dim: 1,
+                action_dim: 1,
+                observations: (0..rows).map(row).collect(),
+                actions: vec![0.5; rows],
+                rewards: vec![0.0; rows],
+                next_observations: (1..=rows).map(row).collect(),
+                terminals: (0..rows).map(|row| row % 10 == 9).collect(),
+                timeouts: vec![false; rows],
+            })
+            .unwrap()
+        };
+        let held_out = Some(numbered(2 * COMPARED));
+        let split = Split { training: numbered(10), held_out, episodes: Vec::new() };
+        let compared = Data::of(split, String::new(), String::new()).unwrap().compared;
+        let expected = Vec::from_iter((0..COMPARED).map(|i| 2.0 * i as f32));
+        assert_eq!(compared.observations, expected);
+    }
 }

@@ -84,6 +84,7 @@ fn a_page_is_one_file_and_escapes_what_it_shows() {
     assert!(["href=\"http", "src=\"/", "url("].iter().all(|words| !text.contains(words)), "{text}");
     for words in [
         "<svg",
+        "2 runs, 0 complete",
         "src=\"data:image/gif;base64,R0lGODlhIG9mIGEgcnVu\"",
         &format!("--seed 4 --run-dir {b}"),
         "8.50 ± 0.71 (0.50)",

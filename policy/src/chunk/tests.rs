@@ -78,6 +78,19 @@ fn a_chunk_is_drawn_from_the_last_observations() {
     ));
 }
 
+#[test]
+fn observations_are_remembered_in_the_networks_units() {
+    let chunk = Chunk { history: 2, length: 3, replan: 1 };
+    let [plain, users] = [0, 1].map(|_| chunked(load(&initial(config(2, 4))).unwrap(), chunk));
+    let observations = Some(Affine { offset: vec![100.0], scale: vec![8.0] });
+    let users = scaled(users.unwrap(), Scaling { observations, ..Scaling::default() }).unwrap();
+    let (plain, mut state, mut expected) = (plain.unwrap(), [users.begin(7)], [users.begin(7)]);
+    users.observe(&[104.0], &mut state);
+    plain.observe(&[0.5], &mut expected);
+    let actions = step(&*users, &[106.0], &mut state);
+    assert_eq!(actions, step(&*plain, &[0.75], &mut expected));
+}
+
 /// The second episode begins a step later, so that no two draw at the same time.
 #[test]
 fn an_episode_does_not_depend_on_others() {

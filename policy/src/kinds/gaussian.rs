@@ -220,6 +220,7 @@ mod tests {
                 assert!((found - expected).abs() < 1e-6, "{spread:?}: {found} for {expected}");
             }
         }
+        assert_eq!(explored(&*policy(Spread::Shared), 0.5, -9.0), -1.0);
         // log σ is at most 2.
         let found = explored(&*policy(Spread::Squashed), 40.0, -2.75);
         assert!((found - (20.0 - 2.75 * 2f32.exp()).tanh()).abs() < 1e-5, "{found}");

@@ -211,6 +211,10 @@ mod tests {
             let experiment = resolve(task, &changes).unwrap();
             assert_eq!(experiment.agent["alpha"].as_float(), Some(alpha), "{changes}");
         }
+        let own = "algorithm = 'fql'\nonline.steps = 9".parse().unwrap();
+        let file = Preset { label: "file".to_owned(), task: tasks::named(task).ok(), own };
+        let experiment = file.resolve(&Table::new()).unwrap();
+        assert_eq!(experiment.agent["alpha"].as_float(), Some(100.0), "a user's file asks");
         let changes: Table = "algorithm = 'cql'\nonline.steps = 9".parse().unwrap();
         let experiment = resolve("antmaze-medium-play-v2", &changes).unwrap();
         assert_eq!((experiment.steps, experiment.episodes), (1_000_000, 20));

@@ -99,8 +99,10 @@ async fn a_learner_that_hangs_fails() {
 fn a_full_disk_fails() {
     let scratch = Scratch::new();
     let folder = scratch.path().join("disk");
-    let Some(disk) = SmallDisk::mount(&folder, 1) else { return };
+    let Some(disk) = SmallDisk::mount(&folder, 50) else { return };
+    let doctor = || doctor(&format!("learner doctor --run-dir {}/run", folder.display()));
+    // Too little for a checkpoint.
+    assert_found(&doctor(), "FAIL", "run folder", &["GiB free", "hint: make room"]);
     disk.fill();
-    let text = doctor(&format!("learner doctor --run-dir {}/run", folder.display()));
-    assert_found(&text, "FAIL", "run folder", &["No space left", "hint: make room"]);
+    assert_found(&doctor(), "FAIL", "run folder", &["No space left", "hint: make room"]);
 }

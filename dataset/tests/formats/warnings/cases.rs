@@ -36,7 +36,10 @@ fn each_case_is_told_by_inspect_and_by_train() {
             Ok(transitions) => transitions.warnings().to_vec(),
         };
         if let Ok(inspection) = inspect(&path, None) {
-            assert_eq!(inspection.problems, told, "{name}: one list");
+            // A file that cannot be trained on is named.
+            let prefix = format!("{}: ", path.display());
+            let told = told.iter().map(|told| told.strip_prefix(&prefix).unwrap_or(told));
+            assert_eq!(inspection.problems, Vec::from_iter(told), "{name}: one list");
         }
         let has = |problem: &String| parts.iter().all(|part| problem.contains(part));
         assert!(told.iter().any(has) || told.is_empty() && parts.is_empty(), "{name}: {told:#?}");

@@ -182,3 +182,27 @@ impl Trial {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use quad_dataset::environment::find;
+    use rand::SeedableRng;
+
+    use super::*;
+
+    #[test]
+    fn a_search_learns_to_move() {
+        let random = ChaCha8Rng::seed_from_u64(3);
+        let mut search = Search::new(find("hopper").unwrap(), random).unwrap();
+        let mut returns = Vec::new();
+        while search.steps < 12_000 {
+            search.iterate();
+            returns.push(search.mean_return);
+        }
+        let quarter = returns.len() / 4;
+        let mean = |returns: &[f64]| returns.iter().sum::<f64>() / returns.len() as f64;
+        // The first policies hardly move.
+        let (first, last) = (mean(&returns[..quarter]), mean(&returns[returns.len() - quarter..]));
+        assert!(last > 2.0 * first, "{first}, then {last}");
+    }
+}

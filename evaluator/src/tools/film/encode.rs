@@ -141,4 +141,15 @@ mod tests {
             assert_eq!(left, 0, "something is left of {name}");
         }
     }
+
+    #[test]
+    fn an_animation_shows_each_picture_for_its_time() {
+        let film = animation(0.04, pictures(9).map(Result::unwrap)).unwrap();
+        let (mut film, mut delays) = (gif::Decoder::new(&film[..]).unwrap(), Vec::new());
+        while let Some(frame) = film.read_next_frame().unwrap() {
+            delays.push(frame.delay);
+        }
+        // In hundredths of a second.
+        assert_eq!(delays, [4; 9]);
+    }
 }

@@ -11,7 +11,7 @@ use quad_run::files;
 use quad_runtime::Hint;
 
 use super::args::{MOST_EPISODES, ScoreArgs};
-use crate::sim::{self, Environments, Rollout, Simulation, Simulations};
+use crate::sim::{self, Environment, EnvironmentError, Rollout, Simulation};
 
 const SNAPSHOT: &str = "pass files like RUN/snapshots/step_000020000.safetensors; \
                         RUN/snapshots/*.safetensors are all of a run";
@@ -86,10 +86,15 @@ impl Subject {
         Ok(subjects)
     }
 
+    /// The environment of the scored episodes.
+    fn simulation(&self) -> Result<Simulation, EnvironmentError> {
+        sim::make(self.spec, self.seed)
+    }
+
     /// Plays the episodes of some seeds as one batch.
     pub fn roll_out(&self, seeds: &[u64]) -> anyhow::Result<Vec<EpisodeScore>> {
         let policy = &*self.policy;
-        let make = || Simulations.make(&self.spec.name, self.seed);
+        let make = || Ok(Box::new(self.simulation()?) as Box<dyn Environment>);
         let sizes = (policy.observation_dim(), policy.action_dim());
         let mut rollout = Rollout::new(make, sizes, seeds, |seed| policy.begin(seed))?;
         while !rollout.is_done() {
@@ -185,7 +190,7 @@ fn has_one_critic(policy: &PolicyConfig) -> bool {
 mod tests {
     use std::fs;
 
-    use quad_policy::{Aggregate, DiffusionShape, Rule};
+    use quad_policy::{Aggregate, DiffusionShape, MlpConfig, Rule};
     use quad_protocol::episode_seeds;
 
     use super::*;
@@ -223,6 +228,18 @@ mod tests {
         assert_eq!(played(None, None), episode_seeds(1, 1, 2));
         assert_eq!(played(Some(9), None), episode_seeds(9, 1, 2));
         assert_eq!(played(None, Some(1)), episode_seeds(1, 1, 1));
+    }
+
+    #[test]
+    fn the_goal_is_that_of_the_run_s_seed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("policy.safetensors");
+        let shape = DiffusionShape::quad((29, 8), &MlpConfig::mish(&[1]), 1, 1);
+        fs::write(&path, file("antmaze-umaze-v0", shape, 1)).unwrap();
+        let subject = &Subject::read(&path, &ScoreArgs::default()).unwrap()[0];
+        let [scored, trained] =
+            [subject.simulation(), sim::make(subject.spec, 1)].map(Result::unwrap);
+        assert_eq!(scored.goal(), trained.goal());
     }
 
     #[test]

@@ -162,3 +162,12 @@ fn the_next_episode_is_waited_for_until_it_is_recorded() {
         assert_eq!(practice.awaited(), awaited);
     }
 }
+
+#[test]
+fn a_line_of_metrics_has_the_return_of_the_newest_episode() {
+    let mut played = episode(3);
+    (played.score.episode_return, played.score.score) = (7.0, 3.0);
+    let (mut practice, _inbox) = practice(&[played]);
+    assert!(practice.absorb_next(&AtomicBool::new(false), &beat()).unwrap());
+    assert_eq!(practice.row()[1], ("practice_return", 7.0));
+}

@@ -81,6 +81,10 @@ agent.candidates = 2",
             "online.share is 0.0019, but must be from 0.001953125 to 1, for a row of experience in each batch",
         ),
         (
+            "algorithm = 'iql'\nonline = { steps = 9, warmup = 0, share = 50.0 }",
+            "online.share is 50, but must be from 0 to 1",
+        ),
+        (
             "algorithm = 'iql'\nonline = { steps = 9, warmup = 0, share = 0.0 }",
             "online.share is 0, but must be from",
         ),
