@@ -81,7 +81,7 @@ impl World {
                 self.carry(Input::Snapshot { step, weights })?;
             }
         }
-        self.tell_evaluators_of_learner();
+        self.publish();
         for evaluator in 0..self.evaluators.len() {
             self.announce_evaluator(evaluator);
         }
@@ -100,7 +100,7 @@ impl World {
             let others = self.rng.random_range(0..=others);
             drop(self.disk.append(&scores[..some], &frames[..others]));
         }
-        self.tell_evaluators_of_learner();
+        self.publish();
     }
 
     /// A query of an evaluator, or of a stranger, arrives.

@@ -16,6 +16,7 @@ mod arithmetic;
 mod disk;
 mod evaluator;
 mod learner;
+mod network;
 mod settings;
 mod strangers;
 mod training;
