@@ -23,7 +23,7 @@ mod training;
 mod world;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use world::World;
@@ -61,13 +61,13 @@ fn any_schedule_of_any_run_ends_with_the_same_weights_and_scores() {
     let seconds = variable("SIMULATION_SECONDS").unwrap_or(10);
     let (begin, limit) = (Instant::now(), Duration::from_secs(seconds));
     let first: u64 = rand::random::<u64>() >> 16;
-    let next = AtomicU64::new(first);
+    let (next, has_failed) = (AtomicU64::new(first), AtomicBool::new(false));
     let failed = std::thread::scope(|scope| {
         let work = || {
-            while begin.elapsed() < limit {
+            while begin.elapsed() < limit && !has_failed.load(Ordering::Relaxed) {
                 let seed = next.fetch_add(1, Ordering::Relaxed);
                 if let Err(error) = run(seed) {
-                    next.fetch_add(u64::MAX / 2, Ordering::Relaxed);
+                    has_failed.store(true, Ordering::Relaxed);
                     return Some((seed, error));
                 }
             }
@@ -77,10 +77,13 @@ fn any_schedule_of_any_run_ends_with_the_same_weights_and_scores() {
         let workers = Vec::from_iter((0..threads).map(|_| scope.spawn(work)));
         workers.into_iter().find_map(|worker| worker.join().unwrap())
     });
-    let count = next.load(Ordering::Relaxed).wrapping_sub(first);
+    let count = next.load(Ordering::Relaxed) - first;
     if let Some((seed, error)) = failed {
         print_trace(seed).ok();
-        panic!("{error}: SIMULATION_SEED={seed} runs it again");
+        panic!(
+            "{error}; schedule {} of this run, SIMULATION_SEED={seed} repeats it",
+            seed - first + 1
+        );
     }
     eprintln!("{count} schedules in {seconds} s, from seed {first}");
 }
