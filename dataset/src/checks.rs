@@ -1,10 +1,8 @@
 //! Checks that refuse a dataset before training.
 
 use crate::error::{Problem, RowProblem};
-use crate::formats::arrays::{ACTION_NAMES, OBSERVATION_NAMES};
-use crate::recording::Recording;
+use crate::recording::{ACTION_NAMES, OBSERVATION_NAMES, Recording, named};
 use crate::tables::environment::EnvironmentSpec;
-use crate::warnings::named;
 
 /// Distance outside [-1, 1] that rounding explains; such actions are clipped.
 const ACTION_TOLERANCE: f32 = 1e-3;

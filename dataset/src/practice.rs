@@ -2,8 +2,7 @@
 //! as a sensor's 1e30, would end training.
 
 use crate::error::{ArrayProblem, Problem};
-use crate::recording::{Names, Recording, RowKind};
-use crate::warnings::named;
+use crate::recording::{Names, Recording, RowKind, named};
 
 /// Largest distance of a number from its column's range in the dataset, relative to its width.
 const FAR: f64 = 1000.0;

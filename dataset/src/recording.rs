@@ -3,6 +3,10 @@
 use crate::same_state::SameState;
 use crate::statistics::Episode;
 
+/// The attribute of the names of observation columns, and that of action columns.
+pub(crate) const OBSERVATION_NAMES: &str = "observation_names";
+pub(crate) const ACTION_NAMES: &str = "action_names";
+
 /// Distance at which the locomotion rule's source (IQL, Kostrikov et al. 2021) ends a trajectory.
 const SAME_OBSERVATION: f64 = 1e-6;
 
@@ -186,6 +190,17 @@ impl Recording {
             Some((first, group)) => (format!("{group}/{column}"), row - first),
         }
     }
+}
+
+/// Columns by number and, if they have one, name.
+pub(crate) fn named(columns: &[usize], names: &[String]) -> String {
+    let one = |column: &usize| match names.get(*column) {
+        Some(name) => format!("{column} ({name})"),
+        None => column.to_string(),
+    };
+    let columns = Vec::from_iter(columns.iter().map(one));
+    let ending = if columns.len() == 1 { "" } else { "s" };
+    format!("column{ending} {}", columns.join(", "))
 }
 
 #[cfg(test)]

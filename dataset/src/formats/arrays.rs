@@ -8,14 +8,11 @@ use crate::checks;
 use crate::error::{ArrayProblem, DatasetError, Problem};
 use crate::formats::hdf5_file::Hdf5File;
 use crate::formats::new_file::{Column, NewFile, text};
-use crate::recording::{Names, Recording, RowKind};
+use crate::recording::{ACTION_NAMES, Names, OBSERVATION_NAMES, Recording, RowKind};
 use crate::same_state::SameState;
 
 /// Value of the root attribute `layout` that distinguishes this layout from D4RL's.
 pub(super) const LAYOUT: &str = "transitions";
-
-pub(crate) const OBSERVATION_NAMES: &str = "observation_names";
-pub(crate) const ACTION_NAMES: &str = "action_names";
 
 /// N transitions in memory, ordered by episode.
 #[derive(Clone, Debug, Default)]

@@ -9,11 +9,11 @@ use serde::Serialize;
 
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
+use crate::read_options::ReadOptions;
 use crate::statistics::Summary;
 use crate::tables::benchmarks;
 use crate::tables::environment::{self, EnvironmentSpec};
 use crate::tables::reward::{RewardRule, RewardScaling};
-use crate::transitions::ReadOptions;
 use crate::{checks, warnings};
 
 pub use histogram::Histogram;

@@ -3,7 +3,7 @@
 use std::fmt;
 
 use super::{Inspection, Range};
-use crate::warnings::named;
+use crate::recording::named;
 
 impl fmt::Display for Inspection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

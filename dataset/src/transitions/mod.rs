@@ -14,34 +14,18 @@ use quad_kernels::scaling::Scaling;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::formats::arrays::Arrays;
-use crate::normalize::{self, Normalize};
+use crate::normalize;
 use crate::practice::{PracticeRows, Ranges};
+use crate::read_options::ReadOptions;
 use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
-use crate::tables::maze::MazeTask;
-use crate::tables::reward::{RewardRule, RewardScaling};
+use crate::tables::reward::RewardScaling;
 use crate::{checks, warnings};
 use hold_out::HoldOut;
 use rows::Rows;
 use statistics::Statistics;
 
 pub use rows::{Batch, Window};
-
-/// Options of [`Transitions::read`].
-#[derive(Clone, Copy, Debug, Default)]
-pub struct ReadOptions {
-    /// Environment that provides dimensions, time limit and reference returns. Without it the
-    /// dimensions are the source's, and a file without timeouts has none.
-    pub environment: Option<&'static EnvironmentSpec>,
-    /// Maze task that replaces the source's rewards and masks.
-    pub task: Option<MazeTask>,
-    /// Map from the source's rewards to those that are trained on.
-    pub reward: RewardRule,
-    /// Columns to normalize. Actions that are not normalized must be within [-1, 1].
-    pub normalize: Normalize,
-    /// Steps of a chunk that will be learned; 0 if that is not known.
-    pub chunk: usize,
-}
 
 /// Transitions for training: those of a dataset, in recorded order, and experience that grows.
 ///

@@ -2,8 +2,7 @@
 
 use std::f64::consts::PI;
 
-use super::named;
-use crate::recording::Recording;
+use crate::recording::{Recording, named};
 
 /// Ratio of the units of action and observation: equal, percent, radians to degrees, and inverses.
 const UNITS: [f64; 5] = [1.0, 100.0, 0.01, 180.0 / PI, PI / 180.0];

@@ -12,9 +12,9 @@ mod sizes;
 mod unwritten;
 
 use crate::checks;
+use crate::read_options::ReadOptions;
 use crate::recording::Recording;
 use crate::tables::reward::RewardRule;
-use crate::transitions::ReadOptions;
 
 /// Number of evenly spaced rows that are sampled.
 const ENOUGH: usize = 20_000;
@@ -63,16 +63,6 @@ fn of_numbers(recording: &Recording, run: &ReadOptions) -> Vec<String> {
     warnings.extend(copied.into_iter().chain(rest).chain(late));
     warnings.extend(sizes::columns(recording, normalize));
     warnings
-}
-
-pub(crate) fn named(columns: &[usize], names: &[String]) -> String {
-    let one = |column: &usize| match names.get(*column) {
-        Some(name) => format!("{column} ({name})"),
-        None => column.to_string(),
-    };
-    let columns = Vec::from_iter(columns.iter().map(one));
-    let ending = if columns.len() == 1 { "" } else { "s" };
-    format!("column{ending} {}", columns.join(", "))
 }
 
 fn short(x: f64) -> String {

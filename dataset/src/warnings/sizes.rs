@@ -1,9 +1,9 @@
 //! Observations and actions whose scale is too large or too small.
 
-use super::{named, short};
+use super::short;
 use crate::error::such_rows;
 use crate::normalize::Normalize;
-use crate::recording::{Recording, RowKind};
+use crate::recording::{Recording, RowKind, named};
 use crate::statistics::Summary;
 
 /// Largest accepted root mean square of a dimension. At this size of one of a simulated cart's

@@ -11,10 +11,10 @@ use tracing::{debug, info, warn};
 use zenoh::Wait;
 use zenoh::liveliness::LivelinessToken;
 
-use super::connection::{ANSWER_TIMEOUT, Connection};
+use super::connection::Connection;
+use super::delivery::Owed;
 use super::discovery::{Found, RunKey};
 use super::duty::{Duty, Note, Step};
-use super::evaluate::Evaluator;
 use super::query::{QueryError, blocking};
 use super::scheduler::Turn;
 use super::snapshot::{Listener, Snapshots};
@@ -107,45 +107,53 @@ impl RunClient {
         }
     }
 
-    /// Runs one job, if the last one is acknowledged, and delivers its results. After an error the
-    /// run rests, and another process of the run is followed, if there is one.
-    pub async fn take_turn(&mut self, evaluator: &mut Evaluator, incarnations: &BTreeSet<u64>) {
+    /// Begins a turn, in which [`next_step`](Self::next_step) says what is to be done.
+    pub fn begin_turn(&mut self) {
         self.duty.begin_turn();
-        while let Some(step) = self.duty.next(rand::random()) {
-            if let Err(error) = self.step(step, evaluator).await {
-                self.warn(&error.into());
-                self.duty.unanswered(Instant::now());
-                self.duty.follow_next(incarnations, Instant::now());
-                return self.listen();
-            }
-        }
     }
 
-    async fn step(&mut self, step: Step, evaluator: &mut Evaluator) -> Result<(), QueryError> {
-        match step {
-            Step::Claim { attempt } => {
-                let names = evaluator.environments.names();
-                let reply = self.connection.claim(attempt, names).await?;
-                if let JobReply::Wait { .. } = reply {
-                    self.last_warning.clear();
-                }
-                self.duty.claimed(reply, rand::random_range(0.5..1.0), Instant::now());
-            }
-            Step::Play(job) => match evaluator.evaluate(&job, self).await {
-                Ok(owed) => self.duty.played(Ok(owed)),
-                Err(error) => {
-                    self.connection.metrics.job("failed");
-                    self.duty.played(Err(&format!("{error:#}")));
-                    self.warn(&error.context(format!("a job of step {} failed", job.step)));
-                }
-            },
-            step => self.deliver(step, ANSWER_TIMEOUT).await?,
+    /// The next step of the turn; `None` once it has ended.
+    pub fn next_step(&mut self) -> Option<Step> {
+        self.duty.next(rand::random())
+    }
+
+    /// Claims a job in one of these environments.
+    pub async fn claim(
+        &mut self,
+        attempt: u64,
+        environments: Vec<String>,
+    ) -> Result<(), QueryError> {
+        let reply = self.connection.claim(attempt, environments).await?;
+        if let JobReply::Wait { .. } = reply {
+            self.last_warning.clear();
         }
+        self.duty.claimed(reply, rand::random_range(0.5..1.0), Instant::now());
         Ok(())
     }
 
+    /// Keeps the results of the claimed job, or the reason why it is to go back.
+    pub fn played(&mut self, job: &Job, results: anyhow::Result<Owed>) {
+        match results {
+            Ok(owed) => self.duty.played(Ok(owed)),
+            Err(error) => {
+                self.connection.metrics.job("failed");
+                self.duty.played(Err(&format!("{error:#}")));
+                self.warn(&error.context(format!("a job of step {} failed", job.step)));
+            }
+        }
+    }
+
+    /// Ends a turn in which the learner has not answered: the run rests, and another of its
+    /// processes is followed, if there is one.
+    pub fn rest(&mut self, error: QueryError, incarnations: &BTreeSet<u64>) {
+        self.warn(&error.into());
+        self.duty.unanswered(Instant::now());
+        self.duty.follow_next(incarnations, Instant::now());
+        self.listen();
+    }
+
     /// Delivers results, or hands a job back.
-    async fn deliver(&mut self, step: Step, timeout: Duration) -> Result<(), QueryError> {
+    pub async fn deliver(&mut self, step: Step, timeout: Duration) -> Result<(), QueryError> {
         let (run, connection) = (self.connection.run.clone(), &self.connection);
         let notes = match step {
             Step::Claim { .. } | Step::Play(_) => Vec::new(),

@@ -36,12 +36,12 @@ impl Early {
     }
 
     /// The report that was not delivered for longest.
-    pub fn next(&mut self) -> Option<ScoreReport> {
+    pub fn take_oldest(&mut self) -> Option<ScoreReport> {
         self.0.pop_front()
     }
 
     /// A report with scores of the evaluation that a job is a part of.
-    pub fn next_like(&mut self, job: &Job) -> Option<ScoreReport> {
+    pub fn take_like(&mut self, job: &Job) -> Option<ScoreReport> {
         let is_like =
             |report: &ScoreReport| (report.step, report.weights) == (job.step, job.weights);
         let index = self.0.iter().position(is_like).filter(|_| job.practice.is_none());

@@ -179,8 +179,8 @@ impl Duty {
             return None;
         }
         let again = match &self.state {
-            State::Idle if !self.delivered_again => self.early.next(),
-            State::Claimed(job) if !self.leaving => self.early.next_like(job),
+            State::Idle if !self.delivered_again => self.early.take_oldest(),
+            State::Claimed(job) if !self.leaving => self.early.take_like(job),
             _ => None,
         };
         if let Some(report) = again {

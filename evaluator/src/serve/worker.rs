@@ -9,8 +9,11 @@ use tokio::task::JoinSet;
 use tracing::warn;
 
 use super::client::RunClient;
+use super::connection::ANSWER_TIMEOUT;
 use super::discovery::{RunKey, Runs};
+use super::duty::Step;
 use super::evaluate::Evaluator;
+use super::query::QueryError;
 use super::scheduler;
 use super::snapshot::Snapshots;
 
@@ -116,8 +119,29 @@ impl Worker {
     async fn take_turn(&mut self, key: &RunKey) {
         let learner = self.found.borrow().get(key).cloned();
         if let (Some(client), Some(learner)) = (self.clients.get_mut(key), learner) {
-            client.take_turn(&mut self.evaluator, &learner.incarnations).await;
+            client.begin_turn();
+            while let Some(step) = client.next_step() {
+                if let Err(error) = take_step(client, step, &mut self.evaluator).await {
+                    return client.rest(error, &learner.incarnations);
+                }
+            }
         }
+    }
+}
+
+async fn take_step(
+    client: &mut RunClient,
+    step: Step,
+    evaluator: &mut Evaluator,
+) -> Result<(), QueryError> {
+    match step {
+        Step::Claim { attempt } => client.claim(attempt, evaluator.environments.names()).await,
+        Step::Play(job) => {
+            let results = evaluator.evaluate(&job, client).await;
+            client.played(&job, results);
+            Ok(())
+        }
+        step => client.deliver(step, ANSWER_TIMEOUT).await,
     }
 }
 

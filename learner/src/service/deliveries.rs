@@ -8,7 +8,8 @@ use quad_run::folder::ScoreLine;
 
 use super::message::{Answer, Count, End, Frame, Order, TryAgain};
 use super::outcomes::PracticeEpisode;
-use super::pieces::{Added, Pieces};
+use super::pieces::Added;
+use super::queue::{Arrival, Writing};
 use super::refusal::Refusal;
 use super::service::Service;
 use super::validate::Validated;
@@ -17,41 +18,6 @@ use super::validate::Validated;
 const MOST_WAITING: usize = 1024;
 /// Most deliveries that are written together.
 const MOST_TOGETHER: usize = 256;
-
-#[derive(Debug)]
-pub(super) struct Deliveries<Q> {
-    arrived: VecDeque<Arrival<Q>>,
-    pieces: Pieces,
-    /// Number of frames that are decoded.
-    decoding: usize,
-    /// What is written, or about to be.
-    writing: Vec<Writing<Q>>,
-    appending: bool,
-}
-
-#[derive(Debug)]
-enum Arrival<Q> {
-    Scores(Q, ScoreReport),
-    Piece(Q, Piece),
-}
-
-#[derive(Debug)]
-enum Writing<Q> {
-    Scores(Q, ScoreReport, Validated),
-    Episode(Frame<Q>, Box<Episode>),
-}
-
-impl<Q> Default for Deliveries<Q> {
-    fn default() -> Self {
-        Self {
-            arrived: VecDeque::new(),
-            pieces: Pieces::default(),
-            decoding: 0,
-            writing: Vec::new(),
-            appending: false,
-        }
-    }
-}
 
 impl<Q> Service<Q> {
     /// True if a flush would do something.

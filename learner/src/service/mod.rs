@@ -13,7 +13,7 @@
 //! as it takes. Its rows arrive in pieces.
 //!
 //! In reading order: `service`, `message` (what it takes and orders), `deliveries` (from their
-//! arrival to their acknowledgment), `scoreboard` (episodes and jobs), `outcomes` (its arguments and
+//! arrival to their acknowledgment; those under way are a `queue`), `scoreboard` (episodes and jobs), `outcomes` (its arguments and
 //! results), `episodes` (one evaluation), `open_job` (a job and its lease), `pieces` (episodes
 //! that arrive in pieces), `validate` (checks of results), `refusal`, `evaluators`, `patience`;
 //! `online_schedule` is training's, of online episodes and gradient steps.
@@ -27,6 +27,7 @@ mod open_job;
 mod outcomes;
 mod patience;
 mod pieces;
+mod queue;
 mod refusal;
 mod scoreboard;
 #[allow(clippy::module_inception)]

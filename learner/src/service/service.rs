@@ -9,11 +9,11 @@ use quad_protocol::{Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReport
 use quad_run::counted;
 use quad_run::folder::SavedScores;
 
-use super::deliveries::Deliveries;
 use super::evaluators::Evaluators;
 use super::message::{Answer, Count, End, Input, Order};
 use super::outcomes::{Claim, Claimed, Lost};
 use super::patience::{Patience, Verdict};
+use super::queue::Deliveries;
 use super::scoreboard::{Rules, Scoreboard};
 
 /// Number of evaluations without scores from which on the evaluators are called slow.

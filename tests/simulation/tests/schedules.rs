@@ -1,32 +1,14 @@
-//! The service in a simulation: one learner and up to 64 evaluators as state machines, with virtual
-//! time, a network, a disk and strangers. Every choice follows from a seed; a failure prints it, and
-//! a trace.
+//! Schedules of whole runs, each from a seed. A failure prints the seed, and a trace.
 //!
 //! - `SIMULATION_SEED=7` runs one seed, and prints its trace in any case.
 //! - `SIMULATION_SECONDS=600` runs fresh seeds for ten minutes.
-//!
-//! What must hold for any schedule: each episode of an evaluation counts once, with the first bits
-//! that are on the disk; each online episode is recorded once; training takes them in their order, so
-//! that its weights are those of a run without faults; nothing that was acknowledged is lost; and the
-//! run ends.
 
-#![allow(missing_docs, clippy::expect_used, clippy::unwrap_used, clippy::print_stderr)]
+#![allow(clippy::expect_used, clippy::unwrap_used, clippy::print_stderr)]
 
-mod arithmetic;
-mod disk;
-mod evaluator;
-mod learner;
-mod network;
-mod settings;
-mod strangers;
-mod training;
-mod world;
-
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use world::World;
+use quad_simulation::{run, trace};
 
 /// Most lines of a trace that are printed.
 const MOST_LINES: usize = 400;
@@ -35,18 +17,9 @@ fn variable(name: &str) -> Option<u64> {
     std::env::var(name).ok().map(|text| text.parse().expect("it is a whole number"))
 }
 
-/// Runs a seed. An error says what does not hold.
-fn run(seed: u64) -> Result<(), String> {
-    let run = catch_unwind(|| World::new(seed, false).run());
-    run.unwrap_or_else(|_| Err("it panicked".to_owned()))
-}
-
 fn print_trace(seed: u64) -> Result<(), String> {
-    let mut world = World::new(seed, true);
-    let result = catch_unwind(AssertUnwindSafe(|| world.run()));
-    let result = result.unwrap_or_else(|_| Err("it panicked".to_owned()));
-    let trace = world.trace.unwrap_or_default();
-    eprintln!("seed {seed}: {:#?}", world.settings);
+    let (settings, trace, result) = trace(seed);
+    eprintln!("seed {seed}: {settings}");
     let skipped = trace.len().saturating_sub(MOST_LINES);
     eprintln!("({skipped} lines before)");
     trace[skipped..].iter().for_each(|line| eprintln!("{line}"));
