@@ -5,6 +5,7 @@ use quad_kernels::scaling::Affine;
 use super::*;
 use crate::recording::RowKind::{Dropped, LastState, Transition};
 use crate::recording::tests::recording;
+use crate::tables::reward::RewardRule;
 
 fn transitions(recording: Recording) -> Transitions {
     let scaling = RewardRule::AsIs.scaling(&[]).unwrap();

@@ -344,7 +344,11 @@ fn an_episode_has_the_actions_that_were_taken() {
     rollout = rollout.recording(0, Hash::of(b""), &Name::new("f32").unwrap());
     while !rollout.is_done() {
         let act = |actions: &mut [f32]| actions.copy_from_slice(&[1.5, -0.25, -2.0]);
-        rollout.step(|_, _, actions| Ok::<_, EnvironmentError>(act(actions))).unwrap();
+        let step = |_: &[f32], _: &mut [_], actions: &mut [f32]| {
+            act(actions);
+            Ok::<_, EnvironmentError>(())
+        };
+        rollout.step(step).unwrap();
     }
     let episode = rollout.into_records().remove(0).1.unwrap();
     assert!(episode.actions.chunks_exact(3).all(|action| action == [1.0, -0.25, -1.0]));

@@ -142,8 +142,10 @@ impl Carrier {
             Order::Reply(request, Answer::Piece(reply)) => request.reply(&reply),
             Order::Reply(request, Answer::TryAgain(why)) => request.send_error(&why.to_string()),
             Order::Learn { number, episode } => {
-                // Training may have ended.
-                self.inbox.as_ref().map(|inbox| inbox.send((number, *episode)));
+                if let Some(inbox) = &self.inbox {
+                    // Training may have ended.
+                    inbox.send((number, *episode)).ok();
+                }
             }
             Order::Evaluated { step, scores, earlier } => {
                 self.show(step, &scores);

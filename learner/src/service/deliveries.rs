@@ -1,7 +1,7 @@
 //! Deliveries: score reports, and online episodes in pieces. They wait for the disk, are checked,
 //! written together, and then acknowledged.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 
 use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, ScoreReply, ScoreReport};
 use quad_run::folder::ScoreLine;

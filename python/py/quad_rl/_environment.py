@@ -188,7 +188,7 @@ class WrappedEnvironment:
                 "is taken (in practice, that is recorded)",
                 file=sys.stderr,
             )
-        return taken.tolist()
+        return [float(number) for number in taken]
 
     def score(self, episode_return: float) -> float:
         if self.score_rule == "return":

@@ -83,10 +83,10 @@ def main() -> None:
     def reply(**message: Any) -> None:
         print(json.dumps(message), file=answer, flush=True)
 
-    paths, task = _read(sys.stdin.buffer), _read(sys.stdin.buffer)
+    paths, pickled = _read(sys.stdin.buffer), _read(sys.stdin.buffer)
     sys.path[:] = json.loads(paths)
     try:
-        task = cloudpickle.loads(task)
+        task = cloudpickle.loads(pickled)
         threading.Thread(target=_end_with, args=(task["parent"],), daemon=True).start()
 
         def give_up(error: Exception) -> None:

@@ -54,7 +54,7 @@ pub fn play(
     let episode_return = f64::from(reward) * rows as f64;
     Episode {
         score: EpisodeScore { seed, episode_return, length: rows as u32, score: episode_return },
-        terminated: bits % 2 == 0,
+        terminated: bits.is_multiple_of(2),
         observations: vec![(bits % 9973) as f32; (rows + 1) * settings.observation_dim],
         actions: vec![(bits % 9949) as f32; rows * ACTION_DIM],
         rewards: vec![reward; rows],
