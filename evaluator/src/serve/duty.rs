@@ -107,7 +107,7 @@ impl Duty {
         !matches!(self.state, State::Idle) || !self.early.is_empty() || self.again.is_some()
     }
 
-    /// True if an online episode is to be delivered, which nobody else may be able to play again.
+    /// True if an online episode is to be delivered, which another evaluator may not be able to play.
     pub fn owes_episode(&self) -> bool {
         matches!(self.state, State::Owing(_, Owed::Episode(_)))
     }

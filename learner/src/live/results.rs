@@ -7,13 +7,12 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use anyhow::Context;
-use quad_protocol::{CodecError, Episode, Hash, decode};
 use quad_run::folder::{ExperienceLog, Log, RunDirError, ScoreLine};
 use quad_runtime::Heartbeat;
 
 use super::carrier::Carrier;
 use super::disk::DiskStatus;
-use crate::service::{Frame, Input, Order};
+use crate::service::{Input, Order};
 
 pub(super) struct Results {
     /// `scores.jsonl`.
@@ -33,7 +32,7 @@ impl Results {
             while let Some(order) = orders.pop_front() {
                 orders.extend(match order {
                     Order::Decode(frame) => {
-                        let episode = read(&frame).map(Box::new);
+                        let episode = frame.decode();
                         self.carrier.carry(Input::Decoded(frame, episode))
                     }
                     Order::Append { scores, frames } => {
@@ -67,13 +66,4 @@ impl Results {
         }
         Ok(results)
     }
-}
-
-/// The episode in a frame whose hash is the claimed one.
-fn read<Q>(frame: &Frame<Q>) -> Result<Episode, CodecError> {
-    let found = Hash::of(&frame.bytes);
-    if found != frame.hash {
-        return Err(CodecError::Hash { claimed: frame.hash, found });
-    }
-    decode(&frame.bytes)
 }

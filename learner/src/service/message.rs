@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use quad_protocol::{
     CodecError, Episode, EpisodeScore, Hash, JobReply, JobRequest, Name, Piece, PieceReply,
-    Progress, ScoreReply, ScoreReport,
+    Progress, ScoreReply, ScoreReport, decode,
 };
 use quad_run::folder::ScoreLine;
 
@@ -117,6 +117,17 @@ pub struct Frame<Q> {
     /// Hash of the bytes, as claimed.
     pub hash: Hash,
     pub bytes: Arc<Vec<u8>>,
+}
+
+impl<Q> Frame<Q> {
+    /// Verifies the claimed hash, and decodes the episode.
+    pub fn decode(&self) -> Result<Box<Episode>, CodecError> {
+        let found = Hash::of(&self.bytes);
+        if found != self.hash {
+            return Err(CodecError::Hash { claimed: self.hash, found });
+        }
+        decode(&self.bytes).map(Box::new)
+    }
 }
 
 #[derive(Debug)]

@@ -4,8 +4,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use quad_dataset::Task;
-use quad_learner::service::{Answer, Frame, Input, Order, Rules, Service};
-use quad_protocol::{CodecError, Episode, Hash, decode};
+use quad_learner::service::{Answer, Input, Order, Rules, Service};
 use rand::Rng;
 
 use crate::arithmetic::ACTION_DIM;
@@ -194,7 +193,7 @@ impl World {
             }
             Some(_) => {
                 let Some(Order::Decode(frame)) = alive.results.pop_front() else { return Ok(()) };
-                let episode = read(&frame).map(Box::new);
+                let episode = frame.decode();
                 self.carry(Input::Decoded(frame, episode))
             }
             None if alive.service.has_deliveries() => self.carry(Input::Flush),
@@ -305,12 +304,4 @@ impl World {
     pub fn last_state(&self) -> Option<State> {
         self.learner.alive.as_ref().map(|alive| alive.training.state())
     }
-}
-
-fn read(frame: &Frame<Sender>) -> Result<Episode, CodecError> {
-    let found = Hash::of(&frame.bytes);
-    if found != frame.hash {
-        return Err(CodecError::Hash { claimed: frame.hash, found });
-    }
-    decode(&frame.bytes)
 }

@@ -31,7 +31,7 @@ pub struct Sender {
 }
 
 impl Sender {
-    /// Nobody waits for its answers.
+    /// No evaluator waits for its answers.
     pub const STRANGER: Self = Self { evaluator: usize::MAX, epoch: 0, query: 0 };
 }
 
@@ -308,7 +308,7 @@ impl World {
     fn check_end(&mut self, end: End) -> Result<(), String> {
         match end {
             End::Complete => {}
-            // Nobody that has the environment was there for long.
+            // No evaluator that has the environment was there for long.
             End::Unscored => return Ok(()),
             End::OtherWeights(error) => return Err(error.to_string()),
         }

@@ -2,7 +2,7 @@
 
 use quad_protocol::{Episode, Exploration, Piece, PieceReply, ScoreReply, encode};
 
-use super::super::message::{Answer, Count, Frame, Input, Order, TryAgain};
+use super::super::message::{Answer, Count, Input, Order, TryAgain};
 use super::super::outcomes::Opening;
 use super::super::service::Service;
 use super::*;
@@ -52,8 +52,7 @@ fn flush(service: &mut Service<u32>, disk: Result<(), String>) -> Vec<Order<u32>
     while !orders.is_empty() {
         match orders.remove(0) {
             Order::Decode(frame) => {
-                let Frame { bytes, .. } = &frame;
-                let episode = quad_protocol::decode(bytes).map(Box::new);
+                let episode = frame.decode();
                 orders.extend(service.handle(Input::Decoded(frame, episode), now));
             }
             Order::Append { .. } => {
