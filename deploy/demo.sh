@@ -14,14 +14,14 @@ cd "$(dirname "$0")/.."
 TASK=hopper-demo
 DATASET=data/hopper-demo.hdf5
 RUN=runs/hopper-demo
-PRACTICE=runs/hopper-practice
+ONLINE=runs/hopper-online
 EVALUATORS=2
 BIN=target/release
 
-say "1 of 5: packages and libmujoco; next: build, data, training, practice"
+say "1 of 5: packages and libmujoco; next: build, data, training, online"
 deploy/setup.sh
 say "2 of 5: building learner and evaluator, 420 crates: 5 to 10 minutes the first time; next: data (one minute), training (two),
-  practice (three)"
+  online (three)"
 cargo build --release --locked --package quad-learner --package quad-evaluator
 
 mkdir -p data
@@ -30,10 +30,10 @@ if [ ! -e "$DATASET" ]; then
   $BIN/evaluator collect --env hopper --out "$DATASET"
 fi
 
-if [ -e "$RUN/complete" ] && [ -e "$PRACTICE/complete" ] && [ $# -eq 0 ]; then
-  $BIN/learner report "$RUN" "$PRACTICE" --html "$RUN/report.html"
-  echo "learning curves: $RUN/learning_curve.svg $PRACTICE/learning_curve.svg"
-  echo "run folders: $RUN $PRACTICE"
+if [ -e "$RUN/complete" ] && [ -e "$ONLINE/complete" ] && [ $# -eq 0 ]; then
+  $BIN/learner report "$RUN" "$ONLINE" --html "$RUN/report.html"
+  echo "learning curves: $RUN/learning_curve.svg $ONLINE/learning_curve.svg"
+  echo "run folders: $RUN $ONLINE"
   say "these runs are complete; for others: deploy/demo.sh --fresh"
   exit
 fi
@@ -52,15 +52,15 @@ train() {
 
 say "4 of 5: training on the file alone"
 train $RUN "$@"
-say "5 of 5: practice, then the tables, a film and a report"
-train $PRACTICE --algorithm rlpd "$@"
+say "5 of 5: online learning, then the tables, a film and a report"
+train $ONLINE --algorithm rlpd "$@"
 # Rendering needs packages, which the evaluator names.
-if told=$($BIN/evaluator film "$PRACTICE" --out "$PRACTICE/film.gif" 2>&1); then
+if told=$($BIN/evaluator film "$ONLINE" --out "$ONLINE/film.gif" 2>&1); then
   echo "$told"
 elif install=$(grep -o 'apt-get install .*egl.*' <<<"$told"); then
-  say "for a film of it: $install, then $BIN/evaluator film $PRACTICE --out $PRACTICE/film.gif"
+  say "for a film of it: $install, then $BIN/evaluator film $ONLINE --out $ONLINE/film.gif"
 else
   echo "$told" >&2
 fi
 # One HTML file with all results.
-$BIN/learner report "$RUN" "$PRACTICE" --html "$RUN/report.html" >/dev/null
+$BIN/learner report "$RUN" "$ONLINE" --html "$RUN/report.html" >/dev/null

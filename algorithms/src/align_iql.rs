@@ -29,7 +29,7 @@ pub(super) const METRICS: &[Metric] = &metrics! {
     critic_loss ["critic loss"] held_out: "Mean over critics and batch of (Q_k(s, a) − y)² (IQL's Eq. 6).";
     bc_loss ["BC loss"] held_out: "Mean over the batch of the sum over dimensions of (ε − ε_θ(a^t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
     advantage_mean held_out: "Mean over the batch of the advantage min_k Q̂_k(s, a) − V(s): AlignIQL's policy takes the sample for which it is closest to 0.";
-    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and stays there with practice.";
+    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and stays there online.";
 };
 
 /// The hyper-parameters of AlignIQL and of IDQL.
@@ -119,7 +119,7 @@ impl DiffusionUpdate for AlignIql {
     fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
         let (config, Networks { actor, critic }) = (&self.config, networks);
         let adam = |rate: f32| AdamStep::after(step, rate);
-        // IDQL's authors move only critics and V with practice.
+        // IDQL's authors move only critics and V online.
         let decayed = *config.actor_learning_rate * context.decay(step, 0.0);
         actor.adam.set_step(adam(decayed))?;
         self.value.adam.set_step(adam(*config.value_learning_rate))?;

@@ -60,7 +60,7 @@ fn discounted(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use quad_dataset::{Arrays, PracticeRows};
+    use quad_dataset::{Arrays, OnlineEpisode};
 
     #[test]
     fn returns_without_a_discount_are_finite() {
@@ -84,7 +84,7 @@ mod tests {
         let mut returns = MonteCarlo::new(&transitions, 0.5);
         let mut expected = vec![3.0, 4.0, -2.0, -2.0, -3.0];
         assert_eq!(returns.returns, expected);
-        let practice = |rewards: &'static [f32], terminated| PracticeRows {
+        let online = |rewards: &'static [f32], terminated| OnlineEpisode {
             observations: &[0.0, 1.0, 2.0],
             actions: &[0.0; 2],
             rewards,
@@ -93,7 +93,7 @@ mod tests {
         for (rewards, terminated, more) in
             [(&[0.0, 2.0], true, [1.0, 2.0]), (&[-1.0, -1.0], false, [-2.0, -2.0])]
         {
-            transitions.add_episode(practice(rewards, terminated)).unwrap();
+            transitions.add_episode(online(rewards, terminated)).unwrap();
             returns.follow(&transitions);
             expected.extend(more);
             assert_eq!(returns.returns, expected);

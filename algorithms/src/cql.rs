@@ -1,7 +1,7 @@
 //! CQL (Kumar, Zhou, Tucker and Levine 2020, "Conservative Q-Learning for Offline Reinforcement
 //! Learning"): soft actor-critic whose critics are also pushed down at actions that the policy
 //! takes and up at those of the data, so that they do not overestimate the policy's value. A run
-//! with practice is Cal-QL, which pushes values down no further than to the data's returns.
+//! online is Cal-QL, which pushes values down no further than to the data's returns.
 //! Equations are that paper's; docs/deviations.md says which of several codes is followed.
 
 use super::calibration::MonteCarlo;
@@ -28,7 +28,7 @@ const MOST_ALPHA_PRIME: f64 = 1e6;
 const METRICS: &[Metric] = &metrics! {
     target_q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', a') with a' from the policy; of several a' the best.";
     critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (the last term of CQL's Eq. 3).";
-    gap ["gap"] held_out: "Mean over batch and critics of log Σ exp Q_k(s, ·) − Q_k(s, a), which the critics also descend (CQL's Eq. 4); below 0 where the data's action is worth more than all others together. With practice the policy's actions count as worth at least the data's discounted return (Cal-QL).";
+    gap ["gap"] held_out: "Mean over batch and critics of log Σ exp Q_k(s, ·) − Q_k(s, a), which the critics also descend (CQL's Eq. 4); below 0 where the data's action is worth more than all others together. Online the policy's actions count as worth at least the data's discounted return (Cal-QL).";
     actor_loss ["actor loss"] held_out: "Mean over the batch of α·log π(a|s) − min_k Q_k(s, a) with a from the policy; while the policy is cloned, −log π of the data's action is in the place of −min_k Q_k.";
     entropy ["entropy"] held_out: "−mean over the batch of log π(a|s) with a from the policy; α holds it at −(dimensions of an action).";
     alpha: "α, the weight of the entropy in the actor's loss, before its step.";
@@ -119,7 +119,7 @@ struct Cql {
     config: Config,
     context: Context,
     networks: Networks,
-    /// The lower bounds of Cal-QL, in a run with practice.
+    /// The lower bounds of Cal-QL, in an online run.
     returns: Option<MonteCarlo>,
 }
 

@@ -19,7 +19,7 @@ pub(super) struct Helps {
 
 /// The help of a learning rate that always decays.
 pub(super) const COSINE: &str =
-    "The actor's learning rate; falls to 0 along a cosine, and is constant with practice.";
+    "The actor's learning rate; falls to 0 along a cosine, and is constant online.";
 
 /// The metrics of one algorithm.
 pub(super) const fn table(helps: Helps) -> [Metric; 9] {
@@ -75,7 +75,7 @@ pub(super) trait ImplicitLosses: Send {
         1
     }
 
-    /// The actor's learning rate falls to 0 along a cosine before practice.
+    /// The actor's learning rate falls to 0 along a cosine before online learning.
     fn actor_rate_decays(&self) -> bool {
         true
     }

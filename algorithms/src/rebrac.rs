@@ -16,9 +16,9 @@ pub(super) const DEFINITION: Definition = Definition {
 };
 
 const METRICS: &[Metric] = &metrics! {
-    target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(min_k Q̂_k(s', ã') − critic_penalty·Σ (ã' − a')²), where ã' is the target policy's action with noise and a' the data's next action (ReBRAC's Eq. 4); with practice critic_penalty is 0.";
+    target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(min_k Q̂_k(s', ã') − critic_penalty·Σ (ã' − a')²), where ã' is the target policy's action with noise and a' the data's next action (ReBRAC's Eq. 4); online critic_penalty is 0.";
     critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)².";
-    actor_loss ["actor loss"] held_out: "Mean over the batch of actor_penalty·Σ (π(s) − a)² − λ·min_k Q_k(s, π(s)) with λ = 1/mean |min_k Q_k(s, π(s))| (ReBRAC's Eq. 5), in the policy's last step; with practice actor_penalty falls to online_cloning of itself.";
+    actor_loss ["actor loss"] held_out: "Mean over the batch of actor_penalty·Σ (π(s) − a)² − λ·min_k Q_k(s, π(s)) with λ = 1/mean |min_k Q_k(s, π(s))| (ReBRAC's Eq. 5), in the policy's last step; online actor_penalty falls to online_cloning of itself.";
     bc_loss held_out: "Mean over the batch of Σ (π(s) − a)², summed over dimensions, in the policy's last step.";
 };
 

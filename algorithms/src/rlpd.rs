@@ -1,7 +1,7 @@
 //! RLPD (Ball, Smith, Kostrikov and Levine 2023, "Efficient Online Reinforcement Learning with
 //! Offline Data"): soft actor-critic on batches that are half of the dataset, half of experience,
 //! with an ensemble of critics that have layer norm, and many updates for each environment step. Its
-//! presets have no steps before practice. Its update is its authors' code's.
+//! presets have no steps before online learning. Its update is its authors' code's.
 
 use super::prelude::*;
 use super::squashed::Squashed;

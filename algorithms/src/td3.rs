@@ -21,7 +21,7 @@ pub(super) struct Common {
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and targets.
     actor_every: Steps,
-    /// Smallest factor of the policy's distance to the data: in practice it is 1 less the share
+    /// Smallest factor of the policy's distance to the data: online it is 1 less the share
     /// that is over, but no less than this.
     online_cloning: UnitInterval,
 }
@@ -36,7 +36,7 @@ pub(super) trait BcRegularizer: Send {
     fn common(&self) -> &Common;
 
     /// Weight of the squared distance between next actions and the data's in the critics' target,
-    /// if there is such a term; with practice there is none.
+    /// if there is such a term; online there is none.
     fn penalty(&self) -> Option<f32> {
         None
     }
@@ -80,7 +80,7 @@ impl<R: BcRegularizer> Td3<R> {
         Ok(Self { regularizer, context, rows, networks, of_actor })
     }
 
-    /// A batch, and the data's next actions where they count: with practice they do not.
+    /// A batch, and the data's next actions where they count: online they do not.
     fn batch(&self, step: u64, indices: &[u32]) -> Result<(Minibatch, Option<Tensor>)> {
         let rows = self.rows.as_ref().filter(|_| self.context.online_share(step).is_none());
         let Some(rows) = rows else { return Ok((self.context.batch(indices)?, None)) };

@@ -17,7 +17,7 @@ pub(super) const DEFINITION: Definition = Definition {
 const METRICS: &[Metric] = &metrics! {
     target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', ã'), where ã' is the target policy's action with noise.";
     critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)².";
-    actor_loss ["actor loss"] held_out: "−λ·mean Q_1(s, π(s)) + mean (π(s) − a)² with λ = weight/mean |Q_1(s, π(s))| (TD3+BC's Eq. 3 to 5), in the policy's last step; with practice the second mean falls to online_cloning of itself.";
+    actor_loss ["actor loss"] held_out: "−λ·mean Q_1(s, π(s)) + mean (π(s) − a)² with λ = weight/mean |Q_1(s, π(s))| (TD3+BC's Eq. 3 to 5), in the policy's last step; online the second mean falls to online_cloning of itself.";
     bc_loss held_out: "Mean over batch and dimensions of (π(s) − a)², in the policy's last step.";
 };
 

@@ -23,7 +23,7 @@ const METRICS: &[Metric] = &table(Helps {
     value_loss: "Gumbel regression of V, mean over the batch of exp(z − M) − z·exp(−M) − exp(−M) with z = (min_k Q̂_k(s, a) − V(s))/beta, at most largest_exponent, and M = max(largest z, −1); before V's last step.",
     critic_loss: "Mean over the batch of the sum over both critics of Huber's loss of y − Q_k(s, a), linear from huber on.",
     actor_loss: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100.",
-    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and is constant with practice or if actor_rate_decays is false.",
+    learning_rate: "The actor's learning rate; falls to 0 along a cosine, and is constant online or if actor_rate_decays is false.",
 });
 
 #[derive(Clone, Deserialize)]
@@ -39,7 +39,7 @@ struct Config {
     temperature: Positive,
     /// Error of the critics from which their loss is linear.
     huber: Positive,
-    /// Decay of the actor's learning rate to 0 along a cosine before practice.
+    /// Decay of the actor's learning rate to 0 along a cosine before online learning.
     actor_rate_decays: bool,
     /// Uniform actions per transition that V sees beside the data's.
     random_actions: u8,

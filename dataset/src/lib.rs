@@ -3,7 +3,7 @@
 //!
 //! # Layout
 //! `tables` has the known environments, benchmarks and datasets. `formats` reads each format into a
-//! `recording`, and writes files; `practice` is an episode that joins a dataset. `checks` refuses
+//! `recording`, and writes files; `online` is an episode that joins a dataset. `checks` refuses
 //! bad recordings, `warnings` reports suspicious ones, `normalize` scales them, `transitions` serves
 //! them. `inspect` prints a summary.
 
@@ -14,7 +14,7 @@ mod error;
 mod formats;
 mod inspect;
 mod normalize;
-mod practice;
+mod online;
 mod read_options;
 mod recording;
 mod same_state;
@@ -25,13 +25,13 @@ mod warnings;
 
 pub use error::{ArrayProblem, DatasetError, Load, Problem, RowProblem};
 pub use formats::arrays::{Arrays, write_own};
-pub use formats::d4rl_writer::{D4rlWriter, Metadata, write_practice};
+pub use formats::d4rl_writer::{D4rlWriter, Metadata, write_experience};
 pub use formats::hdf5_file::hdf5_library;
 pub use formats::recorded::{RecordedRows, Row, matching_environments};
 pub use formats::{data_file, minari_folder, recorded_environment};
 pub use inspect::{Inspection, inspect};
 pub use normalize::Normalize;
-pub use practice::PracticeRows;
+pub use online::OnlineEpisode;
 pub use read_options::ReadOptions;
 pub use recording::Names;
 pub use tables::catalog::NamedDataset;

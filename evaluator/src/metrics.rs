@@ -7,7 +7,7 @@ use prometheus::{
 };
 
 /// Ends of a job.
-const OUTCOMES: [&str; 4] = ["scored", "practiced", "abandoned", "failed"];
+const OUTCOMES: [&str; 4] = ["scored", "played", "abandoned", "failed"];
 
 /// The metrics of one evaluator process.
 #[derive(Clone)]
@@ -17,7 +17,7 @@ pub struct Metrics {
     pub environment_steps: IntCounter,
     pub snapshots_received: IntCounter,
     pub episode_score: Histogram,
-    pub practice_rows: IntCounter,
+    pub experience_rows: IntCounter,
     pub job_duration: Histogram,
     pub select_seconds: Counter,
     pub physics_seconds: Counter,
@@ -48,7 +48,7 @@ impl Metrics {
         };
         let received = "Weight snapshots received whole and verified";
         let score = "Normalized score of each scored episode";
-        let practiced = "Environment steps of practice that a learner has acknowledged";
+        let experience = "Online environment steps that a learner has acknowledged";
         let duration = "Time from the beginning of a job's episodes to the end of the last";
         let rejected = "Messages from the wire that were not used, by reason";
         let runs = IntGauge::with_opts(opts("runs", "Runs that are being served"))?;
@@ -57,7 +57,7 @@ impl Metrics {
             environment_steps: count("environment_steps_total", "Environment steps taken")?,
             snapshots_received: count("snapshots_received_total", received)?,
             episode_score: histogram("episode_score", score, SCORE_BUCKETS)?,
-            practice_rows: count("practice_rows_total", practiced)?,
+            experience_rows: count("experience_rows_total", experience)?,
             job_duration: histogram("job_duration_seconds", duration, SECONDS_BUCKETS)?,
             select_seconds: seconds("select_seconds_total", "Time spent choosing actions")?,
             physics_seconds: seconds("physics_seconds_total", "Time spent in the physics")?,
@@ -72,7 +72,7 @@ impl Metrics {
         Ok(metrics)
     }
 
-    /// Counts a job by its end: `scored` or `practiced` if the learner acknowledged the results,
+    /// Counts a job by its end: `scored` or `played` if the learner acknowledged the results,
     /// `abandoned` if it refused or never fetched them or this evaluator leaves, else `failed`.
     pub fn job(&self, outcome: &'static str) {
         self.jobs.with_label_values(&[outcome]).inc();

@@ -1,4 +1,4 @@
-//! Experience: an evaluator delivers the rows of practice episodes, the learner acknowledges them.
+//! Experience: an evaluator delivers the rows of online episodes, the learner acknowledges them.
 //!
 //! An [`Episode`] is one frame, which travels in pieces, because a learner takes small messages
 //! only. The hash of the frame names the episode, so pieces of two evaluators that have played the
@@ -11,7 +11,7 @@ use crate::hash::Hash;
 use crate::name::Name;
 use crate::score::EpisodeScore;
 
-/// A practice episode of n steps.
+/// An online episode of n steps.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub struct Episode {
     /// Gradient step of the snapshot that acted.

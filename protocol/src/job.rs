@@ -59,7 +59,7 @@ impl JobReply {
     }
 }
 
-/// Actions in practice episodes.
+/// Actions in online episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
 pub enum Exploration {
     /// Uniform in [-1, 1] in each dimension.
@@ -91,9 +91,9 @@ pub struct Job {
     pub environment_seed: u64,
     /// A seed per episode.
     pub seeds: Vec<u64>,
-    /// Exploration of practice episodes, whose rows are delivered as
+    /// Exploration of online episodes, whose rows are delivered as
     /// [`Episode`](crate::Episode)s; `None` for evaluation episodes, of which scores are.
-    pub practice: Option<Exploration>,
+    pub exploration: Option<Exploration>,
     /// Interval of progress messages; after three intervals without progress, the job may go to
     /// another evaluator.
     pub progress_milliseconds: u64,
@@ -113,7 +113,7 @@ impl Message for JobReply {
 
     fn verify(&self) -> Result<(), CodecError> {
         match self {
-            Self::Job(Job { practice: Some(Exploration::Policy { noise }), .. })
+            Self::Job(Job { exploration: Some(Exploration::Policy { noise }), .. })
                 if !(0.0..=1.0).contains(noise) =>
             {
                 Err(CodecError::Malformed(format!("a job's noise is {noise}, not from 0 to 1")))

@@ -45,7 +45,7 @@ pub fn scores(run: &Name) -> String {
     format!("quad/{run}/scores")
 }
 
-/// Deliveries of practice episodes.
+/// Deliveries of online episodes.
 pub fn experience(run: &Name) -> String {
     format!("quad/{run}/experience")
 }

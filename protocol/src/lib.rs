@@ -30,5 +30,5 @@ pub use name::{InvalidName, Name};
 pub use origin::Origin;
 pub use progress::Progress;
 pub use score::{EpisodeScore, ScoreReply, ScoreReport};
-pub use seeds::{episode_seeds, practice_seed};
+pub use seeds::{episode_seeds, online_seed};
 pub use snapshot::Snapshot;

@@ -1,4 +1,4 @@
-//! Seeds of evaluation and practice episodes.
+//! Seeds of evaluation and online episodes.
 
 use std::collections::HashSet;
 use std::iter;
@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 
 /// Separates these draws from other uses of a run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"episodes");
-const PRACTICE: u64 = u64::from_be_bytes(*b"practice");
+const ONLINE: u64 = u64::from_be_bytes(*b"practice");
 
 /// The episode seeds of the evaluation at `step`: distinct, and different at each step, so that no
 /// evaluation is tuned to one set of starting states. Runs with the same seed that differ in
@@ -21,10 +21,10 @@ pub fn episode_seeds(run_seed: u64, step: u64, episodes: u32) -> Vec<u64> {
     iter::repeat_with(|| generator.next_u64() >> 11).filter(new).take(episodes as usize).collect()
 }
 
-/// The seed of a run's practice episode, counted from 0. It equals another given seed of the run with
+/// The seed of a run's online episode, counted from 0. It equals another given seed of the run with
 /// a probability of 2⁻⁵³.
-pub fn practice_seed(run_seed: u64, episode: u64) -> u64 {
-    let mut generator = ChaCha8Rng::seed_from_u64(run_seed ^ PRACTICE);
+pub fn online_seed(run_seed: u64, episode: u64) -> u64 {
+    let mut generator = ChaCha8Rng::seed_from_u64(run_seed ^ ONLINE);
     generator.set_stream(episode);
     generator.next_u64() >> 11
 }
@@ -42,8 +42,8 @@ mod tests {
             assert!(seeds.all(|seed| seed < 1 << 53 && seen.insert(seed)));
         }
         for (run, episode) in [3, 4].into_iter().flat_map(|run| (0..50).map(move |j| (run, j))) {
-            let seed = practice_seed(run, episode);
-            assert!(seed < 1 << 53 && seen.insert(seed) && seed == practice_seed(run, episode));
+            let seed = online_seed(run, episode);
+            assert!(seed < 1 << 53 && seen.insert(seed) && seed == online_seed(run, episode));
         }
     }
 }

@@ -25,7 +25,7 @@ struct PythonEnvironment {
     environment: Py<PyAny>,
     factory: Arc<Py<PyAny>>,
     observation: Vec<f64>,
-    practice: bool,
+    online: bool,
 }
 
 impl Environments for PythonEnvironments {
@@ -48,7 +48,7 @@ impl Environments for PythonEnvironments {
             environment: made.map_err(|error| failed(name, &error))?,
             factory: self.factory.clone(),
             observation: Vec::new(),
-            practice: false,
+            online: false,
         }))
     }
 }
@@ -77,11 +77,11 @@ impl Environment for PythonEnvironment {
     }
 
     fn allow_interventions(&mut self) {
-        self.practice = true;
+        self.online = true;
     }
 
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
-        let arguments = (seed, self.practice);
+        let arguments = (seed, self.online);
         self.observe(|environment| Ok((environment.call_method1("reset", arguments)?.unbind(), ())))
     }
 
@@ -121,7 +121,7 @@ fn failed(name: &str, error: &PyErr) -> EnvironmentError {
 }
 
 /// Serves learners with `factory`'s environments until SIGTERM. `factory` has `make(seed)` and
-/// `release(environment)`, an environment `reset(seed, practice)`, `step(action)` and `score(return)`.
+/// `release(environment)`, an environment `reset(seed, online)`, `step(action)` and `score(return)`.
 #[pyfunction]
 #[pyo3(signature = (name, factory, *, sizes, connect, certificates, precision))]
 pub fn serve_environment(

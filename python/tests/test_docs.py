@@ -25,9 +25,9 @@ def test_the_examples_run(hopper_runs, tmp_path, monkeypatch):
     assert ran >= 5 and len(names["table"]) >= 2 and set(names["table"].dir) == {"runs/mine", "runs/my-robot"}
 
 
-def test_the_cart_practices(tmp_path):
+def test_the_cart_learns_online(tmp_path):
     endpoint = free_endpoint()
-    example = (DOCS / "../examples/practice.py").read_text()
+    example = (DOCS / "../examples/online.py").read_text()
     for usual, here in [
         ("workers=2", f'workers=1, connect="{endpoint}"'),
         ("run_dir", f'listen="{endpoint}", threads=1, run_dir'),
@@ -38,8 +38,8 @@ def test_the_cart_practices(tmp_path):
     ]:
         assert example.count(usual) == 1
         example = example.replace(usual, here)
-    (tmp_path / "practice.py").write_text(example)
-    command = [sys.executable, "practice.py", "run"]
+    (tmp_path / "online.py").write_text(example)
+    command = [sys.executable, "online.py", "run"]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
     scores = json.loads(ended.stdout.replace("(", "[").replace(")", "]"))

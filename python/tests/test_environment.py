@@ -95,7 +95,7 @@ def test_numbers_and_flags_of_any_library_are_taken():
     taken = answering(reward=np.float32(0.5), terminated=np.True_, truncated=np.array(0), observation=[1] * OBSERVATION)
     stepped = taken.step(np.zeros(ACTION, np.float32))
     assert stepped[1:] == (0.5, True, False, None, None) and stepped.observation.tolist() == [1.0] * OBSERVATION
-    assert np.isnan(answering(reward=np.nan).step(np.zeros(ACTION, np.float32)).reward), "an evaluator cuts practice there"
+    assert np.isnan(answering(reward=np.nan).step(np.zeros(ACTION, np.float32)).reward), "an evaluator cuts an online episode there"
 
 
 def test_the_action_taken_is_the_clipped_one_and_a_narrow_space_is_told_once(capfd, monkeypatch):
@@ -147,14 +147,14 @@ def test_an_environment_of_another_form_is_told_before_the_first_job():
             _worker.WrappedEnvironment(Old(), "return")
 
 
-def test_reset_says_which_episodes_are_practice():
+def test_reset_says_which_episodes_are_online():
     class Told(Walk):
         def reset(self, seed=None, options=None):
             self.options = options
             return super().reset(seed)
 
     made = _worker.WrappedEnvironment(Told(), "return")
-    for practice, options in (True, {"practice": True}), (False, None):
-        made.reset(1, practice)
+    for online, options in (True, {"online": True}), (False, None):
+        made.reset(1, online)
         assert made.environment.options == options
     _worker.WrappedEnvironment(Walk(), "return").reset(1, True)

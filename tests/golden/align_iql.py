@@ -70,7 +70,7 @@ def update(config, state, inputs):
     _, alpha_bar = schedule(agent["diffusion_steps"])
     s, a, t, epsilon = (inputs[name] for name in ("observations", "actions", "t", "epsilon"))
 
-    # The actor, which only clones; with practice it stays where it is, and its average follows.
+    # The actor, which only clones; online it stays where it is, and its average follows.
     noisy = np.sqrt(alpha_bar[t])[:, None] * a + np.sqrt(1 - alpha_bar[t])[:, None] * epsilon
     loss, gradients = bc_gradient(state["actor"], s, noisy, t, epsilon, agent["actor"]["activation"])
     rate = decayed(agent["actor_learning_rate"], config, online=0.0)

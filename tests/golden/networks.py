@@ -86,7 +86,7 @@ def clip_by_norm(gradients, limit):
 
 
 def decayed(rate, config, online=1.0):
-    """Cosine decay from the start value to 0 over the steps on the dataset alone; a share of it in those with practice."""
+    """Cosine decay from the start value to 0 over the steps on the dataset alone; a share of it in those online."""
     if config["step"] >= config["total_steps"]:
         return rate * online
     return rate * 0.5 * (1 + math.cos(math.pi * config["step"] / config["total_steps"]))

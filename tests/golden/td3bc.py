@@ -10,7 +10,7 @@ from implicit import CRITICS, SIZES, critic_gradient, fast_action, mean_action, 
 
 from networks import adam_step, compiled, fast_values, follow, near, random_moments, random_network, shape, single, values
 
-# The step: in every second one the policy moves, too; TD3+BC counts from 1. Of practice 30 % are over in `rebrac-online`, and
+# The step: in every second one the policy moves, too; TD3+BC counts from 1. Of the online steps 30 % are over in `rebrac-online`, and
 # in `td3-bc-online` 70 %, when the distance to the data has its smallest factor.
 FOLDERS = {
     "td3-bc": (51, "small"),
@@ -51,7 +51,7 @@ def make_config(variant, size):
 
 
 def cloning_of(config):
-    """Factor of the distance to the data, as CORL's decay_coef: what is left of practice, but no less than its smallest."""
+    """Factor of the distance to the data, as CORL's decay_coef: what is left of the online steps, but no less than its smallest."""
     if "online_steps" not in config:
         return 1.0
     left = (config["total_steps"] + config["online_steps"] - config["step"]) / config["online_steps"]

@@ -1,5 +1,5 @@
 //! Evaluators that do everything on the wire and nothing else: they claim, report progress and
-//! deliver scores, or rows of practice, that they made up. Hundreds of them fit into one test.
+//! deliver scores, or online rows, that they made up. Hundreds of them fit into one test.
 
 use std::mem;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
@@ -99,10 +99,10 @@ impl Member {
             match self.ask(keys::jobs(&run), &claim, |measured| &mut measured.claims).await {
                 Some(JobReply::Job(job)) => {
                     self.shared.busy.fetch_add(1, Relaxed);
-                    if job.practice.is_some() {
+                    if job.exploration.is_some() {
                         // Made up in no time.
                         let (session, name) = (&self.session, self.name.as_str());
-                        let answer = made_up::deliver_practice(session, &job, name).await;
+                        let answer = made_up::deliver_experience(session, &job, name).await;
                         let refused = matches!(answer, PieceReply::Refused { .. });
                         self.shared.measured.lock().unwrap().refused += usize::from(refused);
                     } else {

@@ -70,7 +70,7 @@ pub fn scores(job: &Job, evaluator: &str) -> ScoreReport {
     ScoreReport::new(job, name(evaluator), name("f32"), episodes.collect())
 }
 
-/// An episode of practice in Hopper, of 1,000 steps.
+/// An online episode in Hopper, of 1,000 steps.
 fn episode(job: &Job) -> Episode {
     let hopper = environment::find("hopper").expect("hopper is known");
     let (steps, reward) = (1000, 2.0);
@@ -113,8 +113,8 @@ pub async fn claim_eventually(session: &Session, run: &Name, evaluator: &str) ->
     }
 }
 
-/// Delivers an episode of practice, as if the job's policy had played it. Returns the last answer.
-pub async fn deliver_practice(session: &Session, job: &Job, evaluator: &str) -> PieceReply {
+/// Delivers an online episode, as if the job's policy had played it. Returns the last answer.
+pub async fn deliver_experience(session: &Session, job: &Job, evaluator: &str) -> PieceReply {
     let frame = encode(&episode(job)).expect("it is small");
     let mut piece = Piece {
         evaluator: name(evaluator),

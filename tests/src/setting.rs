@@ -10,7 +10,7 @@ pub struct Setting {
     pub candidates: u32,
     pub hidden: u32,
     pub seed: u64,
-    /// Environment steps of practice that follow `steps`; 0 without any.
+    /// Online environment steps that follow `steps`; 0 without any.
     pub online_steps: u64,
 }
 

@@ -86,11 +86,11 @@ pub(super) struct Config {
     pub candidates: Candidates,
     pub eta: Eta,
     /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine before
-    /// practice.
+    /// online learning.
     pub actor_learning_rate: Positive,
     /// Adam's learning rate for the critics at the first step; decays likewise.
     pub critic_learning_rate: Positive,
-    /// Factor of both rates with practice.
+    /// Factor of both rates online.
     pub online_rate: NotNegative,
     /// Global norm at which each network's gradient is clipped.
     pub gradient_clip: Positive,

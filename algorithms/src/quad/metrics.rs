@@ -11,7 +11,7 @@ pub(super) const METRICS: &[Metric] = &metrics! {
     nu_squared: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23).";
     critic_gradient_norm: "Global norm of the critics' gradient before clipping.";
     actor_gradient_norm: "Global norm of the actor's gradient before clipping.";
-    learning_rate: "The actor's learning rate; falls to 0 along a cosine; with practice it is online_rate of the first.";
+    learning_rate: "The actor's learning rate; falls to 0 along a cosine; online it is online_rate of the first.";
     delta_share: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 with guidance dac and constant. This and all that follow are measured with guidance only.";
     lambda_mean ["λ"] held_out: "Mean over the batch of λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), in (0, 1]: how far the critics' gradients are trusted. With guidance constant, mean or shuffled it is what they have in its place, as in all metrics of λ; 1 with dac.";
     lambda_quantile_10: "A tenth of the batch has a λ below this.";

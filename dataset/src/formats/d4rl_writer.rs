@@ -7,7 +7,7 @@ use hdf5::H5Type;
 use crate::error::{DatasetError, Problem, RowProblem};
 use crate::formats::new_file::{CHUNK_ROWS, Column, NewFile, text};
 use crate::formats::recorded::Row;
-use crate::practice::PracticeRows;
+use crate::online::OnlineEpisode;
 use crate::tables::environment::EnvironmentSpec;
 
 /// Origin of the rows, stored under `metadata/`.
@@ -155,16 +155,16 @@ fn write_metadata(file: &NewFile, environment: &str, metadata: &Metadata) -> hdf
     put(&group, "seed", &metadata.seed)
 }
 
-/// Writes episodes of practice in an environment of these sizes of observation and action, without
+/// Writes online episodes in an environment of these sizes of observation and action, without
 /// the simulator's state. Each comes with the steps, in ascending order, at which a person acted;
 /// if there are any, `infos/intervention` marks them. An existing file is replaced once the new one
 /// is complete.
-pub fn write_practice(
+pub fn write_experience(
     path: impl AsRef<Path>,
     environment: &str,
     (o, a): (usize, usize),
     metadata: &Metadata,
-    episodes: &[(PracticeRows<'_>, &[u32])],
+    episodes: &[(OnlineEpisode<'_>, &[u32])],
 ) -> Result<(), DatasetError> {
     let path = path.as_ref();
     let [mut observations, mut actions, mut next_observations, mut rewards] =

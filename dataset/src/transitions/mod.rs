@@ -15,7 +15,7 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::formats::arrays::Arrays;
 use crate::normalize;
-use crate::practice::{PracticeRows, Ranges};
+use crate::online::{OnlineEpisode, Ranges};
 use crate::read_options::ReadOptions;
 use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
@@ -198,10 +198,10 @@ impl Transitions {
         &self.warnings
     }
 
-    /// Adds an episode of practice. Its rewards and numbers are transformed as the dataset's were,
+    /// Adds an online episode. Its rewards and numbers are transformed as the dataset's were,
     /// and actions beyond its range clipped; anything else that a dataset would be refused for is an
     /// error. Leaves out an episode with a number far outside the dataset's range, and names it.
-    pub fn add_episode(&self, episode: PracticeRows<'_>) -> Result<Option<String>, Problem> {
+    pub fn add_episode(&self, episode: OnlineEpisode<'_>) -> Result<Option<String>, Problem> {
         let recording = episode.recording(self.observation_dim(), self.action_dim())?;
         checks::accept(&recording, None, true)?;
         let far = self.ranges.far(&episode, self.names());

@@ -89,7 +89,7 @@ fn windows_of_steps_end_with_their_episode() {
     let transitions = transitions(d4rl());
     let (observations, terminated) = (&[10.0, 11.0, 12.0, 13.0, 14.0], false);
     let (actions, rewards) = (&[0.1, 0.2, 0.3, 0.4], &[1.0, 2.0, 4.0, 8.0]);
-    transitions.add_episode(PracticeRows { observations, actions, rewards, terminated }).unwrap();
+    transitions.add_episode(OnlineEpisode { observations, actions, rewards, terminated }).unwrap();
     let mut batch = Batch::default();
     let window = Window { length: 3, gamma: 0.5, ..Window::ONE };
     transitions.gather_windows(&[5, 0, 2, 4, 7], window, &mut batch);
@@ -162,7 +162,7 @@ fn experience_follows_the_dataset_and_is_scaled_as_it_was() {
     let scaling = Scaling { actions: Some(actions), observations: None, rewards: Some(2.0) };
     let transitions = Transitions::new(recording, None, reward, scaling);
     let episode = |observations, actions, rewards, terminated| {
-        transitions.add_episode(PracticeRows { observations, actions, rewards, terminated })
+        transitions.add_episode(OnlineEpisode { observations, actions, rewards, terminated })
     };
     episode(&[10.0, 11.0, 12.0], &[0.045, 0.09], &[3.0, 5.0], false).unwrap();
     // Beyond the range of a dataset's actions.
@@ -191,7 +191,7 @@ fn experience_follows_the_dataset_and_is_scaled_as_it_was() {
 fn experience_that_a_dataset_would_be_refused_for_is_refused() {
     let transitions = transitions(d4rl());
     let problem = |observations, actions, rewards| {
-        let episode = PracticeRows { observations, actions, rewards, terminated: true };
+        let episode = OnlineEpisode { observations, actions, rewards, terminated: true };
         transitions.add_episode(episode).unwrap_err().to_string()
     };
     for (problem, expected) in [
@@ -213,7 +213,7 @@ fn an_episode_with_a_number_far_outside_the_dataset_s_range_is_left_out() {
     recording.names.observations = vec!["elbow".to_owned()];
     let transitions = transitions(recording);
     let add = |observations: &[f32], actions: &[f32], rewards: &[f32]| {
-        let episode = PracticeRows { observations, actions, rewards, terminated: true };
+        let episode = OnlineEpisode { observations, actions, rewards, terminated: true };
         transitions.add_episode(episode).unwrap()
     };
     let range = "far outside the dataset's range of";
@@ -243,7 +243,7 @@ fn an_episode_with_a_number_far_outside_the_dataset_s_range_is_left_out() {
 }
 
 #[test]
-fn a_column_that_hardly_moved_may_move_in_practice() {
+fn a_column_that_hardly_moved_may_move_online() {
     let mut recording = d4rl();
     for (row, value) in recording.observations.iter_mut().enumerate() {
         *value = 20.0 + 1e-4 * row as f32;
@@ -253,7 +253,7 @@ fn a_column_that_hardly_moved_may_move_in_practice() {
     let is_left_out = |observation: f32, reward: f32| {
         let observations = &[20.0, observation];
         let episode =
-            PracticeRows { observations, actions: &[0.0], rewards: &[reward], terminated: true };
+            OnlineEpisode { observations, actions: &[0.0], rewards: &[reward], terminated: true };
         transitions.add_episode(episode).unwrap().is_some()
     };
     assert!(!is_left_out(-50.0, 999.0));

@@ -2,8 +2,8 @@ use std::fs;
 use std::path::Path;
 
 use quad_dataset::{
-    D4rlWriter, Metadata, PracticeRows, RecordedRows, RewardRule, Row, environment,
-    recorded_environment, write_practice,
+    D4rlWriter, Metadata, OnlineEpisode, RecordedRows, RewardRule, Row, environment,
+    recorded_environment, write_experience,
 };
 
 use crate::{all, assert_error, hopper, peers, read, scratch};
@@ -93,11 +93,11 @@ fn a_row_that_would_spoil_the_file_is_refused_as_a_whole() {
 }
 
 #[test]
-fn practice_is_read_as_it_was_played() {
-    let (_folder, path) = scratch("practice.hdf5");
+fn experience_is_read_as_it_was_played() {
+    let (_folder, path) = scratch("experience.hdf5");
     let numbers = |from: f32, count: usize| Vec::from_iter((0..count).map(|i| from + i as f32));
     let (long, short, actions) = (numbers(0.0, 4 * 29), numbers(500.0, 3 * 29), vec![0.5; 3 * 8]);
-    let episode = |observations, rewards: &'static [f32], terminated| PracticeRows {
+    let episode = |observations, rewards: &'static [f32], terminated| OnlineEpisode {
         observations,
         actions: &actions[..rewards.len() * 8],
         rewards,
@@ -107,7 +107,7 @@ fn practice_is_read_as_it_was_played() {
     let reached = (episode(&short, &[0.0, 1.0], true), &[][..]);
     let umaze = environment::find("antmaze-umaze").unwrap();
     let episodes = [failed, reached, reached, failed];
-    write_practice(&path, &umaze.name, (29, 8), &METADATA, &episodes).unwrap();
+    write_experience(&path, &umaze.name, (29, 8), &METADATA, &episodes).unwrap();
     assert_eq!(recorded_environment(&path).unwrap().as_deref(), Some("antmaze-umaze"));
     let transitions = read(&path, Some(umaze), RewardRule::AsIs);
     // Each truncated episode's last step makes no transition.
@@ -122,6 +122,6 @@ fn practice_is_read_as_it_was_played() {
     let marked = [true, false, true];
     assert_eq!(marks, [&marked[..], &[false; 4], &marked].concat());
 
-    let error = write_practice(&path, "ant", (27, 8), &METADATA, &episodes).unwrap_err();
+    let error = write_experience(&path, "ant", (27, 8), &METADATA, &episodes).unwrap_err();
     assert_error(&error, "array `observations` has shape [116], but must have [4, 27]", "");
 }

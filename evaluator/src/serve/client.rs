@@ -22,7 +22,7 @@ use crate::metrics::Metrics;
 
 /// Time that a leaving evaluator has to deliver its scores; half of it to hand a job back.
 const LEAVE: Duration = Duration::from_secs(2);
-/// Time that a leaving evaluator has to deliver an episode of practice, which has many pieces.
+/// Time that a leaving evaluator has to deliver an online episode, which has many pieces.
 const LEAVE_EPISODE: Duration = Duration::from_secs(6);
 /// Pause of a leaving evaluator after a learner's error.
 const RETRY: Duration = Duration::from_millis(100);
@@ -194,10 +194,10 @@ impl RunClient {
                 metrics.job("scored");
                 self.last_warning.clear();
             }
-            Note::Practiced { step, seed, rows, duplicate } => {
-                info!(%run, step, seed, rows, duplicate, "an episode of practice delivered");
-                metrics.practice_rows.inc_by(rows);
-                metrics.job("practiced");
+            Note::Experience { step, seed, rows, duplicate } => {
+                info!(%run, step, seed, rows, duplicate, "an online episode delivered");
+                metrics.experience_rows.inc_by(rows);
+                metrics.job("played");
                 self.last_warning.clear();
             }
             Note::Early { step } => {

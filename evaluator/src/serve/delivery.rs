@@ -44,12 +44,12 @@ impl Early {
     pub fn take_like(&mut self, job: &Job) -> Option<ScoreReport> {
         let is_like =
             |report: &ScoreReport| (report.step, report.weights) == (job.step, job.weights);
-        let index = self.0.iter().position(is_like).filter(|_| job.practice.is_none());
+        let index = self.0.iter().position(is_like).filter(|_| job.exploration.is_none());
         self.0.remove(index?)
     }
 }
 
-/// A practice episode on its way to the learner.
+/// An online episode on its way to the learner.
 #[derive(Debug)]
 pub struct Parcel {
     /// Steps of the episode.
@@ -63,7 +63,7 @@ impl Owed {
     /// The results of `played` episodes of `job`.
     ///
     /// # Errors
-    /// An episode of practice cannot be delivered: a number is not finite, or it is too long.
+    /// An online episode cannot be delivered: a number is not finite, or it is too long.
     pub fn new(
         job: &Job,
         evaluator: Name,

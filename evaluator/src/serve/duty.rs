@@ -69,7 +69,7 @@ pub enum Step {
 #[derive(Debug, PartialEq)]
 pub enum Note {
     Scored(ScoreReport, [u32; 2]),
-    Practiced {
+    Experience {
         step: u64,
         seed: u64,
         rows: u64,
@@ -286,7 +286,7 @@ impl Duty {
             PieceReply::Recorded { duplicate, .. } => {
                 self.end_turn(Turn::new(now));
                 let (step, seed, rows) = (job.step, parcel.seed(), parcel.rows);
-                Ok(vec![Note::Practiced { step, seed, rows, duplicate }])
+                Ok(vec![Note::Experience { step, seed, rows, duplicate }])
             }
             PieceReply::Refused { reason, .. } => {
                 let seed = parcel.seed();

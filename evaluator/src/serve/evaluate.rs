@@ -50,7 +50,7 @@ impl Evaluator {
         };
         job::check_memory(job, &*policy).inspect_err(reject)?;
         let arithmetic = Name::new(policy.precision().arithmetic())?;
-        let doing = if job.practice.is_some() { "practicing" } else { "evaluating" };
+        let doing = if job.exploration.is_some() { "playing" } else { "evaluating" };
         info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "{doing}");
         let report =
             |done: Done| client.connection.publish_progress(job, done.steps, done.episodes);

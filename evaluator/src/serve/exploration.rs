@@ -1,9 +1,9 @@
-//! Actions of practice episodes.
+//! Actions of online episodes.
 
 use quad_policy::{EpisodeState, Policy, PolicyError};
 use quad_protocol::Exploration;
 
-/// Fills in the actions of n states of practice, `n × action_dim`, for `observations`,
+/// Fills in the actions of n states of an online episode, `n × action_dim`, for `observations`,
 /// `n × observation_dim`. An action depends on the state and the observation of its own episode.
 pub fn explore(
     rule: Exploration,

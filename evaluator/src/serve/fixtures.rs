@@ -24,7 +24,7 @@ pub fn job() -> Job {
         environment: "hopper".to_owned(),
         environment_seed: 1,
         seeds: vec![1, 2],
-        practice: None,
+        exploration: None,
         progress_milliseconds: 100,
     }
 }

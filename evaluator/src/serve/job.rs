@@ -22,7 +22,7 @@ const MAX_BYTES: u64 = 256 << 20;
 /// Reason not to run a job.
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
-    #[error("it has {0} episodes, but must have from 1 to {MAX_EPISODES}, or one of practice")]
+    #[error("it has {0} episodes, but must have from 1 to {MAX_EPISODES}, or one online episode")]
     Size(usize),
     #[error("each of its steps takes {0} bytes of memory, more than {MAX_BYTES}")]
     Memory(u64),
@@ -51,7 +51,7 @@ impl JobError {
 /// Checks the episodes and the environment of a learner's job.
 pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError> {
     let episodes = job.seeds.len();
-    let most = if job.practice.is_some() { 1 } else { MAX_EPISODES };
+    let most = if job.exploration.is_some() { 1 } else { MAX_EPISODES };
     if !(1..=most).contains(&episodes) {
         return Err(JobError::Size(episodes));
     }
@@ -69,7 +69,7 @@ pub fn check_memory(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
     }
 }
 
-/// The episodes of a job; those of practice with their experience.
+/// The episodes of a job; those that are online with their experience.
 pub type Played = Vec<(EpisodeScore, Option<Episode>)>;
 
 /// Environment steps taken and episodes ended.
@@ -109,14 +109,14 @@ fn run(
     let started = Instant::now();
     let make = || {
         let mut made = environments.make(&job.environment, job.environment_seed);
-        if let (Ok(environment), Some(_)) = (&mut made, job.practice) {
+        if let (Ok(environment), Some(_)) = (&mut made, job.exploration) {
             environment.allow_interventions();
         }
         made
     };
     let sizes = (policy.observation_dim(), policy.action_dim());
     let mut rollout = Rollout::new(make, sizes, &job.seeds, |seed| policy.begin(seed))?;
-    if job.practice.is_some() {
+    if job.exploration.is_some() {
         let precision = Name::new(policy.precision().arithmetic())?;
         rollout = rollout.recording(job.step, job.weights, &precision);
     }
@@ -130,7 +130,7 @@ fn run(
             return Err(JobError::TooLong.into());
         }
         let stepped = rollout.step(|observations, states, actions| {
-            let acted = match job.practice {
+            let acted = match job.exploration {
                 None => policy.act(observations, states, actions),
                 Some(rule) => explore(rule, policy, observations, states, actions),
             };
@@ -281,30 +281,30 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_is_told_of_practice_in_which_a_person_may_act() {
+    fn an_environment_is_told_of_online_episodes_in_which_a_person_may_act() {
         let watched = Watched::default();
         let mut job = job(1);
-        for (practice, allowed) in [(None, 0), (Some(Exploration::Uniform), 1)] {
-            job.practice = practice;
+        for (exploration, allowed) in [(None, 0), (Some(Exploration::Uniform), 1)] {
+            job.exploration = exploration;
             run_for(&watched, &job, Job::LONGEST).unwrap();
             assert_eq!(watched.0.load(Relaxed), allowed);
         }
     }
 
     #[test]
-    fn an_episode_of_practice_has_the_same_bytes_whoever_plays_it() {
-        let practice = |noise, by: &str| {
-            let practice = Some(Exploration::Policy { noise });
-            let job = Job { practice, ..job(1) };
+    fn an_online_episode_has_the_same_bytes_whoever_plays_it() {
+        let play = |noise, by: &str| {
+            let exploration = Some(Exploration::Policy { noise });
+            let job = Job { exploration, ..job(1) };
             let played = run_for(&Simulations, &job, Job::LONGEST).unwrap();
             let [by, precision] = [by, "f32"].map(|name| Name::new(name).unwrap());
             match Owed::new(&job, by, precision, played).unwrap() {
                 Owed::Episode(parcel) => parcel.piece(),
-                Owed::Scores(_) => panic!("it is practice"),
+                Owed::Scores(_) => panic!("it is an online episode"),
             }
         };
         let [one, other, quieter] =
-            [(0.3, "one"), (0.3, "other"), (0.2, "one")].map(|(noise, by)| practice(noise, by));
+            [(0.3, "one"), (0.3, "other"), (0.2, "one")].map(|(noise, by)| play(noise, by));
         assert_eq!((one.hash, &one.bytes), (other.hash, &other.bytes));
         assert_ne!(one.hash, quieter.hash);
 

@@ -1,4 +1,4 @@
-//! Serving: finds runs, evaluates the snapshots that their learners publish and practices with them,
+//! Serving: finds runs, evaluates the snapshots that their learners publish and plays online episodes with them,
 //! delivers scores and experience.
 //!
 //! Owns the sessions, one for each endpoint, and the state of all communication with learners,
@@ -17,7 +17,7 @@
 //!   `client`: does what it says; `connection`: requests to the learner; `query`: a request.
 //! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy from one.
 //! - `evaluate`: one job, from its policy to its results; `job`: all of its episodes, as one batch;
-//!   `exploration`: the actions of practice; `delivery`: the results, as they are delivered.
+//!   `exploration`: the actions of online episodes; `delivery`: the results, as they are delivered.
 
 mod client;
 mod connection;

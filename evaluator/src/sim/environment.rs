@@ -20,7 +20,7 @@ pub struct Step {
 pub trait Environment: Send {
     fn name(&self) -> &str;
 
-    /// Says before [`reset`](Self::reset) that the episode is practice, in which a person may act.
+    /// Says before [`reset`](Self::reset) that the episode is online, in which a person may act.
     fn allow_interventions(&mut self) {}
 
     /// Starts an episode, which is a function of its seed and its actions only.
@@ -62,8 +62,8 @@ pub enum EnvironmentError {
     #[error("the environment \"{name}\" failed: {reason}")]
     Failed { name: String, reason: String },
     #[error(
-        "a person took an action in the evaluation episode with seed {0}, whose score is to be the policy's: in practice alone, \
-         `reset` gets options={{\"practice\": True}}"
+        "a person took an action in the evaluation episode with seed {0}, whose score is to be the policy's: in online episodes alone, \
+         `reset` gets options={{\"online\": True}}"
     )]
     Intervention(u64),
     #[error(

@@ -215,7 +215,7 @@ impl Live {
         if self.score.length == 0 {
             return Err(error);
         }
-        warn!("an episode of practice is cut off before its last step: {error}");
+        warn!("an online episode is cut off before its last step: {error}");
         self.ended = true;
         Ok(())
     }

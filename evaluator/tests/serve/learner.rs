@@ -123,7 +123,7 @@ pub fn job(snapshot: &Snapshot) -> Job {
         environment: "hopper".to_owned(),
         environment_seed: 1,
         seeds: vec![11, 12, 13],
-        practice: None,
+        exploration: None,
         progress_milliseconds: 100,
     }
 }

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod learner;
-mod practice;
+mod online;
 
 use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations};
 use quad_policy::{Precision, load_policy};

@@ -292,10 +292,10 @@ impl Environment for Diverging {
     }
 }
 
-fn diverge(environment: Diverging, practice: bool) -> Result<Option<Episode>, EnvironmentError> {
+fn diverge(environment: Diverging, online: bool) -> Result<Option<Episode>, EnvironmentError> {
     let make = || Ok(Box::new(environment) as Box<dyn Environment>);
     let mut rollout = Rollout::new(make, (2, 1), &[7], |_| ())?;
-    if practice {
+    if online {
         rollout = rollout.recording(0, Hash::of(b""), &Name::new("f32").unwrap());
     }
     while !rollout.is_done() {
@@ -305,7 +305,7 @@ fn diverge(environment: Diverging, practice: bool) -> Result<Option<Episode>, En
 }
 
 #[test]
-fn practice_ends_before_a_step_that_cannot_be_learned_from() {
+fn an_online_episode_ends_before_a_step_that_cannot_be_learned_from() {
     for (pays, value) in [
         (false, f64::NAN),
         (false, f64::NEG_INFINITY),
@@ -327,9 +327,9 @@ fn practice_ends_before_a_step_that_cannot_be_learned_from() {
         assert!(error.contains(&expected), "{error}");
     }
     let nan = Diverging { at: 0, pays: false, value: f64::NAN, state: [0.0; 2] };
-    for practice in [true, false] {
-        for at in if practice { 0..=0 } else { 0..=5 } {
-            let error = diverge(Diverging { at, ..nan }, practice).unwrap_err().to_string();
+    for online in [true, false] {
+        for at in if online { 0..=0 } else { 0..=5 } {
+            let error = diverge(Diverging { at, ..nan }, online).unwrap_err().to_string();
             let expected =
                 format!("observation[1] = NaN after step {at} of the episode with seed 7");
             assert!(error.contains(&expected), "{error}");

@@ -85,7 +85,7 @@ function showCharts(runs) {
   if (scores.some(({ points }) => points.length)) {
     const ofData = runs.length === 1 ? runs[0].dataset_score : null;
     const data = ofData === null ? "" : `; the data's own episodes have ${number(ofData)}`;
-    const begins = runs.length === 1 && runs[0].practice_begins !== null ? ` Practice begins after step ${runs[0].practice_begins}.` : "";
+    const begins = runs.length === 1 && runs[0].online_begins !== null ? ` Online learning begins after step ${runs[0].online_begins}.` : "";
     const about = `Mean over an evaluation's episodes, ± their standard deviation${data}.${begins}`;
     const measure = runs.every((run) => run.measure === "return") ? "Return" : "Score";
     kept.add(chart($("score"), "score", measure, about, scores));
@@ -156,21 +156,21 @@ function showLive(live) {
   [$("progress").value, $("progress").max] = [live.step, live.steps];
   $("figures").replaceChildren(...facts([
     ["gradient steps", `${live.step} of ${live.steps}`], ["steps per second", number(speed)], ["training", left],
-    ["episodes to score", String(live.episodes_pending)], ["evaluators", String(live.evaluators.length)], ...practice(live.practice),
+    ["episodes to score", String(live.episodes_pending)], ["evaluators", String(live.evaluators.length)], ...online(live.online),
   ]).children);
   $("health").textContent = live.problems.join("\n") || "all is well";
   $("health").className = live.problems.length ? "bad" : "good";
   $("evaluators").replaceChildren(...live.evaluators.map(({ name, job, seconds_ago: ago, fits }) => {
     const idle = fits ? "waits for a job" : "has not asked for a job of this environment";
-    return row(name, job ? `${job.practice ? "practice" : "evaluation"}, step ${job.step}: ${job.done} of ${job.episodes} episodes` : idle, right(ago === null ? "–" : `${Math.round(ago)} s ago`));
+    return row(name, job ? `${job.online ? "online" : "evaluation"}, step ${job.step}: ${job.done} of ${job.episodes} episodes` : idle, right(ago === null ? "–" : `${Math.round(ago)} s ago`));
   }));
 }
 
-// Figures of a run with practice.
-function practice(now) {
+// Figures of an online run.
+function online(now) {
   if (!now) return [];
   const newest = now.steps > 0 ? number(now.return) : "–";
-  return [["experience", `${now.steps} of ${now.target}`], ["return in practice", newest], ["waited for practice", duration(now.wait_seconds)]];
+  return [["experience", `${now.steps} of ${now.target}`], ["return online", newest], ["waited for experience", duration(now.wait_seconds)]];
 }
 
 async function refresh() {

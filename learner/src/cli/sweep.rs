@@ -69,7 +69,7 @@ pub struct SweepArgs {
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]
     pub jobs: Option<u16>,
     /// Number of evaluators to start; they serve all runs and log to DIR/STUDY [default: one for
-    /// each core that does not train, at least one; none if no run has evaluations or practice]
+    /// each core that does not train, at least one; none if no run has evaluations or online episodes]
     #[arg(long, value_name = "N", conflicts_with = "connect")]
     pub evaluators: Option<usize>,
     /// Use the evaluators at this Zenoh router instead, e.g. tcp/router:7447

@@ -45,7 +45,7 @@ pub struct TrainArgs {
     /// change
     #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]
     preset: Option<String>,
-    /// Go on with practice where a complete run has ended: with its settings and its last checkpoint,
+    /// Go on online where a complete run has ended: with its settings and its last checkpoint,
     /// in a folder of its own
     #[arg(long, value_name = "RUN", conflicts_with_all = ["task", "preset", "algorithm", "steps"], requires = "online_steps")]
     pub from: Option<PathBuf>,
@@ -68,7 +68,7 @@ pub struct TrainArgs {
     hold_out: Option<f64>,
     /// Folder of the run; its last part names the run. If it contains a run of the same
     /// configuration, that run continues [default: runs/TASK-VARIANT-seedSEED,
-    /// runs/TASK-VARIANT-online-seedSEED with practice after --steps, runs/RUN-online with --from]
+    /// runs/TASK-VARIANT-online-seedSEED with --online-steps, runs/RUN-online with --from]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
     /// Seconds between two checkpoints; a crash loses at most the training since the last one. The
@@ -127,10 +127,10 @@ pub struct TrainArgs {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Instead of the algorithm's value for the task")]
 struct OverrideArgs {
-    /// Gradient steps on the dataset; 0 only with practice
+    /// Gradient steps on the dataset; 0 only with --online-steps
     #[arg(long, value_name = "N", value_parser = parse_count)]
     steps: Option<i64>,
-    /// Environment steps of practice, from which the learner goes on learning
+    /// Online environment steps, from which the learner goes on learning
     #[arg(long, value_name = "N", value_parser = parse_count)]
     online_steps: Option<i64>,
     /// Gradient steps between two evaluations; 0 trains without any evaluation

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use anyhow::{Context, anyhow};
 use quad_policy::{Header, PolicyError, read_tensors};
-use quad_protocol::{Hash, Origin, practice_seed};
+use quad_protocol::{Hash, Origin, online_seed};
 use quad_run::config::Experiment;
 use quad_run::files;
 use quad_run::folder::{RunDir, read_experience};
@@ -22,11 +22,11 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let folder = RunDir::at(&args.run);
     let steps = folder.snapshots()?;
     let best = report.best_of(|step| steps.contains(&step)).map(|best| best.step);
-    let practices = report.config.experiment.practice_begins().is_some();
+    let is_online = report.config.experiment.online_begins().is_some();
     let (step, what) = match args.step {
         At::Step(step) => (Some(step), "of that step"),
         At::Last => (steps.last().copied(), "yet"),
-        At::Best if practices => (best, "with a complete evaluation since practice began"),
+        At::Best if is_online => (best, "with a complete evaluation since online learning began"),
         At::Best => (best, "with a complete evaluation"),
     };
     let (run, name) = (args.run.display(), args.out.display());
@@ -53,8 +53,8 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
         report.evaluations.retain(|it| it.step != step);
     }
     report.judgments.retain(|it| it.weights == weights);
-    let practiced = practiced(&folder, &report.config.experiment, step)?;
-    let about = about(&report, step, args.license.as_deref(), practiced);
+    let experience = experience(&folder, &report.config.experiment, step)?;
+    let about = about(&report, step, args.license.as_deref(), experience);
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
     files::replace(&args.out, &exported)
         .with_context(|| format!("cannot export to {name}"))
@@ -63,14 +63,14 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     print(&format!("{name}: {run} @ {step}, {bytes} bytes"))
 }
 
-/// Size and mean return of the episodes of practice that the policy of a step has learned from; null
+/// Size and mean return of the online episodes that the policy of a step has learned from; null
 /// without any.
-fn practiced(folder: &RunDir, experiment: &Experiment, step: u64) -> anyhow::Result<Value> {
+fn experience(folder: &RunDir, experiment: &Experiment, step: u64) -> anyhow::Result<Value> {
     let rows = experiment.environment_steps(step).unwrap_or(0);
     let played = read_experience(folder.path())?;
     let by_seed = BTreeMap::from_iter(played.iter().map(|it| (it.score.seed, it)));
     // Training takes them by their number.
-    let in_order = (0..).map_while(|number| by_seed.get(&practice_seed(experiment.seed, number)));
+    let in_order = (0..).map_while(|number| by_seed.get(&online_seed(experiment.seed, number)));
     let (mut returns, mut before) = (Vec::new(), 0);
     for episode in in_order {
         if before >= rows {
@@ -79,12 +79,12 @@ fn practiced(folder: &RunDir, experiment: &Experiment, step: u64) -> anyhow::Res
         returns.push(episode.score.episode_return);
         before += episode.rewards.len() as u64;
     }
-    let practiced =
+    let experience =
         json!({ "transitions": rows, "episodes": returns.len(), "mean_return": mean(&returns) });
-    Ok(if rows > 0 { practiced } else { Value::Null })
+    Ok(if rows > 0 { experience } else { Value::Null })
 }
 
-fn about(report: &RunReport, step: u64, license: Option<&str>, practiced: Value) -> Value {
+fn about(report: &RunReport, step: u64, license: Option<&str>, experience: Value) -> Value {
     let (data, experiment) = (&report.config.dataset, &report.config.experiment);
     let name = experiment.dataset.clone().unwrap_or_default();
     let entry = Source::parse(&name).ok().and_then(|source| source.entry());
@@ -113,7 +113,7 @@ fn about(report: &RunReport, step: u64, license: Option<&str>, practiced: Value)
             "episodes": data.episodes,
             "held_out": data.held_out,
             "mean_return": data.mean_return,
-            "practice": practiced,
+            "experience": experience,
         },
         "score": score,
         // Of several, the newest.
@@ -130,7 +130,7 @@ mod tests {
     use crate::fixtures::config;
 
     #[test]
-    fn a_file_counts_the_practice_that_its_policy_has_learned_from() {
+    fn a_file_counts_the_experience_that_its_policy_has_learned_from() {
         let scratch = tempfile::tempdir().unwrap();
         let folder = RunDir::at(scratch.path());
         let mut experiment = config("run", 3).experiment;
@@ -140,7 +140,7 @@ mod tests {
         experiment.online = Some(serde_json::from_value(online).unwrap());
         let (mut log, _) = folder.experience_log().unwrap();
         for (number, episode_return) in [(1, 20.0), (0, 10.0), (2, 90.0)] {
-            let (seed, precision) = (practice_seed(3, number), Name::new("f32").unwrap());
+            let (seed, precision) = (online_seed(3, number), Name::new("f32").unwrap());
             let played = Episode::new(20, Hash::of(b""), precision, seed);
             let episode = Episode {
                 score: EpisodeScore { episode_return, length: 3, ..played.score },
@@ -154,9 +154,9 @@ mod tests {
         for (step, rows, episodes, mean) in [(21, 1, 1, 10.0), (24, 4, 2, 15.0), (29, 9, 3, 40.0)] {
             let expected =
                 json!({ "transitions": rows, "episodes": episodes, "mean_return": mean });
-            assert_eq!(practiced(&folder, &experiment, step).unwrap(), expected);
+            assert_eq!(experience(&folder, &experiment, step).unwrap(), expected);
         }
-        assert_eq!(practiced(&folder, &experiment, 20).unwrap(), Value::Null);
+        assert_eq!(experience(&folder, &experiment, 20).unwrap(), Value::Null);
     }
 
     #[test]
@@ -182,7 +182,7 @@ mod tests {
         RunDir::create(&folder.path().join("run"), &config).unwrap();
         let report = RunReport::scored(&folder.path().join("run")).unwrap();
         let expected = json!({ "name": "my.hdf5", "sha256": "ab", "license": "mine", "transitions": 90,
-            "episodes": 9, "held_out": [4], "mean_return": 2.0, "practice": null });
+            "episodes": 9, "held_out": [4], "mean_return": 2.0, "experience": null });
         assert_eq!(about(&report, 20, Some("mine"), Value::Null)["data"], expected);
     }
 }

@@ -1,7 +1,7 @@
 //! `learner export-data`: the experience of a run as a dataset.
 
 use anyhow::anyhow;
-use quad_dataset::{DatasetError, Metadata, PracticeRows, write_practice};
+use quad_dataset::{DatasetError, Metadata, OnlineEpisode, write_experience};
 use quad_protocol::Episode;
 use quad_run::counted;
 use quad_run::folder::{RunDir, read_experience};
@@ -15,12 +15,12 @@ pub fn export(args: &ExportDataArgs) -> anyhow::Result<()> {
     let played = read_experience(folder.path())?;
     let Some(last) = played.last() else {
         return Err(anyhow!("{} has no experience", args.run.display())).hint(
-            "`learner train --online-steps N` lets evaluators practice; the learner keeps their episodes",
+            "`learner train --online-steps N` lets evaluators play; the learner keeps their episodes",
         );
     };
     let episodes = Vec::from_iter(played.iter().map(|episode| {
         let Episode { observations, actions, rewards, terminated, interventions, .. } = episode;
-        let rows = PracticeRows { observations, actions, rewards, terminated: *terminated };
+        let rows = OnlineEpisode { observations, actions, rewards, terminated: *terminated };
         (rows, interventions.as_slice())
     }));
     let experiment = &config.experiment;
@@ -30,7 +30,7 @@ pub fn export(args: &ExportDataArgs) -> anyhow::Result<()> {
         seed: experiment.seed,
     };
     let (environment, dims) = (&experiment.environment, last.dims());
-    write_practice(&args.out, environment, dims, &metadata, &episodes)
+    write_experience(&args.out, environment, dims, &metadata, &episodes)
         .hint_of(DatasetError::hint)?;
     let rows: usize = episodes.iter().map(|(rows, _)| rows.rewards.len()).sum();
     let (name, episodes) = (args.out.display(), counted(episodes.len(), "episode"));

@@ -68,11 +68,11 @@ impl EarlierRun {
     /// Reads the run, and makes a preset of its settings.
     ///
     /// # Errors
-    /// The run is not complete, its checkpoints were deleted, or its algorithm cannot practice.
+    /// The run is not complete, its checkpoints were deleted, or its algorithm cannot learn online.
     fn read(run: &Path) -> anyhow::Result<(Self, Preset)> {
         let (dir, config) = RunDir::open(run)?;
         if config.experiment.online.is_some() {
-            let error = anyhow!("the run in {} has practiced already", run.display());
+            let error = anyhow!("the run in {} has learned online already", run.display());
             return Err(hinted(error, "--from takes a run of the dataset alone"));
         }
         let steps = config.experiment.steps;
@@ -95,11 +95,11 @@ impl EarlierRun {
         Ok((Self { checkpoint, held_out, experiment, dataset_sha256 }, preset))
     }
 
-    /// Checks that there is practice, that the dataset is the run's, and that the checkpoint's
+    /// Checks that there are online steps, that the dataset is the run's, and that the checkpoint's
     /// numbers still mean the same.
     pub fn check(&self, here: &Experiment, sha256: &str) -> anyhow::Result<()> {
         if here.online.is_none() {
-            let error = anyhow!("without practice there is nothing to go on with");
+            let error = anyhow!("without online steps there is nothing to go on with");
             return Err(hinted(error, "--online-steps N, above 0, says how much of it"));
         }
         let there = &self.experiment;

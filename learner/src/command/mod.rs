@@ -24,7 +24,7 @@ use quad_dataset::{DatasetError, benchmarks, environment};
 use quad_run::config::{ConfigError, Preset, hyperparameters, tasks};
 use quad_run::counted;
 use quad_run::folder::verify::{self, Findings};
-use quad_run::folder::{RunDirError, practiced};
+use quad_run::folder::{RunDirError, verify_experience};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
 use quad_runtime::{
@@ -45,7 +45,7 @@ use crate::report::{Report, draw_all, write_html};
 const DAMAGED: &str = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode \
                        is scored again";
 
-const NOTHING: &str = "nothing is checked: the run has no evaluations, and neither `learner judge` nor practice has \
+const NOTHING: &str = "nothing is checked: the run has no evaluations, and neither `learner judge` nor experience has \
                        kept the hash of a snapshot; --same-as OTHER compares it with another run";
 
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
@@ -210,7 +210,7 @@ fn check_run(dir: &Path, about: &str, same_as: Option<&Path>) -> anyhow::Result<
         print(&format!("{about}{findings}"))
     };
     report(about, verify::verify(dir)?)?;
-    if let Some((findings, promise)) = practiced(dir)? {
+    if let Some((findings, promise)) = verify_experience(dir)? {
         report(about, findings)?;
         print(&format!("{about}{promise}"))?;
     }

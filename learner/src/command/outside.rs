@@ -33,7 +33,9 @@ impl Outside {
     pub fn new(args: &TrainArgs, experiment: &Experiment) -> anyhow::Result<Self> {
         let needs_evaluators = experiment.needs_evaluators();
         if !needs_evaluators && args.evaluators.is_some_and(|count| count > 0) {
-            warn!("--evaluators has no effect: the run has neither evaluations nor practice");
+            warn!(
+                "--evaluators has no effect: the run has neither evaluations nor online episodes"
+            );
         }
         let endpoints = endpoints(args, needs_evaluators)?;
         let is_default = args.listen.is_none() && args.connect.is_none();

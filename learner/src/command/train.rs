@@ -60,8 +60,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let source = Source::parse(dataset)?;
     source.check_environment(&experiment.environment)?;
     let (variant, seed) = (experiment.variant()?, experiment.seed);
-    // With and without practice these are two runs.
-    let online = experiment.practice_begins().map_or("", |_| "-online");
+    // With and without online steps these are two runs.
+    let online = experiment.online_begins().map_or("", |_| "-online");
     let usual = || Path::new("runs").join(format!("{label}-{variant}{online}-seed{seed}"));
     let path = named.unwrap_or_else(usual);
     let name = run_name(&path)?;

@@ -115,7 +115,7 @@ impl Carrier {
             let job = job.map(|(job, done)| {
                 json!({
                     "step": job.step,
-                    "practice": job.practice.is_some(),
+                    "online": job.exploration.is_some(),
                     "done": done,
                     "episodes": job.seeds.len(),
                 })
@@ -173,7 +173,7 @@ impl Carrier {
                 self.metrics.evaluation.scores_duplicate.inc_by(duplicates.into());
             }
             Count::Difference => {
-                self.metrics.practice.differences.inc();
+                self.metrics.online.differences.inc();
                 warn!("an episode was played again with other bits; the first delivery counts");
             }
         }

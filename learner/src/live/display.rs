@@ -110,16 +110,16 @@ impl Display {
                 parts.push(format!("{} {value:.3}", metric.label));
             }
         }
-        parts.extend(self.practice_figures());
+        parts.extend(self.online_figures());
         parts.join(", ")
     }
 
     /// `experience 12,300 of 50,000, return 310`, once there is some.
-    fn practice_figures(&self) -> Option<String> {
-        let practice = &self.metrics.practice;
-        let (rows, target) = (practice.rows.get() as u64, practice.target.get() as u64);
+    fn online_figures(&self) -> Option<String> {
+        let online = &self.metrics.online;
+        let (rows, target) = (online.rows.get() as u64, online.target.get() as u64);
         let (rows, target) = (HumanCount((rows > 0).then_some(rows)?), HumanCount(target));
-        Some(format!("experience {rows} of {target}, return {:.0}", practice.episode_return.get()))
+        Some(format!("experience {rows} of {target}, return {:.0}", online.episode_return.get()))
     }
 
     fn evaluation_figures(&self) -> String {

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use anyhow::Context;
-use quad_protocol::{Episode, Hash, practice_seed};
+use quad_protocol::{Episode, Hash, online_seed};
 use quad_run::config::Experiment;
 use quad_run::folder::{ExperienceLog, RunDir};
 use quad_runtime::Hint;
@@ -33,7 +33,7 @@ impl Experience {
         let mut seeds = Vec::new();
         // Seeds are those of the first episodes: more were never open.
         for number in 0..count + u64::from(lag) {
-            let seed = practice_seed(experiment.seed, number);
+            let seed = online_seed(experiment.seed, number);
             if let Some((hash, episode)) = episodes.remove(&seed) {
                 seeds.push((seed, Some(hash)));
                 inbox.send((number, episode)).ok();

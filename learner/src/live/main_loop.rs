@@ -18,7 +18,7 @@ use super::display::{Display, REDRAW};
 use super::duplicate::Incarnation;
 use super::events::Event;
 use super::metrics::Metrics;
-use super::network::{Online, OpeningSession, Wire, go_online};
+use super::network::{Connected, OpeningSession, Wire, connect};
 use super::threads::{STUCK, Threads};
 use crate::local_evaluators::LocalEvaluators;
 use crate::service::{End, Input, Order};
@@ -66,11 +66,11 @@ struct State {
     trained: bool,
     interrupted: bool,
     wire: Option<Wire>,
-    /// Endpoints for evaluators; empty until the run is online.
+    /// Endpoints for evaluators; empty until the run is connected.
     reachable_at: Vec<String>,
     /// Threads whose disk hangs, as reported.
     hanging: Vec<Writer>,
-    /// Seconds that training has waited for practice.
+    /// Seconds that training has waited for experience.
     waited: f64,
 }
 
@@ -78,7 +78,7 @@ impl MainLoop {
     /// Runs until the end, then ends the threads and the session. Call it on the main thread: the
     /// evaluators end with it.
     pub async fn run(mut self, opening: OpeningSession) -> Ending {
-        let mut online = tokio::spawn(go_online(
+        let mut connecting = tokio::spawn(connect(
             opening,
             self.endpoints.clone(),
             self.incarnation.clone(),
@@ -90,7 +90,7 @@ impl MainLoop {
         // as it does when a session is dropped.
         let local = LocalSet::new();
         let mut state = State::default();
-        let mut ending = local.run_until(self.watch(&mut online, &mut state)).await;
+        let mut ending = local.run_until(self.watch(&mut connecting, &mut state)).await;
         self.display.finish();
         // Everything ends at the same time: after a signal there is little of it.
         let evaluators = local.run_until(self.evaluators.end());
@@ -112,19 +112,19 @@ impl MainLoop {
 
     async fn watch(
         &mut self,
-        online: &mut JoinHandle<anyhow::Result<Online>>,
+        connecting: &mut JoinHandle<anyhow::Result<Connected>>,
         state: &mut State,
     ) -> Ending {
         let mut shutdown = std::pin::pin!(shutdown_signal(LEAVE_WITHIN));
         let mut ticker = interval(REDRAW);
         ticker.set_missed_tick_behavior(MissedTickBehavior::Skip);
-        let mut is_online = false;
+        let mut is_connected = false;
         loop {
             tokio::select! {
-                result = &mut *online, if !is_online => {
-                    is_online = true;
-                    let online = result.map_err(anyhow::Error::from).flatten();
-                    if let Err(error) = online.and_then(|online| self.online(online, state)) {
+                result = &mut *connecting, if !is_connected => {
+                    is_connected = true;
+                    let connected = result.map_err(anyhow::Error::from).flatten();
+                    if let Err(error) = connected.and_then(|connected| self.connected(connected, state)) {
                         return Ending::Failed(error);
                     }
                 }
@@ -159,13 +159,13 @@ impl MainLoop {
         }
     }
 
-    fn online(&mut self, online: Online, state: &mut State) -> anyhow::Result<()> {
-        let (run, zenoh) = (&self.incarnation.run, online.reachable_at.join(", "));
+    fn connected(&mut self, connected: Connected, state: &mut State) -> anyhow::Result<()> {
+        let (run, zenoh) = (&self.incarnation.run, connected.reachable_at.join(", "));
         let metrics = &self.metrics_address;
         self.display
             .line(&format!("run {run} is at {zenoh}, its metrics at http://{metrics}/metrics"));
-        state.reachable_at = online.reachable_at;
-        state.wire = Some(online.wire);
+        state.reachable_at = connected.reachable_at;
+        state.wire = Some(connected.wire);
         let events = self.threads.carrier().events.clone();
         let report = move |line| events.line(line);
         self.evaluators.start(&state.reachable_at, self.run_dir.path(), run.as_str(), report)
@@ -175,7 +175,7 @@ impl MainLoop {
         self.beat.alive();
         self.watch_disk(&mut state.hanging);
         self.display.tick(Instant::now());
-        let waited = self.metrics.practice.wait_seconds.get();
+        let waited = self.metrics.online.wait_seconds.get();
         let training_waits = mem::replace(&mut state.waited, waited) < waited;
         for order in self.threads.carrier().tick(training_waits) {
             match order {
@@ -192,7 +192,7 @@ impl MainLoop {
             None => format!(
                 "no router has answered at {} yet; {} for it",
                 self.endpoints.connect.join(", "),
-                if state.trained { "the scores wait" } else { "practice waits" }
+                if state.trained { "the scores wait" } else { "online episodes wait" }
             ),
             Some(endpoint) => advice(&self.environment, endpoint, self.evaluators.log()),
         }

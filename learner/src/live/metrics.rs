@@ -9,13 +9,13 @@ use quad_algorithms::Metric;
 use quad_protocol::{Name, Progress};
 
 use super::disk::Writer;
-use crate::train::{PracticeMetrics, TrainingMetrics, metrics};
+use crate::train::{OnlineMetrics, TrainingMetrics, metrics};
 
 /// All metrics of one learner. Clones are cheap; an update is an atomic store.
 #[derive(Clone, Debug)]
 pub(crate) struct Metrics {
     pub training: TrainingMetrics,
-    pub practice: PracticeMetrics,
+    pub online: OnlineMetrics,
     pub evaluation: EvaluationMetrics,
     pub evaluators: EvaluatorMetrics,
     pub disk: DiskMetrics,
@@ -71,7 +71,7 @@ impl Metrics {
         registry.register(Box::new(ProcessCollector::for_self()))?;
         let metrics = Self {
             training: TrainingMetrics::new(&registry, target_steps, algorithm)?,
-            practice: PracticeMetrics::new(&registry)?,
+            online: OnlineMetrics::new(&registry)?,
             evaluation: EvaluationMetrics::new(&registry)?,
             evaluators: EvaluatorMetrics::new(&registry)?,
             disk: DiskMetrics::new(&registry)?,

@@ -1,4 +1,4 @@
-//! Brings a run online: opens the session while training begins, and declares everything on it.
+//! Connects a run: opens the session while training begins, and declares everything on it.
 //! Zenoh's callbacks run on Zenoh's threads and must not wait, which would delay their whole
 //! connection: they pass queries to our threads, and record messages that need no answer.
 
@@ -39,7 +39,7 @@ pub(crate) async fn open_network(endpoints: &Endpoints) -> anyhow::Result<Openin
 }
 
 /// A run that evaluators can find.
-pub(super) struct Online {
+pub(super) struct Connected {
     pub wire: Wire,
     /// Endpoints for evaluators.
     pub reachable_at: Vec<String>,
@@ -48,21 +48,21 @@ pub(super) struct Online {
 /// Declares the run as soon as the session is open, and writes its addresses into its folder. Run
 /// this as a separate task: the search for another learner of the name takes seconds, and Zenoh may
 /// block a task.
-pub(super) async fn go_online(
+pub(super) async fn connect(
     opening: OpeningSession,
     endpoints: Endpoints,
     incarnation: Incarnation,
     services: Services,
     run_dir: RunDir,
     metrics: String,
-) -> anyhow::Result<Online> {
+) -> anyhow::Result<Connected> {
     let session = opening.await??;
     let reachable_at = quad_runtime::reachable_at(&session, &endpoints).await?;
     let wire = Wire::declare(session, &incarnation, &services).await?;
     let page = format!("http://{metrics}/");
     let endpoints = RunEndpoints { zenoh: reachable_at.clone(), metrics, page };
     tokio::spawn(write_endpoints(run_dir, endpoints));
-    Ok(Online { wire, reachable_at })
+    Ok(Connected { wire, reachable_at })
 }
 
 /// Writes the learner's addresses as soon as the disk accepts them. Only the user's scripts need
@@ -103,7 +103,7 @@ impl Wire {
     ) -> anyhow::Result<Self> {
         duplicate::wait_until_gone(&session, incarnation).await?;
         let run = &incarnation.run;
-        services.weights.online(&session);
+        services.weights.connected(&session);
         serve(&session, keys::weights_at_any_step(run), services, Services::weights).await?;
         serve(&session, keys::jobs(run), services, Services::job).await?;
         serve(&session, keys::scores(run), services, Services::scores).await?;

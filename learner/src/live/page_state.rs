@@ -22,13 +22,13 @@ pub(crate) struct PageState {
 
 impl PageState {
     pub fn to_json(&self) -> Value {
-        let practice = &self.metrics.practice;
-        let practice = (practice.target.get() > 0).then(|| {
+        let online = &self.metrics.online;
+        let online = (online.target.get() > 0).then(|| {
             json!({
-                "steps": practice.rows.get(),
-                "target": practice.target.get(),
-                "return": practice.episode_return.get(),
-                "wait_seconds": practice.wait_seconds.get(),
+                "steps": online.rows.get(),
+                "target": online.target.get(),
+                "return": online.episode_return.get(),
+                "wait_seconds": online.wait_seconds.get(),
             })
         });
         json!({
@@ -36,7 +36,7 @@ impl PageState {
             "step": self.metrics.training.gradient_steps.get(),
             "steps": self.steps,
             "episodes_pending": self.metrics.evaluation.episodes_pending.get(),
-            "practice": practice,
+            "online": online,
             "problems": self.health.problems(),
             "evaluators": self.carrier.get().map(Carrier::evaluators).unwrap_or_default(),
         })

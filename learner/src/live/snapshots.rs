@@ -66,7 +66,7 @@ impl Snapshots {
     fn save(&mut self, output: &Output) -> anyhow::Result<()> {
         match output {
             Output::Snapshot(policy) => self.snapshot(policy)?,
-            Output::Practice(opening) => self.open_practice(opening)?,
+            Output::Online(opening) => self.open_online(opening)?,
             Output::Waits(episode) => drop(self.carrier.carry(Input::Waits(*episode))),
             Output::Checkpoint(checkpoint) => self.checkpoint(checkpoint)?,
             Output::Rows(rows) => self.rows.append(rows)?,
@@ -77,7 +77,7 @@ impl Snapshots {
 
     /// Writes a snapshot, then opens its evaluation and publishes it.
     fn snapshot(&mut self, trained: &TrainedPolicy) -> anyhow::Result<()> {
-        let &TrainedPolicy { step, ref file, evaluate, practice } = trained;
+        let &TrainedPolicy { step, ref file, evaluate, online } = trained;
         let hash = Hash::of(file);
         let metrics = &self.carrier.metrics.evaluation;
         metrics.snapshot_bytes.set(file.len() as i64);
@@ -89,7 +89,7 @@ impl Snapshots {
                 return Err(OtherWeights { step, found: hash, scored: known.to_string() }.into());
             }
         }
-        if practice {
+        if online {
             self.known.insert(step, hash);
         }
         if evaluate {
@@ -98,16 +98,16 @@ impl Snapshots {
             metrics.snapshots_published.inc();
             self.carrier.events.send(Event::Published { step });
         }
-        if evaluate || practice {
+        if evaluate || online {
             self.weights.publish(step, hash, file.clone())?;
         }
         Ok(())
     }
 
-    fn open_practice(&self, opening: &Opening) -> anyhow::Result<()> {
+    fn open_online(&self, opening: &Opening) -> anyhow::Result<()> {
         let step = opening.step;
         let Some(hash) = self.known.get(&step) else {
-            let error = anyhow!("the snapshot of step {step}, which is to practice, is missing");
+            let error = anyhow!("the snapshot of step {step}, which is to play, is missing");
             return Err(hinted(error, NO_SNAPSHOT));
         };
         self.carrier.carry(Input::Opened(*opening, *hash));

@@ -25,7 +25,7 @@ use super::spawn::spawn_alive;
 use super::weights::Weights;
 use crate::service::{Rules, Service};
 use crate::train::{
-    HeldOut, Inbox, OutputQueue, Practice, PracticeMetrics, Training, origin, resume,
+    HeldOut, Inbox, OnlineMetrics, OnlineTraining, OutputQueue, Training, origin, resume,
 };
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when
@@ -81,9 +81,9 @@ impl Threads {
         }
         let transitions = agent.transitions().clone();
         let rules = rules(&incarnation, experiment, run.task, &transitions);
-        let online = open_practice(dir, experiment, step, transitions, &metrics.practice)?;
-        let (practice, experience, inbox) = match online {
-            Some((practice, experience, inbox)) => (Some(practice), Some(experience), Some(inbox)),
+        let online = open_online(dir, experiment, step, transitions, &metrics.online)?;
+        let (online, experience, inbox) = match online {
+            Some((online, experience, inbox)) => (Some(online), Some(experience), Some(inbox)),
             None => (None, None, None),
         };
         let (experience, episodes) = experience.map(|it| (it.log, it.episodes)).unzip();
@@ -117,7 +117,7 @@ impl Threads {
         let training = Training {
             sampler,
             agent,
-            practice,
+            online,
             held_out: run.held_out,
             schedule,
             origin: origin(experiment),
@@ -173,24 +173,24 @@ fn rules(
     }
 }
 
-/// Practice of a run after gradient step `step`, with the experience that the run has, and the inbox
+/// Online learning of a run after gradient step `step`, with the experience that the run has, and the inbox
 /// of more.
-type Online = (Practice, Experience, Inbox);
+type Begun = (OnlineTraining, Experience, Inbox);
 
 /// `None` in a run without online steps.
-fn open_practice(
+fn open_online(
     dir: &RunDir,
     experiment: &Experiment,
     step: u64,
     transitions: Arc<Transitions>,
-    metrics: &PracticeMetrics,
-) -> anyhow::Result<Option<Online>> {
+    metrics: &OnlineMetrics,
+) -> anyhow::Result<Option<Begun>> {
     let (inbox, recorded) = mpsc::channel();
-    let Some(mut practice) = Practice::new(experiment, transitions, recorded, metrics.clone())
+    let Some(mut online) = OnlineTraining::new(experiment, transitions, recorded, metrics.clone())
     else {
         return Ok(None);
     };
     let experience = Experience::open(dir, experiment, &inbox)?;
-    practice.resume(step).hint(OTHER_FOLDER)?;
-    Ok(Some((practice, experience, inbox)))
+    online.resume(step).hint(OTHER_FOLDER)?;
+    Ok(Some((online, experience, inbox)))
 }

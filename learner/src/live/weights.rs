@@ -18,7 +18,7 @@ use super::requests::NotAccepted;
 pub(super) struct Weights {
     incarnation: Incarnation,
     pub run_dir: RunDir,
-    /// Set once the learner is online.
+    /// Set once the learner is connected.
     session: Arc<OnceLock<Session>>,
     /// The newest snapshot with its step, ready to send; older ones come from the disk.
     newest: Arc<Mutex<Option<(u64, ZBytes)>>>,
@@ -31,7 +31,7 @@ impl Weights {
     }
 
     /// Sets the session, so that later snapshots are published.
-    pub fn online(&self, session: &Session) {
+    pub fn connected(&self, session: &Session) {
         self.session.set(session.clone()).ok();
     }
 

@@ -109,8 +109,8 @@ impl RunPage {
         let mut names = BTreeSet::from(COLUMNS.map(|(name, _)| name.to_owned()));
         names.extend(metrics.iter().flat_map(|it| [it.name.to_owned(), held_out_name(it)]));
         self.history.refresh(&names)?;
-        let practice = config.experiment.online.iter().flat_map(|_| COLUMNS);
-        let metrics = metrics.iter().map(|it| (it.name, it.help)).chain(practice);
+        let online = config.experiment.online.iter().flat_map(|_| COLUMNS);
+        let metrics = metrics.iter().map(|it| (it.name, it.help)).chain(online);
         let metrics = metrics.map(|(name, help)| json!({ "name": name, "help": help }));
         let evaluations = report
             .evaluations
@@ -122,7 +122,7 @@ impl RunPage {
             "agent": report.agent,
             "seed": report.seed,
             "steps": report.steps,
-            "practice_begins": config.experiment.practice_begins(),
+            "online_begins": config.experiment.online_begins(),
             "measure": report.measure(),
             "dataset_score": report.dataset_measure(),
             "dataset": config.dataset.summary(),

@@ -89,9 +89,9 @@ fn dataset_mean(run: &RunReport) -> Option<(String, f64)> {
     run.dataset_measure().map(|mean| (format!("dataset mean {mean:.1}"), mean))
 }
 
-/// Gradient steps after which practice begins.
+/// Gradient steps after which online learning begins.
 fn begins<'a>(runs: impl IntoIterator<Item = &'a RunReport>) -> BTreeSet<u64> {
-    runs.into_iter().filter_map(|run| run.config.experiment.practice_begins()).collect()
+    runs.into_iter().filter_map(|run| run.config.experiment.online_begins()).collect()
 }
 
 fn curves(task: &str, groups: &[&GroupReport]) -> Plot {

@@ -46,7 +46,7 @@ pub struct Plot {
     pub is_falling: bool,
     /// Dashed lines at some y, with labels.
     pub references: Vec<(String, f64)>,
-    /// Dashed lines at gradient steps after which practice begins.
+    /// Dashed lines at gradient steps after which online learning begins.
     pub begins: BTreeSet<u64>,
     pub lines: Vec<Line>,
     /// Plots side by side, in place of lines.
@@ -183,7 +183,7 @@ impl Plot {
         Ok(())
     }
 
-    /// Draws the references, and where practice begins.
+    /// Draws the references, and where online learning begins.
     fn draw_dashed<DB: DrawingBackend>(&self, chart: &mut Chart<DB>, scale: u32) -> Drawn
     where
         DB::ErrorType: 'static,
@@ -202,7 +202,7 @@ impl Plot {
         for step in self.begins.iter().map(|step| *step as f64) {
             chart.draw_series(dashed([(step, y.start), (step, y.end)], 1))?;
             let at = (step, y.start + 0.04 * (y.end - y.start));
-            chart.draw_series([Text::new(" practice", at, font.color(&REFERENCE))])?;
+            chart.draw_series([Text::new(" online", at, font.color(&REFERENCE))])?;
         }
         Ok(())
     }

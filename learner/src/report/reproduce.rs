@@ -29,10 +29,10 @@ pub fn command(run: &RunReport) -> Option<String> {
     if experiment.environment != preset.environment {
         push("--env", &experiment.environment);
     }
-    // What follows from practice is compared with the values for practice.
-    let practiced = with_practice(experiment, &run.config.run.task).ok()?;
-    let [ours, theirs, practiced] = [experiment, &preset, &practiced].map(settings::of_experiment);
-    let keys = differences(&ours, &theirs).chain(differences(&ours, &practiced));
+    // What follows from experience is compared with the online values.
+    let played = online_values(experiment, &run.config.run.task).ok()?;
+    let [ours, theirs, played] = [experiment, &preset, &played].map(settings::of_experiment);
+    let keys = differences(&ours, &theirs).chain(differences(&ours, &played));
     for key in keys.collect::<BTreeSet<_>>() {
         match (key.as_str(), ours.get(key)) {
             ("environment" | "seed", _) => {}
@@ -49,8 +49,8 @@ pub fn command(run: &RunReport) -> Option<String> {
     Some(words.join(" "))
 }
 
-/// The values of an experiment's algorithm for a task with as much practice.
-fn with_practice(experiment: &Experiment, task: &str) -> Result<Experiment, ConfigError> {
+/// The values of an experiment's algorithm for a task with as many online steps.
+fn online_values(experiment: &Experiment, task: &str) -> Result<Experiment, ConfigError> {
     let algorithm = experiment.algorithm.as_str();
     let steps = experiment.online.as_ref().map_or(0, |online| online.steps) as i64;
     resolve(task, &toml::toml! { algorithm = algorithm online.steps = steps })

@@ -7,7 +7,7 @@ use quad_protocol::{CodecError, Episode, Hash, Piece, PieceReply, ScoreReply, Sc
 use quad_run::folder::ScoreLine;
 
 use super::message::{Answer, Count, End, Frame, Order, TryAgain};
-use super::outcomes::PracticeEpisode;
+use super::outcomes::OnlineEpisodeState;
 use super::pieces::Added;
 use super::queue::{Arrival, Writing};
 use super::refusal::Refusal;
@@ -83,10 +83,10 @@ impl<Q> Service<Q> {
     fn add_piece(&mut self, query: Q, piece: &Piece) {
         let incarnation = self.rules.incarnation;
         let Piece { seed, hash, .. } = *piece;
-        let number = match self.board.practice(piece) {
-            Ok(PracticeEpisode::Open { episode }) => episode,
-            Ok(PracticeEpisode::NotYet) => return self.try_again(query, TryAgain::NotYet),
-            Ok(PracticeEpisode::Recorded(recorded)) => {
+        let number = match self.board.online(piece) {
+            Ok(OnlineEpisodeState::Open { episode }) => episode,
+            Ok(OnlineEpisodeState::NotYet) => return self.try_again(query, TryAgain::NotYet),
+            Ok(OnlineEpisodeState::Recorded(recorded)) => {
                 if hash != recorded {
                     self.orders.push(Order::Count(Count::Difference));
                 }
@@ -114,7 +114,7 @@ impl<Q> Service<Q> {
         self.deliveries.decoding -= 1;
         match episode {
             Err(error) => self.drop_frame(frame, error.label(), &error.to_string()),
-            Ok(episode) => match self.board.validate_practice(frame.number, &episode) {
+            Ok(episode) => match self.board.validate_online(frame.number, &episode) {
                 Err(refusal) => self.drop_frame(frame, refusal.label(), &refusal.to_string()),
                 Ok(()) => self.deliveries.writing.push(Writing::Episode(frame, episode)),
             },
@@ -185,7 +185,7 @@ impl<Q> Service<Q> {
     fn recorded(&mut self, frame: Frame<Q>, episode: Box<Episode>) {
         let Frame { query, seed, number, hash, .. } = frame;
         self.deliveries.pieces.remove(seed);
-        let jobs = self.board.record_practice(seed, hash);
+        let jobs = self.board.record_experience(seed, hash);
         let incarnation = self.rules.incarnation;
         let reply = PieceReply::Recorded { incarnation, duplicate: false };
         self.orders.extend([

@@ -1,4 +1,4 @@
-//! Episodes of one snapshot and their states: those of an evaluation, or one of practice.
+//! Episodes of one snapshot and their states: those of an evaluation, or one online episode.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::time::{Duration, Instant};
@@ -14,12 +14,12 @@ const MOST_ATTEMPTS: u32 = 20;
 const ATTEMPTS_AT_ONCE: u32 = 3;
 const LONGEST_REST: Duration = Duration::from_secs(60);
 
-/// Names episodes of one snapshot. Practice comes first, since the learner waits for it, and older
+/// Names episodes of one snapshot. Online episodes come first, since the learner waits for it, and older
 /// steps before newer ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Key {
     /// Number of the episode.
-    Practice(u64),
+    Online(u64),
     /// Gradient step.
     Evaluation(u64),
 }
@@ -29,8 +29,8 @@ pub(super) struct Evaluation {
     /// Gradient step of the snapshot.
     pub step: u64,
     pub weights: Hash,
-    /// Exploration in an episode of practice.
-    pub practice: Option<Exploration>,
+    /// Exploration in an online episode.
+    pub exploration: Option<Exploration>,
     episodes: Vec<Episode>,
     /// Indices of the episodes by seed.
     indices: HashMap<u64, usize>,
@@ -71,7 +71,7 @@ impl Evaluation {
         let mut evaluation = Self {
             step,
             weights,
-            practice: None,
+            exploration: None,
             episodes: seeds.iter().map(episode).collect(),
             indices: seeds.iter().enumerate().map(|(index, &seed)| (seed, index)).collect(),
             waiting: (0..seeds.len()).collect(),
@@ -82,10 +82,10 @@ impl Evaluation {
         evaluation
     }
 
-    /// An episode of practice.
-    pub fn practice(opening: &Opening, weights: Hash) -> Self {
+    /// An online episode.
+    pub fn online(opening: &Opening, weights: Hash) -> Self {
         let Opening { step, seed, exploration, .. } = *opening;
-        Self { practice: Some(exploration), ..Self::new(step, weights, &[seed], &[]) }
+        Self { exploration: Some(exploration), ..Self::new(step, weights, &[seed], &[]) }
     }
 
     /// Number of episodes that have no score yet, and may still get one.
@@ -139,8 +139,8 @@ impl Evaluation {
             if let Some(now) = lost {
                 episode.lost(now);
             }
-            // The learner waits for practice as long as it takes.
-            if episode.lost >= MOST_ATTEMPTS && self.practice.is_none() {
+            // The learner waits for experience as long as it takes.
+            if episode.lost >= MOST_ATTEMPTS && self.exploration.is_none() {
                 self.given_up.insert(index);
                 given_up.push(seed);
             } else {

@@ -4,7 +4,7 @@
 
 use std::mem;
 
-use quad_protocol::{Exploration, practice_seed};
+use quad_protocol::{Exploration, online_seed};
 use quad_run::config::Online;
 
 use super::outcomes::Opening;
@@ -81,7 +81,7 @@ impl OnlineSchedule {
             false => Exploration::Policy { noise: noise as f32 },
         };
         let step = self.online.newest_snapshot(self.begin, step);
-        let seed = practice_seed(self.seed, episode);
+        let seed = online_seed(self.seed, episode);
         self.openings.push(Opening { episode, step, seed, exploration });
     }
 }

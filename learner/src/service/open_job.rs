@@ -13,7 +13,7 @@ const PREPARATION: Duration = Duration::from_secs(60);
 #[derive(Debug)]
 pub(super) struct OpenJob {
     pub job: Job,
-    /// The evaluation, or the practice episode, that it is a part of.
+    /// The evaluation, or the online episode, that it is a part of.
     pub key: Key,
     /// Number of the claim that it was handed out for.
     pub attempt: u64,

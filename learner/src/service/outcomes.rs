@@ -23,7 +23,7 @@ pub(crate) struct Recorded {
     pub evaluation_completed: Option<Vec<EpisodeScore>>,
 }
 
-/// An episode of practice that evaluators may play.
+/// An online episode that evaluators may play.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Opening {
     /// Number of the episode, from 0: experience enters the buffer in this order.
@@ -34,9 +34,9 @@ pub struct Opening {
     pub exploration: Exploration,
 }
 
-/// A practice episode as the learner knows it.
+/// An online episode as the learner knows it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum PracticeEpisode {
+pub(crate) enum OnlineEpisodeState {
     /// It is waited for.
     Open { episode: u64 },
     /// It was recorded, with a frame of this hash.

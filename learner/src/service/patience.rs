@@ -7,10 +7,10 @@ const ADVISE: Duration = Duration::from_secs(10);
 /// After this time the run ends without its scores; the same command waits again.
 const GIVE_UP: Duration = Duration::from_secs(600);
 
-/// The time without an evaluator that could score the run, or practice for it.
+/// The time without an evaluator that could score the run, or play for it.
 #[derive(Debug, Default)]
 pub(super) struct Patience {
-    /// True once training is complete, which itself waits for practice as long as it takes.
+    /// True once training is complete, which itself waits for experience as long as it takes.
     pub trained: bool,
     since: Option<Instant>,
     advised: bool,
@@ -62,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_waits_for_practice_is_not_given_up() {
+    fn a_run_that_waits_for_experience_is_not_given_up() {
         let (mut patience, begin) = (Patience::default(), Instant::now());
         let mut check = |seconds| patience.check(false, begin + Duration::from_secs(seconds));
         assert_eq!(

@@ -21,8 +21,8 @@ pub(crate) enum Refusal {
     Seed(u64),
     #[error("the episode with seed {0} has an impossible length, return or score")]
     Episode(u64),
-    #[error("the run has no practice episode with seed {0}")]
-    Practice(u64),
+    #[error("the run has no online episode with seed {0}")]
+    Online(u64),
     #[error(
         "the episode with seed {0} has observations or actions of another size, or is too long"
     )]
@@ -44,7 +44,7 @@ impl Refusal {
             Self::Weights => "unknown_weights",
             Self::Seed(_) => "unknown_seed",
             Self::Episode(_) => "impossible_episode",
-            Self::Practice(_) => "unknown_practice",
+            Self::Online(_) => "unknown_online",
             Self::Rows(_) => "impossible_rows",
             Self::Crowd => "too_many_evaluators",
         }

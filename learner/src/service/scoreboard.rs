@@ -14,16 +14,16 @@ use quad_run::folder::SavedScores;
 
 use super::episodes::{Evaluation, Key};
 use super::open_job::OpenJob;
-use super::outcomes::{Claim, Claimed, Lost, Opening, OtherWeights, PracticeEpisode, Recorded};
+use super::outcomes::{Claim, Claimed, Lost, OnlineEpisodeState, Opening, OtherWeights, Recorded};
 use super::refusal::{Refusal, require};
 
 /// Time after which an evaluator without a job asks again: the larger of this time, and the second
 /// one for each evaluator, so that hundreds of idle ones do not keep the learner busy. A new
 /// snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
-/// [`ASK_AGAIN`] while there is practice to play, for which training may wait.
-const ASK_FOR_PRACTICE: [Duration; 2] = [Duration::from_millis(20); 2];
-/// [`ASK_AGAIN`] between two episodes of practice: training comes to the next one when it has
+/// [`ASK_AGAIN`] while there are online episodes to play, for which training may wait.
+const ASK_FOR_ONLINE: [Duration; 2] = [Duration::from_millis(20); 2];
+/// [`ASK_AGAIN`] between two online episodes: training comes to the next one when it has
 /// learned from another, which may be short.
 const ASK_BETWEEN: [Duration; 2] = [Duration::from_millis(100), Duration::from_millis(20)];
 /// Time between an evaluator's progress messages, by the rule of [`ASK_AGAIN`].
@@ -33,7 +33,7 @@ const LONGEST_PROGRESS: Duration = Duration::from_secs(20);
 /// Time after which an evaluator without the run's environment asks again.
 const DOES_NOT_FIT: Duration = Duration::from_secs(10);
 
-/// A practice episode for which training has waited for this time goes to a second evaluator: the
+/// An online episode for which training has waited for this time goes to a second evaluator: the
 /// first answer counts.
 const STRAGGLER: Duration = Duration::from_secs(20);
 
@@ -60,7 +60,7 @@ pub struct Rules {
 }
 
 impl Rules {
-    /// Most bytes of a practice episode's frame.
+    /// Most bytes of an online episode's frame.
     pub fn longest_frame(&self) -> usize {
         let steps = self.task.max_episode_steps().unwrap_or(Episode::LONGEST).min(Episode::LONGEST);
         let numbers = self.dims.0 + self.dims.1 + 2;
@@ -76,11 +76,11 @@ pub(crate) struct Scoreboard {
     next_job: u64,
     /// Scores of an earlier incarnation, by step, whose evaluation is not open yet.
     earlier: BTreeMap<u64, SavedScores>,
-    /// Practice episodes by seed.
-    pub(super) practice: HashMap<u64, PracticeEpisode>,
-    /// Number of the practice episode that training waits for, and since when.
+    /// Online episodes by seed.
+    pub(super) online: HashMap<u64, OnlineEpisodeState>,
+    /// Number of the online episode that training waits for, and since when.
     awaited: Option<(u64, Instant)>,
-    practice_ended: bool,
+    online_ended: bool,
 }
 
 impl Scoreboard {
@@ -93,9 +93,9 @@ impl Scoreboard {
             jobs: BTreeMap::new(),
             next_job: 1,
             earlier,
-            practice: HashMap::new(),
+            online: HashMap::new(),
             awaited: None,
-            practice_ended: false,
+            online_ended: false,
         }
     }
 
@@ -139,36 +139,36 @@ impl Scoreboard {
         self.add_evaluation(step, weights, &seeds)
     }
 
-    /// Opens an episode of practice.
-    pub fn open_practice(&mut self, opening: &Opening, weights: Hash) {
+    /// Opens an online episode.
+    pub fn open_online(&mut self, opening: &Opening, weights: Hash) {
         let Opening { episode, seed, .. } = *opening;
-        self.practice.insert(seed, PracticeEpisode::Open { episode });
-        self.evaluations.insert(Key::Practice(episode), Evaluation::practice(opening, weights));
+        self.online.insert(seed, OnlineEpisodeState::Open { episode });
+        self.evaluations.insert(Key::Online(episode), Evaluation::online(opening, weights));
     }
 
-    /// Expects an episode of practice that an earlier incarnation may have opened.
-    pub fn expect_practice(&mut self, seed: u64) {
-        self.practice.insert(seed, PracticeEpisode::NotYet);
+    /// Expects an online episode that an earlier incarnation may have opened.
+    pub fn expect_online(&mut self, seed: u64) {
+        self.online.insert(seed, OnlineEpisodeState::NotYet);
     }
 
-    /// Ends practice: evaluators get no more of its episodes. Those that are open are still accepted,
+    /// Ends online learning: evaluators get no more online episodes. Those that are open are still accepted,
     /// those that were expected are refused, since training has come to all that it needs.
-    pub fn end_practice(&mut self) {
-        self.practice_ended = true;
-        self.practice.retain(|_, practice| *practice != PracticeEpisode::NotYet);
+    pub fn end_online(&mut self) {
+        self.online_ended = true;
+        self.online.retain(|_, online| *online != OnlineEpisodeState::NotYet);
     }
 
-    /// Records that training waits for this practice episode from `now` on.
-    pub fn wait_for_practice(&mut self, episode: u64, now: Instant) {
+    /// Records that training waits for this online episode from `now` on.
+    pub fn wait_for_experience(&mut self, episode: u64, now: Instant) {
         self.awaited = Some((episode, now));
     }
 
-    /// Records a practice episode, whose frame has this hash, as delivered. Returns the number of
+    /// Records an online episode, whose frame has this hash, as delivered. Returns the number of
     /// jobs that this ends.
-    pub fn record_practice(&mut self, seed: u64, hash: Hash) -> usize {
-        let before = self.practice.insert(seed, PracticeEpisode::Recorded(hash));
-        let Some(PracticeEpisode::Open { episode }) = before else { return 0 };
-        let (key, open) = (Key::Practice(episode), self.jobs.len());
+    pub fn record_experience(&mut self, seed: u64, hash: Hash) -> usize {
+        let before = self.online.insert(seed, OnlineEpisodeState::Recorded(hash));
+        let Some(OnlineEpisodeState::Open { episode }) = before else { return 0 };
+        let (key, open) = (Key::Online(episode), self.jobs.len());
         self.evaluations.remove(&key);
         self.jobs.retain(|_, open| open.key != key);
         open - self.jobs.len()
@@ -177,8 +177,8 @@ impl Scoreboard {
     /// Hash of the snapshot of a step whose episodes are run.
     pub fn weights(&self, step: u64) -> Option<Hash> {
         let evaluation = self.evaluations.get(&Key::Evaluation(step));
-        let mut practice = self.evaluations.range(..Key::Evaluation(0)).map(|(_, episode)| episode);
-        let found = evaluation.or_else(|| practice.find(|episode| episode.step == step));
+        let mut online = self.evaluations.range(..Key::Evaluation(0)).map(|(_, episode)| episode);
+        let found = evaluation.or_else(|| online.find(|episode| episode.step == step));
         found.map(|evaluation| evaluation.weights)
     }
 
@@ -206,17 +206,17 @@ impl Scoreboard {
         missing
     }
 
-    /// Hands out a job: the next practice episode, or waiting episodes of the oldest step. An
+    /// Hands out a job: the next online episode, or waiting episodes of the oldest step. An
     /// evaluator has one job at a time; a repeated claim, after a lost answer, gets the same answer.
     pub fn claim(&mut self, claim: Claim<'_>, now: Instant) -> Claimed {
         let Claim { evaluator, attempt, fits, present } = claim;
         if !fits {
             return Claimed::Wait(DOES_NOT_FIT);
         }
-        let first = if self.practice_ended { Key::Evaluation(0) } else { Key::Practice(0) };
+        let first = if self.online_ended { Key::Evaluation(0) } else { Key::Online(0) };
         let often = match self.evaluations.first_key_value() {
-            _ if self.practice_ended || self.practice.is_empty() => ASK_AGAIN,
-            Some((Key::Practice(_), _)) => ASK_FOR_PRACTICE,
+            _ if self.online_ended || self.online.is_empty() => ASK_AGAIN,
+            Some((Key::Online(_), _)) => ASK_FOR_ONLINE,
             _ => ASK_BETWEEN,
         };
         let wait = Claimed::Wait(interval(present, often));
@@ -228,12 +228,12 @@ impl Scoreboard {
             return wait;
         }
         let id = self.next_job;
-        let practice = self.hand_out(first..Key::Evaluation(0), present, now);
-        let handed_out = practice
+        let online = self.hand_out(first..Key::Evaluation(0), present, now);
+        let handed_out = online
             .or_else(|| self.straggler(id, now))
             .or_else(|| self.hand_out(Key::Evaluation(0).., present, now));
         let Some((key, seeds)) = handed_out else { return wait };
-        let Evaluation { step, weights, practice, .. } = &self.evaluations[&key];
+        let Evaluation { step, weights, exploration, .. } = &self.evaluations[&key];
         self.next_job += 1;
         let progress = interval(present, PROGRESS);
         // One message may be lost, and the next one late.
@@ -247,7 +247,7 @@ impl Scoreboard {
             environment: self.rules.task.environment.clone(),
             environment_seed: self.rules.seed,
             seeds,
-            practice: *practice,
+            exploration: *exploration,
             // Often enough to keep the lease.
             progress_milliseconds: progress.min(patience / 3).as_millis() as u64,
         };
@@ -279,10 +279,10 @@ impl Scoreboard {
         })
     }
 
-    /// The practice episode that training has waited for too long, if one evaluator plays it.
+    /// The online episode that training has waited for too long, if one evaluator plays it.
     fn straggler(&mut self, job: u64, now: Instant) -> Option<(Key, Vec<u64>)> {
         let (episode, _) = self.awaited.filter(|(_, since)| now >= *since + STRAGGLER)?;
-        let key = Key::Practice(episode);
+        let key = Key::Online(episode);
         let players = self.jobs.values().filter(|open| open.key == key).count();
         let evaluation = self.evaluations.get_mut(&key).filter(|_| players == 1)?;
         let seeds = evaluation.hand_out_again(job);

@@ -82,8 +82,8 @@ impl<Q> Service<Q> {
         let mut board = Scoreboard::new(rules.clone(), earlier);
         for &(seed, frame) in episodes {
             match frame {
-                Some(hash) => drop(board.record_practice(seed, hash)),
-                None => board.expect_practice(seed),
+                Some(hash) => drop(board.record_experience(seed, hash)),
+                None => board.expect_online(seed),
             }
         }
         Self {
@@ -131,11 +131,11 @@ impl<Q> Service<Q> {
             }
             Input::Opened(opening, weights) => {
                 if opening.episode == 0 {
-                    self.tell(format!("step {}: practice begins", opening.step));
+                    self.tell(format!("step {}: online learning begins", opening.step));
                 }
-                self.board.open_practice(&opening, weights);
+                self.board.open_online(&opening, weights);
             }
-            Input::Waits(episode) => self.board.wait_for_practice(episode, now),
+            Input::Waits(episode) => self.board.wait_for_experience(episode, now),
             Input::Trained => self.trained(),
             Input::Flush => self.flush(),
             Input::Decoded(frame, episode) => self.decoded(frame, episode),
@@ -193,13 +193,13 @@ impl<Q> Service<Q> {
     /// Tells of a job that an evaluator could not run, once for each step, and online, since
     /// training waits, each minute.
     fn failed(&mut self, job: &Job, evaluator: &Name, reason: &str, now: Instant) {
-        let (step, online) = (job.step, job.practice.is_some());
+        let (step, online) = (job.step, job.exploration.is_some());
         self.count_jobs("failed", 1);
         let minute = online.then(|| (now - self.begin).as_secs() / 60);
         if self.told.failed_steps.insert((step, minute)) {
             let printable = reason.chars().filter(|c| !c.is_control());
             let reason = String::from_iter(printable.take(LONGEST_REASON));
-            let what = if online { "play practice" } else { "do a job" };
+            let what = if online { "play online episodes" } else { "do a job" };
             self.tell(format!(
                 "evaluator {evaluator} could not {what} of step {step}, which goes to others: {reason}"
             ));
@@ -258,7 +258,7 @@ impl<Q> Service<Q> {
     }
 
     fn trained(&mut self) {
-        self.board.end_practice();
+        self.board.end_online();
         self.patience = Patience::after_training();
         let present = match self.evaluators.count() {
             0 => "no evaluator".to_owned(),

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use quad_protocol::{Episode, EpisodeScore, Piece, ScoreReport};
 
 use super::episodes::Key;
-use super::outcomes::PracticeEpisode;
+use super::outcomes::OnlineEpisodeState;
 use super::refusal::{Refusal, require};
 use super::scoreboard::Scoreboard;
 
@@ -42,21 +42,21 @@ impl Scoreboard {
         Ok(validated)
     }
 
-    /// The practice episode of a piece, if the run has it and it is not too long.
-    pub fn practice(&self, piece: &Piece) -> Result<PracticeEpisode, Refusal> {
+    /// The online episode of a piece, if the run has it and it is not too long.
+    pub fn online(&self, piece: &Piece) -> Result<OnlineEpisodeState, Refusal> {
         require(piece.run == self.rules.run, Refusal::Run)?;
         let fits = piece.length as usize <= self.rules.longest_frame();
         require(fits, Refusal::Rows(piece.seed))?;
-        self.practice.get(&piece.seed).copied().ok_or(Refusal::Practice(piece.seed))
+        self.online.get(&piece.seed).copied().ok_or(Refusal::Online(piece.seed))
     }
 
-    /// Checks the episode of practice with this number against its opening. Changes nothing, as
+    /// Checks the online episode with this number against its opening. Changes nothing, as
     /// [`validate`](Self::validate).
-    pub fn validate_practice(&self, number: u64, episode: &Episode) -> Result<(), Refusal> {
+    pub fn validate_online(&self, number: u64, episode: &Episode) -> Result<(), Refusal> {
         let seed = episode.score.seed;
-        let open = self.evaluations.get(&Key::Practice(number));
+        let open = self.evaluations.get(&Key::Online(number));
         let open = open.filter(|open| open.is_scored(seed).is_some());
-        let open = open.ok_or(Refusal::Practice(seed))?;
+        let open = open.ok_or(Refusal::Online(seed))?;
         require(open.step == episode.step, Refusal::Step)?;
         require(open.weights == episode.weights, Refusal::Weights)?;
         require(episode.dims() == self.rules.dims, Refusal::Rows(seed))?;

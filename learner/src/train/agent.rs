@@ -12,7 +12,7 @@ use quad_runtime::{Hint, hinted};
 
 use super::device;
 
-const TOO_LARGE: &str = "take smaller networks or fewer critics; or train without practice and evaluations (--eval-interval 0), and \
+const TOO_LARGE: &str = "take smaller networks or fewer critics; or train without online steps and evaluations (--eval-interval 0), and \
                          score the last snapshot by `evaluator score`";
 const OTHER_VERSION: &str =
     "begin anew with --fresh, or continue with the version of the learner that wrote it";

@@ -26,7 +26,7 @@ pub(crate) struct RunCost {
     pub step_seconds: f64,
     pub snapshot_bytes: u64,
     pub checkpoint_bytes: u64,
-    /// Bytes on disk of an environment step of practice: observation, action and reward.
+    /// Bytes on disk of an online environment step: observation, action and reward.
     pub row_bytes: u64,
 }
 

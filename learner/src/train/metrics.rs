@@ -61,15 +61,15 @@ pub(crate) fn register<M: Collector + Clone + 'static>(
 
 metrics! {
     /// Metrics of experience that training has absorbed.
-    PracticeMetrics {
-        target: IntGauge("experience_rows_target", "Environment steps of practice that this run will do"),
-        rows: IntGauge("experience_rows", "Environment steps of practice that training has absorbed"),
-        episodes: IntGauge("experience_episodes", "Episodes of practice that training has absorbed"),
-        left_out: IntCounter("practice_left_out_total", "Episodes of practice with a number far outside the dataset's range"),
-        differences: IntCounter("practice_differences_total", "Episodes of practice that came again with other bits"),
-        episode_return: Gauge("practice_return", "Return of the newest episode that training has absorbed"),
-        score: Gauge("practice_score", "Score of the newest episode that training has absorbed"),
-        wait_seconds: Counter("practice_wait_seconds_total", "Time that training has waited for practice"),
+    OnlineMetrics {
+        target: IntGauge("experience_rows_target", "Online environment steps that this run will do"),
+        rows: IntGauge("experience_rows", "Online environment steps that training has absorbed"),
+        episodes: IntGauge("experience_episodes", "Online episodes that training has absorbed"),
+        left_out: IntCounter("experience_left_out_total", "Online episodes with a number far outside the dataset's range"),
+        differences: IntCounter("experience_differences_total", "Online episodes that came again with other bits"),
+        episode_return: Gauge("online_return", "Return of the newest episode that training has absorbed"),
+        score: Gauge("online_score", "Score of the newest episode that training has absorbed"),
+        wait_seconds: Counter("experience_wait_seconds_total", "Time that training has waited for experience"),
     }
 }
 

@@ -5,7 +5,7 @@
 //! unwritten: it puts its output into the [`OutputQueue`], from which the thread `snapshots` takes
 //! it. The module `live` starts it.
 //!
-//! In reading order: `training` (the loop), `practice` (the order of experience and gradient steps),
+//! In reading order: `training` (the loop), `online` (the order of experience and gradient steps),
 //! `agent` and `device`, `held_out` (metrics on episodes that are kept out), `output_queue`,
 //! `metrics`, `results`. `cost` estimates the cost of a run, on its caller's thread.
 
@@ -14,8 +14,8 @@ mod cost;
 pub(crate) mod device;
 mod held_out;
 mod metrics;
+mod online;
 mod output_queue;
-mod practice;
 mod results;
 #[cfg(test)]
 mod tests;
@@ -24,8 +24,8 @@ mod training;
 pub(crate) use agent::{begin, origin, resume};
 pub(crate) use cost::RunCost;
 pub(crate) use held_out::HeldOut;
-pub(crate) use metrics::{PracticeMetrics, TrainingMetrics, metrics, register};
+pub(crate) use metrics::{OnlineMetrics, TrainingMetrics, metrics, register};
+pub(crate) use online::{COLUMNS, Inbox, OnlineTraining};
 pub(crate) use output_queue::{Output, OutputQueue};
-pub(crate) use practice::{COLUMNS, Inbox, Practice};
 pub(crate) use results::{Outcome, TrainedPolicy, held_out_name};
 pub(crate) use training::Training;

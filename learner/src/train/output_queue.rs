@@ -26,9 +26,9 @@ const POLL: Duration = Duration::from_millis(100);
 #[derive(Debug)]
 pub(crate) enum Output {
     Snapshot(TrainedPolicy),
-    /// Practice that may be played with a snapshot before.
-    Practice(Opening),
-    /// Training waits for this episode of practice.
+    /// Online episodes that may be played with a snapshot before.
+    Online(Opening),
+    /// Training waits for this online episode.
     Waits(u64),
     Checkpoint(Checkpoint),
     Rows(Vec<Row>),
@@ -44,7 +44,7 @@ pub(crate) struct OutputQueue {
 
 #[derive(Debug, Default)]
 struct Waiting {
-    /// Snapshots, and practice with them.
+    /// Snapshots, and online episodes with them.
     snapshots: VecDeque<Output>,
     checkpoint: Option<Checkpoint>,
     rows: Vec<Row>,
@@ -64,13 +64,13 @@ impl OutputQueue {
         self.shared.1.notify_all();
     }
 
-    /// Adds an episode of practice.
-    pub fn practice(&self, opening: Opening) {
-        self.lock().snapshots.push_back(Output::Practice(opening));
+    /// Adds an online episode.
+    pub fn online(&self, opening: Opening) {
+        self.lock().snapshots.push_back(Output::Online(opening));
         self.shared.1.notify_all();
     }
 
-    /// Tells that training waits for this episode of practice from now on.
+    /// Tells that training waits for this online episode from now on.
     pub fn waits(&self, episode: u64) {
         self.lock().snapshots.push_back(Output::Waits(episode));
         self.shared.1.notify_all();

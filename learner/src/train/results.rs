@@ -14,8 +14,8 @@ pub(crate) struct TrainedPolicy {
     pub file: Vec<u8>,
     /// True if it is evaluated.
     pub evaluate: bool,
-    /// True if practice is played with it. A policy with neither, the last of a run, is only kept.
-    pub practice: bool,
+    /// True if online episodes are played with it. A policy with neither, the last of a run, is only kept.
+    pub online: bool,
 }
 
 /// A line of `metrics.jsonl`: means over the gradient steps since the line before.
@@ -30,8 +30,8 @@ pub(crate) struct Row {
     /// Values on held-out episodes after the last of the steps, in the order of `metrics`; empty if
     /// nothing was measured.
     pub held_out: Vec<Option<f32>>,
-    /// Experience so far; empty before practice.
-    pub practice: Vec<(&'static str, f64)>,
+    /// Experience so far; empty before online learning.
+    pub online: Vec<(&'static str, f64)>,
 }
 
 impl Serialize for Row {
@@ -45,7 +45,7 @@ impl Serialize for Row {
         for (metric, value) in measured(self.metrics, &self.held_out) {
             map.serialize_entry(&held_out_name(metric), &value)?;
         }
-        for (name, value) in &self.practice {
+        for (name, value) in &self.online {
             map.serialize_entry(name, value)?;
         }
         map.end()

@@ -33,7 +33,7 @@ use hopper::write_hopper;
 
 mod cost;
 mod held_out;
-mod practice;
+mod online;
 
 struct Trained {
     outcome: Result<Outcome, TrainError>,
@@ -108,7 +108,7 @@ fn run(agent: Agent, held_out: Option<HeldOut>, schedule: Schedule, stop: bool) 
     let mut training = Training {
         sampler: BatchSampler::new(agent.dataset_len(), 4, 0, agent.step()),
         agent,
-        practice: None,
+        online: None,
         held_out,
         schedule,
         origin: origin(&resolve("hopper-demo", &toml::Table::new()).unwrap()),
@@ -131,7 +131,7 @@ fn run(agent: Agent, held_out: Option<HeldOut>, schedule: Schedule, stop: bool) 
             Output::Snapshot(policy) => trained.snapshots.push((policy.step, policy.evaluate)),
             Output::Checkpoint(checkpoint) => trained.checkpoint = Some(checkpoint),
             Output::Rows(rows) => trained.rows.extend(rows),
-            Output::Practice(_) | Output::Waits(_) | Output::Ended(_) => {
+            Output::Online(_) | Output::Waits(_) | Output::Ended(_) => {
                 panic!("the loop does not send this")
             }
         }
@@ -193,7 +193,7 @@ fn a_queue_that_the_disk_does_not_empty_keeps_all_rows_then_the_newest_checkpoin
     let checkpoint = |step: u64| Checkpoint { step, state: vec![step as u8] };
     for step in 1..=3 {
         let (values, held_out) = (vec![], vec![]);
-        queue.row(Row { step, seconds: 0.0, metrics: &[], values, held_out, practice: Vec::new() });
+        queue.row(Row { step, seconds: 0.0, metrics: &[], values, held_out, online: Vec::new() });
         queue.checkpoint(checkpoint(step));
     }
     queue.ended(Outcome::Completed);
@@ -208,7 +208,7 @@ fn a_queue_that_the_disk_does_not_empty_keeps_all_rows_then_the_newest_checkpoin
 
 /// Adds a snapshot of 150 MiB.
 fn add_large(queue: &OutputQueue, step: u64, stop: bool) {
-    let policy = TrainedPolicy { step, file: vec![0; 150 << 20], evaluate: true, practice: false };
+    let policy = TrainedPolicy { step, file: vec![0; 150 << 20], evaluate: true, online: false };
     queue.snapshot(policy, &AtomicBool::new(stop), &beat());
 }
 

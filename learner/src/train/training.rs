@@ -15,8 +15,8 @@ use tracing::debug;
 
 use super::held_out::HeldOut;
 use super::metrics::TrainingMetrics;
+use super::online::{OnlineError, OnlineTraining};
 use super::output_queue::OutputQueue;
-use super::practice::{Practice, PracticeError};
 use super::results::{Means, Outcome, Row, STEPS_PER_ROW, TrainedPolicy, measured};
 
 /// Least time of training that is spent between two checkpoints for each second that one takes:
@@ -35,7 +35,7 @@ pub(crate) enum TrainError {
     #[error("gradient step {step} failed")]
     Update { step: u64, source: AlgorithmError },
     #[error(transparent)]
-    Practice(#[from] PracticeError),
+    Online(#[from] OnlineError),
 }
 
 impl TrainError {
@@ -54,7 +54,7 @@ pub(crate) struct Training {
     pub agent: Agent,
     /// Batches of the dataset alone.
     pub sampler: BatchSampler,
-    pub practice: Option<Practice>,
+    pub online: Option<OnlineTraining>,
     pub held_out: Option<HeldOut>,
     pub schedule: Schedule,
     /// Origin of the snapshots; the step is set for each.
@@ -92,20 +92,20 @@ impl Training {
         let mut means = Means::new(metrics.len());
         let mut next_checkpoint = start + self.checkpoint_every;
         let first = self.agent.step();
-        if first < steps && self.practices_with(first) {
+        if first < steps && self.plays_online_with(first) {
             self.save_policy(first, beat)?;
         }
         while self.agent.step() < steps {
-            if !self.practice(beat)? {
+            if !self.online(beat)? {
                 let (checkpoint, _) = self.checkpoint(self.agent.step())?;
                 self.queue.checkpoint(checkpoint);
                 return Ok(Outcome::Stopped);
             }
             let begin = Instant::now();
             let step = self.agent.step() + 1;
-            let online = self.practice.as_mut().filter(|practice| practice.has_begun(step - 1));
+            let online = self.online.as_mut().filter(|online| online.has_begun(step - 1));
             let batch = match online {
-                Some(practice) => practice.batch(step),
+                Some(online) => online.batch(step),
                 None => self.sampler.next_indices(),
             };
             let values = self.agent.update(batch).map_err(TrainError::at(step))?;
@@ -129,11 +129,11 @@ impl Training {
             if step.is_multiple_of(STEPS_PER_ROW) || is_last || stopped {
                 let seconds = self.seconds_before + start.elapsed().as_secs_f64();
                 let (values, held_out) = (means.take(), self.measure_held_out(step, is_last)?);
-                let online = self.practice.as_ref().filter(|it| it.has_begun(step - 1));
-                let practice = online.map_or(Vec::new(), Practice::row);
-                self.queue.row(Row { step, seconds, metrics, values, held_out, practice });
+                let online = self.online.as_ref().filter(|it| it.has_begun(step - 1));
+                let online = online.map_or(Vec::new(), OnlineTraining::row);
+                self.queue.row(Row { step, seconds, metrics, values, held_out, online });
             }
-            if is_last || self.schedule.is_evaluated(step) || self.practices_with(step) {
+            if is_last || self.schedule.is_evaluated(step) || self.plays_online_with(step) {
                 self.save_policy(step, beat)?;
             }
             if let Some((checkpoint, pause)) = checkpoint {
@@ -147,30 +147,29 @@ impl Training {
         Ok(Outcome::Completed)
     }
 
-    /// Absorbs practice until it allows another gradient step. False if training is to stop.
-    fn practice(&mut self, beat: &Heartbeat) -> Result<bool, TrainError> {
+    /// Absorbs experience until it allows another gradient step. False if training is to stop.
+    fn online(&mut self, beat: &Heartbeat) -> Result<bool, TrainError> {
         let step = self.agent.step();
-        let Some(practice) = self.practice.as_mut().filter(|practice| practice.has_begun(step))
-        else {
+        let Some(online) = self.online.as_mut().filter(|online| online.has_begun(step)) else {
             return Ok(true);
         };
         loop {
-            practice.take_openings().into_iter().for_each(|opening| self.queue.practice(opening));
-            if !practice.is_due(step) {
+            online.take_openings().into_iter().for_each(|opening| self.queue.online(opening));
+            if !online.is_due(step) {
                 return Ok(true);
             }
-            if let Some(episode) = practice.awaited() {
+            if let Some(episode) = online.awaited() {
                 self.queue.waits(episode);
             }
-            if !practice.absorb_next(&self.stop, beat)? {
+            if !online.absorb_next(&self.stop, beat)? {
                 return Ok(false);
             }
         }
     }
 
-    /// True if practice is played with the policy after this gradient step.
-    fn practices_with(&self, step: u64) -> bool {
-        self.practice.as_ref().is_some_and(|practice| practice.is_snapshot(step))
+    /// True if online episodes are played with the policy after this gradient step.
+    fn plays_online_with(&self, step: u64) -> bool {
+        self.online.as_ref().is_some_and(|online| online.is_snapshot(step))
     }
 
     /// Empty if the row of this step has no such metrics.
@@ -194,8 +193,8 @@ impl Training {
         self.origin.step = step;
         let file = self.agent.policy(self.origin.clone()).map_err(TrainError::at(step))?;
         self.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
-        let (evaluate, practice) = (self.schedule.is_evaluated(step), self.practices_with(step));
-        let policy = TrainedPolicy { step, file, evaluate, practice };
+        let (evaluate, online) = (self.schedule.is_evaluated(step), self.plays_online_with(step));
+        let policy = TrainedPolicy { step, file, evaluate, online };
         self.queue.snapshot(policy, &self.stop, beat);
         Ok(())
     }

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::printed;
-use crate::run::{Run, practiced, small, write_all, write_study};
+use crate::run::{Run, online, small, write_all, write_study};
 
 fn draw(folder: &Path) {
     printed(&format!("report {0} --figures {0}/figures", folder.display()));
@@ -56,8 +56,8 @@ fn curves_show_complete_evaluations_only() {
     stopped.scores.truncate(4);
     assert!(curve(&[complete, stopped]).contains("quad (1 seed, not complete)"));
 
-    let begins = |runs: &[Run]| curve(runs).contains("\n practice\n");
-    assert!(begins(&[practiced()]) && begins(&[small(1, 0.0), practiced()]));
+    let begins = |runs: &[Run]| curve(runs).contains("\n online\n");
+    assert!(begins(&[online()]) && begins(&[small(1, 0.0), online()]));
     assert!(!begins(&[small(0, 0.0)]));
 
     let robot = small(0, 0.0).set("experiment.environment", "my-robot");

@@ -118,8 +118,8 @@ pub fn small(seed: u64, shift: f64) -> Run {
     run
 }
 
-/// The run of [`small`] with practice after 3,000 steps.
-pub fn practiced() -> Run {
+/// The run of [`small`] online after 3,000 steps.
+pub fn online() -> Run {
     let online = toml::toml! {
         steps = 2000
         updates_per_step = 2
@@ -132,9 +132,9 @@ pub fn practiced() -> Run {
     small(0, 0.0).set("experiment.steps", 3000).set("experiment.online", online)
 }
 
-/// The run of [`practiced`], but best before practice.
+/// The run of [`online`], but best before online learning.
 pub fn fallen() -> Run {
-    let mut run = practiced();
+    let mut run = online();
     run.scores[4..6].iter_mut().for_each(|line| line["score"] = json!(50.0));
     run
 }

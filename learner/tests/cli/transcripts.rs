@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 
 use crate::export::judge;
 use crate::run::{
-    HOPPER, Run, TASKS, complete, fallen, paper, practiced, small, write_all, write_study,
+    HOPPER, Run, TASKS, complete, fallen, online, paper, small, write_all, write_study,
 };
 use crate::write_dataset;
 
@@ -70,7 +70,7 @@ fn commands_print_what_their_transcripts_have() {
     // Where this fails, another program has the port.
     let _usual_port = TcpListener::bind("127.0.0.1:7447");
     write_verified();
-    write_practiced();
+    write_online_runs();
     write_foreign();
     trycmd::TestCases::new()
         .register_bin("learner", Path::new(env!("CARGO_BIN_EXE_learner")))
@@ -108,7 +108,7 @@ fn bin_path() -> String {
 /// The runs of report.trycmd.
 fn write_reported() {
     small(3, 0.0).write("report/one");
-    practiced().write("report/practiced");
+    online().write("report/online");
     fallen().write("report/fallen");
     let (mut complete, mut stopped) = (small(0, 0.0), small(1, 0.0));
     complete.score(6000, 0, 12.0, "00");
@@ -145,11 +145,11 @@ fn write_reported() {
     let mut last = Run::new("hopper-demo", 0).sizes(100_000, 10_000, 1);
     (1..=10).for_each(|n| last.score(10_000 * n, 0, n as f64, "00"));
     last.write("report/last");
-    // Of these 50,000, practice has 10,000.
-    let online = practiced().config["experiment"]["online"].clone();
+    // Of these 50,000, online learning has 10,000.
+    let online = online().config["experiment"]["online"].clone();
     let online = last.set("experiment.steps", 90_000).set("experiment.online", online);
     let online = online.set("experiment.online.steps", 5500);
-    online.write("report/short-practice");
+    online.write("report/short-online");
     write_all("report/goals", paper("antmaze-umaze-v0", 100_000, |_| 50.0));
 }
 
@@ -315,8 +315,8 @@ fn write_verified() {
 
 /// The runs of export-data.trycmd: one without experience, one with three episodes, in the first of
 /// which a person acted twice.
-fn write_practiced() {
-    let runs = ["practice/none", "practice/run"];
+fn write_online_runs() {
+    let runs = ["online/none", "online/run"];
     for path in runs {
         Run::new("hopper-demo", 5).write(path);
     }
@@ -341,8 +341,8 @@ fn write_practiced() {
         log.append([&*encode(&episode).unwrap()]).unwrap();
     }
     // Another user's file, of an episode without observations.
-    Run::new("hopper-demo", 5).write("practice/foreign");
-    let (mut log, _) = RunDir::at(Path::new("practice/foreign")).experience_log().unwrap();
+    Run::new("hopper-demo", 5).write("online/foreign");
+    let (mut log, _) = RunDir::at(Path::new("online/foreign")).experience_log().unwrap();
     let score = EpisodeScore { seed: 0, episode_return: 1.0, length: 1, score: 1.0 };
     let (actions, rewards) = (vec![0.5; 3], vec![1.0]);
     let precision = Name::new("f32").unwrap();

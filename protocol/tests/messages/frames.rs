@@ -64,7 +64,7 @@ pub fn each(test: &mut impl Check) {
         environment: text(),
         environment_seed: 4,
         seeds: vec![1, 2, 3],
-        practice: Some(Exploration::Policy { noise: 0.1 }),
+        exploration: Some(Exploration::Policy { noise: 0.1 }),
         progress_milliseconds: 300,
     };
     let progress = Progress {
@@ -87,7 +87,7 @@ pub fn each(test: &mut impl Check) {
     test.check(&ScoreReply::NotYet { incarnation: 1 });
     test.check(&ScoreReply::Refused { incarnation: 1, reason: text() });
     test.check(&progress);
-    test.check(&JobReply::Job(Job { practice: Some(Exploration::Uniform), ..job }));
+    test.check(&JobReply::Job(Job { exploration: Some(Exploration::Uniform), ..job }));
     test.check(&Episode {
         score: EpisodeScore { length: 1, ..score(1, 4.0) },
         terminated: true,

@@ -133,14 +133,14 @@ class WrappedEnvironment:
         self.unusable = Unusable(why)
         return self.unusable
 
-    def reset(self, seed: int, practice: bool = False) -> NDArray[np.float64]:
+    def reset(self, seed: int, online: bool = False) -> NDArray[np.float64]:
         # Many simulators take seeds of 32 bits at most.
         seed %= 2**31
         # Some draw from NumPy's global generator or from the action space, which Gymnasium's reset does not seed.
         draw_from(self.generator, seed)
         for space in _action_spaces(self.environment):
             space.seed(seed)
-        options = {"options": {"practice": True}} if practice and self.takes_options else {}
+        options = {"options": {"online": True}} if online and self.takes_options else {}
         answer = self._run(self.environment.reset, seed=seed, **options)
         self.steps = 0
         if not isinstance(answer, (tuple, list)) or len(answer) != 2 or not isinstance(answer[1], (Mapping, type(None))):
@@ -185,7 +185,7 @@ class WrappedEnvironment:
             cls.told, i = True, int(off.argmax())
             print(
                 f"quad_rl: action_space is narrower than the actions of the data: number {i} of an action is {given[i]:g}, and {taken[i]:g} "
-                "is taken (in practice, that is recorded)",
+                "is taken (online, that is recorded)",
                 file=sys.stderr,
             )
         return [float(number) for number in taken]

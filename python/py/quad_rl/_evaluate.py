@@ -138,7 +138,7 @@ def evaluate(name: str, environment: str | Callable[[int], Any], **arguments: An
     name: the environment's name in the learner's run: `learner train --task own-data --env NAME`.
     environment: a Gymnasium id, or a function that takes a seed and returns an environment: an object with `reset(seed=…)`,
         which returns (observation, info), and `step(action)`, which returns (observation, reward, terminated, truncated,
-        info), as in Gymnasium. The seed is the run's, the same for all episodes. Observations are flattened. In practice, the
+        info), as in Gymnasium. The seed is the run's, the same for all episodes. Observations are flattened. Online, the
         action that a person took in place of the given one is learned from, if a step returns it as info["intervention"].
     connect: endpoint of the learner or a router, or a list of endpoints.
     certificates: folder with ca.pem, cert.pem and key.pem, for endpoints like "tls/HOST:PORT".

@@ -19,7 +19,7 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
 
     folders: a run folder, a pattern such as "runs/*", or several of them. Folders without a run are left out.
 
-    Each dictionary has, from `learner report --json`, the evaluation's `step`, `environment_steps` (of practice, else None),
+    Each dictionary has, from `learner report --json`, the evaluation's `step`, `environment_steps` (online, else None),
     `episodes`, `complete`, `score` (mean over the episodes), `score_std`, `return` and `length`; the run's `run`, `dir`,
     `task`, `algorithm`, `variant`, `agent`, `seed`, `steps`, `normalized`, `scored_in`, `dataset_score`, `mean_last_3`,
     `mean_last_5` and `mean_last_50000_steps`, the same in all its rows; and each setting of its `config.toml`, like

@@ -30,12 +30,12 @@ pub enum ConfigError {
     Hyperparameter(String),
     #[error("{0} is no hyper-parameter")]
     NoHyperparameter(String),
-    #[error("practice of {steps} environment steps ends within its warm-up of {warmup}")]
+    #[error("online learning of {steps} environment steps ends within its warm-up of {warmup}")]
     Warmup { steps: u64, warmup: u64 },
-    #[error("a run of 0 steps without practice learns nothing")]
+    #[error("a run of 0 steps without online steps learns nothing")]
     NoSteps,
-    #[error("{0} learns from a dataset alone, not from practice")]
-    NoPractice(&'static str),
+    #[error("{0} learns from a dataset alone, not online")]
+    NotOnline(&'static str),
     #[error("{steps} steps with an evaluation every {interval} are {evaluations} evaluations")]
     Evaluations { steps: u64, interval: u64, evaluations: u64, most: u64 },
     #[error("algorithm {algorithm}")]
@@ -69,14 +69,14 @@ impl ConfigError {
                 format!("--set {key}=VALUE changes it; in a file it is above [agent]")
             }
             Self::Warmup { .. } => {
-                "the learner learns from practice after the warm-up: give more --online-steps, or a shorter one by \
+                "the learner learns from experience after the warm-up: give more --online-steps, or a shorter one by \
                  --set online.warmup=N"
                     .to_owned()
             }
             Self::NoSteps => {
-                "--steps N learns from the dataset alone, --online-steps N from practice too".to_owned()
+                "--steps N learns from the dataset alone, --online-steps N from experience too".to_owned()
             }
-            Self::NoPractice(_) => {
+            Self::NotOnline(_) => {
                 let can = |known: &Definition| Values::of(known).for_task(None).contains_key("online");
                 format!("leave out --online-steps, or choose one of {}", those_that(can))
             }

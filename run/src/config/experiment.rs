@@ -57,7 +57,7 @@ pub struct Experiment {
     pub precision: Precision,
     /// Name of the learning algorithm.
     pub algorithm: String,
-    /// Practice after `steps`; `None` without any.
+    /// Online learning after `steps`; `None` without any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub online: Option<Online>,
     /// Hyper-parameters of the algorithm.
@@ -106,19 +106,19 @@ impl Experiment {
         self.steps.saturating_add(online)
     }
 
-    /// Environment steps of practice that the gradient steps up to `step` wait for; `None` without
-    /// practice.
+    /// Online environment steps that the gradient steps up to `step` wait for; `None` without
+    /// online steps.
     pub fn environment_steps(&self, step: u64) -> Option<u64> {
         let online = self.online.as_ref()?;
         Some(if step > self.steps { online.rows_at(step - self.steps) } else { 0 })
     }
 
-    /// Gradient step after which practice begins, if others come before it.
-    pub fn practice_begins(&self) -> Option<u64> {
+    /// Gradient step after which online learning begins, if others come before it.
+    pub fn online_begins(&self) -> Option<u64> {
         self.online.as_ref().map(|_| self.steps).filter(|steps| *steps > 0)
     }
 
-    /// True if evaluators have something to play: evaluations or practice.
+    /// True if evaluators have something to play: evaluations or online episodes.
     pub fn needs_evaluators(&self) -> bool {
         self.eval_interval > 0 || self.online.is_some()
     }

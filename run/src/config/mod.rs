@@ -2,7 +2,7 @@
 //!
 //! In reading order: `tasks`; `hyperparameters`, an algorithm's values for them; `presets`, a task
 //! or a file; `experiment`, all of that resolved; `run_config`, the contents of `config.toml`;
-//! `online`, practice; `schedule`, the evaluated steps; `settings`, which compares runs key by key.
+//! `online`, the online steps; `schedule`, the evaluated steps; `settings`, which compares runs key by key.
 
 mod error;
 mod experiment;

@@ -1,14 +1,14 @@
-//! Practice: the episodes that evaluators play for the learner to learn from.
+//! Online learning: the episodes that evaluators play for the learner to learn from.
 
 use serde::{Deserialize, Serialize};
 
 use super::error::ConfigError;
 
-/// Learning from practice, after the gradient steps on the dataset alone.
+/// Learning from experience, after the gradient steps on the dataset alone.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Online {
-    /// Environment steps of practice; 0 turns practice off.
+    /// Online environment steps; 0 turns online learning off.
     #[serde(default)]
     pub steps: u64,
     /// Gradient steps for each environment step, the update-to-data ratio.
@@ -25,7 +25,7 @@ pub struct Online {
     pub noise: f64,
     /// Episodes that are in play or wait while the learner learns from those before them.
     pub lag: u32,
-    /// Gradient steps between two snapshots that practice is played with.
+    /// Gradient steps between two snapshots that online episodes are played with.
     pub snapshot_interval: u64,
 }
 
@@ -40,13 +40,13 @@ impl Online {
         self.warmup + updates.div_ceil(u64::from(self.updates_per_step))
     }
 
-    /// True if practice is played with the policy after gradient step `step`, where practice begins
+    /// True if online episodes are played with the policy after gradient step `step`, where online learning begins
     /// after step `begin`.
     pub fn is_snapshot(&self, begin: u64, step: u64) -> bool {
         step >= begin && (step - begin).is_multiple_of(self.snapshot_interval)
     }
 
-    /// The newest gradient step up to `step`, at least `begin`, whose policy plays practice.
+    /// The newest gradient step up to `step`, at least `begin`, whose policy plays online episodes.
     pub fn newest_snapshot(&self, begin: u64, step: u64) -> u64 {
         step - (step - begin) % self.snapshot_interval
     }

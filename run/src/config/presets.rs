@@ -62,21 +62,21 @@ impl Preset {
         self.task.map_or(&self.label, |task| &task.name)
     }
 
-    /// Merges the algorithm's values for the task, the task's keys, the algorithm's for a run with
-    /// practice, the file's keys and `changes`, the later over the earlier, and checks them.
+    /// Merges the algorithm's values for the task, the task's keys, the algorithm's for an
+    /// online run, the file's keys and `changes`, the later over the earlier, and checks them.
     pub fn resolve(&self, changes: &Table) -> Result<Experiment, ConfigError> {
         let definition = self.algorithm(changes)?;
         let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
-        let can_practice = table.contains_key("online");
-        let with_practice = table.remove("with_practice");
+        let has_online = table.contains_key("online");
+        let online_values = table.remove("online_values");
         let mut of_task = self.task.map_or_else(Table::new, |task| task.keys.clone());
-        // An algorithm that learns from practice alone does so in each task.
+        // An algorithm that learns from experience alone does so in each task.
         if table.get("steps") == Some(&Value::Integer(0)) {
             of_task.remove("steps");
         }
         merge(&mut table, of_task);
-        if let Some(Value::Table(values)) = with_practice
-            && [changes, &self.own].into_iter().find_map(practice_steps).is_some_and(|n| n > 0)
+        if let Some(Value::Table(values)) = online_values
+            && [changes, &self.own].into_iter().find_map(online_steps).is_some_and(|n| n > 0)
         {
             merge(&mut table, values);
         }
@@ -84,8 +84,8 @@ impl Preset {
         check_places(&table, changes)?;
         merge(&mut table, changes.clone());
         table.insert("algorithm".to_owned(), definition.name.into());
-        if table.contains_key("online") && !can_practice {
-            return Err(ConfigError::NoPractice(definition.name));
+        if table.contains_key("online") && !has_online {
+            return Err(ConfigError::NotOnline(definition.name));
         }
         let Some(environment) = table.get("environment") else {
             return Err(ConfigError::NoEnvironment(self.label.clone()));
@@ -130,10 +130,12 @@ impl Preset {
                 }
             }
         }
-        let of_practice = |key: &&String| key.starts_with("online.") && *key != "online.steps";
-        for unused in changed.iter().filter(of_practice) {
+        let of_online = |key: &&String| key.starts_with("online.") && *key != "online.steps";
+        for unused in changed.iter().filter(of_online) {
             if experiment.online.is_none() {
-                doubts.push(format!("{unused} has no effect without practice (--online-steps N)"));
+                doubts.push(format!(
+                    "{unused} has no effect without online steps (--online-steps N)"
+                ));
             }
         }
         let steps = experiment.total_steps();
@@ -157,8 +159,8 @@ impl Preset {
     }
 }
 
-/// The environment steps of practice that keys name.
-fn practice_steps(keys: &Table) -> Option<i64> {
+/// The online environment steps that keys name.
+fn online_steps(keys: &Table) -> Option<i64> {
     keys.get("online")?.get("steps")?.as_integer()
 }
 
@@ -197,9 +199,9 @@ pub fn resolve(preset: &str, changes: &Table) -> Result<Experiment, ConfigError>
 mod tests {
     use super::*;
 
-    /// The algorithm's values with practice apply to the whole run, and the user's over them.
+    /// The algorithm's values online apply to the whole run, and the user's over them.
     #[test]
-    fn a_run_with_practice_has_values_of_its_own() {
+    fn an_online_run_has_values_of_its_own() {
         let task = "humanoidmaze-medium-navigate-singletask-v0";
         for (changes, alpha) in [
             ("", 30.0),
@@ -245,7 +247,7 @@ mod tests {
             ("agent.critic = { norm = true, norm_after = true }", None),
             (
                 "online.warmup = 100",
-                Some("online.warmup has no effect without practice (--online-steps N)"),
+                Some("online.warmup has no effect without online steps (--online-steps N)"),
             ),
             ("online = { steps = 5000, warmup = 100 }", None),
             ("steps = 1001\nagent.tau = 0.5", None),

@@ -46,13 +46,12 @@ pub fn differences<'a>(a: &'a Settings, b: &'a Settings) -> impl Iterator<Item =
     keys.filter(|key| a.get(*key) != b.get(*key))
 }
 
-/// The keys at which two settings differ; of practice that only one of them has, its steps alone.
+/// The keys at which two settings differ; of online learning that only one of them has, its steps alone.
 pub fn differences_in_brief<'a>(
     a: &'a Settings,
     b: &'a Settings,
 ) -> impl Iterator<Item = &'a String> {
     const STEPS: &str = "online.steps";
-    let both_practice = a.contains_key(STEPS) == b.contains_key(STEPS);
-    differences(a, b)
-        .filter(move |key| both_practice || *key == STEPS || !key.starts_with("online."))
+    let both_online = a.contains_key(STEPS) == b.contains_key(STEPS);
+    differences(a, b).filter(move |key| both_online || *key == STEPS || !key.starts_with("online."))
 }

@@ -5,7 +5,7 @@
 //! `scores.jsonl`. Commands that only read may run at any time.
 //!
 //! In reading order: `run_dir`, `find`, `lines`, `lock`, `log`, `experience`, `checkpoints`, `error`,
-//! `resume`, `verify`, `practiced`.
+//! `resume`, `verify`, `played`.
 
 mod checkpoints;
 pub(crate) mod error;
@@ -14,12 +14,12 @@ mod find;
 mod lines;
 mod lock;
 mod log;
-mod practiced;
 mod resume;
 mod run_dir;
 #[cfg(test)]
 mod tests;
 pub mod verify;
+mod verify_experience;
 
 pub use checkpoints::Checkpoint;
 pub use error::RunDirError;
@@ -28,6 +28,6 @@ pub use find::walk;
 pub use lines::{RunEndpoints, ScoreLine, read_metrics};
 pub use lock::Lock;
 pub use log::{Log, new_lines};
-pub use practiced::practiced;
 pub use resume::{ExistingRun, ResumePoint, SavedScores};
 pub use run_dir::RunDir;
+pub use verify_experience::verify_experience;

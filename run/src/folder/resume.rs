@@ -122,7 +122,7 @@ impl ResumePoint {
         let snapshots = BTreeMap::new();
         let mut point = Self { checkpoint, snapshots, scores };
         let (schedule, step) = (experiment.schedule(), point.step());
-        let practice = |at| {
+        let online = |at| {
             let online = experiment.online.as_ref();
             online.is_some_and(|online| online.is_snapshot(experiment.steps, at))
         };
@@ -131,7 +131,7 @@ impl ResumePoint {
             let episodes = read_experience(dir.path())?;
             played.extend(episodes.iter().map(|episode| (episode.step, episode.weights)));
         }
-        let is_needed = |at: &u64| schedule.is_evaluated(*at) || practice(*at);
+        let is_needed = |at: &u64| schedule.is_evaluated(*at) || online(*at);
         for at in dir.snapshots()?.into_iter().filter(is_needed) {
             let scored = point.scores.get(&at);
             // The resumed training makes this snapshot again.
@@ -145,7 +145,7 @@ impl ResumePoint {
             match dir.read_snapshot(at).map(|file| Hash::of(&file)) {
                 Ok(hash) if is_other(&hash) => {
                     warn!(
-                        "the snapshot of step {at} is not the one that was scored or that has practiced: its file is damaged"
+                        "the snapshot of step {at} is not the one that was scored or that has learned online: its file is damaged"
                     );
                     dir.mark_damaged(at)?;
                 }

@@ -5,7 +5,7 @@
 //! endpoints.json                     the learner's addresses; written as soon as it listens
 //! metrics.jsonl                      training metrics, a line every hundred gradient steps
 //! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgment
-//! experience.log                     the episodes of practice, each written before the evaluator gets its acknowledgment
+//! experience.log                     the online episodes, each written before the evaluator gets its acknowledgment
 //! snapshots/step_000003000.safetensors   target actor and target critics; written before the evaluation of it begins
 //! checkpoints/step_000003000_….safetensors   the newest three training states, to resume from
 //! report.json, learning_curve.svg    written at the end

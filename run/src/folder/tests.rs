@@ -66,7 +66,7 @@ fn a_run_that_begins_or_resumes_is_no_longer_marked_as_failed() {
 }
 
 #[test]
-fn a_snapshot_that_is_not_the_one_that_has_practiced_is_damaged() {
+fn a_snapshot_that_is_not_the_one_that_played_online_is_damaged() {
     let folder = tempfile::tempdir().unwrap();
     let (path, mut config) = (folder.path().join("a"), config("a", 0));
     let online = "online = { steps = 4, warmup = 0, lag = 2 }".parse().unwrap();

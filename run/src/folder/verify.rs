@@ -116,7 +116,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     Ok(found)
 }
 
-/// Compares snapshots with the hashes that judgments and practice name.
+/// Compares snapshots with the hashes that judgments and experience name.
 fn verify_snapshots(dir: &RunDir) -> Result<Findings, RunDirError> {
     let mut hashes: BTreeMap<u64, BTreeSet<String>> = BTreeMap::new();
     let judged = Judgment::read_all(dir)?.into_iter().map(|it| (it.step, it.weights));

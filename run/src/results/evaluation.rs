@@ -12,7 +12,7 @@ use crate::folder::ScoreLine;
 pub struct EvaluationReport {
     /// Gradient step of the snapshot.
     pub step: u64,
-    /// Environment steps of practice that the gradient steps up to `step` wait for; absent in a run
+    /// Online environment steps that the gradient steps up to `step` wait for; absent in a run
     /// without any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub environment_steps: Option<u64>,
@@ -30,8 +30,8 @@ pub struct EvaluationReport {
 }
 
 impl EvaluationReport {
-    /// True if it makes its run's score: it is complete and, in a run with practice, of a policy that
-    /// has practiced.
+    /// True if it makes its run's score: it is complete and, in an online run, of a policy that
+    /// has learned online.
     pub fn counts(&self) -> bool {
         self.complete && self.environment_steps != Some(0)
     }

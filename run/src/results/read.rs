@@ -62,7 +62,7 @@ impl RunReport {
             Spread::of(&scores).map(|spread| spread.mean)
         };
         let last = |count: usize| mean(&counted[counted.len().checked_sub(count)?..]);
-        let begins = experiment.practice_begins().unwrap_or(0);
+        let begins = experiment.online_begins().unwrap_or(0);
         let final_steps =
             experiment.total_steps().checked_sub(FINAL_STEPS).filter(|start| *start > begins);
         let in_final_steps =

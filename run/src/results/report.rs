@@ -38,11 +38,11 @@ pub struct RunReport {
     pub evaluations: Vec<EvaluationReport>,
     /// Episodes of planned evaluations without a score.
     pub episodes_missing: u64,
-    /// Mean score of the last 3 complete evaluations, with practice of those after it has begun;
+    /// Mean score of the last 3 complete evaluations, online of those after it has begun;
     /// absent if there are fewer.
     pub mean_last_3: Option<f64>,
     pub mean_last_5: Option<f64>,
-    /// Absent for runs of 50,000 steps or fewer, with practice of those after it has begun.
+    /// Absent for runs of 50,000 steps or fewer, online of those after it has begun.
     pub mean_last_50000_steps: Option<f64>,
     /// The algorithm's summary of its metrics, such as of QUAD's λ.
     #[serde(flatten)]

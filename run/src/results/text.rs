@@ -17,7 +17,7 @@ impl RunReport {
             header.insert(3, "return");
         }
         if self.config.experiment.online.is_some() {
-            header.insert(1, "practice");
+            header.insert(1, "online");
         }
         let mut table = Table::new(&Vec::from_iter(header.into_iter().map(|name| (name, Right))));
         for e in &self.evaluations {

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use quad_protocol::{Episode, EpisodeScore, Hash, decode, practice_seed};
+use quad_protocol::{Episode, EpisodeScore, Hash, decode, online_seed};
 use quad_run::folder::{SavedScores, ScoreLine};
 
 use crate::training::State;
@@ -65,7 +65,7 @@ impl Disk {
         }
         let (mut recorded, mut seeds) = (BTreeMap::new(), Vec::new());
         for number in 0..episodes.len() as u64 + u64::from(lag) {
-            let seed = practice_seed(0, number);
+            let seed = online_seed(0, number);
             if let Some((hash, episode)) = episodes.remove(&seed) {
                 recorded.insert(number, episode);
                 seeds.push((seed, Some(hash)));

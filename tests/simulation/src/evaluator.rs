@@ -242,12 +242,12 @@ impl World {
                 let seeds = report.episodes.iter().map(|episode| (report.step, episode.seed));
                 self.acknowledged_scores.extend(seeds);
             }
-            Note::Practiced { seed, .. } => drop(self.acknowledged_episodes.insert(seed)),
+            Note::Experience { seed, .. } => drop(self.acknowledged_episodes.insert(seed)),
             Note::Early { .. } => {}
             Note::Abandoned { step, reason } => {
                 self.record(|| format!("results of step {step} are abandoned: {reason}"));
                 // Training has come to all that it needs.
-                let needless = self.trained && reason.contains("no practice episode");
+                let needless = self.trained && reason.contains("no online episode");
                 if reason.contains("refused") && !needless {
                     return Err(format!("results of step {step} are refused: {reason}"));
                 }
@@ -294,7 +294,7 @@ impl World {
         }
         let (kind, by) = (evaluator.kind, evaluator.name.clone());
         let Some(Playing { job, .. }) = evaluator.playing.take() else { return Ok(()) };
-        let results = job.seeds.iter().map(|&seed| match job.practice {
+        let results = job.seeds.iter().map(|&seed| match job.exploration {
             None => (score(&job.weights, seed, kind), None),
             Some(rule) => {
                 let episode = play(&self.settings, (job.step, job.weights), seed, rule, kind);

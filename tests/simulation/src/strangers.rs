@@ -1,7 +1,7 @@
 //! Well-formed nonsense: messages that no evaluator of ours sends.
 
 use quad_protocol::{
-    EpisodeScore, Hash, JobRequest, Piece, ScoreReport, episode_seeds, practice_seed,
+    EpisodeScore, Hash, JobRequest, Piece, ScoreReport, episode_seeds, online_seed,
 };
 use rand::Rng;
 
@@ -56,7 +56,7 @@ pub fn query(world: &mut World) -> Query {
             let whole = rng.random_bool(0.5);
             let length = if whole { bytes.len() as u32 } else { length };
             let hash = if whole { Hash::of(&bytes) } else { Hash::of(b"guessed") };
-            let seed = practice_seed(0, rng.random_range(0..6));
+            let seed = online_seed(0, rng.random_range(0..6));
             let offset = if whole { 0 } else { offset };
             let run = name("run");
             Query::Piece(Piece {

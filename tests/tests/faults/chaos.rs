@@ -20,7 +20,7 @@ use crate::system::{Fault, Program, System, all_faults};
 /// Gradient steps for each fault, so that training continues until the last of them.
 const STEPS_PER_FAULT: u64 = 12_000;
 
-/// Lets so many faults of those kinds happen, in a run with these environment steps of practice or
+/// Lets so many faults of those kinds happen, in a run with these online environment steps or
 /// without.
 fn endure(faults: &[Fault], count: u64, online_steps: u64) {
     let steps = if online_steps > 0 { 1000 } else { STEPS_PER_FAULT * count };
@@ -69,7 +69,7 @@ fn a_few_faults_change_no_bit_of_a_run() {
 
 /// Five kills of each program, a cut link and a full disk.
 #[test]
-fn a_few_faults_lose_no_row_of_practice_and_change_no_bit() {
+fn a_few_faults_lose_no_row_of_experience_and_change_no_bit() {
     let kills = [Program::Learner, Program::Evaluator].map(Fault::Kill).repeat(5);
     let others = [Fault::Link(Program::Evaluator, Trouble::Cut), Fault::FillDisk];
     let faults = [&kills[..], &others].concat();

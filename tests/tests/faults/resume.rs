@@ -175,7 +175,7 @@ async fn an_episode_that_was_played_before_a_crash_is_recorded_after_it() {
         learner.process.kill();
         learner = start();
         let session = made_up::client(&learner.endpoint()).await;
-        let answer = made_up::deliver_practice(&session, &job, "one").await;
+        let answer = made_up::deliver_experience(&session, &job, "one").await;
         assert!(matches!(answer, PieceReply::Recorded { .. }), "{answer:?}");
     }
 }

@@ -21,7 +21,7 @@ pub const HOST: &str = "127.0.0.1";
 const BRIEF: u64 = 40;
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_run_with_practice_completes_through_the_shipped_router() {
+async fn an_online_run_completes_through_the_shipped_router() {
     let Some(certificates) = Certificates::make() else { return };
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let scratch = Scratch::new();

@@ -5,7 +5,7 @@ mod crowds;
 mod leaving;
 mod local_evaluators;
 mod names;
+mod online;
 mod page;
-mod practice;
 mod runs;
 mod sweep;

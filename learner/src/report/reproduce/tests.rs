@@ -58,13 +58,13 @@ fn the_command_reproduces_the_experiment() {
     let command = command_for(&own_data).unwrap();
     assert!(command.contains(" --hold-out 0 "), "{command}");
     assert_eq!(experiment_of(&command), own_data.experiment, "{command}");
-    // This alpha is the preset's without practice, with which it has another.
-    let mut practice = config.clone();
-    practice.run.task = "humanoidmaze-medium-navigate-singletask-v0".to_owned();
+    // This alpha is the preset's without online steps, with which it has another.
+    let mut online = config.clone();
+    online.run.task = "humanoidmaze-medium-navigate-singletask-v0".to_owned();
     let changes = toml! { algorithm = "fql" online.steps = 9 agent.alpha = 30.0 };
-    practice.experiment = resolve(&practice.run.task, &changes).unwrap();
-    let command = command_for(&practice).unwrap();
-    assert_eq!(experiment_of(&command), practice.experiment, "{command}");
+    online.experiment = resolve(&online.run.task, &changes).unwrap();
+    let command = command_for(&online).unwrap();
+    assert_eq!(experiment_of(&command), online.experiment, "{command}");
     let changes = toml! { from = "0123" online.steps = 5000 };
     let from = resolve("hopper-demo", &changes).unwrap();
     let command = command_for(&RunConfig { experiment: from, ..config.clone() }).unwrap();

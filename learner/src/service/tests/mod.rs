@@ -3,7 +3,7 @@
 mod deliveries;
 mod jobs;
 mod leases;
-mod practice;
+mod online;
 mod reports;
 
 use std::collections::BTreeMap;

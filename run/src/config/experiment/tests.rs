@@ -71,7 +71,7 @@ eval_interval = 2",
 agent.candidates = 2",
             "unknown field `candidates`",
         ),
-        ("algorithm = 'rlpd'\nonline.steps = 0", "0 steps without practice"),
+        ("algorithm = 'rlpd'\nonline.steps = 0", "0 steps without online steps"),
         (
             "algorithm = 'iql'\nonline = { steps = 9, noise = 1.1 }",
             "online.noise is 1.1, but must be",

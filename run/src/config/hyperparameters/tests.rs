@@ -47,7 +47,7 @@ fn every_algorithm_has_values_for_every_task() {
         let changes = toml::Table::from_iter([("algorithm".to_owned(), definition.name.into())]);
         for task in tasks::all() {
             let resolved = match resolve(&task.name, &changes) {
-                // It learns from practice alone, of which this task has none.
+                // It learns from experience alone, of which this task has none.
                 Err(ConfigError::NoSteps)
                     if definition.name == "rlpd" && task.name == "own-data" =>
                 {

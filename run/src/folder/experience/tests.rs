@@ -9,7 +9,7 @@ use tempfile::TempDir;
 use super::*;
 use crate::fixtures::config;
 
-/// A practice episode of two steps.
+/// An online episode of two steps.
 pub(crate) fn episode(seed: u64) -> Episode {
     Episode {
         score: EpisodeScore { seed, episode_return: 3.0, length: 2, score: 3.0 },

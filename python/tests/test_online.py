@@ -1,4 +1,4 @@
-"""Practice in a Python environment: the same run for any number of evaluators, whatever is killed."""
+"""Online learning in a Python environment: the same run for any number of evaluators, whatever is killed."""
 
 import subprocess
 
@@ -21,10 +21,10 @@ class Fall(Walk):
 
 
 def learner(folder, data, **arguments):
-    practice = ["--online-steps", str(ROWS), "--checkpoint-seconds", "0"]
+    online = ["--online-steps", str(ROWS), "--checkpoint-seconds", "0"]
     for value in "warmup=100", "lag=3", "snapshot_interval=50":
-        practice += ["--set", f"online.{value}"]
-    return Learner(folder, data, *practice, interval=500, episodes=2, **arguments)
+        online += ["--set", f"online.{value}"]
+    return Learner(folder, data, *online, interval=500, episodes=2, **arguments)
 
 
 def evaluators(learner, workers, environment=Fall):
@@ -37,7 +37,7 @@ def checkpoint(folder):
 
 def experience(folder):
     """The rows of each episode, by its first."""
-    file = folder / "practice.hdf5"
+    file = folder / "experience.hdf5"
     subprocess.run(["learner", "export-data", str(folder), "--out", str(file)], check=True, capture_output=True, timeout=600)
     with h5py.File(file) as data:
         ends = np.flatnonzero(data["terminals"][:] | data["timeouts"][:]) + 1
@@ -82,7 +82,7 @@ def test_any_number_of_evaluators_and_any_kill_make_the_same_run(tmp_path, data)
 
 
 class Glitches(Fall):
-    """In some episodes of practice it diverges, in some a sensor gives 1e30 once. Its space is narrower than the data's actions."""
+    """In some online episodes it diverges, in some a sensor gives 1e30 once. Its space is narrower than the data's actions."""
 
     def reset(self, seed=None, options=None):
         self.glitch = seed % 4 if options else 0
@@ -110,7 +110,7 @@ def test_glitches_of_a_simulator_end_nothing_and_the_actions_taken_are_kept(tmp_
         run = learner(run.folder, data, listen=run.endpoint)
         code, said = run.end()
     assert code == 0, said
-    assert "training leaves out an episode of practice: array `observations`, row 2, column 3: 1e30, far outside the dataset's range" in said
+    assert "training leaves out an online episode: array `observations`, row 2, column 3: 1e30, far outside the dataset's range" in said
     undisturbed = learner(tmp_path / "undisturbed", data)
     with evaluators(undisturbed, 1, Narrow):
         code, said = undisturbed.end()

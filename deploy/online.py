@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Prints the table of studies/practice.toml, as Markdown: python3 deploy/practice.py runs/practice
+"""Prints the table of studies/online.toml, as Markdown: python3 deploy/online.py runs/online
 
-For each dataset the score before practice (mean of the last three evaluations), after it and on the dataset alone (of the last five),
+For each dataset the score before online learning (mean of the last three evaluations), after it and on the dataset alone (of the last five),
 mean ± sample standard deviation over the seeds, and how many these are where there are not three. Runs that are not complete are left out.
 """
 
@@ -31,7 +31,7 @@ for file in sorted(Path(sys.argv[1]).glob("*/report.json")):
     scores[method.removesuffix("-alone"), environment, column].append(report["mean_last_5"])
 
 if not scores:
-    sys.exit(f"no run below {sys.argv[1]} is complete: `learner sweep studies/practice.toml` trains them")
+    sys.exit(f"no run below {sys.argv[1]} is complete: `learner sweep studies/online.toml` trains them")
 environments = sorted({environment for _, environment, _ in scores})
 row("method", *(f"{environment}, {column}" for environment in environments for column in COLUMNS))
 row(*["---"] * (1 + len(COLUMNS) * len(environments)))

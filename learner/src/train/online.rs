@@ -1,4 +1,4 @@
-//! Practice on the thread of training: its episodes enter the buffer in the order and at the steps
+//! Online learning on the thread of training: episodes enter the buffer in the order and at the steps
 //! that [`OnlineSchedule`] says. An episode that is left out counts as one without rows.
 
 use std::collections::BTreeMap;
@@ -7,57 +7,57 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender};
 use std::time::{Duration, Instant};
 
-use quad_dataset::{OnlineSampler, PracticeRows, Transitions};
+use quad_dataset::{OnlineEpisode, OnlineSampler, Transitions};
 use quad_protocol::Episode;
 use quad_run::config::Experiment;
 use quad_runtime::Heartbeat;
 use tracing::warn;
 
-use super::metrics::PracticeMetrics;
+use super::metrics::OnlineMetrics;
 use crate::service::{OnlineSchedule, Opening};
 
 /// Interval at which training checks for a stop while it waits for an episode.
 const POLL: Duration = Duration::from_millis(100);
 
-/// Names of practice's numbers in `metrics.jsonl`, and what they are.
+/// Names of online learning's numbers in `metrics.jsonl`, and what they are.
 pub(crate) const COLUMNS: [(&str, &str); 3] = [
-    ("experience_rows", "Environment steps of practice that training has absorbed"),
-    ("practice_return", "Return of the newest episode of practice"),
-    ("practice_wait_seconds", "Time that this learner has waited for practice"),
+    ("experience_rows", "Online environment steps that training has absorbed"),
+    ("online_return", "Return of the newest online episode"),
+    ("experience_wait_seconds", "Time that this learner has waited for experience"),
 ];
 
 /// Takes episodes with their numbers to training, once they are on the disk.
 pub(crate) type Inbox = Sender<(u64, Episode)>;
 
-/// The practice of a run.
-pub(crate) struct Practice {
+/// The online learning of a run.
+pub(crate) struct OnlineTraining {
     schedule: OnlineSchedule,
     recorded: Receiver<(u64, Episode)>,
     /// Recorded episodes that are not absorbed yet, by number.
     waiting: BTreeMap<u64, Episode>,
     transitions: Arc<Transitions>,
     sampler: OnlineSampler,
-    metrics: PracticeMetrics,
+    metrics: OnlineMetrics,
 }
 
 /// An episode that does not fit the run's transitions, or is missing from the run's experience.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum PracticeError {
+pub(crate) enum OnlineError {
     #[error(
         "the experience of the run does not have episode {0}, which its checkpoint has learned from"
     )]
     Missing(u64),
-    #[error("practice episode {number} cannot be learned from")]
+    #[error("online episode {number} cannot be learned from")]
     Rows { number: u64, source: quad_dataset::Problem },
 }
 
-impl Practice {
-    /// The practice of an experiment, before its first episode.
+impl OnlineTraining {
+    /// The online learning of an experiment, before its first episode.
     pub fn new(
         experiment: &Experiment,
         transitions: Arc<Transitions>,
         recorded: Receiver<(u64, Episode)>,
-        metrics: PracticeMetrics,
+        metrics: OnlineMetrics,
     ) -> Option<Self> {
         let online = experiment.online.clone()?;
         let (seed, begin) = (experiment.seed, experiment.steps);
@@ -67,22 +67,22 @@ impl Practice {
         Some(Self { schedule, recorded, waiting, transitions, sampler, metrics })
     }
 
-    /// True from the first gradient step of practice on.
+    /// True from the first online gradient step on.
     pub fn has_begun(&self, step: u64) -> bool {
         self.schedule.has_begun(step)
     }
 
-    /// True if practice may be played with the policy after this gradient step.
+    /// True if online episodes may be played with the policy after this gradient step.
     pub fn is_snapshot(&self, step: u64) -> bool {
         self.schedule.is_snapshot(step)
     }
 
     /// Absorbs the episodes that a checkpoint of this step has learned from.
-    pub fn resume(&mut self, step: u64) -> Result<(), PracticeError> {
+    pub fn resume(&mut self, step: u64) -> Result<(), OnlineError> {
         self.waiting.extend(self.recorded.try_iter());
         while self.has_begun(step) && self.schedule.due() < step {
             let number = self.schedule.next_episode();
-            let episode = self.waiting.remove(&number).ok_or(PracticeError::Missing(number))?;
+            let episode = self.waiting.remove(&number).ok_or(OnlineError::Missing(number))?;
             self.absorb(&episode)?;
         }
         Ok(())
@@ -98,7 +98,7 @@ impl Practice {
         &mut self,
         stop: &AtomicBool,
         beat: &Heartbeat,
-    ) -> Result<bool, PracticeError> {
+    ) -> Result<bool, OnlineError> {
         while !stop.load(Ordering::Relaxed) {
             if let Some(episode) = self.waiting.remove(&self.schedule.next_episode()) {
                 return self.absorb(&episode).map(|()| true);
@@ -124,18 +124,18 @@ impl Practice {
         Some(self.schedule.next_episode()).filter(|next| !self.waiting.contains_key(next))
     }
 
-    fn absorb(&mut self, episode: &Episode) -> Result<(), PracticeError> {
+    fn absorb(&mut self, episode: &Episode) -> Result<(), OnlineError> {
         let (number, metrics) = (self.schedule.next_episode(), &self.metrics);
         let Episode { observations, actions, rewards, terminated, score, .. } = episode;
-        let rows = PracticeRows { observations, actions, rewards, terminated: *terminated };
+        let rows = OnlineEpisode { observations, actions, rewards, terminated: *terminated };
         let added = self.transitions.add_episode(rows);
-        let far = added.map_err(|source| PracticeError::Rows { number, source })?;
+        let far = added.map_err(|source| OnlineError::Rows { number, source })?;
         self.schedule.absorb(if far.is_some() { 0 } else { rewards.len() as u64 });
         if let Some(far) = far {
             warn!(
                 episode = number,
                 seed = score.seed,
-                "training leaves out an episode of practice: {far}"
+                "training leaves out an online episode: {far}"
             );
             metrics.left_out.inc();
         } else {

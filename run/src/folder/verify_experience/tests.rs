@@ -7,9 +7,9 @@ use crate::config::resolve;
 use crate::fixtures::config;
 use crate::folder::experience::tests::episode;
 
-/// The first practice episodes of a run of seed 0, of two steps each.
+/// The first online episodes of a run of seed 0, of two steps each.
 fn episodes() -> [Episode; 2] {
-    [0, 1].map(|number| episode(practice_seed(0, number)))
+    [0, 1].map(|number| episode(online_seed(0, number)))
 }
 
 /// Findings on a run of four environment steps with these episodes.
@@ -35,7 +35,7 @@ fn verified_with(
     snapshot.into_iter().for_each(|file| run.write_snapshot(10, file).unwrap());
     let frames = Vec::from_iter(episodes.iter().map(|episode| encode(episode).unwrap()));
     run.experience_log().unwrap().0.append(frames.iter().map(Vec::as_slice)).unwrap();
-    let (findings, promise) = practiced(run.path()).unwrap().unwrap();
+    let (findings, promise) = verify_experience(run.path()).unwrap().unwrap();
     (findings.to_string(), promise)
 }
 
@@ -55,7 +55,7 @@ fn what_is_missing_or_strange_is_named() {
         second.score.seed = seed;
         verified(&[first, second]).0
     };
-    assert_eq!(with(practice_seed(0, 2)), missing);
+    assert_eq!(with(online_seed(0, 2)), missing);
     let of_another = missing.replace("\n", "\nno episode of this run (1): step 10, seed 1\n");
     assert_eq!(with(1), of_another);
     assert_eq!(with(seed), format!("{missing}\nrecorded twice (1): step 10, seed {seed}"));

@@ -1,4 +1,4 @@
-//! An episode of practice, which goes to the learner in pieces until it has saved it.
+//! An online episode, which goes to the learner in pieces until it has saved it.
 
 use quad_protocol::{Episode, Exploration, Hash, Job, Piece, PieceReply, decode};
 use tokio::task::spawn_blocking;
@@ -36,13 +36,13 @@ impl State {
     }
 }
 
-/// A learner that gives out practice in HalfCheetah, an episode of a thousand steps, with an
+/// A learner that gives out online episodes in HalfCheetah, an episode of a thousand steps, with an
 /// evaluator.
 async fn start(behavior: Behavior) -> (Learner, Evaluator, impl Sized) {
     let learner = Learner::start(file_for("halfcheetah", (17, 6)), behavior).await;
-    let practice = Some(Exploration::Policy { noise: 0.0 });
+    let exploration = Some(Exploration::Policy { noise: 0.0 });
     let environment = "halfcheetah".to_owned();
-    learner.give(Job { environment, practice, seeds: vec![11], ..job(&learner.snapshot) });
+    learner.give(Job { environment, exploration, seeds: vec![11], ..job(&learner.snapshot) });
     let (evaluator, token) = learner.evaluator().await;
     (learner, evaluator, token)
 }

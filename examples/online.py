@@ -1,4 +1,4 @@
-"""A simulated cart learns to stop at a mark, from recorded pushes and then from practice: python examples/practice.py FOLDER"""
+"""A simulated cart learns to stop at a mark, from recorded pushes and then online: python examples/online.py FOLDER"""
 
 import sys
 
@@ -7,16 +7,16 @@ import quad_rl
 
 
 class Cart:
-    """Sees its position and speed, and is pushed by -1 to 1. In practice a person pushes it back near the ends of the track."""
+    """Sees its position and speed, and is pushed by -1 to 1. Online a person pushes it back near the ends of the track."""
 
     def reset(self, seed=None, options=None):
-        self.is_practice = bool(options and options.get("practice"))
+        self.is_online = bool(options and options.get("online"))
         self.state, self.steps = np.array([np.random.default_rng(seed).uniform(-1.5, 1.5), 0.0]), 0
         return self.state, {}
 
     def step(self, action):
         (position, speed), push, info = self.state, float(np.clip(action[0], -1, 1)), {}
-        if self.is_practice and abs(position) > 1.6:
+        if self.is_online and abs(position) > 1.6:
             push = -float(np.sign(position))
             info["intervention"] = [push]
         self.state, self.steps = np.array([position + 0.1 * speed, speed + 0.1 * push]), self.steps + 1
@@ -28,7 +28,7 @@ class Cart:
 def record(episodes):
     cart, rows, rng = Cart(), [], np.random.default_rng(0)
     for seed in range(episodes):
-        (seen, _), ended = cart.reset(seed, {"practice": True}), False
+        (seen, _), ended = cart.reset(seed, {"online": True}), False
         while not ended:
             push = rng.uniform(-1, 1, 1) if cart.steps % 10 == 0 else push
             after, reward, terminated, truncated, info = cart.step(push)

@@ -1,4 +1,4 @@
-//! Episodes of practice, and those that are left out: a number far outside the dataset's range, such
+//! Online episodes, and those that are left out: a number far outside the dataset's range, such
 //! as a sensor's 1e30, would end training.
 
 use crate::error::{ArrayProblem, Problem};
@@ -7,9 +7,9 @@ use crate::recording::{Names, Recording, RowKind, named};
 /// Largest distance of a number from its column's range in the dataset, relative to its width.
 const FAR: f64 = 1000.0;
 
-/// An episode of practice of n steps, in the environment's units.
+/// An online episode of n steps, in the environment's units.
 #[derive(Clone, Copy, Debug)]
-pub struct PracticeRows<'a> {
+pub struct OnlineEpisode<'a> {
     /// Observations from the first to the one after the last step, `(n + 1) × o`.
     pub observations: &'a [f32],
     /// Actions as they were taken, `n × a`.
@@ -20,7 +20,7 @@ pub struct PracticeRows<'a> {
     pub terminated: bool,
 }
 
-impl PracticeRows<'_> {
+impl OnlineEpisode<'_> {
     /// n, if all arrays are of n ≥ 1 steps.
     pub(crate) fn steps(&self, o: usize, a: usize) -> Result<usize, Problem> {
         let n = self.rewards.len();
@@ -80,7 +80,7 @@ impl Ranges {
 
     /// The first number of an episode further from the range of its column than [`FAR`] times its
     /// width, if any, in words. A row of observations comes before the step of that number.
-    pub(crate) fn far(&self, episode: &PracticeRows<'_>, names: &Names) -> Option<String> {
+    pub(crate) fn far(&self, episode: &OnlineEpisode<'_>, names: &Names) -> Option<String> {
         [
             ("observations", episode.observations, &self.observations, &*names.observations),
             ("actions", episode.actions, &self.actions, &*names.actions),
@@ -112,7 +112,7 @@ fn ranges(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<R
 }
 
 /// A range that is narrower than a thousandth of its numbers' size, or of 1, counts as this size:
-/// what hardly moved in the data may move in practice.
+/// what hardly moved in the data may move online.
 fn is_far(range: Range, value: f32) -> bool {
     let ([low, high], value) = (range.map(f64::from), f64::from(value));
     let size = low.abs().max(high.abs()).max(1.0);

@@ -1,4 +1,4 @@
-//! Practice: what evaluators live through comes back, and makes the same run for any number of
+//! Online learning: what evaluators live through comes back, and makes the same run for any number of
 //! them.
 
 use std::time::{Duration, Instant};
@@ -41,12 +41,12 @@ fn any_number_of_evaluators_makes_the_same_run() {
 
 /// An evaluator that owes an episode claims no job of the run: without an answer it never would.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_run_without_practice_refuses_an_episode_of_an_earlier_run_of_its_name() {
+async fn an_offline_run_refuses_an_episode_of_an_earlier_run_of_its_name() {
     let scratch = Scratch::new();
     let learner = scratch.learner("run", ENDLESS);
     let (session, run) = (made_up::client(&learner.endpoint()).await, name("run"));
     let job = made_up::claim_eventually(&session, &run, "late").await;
-    let answer = made_up::deliver_practice(&session, &job, "late").await;
+    let answer = made_up::deliver_experience(&session, &job, "late").await;
     assert!(matches!(answer, PieceReply::Refused { .. }), "{answer:?}");
 }
 

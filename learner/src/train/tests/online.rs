@@ -1,14 +1,14 @@
-//! Tests of the order of practice and gradient steps.
+//! Tests of the order of experience and gradient steps.
 
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 
-use quad_protocol::{Episode, Exploration, Hash, Name, practice_seed};
+use quad_protocol::{Episode, Exploration, Hash, Name, online_seed};
 use quad_run::config::{Experiment, Online};
 
 use super::*;
 use crate::service::Opening;
-use crate::train::{Inbox, Practice, PracticeMetrics};
+use crate::train::{Inbox, OnlineMetrics, OnlineTraining};
 
 /// Rows of the episodes; the first two are exactly the warm-up.
 const LENGTHS: [usize; 7] = [3, 2, 5, 5, 1, 9, 5];
@@ -45,21 +45,21 @@ fn episodes() -> Vec<Episode> {
     LENGTHS.map(episode).to_vec()
 }
 
-/// Practice whose first episodes have come.
-fn practice(recorded: &[Episode]) -> (Practice, Inbox) {
-    let metrics = PracticeMetrics::new(&prometheus::Registry::new()).unwrap();
+/// Online learning whose first episodes have come.
+fn online(recorded: &[Episode]) -> (OnlineTraining, Inbox) {
+    let metrics = OnlineMetrics::new(&prometheus::Registry::new()).unwrap();
     let (inbox, episodes) = mpsc::channel();
     for (number, episode) in (0..).zip(recorded) {
         inbox.send((number, episode.clone())).unwrap();
     }
     let transitions = Arc::new(transitions());
-    (Practice::new(&experiment(), transitions, episodes, metrics).unwrap(), inbox)
+    (OnlineTraining::new(&experiment(), transitions, episodes, metrics).unwrap(), inbox)
 }
 
 /// Trains from a gradient step to the end. Episodes come as late as they may. Returns the openings
 /// and the batches.
 fn train(
-    practice: &mut Practice,
+    online: &mut OnlineTraining,
     inbox: &Inbox,
     episodes: &[Episode],
     from: u64,
@@ -67,28 +67,28 @@ fn train(
     let (mut openings, mut batches, stop) = (Vec::new(), Vec::new(), AtomicBool::new(false));
     for step in from..experiment().total_steps() {
         loop {
-            for opening in practice.take_openings() {
+            for opening in online.take_openings() {
                 let number = opening.episode;
                 inbox.send((number, episodes[number as usize].clone())).unwrap();
                 openings.push(opening);
             }
-            if !practice.is_due(step) {
+            if !online.is_due(step) {
                 break;
             }
-            assert!(practice.absorb_next(&stop, &beat()).unwrap());
+            assert!(online.absorb_next(&stop, &beat()).unwrap());
         }
-        batches.push(practice.batch(step + 1).to_vec());
+        batches.push(online.batch(step + 1).to_vec());
     }
     (openings, batches)
 }
 
 #[test]
 fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
-    let (mut practice, inbox) = practice(&[]);
-    assert!(!practice.has_begun(BEGIN - 1) && practice.has_begun(BEGIN));
-    let stopped = practice.absorb_next(&AtomicBool::new(true), &beat());
+    let (mut online, inbox) = online(&[]);
+    assert!(!online.has_begun(BEGIN - 1) && online.has_begun(BEGIN));
+    let stopped = online.absorb_next(&AtomicBool::new(true), &beat());
     assert!(!stopped.unwrap(), "a wait can be ended");
-    let (openings, _) = train(&mut practice, &inbox, &episodes(), BEGIN);
+    let (openings, _) = train(&mut online, &inbox, &episodes(), BEGIN);
     let noise = Exploration::Policy { noise: 0.1 };
     // After 3, 5, 10, 15 and 16 rows, gradient steps 10, 10, 20, 30 and 32 are due.
     let expected = [
@@ -101,19 +101,19 @@ fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
         (6, 30, noise),
     ];
     let opening = |(episode, step, exploration)| {
-        let seed = practice_seed(0, episode);
+        let seed = online_seed(0, episode);
         Opening { episode, step, seed, exploration }
     };
     assert_eq!(openings, expected.map(opening));
 }
 
 #[test]
-fn practice_continues_from_any_step_as_if_it_had_not_stopped() {
+fn online_training_continues_from_any_step_as_if_it_had_not_stopped() {
     let episodes = episodes();
-    let (mut whole, inbox) = practice(&[]);
+    let (mut whole, inbox) = online(&[]);
     let (_, batches) = train(&mut whole, &inbox, &episodes, BEGIN);
     for from in BEGIN..experiment().total_steps() {
-        let (mut resumed, inbox) = practice(&episodes);
+        let (mut resumed, inbox) = online(&episodes);
         resumed.resume(from).unwrap();
         let rest = batches[(from - BEGIN) as usize..].to_vec();
         assert_eq!(
@@ -122,13 +122,13 @@ fn practice_continues_from_any_step_as_if_it_had_not_stopped() {
             "from step {from}"
         );
     }
-    let (mut resumed, _) = practice(&episodes[..1]);
+    let (mut resumed, _) = online(&episodes[..1]);
     assert!(resumed.resume(experiment().total_steps()).is_err(), "experience is missing");
 }
 
 #[test]
 fn an_episode_with_a_glitch_counts_as_one_without_rows_also_after_a_restart() {
-    let (mut sound, inbox) = practice(&[]);
+    let (mut sound, inbox) = online(&[]);
     let (_, expected) = train(&mut sound, &inbox, &episodes(), BEGIN);
     let mut glitch = episode(8);
     glitch.observations[40] = 1e30;
@@ -137,12 +137,12 @@ fn an_episode_with_a_glitch_counts_as_one_without_rows_also_after_a_restart() {
     let mut episodes = episodes();
     places.iter().for_each(|place| episodes.insert(*place, glitch.clone()));
 
-    let (mut whole, inbox) = practice(&[]);
+    let (mut whole, inbox) = online(&[]);
     let (openings, batches) = train(&mut whole, &inbox, &episodes, BEGIN);
     assert_eq!(batches, expected);
     assert_eq!(Vec::from_iter(openings.iter().map(|it| it.episode)), Vec::from_iter(0..11));
     for from in BEGIN..experiment().total_steps() {
-        let (mut resumed, inbox) = practice(&episodes);
+        let (mut resumed, inbox) = online(&episodes);
         resumed.resume(from).unwrap();
         let rest = expected[(from - BEGIN) as usize..].to_vec();
         assert_eq!(
@@ -155,11 +155,11 @@ fn an_episode_with_a_glitch_counts_as_one_without_rows_also_after_a_restart() {
 
 #[test]
 fn the_next_episode_is_waited_for_until_it_is_recorded() {
-    let (mut practice, inbox) = practice(&[]);
+    let (mut online, inbox) = online(&[]);
     for (number, awaited) in [(1, Some(0)), (0, None)] {
         inbox.send((number, episode(LENGTHS[number as usize]))).unwrap();
-        practice.take_openings();
-        assert_eq!(practice.awaited(), awaited);
+        online.take_openings();
+        assert_eq!(online.awaited(), awaited);
     }
 }
 
@@ -167,7 +167,7 @@ fn the_next_episode_is_waited_for_until_it_is_recorded() {
 fn a_line_of_metrics_has_the_return_of_the_newest_episode() {
     let mut played = episode(3);
     (played.score.episode_return, played.score.score) = (7.0, 3.0);
-    let (mut practice, _inbox) = practice(&[played]);
-    assert!(practice.absorb_next(&AtomicBool::new(false), &beat()).unwrap());
-    assert_eq!(practice.row()[1], ("practice_return", 7.0));
+    let (mut online, _inbox) = online(&[played]);
+    assert!(online.absorb_next(&AtomicBool::new(false), &beat()).unwrap());
+    assert_eq!(online.row()[1], ("online_return", 7.0));
 }

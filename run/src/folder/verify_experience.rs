@@ -1,10 +1,10 @@
-//! `learner verify` on a run with practice: what its experience promises.
+//! `learner verify` on an online run: what its experience promises.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use quad_dataset::environment;
-use quad_protocol::{Hash, practice_seed};
+use quad_protocol::{Hash, online_seed};
 
 use super::error::RunDirError;
 use super::experience::read_experience;
@@ -21,16 +21,15 @@ const IF_REPEATABLE: &str = "the run can be repeated bit for bit by evaluators w
 const LOGGED: &str = "the run can be repeated bit for bit from experience.log alone";
 
 /// Checks that each episode of a run's experience is there once and was played with the snapshot
-/// on disk. Also returns the promise that holds. `None` for a run without practice.
-pub fn practiced(path: &Path) -> Result<Option<(Findings, &'static str)>, RunDirError> {
+/// on disk. Also returns the promise that holds. `None` for an offline run.
+pub fn verify_experience(path: &Path) -> Result<Option<(Findings, &'static str)>, RunDirError> {
     let (dir, config) = RunDir::open(path)?;
     let experiment = &config.experiment;
     let Some(online) = &experiment.online else { return Ok(None) };
     let episodes = read_experience(path)?;
     let mut found = Findings { what: "environment steps are recorded", ..Findings::default() };
     let most = episodes.len() as u64 + u64::from(online.lag);
-    let numbers: BTreeMap<_, _> =
-        (0..most).map(|j| (practice_seed(experiment.seed, j), j)).collect();
+    let numbers: BTreeMap<_, _> = (0..most).map(|j| (online_seed(experiment.seed, j), j)).collect();
     let mut lengths = BTreeMap::new();
     for episode in &episodes {
         let seed = episode.score.seed;
