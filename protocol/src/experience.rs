@@ -183,7 +183,7 @@ mod tests {
             actions: vec![0.5, -0.5],
             rewards: vec![1.0, 2.0],
             interventions: vec![1],
-            ..Episode::new(3, Hash::of(b"weights"), Name::new("f32").unwrap(), 7)
+            ..Episode::new(3, Hash::new(b"weights"), Name::new("f32").unwrap(), 7)
         }
     }
 

@@ -10,7 +10,7 @@ pub struct Hash([u8; 32]);
 
 impl Hash {
     /// The hash of `bytes`.
-    pub fn of(bytes: &[u8]) -> Hash {
+    pub fn new(bytes: &[u8]) -> Hash {
         Hash(blake3::hash(bytes).into())
     }
 
@@ -40,6 +40,6 @@ mod tests {
     fn text_is_that_of_b3sum() {
         // printf abc | b3sum
         let text = "6437b3ac38465133ffb63b75273a8db548c558465d79db03fd359c6cd5bd9d85";
-        assert_eq!(Hash::of(b"abc").to_string(), text);
+        assert_eq!(Hash::new(b"abc").to_string(), text);
     }
 }

@@ -35,7 +35,7 @@ impl Message for Snapshot {
     const LIMIT: usize = LARGE;
 
     fn verify(&self) -> Result<(), CodecError> {
-        let (claimed, found) = (self.hash, Hash::of(&self.file));
+        let (claimed, found) = (self.hash, Hash::new(&self.file));
         if found == claimed { Ok(()) } else { Err(CodecError::Hash { claimed, found }) }
     }
 }

@@ -56,7 +56,7 @@ impl Table {
     }
 
     /// A table with a row for each item.
-    pub fn of<T>(items: &[T], columns: &[Column<T>]) -> Self {
+    pub fn from_rows<T>(items: &[T], columns: &[Column<T>]) -> Self {
         let header = columns.iter().map(|(name, alignment, _)| (*name, *alignment));
         let mut table = Self::new(&Vec::from_iter(header));
         for item in items {

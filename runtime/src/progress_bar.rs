@@ -16,35 +16,35 @@ pub struct ProgressBar {
     /// Hidden if stderr is no terminal.
     bar: indicatif::ProgressBar,
     /// The unit; `None` for bytes.
-    counted: Option<&'static str>,
+    unit: Option<&'static str>,
     last_line: Cell<Instant>,
 }
 
 impl ProgressBar {
     /// Progress in bytes, not shown yet.
-    pub fn of_bytes() -> Self {
-        Self::new(None)
+    pub fn bytes() -> Self {
+        let bar = indicatif::ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+        Self { bar, unit: None, last_line: Cell::new(Instant::now()) }
     }
 
     /// Progress in another unit, such as `transitions recorded`, not shown yet.
-    pub fn of(counted: &'static str) -> Self {
-        Self::new(Some(counted))
-    }
-
-    fn new(counted: Option<&'static str>) -> Self {
-        let bar = indicatif::ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
-        Self { bar, counted, last_line: Cell::new(Instant::now()) }
+    pub fn new(unit: &'static str) -> Self {
+        let mut progress = Self::bytes();
+        progress.unit = Some(unit);
+        progress
     }
 
     /// Starts, or starts again, with `position` of `length` done.
     pub fn start(&self, position: u64, length: u64) {
-        let figures = match self.counted {
+        let figures = match self.unit {
             None => "{bytes}/{total_bytes} at {bytes_per_sec}".to_owned(),
-            Some(counted) => format!("{{pos}}/{{len}} {counted}"),
+            Some(unit) => format!("{{pos}}/{{len}} {unit}"),
         };
         // Without our style the bar still works, but shows less.
         let template = format!("{{bar:40}} {figures}, {{eta}} left");
-        ProgressStyle::with_template(&template).into_iter().for_each(|it| self.bar.set_style(it));
+        if let Ok(style) = ProgressStyle::with_template(&template) {
+            self.bar.set_style(style);
+        }
         self.bar.set_length(length);
         self.bar.set_position(position);
         self.bar.reset_eta();
@@ -58,8 +58,8 @@ impl ProgressBar {
         }
         self.last_line.set(Instant::now());
         let length = self.bar.length().unwrap_or(position);
-        match self.counted {
-            Some(counted) => info!("{position} of {length} {counted}"),
+        match self.unit {
+            Some(unit) => info!("{position} of {length} {unit}"),
             None => {
                 let rate = HumanBytes(self.bar.per_sec() as u64);
                 info!("{} of {} at {rate}/s", HumanBytes(position), HumanBytes(length));

@@ -49,7 +49,7 @@ pub fn report(run: &Name, step: u64, seed: u64) -> ScoreReport {
         incarnation: 1,
         job: 1,
         step,
-        weights: Hash::of(b"guessed"),
+        weights: Hash::new(b"guessed"),
         precision: name("f32"),
         episodes: vec![EpisodeScore { seed, episode_return: f64::NAN, length: 0, score: f64::NAN }],
     }
@@ -122,7 +122,7 @@ pub async fn deliver_experience(session: &Session, job: &Job, evaluator: &str) -
         incarnation: job.incarnation,
         job: job.id,
         seed: job.seeds[0],
-        hash: Hash::of(&frame),
+        hash: Hash::new(&frame),
         length: frame.len() as u32,
         offset: 0,
         bytes: Vec::new(),

@@ -82,7 +82,7 @@ impl Owed {
             incarnation: job.incarnation,
             job: job.id,
             seed: episode.score.seed,
-            hash: Hash::of(&frame),
+            hash: Hash::new(&frame),
             length: frame.len() as u32,
             offset: 0,
             bytes: Vec::new(),

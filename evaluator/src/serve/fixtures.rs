@@ -20,7 +20,7 @@ pub fn job() -> Job {
         run: Name::new("run").unwrap(),
         incarnation: 1,
         step: 1,
-        weights: Hash::of(b""),
+        weights: Hash::new(b""),
         environment: "hopper".to_owned(),
         environment_seed: 1,
         seeds: vec![1, 2],
@@ -30,7 +30,7 @@ pub fn job() -> Job {
 }
 
 pub fn snapshot(file: Vec<u8>) -> Snapshot {
-    Snapshot { run: job().run, incarnation: 1, step: 1, hash: Hash::of(&file), file }
+    Snapshot { run: job().run, incarnation: 1, step: 1, hash: Hash::new(&file), file }
 }
 
 /// A diffusion policy for Hopper of the smallest size.

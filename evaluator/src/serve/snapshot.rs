@@ -176,14 +176,14 @@ mod tests {
         let snapshots = Snapshots::default();
         let run = (0, job().run);
         snapshots.keep(&run, snapshot(b"policy".to_vec()));
-        let named = Job { weights: Hash::of(b"policy"), ..job() };
+        let named = Job { weights: Hash::new(b"policy"), ..job() };
         assert!(snapshots.get(&run, &named).is_some());
         assert!(snapshots.get(&(1, job().run), &named).is_none());
         let others: [fn(&mut Job); 4] = [
             |job| job.run = Name::new("other").unwrap(),
             |job| job.incarnation = 2,
             |job| job.step = 8,
-            |job| job.weights = Hash::of(b"others"),
+            |job| job.weights = Hash::new(b"others"),
         ];
         for change in others {
             let mut other = named.clone();

@@ -110,7 +110,7 @@ pub fn name(text: &str) -> Name {
 }
 
 pub fn snapshot(file: Vec<u8>) -> Snapshot {
-    Snapshot { run: name("run"), incarnation: INCARNATION, step: 10, hash: Hash::of(&file), file }
+    Snapshot { run: name("run"), incarnation: INCARNATION, step: 10, hash: Hash::new(&file), file }
 }
 
 pub fn job(snapshot: &Snapshot) -> Job {

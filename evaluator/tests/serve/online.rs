@@ -18,7 +18,7 @@ impl State {
             self.frame.clear();
         }
         let whole = self.frame.len() == length;
-        assert!(!whole || Hash::of(&self.frame) == piece.hash);
+        assert!(!whole || Hash::new(&self.frame) == piece.hash);
         let (offset, reason) = (self.frame.len() as u32, "its rewards are too good".to_owned());
         match self.behavior {
             Behavior::Silent => None,

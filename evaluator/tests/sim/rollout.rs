@@ -188,7 +188,7 @@ impl Environment for Scripted {
 
 #[test]
 fn a_recorded_episode_is_what_was_observed_and_done() {
-    let weights = Hash::of(b"weights");
+    let weights = Hash::new(b"weights");
     let play = |seeds: &[u64]| {
         let make = || Ok(Box::new(Scripted::default()) as Box<dyn Environment>);
         let rollout = Rollout::new(make, (2, 1), seeds, |_| ()).unwrap();
@@ -296,7 +296,7 @@ fn diverge(environment: Diverging, online: bool) -> Result<Option<Episode>, Envi
     let make = || Ok(Box::new(environment) as Box<dyn Environment>);
     let mut rollout = Rollout::new(make, (2, 1), &[7], |_| ())?;
     if online {
-        rollout = rollout.recording(0, Hash::of(b""), &Name::new("f32").unwrap());
+        rollout = rollout.recording(0, Hash::new(b""), &Name::new("f32").unwrap());
     }
     while !rollout.is_done() {
         rollout.step(|_, _, _| Ok::<_, EnvironmentError>(()))?;
@@ -341,7 +341,7 @@ fn an_online_episode_ends_before_a_step_that_cannot_be_learned_from() {
 fn an_episode_has_the_actions_that_were_taken() {
     let make = || Simulations.make("hopper", 0);
     let mut rollout = Rollout::new(make, (11, 3), &[7], |_| ()).unwrap();
-    rollout = rollout.recording(0, Hash::of(b""), &Name::new("f32").unwrap());
+    rollout = rollout.recording(0, Hash::new(b""), &Name::new("f32").unwrap());
     while !rollout.is_done() {
         let act = |actions: &mut [f32]| actions.copy_from_slice(&[1.5, -0.25, -2.0]);
         let step = |_: &[f32], _: &mut [_], actions: &mut [f32]| {

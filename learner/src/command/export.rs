@@ -44,7 +44,7 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let path = folder.snapshot_path(step);
     let (header, tensors) = read()
         .map_err(|error: PolicyError| anyhow!("{} is not a policy: {error}", path.display()))?;
-    let weights = Hash::of(&file).to_string();
+    let weights = Hash::new(&file).to_string();
     let mut scored = lines.iter().filter(|line| line.step == step);
     if scored.any(|line| line.weights != weights) {
         warn!(
@@ -141,7 +141,7 @@ mod tests {
         let (mut log, _) = folder.experience_log().unwrap();
         for (number, episode_return) in [(1, 20.0), (0, 10.0), (2, 90.0)] {
             let (seed, precision) = (online_seed(3, number), Name::new("f32").unwrap());
-            let played = Episode::new(20, Hash::of(b""), precision, seed);
+            let played = Episode::new(20, Hash::new(b""), precision, seed);
             let episode = Episode {
                 score: EpisodeScore { episode_return, length: 3, ..played.score },
                 observations: vec![0.0; 4],

@@ -61,7 +61,7 @@ fn preset(config: &RunConfig, changes: Table) -> anyhow::Result<Preset> {
     // A share of 0 is not in the table, but the task may have another.
     own.insert("hold_out".to_owned(), config.experiment.hold_out.into());
     own.extend(changes);
-    Preset::of_run(config, own).hint_of(ConfigError::hint)
+    Preset::from_run(config, own).hint_of(ConfigError::hint)
 }
 
 impl EarlierRun {
@@ -88,7 +88,7 @@ impl EarlierRun {
             let hint = "let it end first: `learner train` with its settings continues it";
             return Err(hinted(error, hint));
         }
-        let hash = Hash::of(&checkpoint.state).to_string();
+        let hash = Hash::new(&checkpoint.state).to_string();
         let preset = preset(&config, Table::from_iter([("from".to_owned(), hash.into())]))?;
         let (experiment, dataset_sha256) = (config.experiment, config.dataset.sha256);
         let held_out = config.dataset.held_out;

@@ -57,7 +57,7 @@ impl Fetcher {
         }
         fs::create_dir_all(folder).map_err(local)?;
         let mut partial = Partial::open(&path).map_err(local)?;
-        let progress = ProgressBar::of_bytes();
+        let progress = ProgressBar::bytes();
         let mut refusals = String::new();
         for address in self.addresses(dataset) {
             let shown = without_password(&address);

@@ -63,7 +63,7 @@ pub(crate) fn judge(
         forecast(&evaluation, &remaining)?;
         judge_all(&evaluation, &remaining, &conditions, &mut judgments)?;
     }
-    Ranking::of(judgments).pop().context("nothing is judged")
+    Ranking::from_judgments(judgments).pop().context("nothing is judged")
 }
 
 fn judge_all(

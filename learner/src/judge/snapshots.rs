@@ -98,7 +98,7 @@ impl Snapshot {
         Ok(Self {
             caveat: caveat(&chunk),
             step,
-            weights: Hash::of(&file).to_string(),
+            weights: Hash::new(&file).to_string(),
             policy,
             held_out: config.dataset.held_out.iter().copied().collect(),
             config,

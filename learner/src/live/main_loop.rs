@@ -225,7 +225,7 @@ fn report(event: Event, display: &mut Display) {
         }
         Event::Evaluated { step, scores } => {
             let scores = Vec::from_iter(scores.iter().map(|score| score.score));
-            let Some(Spread { mean, std, .. }) = Spread::of(&scores) else { return };
+            let Some(Spread { mean, std, .. }) = Spread::new(&scores) else { return };
             display.scored(step, mean);
             let std = std.map(|std| format!(" ± {std:.2}")).unwrap_or_default();
             let episodes = counted(scores.len(), "episode");

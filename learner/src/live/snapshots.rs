@@ -78,7 +78,7 @@ impl Snapshots {
     /// Writes a snapshot, then opens its evaluation and publishes it.
     fn snapshot(&mut self, trained: &TrainedPolicy) -> anyhow::Result<()> {
         let &TrainedPolicy { step, ref file, evaluate, online } = trained;
-        let hash = Hash::of(file);
+        let hash = Hash::new(file);
         let metrics = &self.carrier.metrics.evaluation;
         metrics.snapshot_bytes.set(file.len() as i64);
         match self.known.get(&step) {

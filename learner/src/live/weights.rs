@@ -68,7 +68,7 @@ impl Weights {
 
     fn read(&self, step: u64, hash: Hash) -> anyhow::Result<ZBytes> {
         let file = self.run_dir.read_snapshot(step)?;
-        anyhow::ensure!(Hash::of(&file) == hash, "the file was changed");
+        anyhow::ensure!(Hash::new(&file) == hash, "the file was changed");
         self.message(step, hash, file)
     }
 

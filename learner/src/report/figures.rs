@@ -174,7 +174,7 @@ fn over_on_task(axis: Axis, task: &str, groups: &[&GroupReport]) -> Plot {
     let key = format!("agent.{}", axis.key);
     let mut by_settings: BTreeMap<Settings, Vec<(f64, &GroupReport)>> = BTreeMap::new();
     for group in groups.iter().filter(|group| !group.scores.is_empty()) {
-        let mut others = settings::of_run(&group.runs[0].config);
+        let mut others = settings::from_run(&group.runs[0].config);
         others.remove("seed");
         if let Some(value) = others.remove(&key).and_then(|value| value.parse().ok()) {
             by_settings.entry(others).or_default().push((value, group));

@@ -131,13 +131,13 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     let (scored, unscored): (Vec<_>, Vec<_>) =
         runs.iter().partition(|run| run.reached() != Some(0));
     for run in scored.into_iter().chain(unscored) {
-        let mut settings = settings::of_run(&run.config);
+        let mut settings = settings::from_run(&run.config);
         settings.remove("seed");
         if let Some(group) = groups.iter_mut().find(|group| group.fits(run, &settings)) {
             group.runs.push(run);
             continue;
         }
-        let preset = as_given(run, true).map(|given| settings::of_experiment(&given));
+        let preset = as_given(run, true).map(|given| settings::from_experiment(&given));
         groups.push(Group {
             variant: [&run.algorithm, &run.variant],
             settings,
@@ -205,7 +205,7 @@ fn report(
     let values = |value: fn(&RunReport) -> Option<f64>| -> Option<Vec<f64>> {
         counted.iter().map(|run| value(run)).collect()
     };
-    let spread = |value| Spread::of(&values(value)?);
+    let spread = |value| Spread::new(&values(value)?);
     let best = |run: &RunReport| run.best().map(|best| best.score.mean);
     let scores = match select {
         Select::Last => values(RunReport::score),

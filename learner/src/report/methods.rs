@@ -191,7 +191,7 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Block
             "No interval for {method}: of a single seed in a task, the spread is not known.\n"
         );
     }
-    let table = Table::of(
+    let table = Table::from_rows(
         methods,
         &[
             ("method", Left, |it| it.method.clone()),
@@ -215,7 +215,7 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Block
          scores more than one of the other.\n",
         comparisons.len()
     )));
-    blocks.push(Block::Table(Table::of(
+    blocks.push(Block::Table(Table::from_rows(
         comparisons,
         &[
             ("method", Left, |it| it.method.clone()),

@@ -94,7 +94,7 @@ impl Footnotes {
             self.ours.push(note);
             self.ours.len() - 1
         });
-        let score = Spread::of(&group.scores).map_or("-".to_owned(), Spread::text_of_both);
+        let score = Spread::new(&group.scores).map_or("-".to_owned(), Spread::text_with_population);
         format!("{score} [{}]", index + 1)
     }
 

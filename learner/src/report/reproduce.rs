@@ -31,7 +31,7 @@ pub fn command(run: &RunReport) -> Option<String> {
     }
     // What follows from experience is compared with the online values.
     let played = online_values(experiment, &run.config.run.task).ok()?;
-    let [ours, theirs, played] = [experiment, &preset, &played].map(settings::of_experiment);
+    let [ours, theirs, played] = [experiment, &preset, &played].map(settings::from_experiment);
     let keys = differences(&ours, &theirs).chain(differences(&ours, &played));
     for key in keys.collect::<BTreeSet<_>>() {
         match (key.as_str(), ours.get(key)) {

@@ -97,7 +97,7 @@ impl Report {
         let missing = |it: &String| format!("Not in this report: {it}.\n");
         blocks.extend(paragraph(self.unreadable.iter().map(missing).collect()));
         let judgments = self.runs.iter().flat_map(|run| &run.judgments);
-        blocks.extend(Ranking::of(judgments.cloned()).iter().flat_map(Ranking::blocks));
+        blocks.extend(Ranking::from_judgments(judgments.cloned()).iter().flat_map(Ranking::blocks));
         for name in all_tables() {
             blocks.extend(published::table(name, &self.groups, self.select));
         }
@@ -116,7 +116,7 @@ impl Report {
 
     fn over_seeds(&self) -> [Block; 2] {
         fn spread(value: Option<Spread>) -> String {
-            value.map_or("-".to_owned(), Spread::text_of_both)
+            value.map_or("-".to_owned(), Spread::text_with_population)
         }
         let mut columns: Vec<Column<GroupReport>> = vec![
             ("task", Left, |it| it.task.clone()),
@@ -142,7 +142,7 @@ impl Report {
         let differs = "what differs from other runs of the task and algorithm";
         columns.push((differs, Left, |it| it.differs.join(", ")));
         let title = "Over seeds: mean ± standard deviation of the runs, divided by n - 1 (in parentheses: by n).\n";
-        let table = Table::of(&self.groups, &columns);
+        let table = Table::from_rows(&self.groups, &columns);
         [Block::Text(title.to_owned()), Block::Table(table)]
     }
 

@@ -122,7 +122,7 @@ pub struct Frame<Q> {
 impl<Q> Frame<Q> {
     /// Verifies the claimed hash, and decodes the episode.
     pub fn decode(&self) -> Result<Box<Episode>, CodecError> {
-        let found = Hash::of(&self.bytes);
+        let found = Hash::new(&self.bytes);
         if found != self.hash {
             return Err(CodecError::Hash { claimed: self.hash, found });
         }

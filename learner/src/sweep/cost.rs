@@ -95,7 +95,7 @@ impl StudyCost {
 
 /// Key of runs that cost the same: all settings but the seed.
 fn configuration(run: &PlannedRun) -> String {
-    let mut settings = settings::of_experiment(&run.experiment);
+    let mut settings = settings::from_experiment(&run.experiment);
     settings.remove("seed");
     format!("{settings:?} {:?}", run.source)
 }

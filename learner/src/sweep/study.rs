@@ -91,14 +91,14 @@ impl PlannedRun {
             }
         };
         let existing = &report.config.experiment;
-        let [old, new] = [existing, &self.experiment].map(settings::of_experiment);
+        let [old, new] = [existing, &self.experiment].map(settings::from_experiment);
         let differences = settings::differences(&old, &new).map(String::as_str);
         let mut differences = Vec::from_iter(differences);
         if existing.dataset != self.experiment.dataset {
             differences.push("dataset");
         }
         if differences.is_empty() {
-            return Ok(State::of(&report)?);
+            return Ok(State::from_report(&report)?);
         }
         let (path, keys) = (dir.display(), differences.join(", "));
         Err(anyhow!("{path} has a run of other settings than the study's: {keys}")).hint(

@@ -24,7 +24,7 @@ fn train(folder: &Path) -> (RunDir, String) {
     ));
     let run = RunDir::at(&run);
     fs::copy(run.snapshot_path(10), run.snapshot_path(5)).unwrap();
-    let weights = Hash::of(&run.read_snapshot(10).unwrap()).to_string();
+    let weights = Hash::new(&run.read_snapshot(10).unwrap()).to_string();
     (run, weights)
 }
 

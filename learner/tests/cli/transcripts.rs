@@ -287,7 +287,7 @@ fn write_verified() {
         let mut run = Run::new("hopper-demo", 4).sizes(15, 10, 3);
         for step in [10, 15] {
             for seed in episode_seeds(4, step, 3) {
-                run.score(step, seed, 1.5, &Hash::of(&[step as u8; 100]).to_string());
+                run.score(step, seed, 1.5, &Hash::new(&[step as u8; 100]).to_string());
             }
         }
         change(&mut run.scores);
@@ -302,7 +302,7 @@ fn write_verified() {
         Run::new("hopper-demo", 4).sizes(15, 0, 3).write(format!("verify/{name}"));
         let mut snapshot = [7; 100];
         if name.starts_with("judged") {
-            let weights = Hash::of(&snapshot).to_string();
+            let weights = Hash::new(&snapshot).to_string();
             judge(&RunDir::at(Path::new("verify").join(name).as_path()), 15, 1.0, &weights);
         }
         snapshot[50] ^= u8::from(name.ends_with("flipped"));
@@ -336,7 +336,7 @@ fn write_online_runs() {
             actions: smooth(length as usize * 3, 1.3),
             rewards: smooth(length as usize, 0.1),
             interventions: if number == 0 { vec![3, 4] } else { Vec::new() },
-            ..Episode::new(20_000, Hash::of(b"weights"), precision, seed)
+            ..Episode::new(20_000, Hash::new(b"weights"), precision, seed)
         };
         log.append([&*encode(&episode).unwrap()]).unwrap();
     }
@@ -347,7 +347,7 @@ fn write_online_runs() {
     let (actions, rewards) = (vec![0.5; 3], vec![1.0]);
     let precision = Name::new("f32").unwrap();
     let empty =
-        Episode { score, actions, rewards, ..Episode::new(20, Hash::of(b""), precision, 0) };
+        Episode { score, actions, rewards, ..Episode::new(20, Hash::new(b""), precision, 0) };
     log.append([&*encode(&empty).unwrap()]).unwrap();
 }
 

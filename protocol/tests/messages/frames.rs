@@ -47,7 +47,7 @@ fn name() -> Name {
 
 /// A snapshot with this file.
 pub fn snapshot(file: Vec<u8>) -> Snapshot {
-    Snapshot { run: name(), incarnation: 1, step: 2, hash: Hash::of(&file), file }
+    Snapshot { run: name(), incarnation: 1, step: 2, hash: Hash::new(&file), file }
 }
 
 /// Checks one message of each kind and variant, with all fields filled.

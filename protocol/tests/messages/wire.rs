@@ -67,7 +67,7 @@ fn a_file_with_another_hash_is_refused() {
     let first = frame.len() - message.file.len();
     for bit in 0..8 * message.file.len() {
         let frame = flipped(&frame, first + bit / 8, bit % 8);
-        let (claimed, found) = (message.hash, Hash::of(&frame[first..]));
+        let (claimed, found) = (message.hash, Hash::new(&frame[first..]));
         assert_eq!(decode::<Snapshot>(&frame), Err(CodecError::Hash { claimed, found }));
     }
 }

@@ -52,7 +52,7 @@ impl Preset {
     }
 
     /// The settings of a run, as `own` keys.
-    pub fn of_run(config: &RunConfig, own: Table) -> Result<Self, ConfigError> {
+    pub fn from_run(config: &RunConfig, own: Table) -> Result<Self, ConfigError> {
         let label = format!("{}-online", config.run.name);
         Ok(Self { label, task: tasks::named(&config.run.task).ok(), own })
     }

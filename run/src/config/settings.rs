@@ -12,8 +12,8 @@ use super::tables;
 pub type Settings = BTreeMap<String, String>;
 
 /// All settings that decide the outcome of a run.
-pub fn of_run(config: &RunConfig) -> Settings {
-    let mut settings = of_experiment(&config.experiment);
+pub fn from_run(config: &RunConfig) -> Settings {
+    let mut settings = from_experiment(&config.experiment);
     let mut dataset = flat(&config.dataset);
     // The path says nothing; a known hash says everything.
     dataset.remove("path");
@@ -28,7 +28,7 @@ pub fn of_run(config: &RunConfig) -> Settings {
 }
 
 /// The settings of an experiment, without the dataset.
-pub fn of_experiment(experiment: &Experiment) -> Settings {
+pub fn from_experiment(experiment: &Experiment) -> Settings {
     let mut settings = flat(experiment);
     settings.remove("dataset");
     settings

@@ -93,7 +93,7 @@ impl Checkpoints {
 }
 
 fn file_name(Checkpoint { step, state }: &Checkpoint) -> String {
-    let hash = Hash::of(state).to_string();
+    let hash = Hash::new(state).to_string();
     format!("step_{step:09}_{}{SUFFIX}", &hash[..16])
 }
 

@@ -33,7 +33,7 @@ impl ExperienceLog {
     ) -> Result<(), RunDirError> {
         let mut bytes = Vec::new();
         for frame in frames {
-            let hash = *Hash::of(frame).bytes();
+            let hash = *Hash::new(frame).bytes();
             let stored = if bytes.is_empty() { hash } else { inverted(hash) };
             bytes.extend((frame.len() as u32).to_le_bytes());
             bytes.extend(stored);
@@ -108,7 +108,7 @@ fn next(reader: &mut impl Read) -> io::Result<Option<(Hash, Vec<u8>, bool)>> {
     let [a, b, c, d, ..] = begin;
     let length = u32::from_le_bytes([a, b, c, d]) as usize;
     reader.take(length.saturating_sub(BEGIN.len()) as u64).read_to_end(&mut frame)?;
-    let hash = Hash::of(&frame);
+    let hash = Hash::new(&frame);
     let stored = &begin[4..HEADER];
     let begins = hash.bytes() == stored;
     let is_complete = frame.len() == length && (begins || inverted(*hash.bytes()) == stored);

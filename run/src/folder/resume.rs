@@ -68,7 +68,7 @@ impl ExistingRun {
     /// Checks that the run has the settings of `config`, unless it is to be set aside.
     pub fn check_same_config(&self, config: &RunConfig) -> Result<(), RunDirError> {
         let Some(begun) = &self.config else { return Ok(()) };
-        let (old, new) = (settings::of_run(begun), settings::of_run(config));
+        let (old, new) = (settings::from_run(begun), settings::from_run(config));
         let line = |key: &String| {
             let [old, new] =
                 [&old, &new].map(|side| side.get(key).map_or("not set", String::as_str));
@@ -142,7 +142,7 @@ impl ResumePoint {
                 scored.is_some_and(|scored| scored.weights != hash.to_string())
                     || played.iter().any(|(step, _)| *step == at) && !played.contains(&(at, *hash))
             };
-            match dir.read_snapshot(at).map(|file| Hash::of(&file)) {
+            match dir.read_snapshot(at).map(|file| Hash::new(&file)) {
                 Ok(hash) if is_other(&hash) => {
                     warn!(
                         "the snapshot of step {at} is not the one that was scored or that has learned online: its file is damaged"

@@ -144,7 +144,7 @@ fn named((step, seed): (u64, u64)) -> String {
 }
 
 fn hash(dir: &RunDir, step: u64) -> Result<Hash, RunDirError> {
-    Ok(Hash::of(&dir.read_snapshot(step)?))
+    Ok(Hash::new(&dir.read_snapshot(step)?))
 }
 
 /// Compares the scores and the snapshots of a run with those of another run of the same
@@ -155,7 +155,7 @@ pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> 
     let by_key = |lines: Vec<ScoreLine>| BTreeMap::from_iter(lines.into_iter().map(with_key));
     let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
     let mut found = Findings::new("episodes are compared", ours.len() as u64);
-    let [a, b] = [&config, &other_config].map(settings::of_run);
+    let [a, b] = [&config, &other_config].map(settings::from_run);
     for key in settings::differences_in_brief(&a, &b) {
         found.add("settings that differ", key.clone());
     }

@@ -55,7 +55,7 @@ pub fn verify_experience(path: &Path) -> Result<Option<(Findings, &'static str)>
     let arithmetic = BTreeSet::from_iter(episodes.iter().map(|it| &it.precision));
     let acted = BTreeSet::from_iter(episodes.iter().map(|it| (it.step, it.weights)));
     let is_same = |(step, weights): &(u64, Hash)| {
-        dir.read_snapshot(*step).map_or(true, |file| Hash::of(&file) == *weights)
+        dir.read_snapshot(*step).map_or(true, |file| Hash::new(&file) == *weights)
     };
     let is_repeatable = arithmetic.len() <= 1
         && episodes.iter().all(|it| it.interventions.is_empty())

@@ -65,7 +65,7 @@ pub fn as_given(run: &RunReport, of_variant: bool) -> Result<Experiment, ConfigE
 }
 
 fn without_seed(experiment: &Experiment) -> Settings {
-    let mut settings = settings::of_experiment(experiment);
+    let mut settings = settings::from_experiment(experiment);
     settings.remove("seed");
     settings
 }

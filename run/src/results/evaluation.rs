@@ -44,7 +44,7 @@ impl EvaluationReport {
             environment_steps: experiment.environment_steps(step),
             episodes: episodes.len(),
             complete: episodes.len() == experiment.episodes as usize,
-            score: Spread::of(&values(|line| line.score))?,
+            score: Spread::new(&values(|line| line.score))?,
             mean_return: mean(&values(|line| line.episode_return)),
             mean_length: mean(&values(|line| line.length.into())),
         })

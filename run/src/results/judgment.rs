@@ -43,7 +43,7 @@ pub struct Estimate {
 impl Estimate {
     /// Spread over the seeds; `None` for an unreliable estimate.
     fn spread(&self) -> Option<Spread> {
-        Spread::of(&self.values).filter(|_| self.doubts.is_empty())
+        Spread::new(&self.values).filter(|_| self.doubts.is_empty())
     }
 }
 
@@ -134,7 +134,7 @@ pub struct Ranking {
 
 impl Ranking {
     /// A ranking for each set of conditions.
-    pub fn of(judgments: impl IntoIterator<Item = Judgment>) -> Vec<Self> {
+    pub fn from_judgments(judgments: impl IntoIterator<Item = Judgment>) -> Vec<Self> {
         let mut groups: Vec<Vec<Judgment>> = Vec::new();
         for judgment in judgments {
             match groups.iter_mut().find(|group| group[0].conditions == judgment.conditions) {
@@ -142,10 +142,10 @@ impl Ranking {
                 None => groups.push(vec![judgment]),
             }
         }
-        groups.into_iter().map(Self::of_group).collect()
+        groups.into_iter().map(Self::from_group).collect()
     }
 
-    fn of_group(mut policies: Vec<Judgment>) -> Self {
+    fn from_group(mut policies: Vec<Judgment>) -> Self {
         let spread = |judgment: &Judgment| judgment.estimate.spread();
         let value =
             |judgment: &Judgment| spread(judgment).map_or(f64::NEG_INFINITY, |spread| spread.mean);

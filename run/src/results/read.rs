@@ -59,7 +59,7 @@ impl RunReport {
         let counted = Vec::from_iter(evaluations.iter().filter(|it| it.counts()));
         let mean = |evaluations: &[&EvaluationReport]| {
             let scores = Vec::from_iter(evaluations.iter().map(|e| e.score.mean));
-            Spread::of(&scores).map(|spread| spread.mean)
+            Spread::new(&scores).map(|spread| spread.mean)
         };
         let last = |count: usize| mean(&counted[counted.len().checked_sub(count)?..]);
         let begins = experiment.online_begins().unwrap_or(0);

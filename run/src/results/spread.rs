@@ -17,7 +17,7 @@ pub struct Spread {
 
 impl Spread {
     /// Spread of some values; `None` without any.
-    pub fn of(values: &[f64]) -> Option<Self> {
+    pub fn new(values: &[f64]) -> Option<Self> {
         if values.is_empty() {
             return None;
         }
@@ -34,7 +34,7 @@ impl Spread {
     }
 
     /// `mean ± std (std)`, by n - 1 and by n.
-    pub fn text_of_both(self) -> String {
+    pub fn text_with_population(self) -> String {
         let population = self.population_std.map(|std| format!(" ({std:.2})"));
         self.text() + &population.unwrap_or_default()
     }

@@ -95,7 +95,7 @@ impl Entry {
 impl Listed {
     fn read(dir: &Path) -> Result<Self, RunDirError> {
         let report = RunReport::scored(dir)?;
-        let (state, newest) = (State::of(&report)?, report.newest());
+        let (state, newest) = (State::from_report(&report)?, report.newest());
         let mut method = report.algorithm.clone();
         if report.variant != method {
             method += &format!(", {}", report.variant);

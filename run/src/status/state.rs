@@ -30,7 +30,7 @@ pub enum State {
 
 impl State {
     /// State of the run of a report.
-    pub fn of(report: &RunReport) -> Result<Self, RunDirError> {
+    pub fn from_report(report: &RunReport) -> Result<Self, RunDirError> {
         let (dir, experiment) = (RunDir::at(&report.dir), &report.config.experiment);
         let last = experiment.total_steps();
         // All checkpoints of a complete run may be deleted.

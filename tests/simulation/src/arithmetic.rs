@@ -21,7 +21,7 @@ pub fn mix(a: u64, b: u64) -> u64 {
 
 /// The snapshot after a gradient step.
 pub fn snapshot(step: u64, digest: u64) -> Hash {
-    Hash::of(&mix(step, digest).to_le_bytes())
+    Hash::new(&mix(step, digest).to_le_bytes())
 }
 
 fn number(hash: &Hash) -> u64 {

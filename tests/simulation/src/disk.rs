@@ -59,7 +59,7 @@ impl Disk {
         let mut episodes = HashMap::new();
         for frame in &self.experience {
             let episode: Episode = decode(frame).map_err(|error| error.to_string())?;
-            if episodes.insert(episode.score.seed, (Hash::of(frame), episode)).is_some() {
+            if episodes.insert(episode.score.seed, (Hash::new(frame), episode)).is_some() {
                 return Err("an online episode is recorded twice".to_owned());
             }
         }

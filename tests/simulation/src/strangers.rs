@@ -44,7 +44,7 @@ pub fn query(world: &mut World) -> Query {
                 incarnation,
                 job,
                 step,
-                weights: weights.unwrap_or_else(|| Hash::of(b"guessed")),
+                weights: weights.unwrap_or_else(|| Hash::new(b"guessed")),
                 precision: precision(0),
                 episodes: seeds.into_iter().map(score).collect(),
             })
@@ -55,7 +55,7 @@ pub fn query(world: &mut World) -> Query {
             let offset = rng.random_range(0..=length - bytes.len() as u32);
             let whole = rng.random_bool(0.5);
             let length = if whole { bytes.len() as u32 } else { length };
-            let hash = if whole { Hash::of(&bytes) } else { Hash::of(b"guessed") };
+            let hash = if whole { Hash::new(&bytes) } else { Hash::new(b"guessed") };
             let seed = online_seed(0, rng.random_range(0..6));
             let offset = if whole { 0 } else { offset };
             let run = name("run");

@@ -91,7 +91,7 @@ impl Training {
         let Some(schedule) = &mut self.schedule else { return false };
         let Some(episode) = self.inbox.remove(&schedule.next_episode()) else { return false };
         let frame = encode(&episode).expect("it was encoded before");
-        let [a, b, c, d, e, f, g, h, ..] = *Hash::of(&frame).bytes();
+        let [a, b, c, d, e, f, g, h, ..] = *Hash::new(&frame).bytes();
         self.buffer = mix(self.buffer, u64::from_le_bytes([a, b, c, d, e, f, g, h]));
         schedule.absorb(episode.rewards.len() as u64);
         true

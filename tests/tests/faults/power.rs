@@ -100,7 +100,7 @@ impl System {
         for (step, seed, weights) in left {
             let snapshot = fs::read(learner.snapshot(step)).unwrap_or_default();
             assert_eq!(
-                Hash::of(&snapshot).to_string(),
+                Hash::new(&snapshot).to_string(),
                 weights,
                 "the snapshot of step {step}, scored with seed {seed}"
             );

@@ -126,7 +126,7 @@ fn other_weights_for_a_scored_step_end_the_run() {
     *bytes.last_mut().unwrap() ^= 1;
     fs::write(&snapshot, &bytes).unwrap();
     let log = learner.run_dir.join("scores.jsonl");
-    let weights = Hash::of(&bytes).to_string();
+    let weights = Hash::new(&bytes).to_string();
     fs::write(&log, fs::read_to_string(&log).unwrap().replace(&first.weights, &weights)).unwrap();
     let mut learner = scratch.learner("run", LONG);
     learner.process.assert_ends(1, PATIENCE);

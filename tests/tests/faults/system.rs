@@ -190,7 +190,7 @@ impl System {
             incarnation: 1,
             job: 1,
             step,
-            weights: Hash::of(&fs::read(self.learner.snapshot(step)).unwrap()),
+            weights: Hash::new(&fs::read(self.learner.snapshot(step)).unwrap()),
             precision: name(&last.precision),
             episodes: episodes.collect(),
         };

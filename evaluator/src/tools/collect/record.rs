@@ -41,7 +41,7 @@ pub fn record(
     let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
     let mut scores = Vec::new();
     let mut simulated = 0;
-    let progress = ProgressBar::of("transitions recorded");
+    let progress = ProgressBar::new("transitions recorded");
     progress.start(0, transitions as u64);
     loop {
         // An episode beyond the end of the highest unfilled band is useless.

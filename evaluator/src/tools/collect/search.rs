@@ -40,7 +40,7 @@ pub fn train(
     random: impl Fn(u64) -> ChaCha8Rng,
 ) -> Result<Vec<LinearPolicy>, EnvironmentError> {
     let mut policies = Vec::new();
-    let progress = ProgressBar::of("steps of training");
+    let progress = ProgressBar::new("steps of training");
     let searches = recipe.searches;
     let steps = recipe.steps_per_transition * (transitions as u64).min(MAX_TRANSITIONS) / searches;
     progress.start(0, searches * steps);

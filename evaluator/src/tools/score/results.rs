@@ -39,7 +39,7 @@ impl Scored {
     /// Spread of the normalized scores.
     pub fn spread(&self) -> Option<Spread> {
         let scores = self.episodes.iter().map(|episode| episode.score);
-        Spread::of(&Vec::from_iter(scores))
+        Spread::new(&Vec::from_iter(scores))
     }
 }
 
@@ -82,7 +82,7 @@ pub fn table(scored: &[Scored]) -> String {
             let with_it = scored.iter().filter(|scored| scored.title() == *title);
             let means = Vec::from_iter(with_it.filter_map(|scored| Some(scored.spread()?.mean)));
             // A mean over fewer snapshots would be another number than the others in the row.
-            text(Spread::of(&means).filter(|_| means.len() == snapshots.len()))
+            text(Spread::new(&means).filter(|_| means.len() == snapshots.len()))
         }));
         table.push(row);
         note.push_str("; in the last row over the snapshots");

@@ -50,7 +50,7 @@ impl Subject {
         let spec = spec
             .with_context(|| format!("{name} is a policy for another environment"))
             .hint(OTHER_ENVIRONMENT)?;
-        let weights = Hash::of(&file);
+        let weights = Hash::new(&file);
         let subject = |policy| Self {
             path: path.to_owned(),
             weights,

@@ -37,7 +37,7 @@ fn pieces(reward: f32, most: usize) -> Vec<Piece> {
         incarnation: INCARNATION,
         job: 1,
         seed: SEED,
-        hash: Hash::of(&frame),
+        hash: Hash::new(&frame),
         length: frame.len() as u32,
         offset: (number * most) as u32,
         bytes: bytes.to_vec(),

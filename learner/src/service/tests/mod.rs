@@ -47,7 +47,7 @@ struct Bench {
 }
 
 fn hash(step: u64) -> Hash {
-    Hash::of(&step.to_le_bytes())
+    Hash::new(&step.to_le_bytes())
 }
 
 impl Bench {

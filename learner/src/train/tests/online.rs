@@ -37,7 +37,7 @@ fn episode(rows: usize) -> Episode {
         observations: vec![rows as f32; (rows + 1) * 11],
         actions: vec![0.5; rows * 3],
         rewards: vec![1.0; rows],
-        ..Episode::new(0, Hash::of(b""), Name::new("f32").unwrap(), 0)
+        ..Episode::new(0, Hash::new(b""), Name::new("f32").unwrap(), 0)
     }
 }
 

@@ -75,7 +75,7 @@ fn values_are_those_of_their_sources() {
             continue;
         }
         let changes = toml::Table::from_iter([("algorithm".to_owned(), keys[0].into())]);
-        let settings = settings::of_experiment(&resolve(name, &changes).unwrap());
+        let settings = settings::from_experiment(&resolve(name, &changes).unwrap());
         assert_eq!(rest.len(), keys.len() - 1, "{line}");
         for (key, value) in keys[1..].iter().zip(rest) {
             let ours: f64 = settings[*key].parse().unwrap();

@@ -16,7 +16,7 @@ pub(crate) fn episode(seed: u64) -> Episode {
         observations: vec![0.0, 1.0, 2.0],
         actions: vec![0.5, -0.5],
         rewards: vec![1.0, 2.0],
-        ..Episode::new(10, Hash::of(b"weights"), Name::new("f32").unwrap(), seed)
+        ..Episode::new(10, Hash::new(b"weights"), Name::new("f32").unwrap(), seed)
     }
 }
 
@@ -47,7 +47,7 @@ fn an_incomplete_record_at_the_end_is_cut_off() {
         fs::write(&path, &bytes[..2 * record_length + kept]).unwrap();
         assert_eq!(read_experience(run.path()).unwrap(), [1, 2].map(episode));
         let (mut log, records) = run.experience_log().unwrap();
-        assert_eq!(records, [1, 2].map(|seed| (Hash::of(&frame(seed)), episode(seed))));
+        assert_eq!(records, [1, 2].map(|seed| (Hash::new(&frame(seed)), episode(seed))));
         log.append([&*frame(3)]).unwrap();
         assert_eq!(fs::read(&path).unwrap(), bytes, "{kept} bytes");
     }

@@ -71,7 +71,7 @@ fn a_snapshot_that_was_deleted_as_it_may_be_takes_no_promise_back() {
 #[test]
 fn only_episodes_of_weights_and_seeds_alone_can_be_played_again() {
     let changes: [fn(&mut Episode); 3] = [
-        |it| it.weights = Hash::of(b"other weights"),
+        |it| it.weights = Hash::new(b"other weights"),
         |it| it.interventions = vec![1],
         |it| it.precision = Name::new("f32-avx512").unwrap(),
     ];

@@ -42,7 +42,8 @@ fn save(run: &RunDir, step: u64, value: f64) {
 
 /// The order of the runs, whether they can be ranked, and the verdict.
 fn ranked(judgments: &[Judgment]) -> (Vec<String>, bool, String) {
-    let [ranking] = <[Ranking; 1]>::try_from(Ranking::of(judgments.to_vec())).ok().unwrap();
+    let [ranking] =
+        <[Ranking; 1]>::try_from(Ranking::from_judgments(judgments.to_vec())).ok().unwrap();
     let runs = ranking.policies.iter().map(|one| one.run.display().to_string());
     (runs.collect(), ranking.can_rank, ranking.verdict)
 }
@@ -58,7 +59,7 @@ fn the_best_comes_first_and_unreliable_estimates_last() {
     assert_eq!((&*order.join(" "), can_rank), ("high low diverged", true));
     // The root mean square of the deviations 0.71 and 0.14 is 0.51, twice that 1.02.
     assert!(verdict.contains("less than 1.02") && verdict.contains("0.50 off"), "{verdict}");
-    let blocks = Ranking::of(judgments.to_vec())[0].blocks();
+    let blocks = Ranking::from_judgments(judgments.to_vec())[0].blocks();
     let text = blocks.map(|block| block.render(Style::Text)).concat();
     for words in ["a ranking, not a score", "13.50 ± 0.71", "beyond what rewards allow"] {
         assert!(text.contains(words), "{text}");
@@ -89,7 +90,7 @@ fn other_conditions_have_another_ranking() {
     others[0].conditions.gamma = 0.9;
     others[1].conditions.environment = "another arm".to_owned();
     for other in others {
-        assert_eq!(Ranking::of([a.clone(), other, b.clone()]).len(), 2);
+        assert_eq!(Ranking::from_judgments([a.clone(), other, b.clone()]).len(), 2);
     }
 }
 
@@ -126,7 +127,8 @@ fn a_caveat_stands_beside_a_rank_and_older_files_have_none() {
     judged[1].caveat = Some("it executes 2 actions of a chunk".to_owned());
     judged[1].save(&run).unwrap();
     assert_eq!(Judgment::read_all(&run).unwrap()[0].caveat, judged[1].caveat);
-    let text = Ranking::of(judged)[0].blocks().map(|block| block.render(Style::Text)).concat();
+    let text =
+        Ranking::from_judgments(judged)[0].blocks().map(|block| block.render(Style::Text)).concat();
     let line = text.lines().find(|line| line.contains("a chunk")).unwrap();
     assert!(line.starts_with("   1  b @ 20 "), "{text}");
 }

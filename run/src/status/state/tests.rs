@@ -15,7 +15,7 @@ fn run(folder: &Path, snapshot: u64, checkpoint: u64) -> RunDir {
 }
 
 fn state(run: &RunDir) -> State {
-    State::of(&RunReport::scored(run.path()).unwrap()).unwrap()
+    State::from_report(&RunReport::scored(run.path()).unwrap()).unwrap()
 }
 
 #[test]
