@@ -15,24 +15,24 @@
 //! evaluator follows one incarnation and ignores messages of earlier ones. TLS and access control
 //! decide which peers may use these keys.
 
+use std::fmt::Display;
+
 use crate::name::Name;
 
 /// Key expression of the liveliness tokens of all runs' learners.
 pub const ALL_LEARNERS: &str = "quad/*/live/learner/*";
+
+/// Stands for every step, evaluator or incarnation in a key expression.
+pub const ANY: &str = "*";
 
 /// The newest weights.
 pub fn weights(run: &Name) -> String {
     format!("quad/{run}/weights")
 }
 
-/// The weights of one gradient step.
-pub fn weights_at(run: &Name, step: u64) -> String {
+/// The weights of a gradient step, or of [`ANY`].
+pub fn weights_at(run: &Name, step: impl Display) -> String {
     format!("quad/{run}/weights/{step}")
-}
-
-/// Key expression of [`weights_at`] for all steps.
-pub fn weights_at_any_step(run: &Name) -> String {
-    format!("quad/{run}/weights/*")
 }
 
 /// Requests of jobs.
@@ -50,34 +50,20 @@ pub fn experience(run: &Name) -> String {
     format!("quad/{run}/experience")
 }
 
-/// Progress of an evaluator.
-pub fn progress(run: &Name, evaluator: &Name) -> String {
+/// Progress of an evaluator, or of [`ANY`].
+pub fn progress(run: &Name, evaluator: impl Display) -> String {
     format!("quad/{run}/progress/{evaluator}")
 }
 
-/// Key expression of [`progress`] for all evaluators.
-pub fn all_progress(run: &Name) -> String {
-    format!("quad/{run}/progress/*")
-}
-
-/// Liveliness token of one incarnation of the learner.
-pub fn live_learner(run: &Name, incarnation: u64) -> String {
+/// Liveliness token of an incarnation of the learner. [`ANY`] also stands for other learners of the
+/// same name.
+pub fn live_learner(run: &Name, incarnation: impl Display) -> String {
     format!("quad/{run}/live/learner/{incarnation}")
 }
 
-/// Key expression of [`live_learner`] for all incarnations, and for all learners of the same name.
-pub fn all_incarnations(run: &Name) -> String {
-    format!("quad/{run}/live/learner/*")
-}
-
-/// Liveliness token of an evaluator.
-pub fn live_evaluator(run: &Name, evaluator: &Name) -> String {
+/// Liveliness token of an evaluator, or of [`ANY`].
+pub fn live_evaluator(run: &Name, evaluator: impl Display) -> String {
     format!("quad/{run}/live/evaluator/{evaluator}")
-}
-
-/// Key expression of [`live_evaluator`] for all evaluators.
-pub fn all_evaluators(run: &Name) -> String {
-    format!("quad/{run}/live/evaluator/*")
 }
 
 /// The evaluator in a key of [`live_evaluator`].

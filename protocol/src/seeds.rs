@@ -6,15 +6,15 @@ use std::iter;
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Separates these draws from other uses of a run's seed.
-const PURPOSE: u64 = u64::from_be_bytes(*b"episodes");
+/// Separate these draws from other uses of a run's seed. Recorded runs depend on the bytes.
+const EVALUATION: u64 = u64::from_be_bytes(*b"episodes");
 const ONLINE: u64 = u64::from_be_bytes(*b"practice");
 
 /// The episode seeds of the evaluation at `step`: distinct, and different at each step, so that no
 /// evaluation is tuned to one set of starting states. Runs with the same seed that differ in
 /// hyper-parameters have the same episodes. Seeds have 53 bits, which JSON readers keep exactly.
 pub fn episode_seeds(run_seed: u64, step: u64, episodes: u32) -> Vec<u64> {
-    let mut generator = ChaCha8Rng::seed_from_u64(run_seed ^ PURPOSE);
+    let mut generator = ChaCha8Rng::seed_from_u64(run_seed ^ EVALUATION);
     generator.set_stream(step);
     let mut seen = HashSet::new();
     let new = |seed: &u64| seen.insert(*seed);

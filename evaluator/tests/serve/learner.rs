@@ -222,7 +222,7 @@ impl Learner {
         queryable.background().await.unwrap();
         let shared = state.clone();
         let callback = move |_| shared.lock().unwrap().events.push(Event::Progress);
-        let progress = keys::all_progress(&name("run"));
+        let progress = keys::progress(&name("run"), keys::ANY);
         let subscriber = session.declare_subscriber(progress).callback(callback);
         subscriber.background().await.unwrap();
         Learner { session, snapshot, endpoint, state }

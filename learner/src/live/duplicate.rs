@@ -58,7 +58,7 @@ pub(super) async fn wait_until_gone(
 
 async fn another(session: &Session, incarnation: &Incarnation) -> anyhow::Result<Option<u64>> {
     let liveliness = session.liveliness();
-    let query = liveliness.get(keys::all_incarnations(&incarnation.run)).timeout(LOOK_AGAIN);
+    let query = liveliness.get(keys::live_learner(&incarnation.run, keys::ANY)).timeout(LOOK_AGAIN);
     let replies = query.await.map_err(anyhow::Error::from_boxed)?;
     while let Ok(reply) = replies.recv_async().await {
         let found =
@@ -91,7 +91,7 @@ pub(super) async fn watch(
     };
     let liveliness = session.liveliness();
     let tokens = liveliness
-        .declare_subscriber(keys::all_incarnations(&incarnation.run))
+        .declare_subscriber(keys::live_learner(&incarnation.run, keys::ANY))
         .history(true)
         .callback(callback);
     tokens.background().await.map_err(anyhow::Error::from_boxed)

@@ -104,19 +104,19 @@ impl Wire {
         duplicate::wait_until_gone(&session, incarnation).await?;
         let run = &incarnation.run;
         services.weights.connected(&session);
-        serve(&session, keys::weights_at_any_step(run), services, Services::weights).await?;
+        serve(&session, keys::weights_at(run, keys::ANY), services, Services::weights).await?;
         serve(&session, keys::jobs(run), services, Services::job).await?;
         serve(&session, keys::scores(run), services, Services::scores).await?;
         serve(&session, keys::experience(run), services, Services::experience).await?;
         let zenoh = anyhow::Error::from_boxed;
         let receiver = services.clone();
         let progress = session
-            .declare_subscriber(keys::all_progress(run))
+            .declare_subscriber(keys::progress(run, keys::ANY))
             .callback(move |sample| receiver.progress(&sample));
         progress.background().await.map_err(zenoh)?;
         let (receiver, liveliness) = (services.clone(), session.liveliness());
         let evaluators = liveliness
-            .declare_subscriber(keys::all_evaluators(run))
+            .declare_subscriber(keys::live_evaluator(run, keys::ANY))
             .history(true)
             .callback(move |token| receiver.evaluator(&token));
         evaluators.background().await.map_err(zenoh)?;
