@@ -56,8 +56,8 @@ pub enum CodecError {
         "the message has protocol version {theirs}, this program speaks {ours}: update the older of the two"
     )]
     Version { theirs: u16, ours: u16 },
-    #[error("the message is of kind {found}, kind {expected} belongs here")]
-    Kind { found: u8, expected: u8 },
+    #[error("the message is of kind {kind}, kind {expected} belongs here")]
+    Kind { kind: u8, expected: u8 },
     #[error("the message is cut off")]
     Truncated,
     #[error("the message has {length} bytes, at most {limit} are allowed")]
@@ -66,8 +66,8 @@ pub enum CodecError {
     Trailing(usize),
     #[error("the message is malformed: {0}")]
     Malformed(String),
-    #[error("the file has the hash {found}, not {claimed} as the message says")]
-    Hash { claimed: Hash, found: Hash },
+    #[error("the file has the hash {actual}, not {claimed} as the message says")]
+    Hash { claimed: Hash, actual: Hash },
 }
 
 impl CodecError {
@@ -115,7 +115,7 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
     let read = &mut header[..length.min(HEADER_LENGTH)];
     frame.read_exact(read).map_err(|_| CodecError::Truncated)?;
     if read.len() < HEADER_LENGTH {
-        let begins = read.iter().zip(MAGIC).all(|(found, expected)| found == expected);
+        let begins = read.iter().zip(MAGIC).all(|(byte, magic)| byte == magic);
         return Err(if begins { CodecError::Truncated } else { CodecError::NotQuad });
     }
     let [magic @ .., version_low, version_high, kind] = header;
@@ -127,7 +127,7 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
         return Err(CodecError::Version { theirs: version, ours: PROTOCOL_VERSION });
     }
     if kind != M::KIND {
-        return Err(CodecError::Kind { found: kind, expected: M::KIND });
+        return Err(CodecError::Kind { kind, expected: M::KIND });
     }
     if length > M::LIMIT {
         return Err(CodecError::Oversized { length, limit: M::LIMIT });

@@ -2,9 +2,9 @@
 //!
 //! # Layout
 //!
-//! In reading order: `name` and `hash`; [`keys`]; `snapshot` and `origin`, weights and the header of
-//! their file; `seeds` and `job`, the episodes that an evaluator runs; `progress`; `score`;
-//! `experience`; `codec`, messages to bytes and back.
+//! In reading order: `name` and `hash`; [`keys`]; `snapshot`, weights and the header of their file;
+//! `seeds` and `job`, the episodes that an evaluator runs; `score`; `experience`; `codec`, messages to
+//! bytes and back.
 //!
 //! Nothing here knows what the weights mean or how episodes are simulated.
 
@@ -16,8 +16,6 @@ mod hash;
 mod job;
 pub mod keys;
 mod name;
-mod origin;
-mod progress;
 mod score;
 mod seeds;
 mod snapshot;
@@ -25,10 +23,8 @@ mod snapshot;
 pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, decode_kept, encode};
 pub use experience::{Episode, Piece, PieceReply};
 pub use hash::Hash;
-pub use job::{Exploration, Job, JobReply, JobRequest};
+pub use job::{Exploration, Job, JobReply, JobRequest, Progress};
 pub use name::{InvalidName, Name};
-pub use origin::Origin;
-pub use progress::Progress;
 pub use score::{EpisodeScore, ScoreReply, ScoreReport};
 pub use seeds::{episode_seeds, online_seed};
-pub use snapshot::Snapshot;
+pub use snapshot::{Origin, Snapshot};

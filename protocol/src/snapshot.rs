@@ -1,6 +1,7 @@
-//! Weights, from the learner to evaluators.
+//! Weights, from the learner to evaluators, and where they come from.
 
 use bincode::{Decode, Encode};
+use serde::{Deserialize, Serialize};
 
 use crate::codec::{CodecError, LARGE, Message};
 use crate::hash::Hash;
@@ -21,7 +22,7 @@ pub struct Snapshot {
     /// BLAKE3 hash of `file`, verified by decoding.
     pub hash: Hash,
     /// The policy's safetensors file, opaque here. Its header has the kind of policy and its
-    /// [`Origin`](crate::Origin).
+    /// [`Origin`].
     pub file: Vec<u8>,
 }
 
@@ -35,7 +36,22 @@ impl Message for Snapshot {
     const LIMIT: usize = LARGE;
 
     fn verify(&self) -> Result<(), CodecError> {
-        let (claimed, found) = (self.hash, Hash::new(&self.file));
-        if found == claimed { Ok(()) } else { Err(CodecError::Hash { claimed, found }) }
+        let (claimed, actual) = (self.hash, Hash::new(&self.file));
+        if actual == claimed { Ok(()) } else { Err(CodecError::Hash { claimed, actual }) }
     }
+}
+
+/// Origin and evaluation of a snapshot, in the header of its file. It is a function of the run's
+/// configuration, so that equal configurations make equal bytes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Origin {
+    /// Name of the environment.
+    pub environment: String,
+    /// Seed of the run, which with `step` decides the [episodes](crate::episode_seeds).
+    pub seed: u64,
+    /// Gradient step.
+    pub step: u64,
+    /// Episodes of the evaluation.
+    pub episodes: u32,
 }

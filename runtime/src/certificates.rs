@@ -109,9 +109,9 @@ impl Certificates {
             return refuse("holds no certificate that can be read".to_owned(), HINT);
         };
         let names = certificate.subject().iter_common_name().filter_map(|name| name.as_str().ok());
-        let (found, wanted) = (Vec::from_iter(names).join(", "), role.common_name());
-        if found != wanted {
-            return refuse(format!("is a certificate for {found}, not for {wanted}"), HINT_ROLE);
+        let (names, wanted) = (Vec::from_iter(names).join(", "), role.common_name());
+        if names != wanted {
+            return refuse(format!("is a certificate for {names}, not for {wanted}"), HINT_ROLE);
         }
         let validity = certificate.validity();
         if !validity.is_valid() {
@@ -177,12 +177,12 @@ impl fmt::Display for Certificates {
 
 /// All certificates of a file. While an authority is replaced, ca.pem has the old and the new one.
 fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, CertificatesError> {
-    let all = CertificateDer::pem_file_iter(path).and_then(Iterator::collect);
-    match all {
-        Ok(all) if Vec::is_empty(&all) => Err(PemError::NoItemsFound),
-        all => all,
+    let read = CertificateDer::pem_file_iter(path).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+    match read {
+        Ok(certificates) if !certificates.is_empty() => Ok(certificates),
+        Ok(_) => Err(unreadable(path, "certificate", &PemError::NoItemsFound)),
+        Err(error) => Err(unreadable(path, "certificate", &error)),
     }
-    .map_err(|error| unreadable(path, "certificate", &error))
 }
 
 fn unreadable(path: &Path, wanted: &str, error: &PemError) -> CertificatesError {

@@ -126,8 +126,8 @@ mod tests {
 
     #[test]
     fn control_characters_are_removed() {
-        let all = String::from_iter((0..0xa0).filter_map(char::from_u32));
-        let text = logged("info", || info!(name = all, "{all}"));
+        let characters = String::from_iter((0..0xa0).filter_map(char::from_u32));
+        let text = logged("info", || info!(name = characters, "{characters}"));
         assert!(!text.contains(|c: char| c.is_control() && !matches!(c, '\n' | '\t')), "{text:?}");
     }
 

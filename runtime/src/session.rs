@@ -1,4 +1,5 @@
-//! The connection between learner and evaluators, over Zenoh.
+//! The connection between learner and evaluators over Zenoh, and a router at which many of one machine
+//! meet.
 
 use std::thread;
 use std::time::Duration;
@@ -9,9 +10,14 @@ use tokio::time::timeout;
 use tracing::warn;
 use zenoh::{Config, Session, Wait};
 
-use crate::access;
-use crate::background::stay_in_background;
 use crate::endpoints::{Endpoints, SessionError};
+use crate::threads::stay_in_background;
+
+/// Settings of a router without and with certificates.
+const ROUTER: &str = include_str!("../../deploy/zenoh/router.json5");
+const ROUTER_TLS: &str = include_str!("../../deploy/zenoh/router-tls.json5");
+/// Loopback; the system chooses the port.
+const ANY_PORT: &str = "tcp/127.0.0.1:0";
 
 /// Time after which a frozen or disconnected process counts as gone: half of Zenoh's default, but long
 /// enough for a busy machine that misses several keep-alive messages.
@@ -116,8 +122,9 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     if let Some(certificates) = &endpoints.certificates {
         settings.push(("transport/link/tls", certificates.settings()));
         if listens {
-            settings.push(("access_control", access::rules()?));
-            settings.push(("low_pass_filter", access::sizes()?));
+            settings.push(("access_control", access_control()?));
+            // The largest message of each kind.
+            settings.push(("low_pass_filter", router_setting("low_pass_filter")?));
         }
     }
     let mut config = Config::default();
@@ -127,8 +134,45 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     Ok(config)
 }
 
+/// Zenoh's `access_control` for a learner's own session.
+///
+/// A router lets learners publish and answer. At a learner that listens, no client may do so, whatever
+/// its certificate.
+fn access_control() -> zenoh::Result<Value> {
+    let mut rules = router_setting("access_control")?;
+    if let Some(policies) = rules["policies"].as_array_mut() {
+        policies.retain(|policy| policy["subjects"] != json!(["learner"]));
+    }
+    Ok(rules)
+}
+
+fn router_setting(key: &str) -> zenoh::Result<Value> {
+    Ok(serde_json::from_str(&Config::from_json5(ROUTER_TLS)?.get_json(key)?)?)
+}
+
+/// Opens a router, which lives as long as the session, and returns its endpoint. Needs a multi-thread
+/// tokio runtime.
+pub async fn open_router() -> Result<(Session, String), SessionError> {
+    let wrong = |error| {
+        let (endpoints, reason) = (ANY_PORT.to_owned(), for_people(error));
+        SessionError::Endpoint { endpoints, reason }
+    };
+    let session = zenoh::open(router_config().map_err(wrong)?).await.map_err(wrong)?;
+    let bound = locators(&session).await.unwrap_or_default();
+    let endpoint = bound.into_iter().next().ok_or(SessionError::Unknown)?;
+    Ok((session, endpoint))
+}
+
+fn router_config() -> zenoh::Result<Config> {
+    let mut config = Config::from_json5(ROUTER)?;
+    config.insert_json5("listen/endpoints", &json!([ANY_PORT]).to_string())?;
+    // Makes the session report which port the system has chosen.
+    config.insert_json5("adminspace/enabled", "true")?;
+    Ok(config)
+}
+
 /// Zenoh's error message without the places in its source code (`at /…/tcp.rs:61.`).
-pub(crate) fn for_people(error: zenoh::Error) -> String {
+fn for_people(error: zenoh::Error) -> String {
     let text = error.to_string();
     let mut words = text.split(' ').peekable();
     let mut plain = String::new();

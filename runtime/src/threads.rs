@@ -1,4 +1,4 @@
-//! Numbers of threads of Zenoh, candle and rayon, which they read from the environment.
+//! Numbers and priorities of threads. Zenoh, candle and rayon read theirs from the environment.
 
 use std::env;
 use std::num::NonZero;
@@ -31,4 +31,18 @@ pub fn choose_threads() {
 /// The user's number of rayon threads, by RAYON_NUM_THREADS; `None` if it is unset, 0 or no number.
 pub fn requested_threads() -> Option<NonZero<usize>> {
     env::var("RAYON_NUM_THREADS").ok()?.parse().ok()
+}
+
+/// A thread of this niceness gets about a tenth of the processor time of a thread that trains.
+const NICENESS: i32 = 10;
+
+/// Lowers the priority of the calling thread and of threads that it starts later, so that messages
+/// hardly slow down training. If training uses every core, an evaluator waits some milliseconds
+/// longer for a job.
+pub fn stay_in_background() {
+    // On Linux this changes the thread; on other systems it would change the process.
+    #[cfg(target_os = "linux")]
+    if let Err(error) = rustix::process::setpriority_process(None, NICENESS) {
+        tracing::debug!(%error, "the priority of a thread could not be lowered");
+    }
 }

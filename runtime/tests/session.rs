@@ -85,7 +85,7 @@ async fn unusable_endpoints_are_errors_at_once() {
     assert!(!text.contains(".rs:"), "{text}");
     for wrong in "127.0.0.1:7447 udp/127.0.0.1:7447 smoke/signals:1 tcp tcp/ ".split(' ') {
         let error = open(connecting_to(wrong)).await;
-        assert!(matches!(&error, SessionError::NotAnEndpoint(it) if it == wrong), "{error}");
+        assert!(matches!(&error, SessionError::NotAnEndpoint(text) if text == wrong), "{error}");
     }
 }
 

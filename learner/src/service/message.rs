@@ -122,9 +122,9 @@ pub struct Frame<Q> {
 impl<Q> Frame<Q> {
     /// Verifies the claimed hash, and decodes the episode.
     pub fn decode(&self) -> Result<Box<Episode>, CodecError> {
-        let found = Hash::new(&self.bytes);
-        if found != self.hash {
-            return Err(CodecError::Hash { claimed: self.hash, found });
+        let actual = Hash::new(&self.bytes);
+        if actual != self.hash {
+            return Err(CodecError::Hash { claimed: self.hash, actual });
         }
         decode(&self.bytes).map(Box::new)
     }

@@ -1,4 +1,4 @@
-//! One message of each kind, for tests and for the fuzzer in protocol/fuzz.
+//! One message of each kind.
 
 use std::fmt::Debug;
 

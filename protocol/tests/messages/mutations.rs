@@ -24,7 +24,7 @@ fn mutation() -> impl Strategy<Value = (Index, usize, Vec<u8>)> {
     let few = (0_usize..20, vec(any::<u8>(), 0..20));
     let one = any::<u8>().prop_map(|byte| (1, vec![byte]));
     let change = prop_oneof![eight, few, one];
-    (any::<Index>(), change).prop_map(|(at, (removed, bytes))| (at, removed, bytes))
+    (any::<Index>(), change).prop_map(|(position, (removed, bytes))| (position, removed, bytes))
 }
 
 proptest! {
@@ -34,9 +34,9 @@ proptest! {
     fn no_decoder_panics(which in any::<Index>(), mutations in vec(mutation(), 1..6)) {
         thread_local!(static FRAMES: Vec<Vec<u8>> = frames());
         let mut frame = FRAMES.with(|frames| which.get(frames).clone());
-        for (at, removed, bytes) in mutations {
-            let at = at.index(frame.len() + 1);
-            drop(frame.splice(at..(at + removed).min(frame.len()), bytes));
+        for (position, removed, bytes) in mutations {
+            let start = position.index(frame.len() + 1);
+            drop(frame.splice(start..(start + removed).min(frame.len()), bytes));
         }
         decode_as_each(&frame);
     }

@@ -42,8 +42,8 @@ impl Check for NamesDamage {
                 let theirs = ours ^ (1 << (8 * (byte - 4) + bit));
                 damaged(&flipped(&frame, byte, bit), CodecError::Version { theirs, ours });
             }
-            let (found, expected) = (M::KIND ^ (1 << bit), M::KIND);
-            damaged(&flipped(&frame, 6, bit), CodecError::Kind { found, expected });
+            let (kind, expected) = (M::KIND ^ (1 << bit), M::KIND);
+            damaged(&flipped(&frame, 6, bit), CodecError::Kind { kind, expected });
         }
     }
 }
@@ -67,8 +67,8 @@ fn a_file_with_another_hash_is_refused() {
     let first = frame.len() - message.file.len();
     for bit in 0..8 * message.file.len() {
         let frame = flipped(&frame, first + bit / 8, bit % 8);
-        let (claimed, found) = (message.hash, Hash::new(&frame[first..]));
-        assert_eq!(decode::<Snapshot>(&frame), Err(CodecError::Hash { claimed, found }));
+        let (claimed, actual) = (message.hash, Hash::new(&frame[first..]));
+        assert_eq!(decode::<Snapshot>(&frame), Err(CodecError::Hash { claimed, actual }));
     }
 }
 

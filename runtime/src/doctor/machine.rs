@@ -8,7 +8,7 @@ use std::{env, thread};
 
 use rustix::fs::statvfs;
 
-use super::findings::Findings;
+use super::Findings;
 
 /// Limits the threads of the networks' arithmetic, which are rayon's.
 const THREADS: &str = "RAYON_NUM_THREADS";
@@ -25,17 +25,20 @@ const LITTLE: u64 = 2 << 30;
 pub fn threads(findings: &mut Findings) {
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let set = env::var(THREADS).unwrap_or_else(|_| "0".to_owned());
-    let found = match set.parse::<usize>() {
-        Ok(0) => format!("{cores}, one per core: {THREADS} is not set or 0"),
-        Ok(threads) if threads <= cores => format!("{THREADS}={threads} of {cores} cores"),
-        _ => {
-            let found = format!("{THREADS}={set}, but this process may use {cores} cores");
-            let hint = "more threads than cores are slow";
-            let hint = format!("set it to a number from 1 to {cores}: {hint}");
-            return findings.warn("threads", found, hint);
+    match set.parse::<usize>() {
+        Ok(0) => {
+            findings.ok("threads", format!("{cores}, one per core: {THREADS} is not set or 0"));
         }
-    };
-    findings.ok("threads", found);
+        Ok(threads) if threads <= cores => {
+            findings.ok("threads", format!("{THREADS}={threads} of {cores} cores"));
+        }
+        _ => {
+            let what = format!("{THREADS}={set}, but this process may use {cores} cores");
+            let hint =
+                format!("set it to a number from 1 to {cores}: more threads than cores are slow");
+            findings.warn("threads", what, hint);
+        }
+    }
 }
 
 /// Checks a folder that a program will write to, or its nearest existing ancestor. `elsewhere` is the
@@ -45,12 +48,12 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
     let shown = path.display();
     let folder = path.ancestors().find(|folder| folder.exists()).unwrap_or(path);
     if !folder.is_dir() {
-        let found = format!("{shown} cannot be made: {} is not a folder", folder.display());
-        return findings.fail(check, found, elsewhere);
+        let what = format!("{shown} cannot be made: {} is not a folder", folder.display());
+        return findings.fail(check, what, elsewhere);
     }
     let room = format!("make room: old runs' snapshots and checkpoints may go; {elsewhere}");
     let (free, took) = match write_trial(folder) {
-        Ok(found) => found,
+        Ok(trial) => trial,
         Err(error) => {
             let hint = match error.kind() {
                 io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => room,
@@ -63,14 +66,17 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
         }
     };
     let gib = free as f64 / f64::from(1 << 30);
-    let found = format!("{shown}: {gib:.1} GiB free, a write of 1 MiB takes {took:.0?}");
-    let little = || format!("{found}: little room for a long run");
-    let faster = || format!("a local disk, or one that is less busy, is faster; {elsewhere}");
+    let what = format!("{shown}: {gib:.1} GiB free, a write of 1 MiB takes {took:.0?}");
     match free {
-        ..TOO_LITTLE => findings.fail(check, found, room),
-        TOO_LITTLE..LITTLE => findings.warn(check, little(), room),
-        _ if took > SLOW => findings.warn(check, found.clone(), faster()),
-        _ => findings.ok(check, found),
+        ..TOO_LITTLE => findings.fail(check, what, room),
+        TOO_LITTLE..LITTLE => {
+            findings.warn(check, format!("{what}: little room for a long run"), room);
+        }
+        _ if took > SLOW => {
+            let faster = "a local disk, or one that is less busy, is faster";
+            findings.warn(check, what, format!("{faster}; {elsewhere}"));
+        }
+        _ => findings.ok(check, what),
     }
 }
 

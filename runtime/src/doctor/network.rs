@@ -10,7 +10,7 @@ use tokio::runtime::Builder;
 use tokio::time::timeout;
 use zenoh::Session;
 
-use super::findings::Findings;
+use super::Findings;
 use crate::certificates::{Certificates, Role};
 use crate::endpoints::{Endpoints, address_of};
 use crate::session::open_session;
@@ -22,29 +22,26 @@ const SESSION: Duration = Duration::from_secs(5);
 
 /// Checks the certificates in `folder`, which must be for `role`.
 pub fn certificates(findings: &mut Findings, folder: &Path, role: Role) -> Option<Certificates> {
-    let found = Certificates::check(folder, role);
-    match &found {
+    let checked = Certificates::check(folder, role);
+    match &checked {
         Err(error) => findings.fail("certificate", error.to_string(), error.hint()),
-        Ok(soon) if soon.expire_soon() => {
+        Ok(certificates) if certificates.expire_soon() => {
             let hint = "make a new one before then with deploy/zenoh/certificates.sh";
-            findings.warn("certificate", soon.to_string(), hint);
+            findings.warn("certificate", certificates.to_string(), hint);
         }
-        Ok(good) => findings.ok("certificate", good.to_string()),
+        Ok(certificates) => findings.ok("certificate", certificates.to_string()),
     }
-    found.ok()
+    checked.ok()
 }
 
 /// Checks that a learner can listen at a port of this machine.
 pub fn port(findings: &mut Findings, port: u16) {
+    let endpoint = format!("tcp/127.0.0.1:{port}");
     match TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
-        Ok(_) => {
-            let found = format!("tcp/127.0.0.1:{port} is free for the learner to listen at");
-            findings.ok("port", found);
-        }
+        Ok(_) => findings.ok("port", format!("{endpoint} is free for the learner to listen at")),
         Err(error) => {
-            let found = format!("tcp/127.0.0.1:{port} cannot be listened at: {error}");
             let hint = "if another learner has it, choose a free one by --listen tcp/127.0.0.1:0, or a router by --connect";
-            findings.warn("port", found, hint);
+            findings.warn("port", format!("{endpoint} cannot be listened at: {error}"), hint);
         }
     }
 }
