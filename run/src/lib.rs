@@ -7,7 +7,6 @@
 //! - [`folder`]: the files of a run.
 //! - [`config`]: the settings of a run.
 //! - [`table`]: tables as text, Markdown and LaTeX.
-//! - `counted`: numbers of things in messages.
 //! - [`files`]: opens and makes files in a run's folder, for all programs.
 
 #![deny(unsafe_code)]
@@ -16,7 +15,6 @@
 extern crate self as quad_run;
 
 pub mod config;
-mod counted;
 pub mod files;
 #[cfg(test)]
 mod fixtures;
@@ -25,4 +23,8 @@ pub mod results;
 pub mod status;
 pub mod table;
 
-pub use counted::counted;
+/// `1 run`, `2 runs`.
+pub fn counted(number: usize, noun: &str) -> String {
+    let plural = if number == 1 { "" } else { "s" };
+    format!("{number} {noun}{plural}")
+}

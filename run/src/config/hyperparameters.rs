@@ -2,8 +2,7 @@
 
 use quad_algorithms::{ALGORITHMS, Definition, Values, fits};
 
-use super::error::ConfigError;
-use super::nearest::did_you_mean;
+use super::error::{ConfigError, did_you_mean};
 use super::tasks::Task;
 
 /// True if an algorithm's authors give no values for a benchmark's task. A task without a dataset

@@ -2,12 +2,12 @@
 //!
 //! In reading order: `tasks`; `hyperparameters`, an algorithm's values for them; `presets`, a task
 //! or a file; `experiment`, all of that resolved; `run_config`, the contents of `config.toml`;
-//! `online`, the online steps; `schedule`, the evaluated steps; `settings`, which compares runs key by key.
+//! `online`, the online steps; `schedule`, the evaluated steps; `settings`, which compares runs key by
+//! key; `tables`.
 
 mod error;
 mod experiment;
 pub mod hyperparameters;
-mod nearest;
 mod online;
 pub mod presets;
 mod run_config;
@@ -16,9 +16,8 @@ pub mod settings;
 pub mod tables;
 pub mod tasks;
 
-pub use error::ConfigError;
+pub use error::{ConfigError, did_you_mean};
 pub use experiment::Experiment;
-pub use nearest::did_you_mean;
 pub use online::Online;
 pub use presets::{Preset, resolve};
 pub use run_config::{DatasetInfo, Device, RunConfig, RunInfo};

@@ -7,8 +7,7 @@ use quad_dataset::catalog;
 use serde::Deserialize;
 use toml::Table;
 
-use super::error::ConfigError;
-use super::nearest::did_you_mean;
+use super::error::{ConfigError, did_you_mean};
 
 /// A learning task: an environment and a dataset under one name.
 #[derive(Debug, Deserialize)]

@@ -8,6 +8,7 @@ use quad_protocol::Hash;
 use tracing::warn;
 
 use super::error::{RunDirError, io_error};
+use super::run_dir::{CHECKPOINTS, RunDir};
 use crate::files;
 
 const SUFFIX: &str = ".safetensors";
@@ -26,72 +27,63 @@ impl Checkpoint {
     pub const KEPT: usize = 3;
 }
 
-/// The folder `checkpoints` of a run. A file's name has the step and the beginning of the BLAKE3
-/// hash of its contents.
-#[derive(Clone, Debug)]
-pub(super) struct Checkpoints {
-    folder: PathBuf,
-}
-
-impl Checkpoints {
-    pub fn of_run(run: &Path) -> Self {
-        Self { folder: run.join("checkpoints") }
-    }
-
-    /// Saves a checkpoint, then removes older ones.
-    pub fn save(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
-        let target = self.folder.join(file_name(checkpoint));
+impl RunDir {
+    /// Saves a training state, durably, and removes all but the newest three.
+    pub fn write_checkpoint(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
+        self.make_folder(CHECKPOINTS)?;
+        let target = self.path().join(CHECKPOINTS).join(file_name(checkpoint));
         files::replace(&target, &checkpoint.state).map_err(io_error("write", &target))?;
-        for older in self.files()?.into_iter().skip(Checkpoint::KEPT) {
+        for older in self.checkpoints()?.into_iter().skip(Checkpoint::KEPT) {
             // One file too many does no harm.
             fs::remove_file(older).ok();
         }
         Ok(())
     }
 
-    /// Loads the newest undamaged checkpoint. Damaged ones are renamed, so that they no longer
+    /// The newest training state that is not damaged. Damaged ones are renamed, so that they no longer
     /// count; unreadable ones stay. If none is undamaged and one is unreadable, this is an error: it
     /// may be readable later, and the run must not begin anew before.
-    pub fn newest(&self) -> Result<Option<Checkpoint>, RunDirError> {
+    pub fn newest_checkpoint(&self) -> Result<Option<Checkpoint>, RunDirError> {
         let mut unreadable = None;
-        for path in self.files()? {
+        for path in self.checkpoints()? {
+            let shown = path.display();
             let state = match files::read(&path) {
                 Ok(state) => state,
                 Err(error) => {
-                    warn!(
-                        "{} cannot be read ({error}); the checkpoint before it is taken",
-                        path.display()
-                    );
+                    warn!("{shown} cannot be read ({error}); the checkpoint before it is taken");
                     unreadable.get_or_insert(io_error("read", &path)(error));
                     continue;
                 }
             };
-            let found = step(&path).map(|step| Checkpoint { step, state });
-            if let Some(whole) = found.filter(|found| path.ends_with(file_name(found))) {
+            let checkpoint = step(&path).map(|step| Checkpoint { step, state });
+            if let Some(whole) =
+                checkpoint.filter(|checkpoint| path.ends_with(file_name(checkpoint)))
+            {
                 return Ok(Some(whole));
             }
-            warn!("{} is damaged; the checkpoint before it is taken", path.display());
+            warn!("{shown} is damaged; the checkpoint before it is taken");
             fs::rename(&path, path.with_extension("damaged")).map_err(io_error("rename", &path))?;
         }
         unreadable.map_or(Ok(None), Err)
     }
 
-    /// The step of the newest checkpoint, by its file's name.
-    pub fn newest_step(&self) -> Result<Option<u64>, RunDirError> {
-        Ok(self.files()?.first().and_then(|path| step(path)))
+    /// The gradient step of the newest training state, which may be damaged.
+    pub fn checkpoint_step(&self) -> Result<Option<u64>, RunDirError> {
+        Ok(self.checkpoints()?.first().and_then(|path| step(path)))
     }
 
     /// The files of all checkpoints, the newest first.
-    fn files(&self) -> Result<Vec<PathBuf>, RunDirError> {
-        let entries = files::optional(fs::read_dir(&self.folder));
-        let entries = entries.map_err(io_error("read", &self.folder))?.into_iter().flatten();
-        let paths = entries.flatten().map(|entry| entry.path());
+    fn checkpoints(&self) -> Result<Vec<PathBuf>, RunDirError> {
+        let folder = self.path().join(CHECKPOINTS);
+        let entries = files::optional(fs::read_dir(&folder)).map_err(io_error("read", &folder))?;
+        let paths = entries.into_iter().flatten().flatten().map(|entry| entry.path());
         let mut files = Vec::from_iter(paths.filter(|path| step(path).is_some()));
         files.sort_unstable_by_key(|path| Reverse(step(path)));
         Ok(files)
     }
 }
 
+/// A file's name has the step and the beginning of the BLAKE3 hash of its contents.
 fn file_name(Checkpoint { step, state }: &Checkpoint) -> String {
     let hash = Hash::new(state).to_string();
     format!("step_{step:09}_{}{SUFFIX}", &hash[..16])

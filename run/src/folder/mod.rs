@@ -4,13 +4,12 @@
 //! `scores.jsonl`, the main thread everything else. A learner at work holds a lock on
 //! `scores.jsonl`. Commands that only read may run at any time.
 //!
-//! In reading order: `run_dir`, `find`, `lines`, `lock`, `log`, `experience`, `checkpoints`, `error`,
-//! `resume`, `verify`, `played`.
+//! In reading order: `run_dir`, `lines`, `lock`, `log`, `experience`, `checkpoints`, `error`, `resume`,
+//! `verify`, `verify_experience`.
 
 mod checkpoints;
 pub(crate) mod error;
 mod experience;
-mod find;
 mod lines;
 mod lock;
 mod log;
@@ -24,10 +23,9 @@ mod verify_experience;
 pub use checkpoints::Checkpoint;
 pub use error::RunDirError;
 pub use experience::{ExperienceLog, read_experience};
-pub use find::walk;
 pub use lines::{RunEndpoints, ScoreLine, read_metrics};
 pub use lock::Lock;
 pub use log::{Log, new_lines};
 pub use resume::{ExistingRun, ResumePoint, SavedScores};
-pub use run_dir::RunDir;
+pub use run_dir::{RunDir, walk};
 pub use verify_experience::verify_experience;

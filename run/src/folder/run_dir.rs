@@ -13,6 +13,7 @@
 //! failed                             the error with which a learner of a sweep has ended
 //! ```
 
+use std::collections::BTreeSet;
 use std::fs::{self, DirEntry};
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -20,7 +21,6 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::checkpoints::{Checkpoint, Checkpoints};
 use super::error::{CREATE, RunDirError, content, io_error};
 use super::lines::{RunEndpoints, ScoreLine};
 use super::lock::Lock;
@@ -34,8 +34,9 @@ const SCORES: &str = "scores.jsonl";
 pub(super) const EXPERIENCE: &str = "experience.log";
 const FAILED: &str = "failed";
 const SNAPSHOTS: &str = "snapshots";
+pub(super) const CHECKPOINTS: &str = "checkpoints";
 /// Files and folders that a run needs to continue and to be verified.
-const OWN: [&str; 6] = [CONFIG, SCORES, EXPERIENCE, "metrics.jsonl", SNAPSHOTS, "checkpoints"];
+const OWN: [&str; 6] = [CONFIG, SCORES, EXPERIENCE, "metrics.jsonl", SNAPSHOTS, CHECKPOINTS];
 
 /// The folder of one run.
 #[derive(Clone, Debug)]
@@ -141,7 +142,7 @@ impl RunDir {
         let path = self.path.join(CONFIG);
         let text = files::read_text(&path).map_err(io_error("read", &path))?;
         let config: RunConfig = toml::from_str(&text).map_err(|error: toml::de::Error| {
-            let before = error.span().and_then(|at| text.get(..at.start));
+            let before = error.span().and_then(|span| text.get(..span.start));
             let line = before.map(|before| before.matches('\n').count() + 1);
             content(&path, line, error.message())
         })?;
@@ -199,7 +200,7 @@ impl RunDir {
     }
 
     /// Makes a folder of the run again that was removed; the run's own folder must exist.
-    fn make_folder(&self, name: &str) -> Result<(), RunDirError> {
+    pub(super) fn make_folder(&self, name: &str) -> Result<(), RunDirError> {
         let folder = self.path.join(name);
         match fs::create_dir(&folder) {
             // Else a power cut could take what will be in it.
@@ -229,7 +230,7 @@ impl RunDir {
     /// Removes files that killed processes have not finished.
     pub fn remove_partial_files(&self) {
         files::remove_partial_files(&self.path);
-        for folder in [SNAPSHOTS, "checkpoints"].map(|name| self.path.join(name)) {
+        for folder in [SNAPSHOTS, CHECKPOINTS].map(|name| self.path.join(name)) {
             if !folder.is_symlink() {
                 files::remove_partial_files(&folder);
             }
@@ -245,27 +246,11 @@ impl RunDir {
             let name = entry.file_name();
             let step = name.to_str()?.strip_prefix("step_")?;
             let step = step.strip_suffix(".safetensors")?.parse().ok();
-            step.filter(|_| entry.file_type().is_ok_and(|it| it.is_file()))
+            step.filter(|_| entry.file_type().is_ok_and(|kind| kind.is_file()))
         };
         let mut steps: Vec<u64> = entries.into_iter().flatten().filter_map(step).collect();
         steps.sort_unstable();
         Ok(steps)
-    }
-
-    /// Saves a training state, durably, and removes all but the newest three.
-    pub fn write_checkpoint(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
-        self.make_folder("checkpoints")?;
-        Checkpoints::of_run(&self.path).save(checkpoint)
-    }
-
-    /// The gradient step of the newest training state, which may be damaged.
-    pub fn checkpoint_step(&self) -> Result<Option<u64>, RunDirError> {
-        Checkpoints::of_run(&self.path).newest_step()
-    }
-
-    /// The newest training state that is not damaged.
-    pub fn newest_checkpoint(&self) -> Result<Option<Checkpoint>, RunDirError> {
-        Checkpoints::of_run(&self.path).newest()
     }
 
     /// Opens `scores.jsonl` for appending, locked. Each append is synchronized, so acknowledged
@@ -312,4 +297,22 @@ impl RunDir {
     pub(super) fn broken_scores(&self, reason: String) -> RunDirError {
         content(&self.path.join(SCORES), None, reason)
     }
+}
+
+/// Lists the run folders at and below a folder, in alphabetical order. Folders that cannot be read
+/// are passed to `unreadable`.
+pub fn walk(path: &Path, unreadable: &mut impl FnMut(&Path, io::Error)) -> Vec<PathBuf> {
+    if RunDir::is_occupied(path) {
+        return vec![path.to_owned()];
+    }
+    let entries = std::fs::read_dir(path).map_err(|error| unreadable(path, error));
+    // Links are not followed: they may lead back.
+    let folders = entries
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()))
+        .map(|entry| entry.path());
+    let folders = BTreeSet::from_iter(folders);
+    folders.iter().flat_map(|folder| walk(folder, unreadable)).collect()
 }

@@ -6,8 +6,7 @@ use std::collections::BTreeSet;
 use quad_dataset::catalog;
 
 use super::published;
-use super::report::RunReport;
-use super::selection::Select;
+use super::report::{RunReport, Select};
 use crate::config::settings::{self, Settings, differences_in_brief};
 use crate::config::{self, ConfigError, Experiment, hyperparameters, tasks};
 

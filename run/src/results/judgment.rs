@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::spread::Spread;
+use super::statistics::Spread;
 use crate::counted;
 use crate::folder::{Lock, RunDir, RunDirError};
 use crate::table::{Block, Table};

@@ -5,10 +5,9 @@ use std::path::Path;
 
 use quad_dataset::environment;
 
-use super::evaluation::EvaluationReport;
 use super::judgment::Judgment;
-use super::report::RunReport;
-use super::spread::Spread;
+use super::report::{EvaluationReport, RunReport};
+use super::statistics::Spread;
 use crate::config::{ConfigError, RunConfig};
 use crate::folder::error::content;
 use crate::folder::{RunDir, RunDirError, ScoreLine, read_metrics};

@@ -1,16 +1,18 @@
-//! The results of one run.
+//! The results of one run, and of its evaluations.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
+use clap::ValueEnum;
 use quad_algorithms::Summary;
 use quad_dataset::environment;
 use serde::Serialize;
 
-use super::evaluation::EvaluationReport;
 use super::judgment::Judgment;
 use super::published;
-use crate::config::RunConfig;
+use super::statistics::{Spread, mean};
+use crate::config::{Experiment, RunConfig};
+use crate::folder::ScoreLine;
 
 /// The results of one run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -82,10 +84,10 @@ impl RunReport {
         self.best_of(|_| true)
     }
 
-    /// The best evaluation that counts of the steps for which `is_one` holds; the last of equal ones.
-    pub fn best_of(&self, is_one: impl Fn(u64) -> bool) -> Option<&EvaluationReport> {
-        let chosen = self.evaluations.iter().filter(|it| it.counts() && is_one(it.step));
-        chosen.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
+    /// The best evaluation that counts, among those of matching steps; of equal ones the latest.
+    pub fn best_of(&self, matches: impl Fn(u64) -> bool) -> Option<&EvaluationReport> {
+        let counted = self.evaluations.iter().filter(|e| e.counts() && matches(e.step));
+        counted.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
     }
 
     /// The last complete evaluation.
@@ -136,9 +138,73 @@ impl RunReport {
     /// [`Self::measure`] with its unit; in a maze, the fraction of episodes that reach the goal.
     pub fn measure_with_unit(&self) -> &'static str {
         match environment::find(&self.config.experiment.environment) {
-            Ok(known) if known.maze.is_some() => "success rate in %",
+            Ok(environment) if environment.maze.is_some() => "success rate in %",
             Ok(_) => "D4RL-normalized score",
             Err(_) => self.measure(),
         }
+    }
+}
+
+/// The episodes of one snapshot.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct EvaluationReport {
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// Online environment steps that the gradient steps up to `step` wait for; absent in a run
+    /// without any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub environment_steps: Option<u64>,
+    /// Scored episodes.
+    pub episodes: usize,
+    /// True if all episodes are scored.
+    pub complete: bool,
+    /// Score over the episodes: D4RL-normalized, or the return where the environment has no
+    /// reference returns.
+    pub score: Spread,
+    /// Mean undiscounted return.
+    pub mean_return: f64,
+    /// Mean length in environment steps.
+    pub mean_length: f64,
+}
+
+impl EvaluationReport {
+    /// True if it makes its run's score: it is complete and, in an online run, of a policy that
+    /// has learned online.
+    pub fn counts(&self) -> bool {
+        self.complete && self.environment_steps != Some(0)
+    }
+
+    /// Summarizes the episodes of the snapshot at `step`; `None` without episodes.
+    pub(super) fn new(step: u64, episodes: &[&ScoreLine], experiment: &Experiment) -> Option<Self> {
+        let values =
+            |value: fn(&ScoreLine) -> f64| Vec::from_iter(episodes.iter().map(|line| value(line)));
+        Some(Self {
+            step,
+            environment_steps: experiment.environment_steps(step),
+            episodes: episodes.len(),
+            complete: episodes.len() == experiment.episodes as usize,
+            score: Spread::new(&values(|line| line.score))?,
+            mean_return: mean(&values(|line| line.episode_return)),
+            mean_length: mean(&values(|line| line.length.into())),
+        })
+    }
+}
+
+/// The evaluations of a run that make its score. (The help of `learner report` has these lines.)
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Select {
+    /// The last ones, as in the paper
+    Last,
+    /// The best one: optimistic, because it is chosen by the very scores that are reported
+    Best,
+}
+
+impl Select {
+    /// A warning for the reader of figures that do not follow the paper's protocol.
+    pub fn warning(self) -> Option<&'static str> {
+        const SELECTED: &str = "Selected: of each run its best complete evaluation counts, in place of the mean of its last ones. It is chosen by the very \
+             scores that are reported, so it is optimistic, and the more so the more evaluations there are.\n";
+        (self == Self::Best).then_some(SELECTED)
     }
 }

@@ -42,6 +42,42 @@ pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
+/// Mean and standard deviation of some values.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Spread {
+    /// The mean.
+    pub mean: f64,
+    /// Sample standard deviation (divided by n - 1); absent for a single value.
+    pub std: Option<f64>,
+    /// Population standard deviation (divided by n), as in DAC's code; absent for a single value.
+    pub population_std: Option<f64>,
+}
+
+impl Spread {
+    /// Spread of some values; `None` without any.
+    pub fn new(values: &[f64]) -> Option<Self> {
+        if values.is_empty() {
+            return None;
+        }
+        let (mean, count) = (mean(values), values.len() as f64);
+        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+        let std = |divisor: f64| (values.len() > 1).then(|| (squares / divisor).sqrt());
+        Some(Self { mean, std: std(count - 1.0), population_std: std(count) })
+    }
+
+    /// `mean ± std`, by n - 1.
+    pub fn text(self) -> String {
+        let std = self.std.map(|std| format!(" ± {std:.2}"));
+        format!("{:.2}{}", self.mean, std.unwrap_or_default())
+    }
+
+    /// `mean ± std (std)`, by n - 1 and by n.
+    pub fn text_with_population(self) -> String {
+        let population = self.population_std.map(|std| format!(" ({std:.2})"));
+        self.text() + &population.unwrap_or_default()
+    }
+}
+
 /// The mean over tasks of a statistic of a task.
 fn over_tasks(scores: &Runs, statistic: impl Fn(&[f64]) -> f64) -> f64 {
     scores.iter().map(|task| statistic(task)).sum::<f64>() / scores.len() as f64
@@ -96,11 +132,11 @@ pub fn fraction_above(scores: &Runs, threshold: f64) -> f64 {
 pub fn probability_of_improvement(x: &Runs, y: &Runs) -> f64 {
     let half = |is_more| 0.5 * f64::from(u8::from(is_more));
     let wins = |x: f64, y: f64| half(x > y) + half(x >= y);
-    let of_task = |(x, y): (&Vec<f64>, &Vec<f64>)| {
-        let all: f64 = x.iter().flat_map(|x| y.iter().map(|y| wins(*x, *y))).sum();
-        all / (x.len() * y.len()) as f64
+    let share = |(x, y): (&Vec<f64>, &Vec<f64>)| {
+        let won: f64 = x.iter().flat_map(|x| y.iter().map(|y| wins(*x, *y))).sum();
+        won / (x.len() * y.len()) as f64
     };
-    x.iter().zip(y).map(of_task).sum::<f64>() / x.len() as f64
+    x.iter().zip(y).map(share).sum::<f64>() / x.len() as f64
 }
 
 /// Statistics of methods' runs with 95 % percentile intervals of the stratified bootstrap, which draws
@@ -123,13 +159,13 @@ pub fn estimates<T: Copy>(
         for (drawn, runs) in drawn.iter_mut().flatten().zip(tasks) {
             drawn.fill_with(|| runs[random.random_range(0..runs.len())]);
         }
-        for (all, value) in resampled.iter_mut().zip(statistics(&drawn)) {
-            all.push(value);
+        for (values, value) in resampled.iter_mut().zip(statistics(&drawn)) {
+            values.push(value);
         }
     }
-    let with_interval = |(value, mut all): (f64, Vec<f64>)| {
-        all.sort_by(f64::total_cmp);
-        let [low, high] = [0.025, 0.975].map(|share| Some(percentile(&all, share)));
+    let with_interval = |(value, mut drawn): (f64, Vec<f64>)| {
+        drawn.sort_by(f64::total_cmp);
+        let [low, high] = [0.025, 0.975].map(|share| Some(percentile(&drawn, share)));
         estimate(value, low, high)
     };
     values.into_iter().zip(resampled).map(with_interval).collect()

@@ -9,7 +9,7 @@ use indicatif::HumanBytes;
 use quad_runtime::one_line;
 use serde::Serialize;
 
-use super::state::State;
+use super::State;
 use crate::folder::{RunDir, RunDirError, walk};
 use crate::results::RunReport;
 use crate::table::{Style, Table};
@@ -116,10 +116,10 @@ impl Listed {
 
 /// Total size of the files in a folder, bytes.
 fn size(dir: &Path) -> u64 {
-    let of = |entry: DirEntry| match entry.metadata() {
+    let bytes = |entry: DirEntry| match entry.metadata() {
         Ok(metadata) if metadata.is_dir() => size(&entry.path()),
         metadata => metadata.map_or(0, |metadata| metadata.len()),
     };
     let entries = fs::read_dir(dir).into_iter().flatten();
-    entries.flatten().map(of).sum()
+    entries.flatten().map(bytes).sum()
 }
