@@ -77,11 +77,13 @@ impl ConfigError {
                 "--steps N learns from the dataset alone, --online-steps N from experience too".to_owned()
             }
             Self::NotOnline(_) => {
-                let can = |known: &Definition| Values::of(known).for_task(None).contains_key("online");
-                format!("leave out --online-steps, or choose one of {}", those_that(can))
+                let can = |algorithm: &Definition| {
+                    Values::of(algorithm).for_task(None).contains_key("online")
+                };
+                format!("leave out --online-steps, or choose one of {}", names_where(can))
             }
             Self::Hyperparameters { source: AgentError::NoChunks(_), .. } => {
-                format!("leave it out, or choose one of {}", those_that(|known| known.chunks))
+                format!("leave it out, or choose one of {}", names_where(|algorithm| algorithm.chunks))
             }
             Self::Evaluations { most, .. } => {
                 format!("choose a larger eval_interval, for at most {most}")
@@ -92,9 +94,9 @@ impl ConfigError {
 }
 
 /// Names of some algorithms.
-fn those_that(can: impl Fn(&Definition) -> bool) -> String {
-    let names = ALGORITHMS.iter().filter(|known| can(known)).map(|known| known.name);
-    Vec::from_iter(names).join(", ")
+fn names_where(can: impl Fn(&Definition) -> bool) -> String {
+    let algorithms = ALGORITHMS.iter().filter(|algorithm| can(algorithm));
+    Vec::from_iter(algorithms.map(|algorithm| algorithm.name)).join(", ")
 }
 
 /// `did you mean a, b? ` with up to three of the names that contain the word or differ in few letters,

@@ -84,8 +84,9 @@ impl Experiment {
 
     /// The variant's label in tables and figures.
     pub fn label(&self) -> Result<String, ConfigError> {
-        let (known, variant) = (self.definition()?.report.variant, self.variant()?);
-        Ok(known.map_or_else(|| variant.to_owned(), |known| (known.called)(variant)))
+        let (definition, variant) = (self.definition()?, self.variant()?);
+        let label = definition.report.variant.map(|names| (names.called)(variant));
+        Ok(label.unwrap_or_else(|| variant.to_owned()))
     }
 
     /// Name, variant and candidates of the algorithm: `quad, guidance dac, 10 candidates`.

@@ -8,9 +8,8 @@ use super::tasks::Task;
 /// True if an algorithm's authors give no values for a benchmark's task. A task without a dataset
 /// of its own is no benchmark's.
 fn lacks(values: &Values, task: &Task) -> bool {
-    let given = task.benchmark.and_then(|of| values.given.get(&of.name));
-    let mut given = given.into_iter().flatten();
-    let is_given = given.any(|pattern| fits(pattern, &task.name));
+    let given = task.benchmark.and_then(|benchmark| values.given.get(&benchmark.name));
+    let is_given = given.is_some_and(|tasks| tasks.iter().any(|pattern| fits(pattern, &task.name)));
     task.text("dataset").is_some() && !is_given
 }
 
@@ -30,13 +29,12 @@ pub fn not_given(definition: &Definition, task: &Task) -> Option<String> {
 /// Finds an algorithm by name.
 pub fn algorithm(name: &str) -> Result<Definition, ConfigError> {
     let unknown = || {
-        let names = Vec::from_iter(ALGORITHMS.iter().map(|known| known.name));
+        let names = Vec::from_iter(ALGORITHMS.iter().map(|definition| definition.name));
         let similar = did_you_mean(name, names.iter().copied());
         let hint = format!("{similar}there are {}", names.join(", "));
         ConfigError::unknown("algorithm", name, hint)
     };
-    let found = ALGORITHMS.iter().find(|known| known.name == name);
-    found.copied().ok_or_else(unknown)
+    ALGORITHMS.iter().find(|definition| definition.name == name).copied().ok_or_else(unknown)
 }
 
 #[cfg(test)]

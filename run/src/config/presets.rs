@@ -69,12 +69,12 @@ impl Preset {
         let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
         let has_online = table.contains_key("online");
         let online_values = table.remove("online_values");
-        let mut of_task = self.task.map_or_else(Table::new, |task| task.keys.clone());
+        let mut task_keys = self.task.map_or_else(Table::new, |task| task.keys.clone());
         // An algorithm that learns from experience alone does so in each task.
         if table.get("steps") == Some(&Value::Integer(0)) {
-            of_task.remove("steps");
+            task_keys.remove("steps");
         }
-        merge(&mut table, of_task);
+        merge(&mut table, task_keys);
         if let Some(Value::Table(values)) = online_values
             && [changes, &self.own].into_iter().find_map(online_steps).is_some_and(|n| n > 0)
         {
@@ -130,13 +130,9 @@ impl Preset {
                 }
             }
         }
-        let of_online = |key: &&String| key.starts_with("online.") && *key != "online.steps";
-        for unused in changed.iter().filter(of_online) {
-            if experiment.online.is_none() {
-                doubts.push(format!(
-                    "{unused} has no effect without online steps (--online-steps N)"
-                ));
-            }
+        let is_online = |key: &&String| key.starts_with("online.") && *key != "online.steps";
+        for unused in changed.iter().filter(|key| experiment.online.is_none() && is_online(key)) {
+            doubts.push(format!("{unused} has no effect without online steps (--online-steps N)"));
         }
         let steps = experiment.total_steps();
         if let Some(key) = definition.report.acts_after
@@ -167,8 +163,7 @@ fn online_steps(keys: &Table) -> Option<i64> {
 /// Refuses a change above `[agent]` to a key that `table` has below it, and the reverse.
 fn check_places(table: &Table, changes: &Table) -> Result<(), ConfigError> {
     let agent = |table: &Table| table.get("agent").and_then(Value::as_table).cloned();
-    let (below, below_changes) =
-        (agent(table).unwrap_or_default(), agent(changes).unwrap_or_default());
+    let [below, below_changes] = [table, changes].map(|table| agent(table).unwrap_or_default());
     let misplaced = |changes: &Table, here: &Table, there: &Table| {
         let is_misplaced = |key: &&String| !here.contains_key(*key) && there.contains_key(*key);
         changes.keys().find(is_misplaced).cloned()

@@ -12,17 +12,17 @@ pub fn parse_assignment(text: &str) -> Result<Table, String> {
 
 /// The values of a table and its inner tables, with dotted keys.
 pub fn keys(table: &Table) -> Vec<(String, &Value)> {
-    let mut all = Vec::new();
+    let mut values = Vec::new();
     for (key, value) in table {
         match value {
             Value::Table(inner) => {
                 let dotted = |(rest, value)| (format!("{key}.{rest}"), value);
-                all.extend(keys(inner).into_iter().map(dotted));
+                values.extend(keys(inner).into_iter().map(dotted));
             }
-            value => all.push((key.clone(), value)),
+            value => values.push((key.clone(), value)),
         }
     }
-    all
+    values
 }
 
 #[cfg(test)]

@@ -45,7 +45,8 @@ static TASKS: LazyLock<Vec<Task>> = LazyLock::new(|| {
     let tasks: Tasks = toml::from_str(include_str!("../../../presets/tasks.toml"))
         .expect("the embedded table is valid");
     let listed = tasks.task.into_iter().map(|task| {
-        let benchmark = task.text("dataset").and_then(catalog::find).map(|known| known.benchmark);
+        let benchmark =
+            task.text("dataset").and_then(catalog::find).map(|dataset| dataset.benchmark);
         Task { benchmark, ..task }
     });
     listed.chain(benchmarks::tasks().map(Task::from)).collect()
@@ -90,8 +91,8 @@ pub fn all() -> &'static [Task] {
 
 /// Finds a task by name.
 pub fn named(name: &str) -> Result<&'static Task, ConfigError> {
-    let found = all().iter().find(|task| task.name == name);
-    found.ok_or_else(|| ConfigError::unknown("task", name, unknown_hint(name)))
+    let task = all().iter().find(|task| task.name == name);
+    task.ok_or_else(|| ConfigError::unknown("task", name, unknown_hint(name)))
 }
 
 /// The hint for an unknown task: similar names.

@@ -141,10 +141,8 @@ mod tests {
 
     #[test]
     fn errors_that_mean_no_locks() {
-        let is_none = |error: Errno| means_no_locks(&error.into());
-        let known = [Errno::NOSYS, Errno::OPNOTSUPP, Errno::NOLCK];
-        assert!(known.into_iter().all(is_none));
-        let others = [Errno::IO, Errno::INTR, Errno::AGAIN, Errno::ACCESS];
-        assert!(!others.into_iter().any(is_none));
+        let means_none = |error: Errno| means_no_locks(&error.into());
+        assert!([Errno::NOSYS, Errno::OPNOTSUPP, Errno::NOLCK].into_iter().all(means_none));
+        assert!(![Errno::IO, Errno::INTR, Errno::AGAIN, Errno::ACCESS].into_iter().any(means_none));
     }
 }

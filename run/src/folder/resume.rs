@@ -122,41 +122,42 @@ impl ResumePoint {
         let snapshots = BTreeMap::new();
         let mut point = Self { checkpoint, snapshots, scores };
         let (schedule, step) = (experiment.schedule(), point.step());
-        let online = |at| {
+        let plays = |snapshot| {
             let online = experiment.online.as_ref();
-            online.is_some_and(|online| online.is_snapshot(experiment.steps, at))
+            online.is_some_and(|online| online.is_snapshot(experiment.steps, snapshot))
         };
         let mut played = BTreeSet::new();
         if experiment.online.is_some() {
             let episodes = read_experience(dir.path())?;
             played.extend(episodes.iter().map(|episode| (episode.step, episode.weights)));
         }
-        let is_needed = |at: &u64| schedule.is_evaluated(*at) || online(*at);
-        for at in dir.snapshots()?.into_iter().filter(is_needed) {
-            let scored = point.scores.get(&at);
+        let is_needed = |snapshot: &u64| schedule.is_evaluated(*snapshot) || plays(*snapshot);
+        for snapshot in dir.snapshots()?.into_iter().filter(is_needed) {
+            let scored = point.scores.get(&snapshot);
             // The resumed training makes this snapshot again.
-            if at > step && scored.is_none() {
+            if snapshot > step && scored.is_none() {
                 continue;
             }
             let is_other = |hash: &Hash| {
                 scored.is_some_and(|scored| scored.weights != hash.to_string())
-                    || played.iter().any(|(step, _)| *step == at) && !played.contains(&(at, *hash))
+                    || played.iter().any(|(step, _)| *step == snapshot)
+                        && !played.contains(&(snapshot, *hash))
             };
-            match dir.read_snapshot(at).map(|file| Hash::new(&file)) {
+            match dir.read_snapshot(snapshot).map(|file| Hash::new(&file)) {
                 Ok(hash) if is_other(&hash) => {
                     warn!(
-                        "the snapshot of step {at} is not the one that was scored or that has learned online: its file is damaged"
+                        "the snapshot of step {snapshot} is not the one that was scored or that played online: its file is damaged"
                     );
-                    dir.mark_damaged(at)?;
+                    dir.mark_damaged(snapshot)?;
                 }
-                Ok(hash) => drop(point.snapshots.insert(at, hash)),
+                Ok(hash) => drop(point.snapshots.insert(snapshot, hash)),
                 Err(error) => warn!("{}", one_line(&error)),
             }
         }
-        for at in schedule.evaluated_steps().take_while(|at| *at <= step) {
-            let scored = point.scores.get(&at).map_or(0, |scores| scores.episodes.len());
-            if !point.snapshots.contains_key(&at) && scored < experiment.episodes as usize {
-                warn!("without the snapshot of step {at} its evaluation stays incomplete");
+        for due in schedule.evaluated_steps().take_while(|due| *due <= step) {
+            let scored = point.scores.get(&due).map_or(0, |scores| scores.episodes.len());
+            if !point.snapshots.contains_key(&due) && scored < experiment.episodes as usize {
+                warn!("without the snapshot of step {due} its evaluation stays incomplete");
             }
         }
         Ok(point)

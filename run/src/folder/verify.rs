@@ -26,7 +26,7 @@ pub struct Findings {
     /// The checked property, such as `episodes are scored`.
     pub what: &'static str,
     /// Number of items that have the property.
-    pub found: u64,
+    pub held: u64,
     /// Number of items that should have it.
     pub expected: u64,
     /// Violations by kind: their number and the first cases.
@@ -54,7 +54,7 @@ impl Findings {
 
 impl fmt::Display for Findings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} of {} {}", self.found, self.expected, self.what)?;
+        write!(f, "{} of {} {}", self.held, self.expected, self.what)?;
         for (kind, (count, listed)) in &self.wrong {
             write!(f, "\n{kind} ({count}): {}", listed.join("; "))?;
             if *count > listed.len() as u64 {
@@ -76,7 +76,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     if expected == 0 && scores.is_empty() {
         return verify_snapshots(&dir);
     }
-    let mut found = Findings::new("episodes are scored", expected);
+    let mut findings = Findings::new("episodes are scored", expected);
     let mut hashes: BTreeMap<u64, Option<String>> = BTreeMap::new();
     let planned = |step| match schedule.is_evaluated(step) {
         true => episode_seeds(experiment.seed, step, experiment.episodes),
@@ -89,39 +89,42 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
         let name = named((step, seed));
         let read = || hash(&dir, step).ok().map(|hash| hash.to_string());
         match hashes.entry(step).or_insert_with(read) {
-            None => found.add("scored, but the snapshot is gone", name.clone()),
+            None => findings.add("scored, but the snapshot is gone", name.clone()),
             Some(hash) if *hash != line.weights => {
-                found.add("scored with other weights than are on disk", name.clone());
+                findings.add("scored with other weights than are on disk", name.clone());
             }
             Some(_) => {}
         }
         let left = left.entry(step).or_insert_with(|| BTreeSet::from_iter(planned(step)));
         if !seen.insert((step, seed)) {
-            found.add("scored twice", name);
+            findings.add("scored twice", name);
         } else if left.remove(&seed) {
-            found.found += 1;
+            findings.held += 1;
         } else {
-            found.add("no episode of this run", name);
+            findings.add("no episode of this run", name);
         }
     }
-    let missing = found.expected - found.found;
+    let missing = findings.expected - findings.held;
     if missing > 0 {
         // A run without end plans more episodes than memory holds.
         let unscored = |(step, seed): &(u64, u64)| !seen.contains(&(*step, *seed));
         let seeds = |step| planned(step).into_iter().map(move |seed| (step, seed));
         let first = schedule.evaluated_steps().flat_map(seeds).filter(unscored);
         let first = first.take(LISTED).map(named).collect();
-        found.wrong.insert("without a score until the run continues", (missing, first));
+        findings.wrong.insert("without a score until the run continues", (missing, first));
     }
-    Ok(found)
+    Ok(findings)
 }
 
 /// Compares snapshots with the hashes that judgments and experience name.
 fn verify_snapshots(dir: &RunDir) -> Result<Findings, RunDirError> {
     let mut hashes: BTreeMap<u64, BTreeSet<String>> = BTreeMap::new();
-    let judged = Judgment::read_all(dir)?.into_iter().map(|it| (it.step, it.weights));
+    let judged =
+        Judgment::read_all(dir)?.into_iter().map(|judgment| (judgment.step, judgment.weights));
     let played = read_experience(dir.path())?.into_iter();
-    for (step, hash) in judged.chain(played.map(|it| (it.step, it.weights.to_string()))) {
+    for (step, hash) in
+        judged.chain(played.map(|episode| (episode.step, episode.weights.to_string())))
+    {
         hashes.entry(step).or_default().insert(hash);
     }
     let mut findings = Findings::new("snapshots have the recorded hash", 0);
@@ -129,7 +132,7 @@ fn verify_snapshots(dir: &RunDir) -> Result<Findings, RunDirError> {
         let Some(recorded) = hashes.get(&step) else { continue };
         findings.expected += 1;
         match *recorded == BTreeSet::from([hash(dir, step)?.to_string()]) {
-            true => findings.found += 1,
+            true => findings.held += 1,
             false => findings.add(
                 "judged or played with other weights than are on disk",
                 format!("step {step}"),
@@ -154,47 +157,47 @@ pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> 
     let with_key = |line: ScoreLine| ((line.step, line.seed), line);
     let by_key = |lines: Vec<ScoreLine>| BTreeMap::from_iter(lines.into_iter().map(with_key));
     let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
-    let mut found = Findings::new("episodes are compared", ours.len() as u64);
+    let mut findings = Findings::new("episodes are compared", ours.len() as u64);
     let [a, b] = [&config, &other_config].map(settings::from_run);
     for key in settings::differences_in_brief(&a, &b) {
-        found.add("settings that differ", key.clone());
+        findings.add("settings that differ", key.clone());
     }
     for (key, line) in &ours {
         let name = named(*key);
         let Some(same) = theirs.get(key) else {
-            found.add("not scored there", name);
+            findings.add("not scored there", name);
             continue;
         };
         let bits = |line: &ScoreLine| (line.episode_return.to_bits(), line.length);
         if line.weights != same.weights {
-            found.add("weights that differ", name);
+            findings.add("weights that differ", name);
         } else if line.precision != same.precision {
             let (here, there) = (&line.precision, &same.precision);
-            found.add(OTHER_ARITHMETIC, format!("{name} ({here} here, {there} there)"));
+            findings.add(OTHER_ARITHMETIC, format!("{name} ({here} here, {there} there)"));
         } else if bits(line) != bits(same) {
-            found.add("scores that differ", name);
+            findings.add("scores that differ", name);
         } else {
-            found.found += 1;
+            findings.held += 1;
         }
     }
-    Ok([found, compare_snapshots(&dir, &other_dir)?])
+    Ok([findings, compare_snapshots(&dir, &other_dir)?])
 }
 
 fn compare_snapshots(dir: &RunDir, other: &RunDir) -> Result<Findings, RunDirError> {
     let (ours, theirs) = (dir.snapshots()?, other.snapshots()?);
-    let mut found = Findings::new("snapshots are compared", ours.len() as u64);
+    let mut findings = Findings::new("snapshots are compared", ours.len() as u64);
     if ours.is_empty() {
         // A complete run has at least one.
-        found.add("nothing to compare", format!("{} has no snapshot", dir.path().display()));
+        findings.add("nothing to compare", format!("{} has no snapshot", dir.path().display()));
     }
     for step in ours {
         if !theirs.contains(&step) {
-            found.add("snapshots that are not there", format!("step {step}"));
+            findings.add("snapshots that are not there", format!("step {step}"));
         } else if hash(dir, step)? != hash(other, step)? {
-            found.add("snapshots that differ", format!("step {step}"));
+            findings.add("snapshots that differ", format!("step {step}"));
         } else {
-            found.found += 1;
+            findings.held += 1;
         }
     }
-    Ok(found)
+    Ok(findings)
 }

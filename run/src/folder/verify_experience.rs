@@ -27,7 +27,7 @@ pub fn verify_experience(path: &Path) -> Result<Option<(Findings, &'static str)>
     let experiment = &config.experiment;
     let Some(online) = &experiment.online else { return Ok(None) };
     let episodes = read_experience(path)?;
-    let mut found = Findings { what: "environment steps are recorded", ..Findings::default() };
+    let mut findings = Findings { what: "environment steps are recorded", ..Findings::default() };
     let most = episodes.len() as u64 + u64::from(online.lag);
     let numbers: BTreeMap<_, _> = (0..most).map(|j| (online_seed(experiment.seed, j), j)).collect();
     let mut lengths = BTreeMap::new();
@@ -35,9 +35,9 @@ pub fn verify_experience(path: &Path) -> Result<Option<(Findings, &'static str)>
         let seed = episode.score.seed;
         let name = format!("step {}, seed {seed}", episode.step);
         match numbers.get(&seed) {
-            None => found.add("no episode of this run", name),
+            None => findings.add("no episode of this run", name),
             Some(j) if lengths.insert(*j, episode.rewards.len() as u64).is_some() => {
-                found.add("recorded twice", name);
+                findings.add("recorded twice", name);
             }
             Some(_) => {}
         }
@@ -47,25 +47,25 @@ pub fn verify_experience(path: &Path) -> Result<Option<(Findings, &'static str)>
     while let Some(length) = lengths.get(&next).filter(|_| rows < online.steps) {
         (next, rows) = (next + 1, rows + length);
     }
-    (found.found, found.expected) = (rows.min(online.steps), online.steps);
+    (findings.held, findings.expected) = (rows.min(online.steps), online.steps);
     if rows < online.steps {
         let missing = online.steps - rows;
-        found.add("not recorded yet", format!("{missing} steps, from episode {next} on"));
+        findings.add("not recorded yet", format!("{missing} steps, from episode {next} on"));
     }
-    let arithmetic = BTreeSet::from_iter(episodes.iter().map(|it| &it.precision));
-    let acted = BTreeSet::from_iter(episodes.iter().map(|it| (it.step, it.weights)));
+    let arithmetic = BTreeSet::from_iter(episodes.iter().map(|episode| &episode.precision));
+    let acted = BTreeSet::from_iter(episodes.iter().map(|episode| (episode.step, episode.weights)));
     let is_same = |(step, weights): &(u64, Hash)| {
         dir.read_snapshot(*step).map_or(true, |file| Hash::new(&file) == *weights)
     };
     let is_repeatable = arithmetic.len() <= 1
-        && episodes.iter().all(|it| it.interventions.is_empty())
+        && episodes.iter().all(|episode| episode.interventions.is_empty())
         && acted.iter().all(is_same);
     let promise = match environment::find(&experiment.environment) {
         _ if !is_repeatable => LOGGED,
         Ok(_) => REPEATABLE,
         Err(_) => IF_REPEATABLE,
     };
-    Ok(Some((found, promise)))
+    Ok(Some((findings, promise)))
 }
 
 #[cfg(test)]

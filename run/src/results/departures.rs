@@ -26,7 +26,8 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
         departures.push(best);
     }
     let definition = ours.definition().ok();
-    departures.extend(definition.and_then(|known| hyperparameters::not_given(&known, task)));
+    departures
+        .extend(definition.and_then(|definition| hyperparameters::not_given(&definition, task)));
     if let Some(theirs) = paper.dataset.as_deref().filter(|theirs| !is_trained_on(run, theirs)) {
         let name = ours.dataset.as_deref().unwrap_or("not named");
         departures.push(format!("dataset is {name}, not {theirs}"));
@@ -52,12 +53,12 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
 }
 
 /// The authors' values of a run's task: of the run's variant, or of the algorithm's default.
-pub fn as_given(run: &RunReport, of_variant: bool) -> Result<Experiment, ConfigError> {
-    let of_key = |key: &str, value: toml::Value| toml::Table::from_iter([(key.to_owned(), value)]);
-    let mut asked = of_key("algorithm", run.algorithm.as_str().into());
+pub fn as_given(run: &RunReport, with_variant: bool) -> Result<Experiment, ConfigError> {
+    let table = |key: &str, value: toml::Value| toml::Table::from_iter([(key.to_owned(), value)]);
+    let mut asked = table("algorithm", run.algorithm.as_str().into());
     let variant = run.config.experiment.definition()?.report.variant;
-    if let Some(known) = variant.filter(|_| of_variant) {
-        let agent = of_key(known.key, run.variant.as_str().into());
+    if let Some(variant) = variant.filter(|_| with_variant) {
+        let agent = table(variant.key, run.variant.as_str().into());
         asked.insert("agent".to_owned(), agent.into());
     }
     config::resolve(&run.config.run.task, &asked)
@@ -71,7 +72,7 @@ fn without_seed(experiment: &Experiment) -> Settings {
 
 /// True if a run learned from the dataset of that name, by its hash or its name.
 fn is_trained_on(run: &RunReport, dataset: &str) -> bool {
-    let known = catalog::find(dataset).and_then(|known| known.sha256.as_ref());
-    let same_file = known.is_some() && run.config.dataset.sha256.as_ref() == known;
+    let hash = catalog::find(dataset).and_then(|entry| entry.sha256.as_ref());
+    let same_file = hash.is_some() && run.config.dataset.sha256.as_ref() == hash;
     same_file || run.config.experiment.dataset.as_deref() == Some(dataset)
 }

@@ -170,7 +170,7 @@ impl Ranking {
         let header = ["rank", "policy", "value", "distance", "doubts"];
         let mut table = Table::new(&header.map(alignment));
         let mut push = |cells: [&str; 5]| table.push(cells.map(str::to_owned));
-        let value = |of: &Estimate| of.spread().map_or_else(|| "-".to_owned(), Spread::text);
+        let value = |estimate: &Estimate| estimate.spread().map_or("-".to_owned(), Spread::text);
         for (judgment, rank) in self.policies.iter().zip(1..) {
             let estimate = &judgment.estimate;
             let rank = match self.can_rank && estimate.doubts.is_empty() {
@@ -185,9 +185,8 @@ impl Ranking {
         let (estimated, recorded) = (value(&self.behavior), format!("{:.2}", self.recorded));
         push(["-", "behavior, estimated", &estimated, "", &doubts]);
         push(["-", "behavior, as recorded", &recorded, "", ""]);
-        let of = &self.conditions;
-        let (environment, gamma, steps, seeds) = (&of.environment, of.gamma, of.steps, of.seeds);
-        let (verdict, episodes) = (&self.verdict, counted(of.episodes.len(), "episode"));
+        let Conditions { environment, gamma, steps, seeds, episodes, .. } = &self.conditions;
+        let (verdict, episodes) = (&self.verdict, counted(episodes.len(), "episode"));
         let text = format!(
             "Judged without a simulator: a ranking, not a score.\n{verdict}\nValues are discounted returns (γ = {gamma}) in {environment} \
              from the first states of {episodes} on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \

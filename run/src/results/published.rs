@@ -1,6 +1,6 @@
 //! Published scores of tasks: the files in `published/`, the QUAD paper's first.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::LazyLock;
 
 use quad_algorithms::fits;
@@ -95,14 +95,14 @@ struct KnownRemark {
 impl KnownRemark {
     /// The remark, if it applies to a score.
     fn on(&'static self, method: &str, task: &str) -> Option<Remark> {
-        let is_of_task = match (self.tasks.is_empty(), self.instead.is_empty()) {
+        let has_task = match (self.tasks.is_empty(), self.instead.is_empty()) {
             (true, true) => true,
             (true, false) => self.instead.contains_key(task),
             (false, _) => self.tasks.iter().any(|pattern| fits(pattern, task)),
         };
-        let is_on = is_of_task && self.methods.iter().any(|known| known == method);
+        let applies = has_task && self.methods.iter().any(|name| name == method);
         let instead = self.instead.get(task).copied();
-        is_on.then_some(Remark { reason: &self.reason, instead, selected: self.selected })
+        applies.then_some(Remark { reason: &self.reason, instead, selected: self.selected })
     }
 }
 
@@ -118,18 +118,18 @@ static SOURCES: LazyLock<[Tables; 4]> = LazyLock::new(|| {
 });
 
 /// The sources of a task.
-fn of_task(task: &str) -> impl Iterator<Item = &'static Tables> {
+fn sources(task: &str) -> impl Iterator<Item = &'static Tables> {
     SOURCES.iter().filter(move |tables| tables.scores.contains_key(task))
 }
 
 /// The published scores of a task, the paper's own method first.
 pub fn scores(task: &str) -> Vec<Published> {
-    let of_source = |source: &'static Tables| {
+    let published = |source: &'static Tables| {
         source.method.iter().filter_map(move |method| {
             let name = &method.name;
             let figures = source.scores[task].get(name)?;
             let (mean, std) = (*figures.first()?, figures.get(1).copied());
-            let remarks = source.remark.iter().filter_map(|known| known.on(name, task));
+            let remarks = source.remark.iter().filter_map(|remark| remark.on(name, task));
             Some(Published {
                 method: name,
                 score: Printed { mean, std },
@@ -140,21 +140,21 @@ pub fn scores(task: &str) -> Vec<Published> {
             })
         })
     };
-    of_task(task).flat_map(of_source).collect()
+    sources(task).flat_map(published).collect()
 }
 
 /// Training seeds per published score of the task; 1 if nothing is published.
 pub fn seeds(task: &str) -> usize {
-    of_task(task).next().map_or(1, |tables| tables.seeds)
+    sources(task).next().map_or(1, |tables| tables.seeds)
 }
 
 /// Number of final evaluations averaged for a score. If nothing is published, it is that of the
 /// first source for the task's benchmark, else the QUAD paper's.
 pub fn final_evaluations(task: &str) -> usize {
     let benchmark = tasks::named(task).ok().and_then(|task| task.benchmark);
-    let is_like = |tables: &&Tables| Some(&tables.benchmark) == benchmark.map(|known| &known.name);
-    let unpublished = SOURCES.iter().find(is_like).unwrap_or(&SOURCES[0]);
-    of_task(task).next().unwrap_or(unpublished).last
+    let name = benchmark.map(|benchmark| &benchmark.name);
+    let similar = SOURCES.iter().find(|tables| Some(&tables.benchmark) == name);
+    sources(task).next().or(similar).unwrap_or(&SOURCES[0]).last
 }
 
 /// The tables for runs of an algorithm: the task's tables that contain the algorithm, else the task's
@@ -162,17 +162,17 @@ pub fn final_evaluations(task: &str) -> usize {
 pub fn tables(task: &str, algorithm: &str) -> Vec<&'static str> {
     let figures = scores(task);
     // A table has the task if one of its scores is in no other table.
-    let of_task = |table: &&str| figures.iter().any(|figure| figure.tables == [*table]);
-    let all = Vec::from_iter(all_tables().into_iter().filter(of_task));
-    let has_it = |table: &&str| {
-        let has = |method: &Method| method.tables.iter().any(|one| one == table);
-        all_methods().any(|method| method.algorithm.as_deref() == Some(algorithm) && has(method))
+    let has_task = |table: &&str| figures.iter().any(|figure| figure.tables == [*table]);
+    let mut tables = Vec::from_iter(all_tables().into_iter().filter(has_task));
+    let has_algorithm = |table: &&str| {
+        let own = |method: &&Method| method.algorithm.as_deref() == Some(algorithm);
+        all_methods().filter(own).flat_map(|method| &method.tables).any(|name| name == table)
     };
-    let with_it = Vec::from_iter(all.iter().copied().filter(has_it));
-    match with_it.is_empty() {
-        true => all.into_iter().take(1).collect(),
-        false => with_it,
+    match tables.iter().any(has_algorithm) {
+        true => tables.retain(has_algorithm),
+        false => tables.truncate(1),
     }
+    tables
 }
 
 /// All tables, in their order.
@@ -183,11 +183,11 @@ pub fn all_tables() -> Vec<&'static str> {
 
 /// The sources' names of a variant of an algorithm: one for each of its rows.
 pub fn methods(algorithm: &str, variant: &str) -> Vec<&'static str> {
-    let is_it = |method: &&Method| {
+    let rows = all_methods().filter(|method| {
         method.algorithm.as_deref() == Some(algorithm)
-            && method.variant.as_deref().is_none_or(|known| known == variant)
-    };
-    once_each(all_methods().filter(is_it).map(|method| &*method.name))
+            && method.variant.as_deref().is_none_or(|name| name == variant)
+    });
+    once_each(rows.map(|method| &*method.name))
 }
 
 fn all_methods() -> impl Iterator<Item = &'static Method> {
@@ -196,13 +196,8 @@ fn all_methods() -> impl Iterator<Item = &'static Method> {
 
 /// Removes later duplicates of names.
 pub fn once_each<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
-    let mut known = Vec::new();
-    for name in names {
-        if !known.contains(&name) {
-            known.push(name);
-        }
-    }
-    known
+    let mut seen = BTreeSet::new();
+    names.filter(|name| seen.insert(*name)).collect()
 }
 
 #[cfg(test)]

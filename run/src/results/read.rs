@@ -55,7 +55,7 @@ impl RunReport {
             EvaluationReport::new(step, &episodes, experiment)
         };
         let evaluations: Vec<_> = by_step.into_iter().filter_map(evaluate).collect();
-        let counted = Vec::from_iter(evaluations.iter().filter(|it| it.counts()));
+        let counted = Vec::from_iter(evaluations.iter().filter(|evaluation| evaluation.counts()));
         let mean = |evaluations: &[&EvaluationReport]| {
             let scores = Vec::from_iter(evaluations.iter().map(|e| e.score.mean));
             Spread::new(&scores).map(|spread| spread.mean)
@@ -64,8 +64,9 @@ impl RunReport {
         let begins = experiment.online_begins().unwrap_or(0);
         let final_steps =
             experiment.total_steps().checked_sub(FINAL_STEPS).filter(|start| *start > begins);
-        let in_final_steps =
-            |start| mean(&counted[counted.partition_point(|it| it.step <= start)..]);
+        let in_final_steps = |start| {
+            mean(&counted[counted.partition_point(|evaluation| evaluation.step <= start)..])
+        };
         let normalized = environment::find(&experiment.environment).is_ok();
         let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
         Ok(Self {

@@ -5,13 +5,13 @@ use super::*;
 
 #[test]
 fn only_tasks_of_benchmarks_can_lack_values() {
-    let of_ogbench = "antmaze-giant-stitch-singletask-task5-v0";
+    let giant = "antmaze-giant-stitch-singletask-task5-v0";
     for (benchmark, given, task, expected) in [
         ("D4RL", "*-v2", "hopper-medium-v2", false),
         ("D4RL", "*-v2", "hopper-demo", false),
         ("D4RL", "*-v2", "antmaze-umaze-v0", true),
-        ("D4RL", "*-v0", of_ogbench, true),
-        ("OGBench", "antmaze-*", of_ogbench, false),
+        ("D4RL", "*-v0", giant, true),
+        ("OGBench", "antmaze-*", giant, false),
         ("OGBench", "antmaze-*", "antmaze-umaze-v0", true),
     ] {
         let given = format!("given.{benchmark} = [{given:?}]");

@@ -86,10 +86,10 @@ fn close_or_doubtful_values_are_not_ranked() {
 #[test]
 fn other_conditions_have_another_ranking() {
     let [a, b] = ["a", "b"].map(|run| judgment(run, &[1.0], 10.0));
-    let mut others = [a.clone(), a.clone()];
-    others[0].conditions.gamma = 0.9;
-    others[1].conditions.environment = "another arm".to_owned();
-    for other in others {
+    let mut different = [a.clone(), a.clone()];
+    different[0].conditions.gamma = 0.9;
+    different[1].conditions.environment = "another arm".to_owned();
+    for other in different {
         assert_eq!(Ranking::from_judgments([a.clone(), other, b.clone()]).len(), 2);
     }
 }

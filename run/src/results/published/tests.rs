@@ -32,8 +32,8 @@ fn columns_add_up_to_the_totals_of_the_paper() {
         let totals = [false, true].map(|maze| total(method, 0, maze));
         assert_eq!(totals, [locomotion, antmaze], "{method}");
     }
-    let of_replication = |figure, maze| total("DAC-Rep", figure, maze);
-    let table_2 = [0, 1].map(|figure| of_replication(figure, false) + of_replication(figure, true));
+    let replication = |figure, maze| total("DAC-Rep", figure, maze);
+    let table_2 = [0, 1].map(|figure| replication(figure, false) + replication(figure, true));
     assert_eq!(table_2.map(|total| (total * 10.0).round() / 10.0), [511.8, 58.1]);
 }
 
@@ -57,9 +57,9 @@ fn columns_have_the_averages_of_corl() {
 #[test]
 fn every_score_has_a_method() {
     for source in &*SOURCES {
-        for (task, of_methods) in &source.scores {
-            let known = |name: &String| source.method.iter().any(|method| method.name == *name);
-            assert!(of_methods.keys().all(known), "{task}");
+        for (task, scores) in &source.scores {
+            let has_row = |name: &String| source.method.iter().any(|method| method.name == *name);
+            assert!(scores.keys().all(has_row), "{task}");
         }
     }
     for task in paper().scores.keys() {
@@ -92,14 +92,14 @@ fn tables_of_a_run() {
 #[test]
 fn every_remark_is_on_a_score_and_differs_from_it() {
     for source in &*SOURCES {
-        for known in &source.remark {
-            for method in &known.methods {
+        for remark in &source.remark {
+            for method in &remark.methods {
                 let score = |task: &String| source.scores.get(task)?.get(method)?.first();
                 let is_on =
-                    |task: &String| score(task).and_then(|_| known.on(method, task)).is_some();
-                assert!(source.scores.keys().any(is_on), "{method}: {}", known.reason);
-                for (task, instead) in &known.instead {
-                    assert!(score(task).is_some_and(|it| it != instead), "{method}, {task}");
+                    |task: &String| score(task).and_then(|_| remark.on(method, task)).is_some();
+                assert!(source.scores.keys().any(is_on), "{method}: {}", remark.reason);
+                for (task, instead) in &remark.instead {
+                    assert!(score(task).is_some_and(|score| score != instead), "{method}, {task}");
                 }
             }
         }

@@ -8,8 +8,8 @@ use super::*;
 
 /// Results of rliable and SciPy, from `statistics.py` beside this file.
 #[derive(Deserialize)]
-struct Known {
-    methods: BTreeMap<String, KnownMethod>,
+struct Reference {
+    methods: BTreeMap<String, Method>,
     thresholds: Vec<f64>,
     /// Value, low, high.
     improvement: [f64; 3],
@@ -18,7 +18,7 @@ struct Known {
 }
 
 #[derive(Deserialize)]
-struct KnownMethod {
+struct Method {
     scores: Runs,
     values: Vec<f64>,
     low: Vec<f64>,
@@ -26,7 +26,7 @@ struct KnownMethod {
     profile: Vec<f64>,
 }
 
-fn known() -> Known {
+fn reference() -> Reference {
     serde_json::from_str(include_str!("statistics.json")).unwrap()
 }
 
@@ -44,33 +44,32 @@ fn agree(estimate: Estimate, value: f64, low: f64, high: f64) {
 
 #[test]
 fn estimates_are_those_of_rliable() {
-    let known = known();
-    for method in known.methods.values() {
-        let of = |drawn: &[Runs]| {
-            let all = [interquartile_mean, mean_of_means, median_of_means, optimality_gap];
-            all.map(|of| of(&drawn[0])).to_vec()
+    let reference = reference();
+    for method in reference.methods.values() {
+        let statistics = |drawn: &[Runs]| {
+            [interquartile_mean, mean_of_means, median_of_means, optimality_gap]
+                .map(|statistic| statistic(&drawn[0]))
+                .to_vec()
         };
-        for (index, estimate) in estimates(&[&method.scores], of).into_iter().enumerate() {
-            let [value, low, high] =
-                [&method.values, &method.low, &method.high].map(|known| known[index]);
-            agree(estimate, value, low, high);
+        for (index, estimate) in estimates(&[&method.scores], statistics).into_iter().enumerate() {
+            agree(estimate, method.values[index], method.low[index], method.high[index]);
         }
-        for (threshold, share) in known.thresholds.iter().zip(&method.profile) {
+        for (threshold, share) in reference.thresholds.iter().zip(&method.profile) {
             assert!(is_close(fraction_above(&method.scores, *threshold), *share), "{threshold}");
         }
     }
-    let [x, y] = ["x", "y"].map(|name| &known.methods[name].scores);
+    let [x, y] = ["x", "y"].map(|name| &reference.methods[name].scores);
     let improvement = |drawn: &[Runs]| vec![probability_of_improvement(&drawn[0], &drawn[1])];
-    let [value, low, high] = known.improvement;
+    let [value, low, high] = reference.improvement;
     agree(estimates(&[x, y], improvement)[0], value, low, high);
 }
 
 #[test]
 fn intervals_are_repeatable_and_need_two_seeds() {
-    let of = |runs: Runs| estimates(&[&runs], |drawn| vec![mean_of_means(&drawn[0])])[0];
+    let estimate = |runs: Runs| estimates(&[&runs], |drawn| vec![mean_of_means(&drawn[0])])[0];
     let runs = vec![vec![1.0, 2.0, 4.0], vec![3.0, 5.0]];
-    assert_eq!(of(runs.clone()), of(runs));
-    let single = of(vec![vec![1.0, 2.0], vec![3.0]]);
+    assert_eq!(estimate(runs.clone()), estimate(runs));
+    let single = estimate(vec![vec![1.0, 2.0], vec![3.0]]);
     assert_eq!((single.value, single.low, single.high), (2.25, None, None));
 }
 
@@ -90,17 +89,17 @@ fn the_interquartile_mean_weighs_tasks_alike() {
 
 #[test]
 fn sign_flips_give_the_p_values_of_scipy() {
-    let known = known();
-    for (count, p_value) in (1..).zip(&known.p_values) {
-        assert!(is_close(sign_flip_test(&known.differences[..count].concat()), *p_value));
+    let Reference { differences, p_values, .. } = reference();
+    for (count, p_value) in (1..).zip(&p_values) {
+        assert!(is_close(sign_flip_test(&differences[..count].concat()), *p_value));
     }
     // For 17 differences, signs are drawn.
     assert_eq!(sign_flip_test(&[1.0; 17]), 1.0 / 10_001.0);
     let balanced: Vec<f64> = (0..17).map(|index| if index % 2 == 0 { 1.0 } else { -1.0 }).collect();
     assert_eq!(sign_flip_test(&balanced), 1.0);
     // Differences of 0 change no p-value.
-    let p_value = sign_flip_test(&[[0.0; 16].to_vec(), known.differences[0].clone()].concat());
-    assert!((p_value - known.p_values[0]).abs() < 0.02, "{p_value}");
+    let p_value = sign_flip_test(&[[0.0; 16].to_vec(), differences[0].clone()].concat());
+    assert!((p_value - p_values[0]).abs() < 0.02, "{p_value}");
 }
 
 #[test]
