@@ -1,4 +1,4 @@
-"""The ROS 2 node of docs/deploying.md, with a fake of rclpy, which pip cannot install, and chunks that are computed ahead."""
+"""The ROS 2 node of examples/, with a fake of rclpy, which pip cannot install, and chunks that are computed ahead."""
 
 import re
 import runpy
@@ -14,6 +14,7 @@ from conftest import train
 
 from quad_rl import Dataset, Policy
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 JOINTS = ["shoulder", "elbow"]
 SEEN = [f"{part}.{joint}" for part in ("position", "velocity") for joint in JOINTS]
 
@@ -50,8 +51,6 @@ def message(names, position, velocity):
 
 
 def test_the_node_maps_joints_by_name(snapshot, tmp_path, monkeypatch):
-    page = (Path(__file__).parents[2] / "docs" / "deploying.md").read_text()
-    code = re.search(r"^## ROS 2\n.*?^```python\n(.*?)^```$", page, re.M | re.S).group(1)
     spun, modules = [], {name: ModuleType(name) for name in ("rclpy", "rclpy.node", "sensor_msgs", "sensor_msgs.msg", "std_msgs", "std_msgs.msg")}
     modules["rclpy"].init, modules["rclpy"].spin, modules["rclpy.node"].Node = lambda: None, spun.append, Node
     modules["sensor_msgs.msg"].JointState, modules["std_msgs.msg"].Float64MultiArray = object, SimpleNamespace
@@ -59,13 +58,13 @@ def test_the_node_maps_joints_by_name(snapshot, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.chdir(tmp_path)
     Path("policy.safetensors").write_bytes(snapshot.read_bytes())
-    exec(compile(code, "docs/deploying.md", "exec"), {})
+    runpy.run_path(str(EXAMPLES / "ros2.py"))
     node, episodes = spun[0], Policy.load(snapshot).begin([0])
     node.receive(message(["shoulder", "elbow"], [0.1, 0.2], [0.3, 0.4]))
     node.receive(message(["gripper", "elbow", "shoulder"], [9.0, 0.2, 0.1], [np.nan, 0.4, 0.3]))
     state = np.array([[0.1, 0.2, 0.3, 0.4]], np.float32)
-    for found in node.published:
-        np.testing.assert_allclose(found, episodes.act(state)[0][::-1], rtol=1e-6)  # The controller's order.
+    for command in node.published:
+        np.testing.assert_allclose(command, episodes.act(state)[0][::-1], rtol=1e-6)  # The controller's order.
     assert len(node.published) == 2 and not node.errors
     node.receive(message(["shoulder", "elbow"], [0.1, float("nan")], [0.3, 0.4]))
     node.receive(message(["shoulder", "elbow"], [0.1, 0.2], []))
@@ -75,7 +74,7 @@ def test_the_node_maps_joints_by_name(snapshot, tmp_path, monkeypatch):
     assert "NaN" in node.errors[0] and "lacks" in node.errors[1]
 
 
-CHUNKS = runpy.run_path(str(Path(__file__).parents[2] / "examples/chunks.py"))
+CHUNKS = runpy.run_path(str(EXAMPLES / "chunks.py"))
 
 
 class Slow:

@@ -220,10 +220,11 @@ def test_constant_actions_are_exact_and_constant_observations_ignored(algorithm,
 
 def test_the_example_of_the_documentation_runs(snapshots, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = (PRESETS.parent / "docs" / "deploying.md").read_text()
+    root = PRESETS.parent
+    page, program = (root / "docs/deploying.md").read_text(), (root / "examples/act.cpp").read_text()
     exec(page.split("```python\n")[1].split("```")[0], {"quad_rl": quad_rl, "policy": Policy.load(snapshots["quad"])})
     inputs = onnxruntime.InferenceSession("policy.onnx").get_inputs()
-    assert [given.shape[1:] for given in inputs] == [[OBSERVATION], [5, 10, 3]] and "{1, 11}, drawn[] = {1, 5, 10, 3}" in page
+    assert [given.shape[1:] for given in inputs] == [[OBSERVATION], [5, 10, 3]] and "{1, 11}, drawn[] = {1, 5, 10, 3}" in program
 
 
 def test_refuses_invalid_choices(snapshots, tmp_path):
