@@ -45,7 +45,7 @@ pub struct TrainArgs {
     /// change
     #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]
     preset: Option<String>,
-    /// Go on online where a complete run has ended: with its settings and its last checkpoint,
+    /// Fine-tune a complete run online: with its settings, from its last checkpoint,
     /// in a folder of its own
     #[arg(long, value_name = "RUN", conflicts_with_all = ["task", "preset", "algorithm", "steps"], requires = "online_steps")]
     pub from: Option<PathBuf>,
@@ -130,7 +130,7 @@ struct OverrideArgs {
     /// Gradient steps on the dataset; 0 only with --online-steps
     #[arg(long, value_name = "N", value_parser = parse_count)]
     steps: Option<i64>,
-    /// Online environment steps, from which the learner goes on learning
+    /// Online environment steps, on which the learner fine-tunes
     #[arg(long, value_name = "N", value_parser = parse_count)]
     online_steps: Option<i64>,
     /// Gradient steps between two evaluations; 0 trains without any evaluation

@@ -99,8 +99,11 @@ impl EarlierRun {
     /// numbers still mean the same.
     pub fn check(&self, here: &Experiment, sha256: &str) -> anyhow::Result<()> {
         if here.online.is_none() {
-            let error = anyhow!("without online steps there is nothing to go on with");
-            return Err(hinted(error, "--online-steps N, above 0, says how much of it"));
+            let error = anyhow!("without online steps there is nothing to continue with");
+            return Err(hinted(
+                error,
+                "give a number of environment steps above 0 by --online-steps N",
+            ));
         }
         let there = &self.experiment;
         let known = self.dataset_sha256.as_deref().unwrap_or(sha256);

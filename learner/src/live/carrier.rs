@@ -23,7 +23,7 @@ pub(crate) struct Carrier {
     shared: Arc<Shared>,
     pub(super) metrics: Metrics,
     pub(super) events: Events,
-    /// In a run that goes on online.
+    /// In an online run.
     inbox: Option<Inbox>,
 }
 

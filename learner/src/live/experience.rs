@@ -22,7 +22,7 @@ pub(super) struct Experience {
 
 impl Experience {
     /// Opens the run's log, and puts what it has into the inbox. An episode that is not there may
-    /// have been played, if the snapshot with which the run goes on online is there.
+    /// have been played, if the snapshot from which online learning begins is there.
     pub fn open(dir: &RunDir, experiment: &Experiment, inbox: &Inbox) -> anyhow::Result<Self> {
         let (log, records) = dir.experience_log()?;
         let by_seed = |(hash, episode): (Hash, Episode)| (episode.score.seed, (hash, episode));

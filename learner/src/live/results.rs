@@ -17,7 +17,7 @@ use crate::service::{Input, Order};
 pub(super) struct Results {
     /// `scores.jsonl`.
     pub scores: Log,
-    /// `experience.log`, in a run that goes on online.
+    /// `experience.log`, in an online run.
     pub experience: Option<ExperienceLog>,
     pub carrier: Carrier,
     pub disk: DiskStatus,

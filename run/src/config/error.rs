@@ -69,7 +69,7 @@ impl ConfigError {
                 format!("--set {key}=VALUE changes it; in a file it is above [agent]")
             }
             Self::Warmup { .. } => {
-                "the learner learns from experience after the warm-up: give more --online-steps, or a shorter one by \
+                "gradient steps begin after the warm-up: give more --online-steps, or a shorter warm-up by \
                  --set online.warmup=N"
                     .to_owned()
             }

@@ -40,8 +40,8 @@ impl Online {
         self.warmup + updates.div_ceil(u64::from(self.updates_per_step))
     }
 
-    /// True if online episodes are played with the policy after gradient step `step`, where online learning begins
-    /// after step `begin`.
+    /// True if online episodes are played with the policy after gradient step `step`, where online
+    /// learning begins after step `begin`.
     pub fn is_snapshot(&self, begin: u64, step: u64) -> bool {
         step >= begin && (step - begin).is_multiple_of(self.snapshot_interval)
     }

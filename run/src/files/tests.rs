@@ -1,8 +1,5 @@
 //! Tests of files, and of all code that opens files without this module.
 
-use std::fs::read_dir;
-use std::path::PathBuf;
-
 use super::*;
 
 /// Calls that open or make a file, without `File::create_new`, which never opens an existing one.
@@ -32,52 +29,45 @@ const ALLOWED: [(&str, &str); 13] = [
     ("dataset/src/formats/new_file.rs", "File::open(&self.partial)"),
 ];
 
-/// The lines before the tests of a source that have one of [`CALLS`], without comments.
-fn calls(source: &str) -> Vec<&str> {
-    let is_call = |line: &&str| {
-        let is_part = |c: char| c.is_alphanumeric() || c == '_';
-        let whole = |at: usize, call: &str| {
-            !line[..at].ends_with(is_part) && !line[at + call.len()..].starts_with(is_part)
-        };
-        let has = |call| line.match_indices(call).any(|(at, _)| whole(at, call));
-        CALLS.split(' ').any(has)
+/// True if a line of code has one of [`CALLS`].
+fn is_call(line: &str) -> bool {
+    let is_part = |c: char| c.is_alphanumeric() || c == '_';
+    let is_whole = |start: usize, call: &str| {
+        !line[..start].ends_with(is_part) && !line[start + call.len()..].starts_with(is_part)
     };
-    let (code, _) = source.split_once("\nmod tests {").unwrap_or((source, ""));
-    let is_code = |line: &&str| !line.starts_with("//") && !line.starts_with("use ");
-    let lines = code.lines().map(str::trim);
-    lines.filter(is_code).filter(is_call).collect()
-}
-
-/// The source files below a folder, without tests.
-fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
-    for entry in read_dir(folder).unwrap().flatten() {
-        let (path, name) = (entry.path(), entry.file_name().into_string().unwrap());
-        match path.is_dir() {
-            _ if ["tests", "tests.rs", "fixtures.rs"].contains(&&*name) => {}
-            true => sources(&path, found),
-            false if name.ends_with(".rs") => found.push(path),
-            false => {}
-        }
-    }
+    let mut calls = CALLS.split(' ').flat_map(|call| line.match_indices(call));
+    !line.starts_with("//") && !line.starts_with("use ") && calls.any(|(i, call)| is_whole(i, call))
 }
 
 #[test]
 fn no_program_opens_files_in_another_way() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    let (mut paths, mut used) = (Vec::new(), [false; ALLOWED.len()]);
-    for name in SOURCES.split(' ') {
-        sources(&root.join(name).join("src"), &mut paths);
-    }
-    assert!(paths.len() > 200, "the sources are elsewhere");
-    for path in paths {
-        let name = path.strip_prefix(root).unwrap().to_owned();
-        for line in calls(&fs::read_to_string(&path).unwrap()) {
-            let mut allowed = ALLOWED.iter();
-            let place = allowed.position(|it| name.starts_with(it.0) && line.contains(it.1));
-            let place = place.unwrap_or_else(|| panic!("{name:?}: {line}\nUse quad_run::files."));
-            used[place] = true;
+    let mut folders = Vec::from_iter(SOURCES.split(' ').map(|name| root.join(name).join("src")));
+    let (mut files, mut used) = (0, [false; ALLOWED.len()]);
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).unwrap().flatten() {
+            let (path, name) = (entry.path(), entry.file_name().into_string().unwrap());
+            if path.is_dir() && name != "tests" {
+                folders.push(path);
+                continue;
+            }
+            if !name.ends_with(".rs") || ["tests.rs", "fixtures.rs"].contains(&&*name) {
+                continue;
+            }
+            files += 1;
+            let (text, name) =
+                (fs::read_to_string(&path).unwrap(), path.strip_prefix(root).unwrap());
+            let code = text.split("\nmod tests {").next().unwrap_or_default();
+            for line in code.lines().map(str::trim).filter(|line| is_call(line)) {
+                let is_allowed =
+                    |(file, part): &(&str, &str)| name.starts_with(file) && line.contains(part);
+                let index = ALLOWED.iter().position(is_allowed);
+                used[index.unwrap_or_else(|| panic!("{name:?}: {line}\nUse quad_run::files."))] =
+                    true;
+            }
         }
     }
+    assert!(files > 200, "the sources are elsewhere");
     for (allowed, used) in ALLOWED.iter().zip(used) {
         assert!(used, "no such call: {allowed:?}");
     }

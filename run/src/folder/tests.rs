@@ -104,21 +104,23 @@ fn metrics_after_the_resumed_step_are_cut_off() {
 
 #[test]
 fn scores_survive_and_an_incomplete_line_is_cut_off() {
-    let (_folder, path, run, log) = new_run();
+    let (_folder, path, run, mut log) = new_run();
+    log.append(&[line(1, 1, 0.1)]).unwrap();
     drop(log);
-    run.score_log().unwrap().append(&[line(1, 1, 0.1)]).unwrap();
     run.score_log().unwrap().append(&[line(1, 2, 0.2)]).unwrap();
     let path = path.join("scores.jsonl");
     let text = fs::read_to_string(&path).unwrap() + "{\"step\":1,";
-    fs::write(&path, &text).unwrap();
-    assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2)]);
-
     for tail in ["", &"x".repeat(200_000)] {
         fs::write(&path, format!("{text}{tail}")).unwrap();
+        assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2)]);
         run.score_log().unwrap().append(&[line(1, 3, 0.3)]).unwrap();
-        let seeds = run.read_scores().unwrap().into_iter().map(|line| line.seed);
-        assert_eq!(Vec::from_iter(seeds), [1, 2, 3]);
+        assert_eq!(seeds(&run), [1, 2, 3]);
     }
+}
+
+/// The seeds of all scores.
+fn seeds(run: &RunDir) -> Vec<u64> {
+    run.read_scores().unwrap().into_iter().map(|line| line.seed).collect()
 }
 
 /// After a power cut, a later part of what was not synchronized may be there without an earlier.
@@ -147,8 +149,7 @@ fn a_torn_append_of_scores_is_dropped_and_damage_before_it_is_an_error() {
         zeroed(start, end);
         assert_eq!(run.read_scores().unwrap().len(), kept);
         run.score_log().unwrap().append(&[line(3, 6, 0.6)]).unwrap();
-        let seeds = run.read_scores().unwrap().into_iter().map(|line| line.seed);
-        assert_eq!(Vec::from_iter(seeds), Vec::from_iter((1..=kept as u64).chain([6])));
+        assert_eq!(seeds(&run), Vec::from_iter((1..=kept as u64).chain([6])));
     }
 
     zeroed(5, 9);

@@ -58,13 +58,13 @@ fn a_damaged_record_before_another_one_is_an_error() {
     let (_folder, run, path, bytes) = recorded();
     let start = bytes.len() / 3;
     // In length, hash, begin and end of the frame of the second.
-    for at in [0, 3, 4, 36, start - 1] {
+    for offset in [0, 3, 4, 36, start - 1] {
         let mut damaged = bytes.clone();
-        damaged[start + at] ^= 0x40;
+        damaged[start + offset] ^= 0x40;
         fs::write(&path, &damaged).unwrap();
         let error = run.experience_log().unwrap_err();
         let words = format!("record 2, at byte {start}, is damaged, but one after it is complete");
-        assert!(error.to_string().ends_with(&words), "{at}: {error}");
+        assert!(error.to_string().ends_with(&words), "{offset}: {error}");
         assert!(error.hint().contains("a copy of the file"));
         assert!(read_experience(run.path()).is_err());
         assert_eq!(fs::read(&path).unwrap(), damaged);
@@ -97,10 +97,11 @@ fn a_torn_append_is_cut_off_from_its_first_damaged_record_on() {
 fn the_log_of_a_program_of_another_version_is_read_but_no_other_message() {
     let (_folder, run, path, _) = recorded();
     // A byte of the version, and the kind.
-    for (at, expected) in [(4, Ok(vec![episode(4)])), (6, Err("is of kind 6, kind 7 belongs here"))]
+    for (byte, expected) in
+        [(4, Ok(vec![episode(4)])), (6, Err("is of kind 6, kind 7 belongs here"))]
     {
         let mut frame = frame(4);
-        frame[at] ^= 1;
+        frame[byte] ^= 1;
         fs::remove_file(&path).unwrap();
         run.experience_log().unwrap().0.append([&*frame]).unwrap();
         let read = read_experience(run.path()).map_err(|error| error.to_string());
