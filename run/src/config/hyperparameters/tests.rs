@@ -4,25 +4,6 @@ use super::super::{ConfigError, resolve, settings, tasks};
 use super::*;
 
 #[test]
-fn only_tasks_of_benchmarks_can_lack_values() {
-    let giant = "antmaze-giant-stitch-singletask-task5-v0";
-    for (benchmark, given, task, expected) in [
-        ("D4RL", "*-v2", "hopper-medium-v2", false),
-        ("D4RL", "*-v2", "hopper-demo", false),
-        ("D4RL", "*-v2", "antmaze-umaze-v0", true),
-        ("D4RL", "*-v0", giant, true),
-        ("OGBench", "antmaze-*", giant, false),
-        ("OGBench", "antmaze-*", "antmaze-umaze-v0", true),
-    ] {
-        let given = format!("given.{benchmark} = [{given:?}]");
-        let text = format!("about = \"an example\"\ngflop = \"1\"\n{given}");
-        let values: Values = toml::from_str(&text).unwrap();
-        let task = tasks::named(task).unwrap();
-        assert_eq!(lacks(&values, task), expected, "{given} for {}", task.name);
-    }
-}
-
-#[test]
 fn a_warning_names_the_values_that_are_used() {
     for (name, task, expected) in [
         ("cql", "antmaze-giant-navigate-singletask-v0", Some("its general values are used")),
@@ -30,6 +11,8 @@ fn a_warning_names_the_values_that_are_used() {
         ("td3-bc", "antmaze-umaze-v0", Some("those for antmaze-*-v0 are used")),
         ("quad", "antmaze-umaze-v2", Some("those for antmaze-umaze-v0 are used")),
         ("quad", "antmaze-umaze-v0", None),
+        // It is no benchmark's.
+        ("quad", "hopper-demo", None),
     ] {
         let task = tasks::named(task).unwrap();
         let warning = not_given(&algorithm(name).unwrap(), task);
