@@ -3,7 +3,7 @@
 
     python3 deploy/lambda.py [FILE...]
 
-The scores of studies/lambda.toml make one figure. Outputs of `evaluator probe --json`, named after task and step
+The scores of studies/lambda.toml make one figure. Outputs of `examples/probe.py gradients --json`, named after task and step
 (hopper-demo-20000.json), make the second, of `evaluator score --json`, named after task and rule (hopper-demo-min.json), the
 third. Needs matplotlib.
 """

@@ -13,7 +13,6 @@ use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
 use crate::sim::Simulations;
 use crate::tools::film::{self, FilmArgs};
-use crate::tools::probe::{self, ProbeArgs};
 use crate::tools::score::{self, ScoreArgs};
 use crate::tools::{collect, verify};
 
@@ -30,7 +29,6 @@ enum Command {
     Serve(ServeArgs),
     Score(ScoreArgs),
     Film(FilmArgs),
-    Probe(ProbeArgs),
     Collect(CollectArgs),
     VerifyDataset(VerifyArgs),
     Doctor(DoctorArgs),
@@ -96,7 +94,6 @@ impl Cli {
             }
             Command::Score(args) => print(&score::score(&args)?),
             Command::Film(args) => print(&film::film(&args)?),
-            Command::Probe(args) => print(&probe::probe(&args)?),
             Command::Collect(args) => {
                 let (out, transitions) = (&args.out, args.transitions as usize);
                 let summary = collect::collect(args.env, out, transitions, args.seed)?;

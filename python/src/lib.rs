@@ -2,21 +2,20 @@
 
 mod acting;
 mod arrays;
-mod choosing;
 mod dataset;
 mod episodes;
 mod error;
 mod evaluate;
 mod file;
 mod policy;
-mod runs;
+mod simulation;
 
 use pyo3::prelude::*;
 
 #[pymodule]
 mod _quad_rl {
     #[pymodule_export]
-    use crate::dataset::{benchmark_tasks, inspect_dataset, write_dataset};
+    use crate::dataset::{benchmark_tasks, inspect_dataset, read_run, write_dataset};
     #[pymodule_export]
     use crate::episodes::Episodes;
     #[pymodule_export]
@@ -24,5 +23,5 @@ mod _quad_rl {
     #[pymodule_export]
     use crate::policy::PyPolicy;
     #[pymodule_export]
-    use crate::runs::read_run;
+    use crate::simulation::PySimulation;
 }

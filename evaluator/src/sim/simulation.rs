@@ -13,7 +13,7 @@ use super::environment::{Environment, EnvironmentError, Step};
 use super::physics::Physics;
 
 /// The rules of a task.
-pub(super) trait Task: Send {
+pub(super) trait Task: Send + Sync {
     /// Returns the reward of the step just taken, which began with the first two positions at
     /// `from`, and whether it terminated the episode.
     fn judge(&self, from: [f64; 2], physics: &Physics) -> (f64, bool);
@@ -72,6 +72,10 @@ impl Simulation {
         Ok(Self { physics, robot, task, observation, steps: 0, spec })
     }
 
+    pub fn spec(&self) -> &'static EnvironmentSpec {
+        self.spec
+    }
+
     /// Starts an episode, which is a function of its seed and its actions only.
     pub fn reset(&mut self, seed: u64) {
         self.task.begin(seed);
@@ -108,8 +112,8 @@ impl Simulation {
             false => (0.0, true),
         };
         let is_beyond = action.iter().any(|value| value.abs() > 1.0);
-        let clipped =
-            is_beyond.then(|| action.iter().map(|value| value.clamp(-1.0, 1.0)).collect());
+        let clip = || action.iter().map(|value| value.clamp(-1.0, 1.0)).collect();
+        let clipped = is_beyond.then(clip);
         Step { reward, terminated, truncated, clipped, ..Step::default() }
     }
 

@@ -7,10 +7,8 @@
 //! - [`verify`]: replays a recorded dataset and measures how far the simulation is from it.
 //! - `score`: scores saved policies.
 //! - `film`: films saved policies.
-//! - `probe`: compares critics with true values.
 
 pub mod collect;
 pub(crate) mod film;
-pub(crate) mod probe;
 pub(crate) mod score;
 pub mod verify;
