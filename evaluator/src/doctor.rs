@@ -90,13 +90,13 @@ fn simulator(findings: &mut Findings) {
 async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> {
     let tokens = session.liveliness().get(keys::ALL_LEARNERS).timeout(ANSWER_TIMEOUT);
     let tokens = tokens.await.map_err(anyhow::Error::msg)?;
-    let mut found = false;
+    let mut count = 0;
     while let Ok(reply) = tokens.recv_async().await {
         let token = reply.result().ok();
         let Some(run) = token.and_then(|token| keys::run_of(token.key_expr().as_str())) else {
             continue;
         };
-        found = true;
+        count += 1;
         match problem_of(session, &run).await? {
             None => {
                 let version = format!("version {PROTOCOL_VERSION} of the protocol");
@@ -105,7 +105,7 @@ async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> 
             Some(problem) => findings.fail("run", format!("{run}: {problem}"), UPDATE),
         }
     }
-    if !found {
+    if count == 0 {
         let hint = "an evaluator waits for learners that start later";
         findings.warn("runs", "no learner is connected", hint);
     }

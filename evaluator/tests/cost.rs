@@ -56,7 +56,7 @@ fn gaussian(hidden: usize) -> PolicyConfig {
     PolicyConfig::Gaussian { shape }
 }
 
-fn of_actor(hidden: usize, norm: bool) -> ActorCriticShape {
+fn actor_critic(hidden: usize, norm: bool) -> ActorCriticShape {
     let actor = MlpConfig::mish(&[hidden; 3]);
     let mut critic = actor.clone();
     critic.norm = norm;
@@ -65,11 +65,11 @@ fn of_actor(hidden: usize, norm: bool) -> ActorCriticShape {
 
 fn squashed(hidden: usize, norm: bool) -> PolicyConfig {
     let choice = Choice::best_of(1024);
-    PolicyConfig::Squashed { shape: of_actor(hidden, norm), choice }
+    PolicyConfig::Squashed { shape: actor_critic(hidden, norm), choice }
 }
 
 fn flow(hidden: usize, candidates: u32) -> PolicyConfig {
-    let (shape, choice) = (of_actor(hidden, false), Choice::best_of(candidates));
+    let (shape, choice) = (actor_critic(hidden, false), Choice::best_of(candidates));
     PolicyConfig::Flow { shape, flow_steps: 10, choice }
 }
 

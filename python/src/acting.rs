@@ -1,16 +1,18 @@
-//! Actions for the rows of an array, and their seeds.
+//! Actions for the rows of an array, their seeds, and the choice among candidates.
 
+use std::fmt::Display;
 use std::process;
-use std::sync::OnceLock;
+use std::str::FromStr;
+use std::sync::{Arc, OnceLock};
 
 use numpy::{PyArray, PyArrayDyn, PyArrayMethods};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use quad_policy::{EpisodeState, Policy, PolicyError};
+use quad_policy::{Choice, EpisodeState, Policy, PolicyError};
 
 use crate::arrays::Rows;
-use crate::error::of_policy;
+use crate::error::policy_error;
 
 /// Memory of one call of a policy, bytes; more rows are split. An action does not depend on other rows.
 const MEMORY: u64 = 256 << 20;
@@ -52,7 +54,7 @@ pub fn compute<T: Send>(
     if *PROCESS.get_or_init(process::id) != process::id() {
         return Err(PyRuntimeError::new_err(FORKED));
     }
-    py.detach(work).map_err(|error| of_policy(&error))
+    py.detach(work).map_err(|error| policy_error(&error))
 }
 
 /// Splits rows and their states into parts of bounded memory.
@@ -111,4 +113,50 @@ pub fn seeds(seed: Option<&Bound<'_, PyAny>>, n: usize) -> PyResult<Vec<u64>> {
 
 pub fn not_seeds(or: &str) -> PyErr {
     PyValueError::new_err(format!("a seed must be an int from 0 to 2**64 - 1, or {or}"))
+}
+
+/// Arguments that change the choice of the file.
+#[derive(Default)]
+pub struct Changes {
+    pub candidates: Option<i64>,
+    pub rule: Option<String>,
+    pub aggregate: Option<String>,
+    pub guidance: Option<f32>,
+}
+
+/// The policy with a changed choice.
+pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn Policy>> {
+    if let Changes { candidates: None, rule: None, aggregate: None, guidance: None } = changes {
+        return Ok(policy.clone());
+    }
+    let mut choice = policy.choice().unwrap_or(Choice::best_of(1));
+    choice.guidance = changes.guidance.unwrap_or(choice.guidance);
+    if let Some(candidates) = changes.candidates {
+        let most = Choice::MOST_CANDIDATES;
+        let count = u32::try_from(candidates).ok().filter(|n| (1..=most).contains(n));
+        let error = format!("candidates is {candidates}, but must be from 1 to {most}");
+        choice.candidates = count.ok_or_else(|| PyValueError::new_err(error))?;
+    }
+    if let Some(rule) = changes.rule {
+        choice.rule = parse("rule", &rule)?;
+    }
+    if let Some(aggregate) = changes.aggregate {
+        choice.aggregate = parse("aggregate", &aggregate)?;
+    }
+    policy.with_choice(choice).map(Arc::from).map_err(|error| policy_error(&error))
+}
+
+fn parse<T: FromStr<Err: Display>>(name: &str, text: &str) -> PyResult<T> {
+    let error = |expected| PyValueError::new_err(format!("{name} is {text:?}, not {expected}"));
+    text.parse().map_err(error)
+}
+
+/// A choice as Python's arguments.
+pub fn as_dictionary(py: Python<'_>, choice: Choice) -> PyResult<Bound<'_, PyDict>> {
+    let dictionary = PyDict::new(py);
+    dictionary.set_item("candidates", choice.candidates)?;
+    dictionary.set_item("rule", choice.rule.to_string())?;
+    dictionary.set_item("aggregate", choice.aggregate.to_string())?;
+    dictionary.set_item("guidance", choice.guidance)?;
+    Ok(dictionary)
 }

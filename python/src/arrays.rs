@@ -46,7 +46,7 @@ impl<'a> Rows<'a> {
     /// of the columns, or empty. A dictionary of `[n]` or of single numbers is read by these names,
     /// its other keys are ignored. Other shapes, columns, and numbers that are not finite are
     /// ValueErrors.
-    pub fn of(
+    pub fn new(
         name: &str,
         given: &'a ArrayLike<'_>,
         width: usize,
@@ -57,7 +57,7 @@ impl<'a> Rows<'a> {
             ArrayLike::Numbers(numbers) => {
                 let array: PyArrayLikeDyn<'_, f32, AllowTypeChange> =
                     stacked(name, numbers, names)?.extract()?;
-                let Rows { values, count, single } = Rows::of_array(name, &array, width, names)?;
+                let Rows { values, count, single } = Rows::from_array(name, &array, width, names)?;
                 return Ok(Self { values: Cow::Owned(values.into_owned()), count, single });
             }
         };
@@ -67,10 +67,10 @@ impl<'a> Rows<'a> {
                 "{name} has the columns {columns}, but the policy takes, in this order, {list}"
             )));
         }
-        Self::of_array(name, array, width, names)
+        Self::from_array(name, array, width, names)
     }
 
-    fn of_array(
+    fn from_array(
         name: &str,
         array: &'a PyArrayLikeDyn<'_, f32, AllowTypeChange>,
         width: usize,
@@ -128,15 +128,16 @@ fn stacked<'py>(
         );
         return Err(PyValueError::new_err(error));
     }
-    let (mut found, mut lacking) = (Vec::new(), Vec::new());
-    if let Some((_, column)) = names.iter().enumerate().find(|(i, it)| names[..*i].contains(it)) {
+    let (mut columns, mut lacking) = (Vec::new(), Vec::new());
+    if let Some((_, column)) = names.iter().enumerate().find(|(i, name)| names[..*i].contains(name))
+    {
         return Err(PyValueError::new_err(format!(
             "{name} is a dictionary, but the policy's data has several columns {column:?}\nhint: give its numbers in its order"
         )));
     }
     for name in names {
         match numbers.get_item(name)? {
-            Some(number) => found.push(number),
+            Some(number) => columns.push(number),
             None => lacking.push(name.as_str()),
         }
     }
@@ -145,5 +146,5 @@ fn stacked<'py>(
         let error = format!("{name} lacks {}; it has {}", lacking.join(", "), keys.join(", "));
         return Err(PyValueError::new_err(error));
     }
-    numbers.py().import("numpy")?.call_method1("stack", (found, -1))
+    numbers.py().import("numpy")?.call_method1("stack", (columns, -1))
 }

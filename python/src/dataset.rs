@@ -1,4 +1,4 @@
-//! Datasets, for `quad_rl.Dataset`.
+//! Datasets, for `quad_rl.Dataset`, and run folders, for `quad_rl.runs`.
 
 use std::path::PathBuf;
 
@@ -6,6 +6,8 @@ use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use quad_dataset::{Arrays, DatasetError, Names, benchmarks, inspect, write_own};
+use quad_run::results::RunReport;
+use quad_runtime::one_line;
 
 use crate::error::with_hint;
 
@@ -47,8 +49,7 @@ pub fn write_dataset(
 #[pyfunction]
 pub fn inspect_dataset(py: Python<'_>, path: PathBuf) -> PyResult<(String, String)> {
     let inspection = py.detach(|| inspect(path, None)).map_err(|error| refused(&error))?;
-    let json = serde_json::to_string(&inspection);
-    Ok((json.map_err(|error| PyRuntimeError::new_err(error.to_string()))?, inspection.to_string()))
+    Ok((json(serde_json::to_string(&inspection))?, inspection.to_string()))
 }
 
 /// A task's goal (x and y, meters), its reach, and the index in `qpos` of the x that must reach it.
@@ -60,4 +61,18 @@ pub fn benchmark_tasks(benchmark: &str) -> Vec<(String, String, Option<Maze>)> {
     let tasks = benchmarks::tasks().filter(|task| task.benchmark.name == benchmark);
     let maze = |task: quad_dataset::MazeTask| (task.goal, task.reach, task.measured);
     tasks.map(|task| (task.name, task.dataset, task.maze.map(maze))).collect()
+}
+
+/// A run's results and its configuration, each as JSON.
+#[pyfunction]
+pub fn read_run(py: Python<'_>, folder: PathBuf) -> PyResult<(String, String)> {
+    let report = py.detach(|| RunReport::read(&folder)).map_err(|error| {
+        PyRuntimeError::new_err(format!("{}\nhint: {}", one_line(&error), error.hint()))
+    })?;
+    let config = serde_json::to_string(&report.config);
+    Ok((json(serde_json::to_string(&report))?, json(config)?))
+}
+
+fn json(text: serde_json::Result<String>) -> PyResult<String> {
+    text.map_err(|error| PyRuntimeError::new_err(error.to_string()))
 }

@@ -13,7 +13,7 @@ pub fn with_hint(error: &dyn Error, hint: &str) -> PyErr {
 }
 
 /// A RuntimeError where arithmetic fails, else a ValueError.
-pub fn of_policy(error: &PolicyError) -> PyErr {
+pub fn policy_error(error: &PolicyError) -> PyErr {
     match error {
         PolicyError::Candle(_) | PolicyError::NotANumber(_) => {
             PyRuntimeError::new_err(one_line(error))

@@ -35,7 +35,7 @@ pub fn read(
 pub fn all_about(header: &Header<Origin>) -> String {
     let Header { chunk, scaling, observation_names, action_names, origin, about, version, .. } =
         header;
-    let of_any = json!({
+    let always = json!({
         "version": version,
         "environment": origin.environment,
         "step": origin.step,
@@ -44,7 +44,7 @@ pub fn all_about(header: &Header<Origin>) -> String {
         "chunk": chunk,
         "scaling": scaling,
     });
-    let mut all = about.as_object().cloned().unwrap_or_default();
-    all.extend(of_any.as_object().cloned().unwrap_or_default());
-    Value::from(all).to_string()
+    let mut fields = about.as_object().cloned().unwrap_or_default();
+    fields.extend(always.as_object().cloned().unwrap_or_default());
+    Value::from(fields).to_string()
 }

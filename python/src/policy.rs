@@ -11,9 +11,10 @@ use quad_policy::{Header, Policy, PolicyConfig, Precision};
 use quad_protocol::Origin;
 use quad_run::files;
 
-use crate::acting::{Array, act, begin, compute, noise, not_seeds, parts, seeds};
+use crate::acting::{
+    Array, Changes, act, as_dictionary, begin, choosing, compute, noise, not_seeds, parts, seeds,
+};
 use crate::arrays::{ArrayLike, Rows};
-use crate::choosing::{Changes, as_dictionary, choosing};
 use crate::episodes::Episodes;
 use crate::file::{HINT, all_about, read};
 
@@ -27,7 +28,12 @@ use crate::file::{HINT, all_about, read};
 pub struct PyPolicy {
     policy: Arc<dyn Policy>,
     config: PolicyConfig,
-    origin: Origin,
+    /// The environment that it was trained for.
+    #[pyo3(get)]
+    environment: String,
+    /// The gradient step of the snapshot.
+    #[pyo3(get)]
+    step: u64,
     names: Arc<Names>,
     /// The file's header as JSON.
     about: String,
@@ -63,7 +69,8 @@ impl PyPolicy {
         let about = all_about(&header);
         let Header { policy: config, observation_names, action_names, origin, .. } = header;
         let names = Arc::new(Names { observations: observation_names, actions: action_names });
-        Ok(Self { policy: policy.into(), config, origin, names, about, file, asked })
+        let (policy, Origin { environment, step, .. }) = (policy.into(), origin);
+        Ok(Self { policy, config, environment, step, names, about, file, asked })
     }
 
     /// Acts in n states: observations [n, observation_size] -> actions [n, action_size], float32.
@@ -147,7 +154,7 @@ impl PyPolicy {
         aggregate: Option<String>,
     ) -> PyResult<Array<'py>> {
         let rows = self.rows(&observations)?;
-        let taken = Rows::of("actions", &actions, self.policy.action_dim(), &self.names.actions)?;
+        let taken = Rows::new("actions", &actions, self.policy.action_dim(), &self.names.actions)?;
         let (n, m) = (rows.count, taken.count);
         if (m, taken.single) != (n, rows.single) {
             let error = format!("{n} observations, but {m} actions: one action for each");
@@ -227,18 +234,6 @@ impl PyPolicy {
         self.names.actions.clone()
     }
 
-    /// The environment that it was trained for.
-    #[getter]
-    fn environment(&self) -> &str {
-        &self.origin.environment
-    }
-
-    /// The gradient step of the snapshot.
-    #[getter]
-    fn step(&self) -> u64 {
-        self.origin.step
-    }
-
     /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's), "flow" (QC's) or "score"
     /// (SfBC's), which draw actions and choose; "planner", which draws plans and chooses one; or "gaussian",
     /// which acts by its mean.
@@ -286,7 +281,7 @@ impl PyPolicy {
     fn __repr__(&self) -> String {
         let choice = self.policy.choice().map_or(String::new(), |choice| format!(", {choice}"));
         let (o, a) = (self.policy.observation_dim(), self.policy.action_dim());
-        let Origin { environment, step, .. } = &self.origin;
+        let Self { environment, step, .. } = self;
         let (kind, precision) = (self.kind(), self.precision());
         format!(
             "Policy({environment}, {kind} after step {step}, {o} -> {a} numbers{choice}, {precision})"
@@ -303,6 +298,6 @@ impl PyPolicy {
 impl PyPolicy {
     fn rows<'a>(&self, observations: &'a ArrayLike<'_>) -> PyResult<Rows<'a>> {
         let width = self.policy.observation_dim();
-        Rows::of("observations", observations, width, &self.names.observations)
+        Rows::new("observations", observations, width, &self.names.observations)
     }
 }

@@ -11,12 +11,10 @@ use tracing::{debug, info, warn};
 use zenoh::Wait;
 use zenoh::liveliness::LivelinessToken;
 
-use super::connection::Connection;
-use super::delivery::Owed;
-use super::discovery::{Found, RunKey};
+use super::connection::{ANSWER_TIMEOUT, Connection, QueryError, blocking};
+use super::discovery::{Learners, RunKey};
 use super::duty::{Duty, Note, Step};
-use super::query::{QueryError, blocking};
-use super::scheduler::Turn;
+use super::evaluate::Evaluator;
 use super::snapshot::{Listener, Snapshots};
 use crate::metrics::Metrics;
 
@@ -32,7 +30,7 @@ pub struct RunClient {
     pub connection: Connection,
     snapshots: Snapshots,
     listener: Listener,
-    duty: Duty,
+    pub duty: Duty,
     /// Time of the learner's disappearance.
     pub gone: Option<Instant>,
     last_warning: String,
@@ -43,12 +41,12 @@ impl RunClient {
     /// Subscribes to the run's snapshots and announces the evaluator in the run.
     pub async fn attach(
         key: RunKey,
-        found: &Found,
+        learners: &Learners,
         evaluator: Name,
         snapshots: Snapshots,
         metrics: Metrics,
     ) -> anyhow::Result<RunClient> {
-        let (session, run) = (found.session.clone(), key.1.clone());
+        let (session, run) = (learners.session.clone(), key.1.clone());
         let listener =
             Listener::start(&session, key.clone(), snapshots.clone(), metrics.clone()).await;
         let listener =
@@ -67,17 +65,8 @@ impl RunClient {
             last_warning: String::new(),
             _token,
         };
-        client.follow(&found.incarnations);
+        client.follow(&learners.incarnations);
         Ok(client)
-    }
-
-    pub fn turn(&self) -> &Turn {
-        self.duty.turn()
-    }
-
-    /// True if there are results to deliver, or a job to hand back.
-    pub fn owes(&self) -> bool {
-        self.duty.owes()
     }
 
     /// Follows one of the run's learner processes, which are there.
@@ -107,40 +96,28 @@ impl RunClient {
         }
     }
 
-    /// Begins a turn, in which [`next_step`](Self::next_step) says what is to be done.
-    pub fn begin_turn(&mut self) {
-        self.duty.begin_turn();
-    }
-
-    /// The next step of the turn; `None` once it has ended.
-    pub fn next_step(&mut self) -> Option<Step> {
-        self.duty.next(rand::random())
-    }
-
-    /// Claims a job in one of these environments.
-    pub async fn claim(
-        &mut self,
-        attempt: u64,
-        environments: Vec<String>,
-    ) -> Result<(), QueryError> {
-        let reply = self.connection.claim(attempt, environments).await?;
-        if let JobReply::Wait { .. } = reply {
-            self.last_warning.clear();
-        }
-        self.duty.claimed(reply, rand::random_range(0.5..1.0), Instant::now());
-        Ok(())
-    }
-
-    /// Keeps the results of the claimed job, or the reason why it is to go back.
-    pub fn played(&mut self, job: &Job, results: anyhow::Result<Owed>) {
-        match results {
-            Ok(owed) => self.duty.played(Ok(owed)),
-            Err(error) => {
-                self.connection.metrics.job("failed");
-                self.duty.played(Err(&format!("{error:#}")));
-                self.warn(&error.context(format!("a job of step {} failed", job.step)));
+    /// Does a step of a turn.
+    pub async fn take(&mut self, step: Step, evaluator: &mut Evaluator) -> Result<(), QueryError> {
+        match step {
+            Step::Claim { attempt } => {
+                let environments = evaluator.environments.names();
+                let reply = self.connection.claim(attempt, environments).await?;
+                if let JobReply::Wait { .. } = reply {
+                    self.last_warning.clear();
+                }
+                self.duty.claimed(reply, rand::random_range(0.5..1.0), Instant::now());
             }
+            Step::Play(job) => match evaluator.evaluate(&job, self).await {
+                Ok(owed) => self.duty.played(Ok(owed)),
+                Err(error) => {
+                    self.connection.metrics.job("failed");
+                    self.duty.played(Err(&format!("{error:#}")));
+                    self.warn(&error.context(format!("a job of step {} failed", job.step)));
+                }
+            },
+            step => self.deliver(step, ANSWER_TIMEOUT).await?,
         }
+        Ok(())
     }
 
     /// Ends a turn in which the learner has not answered: the run rests, and another of its
@@ -153,18 +130,18 @@ impl RunClient {
     }
 
     /// Delivers results, or hands a job back.
-    pub async fn deliver(&mut self, step: Step, timeout: Duration) -> Result<(), QueryError> {
+    async fn deliver(&mut self, step: Step, timeout: Duration) -> Result<(), QueryError> {
         let (run, connection) = (self.connection.run.clone(), &self.connection);
         let notes = match step {
             Step::Claim { .. } | Step::Play(_) => Vec::new(),
             Step::Scores(report) => {
-                let (key, of) = (keys::scores(&run), ScoreReply::incarnation);
-                let reply = connection.deliver(key, &report, timeout, of).await?;
+                let (key, read) = (keys::scores(&run), ScoreReply::incarnation);
+                let reply = connection.deliver(key, &report, timeout, read).await?;
                 self.duty.scored(reply, Instant::now())
             }
             Step::Piece(piece) => {
-                let (key, of) = (keys::experience(&run), PieceReply::incarnation);
-                let reply = connection.deliver(key.clone(), &piece, timeout, of).await?;
+                let (key, read) = (keys::experience(&run), PieceReply::incarnation);
+                let reply = connection.deliver(key.clone(), &piece, timeout, read).await?;
                 let unusable = |reason| QueryError::Unusable { key, reason };
                 self.duty.sent(reply, Instant::now()).map_err(unusable)?
             }

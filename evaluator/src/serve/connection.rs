@@ -1,13 +1,17 @@
-//! An evaluator's requests to the learner of one run.
+//! An evaluator's requests to the learner of one run, and other calls of Zenoh that may block.
 
 use std::time::Duration;
 
-use quad_protocol::{Job, JobReply, JobRequest, Message, Name, Progress, Snapshot, encode, keys};
+use quad_protocol::{
+    CodecError, Job, JobReply, JobRequest, Message, Name, Progress, Snapshot, decode_from, encode,
+    keys,
+};
+use tokio::sync::mpsc;
 use tracing::debug;
 use zenoh::qos::CongestionControl;
+use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 use zenoh::{Session, Wait};
 
-use super::query::{QueryError, query};
 use super::snapshot::is_named_by;
 use crate::metrics::Metrics;
 
@@ -15,6 +19,37 @@ use crate::metrics::Metrics;
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time limit of a snapshot's transfer.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// Capacity for answers to one query. One answer is enough, and few peers answer.
+const MAX_ANSWERS: usize = 64;
+/// The error with which Zenoh itself, not the learner, replies to a query that timed out.
+pub const ZENOH_TIMEOUT: &[u8] = b"Timeout";
+/// Most bytes of a learner's error in a message.
+const MAX_ERROR_LEN: usize = 200;
+
+#[derive(Debug, thiserror::Error)]
+pub enum QueryError {
+    #[error("no answer at {0}")]
+    NoAnswer(String),
+    /// The learner's error, or the fault of its answer.
+    #[error("unusable answer at {key}: {reason}")]
+    Unusable { key: String, reason: String },
+    #[error("cannot send a query to {key}: {reason}")]
+    Send { key: String, reason: String },
+    #[error(transparent)]
+    Encode(#[from] CodecError),
+}
+
+/// Runs a call of Zenoh on a thread that may block.
+///
+/// Zenoh's `get` and declarations do all their work in the first poll of their futures. While a
+/// peer does not read, that poll blocks until Zenoh closes the connection after two seconds.
+pub async fn blocking<T: Send + 'static>(
+    call: impl FnOnce() -> zenoh::Result<T> + Send + 'static,
+) -> anyhow::Result<T> {
+    let result = tokio::task::spawn_blocking(call).await?;
+    result.map_err(|error| anyhow::anyhow!(error))
+}
 
 /// One evaluator's connection to the learner of one run.
 pub struct Connection {
@@ -82,7 +117,7 @@ impl Connection {
     /// Requests the snapshot that `job` names.
     pub async fn snapshot(&self, job: &Job) -> Result<Snapshot, QueryError> {
         let (key, job) = (keys::weights_at(&self.run, job.step), job.clone());
-        let check = move |found: &Snapshot| match is_named_by(&job, found) {
+        let check = move |snapshot: &Snapshot| match is_named_by(&job, snapshot) {
             true => Ok(()),
             false => Err("other_snapshot"),
         };
@@ -109,6 +144,8 @@ impl Connection {
         }
     }
 
+    /// Sends `payload` to every learner at `key`, and returns the first answer that can be decoded and
+    /// passes `check`. For a wrong answer, `check` returns the label of the reason.
     async fn query<A: Message + Send + 'static>(
         &self,
         key: String,
@@ -116,8 +153,62 @@ impl Connection {
         timeout: Duration,
         check: impl Fn(&A) -> Result<(), &'static str> + Send + Sync + 'static,
     ) -> Result<A, QueryError> {
-        query(&self.session, key, payload, timeout, &self.metrics, check).await
+        let (tx, mut rx) = mpsc::channel(MAX_ANSWERS);
+        let metrics = self.metrics.clone();
+        let callback = move |reply: Reply| {
+            let error = reply.result().err().map(|error| error.payload().to_bytes());
+            if error.is_none_or(|error| *error != *ZENOH_TIMEOUT) && !tx.is_closed() {
+                tx.try_send(read(&reply, &metrics, &check)).ok();
+            }
+        };
+        let (session, selector) = (self.session.clone(), key.clone());
+        let get = move || {
+            // All targets: the best matching target would be any peer that claims to be complete.
+            let get = session.get(selector).target(QueryTarget::All);
+            // Consolidation would hold answers back until every peer has answered.
+            let get = get.consolidation(ConsolidationMode::None);
+            get.payload(payload).timeout(timeout).callback(callback).wait()
+        };
+        if let Err(error) = blocking(get).await {
+            let reason = error.to_string();
+            return Err(QueryError::Send { key, reason });
+        }
+        let mut unusable = None;
+        // Zenoh drops the callback, and with it `tx`, after the last answer or the timeout.
+        while let Some(answer) = rx.recv().await {
+            match answer {
+                Ok(answer) => return Ok(answer),
+                Err(reason) => unusable = Some(reason),
+            }
+        }
+        Err(match unusable {
+            Some(reason) => QueryError::Unusable { key, reason },
+            None => QueryError::NoAnswer(key),
+        })
     }
+}
+
+fn read<A: Message>(
+    reply: &Reply,
+    metrics: &Metrics,
+    check: &impl Fn(&A) -> Result<(), &'static str>,
+) -> Result<A, String> {
+    let sample = reply.result().map_err(|error| {
+        let text = error.payload().to_bytes();
+        String::from_utf8_lossy(&text[..text.len().min(MAX_ERROR_LEN)]).into_owned()
+    })?;
+    let rejected = |label: &'static str, reason| {
+        metrics.rejected(label);
+        reason
+    };
+    let payload = sample.payload();
+    let answer = decode_from(payload.len(), payload.reader())
+        .map_err(|error| rejected(error.label(), error.to_string()))?;
+    check(&answer).map_err(|label| {
+        let reason = format!("it is not from the learner that was asked ({label})");
+        rejected(label, reason)
+    })?;
+    Ok(answer)
 }
 
 /// Checks that a reply comes from the followed learner process.
@@ -125,5 +216,82 @@ fn is_from(followed: u64, incarnation: u64) -> Result<(), &'static str> {
     match incarnation == followed {
         true => Ok(()),
         false => Err("other_incarnation"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+
+    use quad_runtime::{Endpoints, open_session, reachable_at};
+    use tokio::time::{sleep, timeout};
+
+    use super::*;
+
+    const POLL: Duration = Duration::from_millis(10);
+
+    /// Queries a learner that reads nothing until the querying task runs on. Returns true if the
+    /// learner's answer arrives.
+    async fn is_answered() -> bool {
+        let any_port = vec!["tcp/127.0.0.1:0".to_owned()];
+        let listen = Endpoints { listen: any_port, ..Endpoints::default() };
+        let learner = open_session(&listen).await.unwrap();
+        let [stalls, has_stalled] = [true, false].map(|value| Arc::new(AtomicBool::new(value)));
+        // The learner's session reads nothing until this callback returns.
+        let (wait, stalled) = (stalls.clone(), has_stalled.clone());
+        let callback = move |_| {
+            stalled.store(true, Relaxed);
+            while wait.load(Relaxed) {
+                std::thread::sleep(POLL);
+            }
+        };
+        let flooded = learner.declare_subscriber("flood").callback(callback);
+        let _flooded = flooded.await.unwrap();
+        let (incarnation, milliseconds) = (1, 1);
+        let answer = encode(&JobReply::Wait { incarnation, milliseconds }).unwrap();
+        let callback = move |query: zenoh::query::Query| {
+            let reply = query.reply(query.key_expr().clone(), answer.clone());
+            reply.wait().ok();
+        };
+        let jobs = learner.declare_queryable("quad/run/jobs").callback(callback);
+        let _jobs = jobs.await.unwrap();
+        let connect = reachable_at(&learner, &listen).await.unwrap();
+        let connect = Endpoints { connect, ..Endpoints::default() };
+        let evaluator = open_session(&connect).await.unwrap();
+        let reach = async {
+            while !has_stalled.load(Relaxed) {
+                evaluator.put("flood", "").await.unwrap();
+                sleep(POLL).await;
+            }
+        };
+        let reached = timeout(Duration::from_secs(60), reach).await;
+        reached.expect("the learner is reached");
+        for _ in 0..2000 {
+            // More than the connection's buffers hold.
+            evaluator.put("flood", vec![0; 20_000]).await.unwrap();
+        }
+        let [run, name] = ["run", "evaluator"].map(|name| Name::new(name).unwrap());
+        let metrics = Metrics::new().unwrap();
+        let connection =
+            Connection { run, evaluator: name, session: evaluator.clone(), metrics, incarnation };
+        let (key, limit) = (keys::jobs(&connection.run), Duration::from_secs(20));
+        let answer = connection.query(key, Vec::new(), limit, |_: &JobReply| Ok(()));
+        let read_on = async {
+            sleep(10 * POLL).await;
+            stalls.store(false, Relaxed);
+        };
+        tokio::join!(answer, read_on).0.is_ok()
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_peer_that_does_not_read_blocks_no_task() {
+        // On a busy machine Zenoh may close the connection all the same.
+        for _ in 0..5 {
+            if is_answered().await {
+                return;
+            }
+        }
+        panic!("the querying task was blocked");
     }
 }

@@ -13,7 +13,7 @@ use tracing::{info, warn};
 use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Session, Wait};
 
-use super::query::blocking;
+use super::connection::blocking;
 use crate::metrics::Metrics;
 
 /// Most learners that an evaluator follows, over all runs and endpoints: a bound on memory, far
@@ -26,16 +26,16 @@ const CHECK_INTERVAL: Duration = Duration::from_secs(10);
 /// through both, because either may fail.
 pub type RunKey = (usize, Name);
 
-/// A run whose learner is connected.
+/// A run's learners that are connected.
 #[derive(Clone)]
-pub struct Found {
+pub struct Learners {
     pub session: Session,
     /// The announced learner processes, at least one. The token of a killed learner may still exist
     /// when the next one starts.
     pub incarnations: BTreeSet<u64>,
 }
 
-pub type Runs = BTreeMap<RunKey, Found>;
+pub type Runs = BTreeMap<RunKey, Learners>;
 
 /// Watches every endpoint until it is dropped.
 pub struct Discovery {
@@ -90,11 +90,11 @@ async fn watch_endpoint(
     let endpoints = Endpoints { connect, certificates, ..Endpoints::default() };
     let session = open_session(&endpoints).await.hint_of(SessionError::hint)?;
     info!(endpoint, "connected");
-    let (found, declarer) = (session.clone(), session.clone());
+    let (served, declarer) = (session.clone(), session.clone());
     let callback = move |token: Sample| {
         let key = token.key_expr().as_str();
         tx.send_if_modified(|runs| {
-            update(runs, (index, &found), token.kind(), key).unwrap_or_else(|label| {
+            update(runs, (index, &served), token.kind(), key).unwrap_or_else(|label| {
                 metrics.rejected(label);
                 warn!(key, label, "a learner is not served");
                 false
@@ -125,22 +125,22 @@ fn update(
 ) -> Result<bool, &'static str> {
     let ids = keys::run_of(key).zip(keys::incarnation_of(key));
     let (run, incarnation) = ids.ok_or("invalid_name")?;
-    let learners: usize = runs.values().map(|found| found.incarnations.len()).sum();
+    let count: usize = runs.values().map(|learners| learners.incarnations.len()).sum();
     let key = (index, run);
     let run = &key.1;
     match (kind, runs.get_mut(&key)) {
-        (SampleKind::Put, _) if learners >= MAX_LEARNERS => Err("too_many_runs"),
-        (SampleKind::Put, Some(found)) => Ok(found.incarnations.insert(incarnation)),
+        (SampleKind::Put, _) if count >= MAX_LEARNERS => Err("too_many_runs"),
+        (SampleKind::Put, Some(learners)) => Ok(learners.incarnations.insert(incarnation)),
         (SampleKind::Put, None) => {
             info!(%run, incarnation, "found a run");
             let (session, incarnations) = (session.clone(), BTreeSet::from([incarnation]));
-            runs.insert(key, Found { session, incarnations });
+            runs.insert(key, Learners { session, incarnations });
             Ok(true)
         }
         (SampleKind::Delete, None) => Ok(false),
-        (SampleKind::Delete, Some(found)) => {
-            let changed = found.incarnations.remove(&incarnation);
-            if found.incarnations.is_empty() {
+        (SampleKind::Delete, Some(learners)) => {
+            let changed = learners.incarnations.remove(&incarnation);
+            if learners.incarnations.is_empty() {
                 info!(%run, incarnation, "the run's learner has left or lost its connection");
                 runs.remove(&key);
             }
@@ -166,7 +166,7 @@ mod tests {
         };
         const MAX: usize = MAX_LEARNERS;
         assert_eq!(update(Put, 0, 1), (Ok(true), 1));
-        assert_eq!(update(Put, 0, 1), (Ok(false), 1), "it is known");
+        assert_eq!(update(Put, 0, 1), (Ok(false), 1), "again");
         assert_eq!(update(Put, 0, 2), (Ok(true), 1), "the next incarnation");
         for run in 2..MAX {
             assert_eq!(update(Put, run, 1), (Ok(true), run));

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use quad_policy::{Policy, Precision};
-use quad_protocol::{Hash, Job, Name};
+use quad_policy::{Header, Policy, Precision, load_policy};
+use quad_protocol::{Hash, Job, Name, Origin, Snapshot};
 use quad_runtime::Heartbeat;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
@@ -13,12 +13,14 @@ use tracing::info;
 use super::client::RunClient;
 use super::delivery::Owed;
 use super::job::{self, Done, JobError, Played};
-use super::policy::load;
 use crate::metrics::Metrics;
 use crate::sim::Environments;
 
 /// Limits of the interval between reports of progress, which a learner chooses.
 const HEARTBEAT: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(20)];
+
+/// Most characters of an environment's name from a file in a message.
+const MAX_NAME_LEN: usize = 64;
 
 pub struct Evaluator {
     pub name: Name,
@@ -112,6 +114,28 @@ fn heartbeat(job: &Job) -> Duration {
     Duration::from_millis(job.progress_milliseconds).clamp(HEARTBEAT[0], HEARTBEAT[1])
 }
 
+/// Loads the policy of `snapshot` for the environment `wanted`, whose sizes may be known.
+fn load(
+    snapshot: &Snapshot,
+    (wanted, wanted_sizes): (&str, Option<(usize, usize)>),
+    precision: Precision,
+) -> Result<Box<dyn Policy>, JobError> {
+    let Header { origin: Origin { environment, .. }, .. } = Header::read(&snapshot.file)?;
+    let policy = load_policy(&snapshot.file, precision)?;
+    let sizes = (policy.observation_dim(), policy.action_dim());
+    let wanted_sizes = wanted_sizes.unwrap_or(sizes);
+    if (environment.as_str(), sizes) == (wanted, wanted_sizes) {
+        return Ok(policy);
+    }
+    let [snapshot, job] = [(&*environment, sizes), (wanted, wanted_sizes)].map(describe);
+    Err(JobError::OtherEnvironment { snapshot, job })
+}
+
+fn describe((name, (observation_dim, action_dim)): (&str, (usize, usize))) -> String {
+    let name: String = name.chars().take(MAX_NAME_LEN).collect();
+    format!("{name} ({observation_dim} numbers observed, {action_dim} in an action)")
+}
+
 #[cfg(test)]
 mod tests {
     use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
@@ -120,7 +144,7 @@ mod tests {
     use quad_policy::{EpisodeState, PolicyError};
     use quad_runtime::Health;
 
-    use super::super::fixtures::{evaluator, job};
+    use super::super::fixtures::{evaluator, file, job, smallest, snapshot};
     use super::*;
 
     const LIMIT: Duration = Duration::from_secs(1);
@@ -183,5 +207,26 @@ mod tests {
         assert_eq!(episodes.await.unwrap().len(), job.seeds.len());
         assert!(policy.noticed.load(Relaxed), "it was stuck");
         assert!(policy.recovered.load(Relaxed), "it has advanced since");
+    }
+
+    #[test]
+    fn loads_a_snapshot_only_for_its_own_environment() {
+        let label = |file| {
+            let loaded = load(&snapshot(file), ("hopper", Some((11, 3))), Precision::F32);
+            loaded.err().map(|error| error.label())
+        };
+        let (mut observes_more, mut acts_more) = (smallest(), smallest());
+        (observes_more.observation_dim, acts_more.action_dim) = (17, 6);
+        let hopper = file("hopper", smallest(), 1);
+        assert_eq!(label(hopper.clone()), None);
+        for other in [
+            file("walker2d", smallest(), 1),
+            file(&"h".repeat(500_000), smallest(), 1),
+            file("hopper", observes_more, 1),
+            file("hopper", acts_more, 1),
+        ] {
+            assert_eq!(label(other), Some("environment"));
+        }
+        assert_eq!(label(hopper[..100].to_vec()), Some("tensors"));
     }
 }

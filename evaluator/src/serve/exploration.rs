@@ -85,7 +85,8 @@ mod tests {
             (noise(0.0), Spread::None, [1.0, 1.0]),
             (noise(0.0), Spread::Shared, [0.3108, 0.6319]),
         ] {
-            let [plain, scaled] = [None, Some(scaling.clone())].map(|it| policy(spread, it));
+            let [plain, scaled] =
+                [None, Some(scaling.clone())].map(|scaling| policy(spread, scaling));
             let drawn = actions(rule, &*plain, &seeds);
             assert!(drawn.iter().all(|action| (-1.0..=1.0).contains(action)));
             for (limit, expected) in [0.4, 0.9].into_iter().zip(shares) {
@@ -98,8 +99,8 @@ mod tests {
             let explores = (rule, spread) != (noise(0.0), Spread::None);
             assert_eq!(drawn[..2] != drawn[2..4], explores, "each step draws anew");
 
-            let others = actions(rule, &*plain, &[1999, 5]);
-            assert_eq!(others, [&drawn[4 * 1999..], &drawn[20..24]].concat());
+            let alone = actions(rule, &*plain, &[1999, 5]);
+            assert_eq!(alone, [&drawn[4 * 1999..], &drawn[20..24]].concat());
             let users = actions(rule, &*scaled, &[5]);
             for (users, drawn) in users.chunks_exact(2).zip(drawn[20..24].chunks_exact(2)) {
                 let expected = [10.0 + 4.0 * drawn[0], -1.0 + 0.5 * drawn[1]];

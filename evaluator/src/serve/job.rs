@@ -30,8 +30,8 @@ pub enum JobError {
     TooLong,
     #[error("this evaluator has no environment \"{0}\"")]
     Environment(String),
-    #[error("the snapshot is for {found}, the job's environment is {wanted}")]
-    OtherEnvironment { found: String, wanted: String },
+    #[error("the snapshot is for {snapshot}, the job's environment is {job}")]
+    OtherEnvironment { snapshot: String, job: String },
     #[error(transparent)]
     Policy(#[from] PolicyError),
 }
@@ -186,54 +186,12 @@ mod tests {
         run(environments, job, &*policy, &metrics, &tx, longest)
     }
 
-    /// Hopper under another name, which records the seeds of its environments.
+    /// Records the seeds of its environments, and counts the episodes in which a person may act.
     #[derive(Default)]
-    struct Renamed(Mutex<Vec<u64>>);
-
-    impl Environments for Renamed {
-        fn names(&self) -> Vec<String> {
-            vec!["my-robot".to_owned()]
-        }
-
-        fn sizes(&self, _: &str) -> Option<(usize, usize)> {
-            None
-        }
-
-        fn make(&self, _: &str, seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
-            self.0.lock().unwrap().push(seed);
-            Simulations.make("hopper", seed)
-        }
+    struct Watched {
+        seeds: Mutex<Vec<u64>>,
+        allowed: Arc<AtomicU32>,
     }
-
-    #[test]
-    fn refuses_empty_and_huge_jobs_and_unknown_environments() {
-        let check = |episodes| check(&job(episodes), &Simulations);
-        for episodes in [1, 256] {
-            check(episodes).unwrap();
-        }
-        for episodes in [0, 257, 65_536] {
-            assert_eq!(check(episodes).unwrap_err().label(), "job_size");
-        }
-        let unknown = super::check(&job(1), &Renamed::default());
-        assert_eq!(unknown.unwrap_err().label(), "environment");
-    }
-
-    #[test]
-    fn makes_environments_by_the_job_s_name_and_seed_and_limits_its_time() {
-        let renamed = Renamed::default();
-        let mut job = job(2);
-        (job.environment, job.environment_seed) = ("my-robot".to_owned(), 5);
-        check(&job, &renamed).unwrap();
-        assert_eq!(run_for(&renamed, &job, Job::LONGEST).unwrap().len(), 2);
-        assert_eq!(*renamed.0.lock().unwrap(), [5, 5]);
-        let error = run_for(&renamed, &job, Duration::ZERO).unwrap_err();
-        let too_long = JobError::TooLong.to_string();
-        assert_eq!(error.to_string(), too_long);
-    }
-
-    /// Counts the episodes in which a person may act.
-    #[derive(Default)]
-    struct Watched(Arc<AtomicU32>);
 
     impl Environments for Watched {
         fn names(&self) -> Vec<String> {
@@ -244,23 +202,21 @@ mod tests {
             None
         }
 
-        fn make(&self, name: &str, _: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
-            Ok(Box::new(OneStep { name: name.to_owned(), allowed: self.0.clone() }))
+        fn make(&self, _: &str, seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+            self.seeds.lock().unwrap().push(seed);
+            Ok(Box::new(OneStep(self.allowed.clone())))
         }
     }
 
-    struct OneStep {
-        name: String,
-        allowed: Arc<AtomicU32>,
-    }
+    struct OneStep(Arc<AtomicU32>);
 
     impl Environment for OneStep {
         fn name(&self) -> &str {
-            &self.name
+            "my-robot"
         }
 
         fn allow_interventions(&mut self) {
-            self.allowed.fetch_add(1, Relaxed);
+            self.0.fetch_add(1, Relaxed);
         }
 
         fn reset(&mut self, _: u64) -> Result<(), EnvironmentError> {
@@ -281,14 +237,34 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_is_told_of_online_episodes_in_which_a_person_may_act() {
-        let watched = Watched::default();
-        let mut job = job(1);
-        for (exploration, allowed) in [(None, 0), (Some(Exploration::Uniform), 1)] {
-            job.exploration = exploration;
-            run_for(&watched, &job, Job::LONGEST).unwrap();
-            assert_eq!(watched.0.load(Relaxed), allowed);
+    fn refuses_empty_and_huge_jobs_and_unknown_environments() {
+        let check = |episodes| check(&job(episodes), &Simulations);
+        for episodes in [1, 256] {
+            check(episodes).unwrap();
         }
+        for episodes in [0, 257, 65_536] {
+            assert_eq!(check(episodes).unwrap_err().label(), "job_size");
+        }
+        let unknown = super::check(&job(1), &Watched::default());
+        assert_eq!(unknown.unwrap_err().label(), "environment");
+    }
+
+    #[test]
+    fn makes_environments_by_the_job_s_seed_tells_them_of_online_episodes_and_limits_its_time() {
+        let watched = Watched::default();
+        let mut job = job(2);
+        (job.environment, job.environment_seed) = ("my-robot".to_owned(), 5);
+        check(&job, &watched).unwrap();
+        assert_eq!(run_for(&watched, &job, Job::LONGEST).unwrap().len(), 2);
+        assert_eq!(
+            (&**watched.seeds.lock().unwrap(), watched.allowed.load(Relaxed)),
+            (&[5, 5][..], 0)
+        );
+        let error = run_for(&watched, &job, Duration::ZERO).unwrap_err();
+        assert_eq!(error.to_string(), JobError::TooLong.to_string());
+        (job.seeds, job.exploration) = (vec![1], Some(Exploration::Uniform));
+        run_for(&watched, &job, Job::LONGEST).unwrap();
+        assert_eq!(watched.allowed.load(Relaxed), 1);
     }
 
     #[test]

@@ -14,8 +14,8 @@
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
 //! - `worker`: the main loop, which serves the runs in turn; `scheduler`: chooses the next run.
 //! - `duty`: the state machine of one run, without input or output: jobs claimed, results kept;
-//!   `client`: does what it says; `connection`: requests to the learner; `query`: a request.
-//! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy from one.
+//!   `client`: does what it says; `connection`: requests to the learner.
+//! - `snapshot`: keeps the newest snapshots.
 //! - `evaluate`: one job, from its policy to its results; `job`: all of its episodes, as one batch;
 //!   `exploration`: the actions of online episodes; `delivery`: the results, as they are delivered.
 
@@ -29,8 +29,6 @@ mod exploration;
 #[cfg(test)]
 pub(crate) mod fixtures;
 mod job;
-mod policy;
-mod query;
 pub mod scheduler;
 mod snapshot;
 mod worker;
@@ -52,9 +50,9 @@ use tracing::{info, warn};
 
 use crate::metrics::Metrics;
 use crate::sim::Environments;
+pub(crate) use connection::ZENOH_TIMEOUT;
 use discovery::Discovery;
 use evaluate::Evaluator;
-pub(crate) use query::ZENOH_TIMEOUT;
 use worker::Worker;
 
 const AFTER_HELP: &str = "\

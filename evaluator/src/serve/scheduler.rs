@@ -44,45 +44,28 @@ pub fn next<'a, K>(runs: impl Iterator<Item = (K, &'a Turn)>, now: Instant) -> O
 mod tests {
     use super::*;
 
-    /// Counts the turns in ten minutes of runs with the seconds that a turn takes and the pause
-    /// after it; `None` if a turn fails.
-    fn turns<const N: usize>(runs: [(u64, Option<u64>); N]) -> [u32; N] {
-        let start = Instant::now();
-        let mut now = start;
-        let (mut turns, mut counts) = (runs.map(|_| Turn::new(start)), [0; N]);
-        while now - start < Duration::from_secs(600) {
-            let Some(i) = next(turns.iter().enumerate(), now) else {
-                now += Duration::from_millis(10);
-                continue;
-            };
-            counts[i] += 1;
-            now += Duration::from_secs(runs[i].0);
-            match runs[i].1 {
-                Some(pause) => turns[i] = Turn::new(now + Duration::from_secs(pause)),
-                None => turns[i].failed(now),
-            }
-        }
-        counts
+    #[test]
+    fn the_run_that_has_been_due_for_longest_is_next() {
+        let now = Instant::now();
+        let [early, late] = [0, 1].map(|seconds| Turn::new(now + Duration::from_secs(seconds)));
+        let after = |seconds| {
+            let runs = [("late", &late), ("early", &early)];
+            next(runs.into_iter(), now + Duration::from_secs(seconds))
+        };
+        assert_eq!((after(0), after(2)), (Some("early"), Some("early")));
+        assert_eq!(next([("late", &late)].into_iter(), now), None);
     }
 
     #[test]
-    fn runs_take_turns() {
-        let [one, idle, other] = turns([(1, Some(0)), (0, Some(1)), (1, Some(0))]);
-        assert!(one.abs_diff(other) <= 1 && one + other >= 600, "{one} {other}");
-        assert!(idle >= 150, "an idle learner is asked again: {idle}");
-        // A learner that does not answer leaves half of the time to the others.
-        let [working, silent] = turns([(1, Some(0)), (5, None)]);
-        assert!(working >= 290 && silent >= 50, "{working} {silent}");
-    }
-
-    #[test]
-    fn new_weights_end_a_pause_but_not_the_one_after_a_failure() {
+    fn failures_pause_longer_each_time_and_new_weights_end_only_other_pauses() {
         let now = Instant::now();
         let mut turn = Turn::new(now + Duration::from_secs(60));
         turn.nudge(now);
         assert_eq!(turn.ready_at, now);
-        turn.failed(now);
-        turn.nudge(now);
-        assert!(turn.ready_at > now);
+        for milliseconds in [250, 500, 1000, 2000, 4000, 5000, 5000] {
+            turn.failed(now);
+            turn.nudge(now);
+            assert_eq!(turn.ready_at, now + Duration::from_millis(milliseconds));
+        }
     }
 }

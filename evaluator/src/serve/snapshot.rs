@@ -11,8 +11,8 @@ use zenoh::pubsub::Subscriber;
 use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
+use super::connection::blocking;
 use super::discovery::RunKey;
-use super::query::blocking;
 use crate::metrics::Metrics;
 
 /// Most bytes of kept snapshots, over all runs. The largest allowed snapshot fits.
@@ -73,12 +73,12 @@ impl Snapshots {
 
 /// A subscription to the snapshots of one run's learner.
 pub struct Listener {
-    state: Arc<State>,
+    inbox: Arc<Inbox>,
     _subscriber: Subscriber<()>,
 }
 
 #[derive(Default)]
-struct State {
+struct Inbox {
     /// The followed learner process.
     incarnation: AtomicU64,
     has_news: AtomicBool,
@@ -98,8 +98,8 @@ impl Listener {
         snapshots: Snapshots,
         metrics: Metrics,
     ) -> anyhow::Result<Listener> {
-        let state = Arc::new(State::default());
-        let (session, weights, shared) = (session.clone(), keys::weights(&key.1), state.clone());
+        let inbox = Arc::new(Inbox::default());
+        let (session, weights, shared) = (session.clone(), keys::weights(&key.1), inbox.clone());
         let callback = move |sample: Sample| match read(&sample, &key.1, &shared) {
             Ok(snapshot) => {
                 metrics.snapshots_received.inc();
@@ -116,29 +116,29 @@ impl Listener {
         };
         let declare = move || session.declare_subscriber(weights).callback(callback).wait();
         let _subscriber = blocking(declare).await?;
-        Ok(Listener { state, _subscriber })
+        Ok(Listener { inbox, _subscriber })
     }
 
     /// Keeps only the snapshots of this learner process from now on.
     pub fn follow(&self, incarnation: u64) {
-        self.state.incarnation.store(incarnation, Relaxed);
+        self.inbox.incarnation.store(incarnation, Relaxed);
     }
 
     /// Returns whether a snapshot has come since the last call.
     pub fn take_news(&self) -> bool {
-        self.state.has_news.swap(false, Relaxed)
+        self.inbox.has_news.swap(false, Relaxed)
     }
 }
 
 /// Decodes a snapshot of the followed learner. An error has the label of the reason.
-fn read(sample: &Sample, run: &Name, state: &State) -> Result<Snapshot, (&'static str, String)> {
+fn read(sample: &Sample, run: &Name, inbox: &Inbox) -> Result<Snapshot, (&'static str, String)> {
     let payload = sample.payload();
     let snapshot: Snapshot = decode_from(payload.len(), payload.reader())
         .map_err(|error| (error.label(), error.to_string()))?;
     if snapshot.run != *run {
         return Err(("other_run", format!("it is of run {}", snapshot.run)));
     }
-    if snapshot.incarnation != state.incarnation.load(Relaxed) {
+    if snapshot.incarnation != inbox.incarnation.load(Relaxed) {
         let problem = "it is from another learner process".to_owned();
         return Err((OTHER_INCARNATION, problem));
     }
@@ -179,13 +179,13 @@ mod tests {
         let named = Job { weights: Hash::new(b"policy"), ..job() };
         assert!(snapshots.get(&run, &named).is_some());
         assert!(snapshots.get(&(1, job().run), &named).is_none());
-        let others: [fn(&mut Job); 4] = [
+        let changes: [fn(&mut Job); 4] = [
             |job| job.run = Name::new("other").unwrap(),
             |job| job.incarnation = 2,
             |job| job.step = 8,
             |job| job.weights = Hash::new(b"others"),
         ];
-        for change in others {
+        for change in changes {
             let mut other = named.clone();
             change(&mut other);
             assert!(snapshots.get(&run, &other).is_none(), "{other:?}");

@@ -9,11 +9,8 @@ use tokio::task::JoinSet;
 use tracing::warn;
 
 use super::client::RunClient;
-use super::connection::ANSWER_TIMEOUT;
 use super::discovery::{RunKey, Runs};
-use super::duty::Step;
 use super::evaluate::Evaluator;
-use super::query::QueryError;
 use super::scheduler;
 use super::snapshot::Snapshots;
 
@@ -23,15 +20,15 @@ const KEEP_RESULTS: Duration = Duration::from_secs(600);
 /// Serves all runs, one job at a time.
 pub struct Worker {
     evaluator: Evaluator,
-    found: watch::Receiver<Runs>,
+    runs: watch::Receiver<Runs>,
     /// Runs with a learner, and runs whose learner is gone but may come back for its results.
     clients: BTreeMap<RunKey, RunClient>,
     snapshots: Snapshots,
 }
 
 impl Worker {
-    pub fn new(evaluator: Evaluator, found: watch::Receiver<Runs>) -> Worker {
-        Worker { evaluator, found, clients: BTreeMap::new(), snapshots: Snapshots::default() }
+    pub fn new(evaluator: Evaluator, runs: watch::Receiver<Runs>) -> Worker {
+        Worker { evaluator, runs, clients: BTreeMap::new(), snapshots: Snapshots::default() }
     }
 
     /// Serves until `stop` is ready, and returns its result. Then delivers results that were not
@@ -60,7 +57,7 @@ impl Worker {
             self.evaluator.metrics.runs.set(self.clients.len() as i64);
             let clients = self.clients.iter();
             let connected = clients.filter(|(_, client)| client.gone.is_none());
-            let turns = connected.map(|(key, client)| (key, client.turn()));
+            let turns = connected.map(|(key, client)| (key, client.duty.turn()));
             match scheduler::next(turns, Instant::now()).cloned() {
                 Some(key) => self.take_turn(&key).await,
                 None => self.wait().await?,
@@ -70,14 +67,14 @@ impl Worker {
 
     /// Follows the learners of its runs, and stops serving runs whose learners are gone.
     fn follow_learners(&mut self) {
-        let (found, now) = (self.found.borrow_and_update(), Instant::now());
+        let (runs, now) = (self.runs.borrow_and_update(), Instant::now());
         let is_over = |key: &RunKey, client: &mut RunClient| {
-            if let Some(learner) = found.get(key) {
-                client.follow(&learner.incarnations);
+            if let Some(learners) = runs.get(key) {
+                client.follow(&learners.incarnations);
                 return false;
             }
             let gone = now - *client.gone.get_or_insert(now);
-            !client.owes() || gone >= KEEP_RESULTS
+            !client.duty.owes() || gone >= KEEP_RESULTS
         };
         for (_, client) in self.clients.extract_if(.., is_over) {
             client.give_up();
@@ -86,14 +83,15 @@ impl Worker {
 
     /// Starts to serve new runs.
     async fn attach(&mut self) {
-        let found = self.found.borrow().clone();
-        for (key, learner) in found {
+        let runs = self.runs.borrow().clone();
+        for (key, learners) in runs {
             if self.clients.contains_key(&key) {
                 continue;
             }
             let Evaluator { name, metrics, .. } = &self.evaluator;
             let (run, snapshots) = (key.clone(), self.snapshots.clone());
-            match RunClient::attach(run, &learner, name.clone(), snapshots, metrics.clone()).await {
+            match RunClient::attach(run, &learners, name.clone(), snapshots, metrics.clone()).await
+            {
                 Ok(client) => drop(self.clients.insert(key, client)),
                 Err(error) => warn!("{error:#}"),
             }
@@ -103,45 +101,29 @@ impl Worker {
     /// Waits until a run is due, runs come or go, or a new snapshot promises work.
     async fn wait(&mut self) -> anyhow::Result<()> {
         let due = self.clients.values().map(|client| match client.gone {
-            None => client.turn().ready_at,
+            None => client.duty.turn().ready_at,
             Some(since) => since + KEEP_RESULTS,
         });
         let latest = Instant::now() + self.evaluator.beat.interval();
         let until = due.min().map_or(latest, |due| due.min(latest));
         tokio::select! {
             () = tokio::time::sleep_until(until.into()) => {}
-            changed = self.found.changed() => changed.context("the search for learners has ended")?,
+            changed = self.runs.changed() => changed.context("the search for learners has ended")?,
             () = self.snapshots.arrival() => self.clients.values_mut().for_each(RunClient::wake_for_snapshot),
         }
         Ok(())
     }
 
     async fn take_turn(&mut self, key: &RunKey) {
-        let learner = self.found.borrow().get(key).cloned();
-        if let (Some(client), Some(learner)) = (self.clients.get_mut(key), learner) {
-            client.begin_turn();
-            while let Some(step) = client.next_step() {
-                if let Err(error) = take_step(client, step, &mut self.evaluator).await {
-                    return client.rest(error, &learner.incarnations);
+        let learners = self.runs.borrow().get(key).cloned();
+        if let (Some(client), Some(learners)) = (self.clients.get_mut(key), learners) {
+            client.duty.begin_turn();
+            while let Some(step) = client.duty.next(rand::random()) {
+                if let Err(error) = client.take(step, &mut self.evaluator).await {
+                    return client.rest(error, &learners.incarnations);
                 }
             }
         }
-    }
-}
-
-async fn take_step(
-    client: &mut RunClient,
-    step: Step,
-    evaluator: &mut Evaluator,
-) -> Result<(), QueryError> {
-    match step {
-        Step::Claim { attempt } => client.claim(attempt, evaluator.environments.names()).await,
-        Step::Play(job) => {
-            let results = evaluator.evaluate(&job, client).await;
-            client.played(&job, results);
-            Ok(())
-        }
-        step => client.deliver(step, ANSWER_TIMEOUT).await,
     }
 }
 
@@ -155,8 +137,8 @@ mod tests {
     #[tokio::test(flavor = "multi_thread")]
     async fn an_evaluator_without_work_is_healthy() {
         let (health, limit) = (Health::default(), Duration::from_secs(1));
-        let (_tx, found) = watch::channel(Runs::new());
-        let worker = Worker::new(evaluator(&health, limit), found);
+        let (_tx, runs) = watch::channel(Runs::new());
+        let worker = Worker::new(evaluator(&health, limit), runs);
         // A part that never reports is unhealthy by then, and stays so.
         let stop = async {
             tokio::time::sleep(2 * limit).await;

@@ -57,8 +57,8 @@ pub trait Environments: Send + Sync {
 pub enum EnvironmentError {
     #[error("this evaluator cannot simulate the environment \"{0}\"")]
     NotSimulated(String),
-    #[error("an observation has {found} numbers, but the policy takes {wanted}")]
-    Observation { found: usize, wanted: usize },
+    #[error("an observation has {size} numbers, but the policy takes {expected}")]
+    Observation { size: usize, expected: usize },
     #[error("the environment \"{name}\" failed: {reason}")]
     Failed { name: String, reason: String },
     #[error(

@@ -176,23 +176,23 @@ mod tests {
     fn goals_lie_beyond_the_center_of_their_cell() {
         let seeds: Vec<u64> = (0..500).collect();
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        let product = |a: &[f64], b: &[f64]| {
-            let products = a.iter().zip(b).map(|(a, b)| (a - 0.75) * (b - 0.75));
-            mean(&Vec::from_iter(products))
-        };
-        let centers = [[0.0, 8.0], [20.0, 20.0], [32.0, 24.0]];
-        for (size, center) in ["umaze", "medium", "large"].into_iter().zip(centers) {
+        for (size, center) in
+            [("umaze", [0.0, 8.0]), ("medium", [20.0; 2]), ("large", [32.0, 24.0])]
+        {
             let goals = goals(&format!("antmaze-{size}"), 0, &seeds);
             let beyond = |axis: usize| goals.iter().map(move |goal| goal[axis] - center[axis]);
             let [x, y] = [0, 1].map(|axis| Vec::from_iter(beyond(axis)));
+            let covariance = |a: &[f64], b: &[f64]| {
+                let products = a.iter().zip(b).map(|(a, b)| (a - 0.75) * (b - 0.75));
+                mean(&Vec::from_iter(products))
+            };
             for values in [&x, &y] {
                 assert!(values.iter().all(|value| (0.0..1.5).contains(value)));
                 assert!((mean(values) - 0.75).abs() < 0.05);
                 // The sum of two uniform draws.
-                let variance = product(values, values);
-                assert!((variance - (1.0 + 0.25) / 12.0).abs() < 0.015, "{variance}");
+                assert!((covariance(values, values) - (1.0 + 0.25) / 12.0).abs() < 0.015);
             }
-            assert!(product(&x, &y).abs() < 0.02, "the axes are independent");
+            assert!(covariance(&x, &y).abs() < 0.02, "the axes are independent");
         }
     }
 }

@@ -164,13 +164,13 @@ impl<S> Rollout<S> {
 /// The observation of an environment, rounded.
 fn observe(
     environment: &dyn Environment,
-    wanted: usize,
+    expected: usize,
 ) -> Result<impl Iterator<Item = f32>, EnvironmentError> {
     let observation = environment.observation();
-    let found = observation.len();
-    match found == wanted {
+    let size = observation.len();
+    match size == expected {
         true => Ok(observation.iter().map(|&value| value as f32)),
-        false => Err(EnvironmentError::Observation { found, wanted }),
+        false => Err(EnvironmentError::Observation { size, expected }),
     }
 }
 

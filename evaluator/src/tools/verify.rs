@@ -27,7 +27,7 @@ const REWARD_TOLERANCE: f64 = 1e-3;
 
 /// Comparison of a file with the simulation.
 #[derive(Debug, Serialize)]
-pub struct Report {
+pub struct Comparison {
     pub environment: &'static str,
     /// Rows replayed.
     pub transitions: usize,
@@ -35,8 +35,8 @@ pub struct Report {
     /// observation of the following row, so it is unknown where an episode ends.
     pub compared: usize,
     /// The largest error of each compared row's next observation, over its values.
-    pub obs_error: ObservationError,
-    pub reward_error: RewardError,
+    pub obs_error: Errors,
+    pub reward_error: LargestError,
     /// Rows whose reward differs from the recorded one by more than float32 explains.
     pub rewards_differ: usize,
     /// Rows that are terminal only in the file or only in the simulation. A terminal step at the
@@ -44,33 +44,33 @@ pub struct Report {
     pub terminals_differ: usize,
 }
 
-/// Absolute errors of the next observation, over the rows.
+/// Absolute errors over the rows.
 #[derive(Debug, Serialize)]
-pub struct ObservationError {
+pub struct Errors {
     pub median: f64,
     pub p99: f64,
     pub max: f64,
 }
 
-/// Absolute errors of the reward, over the rows.
 #[derive(Debug, Serialize)]
-pub struct RewardError {
+pub struct LargestError {
     pub max: f64,
 }
 
-impl fmt::Display for Report {
+impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (transitions, compared) = (self.transitions, self.compared);
-        let ObservationError { median, p99, max } = self.obs_error;
-        writeln!(f, "environment        {}", self.environment)?;
-        writeln!(
+        let Self { environment, transitions, compared, obs_error, reward_error, .. } = self;
+        let Errors { median, p99, max } = obs_error;
+        write!(
             f,
-            "transitions        {transitions}, of which {compared} have a next observation to compare"
-        )?;
-        writeln!(f, "observation error  median {median:.1e}, p99 {p99:.1e}, max {max:.1e}")?;
-        writeln!(f, "reward error       max {:.1e}", self.reward_error.max)?;
-        writeln!(f, "rewards differ     {}", self.rewards_differ)?;
-        write!(f, "terminals differ   {}", self.terminals_differ)
+            "environment        {environment}
+transitions        {transitions}, of which {compared} have a next observation to compare
+observation error  median {median:.1e}, p99 {p99:.1e}, max {max:.1e}
+reward error       max {:.1e}
+rewards differ     {}
+terminals differ   {}",
+            reward_error.max, self.rewards_differ, self.terminals_differ
+        )
     }
 }
 
@@ -88,24 +88,24 @@ fn hint(error: &DatasetError) -> String {
 /// The environment of a file: the one that it names or, if it names none, the only one of its
 /// sizes.
 pub fn environment_of(path: &Path) -> anyhow::Result<&'static EnvironmentSpec> {
+    let file = path.display();
     if let Some(name) = recorded_environment(path).hint_of(hint)? {
-        let other = || format!("{}: recorded in an unknown environment", path.display());
-        return find(&name).with_context(other).hint(ENVIRONMENT);
+        let problem = || format!("{file}: recorded in an unknown environment");
+        return find(&name).with_context(problem).hint(ENVIRONMENT);
     }
     let fitting = matching_environments(path).hint_of(hint)?;
-    if let [only] = fitting[..] {
-        return Ok(only);
-    }
-    let names = Vec::from_iter(fitting.iter().map(|spec| spec.name.as_str()));
-    let names = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-    let path = path.display();
-    let text = "does not say which environment it was recorded in, and its sizes fit";
-    Err(anyhow!("{path}: {text} {names}")).hint(ENVIRONMENT)
+    let names = match &fitting[..] {
+        [only] => return Ok(only),
+        [] => "none".to_owned(),
+        several => Vec::from_iter(several.iter().map(|spec| spec.name.as_str())).join(", "),
+    };
+    let problem = "does not say which environment it was recorded in, and its sizes fit";
+    Err(anyhow!("{file}: {problem} {names}")).hint(ENVIRONMENT)
 }
 
 /// Replays every row of the file at `path`: sets its qpos and qvel, and takes one step with its
 /// action.
-pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> anyhow::Result<Report> {
+pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> anyhow::Result<Comparison> {
     let rows = RecordedRows::read(path, spec).hint_of(hint)?;
     let threads = rayon::current_num_threads();
     let share = rows.len().div_ceil(threads);
@@ -150,19 +150,19 @@ fn replay(environment: &mut Simulation, row: &Row<'_>, goal: Option<&[f64]>) -> 
 }
 
 /// `None` if there is no row to compare.
-fn summarize(spec: &'static EnvironmentSpec, errors: &[RowError]) -> Option<Report> {
+fn summarize(spec: &'static EnvironmentSpec, errors: &[RowError]) -> Option<Comparison> {
     let mut sorted: Vec<f64> = errors.iter().filter_map(|row| row.observation).collect();
     sorted.sort_by(f64::total_cmp);
     let last = sorted.len().checked_sub(1)?;
-    let at = |share: f64| sorted[(last as f64 * share).round() as usize];
-    let (median, p99, max) = (at(0.5), at(0.99), at(1.0));
+    let percentile = |share: f64| sorted[(last as f64 * share).round() as usize];
+    let (median, p99, max) = (percentile(0.5), percentile(0.99), percentile(1.0));
     let rewards = errors.iter().map(|row| row.reward);
-    Some(Report {
+    Some(Comparison {
         environment: &spec.name,
         transitions: errors.len(),
         compared: sorted.len(),
-        obs_error: ObservationError { median, p99, max },
-        reward_error: RewardError { max: rewards.fold(0.0, f64::max) },
+        obs_error: Errors { median, p99, max },
+        reward_error: LargestError { max: rewards.fold(0.0, f64::max) },
         rewards_differ: errors.iter().filter(|row| row.reward_differs).count(),
         terminals_differ: errors.iter().filter(|row| row.terminal_differs).count(),
     })

@@ -5,4 +5,3 @@ mod collect;
 mod edges;
 mod gymnasium;
 mod rollout;
-mod verify;

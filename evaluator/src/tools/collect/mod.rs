@@ -1,11 +1,10 @@
 //! Records a dataset of mediocre behavior, so that a new machine needs no download.
 //!
-//! Following the recipe in an environment's row, `search` trains `linear` policies, and `record`
+//! Following the recipe in an environment's row, `search` trains linear policies, and `record`
 //! mixes episodes of all of them, from the first to the last, into one file in D4RL's layout. The
 //! result resembles D4RL's "medium-replay", the replay buffer of a learning policy. The file is a
 //! function of the number of transitions and the seed; the number of threads does not change it.
 
-mod linear;
 mod record;
 mod search;
 

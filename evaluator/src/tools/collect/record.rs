@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-use super::linear::LinearPolicy;
+use super::search::LinearPolicy;
 use super::{MUJOCO, OUT, stream};
 use crate::sim::{self, EnvironmentError, Simulation, Step};
 
@@ -49,13 +49,10 @@ pub fn record(
         let highest = room.iter().rposition(|&room| room > 0.0).filter(|_| patient);
         let next = highest.and_then(|band| mixture.get(band + 1));
         let ceiling = next.map_or(f64::INFINITY, |&(from, _)| from);
-        let mut draw = || {
-            let policy = &policies[random.random_range(0..policies.len())];
-            (policy, random.random())
-        };
-        let tasks: Vec<(&LinearPolicy, u64)> = (0..ROUND).map(|_| draw()).collect();
-        let running = recorders.par_iter_mut().zip(tasks).with_max_len(1);
-        running.for_each(|(recorder, (policy, seed))| recorder.run(spec, policy, seed, ceiling));
+        let mut draw = |_| (&policies[random.random_range(0..policies.len())], random.random());
+        let drawn: Vec<(&LinearPolicy, u64)> = (0..ROUND).map(&mut draw).collect();
+        let running = recorders.par_iter_mut().zip(drawn).with_max_len(1);
+        running.for_each(|(recorder, (policy, seed))| recorder.run(policy, seed, ceiling));
         for recorder in &recorders {
             simulated += recorder.steps.len();
             let score = spec.normalized_score(recorder.episode_return);
@@ -76,34 +73,25 @@ pub fn record(
 /// An environment and its last episode.
 struct Recorder {
     environment: Simulation,
-    /// From the initial state to the last: one more than steps.
-    states: Vec<State>,
+    /// The initial state, then one after each step.
+    states: Vec<[Vec<f64>; 3]>,
     /// Clipped actions [action_dim], and what follows.
     steps: Vec<(Vec<f64>, Step)>,
     episode_return: f64,
 }
 
-struct State {
-    observation: Vec<f64>,
-    qpos: Vec<f64>,
-    qvel: Vec<f64>,
-}
-
 impl Recorder {
     fn new(spec: &'static EnvironmentSpec) -> Result<Self, EnvironmentError> {
-        Ok(Self {
-            environment: sim::make(spec, 0)?,
-            states: Vec::new(),
-            steps: Vec::new(),
-            episode_return: 0.0,
-        })
+        let environment = sim::make(spec, 0)?;
+        Ok(Self { environment, states: Vec::new(), steps: Vec::new(), episode_return: 0.0 })
     }
 
     /// Runs an episode to its end, or until its score so far is above `ceiling`.
-    fn run(&mut self, spec: &EnvironmentSpec, policy: &LinearPolicy, seed: u64, ceiling: f64) {
+    fn run(&mut self, policy: &LinearPolicy, seed: u64, ceiling: f64) {
         self.states.clear();
         self.steps.clear();
         self.episode_return = 0.0;
+        let spec = self.environment.spec();
         let mut random = stream(seed, NOISE_STREAM);
         let deviation = random.random_range(NOISE);
         let mut action = vec![0.0; spec.action_dim];
@@ -131,25 +119,23 @@ impl Recorder {
     }
 
     fn keep_state(&mut self) {
-        self.states.push(State {
-            observation: self.environment.observation().to_vec(),
-            qpos: self.environment.qpos().to_vec(),
-            qvel: self.environment.qvel().to_vec(),
-        });
+        let Self { environment, states, .. } = self;
+        let state = [environment.observation(), environment.qpos(), environment.qvel()];
+        states.push(state.map(<[f64]>::to_vec));
     }
 
     fn write(&self, writer: &mut D4rlWriter) -> Result<(), DatasetError> {
-        for (i, (action, step)) in self.steps.iter().enumerate() {
-            let state = &self.states[i];
+        for ((action, step), states) in self.steps.iter().zip(self.states.windows(2)) {
+            let [observation, qpos, qvel] = &states[0];
             writer.push(&Row {
-                observation: &state.observation,
+                observation,
                 action,
-                next_observation: &self.states[i + 1].observation,
+                next_observation: &states[1][0],
                 reward: step.reward,
                 terminal: step.terminated,
                 timeout: step.truncated && !step.terminated,
-                qpos: &state.qpos,
-                qvel: &state.qvel,
+                qpos,
+                qvel,
             })?;
         }
         Ok(())

@@ -1,4 +1,4 @@
-//! Augmented random search: learns behavior in seconds, without a gradient.
+//! Augmented random search of linear policies: learns behavior in seconds, without a gradient.
 //!
 //! ARS V2-t of Mania, Guy and Recht, "Simple random search of static linear policies is competitive
 //! for reinforcement learning" (2018). It perturbs the weights of a linear policy in random
@@ -13,7 +13,6 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-use super::linear::{LinearPolicy, Moments};
 use crate::sim::{self, EnvironmentError, Simulation};
 
 /// N: directions tried in one iteration, each forwards and backwards.
@@ -30,6 +29,84 @@ const ALIVE_BONUS: f64 = 1.0;
 /// Transitions beyond which the searches take no more steps: after a minute on two cores, most of
 /// them move well.
 const MAX_TRANSITIONS: u64 = 100_000;
+
+/// a = M · (s - mean) / deviation. The environment clips it.
+#[derive(Clone, Debug)]
+pub struct LinearPolicy {
+    /// M [action_dim, observation_dim].
+    weights: Vec<f64>,
+    mean: Vec<f64>,
+    inverse_std: Vec<f64>,
+}
+
+impl LinearPolicy {
+    fn zero(observation_dim: usize, action_dim: usize) -> Self {
+        Self {
+            weights: vec![0.0; action_dim * observation_dim],
+            mean: vec![0.0; observation_dim],
+            inverse_std: vec![1.0; observation_dim],
+        }
+    }
+
+    /// Writes `action`.
+    pub fn act(&self, observation: &[f64], action: &mut [f32]) {
+        let rows = self.weights.chunks_exact(observation.len());
+        for (value, row) in action.iter_mut().zip(rows) {
+            let mut sum = 0.0;
+            for (i, &observed) in observation.iter().enumerate() {
+                sum += row[i] * (observed - self.mean[i]) * self.inverse_std[i];
+            }
+            *value = sum as f32;
+        }
+    }
+}
+
+/// Running mean and variance of observations, by Welford's recurrence; two merge by Chan's formula.
+#[derive(Clone, Debug)]
+struct Moments {
+    count: f64,
+    mean: Vec<f64>,
+    /// Σ (s - mean)²
+    squares: Vec<f64>,
+}
+
+impl Moments {
+    fn new(observation_dim: usize) -> Self {
+        let [mean, squares] = [(); 2].map(|_| vec![0.0; observation_dim]);
+        Self { count: 0.0, mean, squares }
+    }
+
+    fn push(&mut self, observation: &[f64]) {
+        self.count += 1.0;
+        for (i, value) in observation.iter().enumerate() {
+            let delta = value - self.mean[i];
+            self.mean[i] += delta / self.count;
+            self.squares[i] += delta * (value - self.mean[i]);
+        }
+    }
+
+    fn merge(&mut self, other: &Self) {
+        let count = self.count + other.count;
+        if other.count == 0.0 {
+            return;
+        }
+        for i in 0..self.mean.len() {
+            let delta = other.mean[i] - self.mean[i];
+            self.mean[i] += delta * other.count / count;
+            self.squares[i] += other.squares[i] + delta * delta * self.count * other.count / count;
+        }
+        self.count = count;
+    }
+
+    /// The inverse standard deviations; 1 for a value that never changes, which is only centered.
+    fn inverse_std(&self) -> Vec<f64> {
+        let inverse = |squares: &f64| {
+            let std = (squares / (self.count - 1.0).max(1.0)).sqrt();
+            if std > 1e-7 { 1.0 / std } else { 1.0 }
+        };
+        self.squares.iter().map(inverse).collect()
+    }
+}
 
 /// Trains for as many steps as the recipe has for `transitions`. Returns the policies of all
 /// iterations; `random` makes a generator for each search.
@@ -77,7 +154,6 @@ struct Search {
 struct Trial {
     environment: Simulation,
     policy: LinearPolicy,
-    action: Vec<f32>,
     moments: Moments,
     shaped_return: f64,
     episode_return: f64,
@@ -92,23 +168,15 @@ impl Search {
             Ok(Trial {
                 environment: sim::make(spec, 0)?,
                 policy: policy.clone(),
-                action: vec![0.0; spec.action_dim],
                 moments: moments.clone(),
                 shaped_return: 0.0,
                 episode_return: 0.0,
                 steps: 0,
             })
         };
-        let trials = (0..2 * DIRECTIONS).map(trial);
-        Ok(Self {
-            trials: trials.collect::<Result<_, EnvironmentError>>()?,
-            policies: vec![policy.clone()],
-            mean_return: 0.0,
-            policy,
-            moments,
-            random,
-            steps: 0,
-        })
+        let trials = (0..2 * DIRECTIONS).map(trial).collect::<Result<_, EnvironmentError>>()?;
+        let policies = vec![policy.clone()];
+        Ok(Self { policy, policies, mean_return: 0.0, moments, random, trials, steps: 0 })
     }
 
     /// Runs one iteration.
@@ -117,17 +185,14 @@ impl Search {
     /// the trials, so the result does not depend on the number of threads.
     fn iterate(&mut self) {
         let size = self.policy.weights.len();
-        let mut direction = || {
-            let normal = StandardNormal.sample_iter(&mut self.random);
-            Vec::<f64>::from_iter(normal.take(size))
-        };
-        let directions = Vec::from_iter((0..DIRECTIONS).map(|_| direction()));
+        let mut direction =
+            |_| Vec::<f64>::from_iter(StandardNormal.sample_iter(&mut self.random).take(size));
+        let directions = Vec::from_iter((0..DIRECTIONS).map(&mut direction));
         let seeds: Vec<u64> = self.trials.iter().map(|_| self.random.random()).collect();
 
-        let both = |direction| [(direction, 1.0), (direction, -1.0)];
-        let signed = directions.iter().flat_map(both);
+        let signed = directions.iter().flat_map(|direction| [(direction, 1.0), (direction, -1.0)]);
         for (trial, (direction, sign)) in self.trials.iter_mut().zip(signed) {
-            trial.policy.normalizer = self.policy.normalizer.clone();
+            trial.policy.clone_from(&self.policy);
             let centers = self.policy.weights.iter().zip(direction);
             for (weight, (center, delta)) in trial.policy.weights.iter_mut().zip(centers) {
                 *weight = center + sign * PERTURBATION * delta;
@@ -156,7 +221,8 @@ impl Search {
                 *weight += rate * (forwards - backwards) * delta;
             }
         }
-        self.policy.normalizer = self.moments.normalizer();
+        self.policy.mean.clone_from(&self.moments.mean);
+        self.policy.inverse_std = self.moments.inverse_std();
         self.policies.push(self.policy.clone());
         let returns = self.trials.iter().map(|trial| trial.episode_return);
         self.mean_return = returns.sum::<f64>() / self.trials.len() as f64;
@@ -168,11 +234,12 @@ impl Trial {
         self.moments = Moments::new(self.environment.observation().len());
         (self.shaped_return, self.episode_return, self.steps) = (0.0, 0.0, 0);
         self.environment.reset(seed);
+        let mut action = vec![0.0; self.environment.spec().action_dim];
         loop {
             let observation = self.environment.observation();
             self.moments.push(observation);
-            self.policy.act(observation, &mut self.action);
-            let step = self.environment.step(&self.action);
+            self.policy.act(observation, &mut action);
+            let step = self.environment.step(&action);
             self.shaped_return += step.reward - ALIVE_BONUS;
             self.episode_return += step.reward;
             self.steps += 1;
@@ -204,5 +271,24 @@ mod tests {
         // The first policies hardly move.
         let (first, last) = (mean(&returns[..quarter]), mean(&returns[returns.len() - quarter..]));
         assert!(last > 2.0 * first, "{first}, then {last}");
+    }
+
+    #[test]
+    fn merged_moments_are_those_of_all_observations() {
+        let values = [[1.0, 5.0], [2.0, 5.0], [4.0, 5.0], [9.0, 5.0]];
+        let moments = |values: &[[f64; 2]]| {
+            let mut moments = Moments::new(2);
+            values.iter().for_each(|value| moments.push(value));
+            moments
+        };
+        let mut merged = moments(&values[..1]);
+        merged.merge(&moments(&values[1..]));
+        merged.merge(&moments(&[]));
+        for moments in [moments(&values), merged] {
+            assert_eq!(moments.mean, [4.0, 5.0]);
+            // Variance 38 / 3; the second value never changed.
+            let [varying, constant] = moments.inverse_std()[..] else { panic!() };
+            assert!((varying - (3.0_f64 / 38.0).sqrt()).abs() < 1e-12 && constant == 1.0);
+        }
     }
 }

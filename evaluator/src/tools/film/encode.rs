@@ -1,23 +1,109 @@
-//! Writes pictures to a file: an animation, a video or a strip.
+//! The file of a film: an animation, a video or a strip, and the layout of its pictures.
 
 use std::ffi::OsStr;
 use std::io::Write;
 use std::iter::once;
+use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
-use anyhow::{Context, anyhow, bail};
+use anyhow::{Context, anyhow};
 use color_quant::NeuQuant;
 use gif::{Encoder, Frame, Repeat};
 use quad_run::files;
 use quad_runtime::Hint;
 
-use super::output::{Format, Output};
-use super::picture::Picture;
-
+/// Pictures of a strip.
+const STRIP: usize = 8;
 /// Colors of an animation; fewer colors make a smaller file.
 const COLORS: usize = 64;
 /// Sampling of the first picture to choose colors: 1 is all of it, 10 a tenth.
 const SAMPLE: i32 = 10;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// An animation, which this program encodes.
+    Gif,
+    /// A video, which ffmpeg encodes.
+    Mp4,
+    /// A strip: a few pictures side by side.
+    Png,
+}
+
+#[derive(Clone, Debug)]
+pub struct Output {
+    pub path: PathBuf,
+    pub format: Format,
+}
+
+/// Parses the name of a file.
+pub fn output(name: &str) -> Result<Output, String> {
+    let path = PathBuf::from(name);
+    let format = match path.extension().and_then(OsStr::to_str) {
+        Some("gif") => Format::Gif,
+        Some("mp4") => Format::Mp4,
+        Some("png") => Format::Png,
+        _ => return Err("its name must end with .gif, .mp4 or .png".to_owned()),
+    };
+    Ok(Output { path, format })
+}
+
+impl Format {
+    /// Width and height of one episode's view, pixels.
+    fn view_size(self) -> (usize, usize) {
+        match self {
+            Self::Gif => (320, 240),
+            Self::Mp4 => (480, 360),
+            Self::Png => (240, 240),
+        }
+    }
+
+    /// Width over height of one episode's view.
+    pub fn aspect(self) -> f64 {
+        let (width, height) = self.view_size();
+        width as f64 / height as f64
+    }
+
+    /// Width and height of a picture of several episodes, pixels: side by side, in a strip stacked.
+    pub fn size(self, episodes: usize) -> (usize, usize) {
+        let (width, height) = self.view_size();
+        if self == Self::Png { (width, height * episodes) } else { (width * episodes, height) }
+    }
+
+    /// Left, bottom, width and height of the view of the episode with this index, pixels.
+    pub fn view(self, index: usize, episodes: usize) -> [usize; 4] {
+        let (width, height) = self.view_size();
+        match self {
+            Self::Png => [0, (episodes - 1 - index) * height, width, height],
+            _ => [index * width, 0, width, height],
+        }
+    }
+
+    /// The steps of an episode of `last` steps after which a picture is taken: about 25 a second, and
+    /// the last one; in a strip eight.
+    pub fn steps(self, last: usize, control_period: f64) -> Vec<usize> {
+        match self {
+            Self::Png => (0..STRIP).map(|picture| picture * last / (STRIP - 1)).collect(),
+            _ => (0..last).step_by(stride(control_period)).chain([last]).collect(),
+        }
+    }
+}
+
+/// Steps from one picture of a film to the next.
+pub fn stride(control_period: f64) -> usize {
+    ((0.04 / control_period).round() as usize).max(1)
+}
+
+pub struct Picture {
+    pub width: usize,
+    /// [height, width, 3], from the top left
+    pub rgb: Vec<u8>,
+}
+
+impl Picture {
+    fn height(&self) -> usize {
+        self.rgb.len() / (3 * self.width)
+    }
+}
 
 /// Writes pictures, each shown for `seconds`. The file gets its name when it is whole; after an
 /// error, an earlier file stays.
@@ -39,18 +125,23 @@ pub fn write(
         .hint("choose a file with --out in a folder that you may write to, with enough space")
 }
 
+/// Pictures side by side.
 fn strip(pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     let pictures: Vec<_> = pictures.collect();
-    if pictures.is_empty() {
-        bail!("there are no pictures");
-    }
-    let strip = Picture::strip(&pictures);
+    let height = pictures.first().context("there are no pictures")?.height();
+    let width: usize = pictures.iter().map(|picture| picture.width).sum();
+    let rows = (0..height).flat_map(|row| {
+        pictures
+            .iter()
+            .flat_map(move |picture| &picture.rgb[3 * picture.width * row..][..3 * picture.width])
+    });
+    let rgb = Vec::from_iter(rows.copied());
     let mut file = Vec::new();
-    let mut encoder = png::Encoder::new(&mut file, strip.width as u32, strip.height() as u32);
+    let mut encoder = png::Encoder::new(&mut file, width as u32, height as u32);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_compression(png::Compression::High);
     let mut writer = encoder.write_header()?;
-    writer.write_image_data(&strip.rgb)?;
+    writer.write_image_data(&rgb)?;
     writer.finish()?;
     Ok(file)
 }
@@ -111,7 +202,21 @@ fn video(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::R
 mod tests {
     use std::fs;
 
+    use anyhow::bail;
+
     use super::*;
+
+    #[test]
+    fn films_lie_side_by_side_and_strips_one_below_the_other() {
+        let (film, strip) = (Format::Gif, Format::Png);
+        assert_eq!((film.size(2), strip.size(2)), ((640, 240), (240, 480)));
+        let views = |format: Format| [format.view(0, 2), format.view(1, 2)];
+        assert_eq!(views(film), [[0, 0, 320, 240], [320, 0, 320, 240]]);
+        assert_eq!(views(strip), [[0, 240, 240, 240], [0, 0, 240, 240]]);
+        assert_eq!(film.steps(12, 0.008), [0, 5, 10, 12], "25 pictures a second");
+        assert_eq!(film.steps(2, 0.1), [0, 1, 2]);
+        assert_eq!(strip.steps(14, 0.008), [0, 2, 4, 6, 8, 10, 12, 14]);
+    }
 
     /// Nine pictures of one color each, of which the one with number `broken` cannot be drawn.
     fn pictures(broken: u8) -> impl Iterator<Item = anyhow::Result<Picture>> {
@@ -124,9 +229,8 @@ mod tests {
     #[test]
     fn a_film_gets_its_name_when_it_is_whole() {
         let folder = tempfile::tempdir().unwrap();
-        for (name, format) in [("film.gif", Format::Gif), ("film.png", Format::Png)] {
-            let path = folder.path().join(name);
-            let output = Output { path, format };
+        for name in ["film.gif", "film.png"] {
+            let output = output(folder.path().join(name).to_str().unwrap()).unwrap();
             let unnamed = pictures(9).inspect(|_| assert!(!output.path.exists(), "{name}"));
             write(&output, 0.04, unnamed).unwrap();
             let whole = fs::read(&output.path).unwrap();
@@ -143,13 +247,20 @@ mod tests {
     }
 
     #[test]
-    fn an_animation_shows_each_picture_for_its_time() {
-        let film = animation(0.04, pictures(9).map(Result::unwrap)).unwrap();
+    fn an_animation_shows_each_picture_for_its_time_and_a_strip_all_side_by_side() {
+        let drawn = || pictures(9).map(Result::unwrap);
+        let film = animation(0.04, drawn()).unwrap();
         let (mut film, mut delays) = (gif::Decoder::new(&film[..]).unwrap(), Vec::new());
         while let Some(frame) = film.read_next_frame().unwrap() {
             delays.push(frame.delay);
         }
-        // In hundredths of a second.
-        assert_eq!(delays, [4; 9]);
+        assert_eq!(delays, [4; 9], "hundredths of a second");
+        let strip = strip(drawn()).unwrap();
+        let mut reader = png::Decoder::new(std::io::Cursor::new(strip)).read_info().unwrap();
+        let mut rgb = vec![0; 9 * 3 * 64 * 48];
+        reader.next_frame(&mut rgb).unwrap();
+        for (column, colors) in rgb.chunks_exact(3 * 64).enumerate() {
+            assert!(colors.iter().all(|color| usize::from(*color) == 20 * (column % 9)));
+        }
     }
 }

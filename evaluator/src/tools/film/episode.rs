@@ -1,12 +1,12 @@
 //! Plays an episode and keeps its poses, which are drawn afterwards.
 
+use anyhow::Context;
 use quad_protocol::episode_seeds;
 
-use crate::sim::Simulation;
-use crate::tools::score::Subject;
+use crate::sim::{self, Simulation};
+use crate::tools::score::{Subject, title};
 
 /// Subject of one picture.
-#[derive(Clone, Debug, PartialEq)]
 pub struct Pose {
     /// Generalized positions.
     pub qpos: Vec<f64>,
@@ -14,6 +14,13 @@ pub struct Pose {
     pub goal: Option<[f64; 2]>,
     /// Undiscounted sum of the rewards so far.
     pub episode_return: f64,
+}
+
+impl Pose {
+    fn new(simulation: &Simulation, episode_return: f64) -> Self {
+        let goal = simulation.goal().and_then(|goal| goal.try_into().ok());
+        Self { qpos: simulation.qpos().to_vec(), goal, episode_return }
+    }
 }
 
 /// An episode of a policy.
@@ -36,13 +43,22 @@ impl Episode {
         environment_seed: u64,
     ) -> anyhow::Result<Self> {
         let seed = seed.unwrap_or_else(|| episode_seeds(subject.seed, subject.step, 1)[0]);
-        let mut poses = Vec::new();
-        let see = |simulation: &Simulation, so_far| poses.push(pose(simulation, so_far));
-        let (last, episode_return) = subject.play(seed, environment_seed, see)?;
-        poses.push(pose(&last, episode_return));
-        let choice = subject.policy.choice().map(|choice| choice.to_string());
-        let choice = choice.unwrap_or_else(|| "no candidates".to_owned());
-        Ok(Self { seed, poses, gradient_step: subject.step, choice })
+        let policy = &*subject.policy;
+        let mut simulation = sim::make(subject.spec, environment_seed)?;
+        simulation.reset(seed);
+        let (mut state, mut action) = ([policy.begin(seed)], vec![0.0; policy.action_dim()]);
+        let mut poses = vec![Pose::new(&simulation, 0.0)];
+        loop {
+            let observation = simulation.observation().iter().map(|x| *x as f32);
+            let acted = policy.act(&Vec::from_iter(observation), &mut state, &mut action);
+            acted.with_context(|| subject.cannot_act())?;
+            let step = simulation.step(&action);
+            poses.push(Pose::new(&simulation, poses[poses.len() - 1].episode_return + step.reward));
+            if step.terminated || step.truncated {
+                break;
+            }
+        }
+        Ok(Self { seed, poses, gradient_step: subject.step, choice: title(policy.choice()) })
     }
 
     /// Both columns of the caption after `steps` steps, or at the end if that is earlier.
@@ -66,9 +82,4 @@ impl Episode {
     pub fn length(&self) -> usize {
         self.poses.len() - 1
     }
-}
-
-fn pose(simulation: &Simulation, episode_return: f64) -> Pose {
-    let goal = simulation.goal().and_then(|goal| goal.try_into().ok());
-    Pose { qpos: simulation.qpos().to_vec(), goal, episode_return }
 }

@@ -1,5 +1,10 @@
 //! Draws poses: the model with colors, a floor and a light, seen by a camera.
+//!
+//! OpenGL needs no screen: EGL on Mesa's surfaceless platform, which needs no GPU. The program loads
+//! libEGL when it makes a film, not when it starts: evaluators run on machines without it.
 
+use anyhow::Context;
+use khronos_egl::{self as egl, DynamicInstance, EGL1_5};
 use mujoco_rs::wrappers::mj_data::MjData;
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtGeom, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::mj_rendering::{MjrContext, MjrRectangle, MjtFont, MjtGridPos};
@@ -7,12 +12,16 @@ use mujoco_rs::wrappers::mj_visualization::{
     MjtRndFlag, MjvCamera, MjvOption, MjvPerturb, MjvScene,
 };
 use quad_dataset::{CELL, EnvironmentSpec};
+use quad_runtime::Hint;
 
+use super::encode::{Format, Picture};
 use super::episode::{Episode, Pose};
-use super::gl::Gl;
-use super::output::Layout;
-use super::picture::Picture;
 use crate::sim::{self, EnvironmentError};
+
+pub const INSTALL: &str =
+    "apt-get install --no-install-recommends libegl1 libegl-mesa0 libgl1-mesa-dri";
+/// `EGL_PLATFORM_SURFACELESS_MESA`, of the extension `EGL_MESA_platform_surfaceless`.
+const SURFACELESS: egl::Enum = 0x31DD;
 
 /// The parts of a model that only a camera sees. The light follows the robot.
 const LOOKS: &str = r#"
@@ -41,6 +50,37 @@ const DISTANCE: f64 = 1.25;
 /// The share of a view's height that the caption takes.
 const CAPTION: f64 = 0.2;
 
+/// An OpenGL context, current on the thread that made it.
+pub struct Gl {
+    /// The library, whose objects are valid as long as it is loaded.
+    _egl: DynamicInstance<EGL1_5>,
+}
+
+impl Gl {
+    pub fn new() -> anyhow::Result<Self> {
+        Self::open().context("pictures need EGL with Mesa's software driver").hint(INSTALL)
+    }
+
+    fn open() -> anyhow::Result<Self> {
+        // SAFETY: libEGL is the system's; loading it has no precondition.
+        let egl = unsafe { DynamicInstance::<EGL1_5>::load_required() }
+            .map_err(|error| anyhow::anyhow!("{error}"))?;
+        // SAFETY: this platform takes no native display.
+        let display = unsafe {
+            egl.get_platform_display(SURFACELESS, egl::DEFAULT_DISPLAY, &[egl::ATTRIB_NONE])?
+        };
+        egl.initialize(display)?;
+        egl.bind_api(egl::OPENGL_API)?;
+        let wanted =
+            [egl::SURFACE_TYPE, egl::PBUFFER_BIT, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
+        let config = egl.choose_first_config(display, &wanted)?;
+        let config = config.context("it does not support OpenGL")?;
+        let context = egl.create_context(display, config, None, &[egl::NONE])?;
+        egl.make_current(display, None, None, Some(context))?;
+        Ok(Self { _egl: egl })
+    }
+}
+
 /// Draws the films of one environment.
 pub struct Stage {
     // MuJoCo frees its OpenGL objects before `_gl` ends: fields are dropped in this order.
@@ -50,16 +90,16 @@ pub struct Stage {
     camera: MjvCamera,
     /// Radius of the ball at a goal, meters.
     reach: f64,
-    layout: Layout,
+    format: Format,
     _gl: Gl,
 }
 
 impl Stage {
     /// Makes the stage of an environment, for pictures of several episodes.
-    pub fn new(spec: &EnvironmentSpec, layout: Layout, episodes: usize) -> anyhow::Result<Self> {
+    pub fn new(spec: &EnvironmentSpec, format: Format, episodes: usize) -> anyhow::Result<Self> {
         let gl = Gl::new()?;
-        let model = Box::new(model(spec, layout.size(episodes))?);
-        let camera = camera(&model, layout.aspect());
+        let model = Box::new(model(spec, format.size(episodes))?);
+        let camera = camera(&model, format.aspect());
         // SAFETY: the context of `gl` is current on this thread, and outlives what is made here.
         let mut context = unsafe { MjrContext::new(&model) };
         context.offscreen();
@@ -74,7 +114,7 @@ impl Stage {
             data,
             camera,
             reach: spec.maze.map_or(0.0, |maze| maze.reach),
-            layout,
+            format,
             _gl: gl,
         })
     }
@@ -82,7 +122,7 @@ impl Stage {
     /// The picture of all episodes after `steps` steps.
     pub fn draw(&mut self, episodes: &[Episode], steps: usize) -> anyhow::Result<Picture> {
         for (index, episode) in episodes.iter().enumerate() {
-            let view = self.layout.view(index, episodes.len()).map(|pixels| pixels as i32);
+            let view = self.format.view(index, episodes.len()).map(|pixels| pixels as i32);
             let view = MjrRectangle::new(view[0], view[1], view[2], view[3]);
             self.pose(episode.pose(steps));
             self.scene.render(&view, &self.context);
@@ -90,11 +130,13 @@ impl Stage {
             let [left, right] = episode.caption(steps);
             self.context.overlay(font, corner, view, &left, Some(&right));
         }
-        let (width, height) = self.layout.size(episodes.len());
+        let (width, height) = self.format.size(episodes.len());
         let mut rgb = vec![0; width * height * 3];
-        let all = MjrRectangle::new(0, 0, width as i32, height as i32);
-        self.context.read_pixels(Some(&mut rgb), None, &all)?;
-        Ok(Picture { width, rgb }.flipped())
+        let whole = MjrRectangle::new(0, 0, width as i32, height as i32);
+        self.context.read_pixels(Some(&mut rgb), None, &whole)?;
+        // OpenGL's rows begin at the bottom.
+        let rgb = rgb.chunks_exact(3 * width).rev().flatten().copied().collect();
+        Ok(Picture { width, rgb })
     }
 
     fn pose(&mut self, pose: &Pose) {
@@ -103,10 +145,10 @@ impl Stage {
         let (option, perturb) = (MjvOption::default(), MjvPerturb::default());
         self.scene.update(&mut self.data, &option, &perturb, &mut self.camera);
         if let Some([x, y]) = pose.goal {
-            let (size, at) = ([self.reach; 3], [x, y, self.reach]);
+            let (size, center) = ([self.reach; 3], [x, y, self.reach]);
             let (shape, color) = (MjtGeom::mjGEOM_SPHERE, Some(GOAL));
             // SAFETY: it has no material, texture or object, and the scene has capacity for it.
-            unsafe { self.scene.create_geom(shape, Some(size), Some(at), None, color) };
+            unsafe { self.scene.create_geom(shape, Some(size), Some(center), None, color) };
         }
     }
 }

@@ -10,7 +10,7 @@ use quad_run::table::{Style, Table};
 use serde::Serialize;
 
 /// The results of one policy with one way to choose.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Serialize)]
 pub struct Scored {
     /// Path of the file.
     pub snapshot: String,
@@ -30,10 +30,8 @@ pub struct Scored {
 }
 
 impl Scored {
-    /// The way to choose, as text.
     pub fn title(&self) -> String {
-        let choice = self.choice.map(|choice| choice.to_string());
-        choice.unwrap_or_else(|| "no candidates".to_owned())
+        title(self.choice)
     }
 
     /// Spread of the normalized scores.
@@ -41,6 +39,11 @@ impl Scored {
         let scores = self.episodes.iter().map(|episode| episode.score);
         Spread::new(&Vec::from_iter(scores))
     }
+}
+
+/// A way to choose, as text.
+pub fn title(choice: Option<Choice>) -> String {
+    choice.map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string())
 }
 
 /// A row per snapshot, a column per way to choose; below, their means if all snapshots have one
@@ -60,13 +63,13 @@ pub fn table(scored: &[Scored]) -> String {
     let text = |spread: Option<Spread>| spread.map(Spread::text).unwrap_or_default();
 
     let snapshots = Vec::from_iter(scored.chunk_by(|one, next| one.snapshot == next.snapshot));
-    for of_one in &snapshots {
-        let first = &of_one[0];
-        let mut row = vec![first.snapshot.clone(), first.step.to_string()];
-        row.extend([first.environment.clone(), first.episodes.len().to_string()]);
+    for choices in &snapshots {
+        let Scored { snapshot, step, environment, episodes, .. } = &choices[0];
+        let mut row = vec![snapshot.clone(), step.to_string()];
+        row.extend([environment.clone(), episodes.len().to_string()]);
         row.extend(titles.iter().map(|title| {
-            let found = of_one.iter().find(|scored| scored.title() == *title);
-            text(found.and_then(Scored::spread))
+            let scored = choices.iter().find(|scored| scored.title() == *title);
+            text(scored.and_then(Scored::spread))
         }));
         table.push(row);
     }
@@ -79,8 +82,8 @@ pub fn table(scored: &[Scored]) -> String {
         let mut row = vec![String::new(); head.len()];
         row[0] = format!("mean of {} snapshots", snapshots.len());
         row.extend(titles.iter().map(|title| {
-            let with_it = scored.iter().filter(|scored| scored.title() == *title);
-            let means = Vec::from_iter(with_it.filter_map(|scored| Some(scored.spread()?.mean)));
+            let titled = scored.iter().filter(|scored| scored.title() == *title);
+            let means = Vec::from_iter(titled.filter_map(|scored| Some(scored.spread()?.mean)));
             // A mean over fewer snapshots would be another number than the others in the row.
             text(Spread::new(&means).filter(|_| means.len() == snapshots.len()))
         }));

@@ -10,7 +10,7 @@ use quad_protocol::{EpisodeScore, Hash, Origin};
 use quad_run::files;
 use quad_runtime::Hint;
 
-use super::args::{MOST_EPISODES, ScoreArgs};
+use super::{MOST_EPISODES, ScoreArgs};
 use crate::sim::{self, Environment, EnvironmentError, Rollout, Simulation};
 
 const SNAPSHOT: &str = "pass files like RUN/snapshots/step_000020000.safetensors; \
@@ -73,7 +73,8 @@ impl Subject {
             policy.with_context(cannot).map(subject)
         };
         let subjects = choices.into_iter().map(with_choice).collect::<anyhow::Result<Vec<_>>>()?;
-        let chooses = |of: &Self| of.policy.choice().is_some_and(|choice| choice.candidates > 1);
+        let chooses =
+            |subject: &Self| subject.policy.choice().is_some_and(|choice| choice.candidates > 1);
         if (args.rule.is_some() || args.aggregate.is_some()) && !subjects.iter().any(chooses) {
             let nothing = "samples one action per state, so --rule and --aggregate change nothing";
             return Err(anyhow!("{name} {nothing}"))
@@ -105,43 +106,17 @@ impl Subject {
         Ok(rollout.into_scores())
     }
 
-    /// Plays the episode of a seed. `see` gets the simulation, and the undiscounted return so far, in
-    /// each state in which the policy acts; those of the last state are returned.
-    pub fn play(
-        &self,
-        seed: u64,
-        environment_seed: u64,
-        mut see: impl FnMut(&Simulation, f64),
-    ) -> anyhow::Result<(Simulation, f64)> {
-        let policy = &*self.policy;
-        let mut simulation = sim::make(self.spec, environment_seed)?;
-        simulation.reset(seed);
-        let (mut memory, mut action) = ([policy.begin(seed)], vec![0.0; policy.action_dim()]);
-        let mut episode_return = 0.0;
-        loop {
-            see(&simulation, episode_return);
-            let observation = simulation.observation().iter().map(|x| *x as f32);
-            let acted = policy.act(&Vec::from_iter(observation), &mut memory, &mut action);
-            acted.with_context(|| self.cannot_act())?;
-            let step = simulation.step(&action);
-            episode_return += step.reward;
-            if step.terminated || step.truncated {
-                return Ok((simulation, episode_return));
-            }
-        }
-    }
-
-    fn cannot_act(&self) -> String {
+    pub fn cannot_act(&self) -> String {
         format!("{}: the policy cannot act", self.path.display())
     }
 
     fn check(&self) -> anyhow::Result<()> {
         let (name, environment, episodes) = (self.path.display(), &self.spec.name, self.episodes);
-        let found = (self.policy.observation_dim(), self.policy.action_dim());
-        let wanted = (self.spec.observation_dim, self.spec.action_dim);
-        if found != wanted {
+        let sizes = (self.policy.observation_dim(), self.policy.action_dim());
+        let expected = (self.spec.observation_dim, self.spec.action_dim);
+        if sizes != expected {
             return Err(anyhow!(
-                "{name} has the sizes {found:?} (observation, action), but {environment} has {wanted:?}"
+                "{name} has the sizes {sizes:?} (observation, action), but {environment} has {expected:?}"
             ))
             .hint("choose its environment with --env NAME");
         }
@@ -193,8 +168,20 @@ mod tests {
     use quad_policy::{Aggregate, DiffusionShape, MlpConfig, Rule};
     use quad_protocol::episode_seeds;
 
+    use super::super::measure;
     use super::*;
     use crate::serve::fixtures::{file, smallest};
+
+    fn read(
+        environment: &str,
+        shape: DiffusionShape,
+        args: &ScoreArgs,
+    ) -> anyhow::Result<Vec<Subject>> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("policy.safetensors");
+        fs::write(&path, file(environment, shape, 1)).unwrap();
+        Subject::read(&path, args)
+    }
 
     #[test]
     fn options_replace_the_policy_s_own_choice() {
@@ -202,8 +189,6 @@ mod tests {
         own.aggregate = Aggregate::Min;
         assert!(choices(&args, Some(own)).is_empty());
         let with = |candidates| Choice { candidates, ..own };
-        args.candidates = vec![1, 10];
-        assert_eq!(choices(&args, Some(own)), [with(1), with(10)]);
         args.candidates = vec![10, 1, 10, 1];
         assert_eq!(choices(&args, Some(own)), [with(10), with(1)]);
         own.rule = Rule::Softmax { temperature: 0.5 };
@@ -214,45 +199,26 @@ mod tests {
     }
 
     #[test]
-    fn options_replace_the_file_s_episodes() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("policy.safetensors");
-        fs::write(&path, file("hopper", smallest(), 1)).unwrap();
-        let played = |seed, episodes| {
-            let args = ScoreArgs { seed, episodes, ..ScoreArgs::default() };
-            let subject = &Subject::read(&path, &args).unwrap()[0];
-            let scores = crate::tools::score::measure(subject).unwrap().episodes;
-            Vec::from_iter(scores.iter().map(|episode| episode.seed))
-        };
+    fn options_replace_the_file_s_episodes_in_the_run_s_environment() {
         // The file has seed 1, step 1 and two episodes.
-        assert_eq!(played(None, None), episode_seeds(1, 1, 2));
-        assert_eq!(played(Some(9), None), episode_seeds(9, 1, 2));
-        assert_eq!(played(None, Some(1)), episode_seeds(1, 1, 1));
-    }
-
-    #[test]
-    fn the_goal_is_that_of_the_run_s_seed() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("policy.safetensors");
+        for (seed, episodes, expected) in [
+            (None, None, episode_seeds(1, 1, 2)),
+            (Some(9), None, episode_seeds(9, 1, 2)),
+            (None, Some(1), episode_seeds(1, 1, 1)),
+        ] {
+            let args = ScoreArgs { seed, episodes, ..ScoreArgs::default() };
+            let subject = &read("hopper", smallest(), &args).unwrap()[0];
+            let scores = measure(subject).unwrap().episodes;
+            assert!(scores.iter().map(|episode| episode.seed).eq(expected));
+        }
         let shape = DiffusionShape::quad((29, 8), &MlpConfig::mish(&[1]), 1, 1);
-        fs::write(&path, file("antmaze-umaze-v0", shape, 1)).unwrap();
-        let subject = &Subject::read(&path, &ScoreArgs::default()).unwrap()[0];
-        let [scored, trained] =
-            [subject.simulation(), sim::make(subject.spec, 1)].map(Result::unwrap);
+        let ant = &read("antmaze-umaze-v0", shape, &ScoreArgs::default()).unwrap()[0];
+        let [scored, trained] = [ant.simulation(), sim::make(ant.spec, 1)].map(Result::unwrap);
         assert_eq!(scored.goal(), trained.goal());
     }
 
     #[test]
     fn a_choice_that_changes_nothing_is_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("policy.safetensors");
-        let problem = |critics, candidates: &[u32], aggregate| {
-            fs::write(&path, file("hopper", DiffusionShape { critics, ..smallest() }, 1)).unwrap();
-            let candidates = candidates.to_vec();
-            let args = ScoreArgs { candidates, aggregate: Some(aggregate), ..Default::default() };
-            let error = Subject::read(&path, &args).err();
-            error.map_or_else(String::new, |error| format!("{error:#}"))
-        };
         let (mean, min) = (Aggregate::Mean, Aggregate::Min);
         for (critics, candidates, aggregate, expected) in [
             (0, &[][..], min, "no critics"),
@@ -263,9 +229,12 @@ mod tests {
             (1, &[1, 10], min, "one critic"),
             (2, &[1, 10], min, ""),
         ] {
-            let found = problem(critics, candidates, aggregate);
-            let fits = found.contains(expected) && found.is_empty() == expected.is_empty();
-            assert!(fits, "{critics} critics, {candidates:?}: {found:?}, not {expected:?}");
+            let candidates = candidates.to_vec();
+            let args = ScoreArgs { candidates, aggregate: Some(aggregate), ..Default::default() };
+            let error = read("hopper", DiffusionShape { critics, ..smallest() }, &args).err();
+            let problem = error.map_or_else(String::new, |error| format!("{error:#}"));
+            let fits = problem.contains(expected) && problem.is_empty() == expected.is_empty();
+            assert!(fits, "{critics} critics, {:?}: {problem:?}", args.candidates);
         }
     }
 }
