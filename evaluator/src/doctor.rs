@@ -1,24 +1,21 @@
 //! `evaluator doctor`: checks this machine before it evaluates anything.
 
 use std::path::PathBuf;
-use std::time::Duration;
 
 use clap::Args;
 use quad_dataset::environment;
 use quad_policy::Precision;
-use quad_protocol::{JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
+use quad_protocol::{Name, PROTOCOL_VERSION, keys};
 use quad_runtime::doctor::{self, Findings};
 use quad_runtime::{
     DEFAULT_PORT, Endpoints, Role, certificates_folder, default_endpoint, parse_endpoint,
 };
 use zenoh::Session;
 
-use crate::serve::ZENOH_TIMEOUT;
+use crate::metrics::Metrics;
+use crate::serve::{ANSWER_TIMEOUT, Connection, QueryError};
 use crate::sim;
 use crate::tools::film::{Gl, INSTALL};
-
-/// Time limit for learners' answers.
-const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 
 const UPDATE: &str = "update the older program (see --version); if the learner hangs, see its log";
 
@@ -92,12 +89,12 @@ async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> 
     let tokens = tokens.await.map_err(anyhow::Error::msg)?;
     let mut count = 0;
     while let Ok(reply) = tokens.recv_async().await {
-        let token = reply.result().ok();
-        let Some(run) = token.and_then(|token| keys::run_of(token.key_expr().as_str())) else {
-            continue;
-        };
+        let Ok(token) = reply.result() else { continue };
+        let key = token.key_expr().as_str();
+        let ids = keys::run_of(key).zip(keys::incarnation_of(key));
+        let Some((run, incarnation)) = ids else { continue };
         count += 1;
-        match problem_of(session, &run).await? {
+        match problem(session, run.clone(), incarnation).await? {
             None => {
                 let version = format!("version {PROTOCOL_VERSION} of the protocol");
                 findings.ok("run", format!("{run} speaks {version}, like this program"));
@@ -114,24 +111,17 @@ async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> 
 
 /// Claims a job in no environment, so that the run's learner gives none. Returns the fault of the
 /// answer.
-async fn problem_of(session: &Session, run: &Name) -> anyhow::Result<Option<String>> {
+async fn problem(session: &Session, run: Name, incarnation: u64) -> anyhow::Result<Option<String>> {
     let evaluator = Name::new(format!("doctor-{}", std::process::id()))?;
-    let (attempt, environments) = (rand::random(), Vec::new());
-    let claim = encode(&JobRequest::Claim { evaluator, attempt, environments })?;
-    let replies = session.get(keys::jobs(run)).payload(claim).timeout(ANSWER_TIMEOUT);
-    let replies = replies.await.map_err(anyhow::Error::msg)?;
-    let silent = || Some(format!("its learner has not answered within {ANSWER_TIMEOUT:?}"));
-    let Ok(reply) = replies.recv_async().await else { return Ok(silent()) };
-    Ok(match reply.result() {
-        Err(error) if *error.payload().to_bytes() == *ZENOH_TIMEOUT => silent(),
-        Ok(sample) => {
-            let payload = sample.payload();
-            let answer = decode_from::<JobReply>(payload.len(), payload.reader());
-            answer.err().map(|error| error.to_string())
+    let (session, metrics) = (session.clone(), Metrics::new()?);
+    let connection = Connection { run, evaluator, session, metrics, incarnation };
+    Ok(match connection.claim(rand::random(), Vec::new()).await {
+        Ok(_) => None,
+        Err(QueryError::NoAnswer(_)) => {
+            Some(format!("its learner has not answered within {ANSWER_TIMEOUT:?}"))
         }
         // A learner of another version answers with an error.
-        Err(error) => {
-            Some(String::from_utf8_lossy(&error.payload().to_bytes()).chars().take(200).collect())
-        }
+        Err(QueryError::Unusable { reason, .. }) => Some(reason),
+        Err(error) => Some(error.to_string()),
     })
 }

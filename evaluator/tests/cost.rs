@@ -5,11 +5,10 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use candle_core::{DType, Device, Tensor};
-use quad_nn::{Attention, TrajectoryConfig};
 use quad_policy::{
-    ActorCriticShape, Choice, DiffuserShape, DiffusionShape, GaussianShape, Header, MlpConfig,
-    PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, Spread, ValueGuidance, load_policy,
+    Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Precision, Rule, Scaling, load_policy,
 };
+use serde_json::{Value, json};
 
 /// Bytes that are not accounted for, such as the embedding of each denoising step.
 const SLACK: usize = 1 << 20;
@@ -37,80 +36,53 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-const SIZES: (usize, usize) = (11, 3);
+/// Numbers in an observation and in an action.
+const O: usize = 11;
+const A: usize = 3;
 
 fn diffusion(hidden: usize, critics: usize, steps: usize, choice: Choice) -> PolicyConfig {
     let layers = MlpConfig::mish(&[hidden; 3]);
-    let mut shape = DiffusionShape::quad(SIZES, &layers, critics, steps);
+    let mut shape = DiffusionShape::quad((O, A), &layers, critics, steps);
     shape.value = (choice.rule == Rule::Nearest).then_some(layers);
     PolicyConfig::Diffusion { shape, choice }
 }
 
-fn gaussian(hidden: usize) -> PolicyConfig {
-    let shape = GaussianShape {
-        observation_dim: SIZES.0,
-        action_dim: SIZES.1,
-        actor: MlpConfig::mish(&[hidden; 3]),
-        spread: Spread::None,
-    };
-    PolicyConfig::Gaussian { shape }
+/// A policy as its file's header has it, with the best of some candidates.
+fn policy(kind: &str, mut shape: Value, candidates: u32) -> PolicyConfig {
+    shape["observation_dim"] = O.into();
+    shape["action_dim"] = A.into();
+    let mut config = json!({"kind": kind, "shape": shape});
+    if kind != "gaussian" {
+        config["choice"] = json!(Choice::best_of(candidates));
+    }
+    if kind == "flow" {
+        config["flow_steps"] = 10.into();
+    }
+    serde_json::from_value(config).unwrap()
 }
 
-fn actor_critic(hidden: usize, norm: bool) -> ActorCriticShape {
-    let actor = MlpConfig::mish(&[hidden; 3]);
-    let mut critic = actor.clone();
+fn actor_critic(kind: &str, hidden: usize, norm: bool, candidates: u32) -> PolicyConfig {
+    let (layers, mut critic) = (MlpConfig::mish(&[hidden; 3]), MlpConfig::mish(&[hidden; 3]));
     critic.norm = norm;
-    ActorCriticShape { observation_dim: SIZES.0, action_dim: SIZES.1, actor, critic, critics: 2 }
-}
-
-fn squashed(hidden: usize, norm: bool) -> PolicyConfig {
-    let choice = Choice::best_of(1024);
-    PolicyConfig::Squashed { shape: actor_critic(hidden, norm), choice }
-}
-
-fn flow(hidden: usize, candidates: u32) -> PolicyConfig {
-    let (shape, choice) = (actor_critic(hidden, false), Choice::best_of(candidates));
-    PolicyConfig::Flow { shape, flow_steps: 10, choice }
+    policy(kind, json!({"actor": layers, "critic": critic, "critics": 2}), candidates)
 }
 
 fn score(widths: &[usize], candidates: u32) -> PolicyConfig {
-    let shape = ScorePolicyShape {
-        observation_dim: SIZES.0,
-        action_dim: SIZES.1,
-        actor: MlpConfig::mish(widths),
-        critic: MlpConfig::mish(&[8]),
-        evaluations: 4,
-    };
-    let choice = Choice::best_of(candidates);
-    PolicyConfig::Score { shape, choice }
+    let [actor, critic] = [widths, &[8]].map(MlpConfig::mish);
+    policy("score", json!({"actor": actor, "critic": critic, "evaluations": 4}), candidates)
 }
 
-/// Attention has heads and their width.
-fn diffuser(
+fn planner(
     (horizon, channels): (usize, usize),
     multipliers: &[usize],
-    attention: Option<[usize; 2]>,
+    attention: Value,
     plans: u32,
 ) -> PolicyConfig {
-    let network = TrajectoryConfig {
-        horizon,
-        channels,
-        multipliers: multipliers.to_vec(),
-        groups: 8,
-        attention: attention.map(|[heads, width]| Attention { heads, width }),
-    };
-    let guidance = ValueGuidance { steps: 1, scale: 0.1, stop: 0 };
-    let shape = DiffuserShape {
-        observation_dim: SIZES.0,
-        action_dim: SIZES.1,
-        network,
-        diffusion_steps: 3,
-        guidance,
-        replan_every: 1,
-        units: Scaling::default(),
-    };
-    let choice = Choice::best_of(plans);
-    PolicyConfig::Diffuser { shape, choice }
+    let network = json!({"horizon": horizon, "channels": channels, "multipliers": multipliers, "groups": 8, "attention": attention});
+    let guidance = json!({"steps": 1, "scale": 0.1, "stop": 0});
+    let units = Scaling::default();
+    let shape = json!({"network": network, "diffusion_steps": 3, "guidance": guidance, "replan_every": 1, "units": units});
+    policy("planner", shape, plans)
 }
 
 #[test]
@@ -119,7 +91,9 @@ fn actions_take_no_more_memory_than_the_policy_says() {
     let mut nearest = best_of(1000);
     nearest.rule = Rule::Nearest;
     let guided = |candidates| Choice { guidance: 1.0, ..best_of(candidates) };
-    let halfcheetah = Some([4, 32]);
+    let gaussian = json!({"actor": MlpConfig::mish(&[256; 3])});
+    let [narrow, wide] =
+        [(4, 32), (16, 64)].map(|(heads, width)| json!({"heads": heads, "width": width}));
     let cases = [
         ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
         ("many critics", diffusion(1, 4096, 1, best_of(32)), 64),
@@ -128,17 +102,17 @@ fn actions_take_no_more_memory_than_the_policy_says() {
         ("a value function", diffusion(8, 2, 5, nearest), 256),
         ("with guidance", diffusion(64, 10, 2, guided(10)), 64),
         ("many candidates with guidance", diffusion(8, 2, 2, guided(1000)), 64),
-        ("a Gaussian", gaussian(256), 256),
-        ("a squashed Gaussian", squashed(4, false), 64),
-        ("critics with a norm", squashed(64, true), 10),
-        ("a flow", flow(64, 32), 64),
-        ("a flow to many candidates", flow(8, 1024), 64),
+        ("a Gaussian", policy("gaussian", gaussian, 1), 256),
+        ("a squashed Gaussian", actor_critic("squashed", 4, false, 1024), 64),
+        ("critics with a norm", actor_critic("squashed", 64, true, 1024), 10),
+        ("a flow", actor_critic("flow", 64, false, 32), 64),
+        ("a flow to many candidates", actor_critic("flow", 8, false, 1024), 64),
         ("a score network", score(&[512, 256, 128], 32), 10),
         ("a score network of one block", score(&[64], 1000), 64),
-        ("Hopper's planner", diffuser((32, 32), &[1, 2, 4, 8], None, 64), 1),
-        ("HalfCheetah's", diffuser((4, 32), &[1, 4, 8], halfcheetah, 64), 1),
-        ("many plans", diffuser((16, 16), &[1, 2, 4], None, 8), 64),
-        ("one step", diffuser((1, 32), &[1], Some([16, 64]), 1000), 4),
+        ("Hopper's planner", planner((32, 32), &[1, 2, 4, 8], Value::Null, 64), 1),
+        ("HalfCheetah's", planner((4, 32), &[1, 4, 8], narrow, 64), 1),
+        ("many plans", planner((16, 16), &[1, 2, 4], Value::Null, 8), 64),
+        ("one step", planner((1, 32), &[1], wide, 1000), 4),
     ];
     for (name, config, n) in cases {
         let zeros =
@@ -148,8 +122,8 @@ fn actions_take_no_more_memory_than_the_policy_says() {
         let policy = load_policy(&file, Precision::F32).unwrap();
         let said = policy.memory(n) as usize;
         let mut states: Vec<_> = (0..n as u64).map(|seed| policy.begin(seed)).collect();
-        let observations = vec![0.5; n * SIZES.0];
-        let mut actions = vec![0.0; n * SIZES.1];
+        let observations = vec![0.5; n * O];
+        let mut actions = vec![0.0; n * A];
         let mut act = || policy.act(&observations, &mut states, &mut actions).unwrap();
         // Allocates the threads' own buffers.
         act();

@@ -12,7 +12,7 @@ use pyo3::types::PyDict;
 use quad_policy::{Choice, EpisodeState, Policy, PolicyError};
 
 use crate::arrays::Rows;
-use crate::error::policy_error;
+use crate::policy_error;
 
 /// Memory of one call of a policy, bytes; more rows are split. An action does not depend on other rows.
 const MEMORY: u64 = 256 << 20;
@@ -80,8 +80,7 @@ pub fn noise<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let (shape, draws) = (policy.noise(), policy.choice().map_or(0, |choice| choice.uniforms()));
     let row = if shape.is_empty() { 0 } else { shape.iter().product() };
-    let (mut normal, mut uniform) =
-        (vec![0.0; states.len() * row], Vec::with_capacity(states.len() * draws));
+    let (mut normal, mut uniform) = (vec![0.0; states.len() * row], Vec::new());
     for (i, state) in states.iter_mut().enumerate() {
         state.fill_normal(&mut normal[i * row..][..row]);
         // The last f32 below 1 rather than 1 itself.
@@ -116,7 +115,7 @@ pub fn not_seeds(or: &str) -> PyErr {
 }
 
 /// Arguments that change the choice of the file.
-#[derive(Default)]
+#[derive(Default, PartialEq)]
 pub struct Changes {
     pub candidates: Option<i64>,
     pub rule: Option<String>,
@@ -126,7 +125,7 @@ pub struct Changes {
 
 /// The policy with a changed choice.
 pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn Policy>> {
-    if let Changes { candidates: None, rule: None, aggregate: None, guidance: None } = changes {
+    if changes == Changes::default() {
         return Ok(policy.clone());
     }
     let mut choice = policy.choice().unwrap_or(Choice::best_of(1));

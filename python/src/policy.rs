@@ -27,13 +27,26 @@ use crate::file::{HINT, all_about, read};
 #[pyclass(name = "Policy", module = "quad_rl", frozen)]
 pub struct PyPolicy {
     policy: Arc<dyn Policy>,
-    config: PolicyConfig,
+    /// Numbers in an observation.
+    #[pyo3(get)]
+    observation_size: usize,
+    /// Numbers in an action.
+    #[pyo3(get)]
+    action_size: usize,
+    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's), "flow" (QC's) or "score"
+    /// (SfBC's), which draw actions and choose; "planner", which draws plans and chooses one; or "gaussian",
+    /// which acts by its mean.
+    #[pyo3(get)]
+    kind: &'static str,
     /// The environment that it was trained for.
     #[pyo3(get)]
     environment: String,
     /// The gradient step of the snapshot.
     #[pyo3(get)]
     step: u64,
+    /// Precision in effect, "f32" or "bf16".
+    #[pyo3(get)]
+    precision: &'static str,
     names: Arc<Names>,
     /// The file's header as JSON.
     about: String,
@@ -68,9 +81,20 @@ impl PyPolicy {
         let (asked, policy, header) = read(py, &file, precision, name)?;
         let about = all_about(&header);
         let Header { policy: config, observation_names, action_names, origin, .. } = header;
-        let names = Arc::new(Names { observations: observation_names, actions: action_names });
-        let (policy, Origin { environment, step, .. }) = (policy.into(), origin);
-        Ok(Self { policy, config, environment, step, names, about, file, asked })
+        let Origin { environment, step, .. } = origin;
+        Ok(Self {
+            observation_size: policy.observation_dim(),
+            action_size: policy.action_dim(),
+            kind: kind(&config),
+            precision: policy.precision().name(),
+            environment,
+            step,
+            names: Arc::new(Names { observations: observation_names, actions: action_names }),
+            policy: policy.into(),
+            about,
+            file,
+            asked,
+        })
     }
 
     /// Acts in n states: observations [n, observation_size] -> actions [n, action_size], float32.
@@ -154,7 +178,7 @@ impl PyPolicy {
         aggregate: Option<String>,
     ) -> PyResult<Array<'py>> {
         let rows = self.rows(&observations)?;
-        let taken = Rows::new("actions", &actions, self.policy.action_dim(), &self.names.actions)?;
+        let taken = Rows::new("actions", &actions, self.action_size, &self.names.actions)?;
         let (n, m) = (rows.count, taken.count);
         if (m, taken.single) != (n, rows.single) {
             let error = format!("{n} observations, but {m} actions: one action for each");
@@ -210,18 +234,6 @@ impl PyPolicy {
         Ok(Episodes::new(policy, &seeds, self.names.clone()))
     }
 
-    /// Numbers in an observation.
-    #[getter]
-    fn observation_size(&self) -> usize {
-        self.policy.observation_dim()
-    }
-
-    /// Numbers in an action.
-    #[getter]
-    fn action_size(&self) -> usize {
-        self.policy.action_dim()
-    }
-
     /// Names of the numbers in an observation, from the data; empty if it has none.
     #[getter]
     fn observation_names(&self) -> Vec<String> {
@@ -234,22 +246,6 @@ impl PyPolicy {
         self.names.actions.clone()
     }
 
-    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's), "flow" (QC's) or "score"
-    /// (SfBC's), which draw actions and choose; "planner", which draws plans and chooses one; or "gaussian",
-    /// which acts by its mean.
-    #[getter]
-    fn kind(&self) -> &'static str {
-        match self.config {
-            PolicyConfig::Diffusion { .. } => "diffusion",
-            PolicyConfig::Squashed { .. } => "squashed",
-            PolicyConfig::OneStep { .. } => "one-step",
-            PolicyConfig::Flow { .. } => "flow",
-            PolicyConfig::Gaussian { .. } => "gaussian",
-            PolicyConfig::Score { .. } => "score",
-            PolicyConfig::Diffuser { .. } => "planner",
-        }
-    }
-
     /// The file's header, a dictionary: version of the learner, environment, step, names of the
     /// numbers in observations and actions, chunk (its length, the steps of it that are executed, and
     /// the observations that it is drawn from), scaling (data's = offset + scale · network's, or
@@ -258,12 +254,6 @@ impl PyPolicy {
     #[getter]
     fn about<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         py.import("json")?.call_method1("loads", (&self.about,))
-    }
-
-    /// Precision in effect, "f32" or "bf16".
-    #[getter]
-    fn precision(&self) -> &'static str {
-        self.policy.precision().name()
     }
 
     /// The choice among candidates: a dictionary of `act`'s arguments candidates, rule, aggregate and
@@ -280,11 +270,14 @@ impl PyPolicy {
 
     fn __repr__(&self) -> String {
         let choice = self.policy.choice().map_or(String::new(), |choice| format!(", {choice}"));
-        let (o, a) = (self.policy.observation_dim(), self.policy.action_dim());
-        let Self { environment, step, .. } = self;
-        let (kind, precision) = (self.kind(), self.precision());
         format!(
-            "Policy({environment}, {kind} after step {step}, {o} -> {a} numbers{choice}, {precision})"
+            "Policy({}, {} after step {}, {} -> {} numbers{choice}, {})",
+            self.environment,
+            self.kind,
+            self.step,
+            self.observation_size,
+            self.action_size,
+            self.precision
         )
     }
 
@@ -297,7 +290,18 @@ impl PyPolicy {
 
 impl PyPolicy {
     fn rows<'a>(&self, observations: &'a ArrayLike<'_>) -> PyResult<Rows<'a>> {
-        let width = self.policy.observation_dim();
-        Rows::new("observations", observations, width, &self.names.observations)
+        Rows::new("observations", observations, self.observation_size, &self.names.observations)
+    }
+}
+
+fn kind(config: &PolicyConfig) -> &'static str {
+    match config {
+        PolicyConfig::Diffusion { .. } => "diffusion",
+        PolicyConfig::Squashed { .. } => "squashed",
+        PolicyConfig::OneStep { .. } => "one-step",
+        PolicyConfig::Flow { .. } => "flow",
+        PolicyConfig::Gaussian { .. } => "gaussian",
+        PolicyConfig::Score { .. } => "score",
+        PolicyConfig::Diffuser { .. } => "planner",
     }
 }

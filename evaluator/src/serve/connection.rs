@@ -23,7 +23,7 @@ const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
 /// Capacity for answers to one query. One answer is enough, and few peers answer.
 const MAX_ANSWERS: usize = 64;
 /// The error with which Zenoh itself, not the learner, replies to a query that timed out.
-pub const ZENOH_TIMEOUT: &[u8] = b"Timeout";
+const ZENOH_TIMEOUT: &[u8] = b"Timeout";
 /// Most bytes of a learner's error in a message.
 const MAX_ERROR_LEN: usize = 200;
 
@@ -216,82 +216,5 @@ fn is_from(followed: u64, incarnation: u64) -> Result<(), &'static str> {
     match incarnation == followed {
         true => Ok(()),
         false => Err("other_incarnation"),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::sync::Arc;
-    use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-
-    use quad_runtime::{Endpoints, open_session, reachable_at};
-    use tokio::time::{sleep, timeout};
-
-    use super::*;
-
-    const POLL: Duration = Duration::from_millis(10);
-
-    /// Queries a learner that reads nothing until the querying task runs on. Returns true if the
-    /// learner's answer arrives.
-    async fn is_answered() -> bool {
-        let any_port = vec!["tcp/127.0.0.1:0".to_owned()];
-        let listen = Endpoints { listen: any_port, ..Endpoints::default() };
-        let learner = open_session(&listen).await.unwrap();
-        let [stalls, has_stalled] = [true, false].map(|value| Arc::new(AtomicBool::new(value)));
-        // The learner's session reads nothing until this callback returns.
-        let (wait, stalled) = (stalls.clone(), has_stalled.clone());
-        let callback = move |_| {
-            stalled.store(true, Relaxed);
-            while wait.load(Relaxed) {
-                std::thread::sleep(POLL);
-            }
-        };
-        let flooded = learner.declare_subscriber("flood").callback(callback);
-        let _flooded = flooded.await.unwrap();
-        let (incarnation, milliseconds) = (1, 1);
-        let answer = encode(&JobReply::Wait { incarnation, milliseconds }).unwrap();
-        let callback = move |query: zenoh::query::Query| {
-            let reply = query.reply(query.key_expr().clone(), answer.clone());
-            reply.wait().ok();
-        };
-        let jobs = learner.declare_queryable("quad/run/jobs").callback(callback);
-        let _jobs = jobs.await.unwrap();
-        let connect = reachable_at(&learner, &listen).await.unwrap();
-        let connect = Endpoints { connect, ..Endpoints::default() };
-        let evaluator = open_session(&connect).await.unwrap();
-        let reach = async {
-            while !has_stalled.load(Relaxed) {
-                evaluator.put("flood", "").await.unwrap();
-                sleep(POLL).await;
-            }
-        };
-        let reached = timeout(Duration::from_secs(60), reach).await;
-        reached.expect("the learner is reached");
-        for _ in 0..2000 {
-            // More than the connection's buffers hold.
-            evaluator.put("flood", vec![0; 20_000]).await.unwrap();
-        }
-        let [run, name] = ["run", "evaluator"].map(|name| Name::new(name).unwrap());
-        let metrics = Metrics::new().unwrap();
-        let connection =
-            Connection { run, evaluator: name, session: evaluator.clone(), metrics, incarnation };
-        let (key, limit) = (keys::jobs(&connection.run), Duration::from_secs(20));
-        let answer = connection.query(key, Vec::new(), limit, |_: &JobReply| Ok(()));
-        let read_on = async {
-            sleep(10 * POLL).await;
-            stalls.store(false, Relaxed);
-        };
-        tokio::join!(answer, read_on).0.is_ok()
-    }
-
-    #[tokio::test(flavor = "multi_thread")]
-    async fn a_peer_that_does_not_read_blocks_no_task() {
-        // On a busy machine Zenoh may close the connection all the same.
-        for _ in 0..5 {
-            if is_answered().await {
-                return;
-            }
-        }
-        panic!("the querying task was blocked");
     }
 }

@@ -1,7 +1,5 @@
 //! Results of a job, which the evaluator owes to the learner until they are acknowledged.
 
-use std::collections::VecDeque;
-
 use quad_protocol::{
     CodecError, Episode, EpisodeScore, Hash, Job, Message, Name, Piece, ScoreReport, encode,
 };
@@ -11,42 +9,6 @@ use quad_protocol::{
 pub enum Owed {
     Scores(ScoreReport),
     Episode(Parcel),
-}
-
-/// Scores of snapshots that a learner, back at an earlier step, is still to train again.
-#[derive(Debug, Default)]
-pub struct Early(VecDeque<ScoreReport>);
-
-impl Early {
-    /// Most reports, of some kilobytes each.
-    const MOST: usize = 64;
-
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-
-    pub fn iter(&self) -> impl Iterator<Item = &ScoreReport> {
-        self.0.iter()
-    }
-
-    /// Keeps a report. If there are too many, returns the one that was kept for longest.
-    pub fn keep(&mut self, report: ScoreReport) -> Option<ScoreReport> {
-        self.0.push_back(report);
-        if self.0.len() > Self::MOST { self.0.pop_front() } else { None }
-    }
-
-    /// The report that was not delivered for longest.
-    pub fn take_oldest(&mut self) -> Option<ScoreReport> {
-        self.0.pop_front()
-    }
-
-    /// A report with scores of the evaluation that a job is a part of.
-    pub fn take_like(&mut self, job: &Job) -> Option<ScoreReport> {
-        let is_like =
-            |report: &ScoreReport| (report.step, report.weights) == (job.step, job.weights);
-        let index = self.0.iter().position(is_like).filter(|_| job.exploration.is_none());
-        self.0.remove(index?)
-    }
 }
 
 /// An online episode on its way to the learner.

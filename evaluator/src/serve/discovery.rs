@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use quad_protocol::{Name, keys};
-use quad_runtime::{Certificates, Endpoints, Hint, SessionError, open_session};
+use quad_runtime::{Endpoints, Hint, SessionError, open_session};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::{info, warn};
@@ -48,18 +48,14 @@ impl Discovery {
     ///
     /// Each endpoint gets its own session, because a Zenoh client keeps one connection: in one
     /// session, a second endpoint would only be a spare.
-    pub fn start(
-        endpoints: Vec<String>,
-        certificates: Option<&Certificates>,
-        metrics: &Metrics,
-    ) -> Discovery {
+    pub fn start(endpoints: &Endpoints, metrics: &Metrics) -> Discovery {
         let (tx, runs) = watch::channel(Runs::new());
+        let watch = |(index, endpoint): (usize, &String)| {
+            let endpoints = Endpoints { connect: vec![endpoint.clone()], ..endpoints.clone() };
+            watch_endpoint(index, endpoints, tx.clone(), metrics.clone())
+        };
         let mut tasks = JoinSet::new();
-        for (index, endpoint) in endpoints.into_iter().enumerate() {
-            let (certificates, tx) = (certificates.cloned(), tx.clone());
-            let metrics = metrics.clone();
-            tasks.spawn(watch_endpoint(index, endpoint, certificates, tx, metrics));
-        }
+        endpoints.connect.iter().enumerate().map(watch).for_each(|task| drop(tasks.spawn(task)));
         Discovery { runs, tasks }
     }
 
@@ -80,14 +76,12 @@ impl Discovery {
 
 async fn watch_endpoint(
     index: usize,
-    endpoint: String,
-    certificates: Option<Certificates>,
+    endpoints: Endpoints,
     tx: watch::Sender<Runs>,
     metrics: Metrics,
 ) -> anyhow::Result<Infallible> {
+    let endpoint = &endpoints.connect[0];
     info!(endpoint, "waiting for a learner or a router");
-    let connect = vec![endpoint.clone()];
-    let endpoints = Endpoints { connect, certificates, ..Endpoints::default() };
     let session = open_session(&endpoints).await.hint_of(SessionError::hint)?;
     info!(endpoint, "connected");
     let (served, declarer) = (session.clone(), session.clone());

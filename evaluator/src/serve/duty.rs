@@ -4,17 +4,19 @@
 //! [`Duty::next`] says what to do; the caller does it and reports the outcome, which says what is
 //! next. A turn ends when `next` is `None`.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::mem;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{Job, JobReply, Piece, PieceReply, ScoreReply, ScoreReport};
 
-use super::delivery::{Early, Owed};
+use super::delivery::Owed;
 use super::scheduler::Turn;
 
 /// Shortest and longest pause that a learner without work may ask for.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
+/// Most early reports that are kept, of some kilobytes each.
+const MOST_EARLY: usize = 64;
 /// Most characters of a reason that the evaluator sends; the learner accepts no large messages.
 const MAX_REASON_LEN: usize = 1000;
 
@@ -23,7 +25,8 @@ pub struct Duty {
     state: State,
     /// Number of the claim that has no answer yet.
     attempt: Option<u64>,
-    early: Early,
+    /// Scores of snapshots that a learner, back at an earlier step, is still to train again.
+    early: VecDeque<ScoreReport>,
     /// Early scores that are delivered again.
     again: Option<ScoreReport>,
     /// True if early scores were delivered again in this turn.
@@ -92,7 +95,7 @@ impl Duty {
         Self {
             state: State::Idle,
             attempt: None,
-            early: Early::default(),
+            early: VecDeque::new(),
             again: None,
             delivered_again: false,
             incarnation: 0,
@@ -179,8 +182,8 @@ impl Duty {
             return None;
         }
         let again = match &self.state {
-            State::Idle if !self.delivered_again => self.early.take_oldest(),
-            State::Claimed(job) if !self.leaving => self.early.take_like(job),
+            State::Idle if !self.delivered_again => self.early.pop_front(),
+            State::Claimed(job) if !self.leaving => take_like(&mut self.early, job),
             _ => None,
         };
         if let Some(report) = again {
@@ -255,7 +258,7 @@ impl Duty {
                 vec![Note::Scored(report, [new, duplicates])]
             }
             ScoreReply::NotYet { .. } => {
-                let oldest = self.early.keep(report);
+                let oldest = self.keep_early(report);
                 let dropped = oldest.map(|oldest| Note::Abandoned {
                     step: oldest.step,
                     reason: "too many scores wait for the learner".to_owned(),
@@ -267,6 +270,12 @@ impl Duty {
                 vec![Note::Abandoned { step, reason }]
             }
         }
+    }
+
+    /// Keeps a report. If there are too many, returns the one that was kept for longest.
+    fn keep_early(&mut self, report: ScoreReport) -> Option<ScoreReport> {
+        self.early.push_back(report);
+        if self.early.len() > MOST_EARLY { self.early.pop_front() } else { None }
     }
 
     /// The learner has answered a piece of an episode.
@@ -316,7 +325,7 @@ impl Duty {
 
     /// A step got no usable answer: it is tried again in another turn.
     pub fn unanswered(&mut self, now: Instant) {
-        self.again.take().map(|report| self.early.keep(report));
+        self.again.take().map(|report| self.keep_early(report));
         // If another process is followed by now, the one that gave the job may be gone.
         if let State::Returning(job, _) = &self.state
             && job.incarnation != self.incarnation
@@ -340,6 +349,13 @@ impl Duty {
             other => other,
         };
     }
+}
+
+/// Early scores of the evaluation that a job is a part of.
+fn take_like(early: &mut VecDeque<ScoreReport>, job: &Job) -> Option<ScoreReport> {
+    let is_like = |report: &ScoreReport| (report.step, report.weights) == (job.step, job.weights);
+    let index = early.iter().position(is_like).filter(|_| job.exploration.is_none());
+    early.remove(index?)
 }
 
 fn hand_back(job: &Job, failed: Option<String>) -> Step {

@@ -138,7 +138,7 @@ fn describe((name, (observation_dim, action_dim)): (&str, (usize, usize))) -> St
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
+    use std::sync::Mutex;
     use std::time::Instant;
 
     use quad_policy::{EpisodeState, PolicyError};
@@ -148,15 +148,13 @@ mod tests {
     use super::*;
 
     const LIMIT: Duration = Duration::from_secs(1);
-    const STUCK_AT: u32 = 3;
+    const STUCK_AT: usize = 3;
 
-    /// Acts slowly. One call lasts until the evaluator counts as stuck.
+    /// Acts slowly, and keeps the evaluator's health at each call. One call lasts until that is stuck.
     #[derive(Default)]
     struct Sleeper {
-        calls: AtomicU32,
         health: Health,
-        noticed: AtomicBool,
-        recovered: AtomicBool,
+        seen: Mutex<Vec<bool>>,
     }
 
     impl Policy for Sleeper {
@@ -183,16 +181,13 @@ mod tests {
             actions: &mut [f32],
         ) -> Result<(), PolicyError> {
             let is_well = || self.health.problems().is_empty();
-            let call = self.calls.fetch_add(1, Relaxed);
+            let mut seen = self.seen.lock().unwrap();
             let until = Instant::now() + Duration::from_secs(60);
-            while call == STUCK_AT && is_well() && Instant::now() < until {
+            while seen.len() == STUCK_AT && is_well() && Instant::now() < until {
                 std::thread::sleep(LIMIT / 50);
             }
-            let noticed = call == STUCK_AT && !is_well();
             std::thread::sleep(LIMIT / 50);
-            let recovered = call > STUCK_AT && is_well();
-            self.noticed.fetch_or(noticed, Relaxed);
-            self.recovered.fetch_or(recovered, Relaxed);
+            seen.push(is_well());
             actions.fill(0.0);
             Ok(())
         }
@@ -205,8 +200,8 @@ mod tests {
         let job = job();
         let episodes = evaluator.roll_out(&job, policy.clone(), |_| ());
         assert_eq!(episodes.await.unwrap().len(), job.seeds.len());
-        assert!(policy.noticed.load(Relaxed), "it was stuck");
-        assert!(policy.recovered.load(Relaxed), "it has advanced since");
+        let seen = policy.seen.lock().unwrap();
+        assert!(!seen[STUCK_AT] && seen[STUCK_AT + 1..].contains(&true), "{seen:?}");
     }
 
     #[test]

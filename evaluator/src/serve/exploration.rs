@@ -41,9 +41,7 @@ pub fn explore(
 mod tests {
     use candle_core::{DType, Device, Tensor};
     use quad_nn::Layout;
-    use quad_policy::{
-        Affine, Header, MlpConfig, PolicyConfig, Precision, Scaling, Spread, load_policy,
-    };
+    use quad_policy::{Header, MlpConfig, PolicyConfig, Precision, Scaling, Spread, load_policy};
     use serde_json::json;
 
     use super::*;
@@ -74,8 +72,8 @@ mod tests {
 
     #[test]
     fn actions_are_drawn_as_the_rule_says_in_the_network_s_units_and_for_each_episode_alone() {
-        let actions_scale = Affine { offset: vec![10.0, -1.0], scale: vec![4.0, 0.5] };
-        let scaling = Scaling { actions: Some(actions_scale), ..Scaling::default() };
+        let affine = json!({"offset": [10.0, -1.0], "scale": [4.0, 0.5]});
+        let scaling: Scaling = serde_json::from_value(json!({"actions": affine})).unwrap();
         let seeds = Vec::from_iter(0..2000);
         // Shares of actions within ±0.4 and within ±0.9.
         let noise = |noise| Exploration::Policy { noise };

@@ -51,7 +51,7 @@ impl JobError {
 /// Checks the episodes and the environment of a learner's job.
 pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError> {
     let episodes = job.seeds.len();
-    let most = if job.exploration.is_some() { 1 } else { MAX_EPISODES };
+    let most = job.exploration.map_or(MAX_EPISODES, |_| 1);
     if !(1..=most).contains(&episodes) {
         return Err(JobError::Size(episodes));
     }
@@ -157,9 +157,8 @@ mod tests {
     use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
     use quad_policy::{DiffusionShape, MlpConfig, Precision, load_policy};
-    use quad_protocol::{Exploration, Name, decode};
+    use quad_protocol::Exploration;
 
-    use super::super::delivery::Owed;
     use super::super::fixtures::{self, file};
     use super::*;
     use crate::sim::{Environment, EnvironmentError, Simulations, Step};
@@ -265,27 +264,6 @@ mod tests {
         (job.seeds, job.exploration) = (vec![1], Some(Exploration::Uniform));
         run_for(&watched, &job, Job::LONGEST).unwrap();
         assert_eq!(watched.allowed.load(Relaxed), 1);
-    }
-
-    #[test]
-    fn an_online_episode_has_the_same_bytes_whoever_plays_it() {
-        let play = |noise, by: &str| {
-            let exploration = Some(Exploration::Policy { noise });
-            let job = Job { exploration, ..job(1) };
-            let played = run_for(&Simulations, &job, Job::LONGEST).unwrap();
-            let [by, precision] = [by, "f32"].map(|name| Name::new(name).unwrap());
-            match Owed::new(&job, by, precision, played).unwrap() {
-                Owed::Episode(parcel) => parcel.piece(),
-                Owed::Scores(_) => panic!("it is an online episode"),
-            }
-        };
-        let [one, other, quieter] =
-            [(0.3, "one"), (0.3, "other"), (0.2, "one")].map(|(noise, by)| play(noise, by));
-        assert_eq!((one.hash, &one.bytes), (other.hash, &other.bytes));
-        assert_ne!(one.hash, quieter.hash);
-
-        let Episode { step, weights, score, .. } = decode(&one.bytes).unwrap();
-        assert_eq!((step, weights, score.seed), (job(0).step, job(0).weights, 0));
     }
 
     /// A file of some megabytes asks for 66 GB: one value from each of 65,535 tiny critics for each

@@ -50,7 +50,7 @@ use tracing::{info, warn};
 
 use crate::metrics::Metrics;
 use crate::sim::Environments;
-pub(crate) use connection::ZENOH_TIMEOUT;
+pub(crate) use connection::{ANSWER_TIMEOUT, Connection, QueryError};
 use discovery::Discovery;
 use evaluate::Evaluator;
 use worker::Worker;
@@ -137,8 +137,7 @@ async fn serve_until_stopped(
         info!("metrics at http://{}/metrics", serving.address);
         server = Some(serving);
     }
-    let mut discovery =
-        Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
+    let mut discovery = Discovery::start(&endpoints, &metrics);
     let evaluator = Evaluator {
         name,
         environments,

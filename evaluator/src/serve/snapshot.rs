@@ -23,8 +23,9 @@ const OTHER_INCARNATION: &str = "other_incarnation";
 
 /// Compares everything but the file, whose hash decoding has verified.
 pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
-    let Snapshot { run, incarnation, step, hash, .. } = snapshot;
-    (run, incarnation, step, hash) == (&job.run, &job.incarnation, &job.step, &job.weights)
+    let origin = (&snapshot.run, snapshot.incarnation);
+    origin == (&job.run, job.incarnation)
+        && (snapshot.step, snapshot.hash) == (job.step, job.weights)
 }
 
 type Kept = VecDeque<(RunKey, Arc<Snapshot>)>;
@@ -161,7 +162,8 @@ mod tests {
             Vec::from_iter(snapshots.lock().iter().map(|(_, kept)| kept.step))
         };
         assert_eq!(keep(0, "one", 1, MAX_BYTES / 3), [1]);
-        assert_eq!(keep(1, "one", 2, MAX_BYTES / 3), [1, 2], "another learner's run of the name");
+        // Another learner's run of the name.
+        assert_eq!(keep(1, "one", 2, MAX_BYTES / 3), [1, 2]);
         // It replaces the run's last one.
         assert_eq!(keep(0, "one", 3, MAX_BYTES / 3), [2, 3]);
         // The oldest makes room.

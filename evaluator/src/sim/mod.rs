@@ -6,19 +6,24 @@
 //!
 //! # Layout
 //!
-//! - `environment`: the traits of an environment; `simulation`: an environment that this program
-//!   simulates; `physics`: drives MuJoCo for it.
+//! - `environment`: the traits of an environment; `simulation`: one that this program simulates, by
+//!   MuJoCo.
 //! - `planar` (Hopper, HalfCheetah, Walker2d), `maze`: the tasks, with the rules that D4RL's scores
 //!   are defined by.
 //! - `rollout`: many episodes as one batch, one policy call for each step.
 
 mod environment;
 mod maze;
-mod physics;
 mod planar;
 mod rollout;
 mod simulation;
 
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, Once, PoisonError};
+
+use mujoco_rs::logging::set_log_handler;
+use mujoco_rs::wrappers::mj_logging::MjLogMessage;
+use mujoco_rs::wrappers::mj_model::MjModel;
 use quad_dataset::Simulator;
 use quad_dataset::environment::{EnvironmentSpec, find, names};
 
@@ -37,7 +42,7 @@ pub fn make(
     spec: &'static EnvironmentSpec,
     environment_seed: u64,
 ) -> Result<Simulation, EnvironmentError> {
-    let model = physics::model(spec.simulation(), || mjcf(spec))?;
+    let model = model(spec.simulation(), || mjcf(spec))?;
     let (robot, task): (_, Box<dyn Task>) = match &spec.simulator {
         Simulator::Planar(planar) => (planar::robot(planar), Box::new(planar)),
         Simulator::Maze(robot, _) => {
@@ -46,6 +51,29 @@ pub fn make(
         }
     };
     Simulation::new(model, robot, task, spec)
+}
+
+/// The compiled model of a simulation, which the process shares. `mjcf` makes its text.
+fn model(
+    simulation: &'static str,
+    mjcf: impl FnOnce() -> String,
+) -> Result<Arc<MjModel>, EnvironmentError> {
+    static MODELS: Mutex<BTreeMap<&str, Arc<MjModel>>> = Mutex::new(BTreeMap::new());
+    static LOGGING: Once = Once::new();
+    let mut models = MODELS.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(model) = models.get(simulation) {
+        return Ok(Arc::clone(model));
+    }
+    // SAFETY: every use of MuJoCo starts with a compiled model, so none runs before this.
+    LOGGING.call_once(|| unsafe { set_log_handler(log) });
+    let model = MjModel::from_xml_string(&mjcf())
+        .map_err(|error| EnvironmentError::Model { simulation, reason: error.to_string() })?;
+    Ok(Arc::clone(models.entry(simulation).or_insert(Arc::new(model))))
+}
+
+/// Replaces MuJoCo's own handler, which appends to `MUJOCO_LOG.TXT` in the working directory.
+fn log(message: &MjLogMessage) {
+    tracing::debug!(target: "mujoco", "{}", message.subject());
 }
 
 /// The environments that this program simulates, for evaluators.

@@ -17,8 +17,7 @@
 
 use quad_dataset::{Drive, Planar};
 
-use super::physics::Physics;
-use super::simulation::{RobotSpec, Task};
+use super::simulation::{RobotSpec, Simulation, Task};
 
 pub(super) fn robot(planar: &Planar) -> RobotSpec {
     RobotSpec {
@@ -31,14 +30,13 @@ pub(super) fn robot(planar: &Planar) -> RobotSpec {
 }
 
 impl Task for &'static Planar {
-    fn judge(&self, [x, _]: [f64; 2], physics: &Physics) -> (f64, bool) {
-        let velocity = (physics.qpos()[0] - x) / physics.dt();
-        let cost = self.control_cost
-            * physics.controls().iter().map(|control| control * control).sum::<f64>();
-        let terminated = self
-            .healthy
-            .as_ref()
-            .is_some_and(|healthy| !healthy.contains(physics.qpos(), physics.qvel()));
+    fn judge(&self, [x, _]: [f64; 2], simulation: &Simulation) -> (f64, bool) {
+        let (qpos, qvel) = (simulation.qpos(), simulation.qvel());
+        let velocity = (qpos[0] - x) / simulation.control_period();
+        let squares = simulation.controls().iter().map(|control| control * control);
+        let cost = self.control_cost * squares.sum::<f64>();
+        let healthy = self.healthy.as_ref();
+        let terminated = healthy.is_some_and(|healthy| !healthy.contains(qpos, qvel));
         (velocity + self.alive_bonus - cost, terminated)
     }
 }

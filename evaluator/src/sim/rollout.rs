@@ -222,16 +222,17 @@ impl Live {
 
     /// Refuses what a step gave if no learner could learn from it.
     fn check(&self, reward: f64) -> Result<(), EnvironmentError> {
-        let is_usable = (reward as f32).is_finite()
-            && EpisodeScore::is_in_range(self.score.episode_return + reward);
-        is_usable.then_some(()).ok_or_else(|| self.unusable("reward", 0, reward))?;
+        let episode_return = self.score.episode_return + reward;
+        if !(reward as f32).is_finite() || !EpisodeScore::is_in_range(episode_return) {
+            return Err(self.unusable("reward", 0, reward));
+        }
         self.check_observation()
     }
 
     fn check_observation(&self) -> Result<(), EnvironmentError> {
-        let numbers = self.environment.observation();
-        match numbers.iter().position(|&number| !(number as f32).is_finite()) {
-            Some(index) => Err(self.unusable("observation", index, numbers[index])),
+        let mut numbers = self.environment.observation().iter().copied().enumerate();
+        match numbers.find(|(_, number)| !(*number as f32).is_finite()) {
+            Some((index, number)) => Err(self.unusable("observation", index, number)),
             None => Ok(()),
         }
     }
@@ -242,12 +243,12 @@ impl Live {
     }
 
     fn score(&mut self) -> Result<EpisodeScore, EnvironmentError> {
-        let EpisodeScore { seed, episode_return, length, .. } = self.score;
+        let (seed, length) = (self.score.seed, self.score.length);
         let check = |what, value| match EpisodeScore::is_in_range(value) {
             true => Ok(value),
             false => Err(EnvironmentError::NotCounted { what, seed, value, length }),
         };
-        check("return", episode_return)?;
+        let episode_return = check("return", self.score.episode_return)?;
         self.score.score = check("score", self.environment.score(episode_return)?)?;
         Ok(self.score)
     }

@@ -59,17 +59,22 @@ pub struct LargestError {
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { environment, transitions, compared, obs_error, reward_error, .. } = self;
-        let Errors { median, p99, max } = obs_error;
+        let (transitions, compared, errors) = (self.transitions, self.compared, &self.obs_error);
         write!(
             f,
-            "environment        {environment}
+            "environment        {}
 transitions        {transitions}, of which {compared} have a next observation to compare
-observation error  median {median:.1e}, p99 {p99:.1e}, max {max:.1e}
+observation error  median {:.1e}, p99 {:.1e}, max {:.1e}
 reward error       max {:.1e}
 rewards differ     {}
 terminals differ   {}",
-            reward_error.max, self.rewards_differ, self.terminals_differ
+            self.environment,
+            errors.median,
+            errors.p99,
+            errors.max,
+            self.reward_error.max,
+            self.rewards_differ,
+            self.terminals_differ
         )
     }
 }

@@ -41,27 +41,27 @@ fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
     let (transitions, episodes) = (summary.transitions, summary.episodes);
     let rows = read(&path);
     assert!(rows.len() == transitions && transitions >= TRANSITIONS);
-    let is_end = |i: usize| rows.row(i).terminal || rows.row(i).timeout;
-    assert_eq!((0..transitions).filter(|&i| is_end(i)).count(), episodes);
-    assert!(is_end(transitions - 1));
-    for i in 1..transitions {
-        let is_next = rows.row(i - 1).next_observation == rows.row(i).observation;
-        assert_eq!(is_next, !is_end(i - 1), "row {i}");
-        assert!(rows.row(i).action.iter().all(|value| value.abs() <= 1.0));
-    }
-    let total: f64 = rows.iter().map(|row| row.reward).sum();
-    let expected = hopper().normalized_score(total / episodes as f64);
-    assert!((summary.mean_score - expected).abs() < 1e-3, "{expected}");
-    let (mut best, mut episode_return) = (f64::NEG_INFINITY, 0.0);
+    let (mut returns, mut episode_return) = (Vec::new(), 0.0);
     for i in 0..transitions {
-        episode_return += rows.row(i).reward;
-        if is_end(i) {
-            best = best.max(hopper().normalized_score(episode_return));
-            episode_return = 0.0;
+        let row = rows.row(i);
+        assert!(row.action.iter().all(|value| value.abs() <= 1.0));
+        episode_return += row.reward;
+        let is_end = row.terminal || row.timeout;
+        if is_end {
+            returns.push(std::mem::take(&mut episode_return));
         }
+        let is_followed =
+            i + 1 < transitions && rows.row(i + 1).observation == row.next_observation;
+        assert_eq!(is_followed, !is_end, "row {i}");
     }
+    assert_eq!(returns.len(), episodes);
+    let mean = returns.iter().sum::<f64>() / episodes as f64;
+    let best = returns.into_iter().fold(f64::NEG_INFINITY, f64::max);
     let percentiles = summary.score_percentiles;
-    assert!(percentiles.is_sorted() && (percentiles[3] - best).abs() < 1e-3, "{percentiles:?}");
+    assert!(percentiles.is_sorted(), "{percentiles:?}");
+    for (score, episode_return) in [(summary.mean_score, mean), (percentiles[3], best)] {
+        assert!((score - hopper().normalized_score(episode_return)).abs() < 1e-3, "{score}");
+    }
 
     assert_eq!(environment_of(&path).unwrap(), hopper());
     let report = verify(&path, hopper()).unwrap();

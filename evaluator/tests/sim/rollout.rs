@@ -78,6 +78,10 @@ impl Robot {
         Self { state: [0.0; 2], start: 0.0, rules: Arc::new(rules), score: 1.0 }
     }
 
+    fn problem(&self, online: bool) -> String {
+        self.play(&[7], online).unwrap_err().to_string()
+    }
+
     /// Plays the episodes of some seeds; the action is 10 times the seed, plus the steps before it.
     fn play(&self, seeds: &[u64], online: bool) -> Result<Vec<Played>, EnvironmentError> {
         let mut rollout = self.rollout(2, seeds)?;
@@ -129,19 +133,27 @@ impl Environment for Robot {
     }
 }
 
+fn step(reward: f64, terminated: bool, truncated: bool) -> Step {
+    let (intervention, clipped) = (None, None);
+    Step { reward, terminated, truncated, intervention, clipped }
+}
+
 /// Pays the number of steps, of which there are four; in the third, another reward.
 fn counter(third_reward: f64, score: f64) -> Robot {
     let rules = move |[_, steps]: &mut [f64; 2], _| {
         let reward = if *steps == 3.0 { third_reward } else { *steps };
-        Ok(Step { reward, terminated: *steps == 4.0, ..Step::default() })
+        Ok(step(reward, *steps == 4.0, false))
     };
-    Robot { score, ..Robot::new(rules) }
+    let mut robot = Robot::new(rules);
+    robot.score = score;
+    robot
 }
 
 #[test]
 fn any_environment_has_its_own_scores_and_errors() {
     let counter = counter(3.0, 0.1);
-    for ((episode, _), seed) in counter.play(&[7, 8], false).unwrap().into_iter().zip([7, 8]) {
+    let played = counter.play(&[7, 8], false).unwrap();
+    for ((episode, _), seed) in played.into_iter().zip([7, 8]) {
         assert_eq!((episode.seed, episode.length), (seed, 4));
         assert_eq!((episode.episode_return, episode.score), (10.0, 1.0));
     }
@@ -155,8 +167,7 @@ fn any_environment_has_its_own_scores_and_errors() {
         }
         _ => Ok(Step::default()),
     });
-    let error = breaks.play(&[7], false).unwrap_err().to_string();
-    assert_eq!(error, "the environment \"robot\" failed: a cable is loose");
+    assert_eq!(breaks.problem(false), "the environment \"robot\" failed: a cable is loose");
 }
 
 /// A robot that ends after as many steps as its seed: terminates with seed 1, is truncated with 2,
@@ -164,13 +175,11 @@ fn any_environment_has_its_own_scores_and_errors() {
 #[test]
 fn a_recorded_episode_is_what_was_observed_and_done() {
     let robot = Robot::new(|[seed, steps], action| {
-        Ok(Step {
-            reward: *steps / 4.0,
-            terminated: steps == seed && *seed != 2.0,
-            truncated: steps == seed && *seed != 1.0,
-            intervention: (*steps == 2.0).then(|| vec![action + 90.0]),
-            clipped: (*steps == 3.0).then(|| vec![1.0]),
-        })
+        let [terminates, is_truncated] = [2.0, 1.0].map(|other| steps == seed && *seed != other);
+        let mut step = step(*steps / 4.0, terminates, is_truncated);
+        step.intervention = (*steps == 2.0).then(|| vec![action + 90.0]);
+        step.clipped = (*steps == 3.0).then(|| vec![1.0]);
+        Ok(step)
     });
     let play = |seeds: &[u64]| {
         let played = robot.play(seeds, true).unwrap().into_iter();
@@ -210,9 +219,9 @@ fn returns_and_scores_that_do_not_count_are_errors_as_soon_as_they_are_known() {
         (3.0, f64::NAN, "score", "NaN", 4),
         (3.0, -1e12, "score", "-10000000000000", 4),
     ] {
-        let error = counter(reward, score).play(&[7, 8], false).unwrap_err().to_string();
+        let error = counter(reward, score).problem(false);
         let problem =
-            format!("the {what} of the episode with seed 8 is {value} after {steps} steps");
+            format!("the {what} of the episode with seed 7 is {value} after {steps} steps");
         assert_eq!(error, format!("{problem}, not a finite number up to 1e12"));
     }
     let largest = counter(1e12 - 7.0, 1.0).play(&[7], false).unwrap();
@@ -222,13 +231,17 @@ fn returns_and_scores_that_do_not_count_are_errors_as_soon_as_they_are_known() {
 /// Pays and observes the number of steps; from step `first` on it gives `value` in one of them.
 fn diverging(first: u32, pays: bool, value: f64) -> Robot {
     let rules = move |[_, steps]: &mut [f64; 2], _| {
-        let given = if *steps >= f64::from(first) { value } else { *steps };
-        let (reward, truncated) = (if pays { given } else { *steps }, *steps == 9.0);
-        *steps = if pays { *steps } else { given };
-        Ok(Step { reward, truncated, ..Step::default() })
+        let mut step = step(*steps, false, *steps == 9.0);
+        match *steps >= f64::from(first) {
+            true if pays => step.reward = value,
+            true => *steps = value,
+            false => {}
+        }
+        Ok(step)
     };
-    let start = if first == 0 { value } else { 0.0 };
-    Robot { start, ..Robot::new(rules) }
+    let mut robot = Robot::new(rules);
+    robot.start = if first == 0 { value } else { 0.0 };
+    robot
 }
 
 #[test]
@@ -249,12 +262,12 @@ fn an_online_episode_ends_before_a_step_that_cannot_be_learned_from() {
         episode.verify().unwrap();
 
         let name = if pays { "reward[0]" } else { "observation[1]" };
-        let error = diverging(1, pays, value).play(&[7], true).unwrap_err().to_string();
+        let error = diverging(1, pays, value).problem(true);
         let expected = format!("\"robot\" gave {name} = {value} after step 1 of the episode");
         assert!(error.contains(&expected), "{error}");
     }
     for (online, first) in [(true, 0), (false, 0), (false, 1), (false, 5)] {
-        let error = diverging(first, false, f64::NAN).play(&[7], online).unwrap_err().to_string();
+        let error = diverging(first, false, f64::NAN).problem(online);
         let expected =
             format!("observation[1] = NaN after step {first} of the episode with seed 7");
         assert!(error.contains(&expected), "{error}");

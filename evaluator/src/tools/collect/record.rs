@@ -49,7 +49,10 @@ pub fn record(
         let highest = room.iter().rposition(|&room| room > 0.0).filter(|_| patient);
         let next = highest.and_then(|band| mixture.get(band + 1));
         let ceiling = next.map_or(f64::INFINITY, |&(from, _)| from);
-        let mut draw = |_| (&policies[random.random_range(0..policies.len())], random.random());
+        let mut draw = |_| {
+            let policy = &policies[random.random_range(0..policies.len())];
+            (policy, random.random())
+        };
         let drawn: Vec<(&LinearPolicy, u64)> = (0..ROUND).map(&mut draw).collect();
         let running = recorders.par_iter_mut().zip(drawn).with_max_len(1);
         running.for_each(|(recorder, (policy, seed))| recorder.run(policy, seed, ceiling));
@@ -119,9 +122,9 @@ impl Recorder {
     }
 
     fn keep_state(&mut self) {
-        let Self { environment, states, .. } = self;
-        let state = [environment.observation(), environment.qpos(), environment.qvel()];
-        states.push(state.map(<[f64]>::to_vec));
+        let simulation = &self.environment;
+        let state = [simulation.observation(), simulation.qpos(), simulation.qvel()];
+        self.states.push(state.map(<[f64]>::to_vec));
     }
 
     fn write(&self, writer: &mut D4rlWriter) -> Result<(), DatasetError> {

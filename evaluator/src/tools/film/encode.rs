@@ -66,7 +66,10 @@ impl Format {
     /// Width and height of a picture of several episodes, pixels: side by side, in a strip stacked.
     pub fn size(self, episodes: usize) -> (usize, usize) {
         let (width, height) = self.view_size();
-        if self == Self::Png { (width, height * episodes) } else { (width * episodes, height) }
+        match self {
+            Self::Png => (width, height * episodes),
+            _ => (width * episodes, height),
+        }
     }
 
     /// Left, bottom, width and height of the view of the episode with this index, pixels.
@@ -213,7 +216,7 @@ mod tests {
         let views = |format: Format| [format.view(0, 2), format.view(1, 2)];
         assert_eq!(views(film), [[0, 0, 320, 240], [320, 0, 320, 240]]);
         assert_eq!(views(strip), [[0, 240, 240, 240], [0, 0, 240, 240]]);
-        assert_eq!(film.steps(12, 0.008), [0, 5, 10, 12], "25 pictures a second");
+        assert_eq!(film.steps(12, 0.008), [0, 5, 10, 12]);
         assert_eq!(film.steps(2, 0.1), [0, 1, 2]);
         assert_eq!(strip.steps(14, 0.008), [0, 2, 4, 6, 8, 10, 12, 14]);
     }

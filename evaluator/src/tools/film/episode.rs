@@ -24,7 +24,7 @@ impl Pose {
 }
 
 /// An episode of a policy.
-pub struct Episode {
+pub struct FilmedEpisode {
     pub seed: u64,
     /// The initial pose, then one after each step.
     poses: Vec<Pose>,
@@ -34,7 +34,7 @@ pub struct Episode {
     pub choice: String,
 }
 
-impl Episode {
+impl FilmedEpisode {
     /// Plays the episode of a seed; without one, of the first seed on which the run evaluates the
     /// subject. `environment_seed` decides what the environment draws once for all episodes.
     pub fn play(

@@ -23,7 +23,7 @@ use tracing::info;
 use crate::sim;
 use crate::tools::score::{ScoreArgs, Subject};
 use encode::{Output, output, stride};
-use episode::Episode;
+use episode::FilmedEpisode;
 use stage::Stage;
 pub(crate) use stage::{Gl, INSTALL};
 
@@ -85,14 +85,14 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
             .hint("only policies for one environment can be compared");
     }
     let mut stage = Stage::new(spec, args.out.format, subjects.len())?;
-    let mut episodes: Vec<Episode> = Vec::new();
+    let mut episodes: Vec<FilmedEpisode> = Vec::new();
     for subject in &subjects {
         info!("{}: playing an episode", subject.path.display());
         let seed = args.seed.or(episodes.first().map(|first| first.seed));
-        episodes.push(Episode::play(subject, seed, environment_seed)?);
+        episodes.push(FilmedEpisode::play(subject, seed, environment_seed)?);
     }
     let control_period = sim::make(spec, environment_seed)?.control_period();
-    let last = episodes.iter().map(Episode::length).max().unwrap_or(0);
+    let last = episodes.iter().map(FilmedEpisode::length).max().unwrap_or(0);
     let steps = args.out.format.steps(last, control_period);
     info!("drawing {} pictures", steps.len());
     let draw = |&step| {
@@ -104,7 +104,7 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     let mut summary = String::new();
     for (subject, episode) in subjects.iter().zip(&episodes) {
         let (path, steps) = (subject.path.display(), episode.length());
-        let Episode { seed, choice, .. } = episode;
+        let FilmedEpisode { seed, choice, .. } = episode;
         let episode_return = episode.pose(steps).episode_return;
         summary +=
             &format!("{path}: seed {seed}, {steps} steps, return {episode_return:.2}, {choice}\n");

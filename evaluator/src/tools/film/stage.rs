@@ -15,7 +15,7 @@ use quad_dataset::{CELL, EnvironmentSpec};
 use quad_runtime::Hint;
 
 use super::encode::{Format, Picture};
-use super::episode::{Episode, Pose};
+use super::episode::{FilmedEpisode, Pose};
 use crate::sim::{self, EnvironmentError};
 
 pub const INSTALL: &str =
@@ -120,7 +120,7 @@ impl Stage {
     }
 
     /// The picture of all episodes after `steps` steps.
-    pub fn draw(&mut self, episodes: &[Episode], steps: usize) -> anyhow::Result<Picture> {
+    pub fn draw(&mut self, episodes: &[FilmedEpisode], steps: usize) -> anyhow::Result<Picture> {
         for (index, episode) in episodes.iter().enumerate() {
             let view = self.format.view(index, episodes.len()).map(|pixels| pixels as i32);
             let view = MjrRectangle::new(view[0], view[1], view[2], view[3]);
