@@ -86,11 +86,11 @@ def _read(source: str, given: dict[str, Any]) -> Dataset:
     read, place = _reader(source)
     if len(given.get("success", ())) == 1:
         given["success"] = given["success"][0]
-    known = inspect.signature(read).parameters
-    for name in given.keys() - known.keys():
-        options = ", ".join(f"--{name}" for name in [*known][1:] if name != "features")  # Functions are Python's.
+    parameters = inspect.signature(read).parameters
+    for name in given.keys() - parameters.keys():
+        options = ", ".join(f"--{name}" for name in [*parameters][1:] if name != "features")  # Functions are Python's.
         raise ValueError(f"--{name} does not apply to this source; its options: {options or 'none'}")
-    missing = [name for name, parameter in known.items() if parameter.kind is parameter.KEYWORD_ONLY
+    missing = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY
                and parameter.default is parameter.empty and name not in given]
     if missing:
         raise ValueError(f"{source} needs {' and '.join('--' + name for name in missing)}\nhint: quad-convert --help")

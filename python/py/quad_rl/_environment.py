@@ -82,7 +82,7 @@ class WrappedEnvironment:
             parameters = list(inspect.signature(environment.reset).parameters.values())
         except ValueError:  # Of a C extension.
             parameters = []
-        self.takes_options = any(it.name == "options" or it.kind is it.VAR_KEYWORD for it in parameters)
+        self.takes_options = any(parameter.name == "options" or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
         action_space = getattr(environment, "action_space", None)
         self.action_shape = getattr(action_space, "shape", None)
         is_whole = np.dtype(getattr(action_space, "dtype", None) or float).kind in "biu"
@@ -104,9 +104,9 @@ class WrappedEnvironment:
 
     def try_out(self) -> None:
         """Resets it, and steps it by the action 0, or the nearest, where it has an action space. Raises EnvironmentFailed."""
-        found, sizes = self.reset(0).size, self.sizes()
-        if sizes and found != sizes[0]:
-            raise Unusable(f"reset: the observation has {found} numbers, but those of observation_space have {sizes[0]}")
+        size, sizes = self.reset(0).size, self.sizes()
+        if sizes and size != sizes[0]:
+            raise Unusable(f"reset: the observation has {size} numbers, but those of observation_space have {sizes[0]}")
         if self.action_shape is not None:
             action = np.zeros(self.action_shape, np.float32)
             action = action if self.bounds is None else np.clip(action, *self.bounds)

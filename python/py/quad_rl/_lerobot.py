@@ -44,14 +44,14 @@ def inputs(policy: Policy, features: Iterable[str] = ()) -> dict[str, list[int]]
         the robot's state.
     """
     longest_first = sorted((name for name in features if name.startswith("observation.")), key=len, reverse=True)
-    found = []
+    sources = []
     for column in policy.observation_names:
         match = _FEATURE.match(column)
-        known = next((name for name in longest_first if column == name or column.startswith((f"{name}.", f"{name}["))), None)
-        found += [known] if known else [match.group()] if match else []
-    if len(found) < policy.observation_size:
-        found = ["observation.state"] * policy.observation_size
-    return {name: [place for place, other in enumerate(found) if other == name] for name in dict.fromkeys(found)}
+        feature = next((name for name in longest_first if column == name or column.startswith((f"{name}.", f"{name}["))), None)
+        sources += [feature] if feature else [match.group()] if match else []
+    if len(sources) < policy.observation_size:
+        sources = ["observation.state"] * policy.observation_size
+    return {name: [place for place, other in enumerate(sources) if other == name] for name in dict.fromkeys(sources)}
 
 
 def places(wanted: list[str], there: list[str]) -> list[int]:

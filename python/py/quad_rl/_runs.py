@@ -29,9 +29,9 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
     """
     patterns = [folders] if isinstance(folders, (str, PathLike)) else folders
     expanded = [os.path.expanduser(os.fspath(pattern)) for pattern in patterns]
-    found = [path for given in expanded for path in ([given] if os.path.exists(given) else sorted(glob.glob(given)))]
+    paths = [path for given in expanded for path in ([given] if os.path.exists(given) else sorted(glob.glob(given)))]
     rows: list[dict[str, Any]] = []
-    for path in found:
+    for path in paths:
         try:
             rows += rows_of(path) if Path(path, "config.toml").exists() else []
         except (OSError, RuntimeError) as error:

@@ -29,13 +29,13 @@ def draw(file: File, observations: Value, noise: Value, candidates: int, guidanc
     o, a, steps, reverse = (file.shape[name] for name in ("observation_dim", "action_dim", "diffusion_steps", "reverse"))
     kernel, bias = file["actor.trunk.0.kernel"], file["actor.trunk.0.bias"]
     shifts = embeddings(file, steps) @ kernel[o + a :] + bias
-    of_state = (observations @ kernel[:o]).reshape(-1, 1, kernel.shape[1])
+    state = (observations @ kernel[:o]).reshape(-1, 1, kernel.shape[1])
     exponent = -0.1 / steps - 0.5 * 9.9 * (2 * np.arange(1, steps + 1) - 1) / steps**2
     alpha = cosine(steps) if reverse == "cosine" else np.exp(exponent)
     bar = np.cumprod(np.concatenate([[1.0], alpha]))
     x = noise.at(1, 0)
     for t in range(steps, 0, -1):
-        first = (x.reshape(-1, a) @ kernel[o : o + a]).reshape(-1, candidates, kernel.shape[1]) + of_state + shifts[t - 1]
+        first = (x.reshape(-1, a) @ kernel[o : o + a]).reshape(-1, candidates, kernel.shape[1]) + state + shifts[t - 1]
         epsilon = layers(file, "actor.trunk.", file.shape["actor"], first)
         clean = (x - epsilon * math.sqrt(1 - bar[t])) * (1 / math.sqrt(bar[t]))
         if guidance:

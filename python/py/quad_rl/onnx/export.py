@@ -12,38 +12,38 @@ from quad_rl.onnx import diffusion, flow, gaussian, one_step, planner, score, sq
 from quad_rl.onnx.choosing import choose
 from quad_rl.onnx.file import File
 from quad_rl.onnx.graph import Graph, Value
-from quad_rl.onnx.mlp import of_actions, of_states
+from quad_rl.onnx.mlp import action_outputs, state_outputs
 
 DRAW = {"diffusion": diffusion.draw, "flow": flow.draw, "one-step": one_step.draw, "score": score.draw, "squashed": squashed.draw}
 
 
 def to_network(file: File, observations: Value) -> Value:
-    for units in file.units:
-        if of := units.get("observations"):
-            scale = np.array(of["scale"])
+    for maps in file.units:
+        if units := maps.get("observations"):
+            scale = np.array(units["scale"])
             # A constant observation has scale 0; the network gets 0.
-            observations = (observations - of["offset"]) / np.where(scale == 0, np.inf, scale)
+            observations = (observations - units["offset"]) / np.where(scale == 0, np.inf, scale)
     return observations
 
 
 def to_user(file: File, actions: Value) -> Value:
-    for units in reversed(file.units):
-        if of := units.get("actions"):
-            actions = actions * of["scale"] + of["offset"]
+    for maps in reversed(file.units):
+        if units := maps.get("actions"):
+            actions = actions * units["scale"] + units["offset"]
     return actions
 
 
 def critics(file: File, choice: dict[str, Any], observations: Value, drawn: Value) -> tuple[Value, Value]:
     """The critics' values of drawn [n, candidates, a], and the rule's scores; both [n, candidates]."""
     graph, candidates = drawn.graph, choice["candidates"]
-    of_members = of_actions(file, "critic.", file.shape["critic"], observations, drawn, candidates)
-    values = graph("ReduceMin" if choice["aggregate"] == "min" else "ReduceMean", of_members, axes=[0], keepdims=0)
+    members = action_outputs(file, "critic.", file.shape["critic"], observations, drawn, candidates)
+    values = graph("ReduceMin" if choice["aggregate"] == "min" else "ReduceMean", members, axes=[0], keepdims=0)
     if choice["aggregate"].startswith("mean-minus-std:"):
-        away = of_members - values
+        away = members - values
         values = values - graph("Sqrt", (away * away).mean(0)).at(0, 0) * float(choice["aggregate"].split(":")[1])
     if choice["rule"] != "nearest":
         return values, values
-    difference = values - of_states(file, "value.", file.shape["value"], observations).reshape(-1, 1)
+    difference = values - state_outputs(file, "value.", file.shape["value"], observations).reshape(-1, 1)
     return values, 0.0 - difference * difference
 
 

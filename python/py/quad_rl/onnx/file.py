@@ -25,9 +25,9 @@ class File:
         # From the user's units to the networks', map by map.
         self.units = [units for units in (header.get("scaling"), self.shape.get("units")) if units]
         self.tensors: dict[str, Array] = {}
-        for name, of in listed.items():
-            begin, end = of["data_offsets"]
-            self.tensors[name] = np.frombuffer(data[start + begin : start + end], "<f4").reshape(of["shape"])
+        for name, entry in listed.items():
+            begin, end = entry["data_offsets"]
+            self.tensors[name] = np.frombuffer(data[start + begin : start + end], "<f4").reshape(entry["shape"])
 
     def __getitem__(self, name: str) -> Array:
         return self.tensors[name]

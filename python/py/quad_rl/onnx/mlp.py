@@ -99,13 +99,13 @@ def layers(
     return x
 
 
-def of_states(file: File, prefix: str, config: dict[str, Any], observations: Value) -> Value:
+def state_outputs(file: File, prefix: str, config: dict[str, Any], observations: Value) -> Value:
     """An ensemble's outputs [K, n, outputs] for observations [n, o]."""
     first = observations @ file[f"{prefix}0.kernel"] + file[f"{prefix}0.bias"][:, None]
     return layers(file, prefix, config, first)
 
 
-def of_actions(
+def action_outputs(
     file: File, prefix: str, config: dict[str, Any], observations: Value, actions: Value, each: int, outputs: int = 1
 ) -> Value:
     """An ensemble's outputs [K, n, each] or [K, n, each, outputs] for observations [n, o] and actions [n, each, a]."""

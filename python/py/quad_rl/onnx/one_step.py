@@ -2,10 +2,10 @@
 
 from quad_rl.onnx.file import File
 from quad_rl.onnx.graph import Value
-from quad_rl.onnx.mlp import of_actions
+from quad_rl.onnx.mlp import action_outputs
 
 
 def draw(file: File, observations: Value, noise: Value, candidates: int) -> Value:
     a = file.shape["action_dim"]
-    drawn = of_actions(file, "actor.", file.shape["actor"], observations, noise.at(1, 0), candidates, a)
+    drawn = action_outputs(file, "actor.", file.shape["actor"], observations, noise.at(1, 0), candidates, a)
     return drawn.at(0, 0).reshape(-1, candidates, a).clip(-1.0, 1.0)

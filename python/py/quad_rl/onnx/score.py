@@ -14,7 +14,7 @@ class Network:
 
     def __init__(self, file: File, observations: Value) -> None:
         self.file, self.config = file, file.shape["actor"]
-        self.of_state = self.active("state", observations)
+        self.state = self.active("state", observations)
 
     def linear(self, name: str, x: Value) -> Value:
         return x @ self.file[f"actor.{name}.kernel"] + self.file[f"actor.{name}.bias"]
@@ -29,9 +29,9 @@ class Network:
 
     def __call__(self, x: Value, t: float) -> Value:
         file, angles = self.file, 2 * math.pi * t * self.file["frequencies"].astype(np.float64)
-        of_time = np.concatenate([np.sin(angles), np.cos(angles)]) @ file["actor.time.kernel"] + file["actor.time.bias"]
+        time = np.concatenate([np.sin(angles), np.cos(angles)]) @ file["actor.time.kernel"] + file["actor.time.bias"]
         kernel, bias = file["actor.mix.0.kernel"], file["actor.mix.0.bias"]
-        mixed = self.of_state @ kernel[:32] + (of_time @ kernel[32:] + bias)
+        mixed = self.state @ kernel[:32] + (time @ kernel[32:] + bias)
         condition = self.active("mix.1", activate(self.config["activation"], mixed))
         condition = x.graph("Unsqueeze", condition, np.array([1]))
         widths, narrowed = self.config["hidden"], []

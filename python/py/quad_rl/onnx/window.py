@@ -30,9 +30,9 @@ class Layers:
         half = self.config["channels"] // 2
         angles = (np.array(times)[:, None] - 1) * np.exp(-np.arange(half) * math.log(10_000) / (half - 1))
         x = np.concatenate([np.sin(angles), np.cos(angles)], 1)
-        (first, of_first), (second, of_second) = (self.tensors(f"time.{i}") for i in range(2))
+        (first, first_bias), (second, second_bias) = (self.tensors(f"time.{i}") for i in range(2))
         # [times, channels]
-        self.embedding = mish(x @ first + of_first) @ second + of_second
+        self.embedding = mish(x @ first + first_bias) @ second + second_bias
 
     def tensors(self, name: str, kinds: tuple[str, ...] = ("kernel", "bias")) -> list[Array]:
         return [self.file[f"{self.prefix}{name}.{kind}"] for kind in kinds]
@@ -66,9 +66,9 @@ class Layers:
     def block(self, name: str, x: Value, length: int, t: Value) -> tuple[Value, Back]:
         """A residual block, at the t-th of the times."""
         kernel, bias = self.tensors(f"{name}.time")
-        of_times = (mish(self.embedding) @ kernel + bias)[..., None]
+        times = (mish(self.embedding) @ kernel + bias)[..., None]
         inner, first = self.normed(f"{name}.0", x, length)
-        inner, second = self.normed(f"{name}.1", inner + x.graph.constant(of_times).at(0, t), length)
+        inner, second = self.normed(f"{name}.1", inner + x.graph.constant(times).at(0, t), length)
         if f"{self.prefix}{name}.skip.kernel" not in self.file:
             return inner + x, lambda g: first(second(g)) + g
         beside, skip = self.convolution(f"{name}.skip", x, length)
@@ -137,12 +137,12 @@ class ValueFunction(Layers):
                 x = keep(self.block(f"{name}.{i}", x, length, t))
             x = keep(self.convolution(f"{name}.halve", x, length, stride=2))
         length, channels = (lengths[-1] + 1) // 2, self.file[f"{self.prefix}middle.1.halve.bias"].shape[0]
-        (kernel, bias), (last, of_last) = (self.tensors(f"head.{i}") for i in range(2))
+        (kernel, bias), (last, last_bias) = (self.tensors(f"head.{i}") for i in range(2))
         flat, width = length * channels, kernel.shape[1]
         # Rows: [steps · channels], then the embedding.
         rows = kernel[:flat].reshape(length, channels, width).transpose(1, 0, 2).reshape(flat, width)
-        of_times = x.graph.constant(self.embedding @ kernel[flat:] + bias).at(0, t)
-        linear = x.reshape(-1, flat) @ rows + of_times
+        times = x.graph.constant(self.embedding @ kernel[flat:] + bias).at(0, t)
+        linear = x.reshape(-1, flat) @ rows + times
 
         def gradient() -> Value:
             g = ((mish_slope(linear) * last[:, 0]) @ rows.T).reshape(-1, channels, length)
@@ -150,4 +150,4 @@ class ValueFunction(Layers):
                 g = back(g)
             return g
 
-        return activate("mish", linear) @ last + of_last, gradient
+        return activate("mish", linear) @ last + last_bias, gradient

@@ -68,9 +68,9 @@ def from_frame(
     if path and not {*observations, *actions, episode} & {*there} and any(map(is_number, there)):
         hint = "hint: write one above them, such as " + ",".join([*observations, *actions, episode])
         raise ValueError(f"{place} has no line of names: its first line is {', '.join(there)}\n{hint}")
-    others = {episode, *(rule for rule in (reward, terminal, success) if isinstance(rule, str))}
-    actions = _matching(actions, there, others)
-    observations = _matching(observations, there, {*others, *actions})
+    named = {episode, *(rule for rule in (reward, terminal, success) if isinstance(rule, str))}
+    actions = _matching(actions, there, named)
+    observations = _matching(observations, there, {*named, *actions})
     words = columns_of(observations, actions, reward, terminal, success)
     read = {name: key for name, key in zip(there, keys) if words is None or name in words or name == episode}
     for name in [name for name in read if there.count(name) > 1]:
@@ -84,14 +84,14 @@ def from_frame(
         raise ValueError(f"{place}: there is no column {episode!r} for episodes\nhint: there are {', '.join(map(repr, there))}")
     for name in [name for name in columns if len(columns[name]) != len(columns[episode])]:
         raise ValueError(f"{place}: column {name!r} has {len(columns[name])} rows, but {episode!r} has {len(columns[episode])}")
-    names, of, notes = _episodes(columns[episode], episode, place, apart)
+    names, owners, notes = _episodes(columns[episode], episode, place, apart)
     for name, key in zip(there, keys):
         if _CLOCK.search(name) and name != episode and there.count(name) == 1:
-            notes += _leaps(table[key], name, of)
+            notes += _leaps(table[key], name, owners)
     ends = [name for name in there if name.lower() in _ENDS]
     if ends and terminal is None and success is None:
         notes.append(f"no terminal is given: {ends[0]!r}, if that says where the task was over?")
-    order, cuts = np.argsort(of, kind="stable"), np.cumsum(np.bincount(of, minlength=1))[:-1]
+    order, cuts = np.argsort(owners, kind="stable"), np.cumsum(np.bincount(owners, minlength=1))[:-1]
     parts = zip(*(np.split(array[order], cuts) for array in columns.values())) if names else ()
     episodes = [Episode(name, dict(zip(columns, part)), {}) for name, part in zip(names, parts)]
     log = Log(episodes, notes, there, end="terminal", continuous=continuous)
@@ -108,30 +108,30 @@ def _episodes(ids: NDArray[Any], column: str, place: str, apart: str | None) -> 
         hint = "hint: leave these rows out, or say of which episode they are"
         raise ValueError(f"{place}: column {column!r}, row {empty[0]} is empty: of no episode ({len(empty)} such rows)\n{hint}")
     numbers: dict[Any, int] = {}
-    of = np.array([numbers.setdefault(name, len(numbers)) for name in listed], int)
-    begins = np.diff(of, prepend=-1) != 0
-    torn = [name for name, stretches in zip(numbers, np.bincount(of[begins], minlength=1)) if stretches > 1]
+    owners = np.array([numbers.setdefault(name, len(numbers)) for name in listed], int)
+    begins = np.diff(owners, prepend=-1) != 0
+    torn = [name for name, stretches in zip(numbers, np.bincount(owners[begins], minlength=1)) if stretches > 1]
     if not torn:
-        return list(numbers), of, []
+        return list(numbers), owners, []
     those = f"{len(torn)} of {len(numbers)} episodes: their rows do not lie together"
     if apart is None:
         hint = 'apart="interleaved" if they were recorded at once, "repeated" if such a name is that of several episodes'
         raise ValueError(f"{place}: {those}, as those of {column!r} {torn[0]!r}\nhint: {hint} (quad-convert --apart)")
     if apart == "interleaved":
-        return list(numbers), of, [f"{those}; they count in the table's order"]
+        return list(numbers), owners, [f"{those}; they count in the table's order"]
     names = [listed[row] for row in np.flatnonzero(begins)]
     return names, np.cumsum(begins) - 1, [f"{len(torn)} of {len(numbers)} names are those of several episodes: {len(names)} in all"]
 
 
-def _leaps(column: Any, name: str, of: NDArray[Any]) -> list[str]:
+def _leaps(column: Any, name: str, owners: NDArray[Any]) -> list[str]:
     """Tells of rows that are missing, there twice or out of order, by their times."""
     try:
         array = _column(column, name, "")
-        times = array.astype("M8[ns]").astype(float) / 1e9 if array.dtype.kind == "M" else array.astype(float).reshape(of.shape)
+        times = array.astype("M8[ns]").astype(float) / 1e9 if array.dtype.kind == "M" else array.astype(float).reshape(owners.shape)
     except (TypeError, ValueError):  # Texts, empty places, lists.
         return []
-    order = np.argsort(of, kind="stable")
-    steps = np.diff(times[order])[np.diff(of[order]) == 0]
+    order = np.argsort(owners, kind="stable")
+    steps = np.diff(times[order])[np.diff(owners[order]) == 0]
     ahead, still, back = steps[steps > 0], np.count_nonzero(steps == 0), np.count_nonzero(steps < 0)
     if len(ahead) < max(FEWEST, len(steps) / 2) or 10 * back > len(steps):
         return []  # No clock.
@@ -144,13 +144,13 @@ def _leaps(column: Any, name: str, of: NDArray[Any]) -> list[str]:
     return [f"of {len(steps)} steps, by their {name!r}, {'; '.join(told)}"] if told else []
 
 
-def _matching(names: Sequence[str], there: list[str], others: set[str]) -> Sequence[str]:
-    """The columns of these names or patterns, each once, by patterns none of `others`; what matches none stays, to be refused."""
+def _matching(names: Sequence[str], there: list[str], named: set[str]) -> Sequence[str]:
+    """The columns of these names or patterns, each once, by patterns none of `named`; what matches none stays, to be refused."""
     if isinstance(names, str):
         return names
-    free = [name for name in there if name not in others]
-    found = ([name] if name in there else fnmatch.filter(free, name) or [name] for name in names)
-    return [*dict.fromkeys(chain.from_iterable(found))]
+    free = [name for name in there if name not in named]
+    matches = ([name] if name in there else fnmatch.filter(free, name) or [name] for name in names)
+    return [*dict.fromkeys(chain.from_iterable(matches))]
 
 
 def _column(column: Any, name: str, place: str) -> NDArray[Any]:

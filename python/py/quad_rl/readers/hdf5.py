@@ -41,7 +41,7 @@ def _elsewhere(h5py: Any, group: Any, seen: set[int]) -> str | None:
                 return str(one.name)
         elif isinstance(one, h5py.Group) and (address := h5py.h5o.get_info(one.id).addr) not in seen:
             seen.add(address)
-            found = _elsewhere(h5py, one, seen)
-            if found is not None:
-                return found
+            elsewhere = _elsewhere(h5py, one, seen)
+            if elsewhere is not None:
+                return elsewhere
     return None

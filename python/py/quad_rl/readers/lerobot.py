@@ -73,7 +73,7 @@ def from_lerobot(
     plain = [name for name, stream in streams.items() if stream["dtype"] not in ("image", "video", "string", "language")]
     wanted = {_REWARD, _SUCCESS, _DONE, _TERMINATED, _TRUNCATED, "task_index", *_INDEX, *(plain if words is None else words)}
     columns, unreadable = _frames(root, [name for name in plain if name in wanted])
-    parts = _of_task(root, _whole(root, columns, info, unreadable, notes), task, notes)
+    parts = _with_task(root, _whole(root, columns, info, unreadable, notes), task, notes)
     if features:
         _encode(root, parts, info, features)
     ends = [name for name in (_DONE, _TERMINATED, _TRUNCATED) if name in columns]
@@ -156,9 +156,9 @@ def _whole(
         rows = {row["episode_index"]: row for row in _meta(root, "episodes")}
     except (library("pyarrow", "lerobot").ArrowInvalid, OSError):
         rows = {}
-    of, frame = (columns[name].reshape(-1) for name in _INDEX)
-    order = np.lexsort((frame, of))
-    numbers, first = np.unique(of[order], return_index=True)
+    episode, frame = (columns[name].reshape(-1) for name in _INDEX)
+    order = np.lexsort((frame, episode))
+    numbers, first = np.unique(episode[order], return_index=True)
     parts = zip(*(np.split(array[order], first[1:]) for array in columns.values()))
     there = {int(number): dict(zip(columns, part)) for number, part in zip(numbers, parts)}
     kept, longer, total = {}, [], max(int(info.get("total_episodes", 0)), len(there))
@@ -192,16 +192,16 @@ def _whole(
     return kept
 
 
-def _of_task(root: Path, parts: dict[int, Columns], task: str | None, notes: list[str]) -> dict[int, Columns]:
+def _with_task(root: Path, parts: dict[int, Columns], task: str | None, notes: list[str]) -> dict[int, Columns]:
     """The episodes of which all frames are of the task."""
-    of = {number: tuple(np.unique(part["task_index"]).tolist()) if "task_index" in part else (0,) for number, part in parts.items()}
-    counts = Counter(of[number] for number in sorted(of, key=lambda number: of[number]))
-    several = [number for number, indices in of.items() if len(indices) > 1]
+    tasks = {number: tuple(np.unique(part["task_index"]).tolist()) if "task_index" in part else (0,) for number, part in parts.items()}
+    counts = Counter(tasks[number] for number in sorted(tasks, key=lambda number: tasks[number]))
+    several = [number for number, indices in tasks.items() if len(indices) > 1]
     if task == "all" or (task is None and len(counts) < 2 and not several):
         return parts
     # The other column of v3's is pandas's index, under any name.
     texts = {row["task_index"]: next(row[name] for name in row if name != "task_index") for row in _meta(root, "tasks")}
-    chosen = [number for number, indices in of.items() if len(indices) == 1 and texts.get(indices[0]) == task]
+    chosen = [number for number, indices in tasks.items() if len(indices) == 1 and texts.get(indices[0]) == task]
     if not chosen:
         told = ", ".join(f"{' and '.join(repr(texts.get(index, index)) for index in indices)} "
                          f"({count} episodes{', each of several' if len(indices) > 1 else ''})" for indices, count in counts.items())
@@ -210,8 +210,8 @@ def _of_task(root: Path, parts: dict[int, Columns], task: str | None, notes: lis
     if several:
         some = ", ".join(map(str, several[:5])) + (", …" if len(several) > 5 else "")
         notes.append(f"{len(several)} of {len(parts)} episodes dropped: their frames are of several tasks (episode {some})")
-    others = len(parts) - len(several) - len(chosen)
-    notes.append(f"{others} of {len(parts)} episodes dropped: of another task than {task!r}")
+    rest = len(parts) - len(several) - len(chosen)
+    notes.append(f"{rest} of {len(parts)} episodes dropped: of another task than {task!r}")
     return {number: parts[number] for number in chosen}
 
 

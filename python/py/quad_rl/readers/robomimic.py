@@ -119,7 +119,7 @@ def _check_following(where: str, key: str, seen: NDArray[Any], after: NDArray[An
 
 def _pays(columns: list[dict[str, NDArray[Any]]], reward: Rule) -> bool:
     """True if `dones` are set, and only where there is a reward."""
-    if not isinstance(reward, str) or not all(reward in of for of in columns):
+    if not isinstance(reward, str) or not all(reward in demonstration for demonstration in columns):
         return False
-    flags: NDArray[Any] = np.concatenate([of[_DONE].reshape(-1) > 0 for of in columns])
-    return bool(flags.any()) and bool((np.concatenate([of[reward].reshape(-1) for of in columns])[flags] > 0).all())
+    flags: NDArray[Any] = np.concatenate([demonstration[_DONE].reshape(-1) > 0 for demonstration in columns])
+    return bool(flags.any()) and bool((np.concatenate([demonstration[reward].reshape(-1) for demonstration in columns])[flags] > 0).all())
