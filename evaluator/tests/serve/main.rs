@@ -10,7 +10,7 @@ use quad_policy::{Precision, load_policy};
 use quad_protocol::{EpisodeScore, Job, ScoreReport, encode, keys};
 use zenoh::qos::CongestionControl;
 
-use learner::{Behavior, Event, Learner, file, job, name, reports};
+use learner::{Behavior, Event, Learner, file, in_order, job, name};
 
 /// The scores that `job` must have, to the last bit.
 fn expected(job: &Job) -> Vec<EpisodeScore> {
@@ -48,70 +48,35 @@ async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
         assert_eq!(learner.wait_for_scores(1).await, expected);
         let requests = learner.count(|event| *event == Event::Weights);
         assert_eq!(requests, usize::from(!published));
-        assert!(evaluator.leave().success());
+        drop(evaluator);
         assert_eq!(learner.count(Event::is_handed_back), 0);
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_claim_without_an_answer_is_repeated() {
-    let learner = Learner::start(file(), Behavior::IgnoresClaims).await;
-    let (_evaluator, _token) = learner.evaluator().await;
-    let claims = |events: &[Event]| -> Vec<u64> {
-        let number = |event: &Event| match event {
-            Event::Claim(number) => Some(*number),
-            _ => None,
-        };
-        events.iter().filter_map(number).collect()
-    };
-    let three = |events: &[Event]| Some(claims(events)).filter(|claims| claims.len() >= 3);
-    let first = learner.wait_for(three).await;
-    let is_other = |number: &u64| *number != first[0];
-    assert!(!first.iter().any(is_other), "{first:?}");
-    learner.behave(Behavior::Records);
-    learner.wait_for(|events| claims(events).into_iter().find(is_other)).await;
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn scores_are_sent_until_the_learner_has_saved_them() {
-    let (learner, _evaluator, _token) = Learner::with_job(file(), Behavior::DiskFull).await;
-    let report = learner.wait_for_scores(3).await;
-    learner.behave(Behavior::Records);
-    let claims = |events: &[Event]| matches!(events.last(), Some(Event::Claim(_))).then_some(());
-    learner.wait_for(claims).await;
-    let events = learner.events();
-    assert!(reports(&events).len() > 3 && reports(&events).iter().all(|again| *again == report));
-    let first = events.iter().position(Event::is_scores).unwrap();
-    let last = events.iter().rposition(Event::is_scores).unwrap();
-    let deliveries = &events[first..last];
-    // Nothing is claimed meanwhile.
-    assert!(deliveries.iter().all(Event::is_scores), "{events:?}");
-}
-
-#[tokio::test(flavor = "multi_thread")]
 async fn a_leaving_evaluator_hands_its_job_back_unless_its_scores_may_be_saved() {
-    for (behavior, hands_back) in [(Behavior::DiskFull, false), (Behavior::Silent, true)] {
-        let (learner, evaluator, _token) = Learner::with_job(file(), behavior).await;
+    in_order(async || {
+        let (learner, evaluator, _token) = Learner::with_job(file(), Behavior::DiskFull).await;
         learner.wait_for_scores(1).await;
-        assert!(evaluator.leave().success());
-        if hands_back {
+        let in_order = evaluator.leave();
+        assert_eq!(learner.count(Event::is_handed_back), 0);
+        in_order
+    })
+    .await;
+    for behavior in [Behavior::Silent, Behavior::Hangs] {
+        in_order(async || {
+            let (learner, evaluator, _token) = Learner::with_job(file(), behavior).await;
+            learner.wait_for_scores(1).await;
+            if !evaluator.leave() {
+                return false;
+            }
             // On a busy machine it arrives only after the evaluator has gone.
-            learner.wait_for_hand_back().await;
-        }
-        let returned = learner.count(Event::is_handed_back);
-        assert_eq!(returned, usize::from(hands_back));
-        assert!(learner.count(Event::is_scores) > 1, "they are sent again");
+            learner.behave(Behavior::Silent);
+            assert_eq!(learner.wait_for_hand_back().await, None);
+            true
+        })
+        .await;
     }
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
-    let (learner, evaluator, _token) = Learner::with_job(file(), Behavior::Hangs).await;
-    learner.wait_for_scores(1).await;
-    assert!(evaluator.leave().success());
-    // The learner has not answered the scores, so it finds the job handed back.
-    learner.behave(Behavior::Silent);
-    assert_eq!(learner.wait_for_hand_back().await, None);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -138,40 +103,4 @@ async fn a_job_whose_scores_are_refused_is_handed_back() {
     assert_eq!(reason.unwrap(), "it refused the scores: the sums differ");
     // They are not sent again.
     assert_eq!(learner.count(Event::is_scores), 1);
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn scores_that_come_too_early_are_delivered_again_and_hold_up_no_job() {
-    let (learner, _evaluator, _token) = Learner::with_job(file(), Behavior::IsEarlier).await;
-    let again = learner.wait_for_scores(2).await;
-    assert_eq!(reports(&learner.events())[0], again);
-    // They go before a job of the same evaluation, but not before others.
-    learner.give(Job { id: 3, ..job(&learner.snapshot) });
-    assert_eq!(learner.wait_for_hand_back().await, None);
-    learner.give(Job { id: 2, step: 20, seeds: vec![21], ..job(&learner.snapshot) });
-    let has = |events: &[Event], step| reports(events).iter().any(|report| report.step == step);
-    learner.wait_for(|events| has(events, 20).then_some(())).await;
-    let before = learner.events().len();
-    learner.behave(Behavior::Records);
-    let both = |events: &[Event]| [10, 20].iter().all(|step| has(&events[before..], *step));
-    learner.wait_for(|events| both(events).then_some(())).await;
-    assert_eq!(learner.count(Event::is_handed_back), 1);
-    assert!(reports(&learner.events()).iter().all(|report| report.job != 3));
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_job_is_handed_back_until_the_learner_answers_and_nothing_is_claimed_before() {
-    let learner = Learner::start(b"no tensors".to_vec(), Behavior::LosesHandBack).await;
-    let (_evaluator, _token) = learner.evaluator().await;
-    learner.give(job(&learner.snapshot));
-    let claims_again = |events: &[Event]| {
-        let first = events.iter().position(Event::is_handed_back)?;
-        matches!(events.last()?, Event::Claim(_)).then_some(first)
-    };
-    let first = learner.wait_for(claims_again).await;
-    let events = learner.events();
-    let last = events.iter().rposition(Event::is_handed_back).unwrap();
-    assert!(first < last, "it is handed back twice: {events:?}");
-    let is_claim = |event: &Event| matches!(event, Event::Claim(_));
-    assert!(!events[first..last].iter().any(is_claim), "{events:?}");
 }
