@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs what is missing, builds, and runs all tests but the long ones (CONTRIBUTING.md). No test is skipped because a peer
+# Installs what is missing, builds, and runs all tests. No test is skipped because a peer
 # (Gymnasium, Prometheus, …) is missing; tests that need mounts or recorded files say when they skip. Arguments go to `cargo test`.
 set -euo pipefail
 cd "$(dirname "$0")/.."

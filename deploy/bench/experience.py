@@ -5,7 +5,7 @@
 
 The learner's rows per second, in the same setting:
 
-    cargo test --release -p quad-tests --test service -- --ignored --nocapture experience_arrives
+    cargo run --release -p quad-tests --example load -- 8 online
 """
 
 import multiprocessing

@@ -3,34 +3,29 @@
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
-use std::time::Duration;
 
 use crate::eventually;
 
-/// Path of a file that cargo built.
+/// Path of a program, or another file, that cargo built.
 pub fn built(path: &str) -> PathBuf {
     let test = std::env::current_exe().expect("a test knows its own executable");
     // target/release/deps/test-123 → target/release/name
-    test.parent().and_then(Path::parent).expect("a test lies two folders below target/").join(path)
-}
-
-pub fn binary(name: &str) -> PathBuf {
-    let path = built(name);
-    assert!(path.exists(), "{path:?} is missing; cargo build --release --bins makes it");
+    let folder = test.parent().and_then(Path::parent).expect("a test lies below target/");
+    let path = folder.join(path);
+    assert!(path.exists(), "{path:?} is missing; cargo build --release --bins --examples makes it");
     path
 }
 
 /// Command line prefix that preloads an example of this crate.
 pub fn preload(example: &str) -> Vec<String> {
     let library = built(&format!("examples/lib{example}.so"));
-    assert!(library.exists(), "{library:?} is missing; cargo build --release --examples makes it");
     vec!["env".to_owned(), format!("LD_PRELOAD={}", library.display())]
 }
 
 /// One of our programs with its arguments, none of which has a space in it.
 pub fn command(line: &str) -> Command {
     let mut words = line.split_whitespace();
-    let mut command = Command::new(binary(words.next().expect("a program")));
+    let mut command = Command::new(built(words.next().expect("a program")));
     command.args(words);
     command
 }
@@ -47,13 +42,12 @@ pub fn stdout(output: &Output) -> String {
     text
 }
 
-/// Asserts exit code 1, and `sentence` in the error and `hint` in its hint.
+/// Asserts exit code 1, `sentence` in the error, and `hint` in its hint.
 pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
     let text = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");
-    let advice = text.split_once("hint: ").map(|(_, advice)| advice).unwrap_or_default();
-    assert!(text.contains(sentence), "`{sentence}` is not in\n{text}");
-    assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
+    let (error, advice) = text.split_once("hint: ").unwrap_or((&text, ""));
+    let is_told = error.contains(sentence) && advice.contains(hint);
+    assert!(output.status.code() == Some(1) && is_told, "not {sentence:?}, hint {hint:?}: {text}");
 }
 
 /// Sends a signal by its name, e.g. `TERM` or `KILL`, to a process.
@@ -65,62 +59,54 @@ pub fn signal(signal: &str, process: u32) {
 }
 
 /// The processes that a process has started.
-pub fn children(of: u32) -> Vec<u32> {
-    let list = fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
-    list.split_whitespace().map(|id| id.parse().unwrap()).collect()
+pub fn children(parent: u32) -> Vec<u32> {
+    let list = fs::read_to_string(format!("/proc/{parent}/task/{parent}/children"));
+    list.unwrap_or_default().split_whitespace().map(|id| id.parse().unwrap()).collect()
 }
 
-/// A running program, killed when dropped. A failing test prints the ends of its output.
+/// A running program, killed when dropped. A failing test prints the end of its output.
 pub struct Process {
     name: String,
     child: Child,
     log: PathBuf,
-    out: PathBuf,
 }
 
 impl Process {
-    /// Starts `command` with its output in `folder`, in files called after `name`.
+    /// Starts `command` with all its output in `folder`, in a file called after `name`.
     pub fn start(name: &str, folder: &Path, mut command: Command) -> Process {
-        let (log, out) = (folder.join(format!("{name}.log")), folder.join(format!("{name}.out")));
-        let file = |path: &Path| File::create(path).expect("the scratch folder is writable");
-        command.stdin(Stdio::null()).stdout(file(&out)).stderr(file(&log));
-        let child =
-            command.spawn().unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"));
-        Process { name: name.to_owned(), child, log, out }
+        let log = folder.join(format!("{name}.log"));
+        let file = File::create(&log).expect("the scratch folder is writable");
+        command.stdin(Stdio::null()).stdout(file.try_clone().unwrap()).stderr(file);
+        let child = command.spawn();
+        let child = child.unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"));
+        Process { name: name.to_owned(), child, log }
     }
 
     pub fn log(&self) -> String {
         fs::read_to_string(&self.log).unwrap_or_default()
     }
 
-    pub fn out(&self) -> String {
-        fs::read_to_string(&self.out).unwrap_or_default()
-    }
-
     /// Waits for a line in its log that contains `text`, and gives the line.
-    pub fn wait_for_log(&self, text: &str, patience: Duration) -> String {
-        let what = format!("{:?} in the log of {}", text, self.name);
-        eventually(&what, patience, || {
+    pub fn wait_for_log(&self, text: &str) -> String {
+        eventually(&format!("{text:?} in the log of {}", self.name), || {
             self.log().lines().find(|line| line.contains(text)).map(str::to_owned)
         })
     }
 
-    /// Asserts that its log has `text`.
+    /// The address `host:port` that a line of its log has before `end`.
+    pub fn wait_for_address(&self, end: &str) -> String {
+        let line = self.wait_for_log(end);
+        let (before, _) = line.split_once(end).expect("the line has it");
+        let start = before.rfind(['/', ' ', '=', '"']).map_or(0, |place| place + 1);
+        before[start..].to_owned()
+    }
+
     pub fn assert_said(&self, text: &str) {
-        let log = self.log();
-        assert!(log.contains(text), "`{text}` is not in the log of {}:\n{log}", self.name);
+        assert!(self.log().contains(text), "{} did not say {text:?}", self.name);
     }
 
-    /// Asserts that its log does not have `text`.
     pub fn assert_not_said(&self, text: &str) {
-        let log = self.log();
-        assert!(!log.contains(text), "`{text}` is in the log of {}:\n{log}", self.name);
-    }
-
-    /// Waits for its end with this exit code.
-    pub fn assert_ends(&mut self, code: i32, patience: Duration) {
-        let status = self.wait(patience);
-        assert_eq!(status.code(), Some(code), "{} ended with {status}:\n{}", self.name, self.log());
+        assert!(!self.log().contains(text), "{} said {text:?}", self.name);
     }
 
     pub fn signal(&self, signal: &str) {
@@ -131,13 +117,12 @@ impl Process {
         self.child.id()
     }
 
-    /// The most memory that it has had, bytes; nothing if it has ended.
-    pub fn peak_memory(&self) -> Option<u64> {
-        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).ok()?;
-        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-        let kilobytes =
-            line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number of kilobytes");
-        Some(kilobytes << 10)
+    /// The most memory that it has had, bytes.
+    pub fn peak_memory(&self) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.id())).unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        let kilobytes = line.expect("it runs").trim().trim_end_matches(" kB");
+        kilobytes.parse::<u64>().unwrap() << 10
     }
 
     pub fn kill(&mut self) {
@@ -146,23 +131,19 @@ impl Process {
     }
 
     pub fn is_running(&mut self) -> bool {
-        self.child.try_wait().expect("a child can be waited for").is_none()
+        matches!(self.child.try_wait(), Ok(None))
     }
 
-    pub fn wait(&mut self, patience: Duration) -> ExitStatus {
-        let what = format!("{} ended", self.name);
-        eventually(&what, patience, || self.child.try_wait().expect("a child can be waited for"))
+    pub fn wait(&mut self) -> ExitStatus {
+        eventually(&format!("{} ended", self.name), || {
+            self.child.try_wait().expect("a child can be waited for")
+        })
     }
 
-    pub fn assert_succeeds(&mut self, patience: Duration) {
-        let status = self.wait(patience);
-        assert!(status.success(), "{} ended with {status}", self.name);
-    }
-
-    /// Sends SIGTERM and waits for the end, which a program's own time limit may bring about.
-    pub fn terminate(&mut self, patience: Duration) -> ExitStatus {
-        self.signal("TERM");
-        self.wait(patience)
+    /// Waits for its end with this exit code.
+    pub fn assert_ends(&mut self, code: i32) {
+        let status = self.wait();
+        assert_eq!(status.code(), Some(code), "{} ended with {status}", self.name);
     }
 }
 
@@ -171,11 +152,10 @@ impl Drop for Process {
         self.child.kill().ok();
         self.child.wait().ok();
         if std::thread::panicking() {
-            for (kind, text) in [("stderr", self.log()), ("stdout", self.out())] {
-                let lines: Vec<_> = text.lines().collect();
-                let end = lines[lines.len().saturating_sub(40)..].join("\n");
-                eprintln!("--- the end of {}'s {kind}\n{end}", self.name);
-            }
+            let log = self.log();
+            let lines = Vec::from_iter(log.lines());
+            let end = lines[lines.len().saturating_sub(40)..].join("\n");
+            eprintln!("--- the end of what {} said\n{end}", self.name);
         }
     }
 }

@@ -9,7 +9,6 @@ pub struct Setting {
     /// N_a: what makes an evaluator's job long or short.
     pub candidates: u32,
     pub hidden: u32,
-    pub seed: u64,
     /// Online environment steps that follow `steps`; 0 without any.
     pub online_steps: u64,
 }
@@ -21,7 +20,6 @@ pub const SHORT: Setting = Setting {
     episodes: 6,
     candidates: 2,
     hidden: 16,
-    seed: 1,
     online_steps: 0,
 };
 /// A run that is still training when its test is over. The disk keeps up with its snapshots: a
@@ -31,15 +29,8 @@ pub const ENDLESS: Setting = Setting { steps: 100_000_000, eval_interval: 2000, 
 pub const IDLE: Setting = Setting { eval_interval: 50_000_000, ..ENDLESS };
 
 impl Setting {
-    pub fn evaluated_steps(&self) -> Vec<u64> {
-        (1..=self.steps)
-            .filter(|step| step % self.eval_interval == 0 || *step == self.steps)
-            .collect()
-    }
-
     pub fn to_toml(self) -> String {
-        let Setting { steps, eval_interval, episodes, candidates, hidden, seed, online_steps } =
-            self;
+        let Setting { steps, eval_interval, episodes, candidates, hidden, online_steps } = self;
         let online = match online_steps {
             0 => String::new(),
             steps => format!(
@@ -51,7 +42,7 @@ impl Setting {
 steps = {steps}
 eval_interval = {eval_interval}
 episodes = {episodes}
-seed = {seed}
+seed = 1
 batch_size = 16
 
 [agent]

@@ -1,75 +1,45 @@
-//! A full disk delays what is kept, and ends neither the training nor what was kept before.
+//! A full or hanging disk delays what is kept, and ends neither the training nor what was kept
+//! before; a power cut leaves what was promised to be on the disk.
 
 use std::fs;
-use std::path::PathBuf;
-use std::sync::{Arc, Mutex};
+use std::thread::sleep;
+use std::time::Duration;
 
-use quad_protocol::{Snapshot, decode, keys};
+use quad_protocol::Hash;
+use quad_run::folder::RunDir;
+use quad_runtime::open_router;
+use quad_tests::disk::{LosingDisk, SmallDisk, hanging};
 use quad_tests::learner::Learner;
-use quad_tests::made_up::{client, name};
 use quad_tests::setting::{SHORT, Setting};
-use quad_tests::small_disk::SmallDisk;
 use quad_tests::system::Scratch;
-use quad_tests::{PATIENCE, eventually, http};
-use zenoh::Session;
+use quad_tests::{http, wait_until};
 
-/// Seconds of training, also where a step takes 50 µs: things happen in the middle of it.
 pub const SETTING: Setting =
     Setting { steps: 40_000, eval_interval: 5_000, episodes: 4, hidden: 32, ..SHORT };
 pub const LISTEN: [&str; 4] = ["--listen", "tcp/127.0.0.1:0", "--checkpoint-seconds", "0"];
 
-/// The steps of the snapshots that are published from now on, and whether each was on the disk by
-/// then.
-async fn watch(learner: &Learner) -> (Session, Arc<Mutex<Vec<(u64, bool)>>>) {
-    let session = client(&learner.endpoint()).await;
-    let published = Arc::new(Mutex::new(Vec::new()));
-    let (heard, folder) = (published.clone(), learner.run_dir.clone());
-    let listener = move |sample: zenoh::sample::Sample| {
-        let snapshot: Snapshot = decode(&sample.payload().to_bytes()).unwrap();
-        let path: PathBuf = folder.join(format!("snapshots/step_{:09}.safetensors", snapshot.step));
-        let kept = fs::read(path).is_ok_and(|bytes| bytes == snapshot.file);
-        heard.lock().unwrap().push((snapshot.step, kept));
-    };
-    let weights = keys::weights(&name("run"));
-    session.declare_subscriber(weights).callback(listener).background().await.unwrap();
-    (session, published)
-}
-
 fn assert_unwell(learner: &Learner, reason: &str) {
-    eventually(reason, PATIENCE, || {
-        let (status, health) = http::get(&learner.metrics(), "/healthz")?;
-        (status == 503 && health.contains(reason)).then_some(())
+    learner.process.wait_for_log("No space left on device");
+    wait_until(reason, || {
+        let health = http::get(&learner.metrics(), "/healthz");
+        health.is_some_and(|(status, text)| status == 503 && text.contains(reason))
     });
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn a_full_disk_delays_snapshots_scores_and_checkpoints_until_there_is_room() {
+#[test]
+fn a_full_disk_delays_snapshots_and_checkpoints_until_there_is_room() {
     let scratch = Scratch::new();
-    let Some(disk) = SmallDisk::mount(&scratch.path().join("run"), 6) else { return };
-    // Long enough for the disk to be full in the middle of it.
+    // The run itself fills it.
+    let Some(disk) = SmallDisk::mount(&scratch.path().join("run"), 1) else { return };
     let setting = Setting { hidden: 64, ..SETTING };
     let mut learner = scratch.learner_with("run", setting, &LISTEN);
-    let (_session, published) = watch(&learner).await;
     let _evaluator = scratch.evaluator("one", &learner.endpoint());
-    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
-    disk.fill();
-    learner.wait_for_metric("disk_trouble", "", |trouble| trouble > 0.0);
-    let steps = learner.metric("gradient_steps_total", "").unwrap();
-    learner.process.wait_for_log("No space left on device", PATIENCE);
     assert_unwell(&learner, "the run cannot be saved");
-    // By now, snapshots have been due as well.
-    let later = (steps + 2.0 * setting.eval_interval as f64).min(setting.steps as f64);
-    learner.wait_for_metric("gradient_steps_total", "", |now| now >= later);
-    let counted = learner.metric("scores_recorded_total", "").unwrap();
-    let kept = learner.scores().len();
-    assert!(kept as f64 >= counted, "{counted} scores count as kept, {kept} are on the disk");
-
-    disk.clear();
-    learner.process.wait_for_log("the run can be saved again", PATIENCE);
-    learner.assert_completes(PATIENCE);
-    let published = published.lock().unwrap();
-    let are_kept = published.len() > 2 && published.iter().all(|(_, kept)| *kept);
-    assert!(are_kept, "published before written: {published:?}");
+    let is_last = |steps| steps == setting.steps as f64;
+    learner.wait_for_metric("gradient_steps_total", "", is_last);
+    disk.grow();
+    learner.process.wait_for_log("the run can be saved again");
+    learner.assert_completes();
 }
 
 #[test]
@@ -78,19 +48,83 @@ fn scores_wait_for_a_full_disk() {
     let Some(disk) = SmallDisk::mount(&scratch.path().join("run"), 6) else { return };
     let setting = Setting { steps: 500, eval_interval: 250, ..SETTING };
     let mut learner = scratch.learner_with("run", setting, &LISTEN);
-    learner.process.wait_for_log("waiting for the scores", PATIENCE);
+    learner.process.wait_for_log("waiting for the scores");
     disk.fill();
     let evaluator = scratch.evaluator("one", &learner.endpoint());
-    learner.wait_for_metric("disk_trouble", "scores", |trouble| trouble == 1.0);
-    learner.process.wait_for_log("results cannot be saved", PATIENCE);
+    let page = evaluator.wait_for_address("/metrics");
     assert_unwell(&learner, "results cannot be saved");
-    evaluator.process.wait_for_log("No space left on device", PATIENCE);
+    evaluator.wait_for_log("No space left on device");
     assert!(learner.scores().is_empty());
-
-    disk.clear();
-    learner.process.wait_for_log("results can be saved again", PATIENCE);
-    learner.assert_completes(PATIENCE);
-    let page = http::metrics(&evaluator.metrics()).unwrap();
-    let measured = http::sum(&page, "quad_evaluator_episodes_total", "");
+    disk.grow();
+    learner.assert_completes();
+    let measured = http::sum(&http::metrics(&page).unwrap(), "quad_evaluator_episodes_total", "");
     assert_eq!(measured, 8.0, "nothing is measured twice");
+}
+
+#[test]
+fn a_hanging_disk_blocks_neither_training_nor_exit() {
+    let scratch = Scratch::new();
+    let next = 2 * SETTING.eval_interval;
+    let snapshot = RunDir::at(&scratch.path().join("run")).snapshot_path(next);
+    for signals in [1, 2] {
+        let launcher = hanging(&snapshot);
+        let mut learner = scratch.learner_through(&launcher, "run", SETTING, &LISTEN);
+        let is_last = |steps| steps == SETTING.steps as f64;
+        learner.wait_for_metric("gradient_steps_total", "", is_last);
+        learner.process.signal("TERM");
+        if signals == 2 {
+            // Sooner, the second would count as the first.
+            sleep(Duration::from_secs(1));
+            learner.process.signal("TERM");
+        }
+        let code = learner.process.wait().code();
+        // A busy machine may notice the second after the time limit of the first.
+        let is_second = learner.process.log().contains("ending at once");
+        assert_eq!(code, Some(if is_second { 130 } else { 75 }), "{}", learner.process.log());
+        assert!(!snapshot.exists(), "the disk did not hang");
+    }
+    let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+    let _evaluator = scratch.evaluator("one", &learner.endpoint());
+    learner.assert_completes();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn power_cuts_lose_nothing_acknowledged() {
+    let scratch = Scratch::new();
+    let Some(mut disk) = LosingDisk::mount(&scratch.path().join("disk")) else { return };
+    let (_router, endpoint) = open_router().await.unwrap();
+    let _evaluators = ["one", "two"].map(|name| scratch.evaluator(name, &endpoint));
+    let flags = ["--connect", &endpoint, "--checkpoint-seconds", "0"];
+    // The folder above the run's is not there at first.
+    let start = || scratch.learner_with("disk/runs/run", SETTING, &flags);
+    let mut kept = 0;
+    for _ in 0..3 {
+        let mut learner = start();
+        let mut acknowledged = 0.0;
+        wait_until("scores are acknowledged", || {
+            acknowledged = learner.metric("scores_recorded_total", "").unwrap_or(acknowledged);
+            acknowledged > 0.0 || !learner.process.is_running()
+        });
+        learner.process.kill();
+        disk.cut_power();
+        let scores = learner.scores();
+        assert!(scores.len() >= kept + acknowledged as usize, "an acknowledged score is lost");
+        kept = scores.len();
+        for score in scores {
+            let snapshot = fs::read(learner.snapshot(score.step)).unwrap_or_default();
+            let hash = Hash::new(&snapshot).to_string();
+            assert_eq!(hash, score.weights, "the snapshot of step {} is lost", score.step);
+        }
+        learner.process.assert_not_said("is damaged");
+    }
+    let mut learner = start();
+    learner.assert_completes();
+    let mut calm = scratch.learner("calm", SETTING);
+    let _evaluator = scratch.evaluator("three", &calm.endpoint());
+    calm.assert_completes();
+    learner.assert_same_as(&calm);
+    // A run that is complete is so at once.
+    let mut again = start();
+    again.process.assert_ends(0);
+    again.process.assert_said("mean score of the last 3 evaluations");
 }

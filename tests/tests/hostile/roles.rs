@@ -1,204 +1,157 @@
 //! Rights of each role: at the router as it is shipped, and at a learner that listens itself.
 
-use std::time::{Duration, Instant};
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
-use quad_tests::certificates::{Certificates, come_in};
+use quad_tests::certificates::{Certificates, connect};
+use quad_tests::made_up::put;
 use quad_tests::router::protected_router;
-use quad_tests::setting::ENDLESS;
+use quad_tests::setting::IDLE;
 use quad_tests::system::Scratch;
-use quad_tests::{PATIENCE, eventually};
-use tokio::time::{sleep, timeout};
-use zenoh::Session;
-use zenoh::handlers::FifoChannelHandler;
-use zenoh::pubsub::Subscriber;
-use zenoh::qos::CongestionControl;
+use quad_tests::wait_until;
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::Sample;
+use zenoh::{Session, Wait};
 
 use crate::access::HOST;
 
-/// For what must not happen.
+/// Time for an answer that must not come; one that must is asked for again.
 const LULL: Duration = Duration::from_millis(500);
-/// A message that only shows whether messages arrive.
-const PROBE: &str = "probe";
 
-/// Sessions with the certificates of those roles at the shipped router, which stays as long as the
-/// first part.
-async fn at_the_router<const N: usize>(roles: [&str; N]) -> Option<(impl Sized, [Session; N])> {
-    let certificates = Certificates::make()?;
-    let (router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
-    let mut sessions = Vec::new();
-    for role in roles {
-        sessions.push(come_in(&endpoint, &certificates.of("router"), &certificates.of(role)).await);
-    }
-    Some(((router, certificates), sessions.try_into().unwrap()))
+/// What a subscriber has heard: a key, then words.
+type Heard = Arc<Mutex<BTreeSet<String>>>;
+
+/// A listener's memory, and what is to be called with each sample.
+fn memory() -> (Heard, impl Fn(Sample) + Send + Sync + 'static) {
+    let heard = Heard::default();
+    let list = heard.clone();
+    let hear = move |sample: Sample| {
+        let words = String::from_utf8_lossy(&sample.payload().to_bytes()).into_owned();
+        list.lock().unwrap().insert(format!("{} {words}", sample.key_expr()));
+    };
+    (heard, hear)
 }
 
-/// The key that arrives next.
-async fn next(samples: &Subscriber<FifoChannelHandler<Sample>>) -> String {
-    loop {
-        let sample = timeout(PATIENCE, samples.recv_async()).await;
-        let sample = sample.expect("nothing arrives").unwrap();
-        if *sample.payload().to_bytes() != *PROBE.as_bytes() {
-            return sample.key_expr().to_string();
-        }
-    }
+async fn listen(session: &Session, key: &str) -> Heard {
+    let (heard, hear) = memory();
+    session.declare_subscriber(key).callback(hear).background().await.unwrap();
+    heard
 }
 
-/// Sends once, where a busy machine would else drop it.
-async fn put(session: &Session, key: &str) {
-    session.put(key, "words").congestion_control(CongestionControl::Block).await.unwrap();
+/// The keys of those words.
+fn keys(heard: &Heard, words: &str) -> Vec<String> {
+    let heard = heard.lock().unwrap();
+    heard.iter().filter_map(|line| line.strip_suffix(words)).map(str::to_owned).collect()
 }
 
-/// Sends until it arrives: before, the router does not know of those who listen.
-async fn reach(from: &Session, key: &str, samples: &Subscriber<FifoChannelHandler<Sample>>) {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        from.put(key, PROBE).await.unwrap();
-        match samples.recv_timeout(LULL).unwrap() {
-            Some(sample) if sample.key_expr().as_str() == key => return,
-            _ => assert!(Instant::now() < deadline, "{key} does not arrive"),
-        }
+/// Puts words on every kind of key.
+async fn say_everything(session: &Session, words: &str) {
+    let keys = "weights weights/1 progress/e jobs scores live/learner * **";
+    for key in keys.split(' ').map(|key| format!("quad/run/{key}")) {
+        put(session, &key, words.as_bytes()).await;
     }
+    put(session, "quad/run/progress/large", &[b'w'; 5000]).await;
 }
 
-/// The keys that arrive until `last` does.
-async fn until(samples: &Subscriber<FifoChannelHandler<Sample>>, last: &str) -> Vec<String> {
-    let mut keys = Vec::new();
-    while keys.last().map(String::as_str) != Some(last) {
-        keys.push(next(samples).await);
-    }
-    keys
+/// Puts until it arrives: before, the router does not know of those who listen.
+fn reach(session: &Session, key: &str, heard: &Heard) {
+    wait_until(key, || {
+        session.put(key, "probe").wait().unwrap();
+        keys(heard, " probe").contains(&key.to_owned())
+    });
 }
 
 /// Answers every question.
 async fn answer(session: &Session, key: &str) -> Queryable<()> {
-    let callback = |query: Query| {
-        zenoh::Wait::wait(query.reply(query.key_expr().clone(), "an answer")).ok();
-    };
-    session.declare_queryable(key).callback(callback).await.unwrap()
+    let reply = |query: Query| _ = query.reply(query.key_expr().clone(), "an answer").wait();
+    session.declare_queryable(key).callback(reply).await.unwrap()
 }
 
 /// Number of answers.
-async fn answers(session: &Session, key: &str) -> usize {
-    let replies = session.get(key).timeout(LULL).await.unwrap();
-    let mut count = 0;
-    while let Ok(reply) = replies.recv_async().await {
-        count += usize::from(reply.result().is_ok());
-    }
-    count
+fn answers(session: &Session, key: &str) -> usize {
+    let replies = session.get(key).timeout(LULL).wait().unwrap();
+    replies.into_iter().filter(|reply| reply.result().is_ok()).count()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn only_learners_publish_weights_and_only_evaluators_report_progress() {
-    let roles = ["learner", "evaluator", "monitor", "monitor", "evaluator"];
-    let Some((_router, sessions)) = at_the_router(roles).await else { return };
-    let [learner, evaluator, monitor, listener, receiver] = sessions;
-    let heard = listener.declare_subscriber("quad/run/**").await.unwrap();
-    let weights = receiver.declare_subscriber("quad/run/weights").await.unwrap();
-    let spied = receiver.declare_subscriber("quad/run/progress/*").await.unwrap();
-    reach(&evaluator, "quad/run/progress/e", &heard).await;
-    for samples in [&heard, &weights] {
-        reach(&learner, "quad/run/weights", samples).await;
-    }
-    // A session hears itself whatever it may do, so listener and receiver put nothing.
-    for key in ["progress/e", "jobs", "scores", "weights/1", "live/learner", "*", "**", "weights"] {
-        for session in [&monitor, &evaluator, &learner] {
-            put(session, &format!("quad/run/{key}")).await;
-        }
-    }
-    evaluator.put("quad/run/progress/e", vec![0; 5000]).await.unwrap();
-    // A router may limit how many are passed on in a second.
-    sleep(LULL).await;
-    put(&evaluator, "quad/run/progress/last").await;
-    let mut keys = until(&heard, "quad/run/progress/last").await;
-    while !keys.iter().any(|key| key == "quad/run/weights") {
-        keys.extend(until(&heard, "quad/run/weights").await);
-    }
-    keys.sort();
-    let expected = ["progress/e", "progress/last", "weights"];
-    assert_eq!(keys, expected.map(|key| format!("quad/run/{key}")));
-    assert_eq!(until(&weights, "quad/run/weights").await.len(), 1);
-    assert!(weights.try_recv().unwrap().is_none() && spied.try_recv().unwrap().is_none());
-}
+async fn each_role_may_say_and_hear_what_it_is_for() {
+    let Some(certificates) = Certificates::make() else { return };
+    let authority = certificates.path("router");
+    let (_router, endpoint) = protected_router(HOST, &authority).await;
+    let connect = async |role| connect(&endpoint, &authority, &certificates.path(role)).await;
+    let (learner, evaluator) = (connect("learner").await, connect("evaluator").await);
+    let (monitor, witness) = (connect("monitor").await, connect("monitor").await);
+    let other = connect("evaluator").await;
+    let (progress, weights) = ("quad/run/progress/e", "quad/run/weights");
 
-#[tokio::test(flavor = "multi_thread")]
-async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
-    let roles = ["learner", "evaluator", "monitor", "evaluator"];
-    let Some((_router, sessions)) = at_the_router(roles).await else { return };
-    let [learner, evaluator, monitor, other] = sessions;
+    let heard = listen(&witness, "quad/run/**").await;
+    let received = listen(&other, weights).await;
+    let spied = listen(&other, "quad/run/progress/*").await;
+    reach(&evaluator, progress, &heard);
+    reach(&learner, weights, &heard);
+    reach(&learner, weights, &received);
+    say_everything(&monitor, "monitor").await;
+    say_everything(&evaluator, "evaluator").await;
+    say_everything(&learner, "learner").await;
+    // A session's messages arrive in order: after the answer, all of the monitor's have.
+    let _weights = answer(&learner, "quad/run/weights/*").await;
+    wait_until("monitors get weights", || answers(&monitor, "quad/run/weights/1") == 1);
+    put(&evaluator, progress, b"end").await;
+    put(&learner, weights, b"end").await;
+    wait_until("the last arrives", || keys(&heard, " end") == [progress, weights]);
+    assert_eq!(keys(&heard, " evaluator"), [progress]);
+    assert_eq!(keys(&heard, " learner"), [weights]);
+    // Those, the two ends and the two probes.
+    assert_eq!(heard.lock().unwrap().len(), 6, "{heard:?}");
+    wait_until("the last arrives", || keys(&received, " end") == [weights]);
+    assert!(spied.lock().unwrap().is_empty(), "evaluators do not hear each other");
+
     for impostor in [&evaluator, &monitor] {
         let _all = answer(impostor, "quad/run/**").await;
         let _jobs = answer(impostor, "quad/run/jobs").await;
-        sleep(LULL).await;
-        assert_eq!(answers(&other, "quad/run/jobs").await, 0, "{impostor:?}");
+        assert_eq!(answers(&other, "quad/run/jobs"), 0, "{impostor:?}");
     }
-    let mut held = Vec::new();
-    for key in ["jobs", "scores", "experience", "weights/*"] {
-        held.push(answer(&learner, &format!("quad/run/{key}")).await);
+    for key in ["jobs", "scores", "experience"].map(|key| format!("quad/run/{key}")) {
+        let _queryable = answer(&learner, &key).await;
+        wait_until(&key, || answers(&evaluator, &key) == 1);
+        assert_eq!(answers(&monitor, &key), 0, "{key}");
     }
-    for (session, key, expected) in [
-        (&evaluator, "quad/run/jobs", 1),
-        (&evaluator, "quad/run/scores", 1),
-        (&evaluator, "quad/run/experience", 1),
-        (&evaluator, "quad/run/weights/7", 1),
-        (&monitor, "quad/run/jobs", 0),
-        (&monitor, "quad/run/scores", 0),
-        (&monitor, "quad/run/experience", 0),
-        (&monitor, "quad/run/weights/7", 1),
-    ] {
-        let deadline = Instant::now() + PATIENCE;
-        while answers(session, key).await != expected {
-            assert!(Instant::now() < deadline, "{key} has not {expected} answers for {session:?}");
-        }
-    }
-}
 
-#[tokio::test(flavor = "multi_thread")]
-async fn only_learners_and_evaluators_declare_tokens() {
-    let roles = ["learner", "evaluator", "monitor", "monitor"];
-    let Some((_router, sessions)) = at_the_router(roles).await else { return };
-    let [learner, evaluator, monitor, listener] = sessions;
+    let (tokens, hear) = memory();
+    let subscriber = witness.liveliness().declare_subscriber("quad/**").history(true);
+    subscriber.callback(hear).background().await.unwrap();
     let mut held = Vec::new();
     for (session, key) in [
-        (&evaluator, "quad/forged/live/learner/1"),
         (&monitor, "quad/forged/live/learner/1"),
+        (&monitor, "quad/run/live/evaluator/m"),
+        (&evaluator, "quad/forged/live/learner/1"),
         (&learner, "quad/run/live/learner/1"),
         (&evaluator, "quad/run/live/evaluator/e"),
-        (&monitor, "quad/run/live/evaluator/m"),
     ] {
         held.push(session.liveliness().declare_token(key).await.unwrap());
     }
-    let tokens = listener.liveliness().declare_subscriber("quad/**").history(true).await.unwrap();
-    let mut there = vec![next(&tokens).await, next(&tokens).await];
-    sleep(LULL).await;
-    there.extend(tokens.try_recv().unwrap().map(|token| token.key_expr().to_string()));
-    there.sort();
-    assert_eq!(there, ["quad/run/live/evaluator/e", "quad/run/live/learner/1"]);
+    wait_until("two tokens arrive", || tokens.lock().unwrap().len() >= 2);
+    assert_eq!(keys(&tokens, " "), ["quad/run/live/evaluator/e", "quad/run/live/learner/1"]);
 }
 
-/// Asserts that not even another learner may speak in its place.
+/// Not even another learner may speak in its place.
 #[tokio::test(flavor = "multi_thread")]
 async fn at_a_learner_that_listens_only_evaluators_progress_passes() {
     let Some(certificates) = Certificates::make() else { return };
-    let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
-    let listen = ["--listen", "tls/127.0.0.1:0", "--certificates", &folder];
-    let learner = scratch.learner_with("run", ENDLESS, &listen);
-    let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
-    let connect = async |role| come_in(&endpoint, &authority, &certificates.of(role)).await;
+    let (scratch, folder) = (Scratch::new(), certificates.path("learner"));
+    let flags = ["--listen", "tls/127.0.0.1:0", "--certificates", &folder];
+    let learner = scratch.learner_with("run", IDLE, &flags);
+    let (endpoint, authority) = (learner.endpoint(), certificates.path("learner"));
+    let connect = async |role| connect(&endpoint, &authority, &certificates.path(role)).await;
     let (witness, asker) = (connect("monitor").await, connect("evaluator").await);
     let (evaluator, second) = (connect("evaluator").await, connect("learner").await);
-    let heard = witness.declare_subscriber("quad/forged/**").await.unwrap();
+    let heard = listen(&witness, "quad/forged/**").await;
     for session in [&second, &evaluator] {
-        session.put("quad/forged/weights", "mine").await.unwrap();
-        let _held = answer(session, "quad/forged/jobs").await;
-        sleep(LULL).await;
-        assert_eq!(answers(&asker, "quad/forged/jobs").await, 0);
+        put(session, "quad/forged/weights", b"mine").await;
+        let _queryable = answer(session, "quad/forged/jobs").await;
+        assert_eq!(answers(&asker, "quad/forged/jobs"), 0);
     }
-    eventually("the witness hears of progress, and of nothing else", PATIENCE, || {
-        zenoh::Wait::wait(evaluator.put("quad/forged/progress/e", "half")).unwrap();
-        let sample = heard.recv_timeout(LULL).unwrap()?;
-        assert_eq!(sample.key_expr().as_str(), "quad/forged/progress/e");
-        Some(())
-    });
+    reach(&evaluator, "quad/forged/progress/e", &heard);
+    assert_eq!(heard.lock().unwrap().len(), 1);
 }

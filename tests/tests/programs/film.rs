@@ -1,53 +1,42 @@
 //! `evaluator film` shows the episode that is scored, in files that others read.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File, Permissions};
 use std::io::BufReader;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use std::process::Command;
+use std::process::Output;
 
-use quad_tests::PATIENCE;
-use quad_tests::learner::Learner;
+use quad_tests::disk::SmallDisk;
 use quad_tests::peers::has_egl;
-use quad_tests::process::{assert_refused, binary, stdout};
-use quad_tests::setting::Setting;
-use quad_tests::small_disk::SmallDisk;
+use quad_tests::process::{assert_refused, command, stdout};
 use quad_tests::system::Scratch;
 
-const SETTING: Setting = Setting {
-    steps: 40,
-    eval_interval: 20,
-    episodes: 2,
-    candidates: 3,
-    hidden: 16,
-    seed: 5,
-    online_steps: 0,
-};
+use crate::score::{SETTING, finished_run};
 
-fn film(folder: &Path, arguments: &[&str]) -> Command {
-    let mut command = Command::new(binary("evaluator"));
-    command.current_dir(folder).arg("film").args(arguments);
-    command
+/// Films, with `path` to look for ffmpeg.
+fn film(folder: &Path, line: &str, path: &str) -> Output {
+    let mut film = command(&format!("evaluator film {line}"));
+    film.current_dir(folder).env("PATH", path).output().unwrap()
 }
 
-/// A finished run with scores.
-fn run(scratch: &Scratch) -> Learner {
-    let mut learner = scratch.learner("run", SETTING);
-    let _evaluator = scratch.evaluator("evaluator", &learner.endpoint());
-    learner.process.assert_succeeds(PATIENCE);
-    learner
-}
-
-/// The colors of each frame of an animation: width × height × 4 bytes.
+/// Width and height, and each frame of an animation, 4 bytes a pixel.
 fn frames(path: &Path) -> ((u16, u16), Vec<Vec<u8>>) {
     let mut options = gif::DecodeOptions::new();
     options.set_color_output(gif::ColorOutput::RGBA);
     let mut decoder = options.read_info(BufReader::new(File::open(path).unwrap())).unwrap();
     let size = (decoder.width(), decoder.height());
-    let next = std::iter::from_fn(|| {
-        decoder.read_next_frame().unwrap().map(|frame| frame.buffer.to_vec())
-    });
-    (size, next.collect())
+    let next = || decoder.read_next_frame().unwrap().map(|frame| frame.buffer.to_vec());
+    (size, std::iter::from_fn(next).collect())
+}
+
+/// Width and height, and the picture, 3 bytes a pixel.
+fn picture(path: &Path) -> ((u32, u32), Vec<u8>) {
+    let decoder = png::Decoder::new(BufReader::new(File::open(path).unwrap()));
+    let mut reader = decoder.read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    let info = reader.next_frame(&mut pixels).unwrap();
+    ((info.width, info.height), pixels)
 }
 
 #[test]
@@ -56,46 +45,30 @@ fn a_film_shows_the_episode_that_is_scored() {
         return;
     }
     let scratch = Scratch::new();
-    let learner = run(&scratch);
+    let learner = finished_run(&scratch, "run", "f32", &[]);
     let folder = scratch.path();
-    let (first, last) = (learner.snapshot(20), learner.snapshot(40));
-    let [first, last] = [&first, &last].map(|path| path.to_str().unwrap());
     let score = learner.scores().into_iter().find(|score| score.step == 40).unwrap();
-    let seed = score.seed.to_string();
-
-    let printed = stdout(&film(folder, &[last, "--seed", &seed]).output().unwrap());
-    let (length, episode_return) = (u64::from(score.length), score.episode_return);
-    let words = format!(
-        "seed {seed}, {length} steps, return {episode_return:.2}, {} candidates",
-        SETTING.candidates
-    );
+    let (seed, length) = (score.seed, u64::from(score.length));
+    let last = learner.snapshot(40).display().to_string();
+    let printed = stdout(&film(folder, &format!("{last} --seed {seed}"), ""));
+    let (outcome, candidates) = (score.episode_return, SETTING.candidates);
+    let words =
+        format!("seed {seed}, {length} steps, return {outcome:.2}, {candidates} candidates");
     assert!(printed.contains(&words), "{words:?} is not in {printed:?}");
     let (size, frames) = frames(&folder.join("film.gif"));
     assert_eq!(size, (320, 240));
-    assert_eq!(
-        frames.len() as u64,
-        length.div_ceil(5) + 1,
-        "25 a second, of steps of 0.008 s, and the last"
-    );
-    let colors = |frame: &[u8]| {
-        frame.chunks(4).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>().len()
-    };
+    // 25 a second, of steps of 0.008 s, and the last.
+    assert_eq!(frames.len() as u64, length.div_ceil(5) + 1);
+    let colors = |frame: &Vec<u8>| BTreeSet::from_iter(frame.chunks(4)).len();
     assert!(frames.iter().all(|frame| colors(frame) > 10), "each shows something");
     assert_ne!(frames.first(), frames.last());
 
-    let run = first.split_once("/snapshots").unwrap().0;
-    let flags = [run, "--step", "20", "--compare", last, "--out", "two.png"];
-    let printed = stdout(&film(folder, &flags).output().unwrap());
-    let seeds: Vec<&str> =
-        printed.lines().filter_map(|line| line.split_once("seed ")?.1.split(',').next()).collect();
-    assert!(seeds.len() == 2 && seeds[0] == seeds[1], "two episodes of one seed: {printed}");
-    let mut picture =
-        png::Decoder::new(BufReader::new(File::open(folder.join("two.png")).unwrap()))
-            .read_info()
-            .unwrap();
-    let mut pixels = vec![0; picture.output_buffer_size().unwrap()];
-    let info = picture.next_frame(&mut pixels).unwrap();
-    assert_eq!((info.width, info.height), (8 * 240, 2 * 240));
+    let printed =
+        stdout(&film(folder, &format!("run --step 20 --compare {last} --out two.png"), ""));
+    let seed = printed.split_once("seed ").unwrap().1.split(',').next().unwrap();
+    assert_eq!(printed.matches(&format!("seed {seed},")).count(), 2, "{printed}");
+    let (size, pixels) = picture(&folder.join("two.png"));
+    assert_eq!(size, (8 * 240, 2 * 240));
     let part = |column: usize, row: usize| -> Vec<u8> {
         let rows = pixels.chunks(3 * 8 * 240).skip(240 * row).take(240);
         rows.flat_map(|line| &line[3 * 240 * column..3 * 240 * (column + 1)]).copied().collect()
@@ -114,40 +87,35 @@ fn a_film_is_whole_or_absent() {
         return;
     }
     let scratch = Scratch::new();
-    let learner = run(&scratch);
-    let (folder, snapshot) = (scratch.path(), learner.snapshot(40));
-    let snapshot = snapshot.to_str().unwrap();
+    let learner = finished_run(&scratch, "run", "f32", &[]);
+    let (folder, snapshot) = (scratch.path(), learner.snapshot(40).display().to_string());
     fs::create_dir(folder.join("a:b")).unwrap();
     let ffmpeg = folder.join("ffmpeg");
-    fs::write(&ffmpeg, FFMPEG).unwrap();
-    fs::set_permissions(&ffmpeg, Permissions::from_mode(0o755)).unwrap();
     let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
+    let write_ffmpeg = |script: &str| {
+        fs::write(&ffmpeg, script).unwrap();
+        fs::set_permissions(&ffmpeg, Permissions::from_mode(0o755)).unwrap();
+    };
+    write_ffmpeg(FFMPEG);
     for name in ["-y.mp4", "a:b/x.mp4"] {
-        let out = format!("--out={name}");
-        stdout(&film(folder, &[snapshot, &out]).env("PATH", &path).output().unwrap());
-        assert!(
-            fs::metadata(folder.join(name)).unwrap().len() > 480 * 360 * 3,
-            "{name} has pictures"
-        );
+        stdout(&film(folder, &format!("{snapshot} --out={name}"), &path));
+        let bytes = fs::metadata(folder.join(name)).unwrap().len();
+        assert!(bytes > 480 * 360 * 3, "{name} has pictures");
     }
-    let output =
-        film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", "/nowhere").output().unwrap();
-    assert_refused(&output, "cannot start ffmpeg", "--out film.gif");
-    fs::write(&ffmpeg, "#!/bin/sh\nexit 3\n").unwrap();
-    let output =
-        film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", &path).output().unwrap();
-    assert_refused(&output, "ffmpeg ended with exit status: 3", "--out film.gif");
-    assert!(!folder.join("film.mp4").exists());
-
+    write_ffmpeg("#!/bin/sh\nexit 3\n");
+    for (path, sentence) in
+        [("/nowhere", "cannot start ffmpeg"), (&path, "ffmpeg ended with exit status: 3")]
+    {
+        let output = film(folder, &format!("{snapshot} --out film.mp4"), path);
+        assert_refused(&output, sentence, "--out film.gif");
+        assert!(!folder.join("film.mp4").exists());
+    }
     let Some(disk) = SmallDisk::mount(&folder.join("disk"), 1) else { return };
     disk.fill();
     for name in ["disk/film.gif", "disk/film.png"] {
-        let output = film(folder, &[snapshot, "--out", name]).output().unwrap();
+        let output = film(folder, &format!("{snapshot} --out {name}"), "");
         assert_refused(&output, &format!("cannot write {name}"), "enough space");
-        assert_eq!(
-            fs::read_dir(folder.join("disk")).unwrap().count(),
-            1,
-            "something is left of {name}"
-        );
+        let files = fs::read_dir(folder.join("disk")).unwrap().count();
+        assert_eq!(files, 1, "something is left of {name}");
     }
 }

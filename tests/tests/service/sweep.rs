@@ -4,18 +4,17 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use quad_tests::hanging_disk::launcher;
+use quad_tests::disk::hanging;
 use quad_tests::learner::verify;
-use quad_tests::process::{Process, binary, children, signal, stdout};
+use quad_tests::process::{Process, built, children, signal, stdout};
 use quad_tests::setting::{SHORT, Setting};
-use quad_tests::system::{Scratch, free_port};
-use quad_tests::{PATIENCE, eventually};
+use quad_tests::system::Scratch;
+use quad_tests::{eventually, wait_until};
 
-/// Long enough for a run to be killed in the middle of it.
 const SETTING: Setting = Setting { steps: 12_000, eval_interval: 4000, ..SHORT };
 const RUNS: [&str; 4] = ["none-seed0", "quad-seed0", "none-seed1", "quad-seed1"];
 /// Without evaluators no run is complete before its sweep is told to end, however fast it trains.
-const UNSCORED: [&str; 2] = ["--evaluators", "0"];
+const UNSCORED: &str = "--evaluators 0";
 
 struct Study {
     scratch: Scratch,
@@ -24,27 +23,34 @@ struct Study {
 impl Study {
     fn new() -> Self {
         let scratch = Scratch::new();
-        scratch.preset("tiny", SETTING);
+        let preset = scratch.preset("tiny", SETTING);
         let study = format!(
-            "about = 'a test'\n[run]\npreset = '{}'\ndataset = '{}'\n[axes]\nmethod = ['none', 'quad']\nseed = [0, 1]\n\
-             [method.none]\nagent.guidance = 'none'\n[method.quad]\n",
-            scratch.path().join("tiny.toml").display(),
-            scratch.dataset().display()
+            "about = 'a test'\n[run]\npreset = {preset:?}\ndataset = {:?}\n[axes]\nmethod = ['none', 'quad']\n\
+             seed = [0, 1]\n[method.none]\nagent.guidance = 'none'\n[method.quad]\n",
+            scratch.dataset()
         );
         fs::write(scratch.path().join("study.toml"), study).unwrap();
         Self { scratch }
     }
 
-    fn command(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(binary("learner"));
-        command.arg("sweep").arg(self.scratch.path().join("study.toml")).arg(self.scratch.path());
+    /// The command behind a prefix such as `env`.
+    fn command(&self, launcher: &[String], flags: &str) -> Command {
         // Those are for other networks than a sweep's own.
-        command.args(arguments).env("QUAD_CERTIFICATES", "/nowhere");
+        let env = ["env".to_owned(), "QUAD_CERTIFICATES=/nowhere".to_owned()];
+        let words = [&env, launcher].concat();
+        let mut command = Command::new(&words[0]);
+        command.args(&words[1..]).arg(built("learner")).arg("sweep");
+        command.arg(self.scratch.path().join("study.toml")).arg(self.scratch.path());
+        command.args(flags.split_whitespace());
         command
     }
 
-    fn sweep(&self, arguments: &[&str]) -> Process {
-        Process::start("sweep", self.scratch.path(), self.command(arguments))
+    fn sweep(&self, flags: &str) -> Process {
+        self.sweep_through(&[], flags)
+    }
+
+    fn sweep_through(&self, launcher: &[String], flags: &str) -> Process {
+        Process::start("sweep", self.scratch.path(), self.command(launcher, flags))
     }
 
     fn dir(&self, run: &str) -> PathBuf {
@@ -54,31 +60,28 @@ impl Study {
     /// Waits until a run has begun to train.
     fn wait_for(&self, run: &str) {
         let metrics = self.dir(run).join("metrics.jsonl");
-        eventually(&format!("{run} trains"), PATIENCE, || {
-            metrics.metadata().is_ok_and(|file| file.len() > 0).then_some(())
-        });
+        wait_until(run, || metrics.metadata().is_ok_and(|file| file.len() > 0));
     }
 
     /// The state of each run in `--list`.
     fn states(&self) -> Vec<String> {
-        let list = stdout(&self.command(&["--list"]).output().unwrap());
+        let list = stdout(&self.command(&[], "--list").output().unwrap());
         let states = list.lines().skip(1).zip(RUNS);
         states.map(|(line, run)| line.split_once(run).unwrap().1.trim().to_owned()).collect()
     }
 
-    /// Every episode of every run has one score, and the runs are those of another study.
-    fn assert_same_as(&self, other: &Study) {
-        for run in RUNS {
-            verify(&self.dir(run), &[Path::new("--same-as"), &other.dir(run)]);
-        }
+    fn assert_stops(&self, mut sweep: Process) {
+        sweep.signal("TERM");
+        sweep.assert_ends(75);
+        assert!(!self.states()[0].starts_with("failed"), "{:?}", self.states());
     }
 }
 
 /// The process that a sweep has started by a command line with a word that ends like this: a run's
 /// learner, or an evaluator, whose word is `serve`.
-fn child_of(sweep: &Process, end: &str) -> u32 {
+fn child(sweep: &Process, end: &str) -> u32 {
     let line = |id: &u32| fs::read_to_string(format!("/proc/{id}/cmdline")).unwrap_or_default();
-    eventually(&format!("{end} has started"), PATIENCE, || {
+    eventually(&format!("{end} has started"), || {
         let mut children = children(sweep.id()).into_iter();
         children.find(|id| line(id).split('\0').any(|word| word.ends_with(end)))
     })
@@ -87,22 +90,24 @@ fn child_of(sweep: &Process, end: &str) -> u32 {
 #[test]
 fn a_sweep_resumes_and_a_failed_run_ends_no_other() {
     let (undisturbed, study) = (Study::new(), Study::new());
-    let mut sweep = undisturbed.sweep(&["--jobs", "2"]);
-    sweep.assert_succeeds(PATIENCE);
-    assert!(sweep.out().contains("4 runs complete"), "{}", sweep.out());
+    let mut sweep = undisturbed.sweep("--jobs 2");
+    sweep.assert_ends(0);
+    sweep.assert_said("4 runs complete");
     sweep.assert_said("training takes about");
 
     assert_eq!(study.states(), ["not begun"; 4]);
-    let mut sweep = study.sweep(&[["--jobs", "2"], UNSCORED].concat());
+    let mut sweep = study.sweep(&format!("--jobs 2 {UNSCORED}"));
     study.wait_for(RUNS[1]);
     sweep.signal("INT");
-    sweep.assert_ends(75, PATIENCE);
+    sweep.assert_ends(75);
     assert_eq!(study.states()[3], "not begun");
 
-    let mut sweep = study.sweep(&["--jobs", "2"]);
+    // It never comes to an end by itself.
     let victim = RUNS[2];
-    signal("KILL", child_of(&sweep, victim));
-    sweep.assert_ends(1, PATIENCE);
+    let launcher = hanging(&study.dir(victim).join("snapshots"));
+    let mut sweep = study.sweep_through(&launcher, "--jobs 2");
+    signal("KILL", child(&sweep, victim));
+    sweep.assert_ends(1);
     sweep.assert_said("1 of 4 runs failed");
     sweep.assert_said(&format!("{victim}: the learner ended by signal: 9 (SIGKILL)"));
     sweep.assert_said(&format!("{victim}/learner.log"));
@@ -110,114 +115,62 @@ fn a_sweep_resumes_and_a_failed_run_ends_no_other() {
     assert!(states[2].starts_with("failed after"), "{states:?}");
     assert_eq!([&*states[0], &states[1], &states[3]], ["complete"; 3]);
 
-    study.sweep(&[]).assert_succeeds(PATIENCE);
-    study.assert_same_as(&undisturbed);
-}
-
-#[test]
-fn shards_and_indices_train_parts_of_a_study() {
-    let study = Study::new();
-    study.sweep(&["--shard", "2/2"]).assert_succeeds(PATIENCE);
-    assert_eq!(study.states(), ["not begun", "complete", "not begun", "complete"]);
-    let address = format!("127.0.0.1:{}", free_port());
-    study.sweep(&["--index", "2", "--http", &address]).assert_succeeds(PATIENCE);
-    let endpoints = fs::read_to_string(study.dir(RUNS[2]).join("endpoints.json")).unwrap();
-    assert!(endpoints.contains(&address), "{endpoints}");
-    assert_eq!(study.states(), ["not begun", "complete", "complete", "complete"]);
-    let sweep = study.sweep(&[["--index", "0"], UNSCORED].concat());
-    study.wait_for(RUNS[0]);
-    assert_stops(&study, sweep);
-    let state = &study.states()[0];
-    assert!(state.ends_with("of 12000 steps") || state == "trained, not all scored", "{state}");
-}
-
-#[test]
-fn runs_with_other_settings_are_refused() {
-    let study = Study::new();
-    study.sweep(&["--index", "0"]).assert_succeeds(PATIENCE);
-    study.scratch.preset("tiny", Setting { steps: 16_000, ..SETTING });
-    let mut sweep = study.sweep(&[]);
-    sweep.assert_ends(1, PATIENCE);
-    sweep.assert_said("has a run of other settings than the study's: steps");
+    // As some init scripts and containers start programs; not a shell's `trap`, by which some never
+    // ignore this signal.
+    let launcher = ["env", "--ignore-signal=CHLD", "RAYON_NUM_THREADS=0"].map(str::to_owned);
+    study.sweep_through(&launcher, "").assert_ends(0);
+    for run in RUNS {
+        verify(&study.dir(run), &[Path::new("--same-as"), &undisturbed.dir(run)]);
+    }
 }
 
 /// Its runs would train, and each wait ten minutes for an evaluator.
 #[test]
 fn a_sweep_whose_only_evaluator_is_killed_gets_another() {
     let study = Study::new();
-    let mut sweep = study.sweep(&["--jobs", "1", "--evaluators", "1"]);
+    let mut sweep = study.sweep("--jobs 1 --evaluators 1");
     study.wait_for(RUNS[0]);
-    signal("KILL", child_of(&sweep, "serve"));
-    sweep.assert_succeeds(PATIENCE);
+    signal("KILL", child(&sweep, "serve"));
+    sweep.assert_ends(0);
     sweep.assert_said("an evaluator has ended (signal: 9");
-}
-
-/// As some init scripts and containers start programs.
-#[test]
-fn an_ignored_sigchld_and_zero_threads_change_nothing() {
-    let study = Study::new();
-    let command = study.command(&["--index", "0"]);
-    // Not a shell's `trap`: some shells never ignore this signal.
-    let mut env = Command::new("env");
-    env.args(["--ignore-signal=CHLD", "RAYON_NUM_THREADS=0"]);
-    env.arg(command.get_program()).args(command.get_args());
-    Process::start("sweep", study.scratch.path(), env).assert_succeeds(PATIENCE);
-    assert_eq!(study.states()[0], "complete");
 }
 
 #[test]
 fn two_sweeps_of_one_study_do_not_disturb_each_other() {
     let study = Study::new();
-    for (flags, run) in [(["--jobs", "1"], 0), (["--index", "2"], 2)] {
-        let mut sweep = study.sweep(&[flags, UNSCORED].concat());
+    for (flags, run) in [("--jobs 1", 0), ("--index 2", 2)] {
+        let mut sweep = study.sweep(&format!("{flags} {UNSCORED}"));
         study.wait_for(RUNS[run]);
-        for others in [&[][..], &["--index", &run.to_string()]] {
-            let second = study.command(others).output().unwrap();
-            let said = String::from_utf8_lossy(&second.stderr);
-            assert_eq!(second.status.code(), Some(75), "{flags:?}, {others:?}: {said}");
+        for second in ["", &format!("--index {run}")] {
+            let output = study.command(&[], second).output().unwrap();
+            assert_eq!(output.status.code(), Some(75), "{flags:?}, {second:?}: {output:?}");
             let state = &study.states()[run];
-            assert!(!state.starts_with("failed"), "{flags:?}, {others:?}: {state}");
+            assert!(!state.starts_with("failed"), "{flags:?}, {second:?}: {state}");
         }
-        sweep.terminate(PATIENCE);
+        sweep.signal("TERM");
+        sweep.wait();
     }
 }
 
-fn assert_stops(study: &Study, mut sweep: Process) {
-    sweep.signal("TERM");
-    sweep.assert_ends(75, PATIENCE);
-    assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
-}
-
-/// Slurm queues a task again by this exit code, so neither a slow disk nor a learner that has only
-/// begun may change it.
+/// Slurm queues a task again by this exit code.
 #[test]
 fn a_stopped_sweep_exits_with_75_whatever_hangs() {
     let study = Study::new();
-    // At once: the learner does not yet listen to signals.
-    let sweep = study.sweep(&[["--index", "0"], UNSCORED].concat());
-    child_of(&sweep, RUNS[0]);
-    assert_stops(&study, sweep);
-
     // A learner that is frozen, as by a disk that hangs.
-    let sweep = study.sweep(&[["--index", "0"], UNSCORED].concat());
-    let learner = child_of(&sweep, RUNS[0]);
+    let sweep = study.sweep(&format!("--index 0 {UNSCORED}"));
     study.wait_for(RUNS[0]);
-    signal("STOP", learner);
-    assert_stops(&study, sweep);
+    signal("STOP", child(&sweep, RUNS[0]));
+    study.assert_stops(sweep);
 
     // A disk that hangs when the sweep marks one of three runs as failed.
-    let mut through = Command::new("env");
-    through.args(&launcher("fsync", &study.dir(RUNS[1]).join("failed"))[1..]);
-    through
-        .arg(binary("learner"))
-        .args(study.command(&[["--jobs", "3"], UNSCORED].concat()).get_args());
-    let sweep = Process::start("sweep", study.scratch.path(), through);
+    let launcher = hanging(&study.dir(RUNS[1]).join("failed"));
+    let sweep = study.sweep_through(&launcher, &format!("--jobs 3 {UNSCORED}"));
     study.wait_for(RUNS[1]);
-    signal("KILL", child_of(&sweep, RUNS[1]));
+    signal("KILL", child(&sweep, RUNS[1]));
     study.wait_for(RUNS[2]);
-    assert_stops(&study, sweep);
-    eventually("the sweep has told its learner to end", PATIENCE, || {
+    study.assert_stops(sweep);
+    wait_until("the sweep has told its learner to end", || {
         let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
-        log.contains("received SIGTERM").then_some(())
+        log.contains("received SIGTERM")
     });
 }
