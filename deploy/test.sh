@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Installs what is missing, builds, and runs all tests. No test is skipped because a peer
-# (Gymnasium, Prometheus, …) is missing; tests that need mounts or recorded files say when they skip. Arguments go to `cargo test`.
+# Installs what is missing, builds, and runs all tests. No test is skipped because a peer (Gymnasium, Prometheus, …) is missing;
+# tests that need mounts or recorded files say when they skip. Arguments go to `cargo test`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . deploy/common.sh
@@ -12,8 +12,6 @@ export PATH="$PATH:$PWD/.deps/prometheus" QUAD_REQUIRE_PEERS=1
 # the features that the tests' dependencies turn on, and half of the workspace twice.
 cargo build --release --locked --bins --examples
 cargo test --release --locked --workspace --no-run "$@"
-# Flush the build to disk first, because tests measure how long programs wait for the disk.
-sync
 SECONDS=0
 cargo test --release --locked --workspace "$@"
 echo "the tests took $SECONDS s"
