@@ -271,7 +271,7 @@ impl Algorithm for Dtql {
         let rule = Rule::softmax(*self.config.temperature);
         let choice = Choice::new(*self.config.candidates, Aggregate::Min, rule);
         let (actor, critics) = (&self.networks.actor.network, &self.networks.critic.target);
-        let (shape, tensors) = ActorCriticShape::of(actor, critics)?;
+        let (shape, tensors) = ActorCriticShape::from_networks(actor, critics)?;
         Ok((PolicyConfig::Squashed { shape, choice }, tensors))
     }
 

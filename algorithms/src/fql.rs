@@ -157,7 +157,7 @@ impl Algorithm for Fql {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
         let (actor, critics) = (&self.networks.actor, &self.networks.critic.target);
-        let (shape, tensors) = ActorCriticShape::of(actor, critics)?;
+        let (shape, tensors) = ActorCriticShape::from_networks(actor, critics)?;
         Ok((PolicyConfig::OneStep { shape, choice }, tensors))
     }
 

@@ -111,7 +111,7 @@ impl Algorithm for Qc {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
         let (flow, critics) = (&self.networks.flow, &self.networks.critic);
-        let (shape, tensors) = ActorCriticShape::of(flow, critics)?;
+        let (shape, tensors) = ActorCriticShape::from_networks(flow, critics)?;
         Ok((PolicyConfig::Flow { shape, flow_steps: *self.config.flow_steps, choice }, tensors))
     }
 

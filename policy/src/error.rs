@@ -38,7 +38,7 @@ pub enum PolicyError {
     #[error("this policy has no critics, which would value its actions")]
     NoCritics,
     #[error(
-        "the critics of this policy take a history of {history} and a chunk of {length}, not one observation and one action"
+        "the values of this policy are of a history of {history} and a chunk of {length}, not of one observation and one action"
     )]
     ValuesChunks { history: usize, length: usize },
     #[error("the rule `nearest` takes a value function, which this policy does not have")]

@@ -1,19 +1,16 @@
 //! The file of a policy: tensors and a header.
 
-use crate::chunk::{Chunk, chunked};
 use crate::error::{PolicyError, Result, VERSION, check_range};
+use crate::executor::{Chunk, executor};
 use crate::kinds::actor_critic::{ACTOR, ActorCriticShape, CRITIC};
-use crate::kinds::diffuser::{self, DiffuserPolicy};
+use crate::kinds::diffuser::{self, DiffuserPolicy, DiffuserShape};
 use crate::kinds::diffusion::{DiffusionPolicy, DiffusionShape, VALUE};
-use crate::kinds::flow::FlowActor;
+use crate::kinds::flow::{FlowActor, OneStepActor};
 use crate::kinds::gaussian::{GaussianPolicy, GaussianShape};
-use crate::kinds::one_step::OneStepActor;
-use crate::kinds::planner::DiffuserShape;
 use crate::kinds::score::{FREQUENCIES, ScorePolicy, ScorePolicyShape};
 use crate::kinds::squashed::SquashedActor;
 use crate::policy::Policy;
 use crate::sampling::choice::Choice;
-use crate::scaled::scaled;
 use candle_core::safetensors::Load;
 use candle_core::{DType, Device, Tensor};
 use quad_kernels::scaling::Scaling;
@@ -74,7 +71,9 @@ impl PolicyConfig {
                 if shape.critics > 0 {
                     add(CRITIC, shape.critics().layout())?;
                 }
-                shape.value().map(|value| add(VALUE, value.layout())).transpose()?;
+                if let Some(value) = shape.value() {
+                    add(VALUE, value.layout())?;
+                }
             }
             Self::Squashed { shape, .. } => {
                 add(ACTOR, SquashedActor::shape(shape).layout())?;
@@ -90,7 +89,9 @@ impl PolicyConfig {
             }
             Self::Gaussian { shape } => {
                 add(ACTOR, shape.actor().layout())?;
-                shape.log_std().map(|log_std| add("", log_std)).transpose()?;
+                if let Some(log_std) = shape.log_std() {
+                    add("", log_std)?;
+                }
             }
             Self::Score { shape, .. } => {
                 add(ACTOR, shape.actor().layout())?;
@@ -204,7 +205,8 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>>
         }
         PolicyConfig::Flow { shape, flow_steps, choice } => {
             check_range("flow_steps", flow_steps, FlowActor::MOST_STEPS)?;
-            let (flow, new) = (FlowActor::shape(&shape), |flow| FlowActor::new(flow, flow_steps));
+            let flow = FlowActor::shape(&shape);
+            let new = |network| FlowActor::new(network, flow_steps);
             Box::new(shape.load(flow, new, choice, tensors, precision)?)
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, tensors)?),
@@ -212,18 +214,15 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>>
             Box::new(ScorePolicy::load(&shape, choice, tensors)?)
         }
         PolicyConfig::Diffuser { shape, choice } => {
-            let units = shape.units.clone();
-            scaled(Box::new(DiffuserPolicy::load(shape, choice, tensors)?), units)?
+            let (units, chunk) = (shape.units.clone(), Chunk::open_loop(shape.replan_every));
+            let policy = DiffuserPolicy::load(shape, choice, tensors)?;
+            executor(Box::new(policy), chunk, units)?
         }
     };
     if let Some(name) = tensors.keys().next() {
         return Err(PolicyError::Unexpected(name.clone()));
     }
-    let policy = chunked(policy, header.chunk)?;
-    match header.scaling {
-        Some(scaling) => scaled(policy, scaling),
-        None => Ok(policy),
-    }
+    executor(policy, header.chunk, header.scaling.unwrap_or_default())
 }
 
 /// A safetensors file of tensors, with `header` as JSON under `key` in its metadata. Equal arguments
@@ -248,15 +247,20 @@ pub fn write_tensors(tensors: &Tensors, key: &str, header: &impl Serialize) -> R
 pub fn read_header<T: DeserializeOwned>(file: &[u8], key: &'static str) -> Result<T> {
     check_header(file)?;
     let (_, metadata) = SafeTensors::read_metadata(file)?;
-    let header = metadata.metadata().as_ref().and_then(|metadata| metadata.get(key));
-    Ok(serde_json::from_str(header.ok_or(PolicyError::NoHeader(key))?)?)
+    let texts = metadata.metadata().as_ref();
+    let header = texts.and_then(|texts| texts.get(key));
+    let header = header.ok_or(PolicyError::NoHeader(key))?;
+    Ok(serde_json::from_str(header)?)
 }
 
 /// Reads all tensors of a safetensors file, on the CPU.
 pub fn read_tensors(bytes: &[u8]) -> Result<Tensors> {
     check_header(bytes)?;
-    let tensors = SafeTensors::deserialize(bytes)?.tensors().into_iter();
-    tensors.map(|(name, view)| Ok((name, view.load(&Device::Cpu)?))).collect()
+    let mut tensors = Tensors::new();
+    for (name, view) in SafeTensors::deserialize(bytes)?.tensors() {
+        tensors.insert(name, view.load(&Device::Cpu)?);
+    }
+    Ok(tensors)
 }
 
 /// Checks the length of the header, the file's first eight bytes. A shorter file is refused later.

@@ -12,36 +12,47 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 /// The file of a policy whose networks have the weights that `values` returns for their layouts.
-pub(crate) fn file_of(
+fn file_with(
     policy: PolicyConfig,
     scaling: Option<Scaling>,
     mut values: impl FnMut(&Layout) -> Vec<f32>,
 ) -> Vec<u8> {
-    let tensors = policy.tensors(|layout| Tensor::new(values(layout), &Device::Cpu)).unwrap();
+    let values = |layout: &Layout| Tensor::new(values(layout), &Device::Cpu);
+    let tensors = policy.tensors(values).unwrap();
     let mut header = Header::new(policy, ());
     header.scaling = scaling;
     header.to_safetensors(&tensors).unwrap()
 }
 
+/// The file of a policy with these weights of one network after the other.
+pub(crate) fn with_weights(policy: PolicyConfig, weights: Vec<Vec<f32>>) -> Vec<u8> {
+    let mut weights = weights.into_iter();
+    file_with(policy, None, |_| weights.next().unwrap())
+}
+
 /// The file of a policy that lacks the weights.
 pub(crate) fn without_tensors(policy: PolicyConfig) -> Vec<u8> {
-    Header::new(policy, ()).to_safetensors(&Tensors::new()).unwrap()
+    let header = Header::new(policy, ());
+    header.to_safetensors(&Tensors::new()).unwrap()
 }
 
 /// The file of a policy with initial weights.
 pub(crate) fn initial(policy: PolicyConfig) -> Vec<u8> {
     let generator = &mut ChaCha8Rng::seed_from_u64(5);
-    file_of(policy, None, |layout| {
-        Weights::initial(layout, generator, &Device::Cpu).unwrap().to_vec1().unwrap()
+    file_with(policy, None, |layout| {
+        let weights = Weights::initial(layout, generator, &Device::Cpu);
+        weights.unwrap().to_vec1().unwrap()
     })
 }
 
 pub(crate) fn layers(activation: Activation, hidden: &[usize]) -> MlpConfig {
-    MlpConfig { activation, ..MlpConfig::mish(hidden) }
+    let mut layers = MlpConfig::mish(hidden);
+    layers.activation = activation;
+    layers
 }
 
 /// The shape of a policy of one number of state, whose two critics and actor have two units.
-pub(crate) fn of_two_units(action_dim: usize) -> ActorCriticShape {
+pub(crate) fn two_units(action_dim: usize) -> ActorCriticShape {
     ActorCriticShape {
         observation_dim: 1,
         action_dim,
@@ -64,10 +75,12 @@ pub(crate) fn diffusion_file(
     v: Option<f32>,
     scaling: Option<Scaling>,
 ) -> Vec<u8> {
-    let shape = DiffusionShape { value: v.map(|_| small().critic), ..small() };
+    let mut shape = small();
+    shape.value = v.map(|_| small().critic);
+    let policy = PolicyConfig::Diffusion { shape, choice };
     // Magnitude and last weight of actor, critics and value function.
     let mut sizes = [(0.1, 0.1), (critic, critic), (0.0, v.unwrap_or(0.0))].into_iter();
-    file_of(PolicyConfig::Diffusion { shape, choice }, scaling, |layout| {
+    file_with(policy, scaling, |layout| {
         let (size, last) = sizes.next().unwrap();
         let signed = |i: usize| [size, -size][i / 3 % 2];
         let mut weights: Vec<f32> = (1..layout.count()).map(signed).collect();
@@ -95,5 +108,6 @@ pub(crate) fn sample(policy: &dyn Policy, observations: &[f32], seeds: &[u64]) -
 }
 
 pub(crate) fn argmax(values: &[f32]) -> usize {
-    (0..values.len()).max_by(|i, j| values[*i].total_cmp(&values[*j])).unwrap()
+    let order = |i: &usize, j: &usize| values[*i].total_cmp(&values[*j]);
+    (0..values.len()).max_by(order).unwrap()
 }

@@ -7,10 +7,9 @@ use std::path::Path;
 
 use candle_core::{Device, Tensor};
 use libfuzzer_sys::fuzz_target;
-use quad_nn::{Affine, Layout, MlpConfig, Precision, Scaling};
+use quad_nn::{Layout, MlpConfig, Precision, Scaling};
 use quad_policy::{
-    ActorCriticShape, Choice, DiffusionShape, GaussianShape, Header, PolicyConfig, Rule,
-    ScorePolicyShape, Spread, load_policy,
+    Choice, DiffusionShape, GaussianShape, Header, PolicyConfig, Rule, Spread, load_policy,
 };
 
 const STATES: usize = 2;
@@ -20,44 +19,24 @@ const MOST_MEMORY: u64 = 1 << 20;
 /// Writes policies to begin with into cargo-fuzz's corpus.
 fn write_seeds() {
     let layers = MlpConfig::mish(&[2; 3]);
-    let (observation_dim, action_dim) = (2, 1);
-    let (actor, critic) = (layers.clone(), layers.clone());
-    let choice = |rule| Choice { rule, ..Choice::best_of(3) };
-    let softmax = choice(Rule::Softmax { temperature: 0.5 });
-    let diffusion = |choice: Choice| {
-        let value = (choice.rule == Rule::Nearest).then(|| layers.clone());
-        let shape = DiffusionShape { value, ..DiffusionShape::quad((2, 1), &layers, 2, 2) };
-        PolicyConfig::Diffusion { shape, choice }
+    let mut shape = DiffusionShape::quad((2, 1), &layers, 2, 2);
+    shape.value = Some(layers.clone());
+    let mut choice = Choice::best_of(3);
+    choice.rule = Rule::Nearest;
+    let nearest = PolicyConfig::Diffusion { shape, choice };
+    let shape = GaussianShape {
+        observation_dim: 2,
+        action_dim: 1,
+        actor: layers,
+        spread: Spread::Shared,
     };
-    let normed = MlpConfig { norm: true, ..layers.clone() };
-    let squashed = ActorCriticShape {
-        observation_dim,
-        action_dim,
-        actor: layers.clone(),
-        critic: normed,
-        critics: 2,
-    };
-    let score = ScorePolicyShape { observation_dim, action_dim, actor, critic, evaluations: 2 };
-    let average = choice(Rule::Average { temperature: 0.5, actions: 2 });
-    let gaussian = |spread| PolicyConfig::Gaussian {
-        shape: GaussianShape { observation_dim, action_dim, actor: layers.clone(), spread },
-    };
-    let actions = Some(Affine { offset: vec![3.0], scale: vec![2.0] });
-    let scaling = Some(Scaling { actions, ..Scaling::default() });
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus/weights");
     fs::create_dir_all(&corpus).unwrap();
-    for (name, policy, scaling) in [
-        ("best", diffusion(choice(Rule::Best)), None),
-        ("nearest", diffusion(choice(Rule::Nearest)), None),
-        ("softmax", diffusion(softmax), None),
-        ("squashed", PolicyConfig::Squashed { shape: squashed, choice: softmax }, None),
-        ("score", PolicyConfig::Score { shape: score, choice: average }, None),
-        ("gaussian", gaussian(Spread::Shared), scaling),
-        ("gaussian-squashed", gaussian(Spread::Squashed), None),
-    ] {
+    for (name, policy) in [("nearest", nearest), ("gaussian", PolicyConfig::Gaussian { shape })] {
         let halves = |layout: &Layout| Tensor::full(0.5f32, layout.count(), &Device::Cpu);
         let tensors = policy.tensors(halves).unwrap();
-        let header = Header { scaling, ..Header::new(policy, ()) };
+        let mut header = Header::new(policy, ());
+        header.scaling = Some(Scaling::default());
         fs::write(corpus.join(name), header.to_safetensors(&tensors).unwrap()).unwrap();
     }
 }

@@ -34,7 +34,10 @@ impl ActorCriticShape {
     }
 
     /// The shape of a policy of these networks, and the tensors of its file.
-    pub fn of(actor: &Ensemble, critics: &Ensemble) -> candle_core::Result<(Self, Tensors)> {
+    pub fn from_networks(
+        actor: &Ensemble,
+        critics: &Ensemble,
+    ) -> candle_core::Result<(Self, Tensors)> {
         let mut tensors = actor.weights().tensors(ACTOR)?;
         tensors.extend(critics.weights().tensors(CRITIC)?);
         let shape = critics.shape();

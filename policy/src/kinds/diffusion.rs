@@ -98,35 +98,22 @@ impl DiffusionPolicy {
         Ok(tensors)
     }
 
-    /// Loads noise predictor and, if there are any, critics, removing their tensors from `tensors`.
-    ///
-    /// # Errors
-    /// A size is out of range, or tensors are missing or not finite.
-    pub fn networks(
-        shape: &DiffusionShape,
-        tensors: &mut Tensors,
-        precision: Precision,
-    ) -> Result<(NoisePredictor, Option<Ensemble>)> {
-        check_dims(shape.observation_dim, shape.action_dim)?;
-        check_range("critics", shape.critics.max(1), MAX_DIM)?;
-        check_range("diffusion_steps", shape.diffusion_steps, MOST_STEPS)?;
-        let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
-        let actor = NoisePredictor::new(shape.actor(), weights, precision).packed()?;
-        let critics = || Ensemble::take(shape.critics(), tensors, CRITIC, precision);
-        let critics = (shape.critics > 0).then(critics).transpose()?;
-        Ok((actor, critics))
-    }
-
     pub(crate) fn load(
         shape: &DiffusionShape,
         choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
     ) -> Result<CandidatePolicy> {
-        let (actor, critics) = Self::networks(shape, tensors, precision)?;
+        check_dims(shape.observation_dim, shape.action_dim)?;
+        check_range("critics", shape.critics.max(1), MAX_DIM)?;
+        check_range("diffusion_steps", shape.diffusion_steps, MOST_STEPS)?;
+        let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
+        let actor = NoisePredictor::new(shape.actor(), weights, precision).packed()?;
+        let actor = Box::new(actor);
+        let critics = || Ensemble::take(shape.critics(), tensors, CRITIC, precision);
+        let critics = (shape.critics > 0).then(critics).transpose()?;
         let value = |shape| Ensemble::take(shape, tensors, VALUE, precision);
         let value = shape.value().map(value).transpose()?;
-        let actor = Box::new(actor);
         let networks = Networks { actor, critics, value, precision };
         CandidatePolicy::new(networks.into(), choice)
     }

@@ -53,7 +53,10 @@ pub struct GaussianShape {
 impl GaussianShape {
     /// Shape of the actor. The tanh of its first a outputs is the mode.
     pub fn actor(&self) -> EnsembleShape {
-        let outputs = self.action_dim * if self.spread == Spread::Squashed { 2 } else { 1 };
+        let outputs = match self.spread {
+            Spread::Squashed => 2 * self.action_dim,
+            _ => self.action_dim,
+        };
         EnsembleShape::of_state(self.observation_dim, &self.actor, outputs)
     }
 
@@ -96,29 +99,33 @@ impl GaussianPolicy {
         Ok(Self { log_std: log_std.transpose()?, shape, actor })
     }
 
-    /// The network's outputs, `[n, a]` or `[n, 2a]`, for `observations`, n × o.
-    fn outputs(&self, observations: &[f32], n: usize) -> Result<Tensor> {
-        let shape = (n, self.shape.observation_dim);
+    /// Writes the modes of n states or, with standard normal `noise [n, a]`, draws from the
+    /// distribution.
+    fn write(
+        &self,
+        observations: &[f32],
+        noise: Option<Tensor>,
+        actions: &mut [f32],
+    ) -> Result<()> {
+        let (o, a) = (self.shape.observation_dim, self.shape.action_dim);
+        let shape = (observations.len() / o, o);
         let observations = Tensor::from_slice(observations, shape, &Device::Cpu)?;
-        Ok(self.actor.state_outputs(&observations)?.squeeze(0)?)
-    }
-
-    /// Actions `[n, a]` from the distribution, by standard normal noise `[n, a]`.
-    fn draw(&self, observations: &[f32], noise: &Tensor) -> Result<Tensor> {
-        let (n, a) = noise.dims2()?;
-        let out = self.outputs(observations, n)?;
+        let out = self.actor.state_outputs(&observations)?.squeeze(0)?;
         let mean = out.narrow(1, 0, a)?;
-        if self.shape.spread == Spread::Squashed {
-            let std = out.narrow(1, a, a)?.clamp(Self::LOG_STD.0, Self::LOG_STD.1)?.exp()?;
-            return Ok((mean + (noise * std)?)?.tanh()?);
-        }
-        let mode = mean.tanh()?;
-        match &self.log_std {
-            Some(log_std) => {
-                Ok((mode + noise.broadcast_mul(&log_std.exp()?)?)?.clamp(-1f32, 1f32)?)
+        let drawn = match (noise, &self.log_std) {
+            (Some(noise), _) if self.shape.spread == Spread::Squashed => {
+                let (least, most) = Self::LOG_STD;
+                let std = out.narrow(1, a, a)?.clamp(least, most)?.exp()?;
+                (mean + (noise * std)?)?.tanh()?
             }
-            None => Ok(mode),
-        }
+            (Some(noise), Some(log_std)) => {
+                let noise = noise.broadcast_mul(&log_std.exp()?)?;
+                (mean.tanh()? + noise)?.clamp(-1f32, 1f32)?
+            }
+            _ => mean.tanh()?,
+        };
+        read(&drawn, |drawn: &[f32]| actions.copy_from_slice(drawn))?;
+        check_numbers("an action", actions)
     }
 }
 
@@ -142,16 +149,8 @@ impl Policy for GaussianPolicy {
         f32_bytes(self.shape.actor().floats(states, 1) + numbers)
     }
 
-    fn act(
-        &self,
-        observations: &[f32],
-        states: &mut [EpisodeState],
-        actions: &mut [f32],
-    ) -> Result<()> {
-        let out = self.outputs(observations, states.len())?;
-        let modes = out.narrow(1, 0, self.shape.action_dim)?.tanh()?;
-        read(&modes, |modes: &[f32]| actions.copy_from_slice(modes))?;
-        check_numbers("an action", actions)
+    fn act(&self, observations: &[f32], _: &mut [EpisodeState], actions: &mut [f32]) -> Result<()> {
+        self.write(observations, None, actions)
     }
 
     fn explore(
@@ -166,9 +165,7 @@ impl Policy for GaussianPolicy {
             state.fill_normal(noise);
         }
         let noise = Tensor::from_vec(noise, (states.len(), a), &Device::Cpu)?;
-        let drawn = self.draw(observations, &noise)?;
-        read(&drawn, |drawn: &[f32]| actions.copy_from_slice(drawn))?;
-        check_numbers("an action", actions)
+        self.write(observations, Some(noise), actions)
     }
 }
 
@@ -176,53 +173,50 @@ impl Policy for GaussianPolicy {
 mod tests {
     use super::*;
     use crate::file::PolicyConfig;
-    use crate::testing::{act, file_of, load};
-    use quad_nn::Activation;
+    use crate::testing::{act, load, two_units, with_weights};
 
     /// A policy of one number with the mean s/2 before the tanh. log σ is −1, or s.
     fn policy(spread: Spread) -> Box<dyn Policy> {
-        let actor = MlpConfig { activation: Activation::Relu, ..MlpConfig::mish(&[2]) };
-        let shape = GaussianShape { observation_dim: 1, action_dim: 1, actor, spread };
+        let actor = two_units(1).actor;
+        let (observation_dim, action_dim) = (1, 1);
+        let shape = GaussianShape { observation_dim, action_dim, actor, spread };
         // relu(x) − relu(−x) = x.
         let first = [1.0, -1.0, 0.0, 0.0];
         let (last, log_std): (&[f32], _) = match spread {
             Spread::Squashed => (&[0.5, 1.0, -0.5, -1.0, 0.0, 0.0], vec![]),
             _ => (&[0.5, -0.5, 0.0], vec![-1.0]),
         };
-        let mut weights = [[&first[..], last].concat(), log_std].into_iter();
-        let policy = PolicyConfig::Gaussian { shape };
-        load(&file_of(policy, None, |_| weights.next().unwrap())).unwrap()
+        let weights = vec![[&first[..], last].concat(), log_std];
+        load(&with_weights(PolicyConfig::Gaussian { shape }, weights)).unwrap()
     }
 
     fn explored(policy: &dyn Policy, state: f32, noise: f32) -> f32 {
-        let mut action = [0.0];
-        policy
-            .explore(&[state], &mut [EpisodeState::with_noise(vec![noise])], &mut action)
-            .unwrap();
+        let (mut states, mut action) = ([EpisodeState::with_noise(vec![noise])], [0.0]);
+        policy.explore(&[state], &mut states, &mut action).unwrap();
         action[0]
     }
 
     #[test]
     fn exploring_draws_from_the_distribution_around_the_mode() {
         let mode = 0.25f32.tanh();
-        for (spread, expected) in [
-            (Spread::None, [mode, mode]),
-            (Spread::Shared, [mode + 0.4 * (-1f32).exp(), 1.0]),
-            (
-                Spread::Squashed,
-                [(0.25 + 0.4 * 0.5f32.exp()).tanh(), (0.25 + 9.0 * 0.5f32.exp()).tanh()],
-            ),
+        let shared = mode + 0.4 * (-1f32).exp();
+        let squashed = |noise: f32| (0.25 + noise * 0.5f32.exp()).tanh();
+        // log σ is at most 2.
+        let clipped = (20.0 - 2.75 * 2f32.exp()).tanh();
+        for (spread, state, noise, expected) in [
+            (Spread::None, 0.5, 9.0, mode),
+            (Spread::Shared, 0.5, 0.4, shared),
+            (Spread::Shared, 0.5, 9.0, 1.0),
+            (Spread::Shared, 0.5, -9.0, -1.0),
+            (Spread::Squashed, 0.5, 0.4, squashed(0.4)),
+            (Spread::Squashed, 0.5, 9.0, squashed(9.0)),
+            (Spread::Squashed, 40.0, -2.75, clipped),
         ] {
             let policy = policy(spread);
-            assert!((act(&*policy, &[0.5], &[1]).unwrap()[0] - mode).abs() < 1e-6);
-            for (noise, expected) in [0.4, 9.0].into_iter().zip(expected) {
-                let found = explored(&*policy, 0.5, noise);
-                assert!((found - expected).abs() < 1e-6, "{spread:?}: {found} for {expected}");
-            }
+            let taken = act(&*policy, &[0.5], &[1]).unwrap()[0];
+            let action = explored(&*policy, state, noise);
+            let error = (taken - mode).abs().max((action - expected).abs());
+            assert!(error < 1e-5, "{spread:?}: {action} for {expected}");
         }
-        assert_eq!(explored(&*policy(Spread::Shared), 0.5, -9.0), -1.0);
-        // log σ is at most 2.
-        let found = explored(&*policy(Spread::Squashed), 40.0, -2.75);
-        assert!((found - (20.0 - 2.75 * 2f32.exp()).tanh()).abs() < 1e-5, "{found}");
     }
 }

@@ -5,7 +5,5 @@ pub(crate) mod diffuser;
 pub(crate) mod diffusion;
 pub(crate) mod flow;
 pub(crate) mod gaussian;
-pub(crate) mod one_step;
-pub(crate) mod planner;
 pub(crate) mod score;
 pub(crate) mod squashed;

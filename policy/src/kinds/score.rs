@@ -71,11 +71,13 @@ impl ScorePolicy {
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
         let network = ScoreNetwork::new(shape.actor(), weights, frequencies);
         let solver = DpmSolver::new(shape.evaluations);
+        let precision = Precision::F32;
+        let critic = Ensemble::take(shape.critic(), tensors, CRITIC, precision)?;
         let networks = Networks {
             actor: Box::new(ScoreActor { network, solver }),
-            critics: Some(Ensemble::take(shape.critic(), tensors, CRITIC, Precision::F32)?),
+            critics: Some(critic),
             value: None,
-            precision: Precision::F32,
+            precision,
         };
         CandidatePolicy::new(networks.into(), choice)
     }
@@ -93,7 +95,8 @@ impl Actor for ScoreActor {
     }
 
     fn draw(&self, observations: &Tensor, noise: &Tensor) -> candle_core::Result<Tensor> {
-        self.network.sample(&self.solver, observations, &noise.get(0)?)
+        let noise = noise.get(0)?;
+        self.network.sample(&self.solver, observations, &noise)
     }
 
     fn floats(&self, states: u128, candidates: u128) -> u128 {
@@ -156,7 +159,7 @@ mod tests {
     fn a_shape_out_of_range_is_refused() {
         for evaluations in [0, 1001, usize::MAX] {
             let policy = load_policy(&file(evaluations, Choice::best_of(1)), Precision::F32);
-            assert!(matches!(policy, Err(PolicyError::Range { .. })), "{evaluations}");
+            assert!(matches!(policy, Err(PolicyError::Range { .. })));
         }
     }
 }

@@ -59,14 +59,10 @@ mod tests {
     use crate::file::PolicyConfig;
     use crate::policy::{Policy, Samples};
     use crate::sampling::choice::{Aggregate, Choice, Rule};
-    use crate::testing::{act, file_of, load, of_two_units, sample};
+    use crate::sampling::episode::EpisodeState;
+    use crate::testing::{load, two_units, with_weights};
 
-    const CHOICE: Choice = Choice {
-        candidates: 3000,
-        aggregate: Aggregate::Min,
-        rule: Rule::Softmax { temperature: f32::MIN_POSITIVE },
-        guidance: 0.0,
-    };
+    const CHOICE: Choice = Choice::new(2, Aggregate::Min, Rule::softmax(f32::MIN_POSITIVE));
 
     /// A policy with the mean (s/2, −1) and log σ (−1, 10·s), whose critics' values are a_0.
     fn policy() -> Box<dyn Policy> {
@@ -77,61 +73,42 @@ mod tests {
         let first = [0.0, 0.0, 1.0, -1.0, 0.0, 0.0].repeat(2);
         let last = [1.0, -1.0, 1.0, -1.0];
         let critics = [&first[..], &[0.0; 4], &last, &[0.0; 2]].concat();
-        let mut weights = [actor, critics].into_iter();
-        let (shape, choice) = (of_two_units(2), CHOICE);
+        let (shape, choice) = (two_units(2), CHOICE);
         let policy = PolicyConfig::Squashed { shape, choice };
-        load(&file_of(policy, None, |_| weights.next().unwrap())).unwrap()
+        load(&with_weights(policy, vec![actor, critics])).unwrap()
     }
 
+    /// log σ_1 is −4, then clipped to 2 and to −5.
     #[test]
     fn candidates_are_tanh_of_normal_numbers() {
-        // Mean and standard deviation of atanh of every second action.
-        let moments = |actions: &[f32]| {
-            let actions = actions.iter().step_by(2);
-            let u: Vec<f64> = actions.map(|a| f64::from(*a).atanh()).collect();
-            let mean = u.iter().sum::<f64>() / u.len() as f64;
-            let variance = u.iter().map(|u| (u - mean).powi(2)).sum::<f64>() / u.len() as f64;
-            (mean, variance.sqrt())
-        };
         let policy = policy();
-        // In the first state log σ_1 is −4, in the second it would be 8.
-        let (observations, seeds) = ([-0.4, 0.8], [1, 2]);
-        let Samples { actions, values } = sample(&*policy, &observations, &seeds).unwrap();
-        assert_eq!((actions.len(), values.len()), (2 * 3000 * 2, 2 * 3000));
-        let (first, second) = actions.split_at(6000);
-        for (found, expected) in [
-            (moments(first), (-0.2, (-1f64).exp())),
-            (moments(&first[1..]), (-1.0, (-4f64).exp())),
-            (moments(second), (0.4, (-1f64).exp())),
-        ] {
-            let near = |x: f64, y: f64| (x - y).abs() < 0.06 * expected.1;
-            let near = near(found.0, expected.0) && near(found.1, expected.1);
-            assert!(near, "{found:?} for {expected:?}");
+        let noise = [0.3, -0.2, 1.1, 0.05];
+        for (state, log_std) in [(-0.4, -4.0), (0.8, 2.0), (-0.9, -5.0)] {
+            let begin = || [EpisodeState::with_noise(noise.to_vec())];
+            let Samples { actions, values } = policy.sample(&[state], &mut begin()).unwrap();
+            let expected = noise.chunks(2).flat_map(|noise| {
+                let u = state / 2.0 + noise[0] * (-1_f32).exp();
+                [u.tanh(), (noise[1] * f32::exp(log_std) - 1.0).tanh()]
+            });
+            let error = actions.iter().zip(expected).map(|(x, y)| (x - y).abs());
+            assert!(error.fold(0.0, f32::max) < 1e-6, "{actions:?}");
+            assert_eq!(values, [actions[0], actions[2]]);
+            // The cold softmax takes the largest a_0.
+            let mut taken = [0.0; 2];
+            policy.act(&[state], &mut begin(), &mut taken).unwrap();
+            assert_eq!(taken, actions[2..]);
         }
-        // σ is clamped to e², so that 5.9 % are within ±0.5.
-        let log_std_1 = second[1..].iter().step_by(2);
-        let inside = log_std_1.filter(|a| a.abs() < 0.5).count();
-        assert!((120..240).contains(&inside), "{inside}");
-        // The cold softmax takes the largest a_0.
-        let taken = act(&*policy, &observations, &seeds).unwrap();
-        for (taken, drawn) in taken.chunks_exact(2).zip([first, second]) {
-            assert!(drawn.contains(&taken[0]));
-            assert!(drawn.iter().step_by(2).all(|a| *a <= taken[0]));
-        }
-        assert_eq!(policy.value(&[0.0; 2], &[0.25, 1.0, -0.5, 1.0]).unwrap(), [0.25, -0.5]);
+        let values = policy.value(&[0.0; 2], &[0.25, 1.0, -0.5, 1.0]);
+        assert_eq!(values.unwrap(), [0.25, -0.5]);
     }
 
     #[test]
-    fn another_choice_applies() {
+    fn guidance_takes_a_diffusion_policy() {
         let policy = policy();
         assert_eq!(policy.choice(), Some(CHOICE));
-        let of_one = policy.with_choice(Choice::best_of(1)).unwrap();
-        let drawn = sample(&*of_one, &[0.0], &[5]).unwrap();
-        assert_eq!(act(&*of_one, &[0.0], &[5]).unwrap(), drawn.actions);
-        let nearest = policy.with_choice(Choice::new(2, Aggregate::Min, Rule::Nearest));
-        assert!(matches!(nearest, Err(PolicyError::NoValue)));
-        let guided = policy.with_choice(Choice { guidance: 1.0, ..CHOICE });
+        let mut guided = CHOICE;
+        guided.guidance = 1.0;
+        let guided = policy.with_choice(guided);
         assert!(matches!(guided, Err(PolicyError::NoGuidance)));
-        assert!(act(&*policy, &[f32::NAN], &[5]).is_err());
     }
 }

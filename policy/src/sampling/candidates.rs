@@ -54,7 +54,8 @@ impl CandidatePolicy {
         if choice.rule == Rule::Nearest && networks.value.is_none() {
             return Err(PolicyError::NoValue);
         }
-        let unvalued = Choice { guidance: choice.guidance, ..Choice::best_of(1) };
+        let mut unvalued = Choice::best_of(1);
+        unvalued.guidance = choice.guidance;
         if choice != unvalued && networks.critics.is_none() {
             return Err(PolicyError::NoCritics);
         }
@@ -102,31 +103,24 @@ impl CandidatePolicy {
     /// The critics' values of actions, by the choice's
     /// [`Aggregate`](crate::sampling::choice::Aggregate).
     fn values(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>> {
-        let rows = actions.dim(0)?;
-        let critics = self.networks.critics.as_ref().ok_or(PolicyError::NoCritics)?;
+        let (critics, rows) = (self.networks.critics.as_ref(), actions.dim(0)?);
+        let critics = critics.ok_or(PolicyError::NoCritics)?;
         let values = critics.values(observations, actions)?;
-        Ok(read(&values, |values: &[f32]| self.choice.aggregate.reduce(values, rows))?)
+        let values = read(&values, <[f32]>::to_vec)?;
+        Ok(self.choice.aggregate.reduce(&values, rows))
     }
 
     /// The numbers that the choice's rule compares: values Q, or −(Q − V)² for the rule `nearest`.
     fn scores(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>> {
         let mut scores = self.values(observations, actions)?;
         if let (Rule::Nearest, Some(value)) = (self.choice.rule, &self.networks.value) {
-            let of_states = read(&value.state_values(observations)?, <[f32]>::to_vec)?;
+            let values = read(&value.state_values(observations)?, <[f32]>::to_vec)?;
             let candidates = scores.chunks_exact_mut(self.choice.candidates as usize);
-            for (scores, v) in candidates.zip(of_states) {
+            for (scores, v) in candidates.zip(values) {
                 scores.iter_mut().for_each(|q| *q = -(*q - v).powi(2));
             }
         }
         Ok(scores)
-    }
-}
-
-/// Writes the mean of the chosen candidates.
-fn mean_of(chosen: &[usize], drawn: &[f32], action: &mut [f32]) {
-    let a = action.len();
-    for (j, x) in action.iter_mut().enumerate() {
-        *x = chosen.iter().map(|place| drawn[place * a + j]).sum::<f32>() / chosen.len() as f32;
     }
 }
 
@@ -158,13 +152,14 @@ impl Policy for CandidatePolicy {
         // The noise of all steps, the candidates and their copies, and their values.
         let drawn = states * candidates * (action_dim * (noises + 3) + 1) as u128;
         let sampling = drawn + states * observation_dim as u128 + actor.floats(states, candidates);
-        let of_states = value.as_ref().map_or(0, |value| value.shape().floats(states, 1));
-        let of_critics = |critics: &Ensemble| critics.shape().floats(states, candidates);
-        let of_critics = critics.as_ref().map_or(0, of_critics);
-        let of_guided = |(actor, critics): (&NoisePredictor, &Ensemble)| {
-            actor.guided_floats(states * candidates, critics)
+        let floats = |ensemble: &Option<Ensemble>, actions| {
+            ensemble.as_ref().map_or(0, |ensemble| ensemble.shape().floats(states, actions))
         };
-        f32_bytes(sampling + of_critics + of_states + self.guided().map_or(0, of_guided))
+        let valuing = floats(critics, candidates) + floats(value, 1);
+        let guiding = self
+            .guided()
+            .map_or(0, |(actor, critics)| actor.guided_floats(states * candidates, critics));
+        f32_bytes(sampling + valuing + guiding)
     }
 
     fn noise(&self) -> Vec<usize> {
@@ -178,20 +173,13 @@ impl Policy for CandidatePolicy {
         states: &mut [EpisodeState],
         actions: &mut [f32],
     ) -> Result<()> {
-        let (action_dim, candidates) = (self.action_dim(), self.choice.candidates as usize);
         let (observations, drawn) = self.candidates(observations, states)?;
-        let scores = match candidates {
+        let scores = match self.choice.candidates {
             1 => vec![0.0; states.len()], // not compared
             _ => self.scores(&observations, &drawn)?,
         };
         let drawn = read(&drawn, <[f32]>::to_vec)?;
-        let drawn = drawn.chunks_exact(candidates * action_dim);
-        let of_states = drawn.zip(scores.chunks_exact(candidates)).zip(states);
-        for (action, ((drawn, scores), state)) in
-            actions.chunks_exact_mut(action_dim).zip(of_states)
-        {
-            mean_of(&self.choice.pick(scores, state)?, drawn, action);
-        }
+        self.choice.take(&drawn, &scores, states, actions)?;
         check_numbers("a sampled action", actions)
     }
 

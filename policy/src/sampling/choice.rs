@@ -72,20 +72,21 @@ impl Choice {
     pub const MOST_CANDIDATES: u32 = 10_000;
 
     /// The best of this many candidates by the mean of the critics (Eq. 25).
-    pub fn best_of(candidates: u32) -> Self {
+    pub const fn best_of(candidates: u32) -> Self {
         Self::new(candidates, Aggregate::Mean, Rule::Best)
     }
 
     /// A choice of these values, which [`Self::check`] checks.
-    pub fn new(candidates: u32, aggregate: Aggregate, rule: Rule) -> Self {
+    pub const fn new(candidates: u32, aggregate: Aggregate, rule: Rule) -> Self {
         Self { candidates, aggregate, rule, guidance: 0.0 }
     }
 
     /// Checks the numbers of candidates, the temperature and the strength of guidance.
     pub fn check(&self) -> Result<()> {
-        check_range("candidates", self.candidates as usize, Self::MOST_CANDIDATES as usize)?;
+        let most = Self::MOST_CANDIDATES as usize;
+        check_range("candidates", self.candidates as usize, most)?;
         if let Rule::Average { actions, .. } = self.rule {
-            check_range("actions", actions as usize, Self::MOST_CANDIDATES as usize)?;
+            check_range("actions", actions as usize, most)?;
         }
         if !(self.guidance >= 0.0 && self.guidance.is_finite()) {
             return Err(PolicyError::Guidance(self.guidance));
@@ -127,11 +128,34 @@ impl Choice {
             _ => vec![best(scores)],
         })
     }
+
+    /// Writes the mean of each state's chosen candidates to `actions`, states × a. `drawn` is
+    /// states × candidates × a, and `scores` are those that [`Self::pick`] takes.
+    pub(crate) fn take(
+        &self,
+        drawn: &[f32],
+        scores: &[f32],
+        states: &mut [EpisodeState],
+        actions: &mut [f32],
+    ) -> Result<()> {
+        let (candidates, a) = (self.candidates as usize, actions.len() / states.len());
+        let scores = scores.chunks_exact(candidates);
+        let candidates = drawn.chunks_exact(candidates * a).zip(scores);
+        let states = states.iter_mut().zip(candidates);
+        for (action, (state, (drawn, scores))) in actions.chunks_exact_mut(a).zip(states) {
+            let chosen = self.pick(scores, state)?;
+            for (j, x) in action.iter_mut().enumerate() {
+                let sum = chosen.iter().map(|place| drawn[place * a + j]).sum::<f32>();
+                *x = sum / chosen.len() as f32;
+            }
+        }
+        Ok(())
+    }
 }
 
 impl Rule {
     /// [`Self::Softmax`] with this temperature.
-    pub fn softmax(temperature: f32) -> Self {
+    pub const fn softmax(temperature: f32) -> Self {
         Self::Softmax { temperature }
     }
 }
@@ -144,7 +168,7 @@ impl Aggregate {
             true => q,
             false => min,
         };
-        let of_action = |row| {
+        let aggregate = |row| {
             let values = values.iter().skip(row).step_by(rows).copied();
             match self {
                 Self::Mean => values.map(|q| q / critics).sum(),
@@ -156,7 +180,7 @@ impl Aggregate {
                 }
             }
         };
-        (0..rows).map(of_action).collect()
+        (0..rows).map(aggregate).collect()
     }
 }
 
@@ -208,8 +232,8 @@ impl FromStr for Aggregate {
     type Err = &'static str;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let kappa =
-            text.strip_prefix("mean-minus-std:").and_then(|kappa| kappa.parse::<f32>().ok());
+        let kappa = text.strip_prefix("mean-minus-std:");
+        let kappa = kappa.and_then(|kappa| kappa.parse::<f32>().ok());
         match (text, kappa) {
             ("mean", _) => Ok(Self::Mean),
             ("min", _) => Ok(Self::Min),
@@ -223,7 +247,8 @@ impl TryFrom<String> for Aggregate {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        text.parse().map_err(|expected| format!("{text:?} is not {expected}"))
+        let error = |expected| format!("{text:?} is not {expected}");
+        text.parse().map_err(error)
     }
 }
 
@@ -255,8 +280,9 @@ impl FromStr for Rule {
             ["nearest"] => Ok(Self::Nearest),
             ["softmax", number] => Ok(Self::softmax(temperature(number)?)),
             ["average", number, actions] => {
+                let temperature = temperature(number)?;
                 let actions = actions.parse().map_err(|_| expected)?;
-                Ok(Self::Average { temperature: temperature(number)?, actions })
+                Ok(Self::Average { temperature, actions })
             }
             _ => Err(expected),
         }
@@ -278,15 +304,17 @@ impl fmt::Display for Rule {
 /// `10 candidates`, then rule and aggregate where they are not the best by the mean, and guidance.
 impl fmt::Display for Choice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { candidates, aggregate, rule, guidance } = self;
-        write!(f, "{candidates} candidate{}", if *candidates == 1 { "" } else { "s" })?;
-        if *candidates > 1 && *rule != Rule::Best {
-            write!(f, ", {rule}")?;
+        match self.candidates {
+            1 => write!(f, "1 candidate")?,
+            many => write!(f, "{many} candidates")?,
         }
-        if *candidates > 1 && *aggregate != Aggregate::Mean {
-            write!(f, ", {aggregate}")?;
+        if self.candidates > 1 && self.rule != Rule::Best {
+            write!(f, ", {}", self.rule)?;
         }
-        match *guidance {
+        if self.candidates > 1 && self.aggregate != Aggregate::Mean {
+            write!(f, ", {}", self.aggregate)?;
+        }
+        match self.guidance {
             0.0 => Ok(()),
             strength => write!(f, ", guidance {strength}"),
         }

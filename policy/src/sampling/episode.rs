@@ -13,8 +13,6 @@ pub struct EpisodeState {
     noise: ChaCha8Rng,
     /// Numbers that come before the generator's.
     given: Vec<f32>,
-    /// Memory from step to step, such as a plan; empty when an episode begins.
-    pub memory: Vec<f32>,
     /// The last observations, oldest first, of a policy that sees several.
     pub(crate) seen: Vec<f32>,
     /// The actions of a chunk that are still to be executed.
@@ -27,20 +25,24 @@ impl EpisodeState {
     pub fn new(seed: u64) -> Self {
         let mut noise = ChaCha8Rng::seed_from_u64(seed);
         noise.set_stream(POLICY_STREAM);
-        Self { noise, given: Vec::new(), memory: Vec::new(), seen: Vec::new(), chunk: Vec::new() }
+        let [given, seen, chunk] = [const { Vec::new() }; 3];
+        Self { noise, given, seen, chunk }
     }
 
     /// Begins an episode whose first normal numbers are these, for a comparison with another
     /// implementation.
     pub fn with_noise(noise: Vec<f32>) -> Self {
-        Self { given: noise, ..Self::new(0) }
+        let mut state = Self::new(0);
+        state.given = noise;
+        state
     }
 
     /// Fills `out` with standard normal numbers.
     pub fn fill_normal(&mut self, out: &mut [f32]) {
         let given = self.given.len().min(out.len());
         let (first, rest) = out.split_at_mut(given);
-        first.iter_mut().zip(self.given.drain(..given)).for_each(|(x, given)| *x = given);
+        let given = self.given.drain(..given);
+        first.iter_mut().zip(given).for_each(|(x, given)| *x = given);
         rest.fill_with(|| StandardNormal.sample(&mut self.noise));
     }
 
