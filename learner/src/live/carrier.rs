@@ -8,13 +8,12 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash, JobReply};
-use serde_json::{Value, json};
 use tracing::{debug, warn};
 
-use super::events::{Event, Events};
+use super::main_loop::{Event, Events};
 use super::metrics::Metrics;
 use super::requests::Request;
-use crate::service::{Answer, Connected, Count, End, Input, Order, OtherWeights, Service};
+use crate::service::{Answer, Count, End, Input, Order, OtherWeights, Service};
 use crate::train::Inbox;
 
 /// A handle to the service. Clones share it.
@@ -47,7 +46,7 @@ impl Carrier {
     }
 
     // A panic with the lock held ends the run.
-    fn lock(&self) -> MutexGuard<'_, Service<Request>> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, Service<Request>> {
         self.shared.service.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -108,28 +107,6 @@ impl Carrier {
         self.lock().weights(step)
     }
 
-    /// Each connected evaluator and its job, for the page.
-    pub fn evaluators(&self) -> Vec<Value> {
-        let service = self.lock();
-        let evaluator = |Connected { name, fits, last_seen, job }: Connected<'_>| {
-            let job = job.map(|(job, done)| {
-                json!({
-                    "step": job.step,
-                    "online": job.exploration.is_some(),
-                    "done": done,
-                    "episodes": job.seeds.len(),
-                })
-            });
-            json!({
-                "name": name.as_str(),
-                "fits": fits,
-                "seconds_ago": last_seen.map(|seen| seen.elapsed().as_secs_f64()),
-                "job": job,
-            })
-        };
-        service.connected().map(evaluator).collect()
-    }
-
     fn carry_out(&self, order: Order<Request>) -> Option<Order<Request>> {
         match order {
             Order::Reply(request, Answer::Job(reply)) => {
@@ -140,7 +117,7 @@ impl Carrier {
             }
             Order::Reply(request, Answer::Scores(reply)) => request.reply(&reply),
             Order::Reply(request, Answer::Piece(reply)) => request.reply(&reply),
-            Order::Reply(request, Answer::TryAgain(why)) => request.send_error(&why.to_string()),
+            Order::Reply(request, Answer::TryAgain(why)) => request.send_error(&why),
             Order::Learn { number, episode } => {
                 if let Some(inbox) = &self.inbox {
                     // Training may have ended.
@@ -169,7 +146,7 @@ impl Carrier {
             Count::Jobs(outcome, count) => self.metrics.jobs(outcome, count),
             Count::Rejected(reason) => self.metrics.reject(reason),
             Count::Scores { new, duplicates } => {
-                self.metrics.evaluation.scores_recorded.inc_by(new as u64);
+                self.metrics.evaluation.scores_recorded.inc_by(new.into());
                 self.metrics.evaluation.scores_duplicate.inc_by(duplicates.into());
             }
             Count::Difference => {

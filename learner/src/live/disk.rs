@@ -7,43 +7,37 @@ use prometheus::IntGauge;
 use quad_runtime::Heartbeat;
 use tracing::warn;
 
-use super::events::Events;
+use super::main_loop::Events;
 
 /// Interval of reminders in the log.
 const REMIND: Duration = Duration::from_secs(60);
 
 /// A thread that writes to the run's folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Writer {
-    /// Writes snapshots, checkpoints and metrics.
-    Snapshots,
-    Scores,
+pub(crate) struct Writer {
+    pub thread: &'static str,
+    /// Its output, as a metric's label and for people.
+    pub label: &'static str,
+    output: &'static str,
+    /// What a disk that hangs means, for people.
+    pub waits: &'static str,
 }
 
 impl Writer {
-    pub const ALL: [Self; 2] = [Self::Snapshots, Self::Scores];
-
-    pub fn thread(self) -> &'static str {
-        match self {
-            Self::Snapshots => "snapshots",
-            Self::Scores => "scores",
-        }
-    }
-
-    /// The output as a metric's label.
-    pub fn label(self) -> &'static str {
-        match self {
-            Self::Snapshots => "run",
-            Self::Scores => "scores",
-        }
-    }
-
-    fn output(self) -> &'static str {
-        match self {
-            Self::Snapshots => "the run",
-            Self::Scores => "results",
-        }
-    }
+    /// Writes snapshots, checkpoints and metrics.
+    pub const SNAPSHOTS: Self = Self {
+        thread: "snapshots",
+        label: "run",
+        output: "the run",
+        waits: "snapshots and checkpoints wait for it; training continues",
+    };
+    pub const SCORES: Self = Self {
+        thread: "scores",
+        label: "scores",
+        output: "results",
+        waits: "results wait for it; evaluators keep theirs",
+    };
+    pub const ALL: [Self; 2] = [Self::SNAPSHOTS, Self::SCORES];
 }
 
 /// The success of one thread's writes.
@@ -58,7 +52,7 @@ pub(crate) struct DiskStatus {
 
 impl DiskStatus {
     pub fn new(writer: Writer, gauge: IntGauge, events: Events) -> Self {
-        Self { output: writer.output(), gauge, events, trouble: None }
+        Self { output: writer.output, gauge, events, trouble: None }
     }
 
     /// Records that the disk refused a write.

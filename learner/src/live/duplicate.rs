@@ -11,7 +11,7 @@ use tracing::info;
 use zenoh::Session;
 use zenoh::sample::{Sample, SampleKind};
 
-use super::events::{Event, Events};
+use super::main_loop::{Event, Events};
 
 /// Zenoh takes five seconds to remove the token of a learner that lost its connection, and longer
 /// on a busy machine.
@@ -61,9 +61,9 @@ async fn another(session: &Session, incarnation: &Incarnation) -> anyhow::Result
     let query = liveliness.get(keys::live_learner(&incarnation.run, keys::ANY)).timeout(LOOK_AGAIN);
     let replies = query.await.map_err(anyhow::Error::from_boxed)?;
     while let Ok(reply) = replies.recv_async().await {
-        let found =
+        let number =
             reply.result().ok().and_then(|token| keys::incarnation_of(token.key_expr().as_str()));
-        if let Some(other) = found.filter(|other| *other != incarnation.number) {
+        if let Some(other) = number.filter(|other| *other != incarnation.number) {
             return Ok(Some(other));
         }
     }

@@ -3,20 +3,19 @@
 use std::mem;
 use std::time::{Duration, Instant};
 
+use quad_protocol::EpisodeScore;
 use quad_run::counted;
 use quad_run::folder::RunDir;
 use quad_run::results::Spread;
 use quad_runtime::{Endpoints, Health, Heartbeat, LEAVE_WITHIN, shutdown_signal};
-use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender};
 use tokio::task::{JoinHandle, LocalSet};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{error, warn};
 
-use super::advice::advice;
 use super::disk::Writer;
-use super::display::{Display, REDRAW};
+use super::display::{Display, REDRAW, advice};
 use super::duplicate::Incarnation;
-use super::events::Event;
 use super::metrics::Metrics;
 use super::network::{Connected, OpeningSession, Wire, connect};
 use super::threads::{STUCK, Threads};
@@ -29,6 +28,36 @@ const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// After this time a failed run gives up output that waits for the disk: the disk may be in
 /// trouble, too.
 const LAST_WRITES: Duration = Duration::from_secs(15);
+
+/// A report of another thread to the main loop.
+#[derive(Debug)]
+pub(crate) enum Event {
+    /// A line for the user. Lines that the network can cause are sent once for each step, name or
+    /// period, so the queue stays short.
+    Line(String),
+    /// A snapshot is ready to be evaluated.
+    Published { step: u64 },
+    /// All episodes of an evaluation are scored.
+    Evaluated { step: u64, scores: Vec<EpisodeScore> },
+    /// No gradient step will follow, and all output of training is on the disk.
+    TrainingEnded(Outcome),
+    /// The run cannot continue.
+    Failed(anyhow::Error),
+}
+
+/// Sends events, which get lost once the main loop has ended.
+#[derive(Clone, Debug)]
+pub(crate) struct Events(pub UnboundedSender<Event>);
+
+impl Events {
+    pub fn send(&self, event: Event) {
+        self.0.send(event).ok();
+    }
+
+    pub fn line(&self, text: impl Into<String>) {
+        self.send(Event::Line(text.into()));
+    }
+}
 
 #[derive(Debug)]
 pub(crate) enum Ending {
@@ -201,14 +230,10 @@ impl MainLoop {
     /// A thread that writes and has not reported for long waits for the disk.
     fn watch_disk(&self, reported: &mut Vec<Writer>) {
         let mut hanging = Vec::from(Writer::ALL);
-        hanging.retain(|writer| self.health.is_silent(writer.thread()));
+        hanging.retain(|writer| self.health.is_silent(writer.thread));
         for writer in hanging.iter().filter(|writer| !reported.contains(writer)) {
             self.metrics.disk_trouble(*writer).set(1);
-            let waits = match writer {
-                Writer::Snapshots => "snapshots and checkpoints wait for it; training continues",
-                Writer::Scores => "results wait for it; evaluators keep theirs",
-            };
-            let silent = STUCK.as_secs();
+            let (silent, waits) = (STUCK.as_secs(), writer.waits);
             self.display.line(&format!(
                 "nothing was saved for {silent} s, as the disk hangs or the machine is too busy: {waits}"
             ));

@@ -98,7 +98,7 @@ impl Metrics {
 
     /// The gauge that is 1 while the disk refuses the output of this thread.
     pub fn disk_trouble(&self, writer: Writer) -> IntGauge {
-        self.disk.trouble.with_label_values(&[writer.label()])
+        self.disk.trouble.with_label_values(&[writer.label])
     }
 }
 

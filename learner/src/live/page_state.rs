@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 
 use super::carrier::Carrier;
 use super::metrics::Metrics;
+use crate::service::Connected;
 
 /// A handle to the state. Clones share it.
 #[derive(Clone)]
@@ -38,7 +39,29 @@ impl PageState {
             "episodes_pending": self.metrics.evaluation.episodes_pending.get(),
             "online": online,
             "problems": self.health.problems(),
-            "evaluators": self.carrier.get().map(Carrier::evaluators).unwrap_or_default(),
+            "evaluators": self.carrier.get().map(evaluators).unwrap_or_default(),
         })
     }
+}
+
+/// Each connected evaluator and its job.
+fn evaluators(carrier: &Carrier) -> Vec<Value> {
+    let service = carrier.lock();
+    let evaluator = |Connected { name, fits, last_seen, job }: Connected<'_>| {
+        let job = job.map(|(job, done)| {
+            json!({
+                "step": job.step,
+                "online": job.exploration.is_some(),
+                "done": done,
+                "episodes": job.seeds.len(),
+            })
+        });
+        json!({
+            "name": name.as_str(),
+            "fits": fits,
+            "seconds_ago": last_seen.map(|seen| seen.elapsed().as_secs_f64()),
+            "job": job,
+        })
+    };
+    service.connected().map(evaluator).collect()
 }

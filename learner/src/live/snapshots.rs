@@ -12,7 +12,7 @@ use tracing::debug;
 
 use super::carrier::Carrier;
 use super::disk::DiskStatus;
-use super::events::Event;
+use super::main_loop::Event;
 use super::metrics::unix_time;
 use super::weights::Weights;
 use crate::service::{Input, Opening, OtherWeights};
@@ -34,7 +34,7 @@ pub(super) struct Snapshots {
     pub weights: Weights,
     pub carrier: Carrier,
     /// Snapshots of earlier processes, by step: training may reach their steps again.
-    pub known: BTreeMap<u64, Hash>,
+    pub saved: BTreeMap<u64, Hash>,
     pub disk: DiskStatus,
 }
 
@@ -81,16 +81,16 @@ impl Snapshots {
         let hash = Hash::new(file);
         let metrics = &self.carrier.metrics.evaluation;
         metrics.snapshot_bytes.set(file.len() as i64);
-        match self.known.get(&step) {
+        match self.saved.get(&step) {
             None => self.weights.run_dir.write_snapshot(step, file)?,
-            Some(known) if *known == hash => {}
+            Some(saved) if *saved == hash => {}
             // The step has scores already: the snapshot is neither overwritten nor published.
-            Some(known) => {
-                return Err(OtherWeights { step, found: hash, scored: known.to_string() }.into());
+            Some(saved) => {
+                return Err(OtherWeights { step, trained: hash, scored: saved.to_string() }.into());
             }
         }
         if online {
-            self.known.insert(step, hash);
+            self.saved.insert(step, hash);
         }
         if evaluate {
             // The jobs must exist first: evaluators claim one as soon as the snapshot arrives.
@@ -106,7 +106,7 @@ impl Snapshots {
 
     fn open_online(&self, opening: &Opening) -> anyhow::Result<()> {
         let step = opening.step;
-        let Some(hash) = self.known.get(&step) else {
+        let Some(hash) = self.saved.get(&step) else {
             let error = anyhow!("the snapshot of step {step}, which is to play, is missing");
             return Err(hinted(error, NO_SNAPSHOT));
         };

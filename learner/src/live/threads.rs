@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -10,13 +9,13 @@ use quad_algorithms::Agent;
 use quad_dataset::{BatchSampler, Task, Transitions};
 use quad_run::config::{Experiment, RunConfig};
 use quad_run::folder::{Log, ResumePoint, RunDir};
-use quad_runtime::{Health, Hint};
+use quad_runtime::Health;
 
 use super::carrier::Carrier;
 use super::disk::{DiskStatus, Writer};
 use super::duplicate::Incarnation;
-use super::events::Events;
-use super::experience::{Experience, OTHER_FOLDER};
+use super::experience::Experience;
+use super::main_loop::Events;
 use super::metrics::Metrics;
 use super::results::Results;
 use super::services::Services;
@@ -24,9 +23,7 @@ use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
 use super::weights::Weights;
 use crate::service::{Rules, Service};
-use crate::train::{
-    HeldOut, Inbox, OnlineMetrics, OnlineTraining, OutputQueue, Training, origin, resume,
-};
+use crate::train::{HeldOut, OutputQueue, Training, origin, resume};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when
 /// hundreds wait.
@@ -73,7 +70,7 @@ impl Threads {
         events: &Events,
     ) -> anyhow::Result<Self> {
         let Run { incarnation, config, dir, past, mut agent, .. } = run;
-        let ResumePoint { checkpoint, snapshots: known, scores: earlier } = past;
+        let ResumePoint { checkpoint, snapshots: saved, scores: earlier } = past;
         let experiment = &config.experiment;
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         if let Some(checkpoint) = checkpoint {
@@ -81,33 +78,34 @@ impl Threads {
         }
         let transitions = agent.transitions().clone();
         let rules = rules(&incarnation, experiment, run.task, &transitions);
-        let online = open_online(dir, experiment, step, transitions, &metrics.online)?;
-        let (online, experience, inbox) = match online {
-            Some((online, experience, inbox)) => (Some(online), Some(experience), Some(inbox)),
-            None => (None, None, None),
+        let experience = Experience::open(dir, experiment, step, transitions, &metrics.online)?;
+        let (online, inbox, experience, episodes) = match experience {
+            Some(Experience { training, inbox, log, episodes }) => {
+                (Some(training), Some(inbox), Some(log), episodes)
+            }
+            None => (None, None, None, Vec::new()),
         };
-        let (experience, episodes) = experience.map(|it| (it.log, it.episodes)).unzip();
-        let service = Service::new(rules, earlier, &episodes.unwrap_or_default(), Instant::now());
+        let service = Service::new(rules, earlier, &episodes, Instant::now());
         let carrier = Carrier::new(service, metrics.clone(), events.clone(), inbox);
         let schedule = experiment.schedule();
-        for (&step, &hash) in known.iter().filter(|(step, _)| schedule.is_evaluated(**step)) {
+        for (&step, &hash) in saved.iter().filter(|(step, _)| schedule.is_evaluated(**step)) {
             carrier.open(step, hash)?;
         }
         let weights = Weights::new(incarnation, dir.clone());
         let services = Services::start(carrier.clone(), weights.clone())?;
 
         let disk = |writer| DiskStatus::new(writer, metrics.disk_trouble(writer), events.clone());
-        let (writer, scores) = (Writer::Scores, run.scores);
+        let (writer, scores) = (Writer::SCORES, run.scores);
         let results = Results { scores, experience, carrier: carrier.clone(), disk: disk(writer) };
-        let beat = health.register(writer.thread(), STUCK);
-        let results = spawn_alive(writer.thread(), events, beat, move |beat| results.run(beat))?;
+        let beat = health.register(writer.thread, STUCK);
+        let results = spawn_alive(writer.thread, events, beat, move |beat| results.run(beat))?;
 
         metrics.training.gradient_steps.inc_by(step);
         let (rows, seconds_before) = dir.metrics_log(step)?;
         let queue = OutputQueue::default();
-        let disk = disk(Writer::Snapshots);
-        let snapshots = Snapshots { queue: queue.clone(), rows, weights, carrier, known, disk };
-        let writer = Writer::Snapshots.thread();
+        let disk = disk(Writer::SNAPSHOTS);
+        let snapshots = Snapshots { queue: queue.clone(), rows, weights, carrier, saved, disk };
+        let writer = Writer::SNAPSHOTS.thread;
         let beat = health.register(writer, STUCK);
         let snapshots = spawn_alive(writer, events, beat, move |beat| snapshots.run(beat))?;
 
@@ -171,26 +169,4 @@ fn rules(
         job_episodes: JOB_EPISODES,
         lease: LEASE,
     }
-}
-
-/// Online learning of a run after gradient step `step`, with the experience that the run has, and the inbox
-/// of more.
-type Begun = (OnlineTraining, Experience, Inbox);
-
-/// `None` in a run without online steps.
-fn open_online(
-    dir: &RunDir,
-    experiment: &Experiment,
-    step: u64,
-    transitions: Arc<Transitions>,
-    metrics: &OnlineMetrics,
-) -> anyhow::Result<Option<Begun>> {
-    let (inbox, recorded) = mpsc::channel();
-    let Some(mut online) = OnlineTraining::new(experiment, transitions, recorded, metrics.clone())
-    else {
-        return Ok(None);
-    };
-    let experience = Experience::open(dir, experiment, &inbox)?;
-    online.resume(step).hint(OTHER_FOLDER)?;
-    Ok(Some((online, experience, inbox)))
 }

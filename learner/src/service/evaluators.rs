@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::Name;
 
-use super::refusal::Refusal;
+use super::message::Refusal;
 
 /// Most evaluators that the learner tracks: far above any real pool. The limit bounds the memory
 /// that made-up names take.
@@ -47,7 +47,8 @@ impl Evaluators {
 
     /// Name, whether it has the run's environment, and time of the last progress of each.
     pub fn iter(&self) -> impl Iterator<Item = (&Name, bool, Option<Instant>)> {
-        let row = |(name, it): (_, &Present)| (name, it.fits == Some(true), it.last_seen);
+        let row =
+            |(name, present): (_, &Present)| (name, present.fits == Some(true), present.last_seen);
         self.present.iter().map(row)
     }
 

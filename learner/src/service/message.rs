@@ -8,8 +8,7 @@ use quad_protocol::{
 };
 use quad_run::folder::ScoreLine;
 
-use super::outcomes::{Opening, OtherWeights};
-use super::refusal::Refusal;
+use super::Opening;
 
 /// A message or an event. `Q` is a query, by which its answer finds the way back.
 #[derive(Debug)]
@@ -89,7 +88,7 @@ pub enum Count {
     /// A message that was not accepted, by reason.
     Rejected(&'static str),
     Scores {
-        new: usize,
+        new: u32,
         duplicates: u32,
     },
     /// An online episode came again with other bits.
@@ -104,6 +103,17 @@ pub enum End {
     /// Training is complete, but no evaluator came that may have the run's environment.
     Unscored,
     OtherWeights(OtherWeights),
+}
+
+/// Retrained weights differ from the scored ones.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("the weights of step {step} are {trained}, but {scored} were scored before")]
+pub struct OtherWeights {
+    pub step: u64,
+    /// Hash of the retrained weights.
+    pub trained: Hash,
+    /// Hash of the weights that have scores.
+    pub scored: String,
 }
 
 /// The frame of an online episode, whole.
@@ -130,36 +140,74 @@ impl<Q> Frame<Q> {
     }
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub enum Answer {
     Job(JobReply),
     Scores(ScoreReply),
     Piece(PieceReply),
-    /// The evaluator is to try it again.
-    TryAgain(TryAgain),
-}
-
-/// A reason for which a delivery is not acknowledged yet.
-#[derive(Debug, thiserror::Error)]
-pub enum TryAgain {
-    #[error("training has not come to the episode again since the learner's start, try again")]
-    NotYet,
-    #[error("it could not be saved, try again: {0}")]
-    NotSaved(String),
-}
-
-impl TryAgain {
-    /// The reason as a metric's label.
-    pub fn label(&self) -> &'static str {
-        match self {
-            Self::NotYet => "not_open_yet",
-            Self::NotSaved(_) => "not_saved",
-        }
-    }
+    /// It is not acknowledged yet, for this reason: the evaluator is to try it again.
+    TryAgain(String),
 }
 
 impl<Q> Order<Q> {
     pub(super) fn rejected(refusal: Refusal) -> Self {
         Self::Count(Count::Rejected(refusal.label()))
     }
+}
+
+/// A reason not to accept a message about a job or its results.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub(super) enum Refusal {
+    #[error("it is for another run")]
+    Run,
+    #[error("it is for another incarnation of the learner")]
+    Incarnation,
+    #[error("the evaluator has no such job")]
+    Job,
+    #[error("the job is not further than before")]
+    NotAdvanced,
+    #[error("the run has no evaluation of that step")]
+    Step,
+    /// The only one that is not final.
+    #[error("training has not come to that step since the learner's start")]
+    NotYet,
+    #[error("the evaluation of that step is about other weights")]
+    Weights,
+    #[error("seed {0} is not in the evaluation, or twice in the report")]
+    Seed(u64),
+    #[error("the episode with seed {0} has an impossible length, return or score")]
+    Episode(u64),
+    #[error("the run has no online episode with seed {0}")]
+    Online(u64),
+    #[error(
+        "the episode with seed {0} has observations or actions of another size, or is too long"
+    )]
+    Rows(u64),
+    #[error("there are too many evaluators")]
+    Crowd,
+}
+
+impl Refusal {
+    /// The reason as a metric's label.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Run => "unknown_run",
+            Self::Incarnation => "unknown_incarnation",
+            Self::Job => "unknown_job",
+            Self::NotAdvanced => "not_advanced",
+            Self::Step => "unknown_step",
+            Self::NotYet => "not_open_yet",
+            Self::Weights => "unknown_weights",
+            Self::Seed(_) => "unknown_seed",
+            Self::Episode(_) => "impossible_episode",
+            Self::Online(_) => "unknown_online",
+            Self::Rows(_) => "impossible_rows",
+            Self::Crowd => "too_many_evaluators",
+        }
+    }
+}
+
+/// `refusal`, unless `holds`.
+pub(super) fn require(holds: bool, refusal: Refusal) -> Result<(), Refusal> {
+    if holds { Ok(()) } else { Err(refusal) }
 }

@@ -7,7 +7,16 @@ use std::mem;
 use quad_protocol::{Exploration, online_seed};
 use quad_run::config::Online;
 
-use super::outcomes::Opening;
+/// An online episode that evaluators may play.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Opening {
+    /// Number of the episode, from 0: experience enters the buffer in this order.
+    pub episode: u64,
+    /// Gradient step of the snapshot that acts.
+    pub step: u64,
+    pub seed: u64,
+    pub exploration: Exploration,
+}
 
 /// The schedule after the episodes that training has absorbed.
 #[derive(Clone, Debug)]

@@ -10,8 +10,6 @@ const GIVE_UP: Duration = Duration::from_secs(600);
 /// The time without an evaluator that could score the run, or play for it.
 #[derive(Debug, Default)]
 pub(super) struct Patience {
-    /// True once training is complete, which itself waits for experience as long as it takes.
-    pub trained: bool,
     since: Option<Instant>,
     advised: bool,
 }
@@ -25,18 +23,14 @@ pub(super) enum Verdict {
 }
 
 impl Patience {
-    /// From the end of training on.
-    pub fn after_training() -> Self {
-        Self { trained: true, ..Self::default() }
-    }
-
-    pub fn check(&mut self, any_evaluator: bool, now: Instant) -> Verdict {
+    /// Before the run is `trained`, training waits for experience as long as it takes.
+    pub fn check(&mut self, any_evaluator: bool, trained: bool, now: Instant) -> Verdict {
         if any_evaluator {
-            *self = Self { trained: self.trained, ..Self::default() };
+            *self = Self::default();
             return Verdict::Wait;
         }
         let waited = now - *self.since.get_or_insert(now);
-        if waited >= GIVE_UP && self.trained {
+        if waited >= GIVE_UP && trained {
             return Verdict::GiveUp;
         }
         if waited < ADVISE || self.advised {
@@ -49,29 +43,20 @@ impl Patience {
 
 #[cfg(test)]
 mod tests {
+    use super::Verdict::{Advise, GiveUp, Wait};
     use super::*;
 
     #[test]
-    fn an_evaluator_that_comes_starts_the_time_anew() {
-        use Verdict::{Advise, GiveUp, Wait};
-        let (mut patience, begin) = (Patience::after_training(), Instant::now());
-        let mut check = |any, seconds| patience.check(any, begin + Duration::from_secs(seconds));
-        assert_eq!([0, 9, 10, 11, 599].map(|s| check(false, s)), [Wait, Wait, Advise, Wait, Wait]);
-        assert_eq!(check(true, 599), Wait);
-        assert_eq!([600, 610, 1199, 1200].map(|s| check(false, s)), [Wait, Advise, Wait, GiveUp]);
-    }
-
-    #[test]
-    fn a_run_that_waits_for_experience_is_not_given_up() {
-        let (mut patience, begin) = (Patience::default(), Instant::now());
-        let mut check = |seconds| patience.check(false, begin + Duration::from_secs(seconds));
-        assert_eq!(
-            [0, 10, 600, 86_400].map(&mut check),
-            [Verdict::Wait, Verdict::Advise, Verdict::Wait, Verdict::Wait]
-        );
-        patience = Patience::after_training();
-        let verdicts = [86_400, 87_000]
-            .map(|seconds| patience.check(false, begin + Duration::from_secs(seconds)));
-        assert_eq!(verdicts, [Verdict::Wait, Verdict::GiveUp]);
+    fn a_trained_run_gives_up_after_ten_minutes_without_an_evaluator() {
+        for (trained, last) in [(true, GiveUp), (false, Wait)] {
+            let (mut patience, begin) = (Patience::default(), Instant::now());
+            let mut check =
+                |any, seconds| patience.check(any, trained, begin + Duration::from_secs(seconds));
+            let verdicts = [0, 9, 10, 11, 599].map(|seconds| check(false, seconds));
+            assert_eq!(verdicts, [Wait, Wait, Advise, Wait, Wait]);
+            assert_eq!(check(true, 599), Wait);
+            let verdicts = [600, 610, 1199, 1200].map(|seconds| check(false, seconds));
+            assert_eq!(verdicts, [Wait, Advise, Wait, last]);
+        }
     }
 }

@@ -19,6 +19,14 @@ pub fn mix(a: u64, b: u64) -> u64 {
     z ^ (z >> 31)
 }
 
+/// A number that depends on all bits of an episode that training learns from.
+pub fn digest(episode: &Episode) -> u64 {
+    let Episode { score, terminated, observations, actions, rewards, .. } = episode;
+    let numbers = observations.iter().chain(actions).chain(rewards);
+    let digest = mix(score.seed, u64::from(*terminated));
+    numbers.fold(digest, |digest, number| mix(digest, number.to_bits().into()))
+}
+
 /// The snapshot after a gradient step.
 pub fn snapshot(step: u64, digest: u64) -> Hash {
     Hash::new(&mix(step, digest).to_le_bytes())

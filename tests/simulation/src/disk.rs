@@ -6,6 +6,7 @@ use std::sync::Arc;
 use quad_protocol::{Episode, EpisodeScore, Hash, decode, online_seed};
 use quad_run::folder::{SavedScores, ScoreLine};
 
+use crate::settings::Settings;
 use crate::training::State;
 
 #[derive(Debug, Default)]
@@ -19,7 +20,7 @@ pub struct Disk {
 }
 
 /// Online episodes that a learner finds when it starts.
-pub struct Found {
+pub struct Experience {
     /// By number.
     pub recorded: BTreeMap<u64, Episode>,
     /// Seeds of the run's episodes so far, with the hash of those in the log.
@@ -54,8 +55,9 @@ impl Disk {
         saved
     }
 
-    /// Online episodes of a run that goes on online after `begin`.
-    pub fn online(&self, begin: u64, lag: u32) -> Result<Found, String> {
+    /// Online episodes, for a learner that starts; none in a run without.
+    pub fn online(&self, settings: &Settings) -> Result<Experience, String> {
+        let lag = settings.online.as_ref().map_or(0, |online| online.lag);
         let mut episodes = HashMap::new();
         for frame in &self.experience {
             let episode: Episode = decode(frame).map_err(|error| error.to_string())?;
@@ -69,12 +71,12 @@ impl Disk {
             if let Some((hash, episode)) = episodes.remove(&seed) {
                 recorded.insert(number, episode);
                 seeds.push((seed, Some(hash)));
-            } else if self.snapshots.contains_key(&begin) {
+            } else if self.snapshots.contains_key(&settings.offline_steps) {
                 seeds.push((seed, None));
             }
         }
         match episodes.is_empty() {
-            true => Ok(Found { recorded, seeds }),
+            true => Ok(Experience { recorded, seeds }),
             false => Err("there is an online episode that the run never opened".to_owned()),
         }
     }

@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use quad_evaluator::serve::delivery::Owed;
-use quad_evaluator::serve::duty::{Duty, Note, Step};
+use quad_evaluator::serve::duty::{Duty, Step};
+use quad_learner::service::Answer;
 use quad_protocol::{Job, JobReply, JobRequest, Name, Progress};
 use rand::Rng;
 
@@ -30,9 +31,13 @@ pub struct EvaluatorProcess {
     /// Duration of an environment step.
     environment_step: Duration,
     fits: bool,
-    /// The query that waits for its answer.
-    query: Option<u64>,
-    queries: u64,
+    /// The query that waits for its answer, and until when.
+    query: Option<(u32, Duration)>,
+    queries: u32,
+    /// True while a timeout is to come.
+    timed: bool,
+    /// Steps of results that are not acknowledged.
+    pub owed: Vec<u64>,
     playing: Option<Playing>,
     leaves_at: Option<Duration>,
 }
@@ -62,6 +67,8 @@ impl EvaluatorProcess {
             fits: number == 0 || rng.random_bool(0.95),
             query: None,
             queries: 0,
+            timed: false,
+            owed: Vec::new(),
             playing: None,
             leaves_at: None,
         }
@@ -71,7 +78,8 @@ impl EvaluatorProcess {
 impl World {
     /// The evaluator with this number, unless it was started again since.
     fn evaluator(&mut self, number: usize, epoch: u32) -> Option<&mut EvaluatorProcess> {
-        self.evaluators.get_mut(number).filter(|it| it.alive && it.epoch == epoch)
+        let evaluator = self.evaluators.get_mut(number);
+        evaluator.filter(|evaluator| evaluator.alive && evaluator.epoch == epoch)
     }
 
     pub fn crash_evaluator(&mut self, number: usize) {
@@ -88,7 +96,7 @@ impl World {
 
     pub fn start_evaluator(&mut self, number: usize) {
         let evaluator = &mut self.evaluators[number];
-        if evaluator.alive {
+        if evaluator.alive || self.deserted {
             return;
         }
         let epoch = evaluator.epoch + 1;
@@ -98,7 +106,7 @@ impl World {
         self.tell_evaluator_of_learner(number);
     }
 
-    pub fn leave_evaluator(&mut self, number: usize) {
+    pub fn leave_evaluator(&mut self, number: usize) -> Result<(), String> {
         let now = self.now;
         let evaluator = &mut self.evaluators[number];
         if evaluator.alive && evaluator.leaves_at.is_none() {
@@ -108,32 +116,39 @@ impl World {
             evaluator.duty.leave();
             let epoch = evaluator.epoch;
             self.after(LEAVE, Event::Turn(number, epoch));
-            self.turn(number, epoch);
+            return self.turn(number, epoch);
         }
+        Ok(())
     }
 
     /// An evaluator sees which learners are there.
-    pub fn sees_learners(&mut self, number: usize, epoch: u32, incarnations: BTreeSet<u64>) {
+    pub fn sees_learners(
+        &mut self,
+        number: usize,
+        epoch: u32,
+        incarnations: BTreeSet<u64>,
+    ) -> Result<(), String> {
         let now = self.instant();
-        let Some(evaluator) = self.evaluator(number, epoch) else { return };
+        let Some(evaluator) = self.evaluator(number, epoch) else { return Ok(()) };
         evaluator.incarnations = incarnations;
         evaluator.duty.follow(&evaluator.incarnations, now);
         evaluator.duty.nudge(now);
-        self.turn(number, epoch);
+        self.turn(number, epoch)
     }
 
     /// Goes on with the turn of an evaluator, or begins one that is due.
-    pub fn turn(&mut self, number: usize, epoch: u32) {
+    pub fn turn(&mut self, number: usize, epoch: u32) -> Result<(), String> {
         let (now, instant, random) = (self.now, self.instant(), self.rng.random());
-        let Some(evaluator) = self.evaluator(number, epoch) else { return };
-        if evaluator.leaves_at.is_some_and(|at| now >= at) {
-            return self.crash_evaluator(number);
+        let Some(evaluator) = self.evaluator(number, epoch) else { return Ok(()) };
+        if evaluator.leaves_at.is_some_and(|time| now >= time) {
+            self.crash_evaluator(number);
+            return Ok(());
         }
         if evaluator.query.is_some()
             || evaluator.playing.is_some()
             || evaluator.incarnations.is_empty()
         {
-            return;
+            return Ok(());
         }
         let step = match evaluator.duty.next(random) {
             Some(step) => Some(step),
@@ -144,21 +159,26 @@ impl World {
             None => None,
         };
         match step {
-            Some(step) => self.step(number, epoch, step),
+            Some(step) => return self.step(number, epoch, step),
             None if evaluator.leaves_at.is_some() => self.crash_evaluator(number),
             None => {
                 let pause = evaluator.duty.turn().ready_at - instant;
                 self.after(pause, Event::Turn(number, epoch));
             }
         }
+        Ok(())
     }
 
-    fn step(&mut self, number: usize, epoch: u32, step: Step) {
+    fn step(&mut self, number: usize, epoch: u32, step: Step) -> Result<(), String> {
         self.record(|| format!("e{number}: {step:?}"));
         let evaluator = &mut self.evaluators[number];
         let name = evaluator.name.clone();
         let query = match step {
             Step::Claim { attempt } => {
+                let kept = Vec::from_iter(evaluator.duty.owed_steps());
+                if let Some(step) = evaluator.owed.iter().find(|step| !kept.contains(step)) {
+                    return Err(format!("{name} has forgotten results of step {step}"));
+                }
                 let environment = if evaluator.fits { "robot" } else { "other" };
                 let environments = vec![environment.to_owned()];
                 Query::Job(JobRequest::Claim { evaluator: name, attempt, environments })
@@ -176,15 +196,37 @@ impl World {
             }
         };
         self.ask(number, epoch, query);
+        Ok(())
     }
 
     fn ask(&mut self, number: usize, epoch: u32, query: Query) {
+        let deadline = self.now + ANSWER_TIMEOUT;
         let evaluator = &mut self.evaluators[number];
         evaluator.queries += 1;
-        evaluator.query = Some(evaluator.queries);
+        evaluator.query = Some((evaluator.queries, deadline));
         let from = Sender { evaluator: number, epoch, query: evaluator.queries };
-        self.send(Event::Query(from, query), Some(number));
-        self.after(ANSWER_TIMEOUT, Event::Timeout(from));
+        if !std::mem::replace(&mut evaluator.timed, true) {
+            self.after(ANSWER_TIMEOUT, Event::Timeout(number, epoch));
+        }
+        self.send(Event::Query(from, Box::new(query)), Some(number));
+    }
+
+    /// Ends the wait for an answer, if that time is over.
+    pub fn timeout(&mut self, number: usize, epoch: u32) -> Result<(), String> {
+        let now = self.now;
+        let Some(evaluator) = self.evaluator(number, epoch) else { return Ok(()) };
+        evaluator.timed = false;
+        match evaluator.query {
+            Some((query, deadline)) if now >= deadline => {
+                self.answered(Sender { evaluator: number, epoch, query }, None)
+            }
+            Some((_, deadline)) => {
+                evaluator.timed = true;
+                self.after(deadline - now, Event::Timeout(number, epoch));
+                Ok(())
+            }
+            None => Ok(()),
+        }
     }
 
     /// The answer to a query, if it is still waited for; `None` if there was none in time.
@@ -192,68 +234,45 @@ impl World {
         let (now, spread) = (self.instant(), self.rng.random_range(0.5..1.0));
         let Sender { evaluator: number, epoch, query } = to;
         let Some(evaluator) = self.evaluator(number, epoch) else { return Ok(()) };
-        if evaluator.query != Some(query) {
+        if evaluator.query.is_none_or(|(waiting, _)| waiting != query) {
             return Ok(());
         }
         evaluator.query = None;
         if evaluator.playing.is_some() {
             self.begin_play(number, epoch, reply);
-            self.turn(number, epoch);
-            return Ok(());
+            return self.turn(number, epoch);
         }
         let followed = evaluator.duty.incarnation();
         let duty = &mut evaluator.duty;
         let notes = match reply {
-            Some(Reply::Job(reply @ JobReply::HandedBack { .. })) => {
-                drop(reply);
+            Some(Reply::Service(Answer::Job(JobReply::HandedBack { .. }))) => {
                 duty.handed_back(now);
-                Vec::new()
+                Ok(Vec::new())
             }
-            Some(Reply::Job(reply)) if reply.incarnation() == followed => {
+            Some(Reply::Service(Answer::Job(reply))) if reply.incarnation() == followed => {
                 duty.claimed(reply, spread, now);
-                Vec::new()
+                Ok(Vec::new())
             }
-            Some(Reply::Scores(reply)) if reply.incarnation() == followed => {
-                duty.scored(reply, now)
+            Some(Reply::Service(Answer::Scores(reply))) if reply.incarnation() == followed => {
+                Ok(duty.scored(reply, now))
             }
-            Some(Reply::Piece(reply)) if reply.incarnation() == followed => {
-                duty.sent(reply, now).unwrap_or_else(|_| {
-                    duty.unanswered(now);
-                    Vec::new()
-                })
+            Some(Reply::Service(Answer::Piece(reply))) if reply.incarnation() == followed => {
+                duty.sent(reply, now)
             }
             _ => {
                 duty.unanswered(now);
                 duty.follow_next(&evaluator.incarnations, now);
-                Vec::new()
+                Ok(Vec::new())
             }
         };
+        let notes = notes.unwrap_or_else(|_| {
+            evaluator.duty.unanswered(now);
+            Vec::new()
+        });
         for note in notes {
-            self.noted(note)?;
+            self.noted(number, note)?;
         }
-        self.turn(number, epoch);
-        Ok(())
-    }
-
-    /// What the learner has acknowledged is on the disk from then on.
-    fn noted(&mut self, note: Note) -> Result<(), String> {
-        match note {
-            Note::Scored(report, _) => {
-                let seeds = report.episodes.iter().map(|episode| (report.step, episode.seed));
-                self.acknowledged_scores.extend(seeds);
-            }
-            Note::Experience { seed, .. } => drop(self.acknowledged_episodes.insert(seed)),
-            Note::Early { .. } => {}
-            Note::Abandoned { step, reason } => {
-                self.record(|| format!("results of step {step} are abandoned: {reason}"));
-                // Training has come to all that it needs.
-                let needless = self.trained && reason.contains("no online episode");
-                if reason.contains("refused") && !needless {
-                    return Err(format!("results of step {step} are refused: {reason}"));
-                }
-            }
-        }
-        Ok(())
+        self.turn(number, epoch)
     }
 
     fn begin_play(&mut self, number: usize, epoch: u32, reply: Option<Reply>) {
@@ -288,7 +307,7 @@ impl World {
             let (job, done, pause) = (&playing.job, playing.done, evaluator.environment_step);
             let progress =
                 Progress { steps_done: done, ..Progress::new(job, evaluator.name.clone()) };
-            self.send(Event::Progress(progress), Some(number));
+            self.send(Event::Progress(Box::new(progress)), Some(number));
             self.after(pause, Event::Played(number, epoch));
             return Ok(());
         }
@@ -303,8 +322,9 @@ impl World {
         });
         let owed = Owed::new(&job, by, precision(kind), results.collect());
         let owed = owed.map_err(|error| format!("results cannot be delivered: {error}"))?;
-        self.evaluators[number].duty.played(Ok(owed));
-        self.turn(number, epoch);
-        Ok(())
+        let evaluator = &mut self.evaluators[number];
+        evaluator.owed.push(job.step);
+        evaluator.duty.played(Ok(owed));
+        self.turn(number, epoch)
     }
 }

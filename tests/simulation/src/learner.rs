@@ -1,13 +1,15 @@
 //! A learner's process: the service, the threads around it, and its death and return.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
 use quad_dataset::Task;
-use quad_learner::service::{Answer, Input, Order, Rules, Service};
+use quad_learner::service::{Answer, Count, Input, Order, Rules, Service};
+use quad_protocol::JobReply;
 use rand::Rng;
 
 use crate::arithmetic::ACTION_DIM;
+use crate::disk::Experience;
 use crate::training::{Output, Progress, State, Training};
 use crate::world::{Event, Query, Reply, Sender, World, name};
 
@@ -34,6 +36,11 @@ pub struct Alive {
     writing: bool,
     results: VecDeque<Order<Sender>>,
     appending: bool,
+    /// Seeds of the online episodes that are on the disk.
+    pub recorded: BTreeSet<u64>,
+    /// Steps whose evaluations are complete.
+    pub evaluated: BTreeSet<u64>,
+    pub last_job: u64,
 }
 
 impl World {
@@ -57,12 +64,7 @@ impl World {
         self.learner.incarnation = self.rng.random_range(1..1_000_000);
         self.learner.epoch += 1;
         let epoch = self.learner.epoch;
-        let (begin, online) = (self.settings.offline_steps, &self.settings.online);
-        let found = match online {
-            Some(online) => Some(self.disk.online(begin, online.lag)?),
-            None => None,
-        };
-        let (recorded, seeds) = found.map_or_else(Default::default, |it| (it.recorded, it.seeds));
+        let Experience { recorded, seeds } = self.disk.online(&self.settings)?;
         let service = Service::new(self.rules(), self.disk.saved_scores(), &seeds, self.instant());
         let training = Training::new(&self.settings, self.disk.checkpoint, recorded)?;
         self.learner.alive = Some(Alive {
@@ -73,6 +75,9 @@ impl World {
             writing: false,
             results: VecDeque::new(),
             appending: false,
+            recorded: seeds.iter().filter_map(|(seed, frame)| frame.map(|_| *seed)).collect(),
+            evaluated: BTreeSet::new(),
+            last_job: 0,
         });
         let schedule = self.settings.schedule;
         for (step, weights) in self.disk.snapshots.clone() {
@@ -95,9 +100,9 @@ impl World {
         if let Some(Order::Append { scores, frames }) = alive.results.pop_front()
             && alive.appending
         {
-            let (some, others) = (self.rng.random_range(0..=scores.len()), frames.len());
-            let others = self.rng.random_range(0..=others);
-            drop(self.disk.append(&scores[..some], &frames[..others]));
+            let written = self.rng.random_range(0..=scores.len());
+            let frames_written = self.rng.random_range(0..=frames.len());
+            drop(self.disk.append(&scores[..written], &frames[..frames_written]));
         }
         self.publish();
     }
@@ -111,8 +116,8 @@ impl World {
             Query::Piece(piece) => self.carry(Input::Piece(from, piece)),
             Query::Weights(step) => {
                 let weights = alive.service.weights(step);
-                let found = weights.filter(|hash| self.disk.snapshots.get(&step) == Some(hash));
-                if let Some(hash) = found {
+                let on_disk = self.disk.snapshots.get(&step);
+                if let Some(hash) = weights.filter(|hash| on_disk == Some(hash)) {
                     self.answer(from, Reply::Weights(step, hash));
                 }
                 Ok(())
@@ -139,26 +144,34 @@ impl World {
             self.record(|| format!("learner orders {order:?}"));
         }
         match order {
-            Order::Reply(to, Answer::Job(reply)) => self.answer(to, Reply::Job(reply)),
-            Order::Reply(to, Answer::Scores(reply)) => self.answer(to, Reply::Scores(reply)),
-            Order::Reply(to, Answer::Piece(reply)) => self.answer(to, Reply::Piece(reply)),
-            Order::Reply(to, Answer::TryAgain(_)) => self.answer(to, Reply::Error),
+            Order::Reply(to, answer) => {
+                if let Answer::Job(JobReply::Job(job)) = &answer {
+                    self.check_job(job)?;
+                }
+                self.answer(to, Reply::Service(answer));
+            }
             Order::Decode(_) | Order::Append { .. } => {
                 if let Some(alive) = &mut self.learner.alive {
                     alive.results.push_back(order);
                 }
             }
             Order::Learn { number, episode } => {
-                let waits = self.learner.alive.as_mut().is_some_and(|alive| {
-                    alive.training.inbox.insert(number, *episode);
-                    std::mem::take(&mut alive.waits)
-                });
-                if waits {
+                let Some(alive) = &mut self.learner.alive else { return Ok(()) };
+                let is_new = alive.recorded.insert(episode.score.seed);
+                if !is_new || alive.recorded.len() > self.disk.experience.len() {
+                    return Err(format!("training gets episode {number} twice, or too early"));
+                }
+                alive.training.inbox.insert(number, *episode);
+                if std::mem::take(&mut alive.waits) {
                     self.after(Duration::ZERO, Event::Train(self.learner.epoch));
                 }
             }
             Order::End(end) => self.ended = Some(end),
             Order::Evaluated { step, scores, .. } => {
+                let alive = self.learner.alive.as_mut();
+                if alive.is_some_and(|alive| !alive.evaluated.insert(step)) {
+                    return Err(format!("the evaluation of step {step} is complete twice"));
+                }
                 for score in scores {
                     let on_disk = self.disk.score(step, score.seed);
                     if on_disk != Some(score) {
@@ -167,6 +180,11 @@ impl World {
                         ));
                     }
                 }
+            }
+            Order::Count(Count::Jobs("expired", _))
+                if self.settings.faults.until.is_zero() && !self.deserted =>
+            {
+                return Err("a job ended although nothing fails".to_owned());
             }
             Order::Tell(_)
             | Order::Advise

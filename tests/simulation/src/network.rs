@@ -34,7 +34,7 @@ impl World {
     /// Sends the learner's answer.
     pub fn answer(&mut self, to: Sender, reply: Reply) {
         if to != Sender::STRANGER {
-            self.send(Event::Answer(to, reply), Some(to.evaluator));
+            self.send(Event::Answer(to, Box::new(reply)), Some(to.evaluator));
         }
     }
 

@@ -40,6 +40,8 @@ pub struct Faults {
     pub partitions: Option<Duration>,
     pub disk_failures: Option<Duration>,
     pub strangers: Option<Duration>,
+    /// Time after which no evaluator is there, nor will be.
+    pub desertion: Option<Duration>,
     /// Probability that a job hangs, or fails.
     pub hangs: f64,
     pub failures: f64,
@@ -74,11 +76,17 @@ impl Settings {
         });
         let updates = online.as_ref().map_or(0, |online| online.updates_after(u64::MAX));
         let steps = offline_steps + updates;
-        let evaluators = match rng.random_range(0..20) {
+        let evaluators = match rng.random_range(0..40) {
             0 => rng.random_range(9..65),
-            1..4 => rng.random_range(4..9),
+            1..6 => rng.random_range(4..9),
             _ => rng.random_range(1..4),
         };
+        let mut faults = Faults::draw(rng);
+        if online.is_none() && rng.random_bool(0.03) {
+            // A run with online episodes would wait for ever.
+            faults.desertion = Some(seconds(rng, 0.0, 60.0));
+            faults.strangers = None;
+        }
         Self {
             schedule: Schedule { start: 0, steps, eval_interval: rng.random_range(1..=steps) },
             offline_steps,
@@ -87,15 +95,36 @@ impl Settings {
             job_episodes: [rng.random_range(1..4), 4],
             lease: seconds(rng, 5.0, 60.0),
             gradient_step: seconds(rng, 0.01, 2.0),
-            observation_dim: if rng.random_bool(0.05) { 3000 } else { 2 },
+            observation_dim: if rng.random_bool(0.02) { 3000 } else { 2 },
             evaluators,
-            faults: Faults::draw(rng),
+            faults,
         }
     }
 }
 
 impl Faults {
+    /// A world in which nothing fails.
+    const NONE: Self = Self {
+        until: Duration::ZERO,
+        lost: 0.0,
+        doubled: 0.0,
+        delay: Duration::ZERO,
+        learner_crashes: None,
+        evaluator_crashes: None,
+        evaluator_leaves: None,
+        partitions: None,
+        disk_failures: None,
+        strangers: None,
+        desertion: None,
+        hangs: 0.0,
+        failures: 0.0,
+        other_bits: false,
+    };
+
     fn draw(rng: &mut StdRng) -> Self {
+        if rng.random_bool(0.05) {
+            return Self::NONE;
+        }
         let mut every = |least, most| {
             let mean = seconds(rng, least, most);
             rng.random_bool(0.4).then_some(mean)
@@ -117,6 +146,7 @@ impl Faults {
             partitions,
             disk_failures,
             strangers,
+            desertion: None,
             hangs: mostly(rng, 0.0, 0.05),
             failures: mostly(rng, 0.0, 0.05),
             other_bits: rng.random_bool(0.1),

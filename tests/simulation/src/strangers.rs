@@ -1,11 +1,12 @@
 //! Well-formed nonsense: messages that no evaluator of ours sends.
 
 use quad_protocol::{
-    EpisodeScore, Hash, JobRequest, Piece, ScoreReport, episode_seeds, online_seed,
+    EpisodeScore, Exploration, Hash, JobRequest, Piece, ScoreReport, encode, episode_seeds,
+    online_seed,
 };
 use rand::Rng;
 
-use crate::arithmetic::precision;
+use crate::arithmetic::{play, precision};
 use crate::world::{Query, World, name};
 
 /// A message with names, numbers and hashes that may be those of the run.
@@ -31,8 +32,8 @@ pub fn query(world: &mut World) -> Query {
         }
         2 | 3 => {
             // Of other weights, or of seeds that are not the run's.
-            let known = world.disk.snapshots.get(&step).copied();
-            let weights = known.filter(|_| rng.random_bool(0.5));
+            let saved = world.disk.snapshots.get(&step).copied();
+            let weights = saved.filter(|_| rng.random_bool(0.5));
             let seeds = match weights {
                 Some(_) => episode_seeds(1, step, episodes),
                 None => episode_seeds(0, step, episodes),
@@ -49,15 +50,11 @@ pub fn query(world: &mut World) -> Query {
                 episodes: seeds.into_iter().map(score).collect(),
             })
         }
-        _ => {
+        4 => {
             let bytes = vec![7; rng.random_range(1..200)];
             let length = rng.random_range(bytes.len()..2000) as u32;
             let offset = rng.random_range(0..=length - bytes.len() as u32);
-            let whole = rng.random_bool(0.5);
-            let length = if whole { bytes.len() as u32 } else { length };
-            let hash = if whole { Hash::new(&bytes) } else { Hash::new(b"guessed") };
-            let seed = online_seed(0, rng.random_range(0..6));
-            let offset = if whole { 0 } else { offset };
+            let (seed, hash) = (online_seed(0, rng.random_range(0..6)), Hash::new(b"guessed"));
             let run = name("run");
             Query::Piece(Piece {
                 evaluator,
@@ -68,6 +65,29 @@ pub fn query(world: &mut World) -> Query {
                 hash,
                 length,
                 offset,
+                bytes,
+            })
+        }
+        // A whole episode, of other weights or of another seed.
+        _ => {
+            let number = rng.random_range(0..6);
+            let (seed, other) = (online_seed(0, number), online_seed(0, number + 1));
+            let (weights, played) = match world.disk.snapshots.get(&step) {
+                Some(weights) if rng.random() => (*weights, other),
+                _ => (Hash::new(b"guessed"), seed),
+            };
+            let episode = play(settings, (step, weights), played, Exploration::Uniform, 0);
+            let bytes = encode(&episode).expect("its numbers are finite");
+            let (hash, length, run) = (Hash::new(&bytes), bytes.len() as u32, name("run"));
+            Query::Piece(Piece {
+                evaluator,
+                run,
+                incarnation,
+                job,
+                seed,
+                hash,
+                length,
+                offset: 0,
                 bytes,
             })
         }

@@ -4,9 +4,9 @@
 use std::collections::BTreeMap;
 
 use quad_learner::service::{OnlineSchedule, Opening};
-use quad_protocol::{Episode, Hash, encode};
+use quad_protocol::{Episode, Hash};
 
-use crate::arithmetic::{mix, play, snapshot};
+use crate::arithmetic::{digest, mix, play, snapshot};
 use crate::settings::Settings;
 
 /// A training state, as a checkpoint keeps it.
@@ -60,7 +60,7 @@ impl Training {
         inbox: BTreeMap<u64, Episode>,
     ) -> Result<Self, String> {
         let online = settings.online.clone();
-        let schedule = online.map(|it| OnlineSchedule::new(it, settings.offline_steps, 0));
+        let schedule = online.map(|online| OnlineSchedule::new(online, settings.offline_steps, 0));
         let state = checkpoint.unwrap_or(State { step: 0, digest: 0 });
         let mut training = Self {
             state,
@@ -74,7 +74,7 @@ impl Training {
         while training
             .schedule
             .as_ref()
-            .is_some_and(|it| it.has_begun(state.step) && it.due() < state.step)
+            .is_some_and(|online| online.has_begun(state.step) && online.due() < state.step)
         {
             if !training.absorb() {
                 return Err("the log lacks an episode that its checkpoint has learned from".into());
@@ -90,9 +90,7 @@ impl Training {
     fn absorb(&mut self) -> bool {
         let Some(schedule) = &mut self.schedule else { return false };
         let Some(episode) = self.inbox.remove(&schedule.next_episode()) else { return false };
-        let frame = encode(&episode).expect("it was encoded before");
-        let [a, b, c, d, e, f, g, h, ..] = *Hash::new(&frame).bytes();
-        self.buffer = mix(self.buffer, u64::from_le_bytes([a, b, c, d, e, f, g, h]));
+        self.buffer = mix(self.buffer, digest(&episode));
         schedule.absorb(episode.rewards.len() as u64);
         true
     }
@@ -124,7 +122,9 @@ impl Training {
 
     /// Absorbs online episodes until they allow a gradient step. False if one is missing.
     fn go_online(&mut self, step: u64) -> bool {
-        while let Some(schedule) = self.schedule.as_mut().filter(|it| it.has_begun(step)) {
+        while let Some(schedule) =
+            self.schedule.as_mut().filter(|schedule| schedule.has_begun(step))
+        {
             for opening in schedule.take_openings() {
                 if !self.inbox.contains_key(&opening.episode) {
                     self.outputs.push(Output::Opening(opening));

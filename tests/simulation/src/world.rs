@@ -1,13 +1,10 @@
 //! Virtual time, the network, and the order of all events. Every choice follows from one seed.
 
-use std::cmp::Reverse;
-use std::collections::{BTreeSet, BinaryHeap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-use quad_learner::service::{End, Input};
-use quad_protocol::{
-    Hash, JobReply, JobRequest, Name, Piece, PieceReply, Progress, ScoreReply, ScoreReport,
-};
+use quad_learner::service::{Answer, End, Input};
+use quad_protocol::{Hash, JobRequest, Name, Piece, Progress, ScoreReport};
 use rand::rngs::StdRng;
 use rand::{Rng, SeedableRng};
 
@@ -27,7 +24,7 @@ const MOST_EVENTS: u64 = 2_000_000;
 pub struct Sender {
     pub evaluator: usize,
     pub epoch: u32,
-    pub query: u64,
+    pub query: u32,
 }
 
 impl Sender {
@@ -45,20 +42,18 @@ pub enum Query {
 
 #[derive(Clone, Debug)]
 pub enum Reply {
-    Job(JobReply),
-    Scores(ScoreReply),
-    Piece(PieceReply),
+    Service(Answer),
     Weights(u64, Hash),
-    Error,
 }
 
 /// Names of evaluators are followed by the number of their start, learners' events by theirs.
 #[derive(Clone, Debug)]
 pub enum Event {
-    Query(Sender, Query),
-    Answer(Sender, Reply),
-    Timeout(Sender),
-    Progress(Progress),
+    Query(Sender, Box<Query>),
+    Answer(Sender, Box<Reply>),
+    /// The time to answer an evaluator's query may be over.
+    Timeout(usize, u32),
+    Progress(Box<Progress>),
     /// The learner sees whether an evaluator is there.
     Token(usize),
     /// An evaluator sees the learners that are there.
@@ -76,43 +71,20 @@ pub enum Event {
     LeaveEvaluator(usize),
     Cut(usize),
     Heal(usize),
+    /// All evaluators are gone for ever.
+    Desert,
     DiskFails(bool),
     Stranger,
-}
-
-struct Scheduled {
-    at: Duration,
-    number: u64,
-    event: Event,
-}
-
-impl PartialEq for Scheduled {
-    fn eq(&self, other: &Self) -> bool {
-        self.number == other.number
-    }
-}
-
-impl Eq for Scheduled {}
-
-impl PartialOrd for Scheduled {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl Ord for Scheduled {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        (self.at, self.number).cmp(&(other.at, other.number))
-    }
 }
 
 pub struct World {
     pub rng: StdRng,
     pub settings: Settings,
-    reference: Reference,
+    pub reference: Reference,
     start: Instant,
     pub now: Duration,
-    queue: BinaryHeap<Reverse<Scheduled>>,
+    /// Events by time and number.
+    queue: BTreeMap<(Duration, u64), Event>,
     number: u64,
     pub learner: LearnerProcess,
     pub evaluators: Vec<EvaluatorProcess>,
@@ -120,6 +92,8 @@ pub struct World {
     pub acknowledged_scores: BTreeSet<(u64, u64)>,
     pub acknowledged_episodes: BTreeSet<u64>,
     pub trained: bool,
+    /// True once all evaluators are gone for ever.
+    pub deserted: bool,
     pub ended: Option<End>,
     pub trace: Option<Vec<String>>,
 }
@@ -139,7 +113,7 @@ impl World {
             settings,
             start: Instant::now(),
             now: Duration::ZERO,
-            queue: BinaryHeap::new(),
+            queue: BTreeMap::new(),
             number: 0,
             learner: LearnerProcess::default(),
             evaluators: Vec::new(),
@@ -147,6 +121,7 @@ impl World {
             acknowledged_scores: BTreeSet::new(),
             acknowledged_episodes: BTreeSet::new(),
             trained: false,
+            deserted: false,
             ended: None,
             trace: traced.then(Vec::new),
         };
@@ -165,13 +140,13 @@ impl World {
             if let Some(end) = self.ended.take() {
                 return self.check_end(end);
             }
-            let Some(Reverse(Scheduled { at, event, .. })) = self.queue.pop() else {
+            let Some(((time, _), event)) = self.queue.pop_first() else {
                 return Err("nothing is left to happen, and the run has not ended".to_owned());
             };
-            if at > LONGEST || events > MOST_EVENTS {
-                return Err(format!("the run has not ended after {at:?} and {events} events"));
+            if time > LONGEST || events > MOST_EVENTS {
+                return Err(format!("the run has not ended after {time:?} and {events} events"));
             }
-            self.now = at;
+            self.now = time;
             self.happen(event)?;
         }
         Ok(())
@@ -179,10 +154,10 @@ impl World {
 
     fn happen(&mut self, event: Event) -> Result<(), String> {
         match event {
-            Event::Query(from, query) => return self.query(from, query),
-            Event::Answer(to, reply) => return self.answered(to, Some(reply)),
-            Event::Timeout(to) => return self.answered(to, None),
-            Event::Progress(progress) => return self.carry(Input::Progress(progress)),
+            Event::Query(from, query) => return self.query(from, *query),
+            Event::Answer(to, reply) => return self.answered(to, Some(*reply)),
+            Event::Timeout(number, epoch) => return self.timeout(number, epoch),
+            Event::Progress(progress) => return self.carry(Input::Progress(*progress)),
             Event::Token(number) => {
                 let evaluator = &self.evaluators[number];
                 let (name, here) = (evaluator.name.clone(), evaluator.alive && !evaluator.cut);
@@ -191,9 +166,9 @@ impl World {
             Event::Learners(number, epoch) => {
                 let here = self.learner.alive.is_some() && !self.evaluators[number].cut;
                 let seen = BTreeSet::from_iter(here.then_some(self.learner.incarnation));
-                self.sees_learners(number, epoch, seen);
+                return self.sees_learners(number, epoch, seen);
             }
-            Event::Turn(number, epoch) => self.turn(number, epoch),
+            Event::Turn(number, epoch) => return self.turn(number, epoch),
             Event::Played(number, epoch) => return self.played(number, epoch),
             Event::Train(epoch) => return self.train(epoch),
             Event::Written(epoch) => return self.written(epoch),
@@ -214,13 +189,13 @@ impl World {
             Event::CrashEvaluator(number) => {
                 self.record(|| format!("e{number} crashes"));
                 self.crash_evaluator(number);
-                self.again(|it| it.evaluator_crashes, Event::CrashEvaluator(number));
+                self.again(|faults| faults.evaluator_crashes, Event::CrashEvaluator(number));
             }
             Event::StartEvaluator(number) => self.start_evaluator(number),
             Event::LeaveEvaluator(number) => {
                 self.record(|| format!("e{number} leaves"));
-                self.leave_evaluator(number);
-                self.again(|it| it.evaluator_leaves, Event::LeaveEvaluator(number));
+                self.leave_evaluator(number)?;
+                self.again(|faults| faults.evaluator_leaves, Event::LeaveEvaluator(number));
             }
             Event::Cut(number) => {
                 self.cut(number, true);
@@ -229,6 +204,11 @@ impl World {
                 self.again(|faults| faults.partitions, Event::Cut(number));
             }
             Event::Heal(number) => self.cut(number, false),
+            Event::Desert => {
+                self.record(|| "all evaluators are gone for ever".to_owned());
+                self.deserted = true;
+                (0..self.evaluators.len()).for_each(|number| self.crash_evaluator(number));
+            }
             Event::DiskFails(fails) => {
                 self.record(|| format!("the disk fails: {fails}"));
                 self.disk.fails = fails;
@@ -237,7 +217,7 @@ impl World {
                         let pause = Duration::from_millis(self.rng.random_range(100..30_000));
                         self.after(pause, Event::DiskFails(false));
                     }
-                    false => self.again(|it| it.disk_failures, Event::DiskFails(true)),
+                    false => self.again(|faults| faults.disk_failures, Event::DiskFails(true)),
                 }
             }
         }
@@ -250,13 +230,16 @@ impl World {
 
     fn schedule_faults(&mut self) {
         for number in 0..self.evaluators.len() {
-            self.again(|it| it.evaluator_crashes, Event::CrashEvaluator(number));
-            self.again(|it| it.evaluator_leaves, Event::LeaveEvaluator(number));
-            self.again(|it| it.partitions, Event::Cut(number));
+            self.again(|faults| faults.evaluator_crashes, Event::CrashEvaluator(number));
+            self.again(|faults| faults.evaluator_leaves, Event::LeaveEvaluator(number));
+            self.again(|faults| faults.partitions, Event::Cut(number));
         }
-        self.again(|it| it.learner_crashes, Event::CrashLearner);
-        self.again(|it| it.disk_failures, Event::DiskFails(true));
-        self.again(|it| it.strangers, Event::Stranger);
+        self.again(|faults| faults.learner_crashes, Event::CrashLearner);
+        self.again(|faults| faults.disk_failures, Event::DiskFails(true));
+        self.again(|faults| faults.strangers, Event::Stranger);
+        if let Some(desertion) = self.settings.faults.desertion {
+            self.after(desertion, Event::Desert);
+        }
     }
 
     /// Schedules the next fault of a kind, unless the time of faults is over.
@@ -286,72 +269,12 @@ impl World {
 
     pub fn after(&mut self, pause: Duration, event: Event) {
         self.number += 1;
-        let (at, number) = (self.now + pause, self.number);
-        self.queue.push(Reverse(Scheduled { at, number, event }));
+        self.queue.insert((self.now + pause, self.number), event);
     }
 
     pub fn record(&mut self, line: impl FnOnce() -> String) {
         if let Some(trace) = &mut self.trace {
             trace.push(format!("{:>10.3} s  {}", self.now.as_secs_f64(), line()));
         }
-    }
-
-    /// A snapshot has the weights of a run without faults, if all evaluators compute the same bits.
-    pub fn check_snapshot(&self, step: u64, weights: Hash) -> Result<(), String> {
-        let expected = self.reference.snapshots.get(&step);
-        match self.settings.faults.other_bits || expected == Some(&weights) {
-            true => Ok(()),
-            false => Err(format!("the snapshot of step {step} depends on the schedule")),
-        }
-    }
-
-    fn check_end(&mut self, end: End) -> Result<(), String> {
-        match end {
-            End::Complete => {}
-            // No evaluator that has the environment was there for long.
-            End::Unscored => return Ok(()),
-            End::OtherWeights(error) => return Err(error.to_string()),
-        }
-        self.disk.check()?;
-        for &(step, seed) in &self.acknowledged_scores {
-            if self.disk.score(step, seed).is_none() {
-                return Err(format!("the acknowledged score of step {step}, seed {seed} is lost"));
-            }
-        }
-        let seeds = match &self.settings.online {
-            Some(online) => self.disk.online(self.settings.offline_steps, online.lag)?.seeds,
-            None => Vec::new(),
-        };
-        for seed in &self.acknowledged_episodes {
-            if !seeds.iter().any(|(recorded, hash)| recorded == seed && hash.is_some()) {
-                return Err(format!("the acknowledged episode with seed {seed} is lost"));
-            }
-        }
-        if !self.settings.faults.other_bits && self.last_state() != Some(self.reference.last) {
-            return Err("the last state depends on the schedule".to_owned());
-        }
-        self.check_scores()
-    }
-
-    /// Every episode has its score, unless it was given up.
-    fn check_scores(&self) -> Result<(), String> {
-        let Some(alive) = &self.learner.alive else { return Ok(()) };
-        let missing = alive.service.gauges().missing;
-        let steps = self.settings.schedule.evaluations();
-        let expected = steps as usize * self.settings.episodes as usize;
-        if self.disk.scores.len() + missing != expected {
-            let scores = self.disk.scores.len();
-            return Err(format!("{scores} scores and {missing} given up are not {expected}"));
-        }
-        if self.settings.faults.other_bits {
-            return Ok(());
-        }
-        for line in &self.disk.scores {
-            let weights = self.reference.snapshots[&line.step];
-            if line.episode() != crate::arithmetic::score(&weights, line.seed, 0) {
-                return Err(format!("step {}, seed {} has another score", line.step, line.seed));
-            }
-        }
-        Ok(())
     }
 }
