@@ -4,7 +4,7 @@
 //!
 //! - [`sim`]: environments, and batches of episodes. The next two use it, and not each other:
 //! - [`serve`]: finds runs on the network, evaluates their snapshots, delivers the scores.
-//! - [`tools`]: records and replays datasets, scores and films policies, on this machine.
+//! - `tools`: records and replays datasets, scores and films policies, on this machine.
 //! - [`cli`]: the command line; `doctor`: checks of this machine; `metrics`: for Prometheus.
 #![allow(missing_docs)] // A program: a name that says enough needs no comment.
 
@@ -13,4 +13,4 @@ mod doctor;
 mod metrics;
 pub mod serve;
 pub mod sim;
-pub mod tools;
+mod tools;

@@ -101,7 +101,7 @@ impl Environments for Simulations {
 }
 
 /// The MJCF text that an environment's model is compiled from.
-#[allow(clippy::expect_used)] // The table is part of the program, and the test here makes each of its environments.
+#[allow(clippy::expect_used)] // The table is part of the program, and a test makes each of its environments.
 pub fn mjcf(spec: &EnvironmentSpec) -> String {
     let file = |name: &str| {
         let listed = MODELS.iter().find(|(model, _)| *model == name);
@@ -110,20 +110,5 @@ pub fn mjcf(spec: &EnvironmentSpec) -> String {
     match spec.simulator {
         Simulator::Planar(_) => file(spec.simulation()).to_owned(),
         Simulator::Maze(robot, map) => maze::mjcf(file(&robot.name), map),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_environment_of_the_table_is_simulated() {
-        for spec in quad_dataset::environment::all() {
-            let simulation = make(spec, 0).unwrap();
-            let sizes = [simulation.observation(), simulation.qpos(), simulation.qvel()];
-            let expected = [spec.observation_dim, spec.qpos_dim, spec.qvel_dim];
-            assert_eq!(sizes.map(<[f64]>::len), expected, "{}", spec.name);
-        }
     }
 }

@@ -9,6 +9,6 @@
 //! - `film`: films saved policies.
 
 pub mod collect;
-pub(crate) mod film;
-pub(crate) mod score;
+pub mod film;
+pub mod score;
 pub mod verify;

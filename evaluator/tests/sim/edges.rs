@@ -12,6 +12,8 @@ fn simulation(name: &str) -> Simulation {
 fn an_episode_is_a_function_of_its_seed() {
     for spec in all() {
         let (mut one, mut other) = (make(spec, 0).unwrap(), make(spec, 0).unwrap());
+        let sizes = [one.observation(), one.qpos(), one.qvel()].map(<[f64]>::len);
+        assert_eq!(sizes, [spec.observation_dim, spec.qpos_dim, spec.qvel_dim], "{}", spec.name);
         let action = vec![0.3; spec.action_dim];
         one.reset(7);
         one.step(&action);

@@ -1,7 +1,6 @@
-//! Simulations, batches of episodes in them, and the tools that record and replay.
+//! Simulations, and batches of episodes in them.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-mod collect;
 mod edges;
 mod gymnasium;
 mod rollout;

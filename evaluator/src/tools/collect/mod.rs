@@ -7,6 +7,8 @@
 
 mod record;
 mod search;
+#[cfg(test)]
+mod tests;
 
 use std::fmt;
 use std::path::Path;

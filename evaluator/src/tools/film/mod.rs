@@ -25,7 +25,7 @@ use crate::tools::score::{ScoreArgs, Subject};
 use encode::{Output, output, stride};
 use episode::FilmedEpisode;
 use stage::Stage;
-pub(crate) use stage::{Gl, INSTALL};
+pub use stage::{Gl, INSTALL};
 
 const RUN: &str =
     "pass a file like RUN/snapshots/step_000020000.safetensors, or the folder of a run";
@@ -69,7 +69,7 @@ pub struct FilmArgs {
 }
 
 /// Makes the film. Returns the text to print.
-pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
+pub fn film(args: &FilmArgs) -> anyhow::Result<String> {
     let read = |path: &Path, step| {
         let mut subjects = Subject::read(&snapshot(path, step)?, &ScoreArgs::default())?;
         anyhow::Ok(subjects.remove(0))

@@ -16,9 +16,9 @@ use quad_run::results::Spread;
 use rayon::prelude::*;
 use tracing::{info, warn};
 
-pub(crate) use results::title;
+pub use results::title;
 use results::{Scored, table};
-pub(crate) use subject::Subject;
+pub use subject::Subject;
 use subject::once_each;
 
 /// Most episodes: far above any use, but few enough for memory.
@@ -89,7 +89,7 @@ pub struct ScoreArgs {
 const BATCH: usize = 16;
 
 /// Scores the policies of the command line. Returns the text to print.
-pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
+pub fn score(args: &ScoreArgs) -> anyhow::Result<String> {
     if !args.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }

@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use quad_dataset::environment::find;
-use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata, RecordedRows};
-use quad_evaluator::tools::collect::{Summary, collect};
-use quad_evaluator::tools::verify::{environment_of, verify};
+use quad_dataset::RecordedRows;
 use tempfile::TempDir;
+
+use super::*;
+use crate::tools::verify::{environment_of, verify};
 
 const TRANSITIONS: usize = 2000;
 
