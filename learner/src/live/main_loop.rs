@@ -20,7 +20,7 @@ use super::events::Event;
 use super::metrics::Metrics;
 use super::network::{Connected, OpeningSession, Wire, connect};
 use super::threads::{STUCK, Threads};
-use crate::local_evaluators::LocalEvaluators;
+use crate::children::LocalEvaluators;
 use crate::service::{End, Input, Order};
 use crate::train::Outcome;
 
