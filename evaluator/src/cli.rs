@@ -7,6 +7,7 @@ use anyhow::Context;
 use clap::{Args, CommandFactory, Parser, Subcommand, value_parser};
 use clap_complete::Shell;
 use quad_dataset::environment::{self, EnvironmentSpec};
+use quad_run::folder::{RunDir, RunDirError};
 use quad_runtime::{Hint, certificates_folder, json, print};
 
 use crate::doctor::{self, DoctorArgs};
@@ -96,6 +97,7 @@ impl Cli {
             Command::Film(args) => print(&film::film(&args)?),
             Command::Collect(args) => {
                 let (out, transitions) = (&args.out, args.transitions as usize);
+                RunDir::refuse_own_file(out).hint_of(RunDirError::hint)?;
                 let summary = collect::collect(args.env, out, transitions, args.seed)?;
                 print(&format!("{}: {summary}", out.display()))
             }

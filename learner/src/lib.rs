@@ -7,8 +7,7 @@
 //! - `cli` is the command line; [`command`] runs a command, up to its exit code.
 //! - `sweep` runs many runs, each as a process.
 //! - `live` is a run at work: threads, main loop, Zenoh.
-//! - `local_evaluators` are evaluators that a learner or a sweep starts; `children` are processes
-//!   that end with this one.
+//! - `children` are processes that end with this one: evaluators, and a sweep's learners.
 //! - `page` shows runs in a browser.
 //! - `report` summarizes scores as tables and figures.
 //! - `judge` ranks policies without a simulator.
@@ -29,7 +28,6 @@ mod data;
 mod fixtures;
 mod judge;
 mod live;
-mod local_evaluators;
 mod page;
 mod report;
 pub mod service;

@@ -1,4 +1,4 @@
-//! Tables and paragraphs: aligned for a terminal, as Markdown or LaTeX.
+//! Tables and paragraphs: aligned for a terminal, or as LaTeX.
 
 use std::fmt::Alignment::{self, Right};
 
@@ -9,7 +9,6 @@ use serde::Serialize;
 #[allow(missing_docs)]
 pub enum Style {
     Text,
-    Markdown,
     /// LaTeX with the package booktabs.
     Latex,
 }
@@ -28,7 +27,7 @@ impl Block {
     pub fn render(&self, style: Style) -> String {
         match (self, style) {
             (Self::Table(table), _) => table.render(style),
-            (Self::Text(text), Style::Text | Style::Markdown) => text.clone(),
+            (Self::Text(text), Style::Text) => text.clone(),
             (Self::Text(text), Style::Latex) => {
                 text.lines().map(|line| format!("{}\n\n", latex(line))).collect()
             }
@@ -74,19 +73,7 @@ impl Table {
     /// The table as text.
     pub fn render(&self, style: Style) -> String {
         match style {
-            Style::Text => {
-                let line = |cells: &[String]| format!("{}\n", cells.join("  ").trim_end());
-                self.lines(line).concat()
-            }
-            Style::Markdown => {
-                let escape = |row: &Vec<String>| row.iter().map(|cell| markdown(cell)).collect();
-                let rows = self.rows.iter().map(escape).collect();
-                let escaped = Self { right: self.right.clone(), rows };
-                let mut lines = escaped.lines(|cells| format!("| {} |\n", cells.join(" | ")));
-                let rule = self.right.iter().map(|right| if *right { "---:" } else { "---" });
-                lines.insert(1, format!("| {} |\n", Vec::from_iter(rule).join(" | ")));
-                lines.concat()
-            }
+            Style::Text => self.lines(),
             Style::Latex => {
                 let line = |row: &Vec<String>| {
                     let cells = Vec::from_iter(row.iter().map(|cell| latex(cell))).join(" & ");
@@ -107,7 +94,7 @@ impl Table {
     }
 
     /// The rows, with cells as wide as their columns.
-    fn lines(&self, line: impl Fn(&[String]) -> String) -> Vec<String> {
+    fn lines(&self) -> String {
         let width = |column: usize| {
             let cells = self.rows.iter().map(|row| row[column].chars().count());
             cells.max().unwrap_or(0)
@@ -117,10 +104,11 @@ impl Table {
             false => format!("{cell:<width$}"),
             true => format!("{cell:>width$}"),
         };
-        let padded = |row: &Vec<String>| {
-            line(&Vec::from_iter(row.iter().zip(&widths).zip(&self.right).map(pad)))
+        let line = |row: &Vec<String>| {
+            let cells = Vec::from_iter(row.iter().zip(&widths).zip(&self.right).map(pad));
+            format!("{}\n", cells.join("  ").trim_end())
         };
-        self.rows.iter().map(padded).collect()
+        self.rows.iter().map(line).collect()
     }
 }
 
@@ -140,11 +128,6 @@ fn latex(text: &str) -> String {
         other => other.to_string(),
     };
     text.chars().map(escaped).collect()
-}
-
-/// Escapes a cell of a Markdown table.
-fn markdown(cell: &str) -> String {
-    cell.replace('\\', "\\\\").replace('|', "\\|").replace('<', "\\<")
 }
 
 #[cfg(test)]

@@ -1,7 +1,6 @@
 //! The command line.
 
-mod export;
-mod judge;
+mod policies;
 mod sweep;
 mod train;
 
@@ -18,8 +17,7 @@ use quad_run::config::{presets, tasks};
 use quad_run::results::Select;
 use quad_runtime::{parse_address, parse_endpoint};
 
-pub use export::{At, ExportArgs, ExportDataArgs};
-pub use judge::JudgeArgs;
+pub use policies::{At, ExportArgs, ExportDataArgs, JudgeArgs};
 pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
 
@@ -63,10 +61,10 @@ pub enum Command {
     /// in them
     Report(ReportArgs),
     /// Rank policies without a simulator, by what the data alone says of them
-    #[command(after_help = judge::EXAMPLES)]
+    #[command(after_help = policies::JUDGE_EXAMPLES)]
     Judge(JudgeArgs),
     /// Write a policy's file that stands alone: it says what it has learned from and how good it is
-    #[command(after_help = export::EXAMPLES)]
+    #[command(after_help = policies::EXPORT_EXAMPLES)]
     Export(ExportArgs),
     /// Write the experience of a run, which evaluators played for it, as a dataset
     ExportData(ExportDataArgs),
@@ -189,9 +187,6 @@ pub struct ReportArgs {
     /// Print JSON instead of tables
     #[arg(long, group = "style")]
     pub json: bool,
-    /// Print the tables as Markdown
-    #[arg(long, group = "style")]
-    pub markdown: bool,
     /// Print the tables as LaTeX, which needs the package booktabs
     #[arg(long, group = "style")]
     pub latex: bool,
@@ -235,7 +230,7 @@ impl TypedValueParser for TaskName {
 }
 
 fn algorithm_names() -> PossibleValuesParser {
-    ALGORITHMS.iter().map(|known| known.name).into()
+    ALGORITHMS.iter().map(|definition| definition.name).into()
 }
 
 fn parse_preset(text: &str) -> Result<String, String> {

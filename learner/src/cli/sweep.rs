@@ -62,9 +62,6 @@ pub struct SweepArgs {
     /// port]
     #[arg(long, value_name = "ADDR:PORT", value_parser = parse_address, requires = "index")]
     pub http: Option<SocketAddr>,
-    /// Further names of that address, such as a service's
-    #[arg(long, value_name = "NAME,…", value_delimiter = ',', requires = "http")]
-    pub http_hosts: Vec<String>,
     /// Runs at a time [default: three for every four cores, so that evaluators have the fourth]
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]
     pub jobs: Option<u16>,

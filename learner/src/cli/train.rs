@@ -1,18 +1,17 @@
 //! The arguments of `learner train`.
 
 use std::net::SocketAddr;
-use std::num::NonZero;
 use std::path::PathBuf;
 
 use anyhow::anyhow;
 use clap::{Args, value_parser};
 use quad_policy::Precision;
-use quad_run::config::Device;
 use quad_run::config::tables::{self, parse_assignment};
+use quad_run::config::{Device, presets};
 use quad_runtime::{Hint, parse_address, parse_endpoint};
 use toml::{Table, Value};
 
-use super::{TaskName, algorithm_names, parse_preset};
+use super::{TaskName, algorithm_names};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
@@ -28,6 +27,7 @@ Examples:
   # Print all values of the run, and the time, memory and disk that it will take.
   learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --dry-run
 
+It trains on $RAYON_NUM_THREADS threads, each of which keeps a core busy; by default on one per core, at most 16.
 At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learner saves a checkpoint and ends with exit code 75; at a second signal it ends at
 once. Then, or after a crash, the same command continues from the newest checkpoint in the run's folder. On the same machine an
 interrupted run ends with the same weights, bit for bit, as a run without interruption.";
@@ -41,9 +41,8 @@ pub struct TrainArgs {
     /// The algorithm (`learner presets` lists algorithms) [default: quad]
     #[arg(long, value_name = "NAME", value_parser = algorithm_names(), hide_possible_values = true)]
     algorithm: Option<String>,
-    /// A task, as --task NAME; or a file of your own with `task`, `algorithm` and the values to
-    /// change
-    #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]
+    /// A file of your own with `task`, `algorithm` and the values to change
+    #[arg(long, value_name = "FILE.toml", value_parser = parse_file, conflicts_with = "task")]
     preset: Option<String>,
     /// Fine-tune a complete run online: with its settings, from its last checkpoint,
     /// in a folder of its own
@@ -95,10 +94,6 @@ pub struct TrainArgs {
     /// none with --listen, --connect or certificates, nor for an environment of your own]
     #[arg(long, value_name = "N", conflicts_with = "certificates")]
     pub evaluators: Option<usize>,
-    /// Training threads, each of which keeps a core busy [default: RAYON_NUM_THREADS, or one per
-    /// core, at most 16]
-    #[arg(long, value_name = "N", value_parser = parse_threads)]
-    pub threads: Option<NonZero<usize>>,
     /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same
     /// authority, and endpoints are tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES,
     /// but none with --evaluators]
@@ -207,10 +202,13 @@ fn parse_count(text: &str) -> Result<i64, &'static str> {
     count.ok_or("write a whole number such as 1000000, below 2⁶³")
 }
 
-fn parse_share(text: &str) -> Result<f64, &'static str> {
-    text.parse().map_err(|_| "write a share such as 0.1")
+fn parse_file(text: &str) -> Result<String, &'static str> {
+    match presets::is_path(text) {
+        true => Ok(text.to_owned()),
+        false => Err("a file must end in .toml; a task is named by --task"),
+    }
 }
 
-fn parse_threads(text: &str) -> Result<NonZero<usize>, &'static str> {
-    text.parse().map_err(|_| "write a whole number from 1")
+fn parse_share(text: &str) -> Result<f64, &'static str> {
+    text.parse().map_err(|_| "write a share such as 0.1")
 }

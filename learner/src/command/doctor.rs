@@ -29,7 +29,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
         let hint =
             format!("{variable} chooses another folder for datasets that are fetched by name");
         let mut checks = Findings::default();
-        match data::cache::folder(benchmark) {
+        match data::cache_folder(benchmark) {
             Ok(folder) => doctor::folder(&mut checks, "datasets", &folder, &hint),
             Err(error) => checks.warn("datasets", format!("{error:#}"), &hint),
         }
@@ -56,14 +56,14 @@ fn locks(findings: &mut Findings, run_dir: &Path) {
     match Lock::is_possible(folder) {
         Ok(true) => findings.ok("locks", format!("files have locks in {shown}")),
         Ok(false) => {
-            let found = format!("files have no locks in {shown}");
+            let problem = format!("files have no locks in {shown}");
             let hint = "a learner keeps others out by a file scores.host instead: after the end of a host that had it, \
                         remove it";
-            findings.warn("locks", found, hint);
+            findings.warn("locks", problem, hint);
         }
         Err(error) => {
-            let found = format!("{shown}: {error}");
-            findings.fail("locks", found, "choose another --run-dir");
+            let problem = format!("{shown}: {error}");
+            findings.fail("locks", problem, "choose another --run-dir");
         }
     }
 }
@@ -72,8 +72,8 @@ fn hdf5(findings: &mut Findings) {
     match quad_dataset::hdf5_library() {
         (version, true) => findings.ok("HDF5", format!("{version}, with compression")),
         (version, false) => {
-            let found = format!("{version}, without zlib");
-            findings.fail("HDF5", found, "install Debian's libhdf5-103-1");
+            let problem = format!("{version}, without zlib");
+            findings.fail("HDF5", problem, "install Debian's libhdf5-103-1");
         }
     }
 }

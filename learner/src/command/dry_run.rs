@@ -17,8 +17,8 @@ pub fn estimate(path: &Path, config: &RunConfig, data: Split) -> anyhow::Result<
     let steps = experiment.total_steps() - experiment.schedule().start;
     let cost = RunCost::measure(experiment, config.run.device, data)?;
     let milliseconds = cost.step_seconds * 1e3;
-    let all = Duration::try_from_secs_f64((cost.step_seconds * steps as f64).ceil());
-    let all = HumanDuration(all.unwrap_or(Duration::MAX));
+    let total = Duration::try_from_secs_f64((cost.step_seconds * steps as f64).ceil());
+    let total = HumanDuration(total.unwrap_or(Duration::MAX));
     let (mut grows, mut kept) = (String::new(), "snapshots and checkpoints");
     if let Some(online) = &experiment.online {
         let bytes = HumanBytes(cost.experience_bytes(online.steps));
@@ -26,7 +26,7 @@ pub fn estimate(path: &Path, config: &RunConfig, data: Split) -> anyhow::Result<
             (format!("; experience adds {bytes}"), "snapshots, checkpoints and experience");
     }
     print(&format!(
-        "# folder: {}\n# data: {}\n# time: {milliseconds:.1} ms a gradient step, measured over a second; {all} for all \
+        "# folder: {}\n# data: {}\n# time: {milliseconds:.1} ms a gradient step, measured over a second; {total} for all \
          {steps}\n# memory: {}, without evaluators{grows}\n# disk: {} for {kept}\n\n{}",
         path.display(),
         config.dataset.summary(),

@@ -6,7 +6,7 @@ use anyhow::anyhow;
 use quad_protocol::Hash;
 use quad_run::config::{ConfigError, Experiment, Preset, RunConfig};
 use quad_run::folder::{Checkpoint, RunDir};
-use quad_runtime::{Hint, hinted};
+use quad_runtime::Hint;
 use toml::Table;
 use tracing::info;
 
@@ -36,8 +36,8 @@ pub(super) fn read(
     if let [Ok(there), Ok(here)] = [source, folder].map(Path::canonicalize)
         && there == here
     {
-        let error = anyhow!("{} cannot begin with itself", folder.display());
-        return Err(hinted(error, "the new run has a folder of its own: name it by --run-dir"));
+        return Err(anyhow!("{} cannot begin with itself", folder.display()))
+            .hint("the new run has a folder of its own: name it by --run-dir");
     }
     match (EarlierRun::read(source), begun(folder).filter(|_| !fresh)) {
         (Ok((run, preset)), _) => Ok((Some(run), preset)),
@@ -72,21 +72,19 @@ impl EarlierRun {
     fn read(run: &Path) -> anyhow::Result<(Self, Preset)> {
         let (dir, config) = RunDir::open(run)?;
         if config.experiment.online.is_some() {
-            let error = anyhow!("the run in {} has learned online already", run.display());
-            return Err(hinted(error, "--from takes a run of the dataset alone"));
+            return Err(anyhow!("the run in {} has learned online already", run.display()))
+                .hint("--from takes a run of the dataset alone");
         }
         let steps = config.experiment.steps;
         let Some(checkpoint) = dir.newest_checkpoint()? else {
-            let error = anyhow!("the run in {} has no checkpoint", run.display());
-            let hint = "--from begins with a run's last one: put checkpoints/ back if it was \
-                        deleted, or let the run end";
-            return Err(hinted(error, hint));
+            return Err(anyhow!("the run in {} has no checkpoint", run.display())).hint(
+                "--from begins with a run's last one: put checkpoints/ back if it was deleted, or let the run end",
+            );
         };
         if checkpoint.step != steps {
-            let error =
-                anyhow!("the run in {} has not reached its last step, {steps}", run.display());
-            let hint = "let it end first: `learner train` with its settings continues it";
-            return Err(hinted(error, hint));
+            let run = run.display();
+            return Err(anyhow!("the run in {run} has not reached its last step, {steps}"))
+                .hint("let it end first: `learner train` with its settings continues it");
         }
         let hash = Hash::new(&checkpoint.state).to_string();
         let preset = preset(&config, Table::from_iter([("from".to_owned(), hash.into())]))?;
@@ -99,23 +97,20 @@ impl EarlierRun {
     /// numbers still mean the same.
     pub fn check(&self, here: &Experiment, sha256: &str) -> anyhow::Result<()> {
         if here.online.is_none() {
-            let error = anyhow!("without online steps there is nothing to continue with");
-            return Err(hinted(
-                error,
-                "give a number of environment steps above 0 by --online-steps N",
-            ));
+            return Err(anyhow!("without online steps there is nothing to continue with"))
+                .hint("give a number of environment steps above 0 by --online-steps N");
         }
         let there = &self.experiment;
-        let known = self.dataset_sha256.as_deref().unwrap_or(sha256);
+        let recorded = self.dataset_sha256.as_deref().unwrap_or(sha256);
         let kept = [
-            ("dataset", known == sha256),
+            ("dataset", recorded == sha256),
             ("steps", there.steps == here.steps),
             ("reward", there.reward == here.reward),
             ("normalize", there.normalize == here.normalize),
             ("hold_out", there.hold_out == here.hold_out),
         ];
         let Some((key, _)) = kept.iter().find(|(_, is_kept)| !is_kept) else { return Ok(()) };
-        let error = anyhow!("the run of --from has learned with another value of {key}");
-        Err(hinted(error, "leave it as it was there: what has been learned depends on it"))
+        Err(anyhow!("the run of --from has learned with another value of {key}"))
+            .hint("leave it as it was there: what has been learned depends on it")
     }
 }

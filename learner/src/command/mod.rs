@@ -5,10 +5,8 @@ mod dataset_hints;
 mod doctor;
 mod dry_run;
 mod export;
-mod export_data;
 mod from;
 mod outside;
-mod page;
 mod sweep;
 mod train;
 
@@ -20,26 +18,29 @@ use anyhow::anyhow;
 use clap::CommandFactory;
 use clap_complete::Shell;
 use quad_algorithms::{ALGORITHMS, Definition, Values};
-use quad_dataset::{DatasetError, benchmarks, environment};
+use quad_dataset::{DatasetError, OnlineEpisode, benchmarks, environment};
+use quad_protocol::Episode;
 use quad_run::config::{ConfigError, Preset, hyperparameters, tasks};
 use quad_run::counted;
 use quad_run::folder::verify::{self, Findings};
-use quad_run::folder::{RunDirError, verify_experience};
+use quad_run::folder::{RunDir, RunDirError, verify_experience};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
 use quad_runtime::{
-    Hint, hinted, json, print, stay_in_background, unfinished, unfinished_at_signal,
+    Health, Hint, LEAVE_WITHIN, ListenError, hinted, json, print, serve_metrics, shutdown_signal,
+    stay_in_background, unfinished, unfinished_at_signal,
 };
 use serde::Serialize;
 use tokio::runtime::{Builder, Runtime};
 use tracing::{info, warn};
 
 use crate::cli::{
-    Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, JudgeArgs, ListArgs, PresetsArgs,
-    ReportArgs, VerifyArgs,
+    Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, JudgeArgs, ListArgs, PageArgs,
+    PresetsArgs, ReportArgs, VerifyArgs,
 };
-use crate::data::{Source, cache};
-use crate::judge::{Budget, judge};
+use crate::data::{Source, cache_folder, cached, load};
+use crate::judge::judge;
+use crate::page;
 use crate::report::{Report, draw_all, write_html};
 
 const DAMAGED: &str = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode \
@@ -59,11 +60,11 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
         Command::Export(args) => export::export(args),
-        Command::ExportData(args) => export_data::export(args),
+        Command::ExportData(args) => export::export_data(args),
         Command::Judge(args) => rank(args),
         Command::Verify(args) => check_runs(args),
         Command::List(args) => list_runs(args),
-        Command::Page(args) => page::show(args),
+        Command::Page(args) => serve_page(args),
         Command::Doctor(args) => examine(args),
         Command::Completions { shell } => completions(*shell),
     };
@@ -101,22 +102,22 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.metrics {
         return print_metrics(args.algorithm.as_deref());
     }
-    let mut known = table(["task", "environment", "dataset", "what it is"]);
+    let mut tasks = table(["task", "environment", "dataset", "what it is"]);
     for task in tasks::all().iter().filter(|task| task.is_listed) {
         let [environment, dataset] =
             ["environment", "dataset"].map(|key| task.text(key).unwrap_or("-"));
-        known.push([&*task.name, environment, dataset, &task.about].map(str::to_owned));
+        tasks.push([&*task.name, environment, dataset, &task.about].map(str::to_owned));
     }
-    let given = "its authors give values for";
-    let mut algorithms = table(["algorithm", "what it is", given, "GFLOP a step"]);
+    let header = ["algorithm", "what it is", "its authors give values for", "GFLOP a step"];
+    let mut algorithms = table(header);
     for definition in ALGORITHMS {
         let (name, values) = (definition.name.to_owned(), Values::of(definition));
-        let of_benchmark = |(name, tasks): (_, &Vec<_>)| format!("{name}: {}", tasks.join(", "));
-        let given = Vec::from_iter(values.given.iter().map(of_benchmark)).join("; ");
+        let words = |(name, tasks): (_, &Vec<_>)| format!("{name}: {}", tasks.join(", "));
+        let given = Vec::from_iter(values.given.iter().map(words)).join("; ");
         algorithms.push([name, values.about, given, values.gflop]);
     }
-    let [known, algorithms] = [known, algorithms].map(|table| table.render(Style::Text));
-    print(&format!("{known}\n{algorithms}"))
+    let [tasks, algorithms] = [tasks, algorithms].map(|table| table.render(Style::Text));
+    print(&format!("{tasks}\n{algorithms}"))
 }
 
 fn table<const N: usize>(header: [&str; N]) -> Table {
@@ -164,11 +165,7 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
         write_html(path, &report)?;
         info!("report: {}", path.display());
     }
-    let style = match (args.markdown, args.latex) {
-        (true, _) => Style::Markdown,
-        (_, true) => Style::Latex,
-        _ => Style::Text,
-    };
+    let style = if args.latex { Style::Latex } else { Style::Text };
     show(args.json, &report, || report.render(style))?;
     all_readable(report.unreadable.len())
 }
@@ -210,7 +207,18 @@ fn check_run(dir: &Path, about: &str, same_as: Option<&Path>) -> anyhow::Result<
         print(&format!("{about}{findings}"))
     };
     report(about, verify::verify(dir)?)?;
-    if let Some((findings, promise)) = verify_experience(dir)? {
+    let config = RunDir::at(dir).read_config()?;
+    // By the run's dataset, if that is still there: training leaves out what is far from its range.
+    let data = config.experiment.online.as_ref().and_then(|_| {
+        let (path, held_out) = (&config.dataset.path, &config.dataset.held_out);
+        load(path, &config.experiment, Some(held_out)).ok()
+    });
+    let is_left_out = |episode: &Episode| {
+        let Episode { observations, actions, rewards, terminated, .. } = episode;
+        let rows = OnlineEpisode { observations, actions, rewards, terminated: *terminated };
+        data.as_ref().is_some_and(|data| matches!(data.training.add_episode(rows), Ok(Some(_))))
+    };
+    if let Some((findings, promise)) = verify_experience(dir, is_left_out)? {
         report(about, findings)?;
         print(&format!("{about}{promise}"))?;
     }
@@ -241,9 +249,7 @@ fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
 }
 
 fn rank(args: &JudgeArgs) -> anyhow::Result<()> {
-    let (steps, seeds) = (args.steps, args.seeds);
-    let (dataset, budget) = (args.dataset.as_deref(), Budget { steps, seeds });
-    let ranking = judge(&args.policies, dataset, args.gamma, budget)?;
+    let ranking = judge(&args.policies, args.dataset.as_deref(), args.steps, args.seeds)?;
     let blocks = ranking.blocks().map(|block| block.render(Style::Text));
     show(args.json, &ranking, || blocks.join("\n"))
 }
@@ -265,12 +271,12 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
         DatasetsCommand::List => {
             let [size, cache] = [("size", Right), ("in the cache", Left)];
             let mut table = Table::new(&[("dataset", Left), ("environment", Left), size, cache]);
-            for dataset in cache::list() {
+            for dataset in cached() {
                 table.push(dataset?);
             }
             let mut folders = Vec::new();
             for benchmark in benchmarks::all() {
-                let folder = cache::folder(benchmark)?;
+                let folder = cache_folder(benchmark)?;
                 folders.push(format!("{} of {}", folder.display(), benchmark.name));
             }
             let (table, folders) = (table.render(Style::Text), folders.join(", "));
@@ -299,4 +305,23 @@ fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let (problems, path) = (inspection.problems.len(), inspection.path.display());
     anyhow::ensure!(problems == 0, "{} in {path}", counted(problems, "problem"));
     Ok(())
+}
+
+/// Serves the page of all runs until a signal.
+fn serve_page(args: &PageArgs) -> anyhow::Result<()> {
+    let folder = args.runs.display();
+    if !args.runs.is_dir() {
+        return Err(anyhow!("there is no folder {folder}")).hint("name one: learner page DIR");
+    }
+    let runtime = Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(async {
+        let page = page::routes(args.runs.clone(), None);
+        let server =
+            serve_metrics(args.http, &args.http_hosts, Default::default(), Health::default(), page);
+        let server = server.await;
+        let server = server.hint_of(ListenError::hint)?;
+        info!("page: http://{}/ shows the runs in {folder}; Ctrl-C ends it", server.address);
+        shutdown_signal(LEAVE_WITHIN).await;
+        Ok(())
+    })
 }

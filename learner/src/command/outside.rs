@@ -11,9 +11,9 @@ use quad_runtime::{
 };
 use tracing::{info, warn};
 
+use crate::children::LocalEvaluators;
 use crate::cli::TrainArgs;
 use crate::live::{OpeningSession, open_network};
-use crate::local_evaluators::LocalEvaluators;
 
 /// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with
 /// one next action per state), and threads that wait for a tile keep their cores busy.
@@ -47,7 +47,7 @@ impl Outside {
             _ if args.dry_run || !needs_evaluators => (0, cores),
             Some(count) => (count, cores),
             None if is_alone => {
-                let left = cores.saturating_sub(training_threads(args.threads)).max(1);
+                let left = cores.saturating_sub(training_threads()).max(1);
                 (left.min(experiment.episodes as usize), left)
             }
             None => (0, cores),
@@ -80,12 +80,10 @@ impl Outside {
     }
 }
 
-/// The number of training threads: that of the command line or RAYON_NUM_THREADS, or else one per
-/// core, up to a limit.
-pub(super) fn training_threads(asked: Option<NonZero<usize>>) -> usize {
+/// The number of training threads: RAYON_NUM_THREADS, or else one per core, up to a limit.
+pub(super) fn training_threads() -> usize {
     let cores = available_parallelism().map_or(1, NonZero::get);
-    let asked = asked.or_else(requested_threads);
-    asked.map_or(cores.min(MOST_THREADS), NonZero::get)
+    requested_threads().map_or(cores.min(MOST_THREADS), NonZero::get)
 }
 
 fn endpoints(args: &TrainArgs, needs_evaluators: bool) -> anyhow::Result<Endpoints> {

@@ -10,7 +10,7 @@ use anyhow::{Context, anyhow};
 use quad_run::counted;
 use quad_run::folder::{Lock, RunDirError};
 use quad_run::status::State;
-use quad_run::table::{Style, Table};
+use quad_run::table::{Column, Style, Table};
 use quad_runtime::{Hint, SessionError, open_router, print, requested_threads, unfinished};
 use tokio::sync::mpsc;
 use tokio::task::LocalSet;
@@ -18,8 +18,8 @@ use tracing::{info, warn};
 
 use super::all_readable;
 use super::dataset_hints::record_hint;
+use crate::children::LocalEvaluators;
 use crate::cli::SweepArgs;
-use crate::local_evaluators::LocalEvaluators;
 use crate::sweep::{LearnerOptions, Outcome, PlannedRun, Study, StudyCost, Sweep};
 
 type Runs = Vec<(PlannedRun, State)>;
@@ -28,7 +28,7 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     let study = Study::read(&args.study, &args.only, &args.set)?;
     let folder = args.runs.join(&study.name);
     let mut runs = chosen(&study, args, &folder)?;
-    let count = |state| runs.iter().filter(|(_, found)| *found == state).count();
+    let count = |state| runs.iter().filter(|(_, reached)| *reached == state).count();
     let [complete, unreadable, new] =
         [State::Complete, State::Unreadable, State::NotBegun].map(count);
     if args.list {
@@ -36,9 +36,9 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
         return all_readable(unreadable);
     }
     info!("{}: {}", study.name, study.about);
-    let (all, todo) = (runs.len(), runs.len() - complete - unreadable);
+    let (total, todo) = (runs.len(), runs.len() - complete - unreadable);
     let begun = todo - new;
-    info!("{}: {complete} complete, {todo} to do ({begun} begun)", counted(all, "run"));
+    info!("{}: {complete} complete, {todo} to do ({begun} begun)", counted(total, "run"));
     let mut failed = Vec::new();
     for (run, _) in runs.iter().filter(|(_, state)| *state == State::Unreadable) {
         failed.push(format!("{}: its folder cannot be read", run.name));
@@ -52,20 +52,12 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
         _ => work(args, &study.name, &folder, runs)?,
     };
     ended.failed.extend(failed);
-    conclude(&folder, all, ended)
-}
-
-fn make(folder: &Path) -> anyhow::Result<()> {
-    let failed = || format!("cannot make the folder {}", folder.display());
-    fs::create_dir_all(folder)
-        .with_context(failed)
-        .hint("choose another folder: learner sweep STUDY.toml DIR")
+    conclude(&folder, total, ended)
 }
 
 /// Keeps others from the study's folder, or from the whole study if this is a part of it: two
 /// sweeps of the same runs would start them twice.
 fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
-    make(folder)?;
     let path = folder.join("sweep.lock");
     let is_part = args.index.is_some() || args.shard.is_some() || !args.only.is_empty();
     let take = if is_part { Lock::share } else { Lock::take };
@@ -94,12 +86,12 @@ fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs
 }
 
 fn list(runs: &Runs) -> String {
-    let mut table = Table::new(&[("index", Right), ("run", Left), ("state", Left)]);
-    for (run, state) in runs {
-        let (index, state) = (run.index.to_string(), state.text(run.experiment.total_steps()));
-        table.push([index, run.name.clone(), state]);
-    }
-    table.render(Style::Text)
+    let columns: [Column<(PlannedRun, State)>; 3] = [
+        ("index", Right, |(run, _)| run.index.to_string()),
+        ("run", Left, |(run, _)| run.name.clone()),
+        ("state", Left, |(run, state)| state.text(run.experiment.total_steps())),
+    ];
+    Table::from_rows(runs, &columns).render(Style::Text)
 }
 
 /// The number of learners at a time, and of cores that they leave to evaluators.
@@ -156,11 +148,12 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
         info!("{}", cost.text(jobs));
         step_seconds = cost.step_seconds;
     }
-    let _lock = lock(args, folder)?;
     // Tasks of an array job must not write into each other's logs.
-    let own = args.index.map_or("", |_| &*left[0].0.name);
-    let logs = folder.join(own);
-    make(&logs)?;
+    let logs = folder.join(args.index.map_or("", |_| &*left[0].0.name));
+    fs::create_dir_all(&logs)
+        .with_context(|| format!("cannot make the folder {}", folder.display()))
+        .hint("choose another folder: learner sweep STUDY.toml DIR")?;
+    let _lock = lock(args, folder)?;
 
     let runtime = super::runtime()?;
     let ended = runtime.block_on(async {
@@ -181,8 +174,7 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
         let work = async {
             evaluators.start(std::slice::from_ref(&endpoint), &logs, study, report)?;
             let (folder, waiting) = (folder.to_owned(), VecDeque::from(left));
-            let http_hosts = args.http_hosts.clone();
-            let options = LearnerOptions { threads, endpoint, http: args.http, http_hosts };
+            let options = LearnerOptions { threads, endpoint, http: args.http };
             let sweep = Sweep { folder, waiting, jobs, options, evaluators, lines, step_seconds };
             anyhow::Ok(sweep.run().await)
         };

@@ -1,23 +1,20 @@
 //! `learner train`, from the parsed command line to the report.
 
-use std::num::NonZero;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use prometheus::Registry;
 use quad_algorithms::Agent;
 use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo};
-use quad_run::counted;
 use quad_run::folder::{Checkpoint, ExistingRun, Log, ResumePoint, RunDir};
 use quad_run::results::RunReport;
-use quad_runtime::{
-    Health, Hint, ListenError, MetricsServer, hinted, print, serve_metrics, unfinished,
-};
+use quad_run::{counted, files};
+use quad_runtime::{Health, Hint, ListenError, hinted, print, serve_metrics, unfinished};
+use rayon::ThreadPoolBuilder;
 use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
@@ -72,7 +69,12 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let dataset = source.obtain().hint(record_hint(&experiment))?;
     from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &dataset.sha256))?;
 
-    start_pool(args.threads)?;
+    let threads = training_threads();
+    let pool = ThreadPoolBuilder::new().thread_name(|_| "training".to_owned());
+    pool.num_threads(threads)
+        .build_global()
+        .with_context(|| format!("cannot start {threads} threads for training"))
+        .hint("choose fewer by RAYON_NUM_THREADS")?;
     let held_out = begun.as_ref().and_then(ExistingRun::held_out);
     let held_out = held_out.or(from.as_ref().map(|from| &*from.held_out));
     let data = load(&dataset.path, &experiment, held_out)?;
@@ -128,15 +130,6 @@ fn announce(
     Ok(())
 }
 
-fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
-    let threads = training_threads(asked);
-    let pool = rayon::ThreadPoolBuilder::new().thread_name(|_| "training".to_owned());
-    pool.num_threads(threads)
-        .build_global()
-        .with_context(|| format!("cannot start {threads} threads for training"))
-        .hint("choose fewer by --threads or RAYON_NUM_THREADS")
-}
-
 async fn run_to_end(
     args: &TrainArgs,
     mut outside: Outside,
@@ -157,7 +150,11 @@ async fn run_to_end(
         carrier: Arc::default(),
     };
     let carrier = page_state.carrier.clone();
-    let server = serve_page(args, path, page_state, registry).await?;
+    let live = Arc::new(move || page_state.to_json());
+    let page = page::routes(path.to_owned(), Some(live));
+    let server = serve_metrics(args.http, &args.http_hosts, registry, health.clone(), page).await;
+    let server = server.hint_of(ListenError::hint)?;
+    info!("page: http://{}/", server.address);
     let (o, a) = (data.training.observation_dim(), data.training.action_dim());
     let task = Task::new(&experiment.environment, o, a);
     let (agent, held_out) = begin_agent(config, data, first.as_ref())?;
@@ -213,24 +210,9 @@ fn begin_agent(
             agent.load(state).hint("networks stay as they are: leave out what changes them");
         loaded.context("the last checkpoint of --from does not fit")?;
     }
-    let held_out = data.held_out.and_then(|it| HeldOut::new(experiment, device, it, &mut agent));
+    let held_out =
+        data.held_out.and_then(|data| HeldOut::new(experiment, device, data, &mut agent));
     Ok((agent, held_out))
-}
-
-/// Serves the page and the metrics of the run in a folder.
-async fn serve_page(
-    args: &TrainArgs,
-    path: &Path,
-    state: PageState,
-    registry: Registry,
-) -> anyhow::Result<MetricsServer> {
-    let health = state.health.clone();
-    let live = Arc::new(move || state.to_json());
-    let page = page::routes(path.to_owned(), Some(live));
-    let server = serve_metrics(args.http, &args.http_hosts, registry, health, page).await;
-    let server = server.hint_of(ListenError::hint)?;
-    info!("page: http://{}/", server.address);
-    Ok(server)
 }
 
 /// The run in the folder, or a new one; without a checkpoint of its own it begins with `first`.
@@ -275,7 +257,18 @@ fn conclude(
     );
     let (steps, environment) = (config.experiment.total_steps(), &config.experiment.environment);
     let error = match ending {
-        Ending::Complete => return all_scored(summarize(run_dir)?),
+        Ending::Complete => match summarize(run_dir)?.episodes_missing {
+            0 => return Ok(()),
+            missing => {
+                return Err(hinted(
+                    anyhow!(
+                        "training is complete, without the scores of {}",
+                        counted(missing as usize, "episode")
+                    ),
+                    "the log says why; fix it, and the same command hands them out again",
+                ));
+            }
+        },
         Ending::Failed(error) => hinted(error, kept),
         Ending::Interrupted => unfinished(
             anyhow!("interrupted before the end of {steps} steps and their evaluations"),
@@ -299,22 +292,15 @@ fn conclude(
     Err(error)
 }
 
-fn all_scored(report: RunReport) -> anyhow::Result<()> {
-    if report.is_complete() {
-        return Ok(());
-    }
-    let missing = counted(report.episodes_missing as usize, "episode");
-    Err(anyhow!("training is complete, without the scores of {missing}"))
-        .hint("the log says why; fix it, and the same command hands them out again")
-}
-
 fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     let report = RunReport::read(run_dir.path())?;
     let mut text = String::new();
     if !report.evaluations.is_empty() {
         run_dir.write_json("report.json", &report)?;
         let picture = run_dir.path().join("learning_curve.svg");
-        learning_curve(&report).write_svg(&picture)?;
+        let svg = learning_curve(&report).svg()?;
+        files::replace(&picture, svg.as_bytes())
+            .with_context(|| format!("cannot write {}", picture.display()))?;
         let (scores, picture) = (report.text(), picture.display());
         text = format!("\n{scores}\nlearning curve: {picture}\n");
     }
@@ -332,15 +318,6 @@ fn run_name(path: &Path) -> anyhow::Result<Name> {
         )
 }
 
-/// The CPU and the instructions that training uses.
-fn machine(precision: Precision) -> String {
-    let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
-    let name = name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
-    let threads = counted(rayon::current_num_threads(), "thread");
-    format!("{name}, {threads}, {}", precision.arithmetic())
-}
-
 fn run_config(
     args: &TrainArgs,
     name: &Name,
@@ -350,13 +327,17 @@ fn run_config(
     data: &Split,
 ) -> anyhow::Result<RunConfig> {
     let statistics = data.training.statistics();
+    let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let cpu = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
+    let cpu = cpu.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
+    let threads = counted(rayon::current_num_threads(), "thread");
     Ok(RunConfig {
         run: RunInfo {
             name: name.clone(),
             started: now()?,
             task: task.to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            machine: Some(machine(experiment.precision)),
+            machine: Some(format!("{cpu}, {threads}, {}", experiment.precision.arithmetic())),
             device: args.device,
         },
         dataset: DatasetInfo {

@@ -1,18 +1,20 @@
-//! Files of the catalog, from the cache folder or from the first address that has them.
+//! Files of the catalog, from the cache folder or from the first address that has them, checked
+//! against the catalog.
 
 use std::fs;
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Error, anyhow};
 use quad_dataset::NamedDataset;
+use quad_dataset::benchmarks::Format;
+use quad_run::files;
 use quad_runtime::{Hint, ProgressBar, hinted};
+use sha2::{Digest, Sha256};
 use ureq::Agent;
 
-use super::partial::Partial;
-use super::transfer::{Failure, client, transfer};
-use super::verify::verify;
+use super::transfer::{Failure, Partial, client, transfer};
 
 #[cfg(test)]
 mod tests;
@@ -107,19 +109,15 @@ impl Fetcher {
                 Some(bytes) if bytes == partial.length => Ok(()),
                 bytes => transfer(&self.client, address, bytes, partial, progress),
             };
-            let failure = match result.and_then(|()| check(dataset, partial)) {
-                Ok(sha256) => return Ok(sha256),
-                Err(failure) => failure,
-            };
             attempts -= 1;
             if partial.length > furthest {
                 (furthest, attempts) = (partial.length, ATTEMPTS);
             }
-            match failure {
-                Failure::Passing(reason) if attempts > 0 => {
-                    progress.say(&format!("{reason}; trying again"))
+            match result.and_then(|()| check(dataset, partial)) {
+                Err(Failure::Passing(reason)) if attempts > 0 => {
+                    progress.say(&format!("{reason}; trying again"));
                 }
-                failure => return Err(failure),
+                ended => return ended,
             }
             std::thread::sleep(self.pause);
         }
@@ -128,10 +126,11 @@ impl Fetcher {
 
 /// An address to be shown, without what stands before an `@`: a user's name and password.
 fn without_password(address: &str) -> String {
-    let Some((before, host)) = address.rsplit_once('@') else { return address.to_owned() };
-    let scheme =
-        before.split_once("://").map_or(String::new(), |(scheme, _)| scheme.to_owned() + "://");
-    format!("{scheme}…@{host}")
+    match (address.rsplit_once('@'), address.split_once("://")) {
+        (None, _) => address.to_owned(),
+        (Some((_, host)), Some((scheme, _))) => format!("{scheme}://…@{host}"),
+        (Some((_, host)), None) => format!("…@{host}"),
+    }
 }
 
 /// SHA-256 of the fetched file, which is deleted if it is not the dataset's.
@@ -156,4 +155,36 @@ fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
     let (name, folder) = (&dataset.name, folder.display());
     let text = format!("cannot keep the dataset {name} in {folder}");
     hinted(Error::new(error).context(text), hint)
+}
+
+/// SHA-256 of a file in lower-case hexadecimal if size, format and checksum are those of the
+/// catalog; otherwise the mismatch.
+fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, String>> {
+    let mut file = files::open_named(path)?;
+    let bytes = file.metadata()?.len();
+    if let Some(expected) = dataset.bytes.filter(|expected| *expected != bytes) {
+        return Ok(Err(format!("it has {bytes} bytes, but must have {expected}")));
+    }
+    let mut start = Vec::new();
+    let format = dataset.benchmark.format;
+    file.by_ref().take(16).read_to_end(&mut start)?;
+    // Some servers send a web page instead of an error.
+    if Format::from_start(&start) != Some(format) {
+        return Ok(Err(format!("it is not an {}", format.name())));
+    }
+    let sha256 = sha256(path)?;
+    Ok(match &dataset.sha256 {
+        Some(expected) if *expected != sha256 => {
+            Err(format!("its SHA-256 is {sha256}, but must be {expected}"))
+        }
+        _ => Ok(sha256),
+    })
+}
+
+/// SHA-256 of a file in lower-case hexadecimal.
+pub fn sha256(path: &Path) -> io::Result<String> {
+    let mut file = files::open_named(path)?;
+    let mut hasher = Sha256::new();
+    io::copy(&mut file, &mut hasher)?;
+    Ok(format!("{:x}", hasher.finalize()))
 }

@@ -1,16 +1,18 @@
-//! Values of `--dataset`: a path, a name of the catalog, or `minari:` and an ID.
+//! Values of `--dataset`: a path, a name of the catalog, or `minari:` and an ID; and the cache folders
+//! of benchmarks.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
+use indicatif::HumanBytes;
+use quad_dataset::benchmarks::{Benchmark, Cache};
 use quad_dataset::environment::{self, simulation_of};
 use quad_dataset::{DatasetError, NamedDataset, catalog};
 use quad_run::config::{did_you_mean, tasks};
 use quad_runtime::Hint;
 
-use super::cache;
-use super::fetch::{Fetcher, LocalDataset};
-use super::verify::sha256;
+use super::fetch::{Fetcher, LocalDataset, sha256};
+use super::transfer::partial_files;
 
 /// Environment variable with the address of a mirror that is tried before the catalog's addresses.
 const MIRROR: &str = "QUAD_DATASETS_URL";
@@ -43,16 +45,16 @@ impl Source {
     pub fn named(name: &str) -> anyhow::Result<Self> {
         const LIST: &str =
             "`learner datasets list` prints all names; to train on a file, give its path";
-        let known = catalog::all().iter().map(|dataset| dataset.name.as_str());
+        let names = catalog::all().iter().map(|dataset| dataset.name.as_str());
         let hint = match tasks::named(name).map(|task| task.text("dataset")) {
             Ok(Some(dataset)) => format!("it is a task, whose dataset is {dataset}"),
             Ok(None) => {
                 format!("it is a task: `learner train --task {name}` says how to make its data")
             }
-            Err(_) => did_you_mean(name, known) + LIST,
+            Err(_) => did_you_mean(name, names) + LIST,
         };
-        let found = catalog::find(name).with_context(|| format!("unknown dataset `{name}`"));
-        Ok(Self::Named(found.hint(hint)?))
+        let dataset = catalog::find(name).with_context(|| format!("unknown dataset `{name}`"));
+        Ok(Self::Named(dataset.hint(hint)?))
     }
 
     /// The entry of the catalog, for a path by the file's name.
@@ -93,7 +95,7 @@ impl Source {
             Self::Named(dataset) => {
                 let mirror = std::env::var(MIRROR).ok();
                 let fetcher = Fetcher::new(mirror.filter(|mirror| !mirror.is_empty()));
-                fetcher.fetch(dataset, &cache::folder(dataset.benchmark)?)
+                fetcher.fetch(dataset, &cache_folder(dataset.benchmark)?)
             }
             Self::Minari(id) => {
                 let path = quad_dataset::minari_folder(id);
@@ -115,6 +117,43 @@ fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
     let data = quad_dataset::data_file(&path).hint_of(DatasetError::hint)?;
     let sha256 = sha256(&data).with_context(|| format!("cannot read {}", data.display()))?;
     Ok(LocalDataset { path, sha256 })
+}
+
+/// The cache folder of a benchmark, shared with its Python package.
+pub fn cache_folder(benchmark: &Benchmark) -> anyhow::Result<PathBuf> {
+    let Cache { folder, variable } = &benchmark.cache;
+    let named = variable.as_ref().and_then(std::env::var_os);
+    if let Some(named) = named.filter(|named| !named.is_empty()) {
+        return Ok(named.into());
+    }
+    let hint = match variable {
+        Some(variable) => format!("name a folder in {variable}"),
+        None => "name a home folder in HOME".to_owned(),
+    };
+    let home = std::env::home_dir().filter(|home| !home.as_os_str().is_empty());
+    home.map(|home| home.join(folder))
+        .ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
+        .hint(hint)
+}
+
+/// The catalog: name, environment, size, and state of the file in its folder. Does not compute
+/// checksums.
+pub fn cached() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
+    catalog::all().iter().map(|dataset| {
+        let NamedDataset { name, environment, bytes, .. } = dataset;
+        let path = cache_folder(dataset.benchmark)?.join(&dataset.file);
+        let parts = partial_files(&path).into_iter().map(|(_, length)| length);
+        let state = match (path.metadata().map(|file| file.len()), parts.max()) {
+            (Ok(size), _) if bytes.is_some_and(|bytes| bytes != size) => {
+                format!("another file of {size} bytes")
+            }
+            (Ok(_), _) => "yes".to_owned(),
+            (Err(_), Some(part)) => format!("{} of it", HumanBytes(part)),
+            (Err(_), None) => "no".to_owned(),
+        };
+        let size = bytes.map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string());
+        Ok([name.clone(), environment.clone(), size, state])
+    })
 }
 
 #[cfg(test)]

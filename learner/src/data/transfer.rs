@@ -1,13 +1,14 @@
-//! One attempt to get the rest of a file from one address.
+//! One attempt to get the rest of a file from one address, and files that have arrived in part.
 
-use std::io::{self, Read};
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use quad_run::files;
 use quad_runtime::ProgressBar;
 use ureq::http::{Response, StatusCode};
 use ureq::{Agent, Body, Error};
-
-use super::partial::Partial;
 
 const CHUNK: usize = 1 << 16;
 const CONNECT: Duration = Duration::from_secs(10);
@@ -70,8 +71,8 @@ pub fn transfer(
     };
     let rest = response.body().content_length();
     let bytes = match (expected, rest.map(|rest| first + rest)) {
-        (Some(expected), Some(found)) if found != expected => {
-            let reason = format!("the server's file has {found} bytes, but must have {expected}");
+        (Some(expected), Some(bytes)) if bytes != expected => {
+            let reason = format!("the server's file has {bytes} bytes, but must have {expected}");
             return Err(Failure::Lasting(reason));
         }
         (Some(bytes), _) | (None, Some(bytes)) => bytes,
@@ -114,15 +115,13 @@ fn append(
 }
 
 fn network(error: Error) -> Failure {
-    use Error::{BadUri, Http, Tls, TooManyRedirects};
-    let reason = match &error {
-        // Its text has the whole address, also a password.
-        BadUri(_) => "this is no address of a file".to_owned(),
-        error => error.to_string(),
-    };
     match error {
-        BadUri(_) | Http(_) | Tls(_) | TooManyRedirects => Failure::Lasting(reason),
-        _ => Failure::Passing(reason),
+        // Its text has the whole address, also a password.
+        Error::BadUri(_) => Failure::Lasting("this is no address of a file".to_owned()),
+        Error::Http(_) | Error::Tls(_) | Error::TooManyRedirects => {
+            Failure::Lasting(error.to_string())
+        }
+        error => Failure::Passing(error.to_string()),
     }
 }
 
@@ -140,4 +139,70 @@ fn first_byte(response: &Response<Body>) -> Option<u64> {
     let range = response.headers().get("content-range")?.to_str().ok()?;
     let (first, _) = range.strip_prefix("bytes ")?.split_once('-')?;
     first.parse().ok()
+}
+
+/// The part of `<file>` that this process has fetched: `<file>.<number>.partial`.
+pub struct Partial {
+    pub path: PathBuf,
+    pub length: u64,
+    file: File,
+}
+
+impl Partial {
+    /// Continues the part that an interrupted process has left of `target`, or makes an empty one.
+    pub fn open(target: &Path) -> io::Result<Self> {
+        let path = target.with_added_extension(format!("{:08x}.partial", rand::random::<u32>()));
+        for (left, _) in partial_files(target) {
+            // A process that is still fetching has a lock on its file.
+            let Ok(file) = files::append(&left) else { continue };
+            if file.try_lock().is_ok() && fs::rename(&left, &path).is_ok() {
+                let length = file.metadata()?.len();
+                return Ok(Self { path, length, file });
+            }
+        }
+        let file = files::append(&path)?;
+        // On a file system without locks, nothing is continued.
+        file.try_lock().ok();
+        Ok(Self { path, length: 0, file })
+    }
+
+    pub fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.file.write_all(bytes)?;
+        self.length += bytes.len() as u64;
+        Ok(())
+    }
+
+    pub fn clear(&mut self) -> io::Result<()> {
+        self.length = 0;
+        self.file.set_len(0)
+    }
+
+    /// Renames the file to `target`, which is whole even after a power cut.
+    pub fn finish(self, target: &Path) -> io::Result<()> {
+        self.file.sync_all()?;
+        fs::rename(&self.path, target)?;
+        files::synchronize_folder(target)
+    }
+}
+
+impl Drop for Partial {
+    fn drop(&mut self) {
+        if self.length == 0 {
+            fs::remove_file(&self.path).ok();
+        }
+    }
+}
+
+/// The non-empty partial files of `target`, and their lengths.
+pub fn partial_files(target: &Path) -> Vec<(PathBuf, u64)> {
+    let folder = target.parent().and_then(|folder| fs::read_dir(folder).ok());
+    let file = target.file_name().unwrap_or_default().to_string_lossy();
+    let length = |entry: io::Result<fs::DirEntry>| {
+        let path = entry.ok()?.path();
+        let rest = path.file_name()?.to_str()?.strip_prefix(&*file)?;
+        let length = path.metadata().ok()?.len();
+        (rest.starts_with('.') && rest.ends_with(".partial") && length > 0)
+            .then_some((path, length))
+    };
+    folder.into_iter().flatten().filter_map(length).collect()
 }

@@ -22,8 +22,6 @@ pub(super) struct Snapshot {
     pub policy: Box<dyn Policy>,
     /// Why it acts otherwise in an episode than it is judged.
     pub caveat: Option<String>,
-    /// Episodes that the run has not trained on.
-    pub held_out: BTreeSet<usize>,
 }
 
 /// The last snapshot of each run in or below a folder, and each snapshot that is named itself;
@@ -32,7 +30,7 @@ pub(super) fn find(paths: &[PathBuf]) -> anyhow::Result<Vec<Snapshot>> {
     let mut snapshots = Vec::new();
     for path in paths {
         if path.is_file() {
-            snapshots.push(of_file(path)?);
+            snapshots.push(from_file(path)?);
             continue;
         }
         let runs = walk(path, &mut |_, _| ());
@@ -54,20 +52,17 @@ pub(super) fn find(paths: &[PathBuf]) -> anyhow::Result<Vec<Snapshot>> {
     Ok(snapshots)
 }
 
-fn of_file(path: &Path) -> anyhow::Result<Snapshot> {
+fn from_file(path: &Path) -> anyhow::Result<Snapshot> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let number = name.trim_start_matches("step_").trim_end_matches(".safetensors");
     let run = path.parent().and_then(Path::parent).map(RunDir::at);
-    match (number.parse(), run) {
-        (Ok(step), Some(run)) if run.snapshot_path(step) == path => Snapshot::read(run, step),
-        _ => {
-            let path = path.display();
-            Err(anyhow!(
-                "{path} is in no run's folder, so that nothing says what it has learned from"
-            ))
-            .hint(HELP)
-        }
+    if let (Ok(step), Some(run)) = (number.parse(), run)
+        && run.snapshot_path(step) == path
+    {
+        return Snapshot::read(run, step);
     }
+    let text = "is in no run's folder, so that nothing says what it has learned from";
+    Err(anyhow!("{} {text}", path.display())).hint(HELP)
 }
 
 /// An episode's first observation stands for those before it, and a chunk begins there.
@@ -79,8 +74,9 @@ fn caveat(&Chunk { history, replan, .. }: &Chunk) -> Option<String> {
     if replan > 1 {
         acts.push(format!("executes {}", counted(replan, "action")) + " of a chunk");
     }
-    let acts = (!acts.is_empty()).then(|| acts.join(" and "))?;
-    Some(format!("judged as if each state were an episode's first, but it {acts}"))
+    let acts = acts.join(" and ");
+    let caveat = format!("judged as if each state were an episode's first, but it {acts}");
+    (!acts.is_empty()).then_some(caveat)
 }
 
 impl Snapshot {
@@ -100,7 +96,6 @@ impl Snapshot {
             step,
             weights: Hash::new(&file).to_string(),
             policy,
-            held_out: config.dataset.held_out.iter().copied().collect(),
             config,
             folder,
         })

@@ -19,7 +19,7 @@ use super::duplicate::Incarnation;
 use super::metrics::Metrics;
 use super::network::{Connected, OpeningSession, Wire, connect};
 use super::threads::{STUCK, Threads};
-use crate::local_evaluators::LocalEvaluators;
+use crate::children::LocalEvaluators;
 use crate::service::{End, Input, Order};
 use crate::train::Outcome;
 

@@ -9,7 +9,6 @@ use serde::{Serialize, Serializer};
 
 /// More than a chart has pixels for. Even, so that pairs of rows can be merged.
 const MAX_ROWS: usize = 500;
-const SIGNIFICANT_DIGITS: usize = 5;
 
 /// The contents of `metrics.jsonl`. A row is the mean of `stride` lines.
 #[derive(Debug, Default, Serialize)]
@@ -38,7 +37,7 @@ struct Row {
 }
 
 impl History {
-    pub fn of(path: PathBuf) -> Self {
+    pub fn new(path: PathBuf) -> Self {
         Self { path, stride: 1, ..Self::default() }
     }
 
@@ -107,16 +106,11 @@ impl Row {
 /// `[step, seconds, mean, …]`, null where a metric was not measured.
 impl Serialize for Row {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut numbers = vec![self.step, self.seconds];
-        numbers.extend(self.values.iter().map(|(sum, count)| sum / f64::from(*count)));
-        serializer.collect_seq(numbers.into_iter().map(rounded))
+        let means = self.values.iter().map(|(sum, count)| sum / f64::from(*count));
+        let numbers = [self.step, self.seconds].into_iter().chain(means);
+        // Fewer digits: a chart shows no more, and the answer is shorter.
+        serializer.collect_seq(numbers.map(|number| number as f32))
     }
-}
-
-fn rounded(value: f64) -> Option<f64> {
-    let text = format!("{value:.*e}", SIGNIFICANT_DIGITS - 1);
-    let rounded: f64 = text.parse().ok()?;
-    rounded.is_finite().then_some(rounded)
 }
 
 #[cfg(test)]

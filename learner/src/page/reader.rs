@@ -73,7 +73,7 @@ impl Reader {
         }
         // Runs of two studies may have the same name.
         let shown = (*dir != self.root).then(|| name.clone());
-        let new = || (RunPage::of(dir), Cache::default());
+        let new = || (RunPage::new(dir), Cache::default());
         let (run, cache) = self.runs.entry(name).or_insert_with(new);
         let failed = |error| json!({ "error": format!("{error:#}") });
         Some(cache.get(RUN_LIFETIME, || {
@@ -86,7 +86,7 @@ impl Reader {
     }
 }
 
-struct RunPage {
+pub(super) struct RunPage {
     dir: PathBuf,
     /// Start time of the run whose history this is.
     started: u64,
@@ -94,28 +94,30 @@ struct RunPage {
 }
 
 impl RunPage {
-    fn of(dir: &Path) -> Self {
-        Self { dir: dir.to_owned(), started: 0, history: History::of(dir.join("metrics.jsonl")) }
+    pub fn new(dir: &Path) -> Self {
+        Self { dir: dir.to_owned(), started: 0, history: History::new(dir.join("metrics.jsonl")) }
     }
 
-    fn read(&mut self) -> anyhow::Result<Value> {
+    pub fn read(&mut self) -> anyhow::Result<Value> {
         let (report, scores) = RunReport::with_scores(&self.dir)?;
         let config = &report.config;
         // After --fresh, another run has the folder.
         if self.started != config.run.started {
-            *self = Self { started: config.run.started, ..Self::of(&self.dir) };
+            *self = Self { started: config.run.started, ..Self::new(&self.dir) };
         }
         let metrics = config.experiment.definition()?.metrics;
         let mut names = BTreeSet::from(COLUMNS.map(|(name, _)| name.to_owned()));
-        names.extend(metrics.iter().flat_map(|it| [it.name.to_owned(), held_out_name(it)]));
+        names.extend(
+            metrics.iter().flat_map(|metric| [metric.name.to_owned(), held_out_name(metric)]),
+        );
         self.history.refresh(&names)?;
         let online = config.experiment.online.iter().flat_map(|_| COLUMNS);
-        let metrics = metrics.iter().map(|it| (it.name, it.help)).chain(online);
+        let metrics = metrics.iter().map(|metric| (metric.name, metric.help)).chain(online);
         let metrics = metrics.map(|(name, help)| json!({ "name": name, "help": help }));
-        let evaluations = report
-            .evaluations
-            .iter()
-            .map(|it| json!([it.step, it.score.mean, it.score.std, it.episodes, it.complete]));
+        let evaluations = report.evaluations.iter().map(|evaluation| {
+            let (step, score) = (evaluation.step, evaluation.score);
+            json!([step, score.mean, score.std, evaluation.episodes, evaluation.complete])
+        });
         Ok(json!({
             "run": report.run,
             "task": report.task,
@@ -134,6 +136,3 @@ impl RunPage {
         }))
     }
 }
-
-#[cfg(test)]
-mod tests;

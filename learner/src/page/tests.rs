@@ -1,4 +1,4 @@
-//! Tests of `page/mod.rs`: answers of the web server.
+//! Tests of the web server's answers, and of what it reads.
 
 use std::fs;
 use std::path::Path;
@@ -11,6 +11,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
+use super::reader::RunPage;
 use super::*;
 use crate::fixtures::{config, line};
 
@@ -87,4 +88,34 @@ async fn the_api_has_runs_with_scores_metrics_and_settings() {
     assert_eq!(run["metrics"].as_array().unwrap().len(), metrics.len());
     let settings = run["settings"].as_str().unwrap();
     assert!(settings.contains("[experiment.agent]"));
+}
+
+#[test]
+fn a_new_run_in_the_same_folder_is_shown_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().join("run");
+    let mut page = RunPage::new(&dir);
+    for (started, steps) in [(1, 3), (2, 4)] {
+        let mut config = config("run", started);
+        config.run.started = started;
+        RunDir::create(&dir, &config).unwrap();
+        let line = |n| format!("{{\"step\":{n},\"seconds\":{n}.0,\"bc_loss\":{started}.0}}\n");
+        fs::write(dir.join("metrics.jsonl"), String::from_iter((1..=steps).map(line))).unwrap();
+        let shown = page.read().unwrap();
+        let rows = shown["history"]["rows"].as_array().unwrap();
+        assert_eq!(rows.len(), steps);
+        assert!(rows.iter().all(|row| row[2] == started as f64), "{rows:?}");
+        RunDir::at(&dir).set_aside().unwrap();
+    }
+}
+
+#[test]
+fn names_that_no_metric_has_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().join("run");
+    RunDir::create(&dir, &config("run", 0)).unwrap();
+    let line = |step| format!("{{\"step\":{step},\"name{step}\":1.0,\"held_out_bc_loss\":2.0}}\n");
+    fs::write(dir.join("metrics.jsonl"), String::from_iter((1..=40_000).map(line))).unwrap();
+    let shown = RunPage::new(&dir).read().unwrap();
+    assert_eq!(shown["history"]["names"], json!(["held_out_bc_loss"]));
 }

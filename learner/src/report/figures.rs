@@ -6,58 +6,65 @@ use std::path::Path;
 
 use anyhow::Context;
 use quad_algorithms::{ALGORITHMS, Axis, Definition};
-use quad_run::config::settings::{self, Settings};
-use quad_run::counted;
+use quad_run::config::settings::Settings;
 use quad_run::results::RunReport;
 use quad_run::results::statistics::{self, Estimate, Runs};
+use quad_run::{counted, files};
 use quad_runtime::Hint;
 
-use super::groups::GroupReport;
+use super::groups::{GroupReport, seedless};
 use super::methods::MethodReport;
 use super::plot::{Line, Plot};
 use super::summary::Report;
 
 const BAND: &str = "mean over seeds, with its 95 % interval";
 
+/// Writes all figures into a folder, each as SVG and as PNG.
 pub fn draw_all(folder: &Path, report: &Report) -> anyhow::Result<()> {
     fs::create_dir_all(folder)
         .with_context(|| format!("cannot make {}", folder.display()))
         .hint("--figures names a folder that you may write in")?;
-    for (name, plot) in all(report) {
-        plot.write_svg(&folder.join(format!("{name}.svg")))?;
-        plot.write_png(&folder.join(format!("{name}.png")))?;
+    for (name, plot) in figures(report) {
+        for (ending, file) in [("svg", plot.svg()?.into_bytes()), ("png", plot.png()?)] {
+            let path = folder.join(format!("{name}.{ending}"));
+            files::replace(&path, &file)
+                .with_context(|| format!("cannot write {}", path.display()))?;
+        }
     }
     Ok(())
 }
 
-/// The file name of a task's learning curve. Another user may have named the task, so it is no
-/// path.
-fn curve_name(task: &str) -> String {
+/// The file name of a task's figure. Another user may have named the task, so it is no path.
+fn file_name(figure: &str, task: &str) -> String {
     let is_plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
-    format!("curve-{}", task.replace(|c: char| !is_plain(c), "-"))
+    format!("{figure}-{}", task.replace(|c: char| !is_plain(c), "-"))
 }
 
-/// All figures with their file names: performance profiles; the learning curves of each task; and
-/// for each algorithm, scores over the hyper-parameter that it names, such as τ.
-pub fn all(report: &Report) -> Vec<(String, Plot)> {
+/// All figures with their file names: performance profiles; and of each task the learning curves,
+/// and for each algorithm scores over the hyper-parameter that it names, such as τ.
+pub fn figures(report: &Report) -> Vec<(String, Plot)> {
     if let [run] = &report.runs[..] {
-        return vec![(curve_name(&run.task), learning_curve(run))];
+        return vec![(file_name("curve", &run.task), learning_curve(run))];
     }
     let mut by_task: BTreeMap<&str, Vec<&GroupReport>> = BTreeMap::new();
     for group in report.groups.iter().filter(|group| !group.runs.is_empty()) {
         by_task.entry(&group.task).or_default().push(group);
     }
     let mut plots = vec![("profile".to_owned(), profiles(report))];
-    for (task, groups) in &by_task {
-        let mut name = curve_name(task);
+    let mut push = |figure, task, plot| {
+        let mut name = file_name(figure, task);
         while plots.iter().any(|(taken, _)| *taken == name) {
             name.push('-');
         }
-        plots.push((name, curves(task, groups)));
-    }
-    for Definition { name, report, .. } in ALGORITHMS {
-        let Some(axis) = report.axis else { continue };
-        plots.push((axis.key.to_owned(), over(axis, name, &by_task)));
+        plots.push((name, plot));
+    };
+    for (task, groups) in &by_task {
+        push("curve", task, curves(task, groups));
+        for Definition { name, report, .. } in ALGORITHMS {
+            if let Some(axis) = report.axis {
+                push(axis.key, task, scores_over(axis, name, task, groups));
+            }
+        }
     }
     plots.retain(|(_, plot)| !plot.is_empty());
     plots
@@ -114,8 +121,8 @@ fn curves(task: &str, groups: &[&GroupReport]) -> Plot {
 fn curve(group: &GroupReport) -> Line {
     let mut runs: Vec<BTreeMap<u64, f64>> = Vec::new();
     for run in &group.runs {
-        let complete = run.evaluations.iter().filter(|it| it.complete);
-        runs.push(complete.map(|it| (it.step, it.score.mean)).collect());
+        let complete = run.evaluations.iter().filter(|evaluation| evaluation.complete);
+        runs.push(complete.map(|evaluation| (evaluation.step, evaluation.score.mean)).collect());
     }
     let mut steps = Vec::from_iter(runs[0].keys());
     steps.retain(|step| runs.iter().all(|run| run.contains_key(step)));
@@ -135,7 +142,7 @@ fn profiles(report: &Report) -> Plot {
     let mut lines = Vec::new();
     for MethodReport { method, profile, .. } in &report.study {
         let label = method.clone();
-        let points = profile.iter().map(|it| (it.threshold, it.share)).collect();
+        let points = profile.iter().map(|point| (point.threshold, point.share)).collect();
         lines.push(Line { label, points });
     }
     lines.retain(|line| !line.points.is_empty());
@@ -143,41 +150,21 @@ fn profiles(report: &Report) -> Plot {
         title: "Performance profile, with its 95 % interval".to_owned(),
         x: "D4RL-normalized score",
         y: "share of runs that score more",
-        is_falling: true,
         lines,
         ..Plot::default()
     }
 }
 
-/// Scores over a hyper-parameter of an algorithm, a panel for each task: over τ, Figures 3 and 4 of
-/// the paper.
-fn over(axis: Axis, algorithm: &str, by_task: &BTreeMap<&str, Vec<&GroupReport>>) -> Plot {
-    let mut panels = Vec::new();
-    for (task, groups) in by_task {
-        let mut groups = groups.clone();
-        groups.retain(|group| group.algorithm == algorithm);
-        panels.push(over_on_task(axis, task, &groups));
-    }
-    panels.retain(|panel| !panel.is_empty());
-    match panels.len() {
-        1 => panels.remove(0),
-        _ => Plot {
-            title: format!("Scores over {}: {BAND}", axis.symbol),
-            panels,
-            ..Plot::default()
-        },
-    }
-}
-
-/// A line for each set of other settings with several values of the hyper-parameter.
-fn over_on_task(axis: Axis, task: &str, groups: &[&GroupReport]) -> Plot {
+/// Scores of a task over a hyper-parameter of an algorithm: over τ, Figures 3 and 4 of the paper. A
+/// line for each set of other settings with several values of the hyper-parameter.
+fn scores_over(axis: Axis, algorithm: &str, task: &str, groups: &[&GroupReport]) -> Plot {
     let key = format!("agent.{}", axis.key);
     let mut by_settings: BTreeMap<Settings, Vec<(f64, &GroupReport)>> = BTreeMap::new();
-    for group in groups.iter().filter(|group| !group.scores.is_empty()) {
-        let mut others = settings::from_run(&group.runs[0].config);
-        others.remove("seed");
-        if let Some(value) = others.remove(&key).and_then(|value| value.parse().ok()) {
-            by_settings.entry(others).or_default().push((value, group));
+    for group in groups.iter().filter(|group| group.algorithm == algorithm) {
+        let mut settings = seedless(&group.runs[0].config);
+        let value = settings.remove(&key).and_then(|value| value.parse().ok());
+        if let Some(value) = value.filter(|_| !group.scores.is_empty()) {
+            by_settings.entry(settings).or_default().push((value, group));
         }
     }
     let mean = |drawn: &[Runs]| vec![statistics::mean_of_means(&drawn[0])];
@@ -193,7 +180,7 @@ fn over_on_task(axis: Axis, task: &str, groups: &[&GroupReport]) -> Plot {
         lines.push(Line { label: names.join(", "), points });
     }
     Plot {
-        title: format!("{task} over {}", axis.symbol),
+        title: format!("{task} over {}: {BAND}", axis.symbol),
         x: axis.symbol,
         is_log: true,
         y: groups.first().map_or("", |group| group.measure()),
@@ -225,7 +212,7 @@ mod tests {
         }
         let read = |path: &str| {
             let report = Report::read(&[folder.path().join(path)], Select::Last).unwrap();
-            let (_, plot) = all(&report).remove(0);
+            let (_, plot) = figures(&report).remove(0);
             let points = plot.lines[0].points.iter();
             let points = points.map(|(x, y)| (*x, y.value, y.high.unwrap() - y.value));
             (plot.references, Vec::from_iter(points))
@@ -241,20 +228,5 @@ mod tests {
             assert_eq!((point.0, point.1), (expected.0, expected.1));
             assert!((point.2 - expected.2).abs() < 1e-9, "{points:?}");
         }
-    }
-
-    #[test]
-    fn tasks_whose_names_have_the_same_letters_have_two_figures() {
-        let folder = tempfile::tempdir().unwrap();
-        for (seed, task) in ["a b", "a/b"].into_iter().enumerate() {
-            let mut config = config("r", seed as u64);
-            config.run.task = task.to_owned();
-            let run = folder.path().join(seed.to_string());
-            let (_, mut log) = RunDir::create(&run, &config).unwrap();
-            log.append(&[line(2000, 1, 1.0), line(2000, 2, 1.0)]).unwrap();
-        }
-        let report = Report::read(&[folder.path().to_owned()], Select::Last).unwrap();
-        let names = Vec::from_iter(all(&report).into_iter().map(|(name, _)| name));
-        assert_eq!(names, ["curve-a-b", "curve-a-b-"]);
     }
 }

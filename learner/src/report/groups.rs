@@ -1,16 +1,15 @@
-//! Groups of runs that differ only in their seed.
+//! Groups of runs that differ only in their seed, and the tasks by which groups are compared.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use quad_dataset::{GoalDraw, environment};
-use quad_run::config::Device;
 use quad_run::config::settings::{self, Settings, differences_in_brief};
+use quad_run::config::{Device, RunConfig};
 use quad_run::counted;
 use quad_run::results::departures::{as_given, departures};
 use quad_run::results::published::{self, Published};
-use quad_run::results::{RunReport, joined};
-use quad_run::results::{Select, Spread};
+use quad_run::results::{RunReport, Select, Spread, joined};
 use serde::Serialize;
 
 /// Runs that agree in task, data, device, all hyper-parameters and progress. The precision of their
@@ -124,6 +123,15 @@ impl Group<'_> {
     }
 }
 
+/// All settings but the seed, and of the checkpoint of `--from` only that there is one: the runs that
+/// others go on from differ in their seeds, too.
+pub fn seedless(config: &RunConfig) -> Settings {
+    let mut settings = settings::from_run(config);
+    settings.remove("seed");
+    settings.entry("from".to_owned()).and_modify(|hash| *hash = "a run".to_owned());
+    settings
+}
+
 /// Groups runs, in the order in which they are given, but those without scores last: they join
 /// others.
 pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
@@ -131,8 +139,7 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     let (scored, unscored): (Vec<_>, Vec<_>) =
         runs.iter().partition(|run| run.reached() != Some(0));
     for run in scored.into_iter().chain(unscored) {
-        let mut settings = settings::from_run(&run.config);
-        settings.remove("seed");
+        let settings = seedless(&run.config);
         if let Some(group) = groups.iter_mut().find(|group| group.fits(run, &settings)) {
             group.runs.push(run);
             continue;
@@ -145,32 +152,24 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
             runs: vec![run],
         });
     }
-    // The settings in which groups of one variant differ. Two tasks may have values of their own;
-    // any other value makes another method.
-    let mut differing: BTreeMap<[&str; 2], BTreeSet<&String>> = BTreeMap::new();
-    for (index, one) in groups.iter().enumerate() {
-        let earlier = groups[..index].iter();
-        for other in earlier.filter(|other| other.variant == one.variant) {
-            let other_task = one.task() != other.task();
-            let keys = differences_in_brief(&one.settings, &other.settings)
-                .filter(|key| !(other_task && one.is_preset(key) && other.is_preset(key)));
-            differing.entry(one.variant).or_default().extend(keys);
-        }
-    }
     let mut reports = Vec::new();
     for group in &groups {
-        let mut method = vec![group.runs[0].label.clone()];
-        for key in differing.get(&group.variant).into_iter().flatten() {
-            if group.preset.get(*key) != group.settings.get(*key) {
-                method.push(group.setting(key));
-            }
-        }
-        let mut differs = BTreeSet::new();
+        let (mut differs, mut names) = (BTreeSet::new(), BTreeSet::new());
         for other in &groups {
-            if other.task() == group.task() && other.variant[0] == group.variant[0] {
-                differs.extend(differences_in_brief(&group.settings, &other.settings));
+            let is_same_task = other.task() == group.task();
+            let keys = Vec::from_iter(differences_in_brief(&group.settings, &other.settings));
+            if is_same_task && other.variant[0] == group.variant[0] {
+                differs.extend(keys.clone());
+            }
+            // Two tasks may have values of their own; any other value makes another method.
+            let is_own = |key| !is_same_task && group.is_preset(key) && other.is_preset(key);
+            if other.variant == group.variant {
+                names.extend(keys.into_iter().filter(|key| !is_own(key)));
             }
         }
+        let mut method = vec![group.runs[0].label.clone()];
+        names.retain(|key| group.preset.get(*key) != group.settings.get(*key));
+        method.extend(names.into_iter().map(|key| group.setting(key)));
         let differs = differs.into_iter().map(|key| group.setting(key)).collect();
         reports.push(report(&group.runs, method.join(", "), differs, select));
     }
@@ -186,8 +185,7 @@ fn that_count<'a>(runs: &[&'a RunReport]) -> (Vec<&'a RunReport>, Vec<String>) {
             left_out.push(format!("{dir} has no complete evaluation"));
         } else if let Some(first) = counted.iter().find(|other| other.seed == seed) {
             let first = first.dir.display();
-            let reason = format!("{dir} has seed {seed} like {first}, which is counted");
-            left_out.push(reason);
+            left_out.push(format!("{dir} has seed {seed} again; only {first} is counted"));
         } else {
             counted.push(run);
         }
@@ -215,7 +213,7 @@ fn report(
     let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
     let published = published::scores(&first.config.run.task);
     let environment = environment::find(&first.config.experiment.environment);
-    let maze = environment.ok().and_then(|known| known.maze);
+    let maze = environment.ok().and_then(|spec| spec.maze);
     let has_one_goal = maze.is_some_and(|maze| maze.draw == GoalDraw::EachInstance);
     let mut unfinished = Vec::new();
     for run in counted.iter().filter(|run| !run.is_complete()) {
@@ -252,4 +250,22 @@ fn report(
         scored_in,
         published,
     }
+}
+
+/// Adds environment and data to the names of tasks that have several of them in these runs, such as
+/// `own-data` of two robots.
+pub fn tell_apart(runs: &mut [RunReport]) {
+    let mut settings: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for run in &*runs {
+        settings.entry(run.task.clone()).or_default().insert(setting(run));
+    }
+    for run in runs.iter_mut().filter(|run| settings[&run.task].len() > 1) {
+        run.task = format!("{} ({})", run.task, setting(run));
+    }
+}
+
+/// The environment and the beginning of the data's SHA-256, which older runs lack.
+fn setting(run: &RunReport) -> String {
+    let sha256 = run.config.dataset.sha256.as_deref().unwrap_or("unknown");
+    format!("{}, data {sha256:.8}", run.config.experiment.environment)
 }

@@ -74,27 +74,26 @@ pub fn aggregate(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>)
             comparable.push(Vec::new());
         }
         let methods = &mut comparable[index];
-        let mut known = methods.iter_mut();
-        match known.find(|method| method[0].method == group.method) {
+        match methods.iter_mut().find(|method| method[0].method == group.method) {
             Some(method) => method.push(group),
             None => methods.push(vec![group]),
         }
     }
-    let reports = comparable.iter().flatten().map(of_method).collect();
+    let reports = comparable.iter().flatten().map(method_report).collect();
     let mut comparisons = Vec::new();
     for methods in &comparable {
-        let others = methods[1..].iter();
-        comparisons.extend(others.filter_map(|method| compare(method, &methods[0])));
+        let compared = methods[1..].iter().filter_map(|method| compare(method, &methods[0]));
+        comparisons.extend(compared);
     }
     let p_values = Vec::from_iter(comparisons.iter().filter_map(|comparison| comparison.p));
-    let tested = comparisons.iter_mut().filter(|it| it.p.is_some());
+    let tested = comparisons.iter_mut().filter(|comparison| comparison.p.is_some());
     for (comparison, p) in tested.zip(statistics::holm(&p_values)) {
         comparison.p_holm = Some(p);
     }
     (reports, comparisons)
 }
 
-fn of_method(method: &Method) -> MethodReport {
+fn method_report(method: &Method) -> MethodReport {
     use statistics::{fraction_above, interquartile_mean, mean_of_means};
     use statistics::{median_of_means, optimality_gap};
     let first = method[0];
@@ -105,7 +104,7 @@ fn of_method(method: &Method) -> MethodReport {
         let runs = &drawn[0];
         let mut values = vec![interquartile_mean(runs), mean_of_means(runs)];
         values.extend([median_of_means(runs), optimality_gap(runs)]);
-        values.extend(thresholds.iter().map(|at| fraction_above(runs, *at)));
+        values.extend(thresholds.iter().map(|threshold| fraction_above(runs, *threshold)));
         values
     };
     let estimates = statistics::estimates(&[&runs], statistics);
@@ -186,7 +185,8 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Block
         "Over tasks and seeds, in brackets the 95 % interval of the bootstrap: {RESAMPLES} times, seeds are drawn in each task \
          (Agarwal et al. 2021). The optimality gap is that of scores over 100. Only complete runs count.\n"
     );
-    for MethodReport { method, .. } in methods.iter().filter(|it| it.seeds_per_task[0] < 2) {
+    for MethodReport { method, .. } in methods.iter().filter(|method| method.seeds_per_task[0] < 2)
+    {
         notes += &format!(
             "No interval for {method}: of a single seed in a task, the spread is not known.\n"
         );
@@ -194,14 +194,14 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Block
     let table = Table::from_rows(
         methods,
         &[
-            ("method", Left, |it| it.method.clone()),
+            ("method", Left, |row| row.method.clone()),
             ("tasks", Left, MethodReport::tasks_in_words),
             ("seeds", Right, MethodReport::seeds_in_words),
-            ("IQM", Right, |it| it.iqm.text(2)),
-            ("mean", Right, |it| it.mean.text(2)),
-            ("median", Right, |it| it.median.text(2)),
-            ("optimality gap", Right, |it| {
-                it.optimality_gap.map_or("-".to_owned(), |gap| gap.text(3))
+            ("IQM", Right, |row| row.iqm.text(2)),
+            ("mean", Right, |row| row.mean.text(2)),
+            ("median", Right, |row| row.median.text(2)),
+            ("optimality gap", Right, |row| {
+                row.optimality_gap.map_or("-".to_owned(), |gap| gap.text(3))
             }),
         ],
     );
@@ -218,14 +218,14 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Block
     blocks.push(Block::Table(Table::from_rows(
         comparisons,
         &[
-            ("method", Left, |it| it.method.clone()),
-            ("against", Left, |it| it.against.clone()),
-            ("tasks", Right, |it| it.tasks.len().to_string()),
-            ("pairs", Right, |it| it.pairs.to_string()),
-            ("mean difference", Right, |it| number(it.mean_difference, 2)),
-            ("p", Right, |it| number(it.p, 4)),
-            ("p (Holm)", Right, |it| number(it.p_holm, 4)),
-            ("probability of improvement", Right, |it| it.probability_of_improvement.text(2)),
+            ("method", Left, |row| row.method.clone()),
+            ("against", Left, |row| row.against.clone()),
+            ("tasks", Right, |row| row.tasks.len().to_string()),
+            ("pairs", Right, |row| row.pairs.to_string()),
+            ("mean difference", Right, |row| number(row.mean_difference, 2)),
+            ("p", Right, |row| number(row.p, 4)),
+            ("p (Holm)", Right, |row| number(row.p_holm, 4)),
+            ("probability of improvement", Right, |row| row.probability_of_improvement.text(2)),
         ],
     )));
     blocks

@@ -8,10 +8,10 @@
 //! standard deviation. With `--select best`, a run's best evaluation counts instead, and the report
 //! says so. A run that is not complete has no score.
 //!
-//! In reading order: `tasks` tells tasks of one name apart; `groups` groups runs that differ only in
-//! their seed; `methods` aggregates them over tasks; `published` makes published tables with our
+//! In reading order: `groups` groups runs that differ only in their seed; `methods` aggregates them
+//! over tasks; `published` makes published tables with our
 //! scores; `summary` is the whole report; `figures` are its plots, which `plot` draws; `html` is the
-//! report as one file, with the commands of `reproduce`.
+//! report as one file.
 
 mod figures;
 mod groups;
@@ -19,9 +19,7 @@ mod html;
 mod methods;
 mod plot;
 mod published;
-mod reproduce;
 mod summary;
-mod tasks;
 
 pub(crate) use figures::{draw_all, learning_curve};
 pub(crate) use html::write as write_html;

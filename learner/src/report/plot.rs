@@ -3,20 +3,14 @@
 use std::collections::BTreeSet;
 use std::error::Error;
 use std::ops::Range;
-use std::path::Path;
 use std::sync::LazyLock;
 
-use anyhow::{Context, anyhow};
-use plotters::coord::Shift;
-use plotters::coord::types::RangedCoordf64;
+use anyhow::anyhow;
 use plotters::prelude::*;
 use plotters::style::register_font;
-use quad_run::files;
 use quad_run::results::statistics::Estimate;
 
 const SIZE: (u32, u32) = (900, 540);
-/// Panels in a row; each has half the size of a plot.
-const COLUMNS: usize = 3;
 /// Pixels of a PNG for each of an SVG.
 const PNG_SCALE: u32 = 2;
 /// Longer lines have no markers.
@@ -42,15 +36,11 @@ pub struct Plot {
     pub y: &'static str,
     /// True if x is the base-10 logarithm of the number that the axis shows.
     pub is_log: bool,
-    /// True if the lines fall from the top, so that the legend is below them.
-    pub is_falling: bool,
     /// Dashed lines at some y, with labels.
     pub references: Vec<(String, f64)>,
     /// Dashed lines at gradient steps after which online learning begins.
     pub begins: BTreeSet<u64>,
     pub lines: Vec<Line>,
-    /// Plots side by side, in place of lines.
-    pub panels: Vec<Self>,
 }
 
 /// Points by x, with a band where they have intervals.
@@ -60,23 +50,15 @@ pub struct Line {
     pub points: Vec<(f64, Estimate)>,
 }
 
-type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
-type Drawn = Result<(), Box<dyn Error>>;
-
 impl Plot {
     pub fn svg(&self) -> anyhow::Result<String> {
         let mut svg = String::new();
-        self.render(SVGBackend::with_string(&mut svg, self.size()), 1)?;
+        self.render(SVGBackend::with_string(&mut svg, SIZE), 1)?;
         Ok(svg)
     }
 
-    pub fn write_svg(&self, path: &Path) -> anyhow::Result<()> {
-        write(path, self.svg()?.as_bytes())
-    }
-
-    pub fn write_png(&self, path: &Path) -> anyhow::Result<()> {
-        let (width, height) = self.size();
-        let (width, height) = (width * PNG_SCALE, height * PNG_SCALE);
+    pub fn png(&self) -> anyhow::Result<Vec<u8>> {
+        let (width, height) = (SIZE.0 * PNG_SCALE, SIZE.1 * PNG_SCALE);
         let mut pixels = vec![0; (width * height * 3) as usize];
         let backend = BitMapBackend::with_buffer(&mut pixels, (width, height));
         self.render(backend, PNG_SCALE)?;
@@ -84,24 +66,11 @@ impl Plot {
         let mut encoder = png::Encoder::new(&mut file, width, height);
         encoder.set_color(png::ColorType::Rgb);
         encoder.write_header()?.write_image_data(&pixels)?;
-        write(path, &file)
+        Ok(file)
     }
 
     pub fn is_empty(&self) -> bool {
         self.lines.iter().all(|line| line.points.is_empty())
-            && self.panels.iter().all(Self::is_empty)
-    }
-
-    fn grid(&self) -> (usize, usize) {
-        let count = self.panels.len();
-        (count.div_ceil(COLUMNS), count.min(COLUMNS))
-    }
-
-    fn size(&self) -> (u32, u32) {
-        match self.grid() {
-            (0, _) => SIZE,
-            (rows, columns) => (SIZE.0 / 2 * columns as u32, SIZE.1 / 2 * rows as u32),
-        }
     }
 
     fn render<DB: DrawingBackend>(&self, backend: DB, scale: u32) -> anyhow::Result<()>
@@ -109,19 +78,13 @@ impl Plot {
         DB::ErrorType: 'static,
     {
         LazyLock::force(&FONT);
-        let area = backend.into_drawing_area();
-        let drawn = area
-            .fill(&WHITE)
-            .map_err(Into::into)
-            .and_then(|()| self.finite().draw(&area, scale))
-            .and_then(|()| Ok(area.present()?));
+        let drawn = self.finite().draw(backend, scale);
         drawn.map_err(|error| anyhow!("cannot draw {}: {error}", self.title))
     }
 
     fn finite(&self) -> Self {
         let is_finite = |value: &f64| value.abs() < LARGEST;
         let mut plot = self.clone();
-        plot.panels = self.panels.iter().map(Self::finite).collect();
         plot.references.retain(|(_, y)| is_finite(y));
         for Line { points, .. } in &mut plot.lines {
             points.retain(|(x, y)| is_finite(x) && is_finite(&y.value));
@@ -132,23 +95,21 @@ impl Plot {
         plot
     }
 
-    fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Drawn
+    fn draw<DB: DrawingBackend>(&self, backend: DB, scale: u32) -> Result<(), Box<dyn Error>>
     where
         DB::ErrorType: 'static,
     {
-        if !self.panels.is_empty() {
-            let mut panels = self.panels.iter().zip(area.split_evenly(self.grid()));
-            return panels.try_for_each(|(it, area)| it.draw(&area, scale));
-        }
+        let area = backend.into_drawing_area();
+        area.fill(&WHITE)?;
         let font = |size: u32| ("sans-serif", size * scale).into_font();
         let (x, y) = self.limits();
-        let mut chart = ChartBuilder::on(area)
+        let mut chart = ChartBuilder::on(&area)
             .caption(&self.title, font(18))
             .margin(16 * scale)
             .margin_right(36 * scale)
             .x_label_area_size(44 * scale)
             .y_label_area_size(56 * scale)
-            .build_cartesian_2d(x, y)?;
+            .build_cartesian_2d(x.clone(), y.clone())?;
         // A logarithmic axis has labels at whole powers of ten.
         let label = |x: &f64| match self.is_log {
             true if (x - x.round()).abs() > 1e-6 => String::new(),
@@ -164,46 +125,42 @@ impl Plot {
             .x_label_formatter(&label)
             .light_line_style(WHITE)
             .draw()?;
-        self.draw_dashed(&mut chart, scale)?;
-        for (line, color) in self.lines.iter().zip(COLORS.iter().cycle()) {
-            line.draw(&mut chart, *color, scale)?;
-        }
-        let position = match self.is_falling {
-            true => SeriesLabelPosition::LowerLeft,
-            false => SeriesLabelPosition::UpperLeft,
+        let dashed = |ends: [(f64, f64); 2], width| {
+            let style = REFERENCE.stroke_width(width * scale);
+            DashedLineSeries::new(ends, 6 * scale, 4 * scale, style)
         };
+        for (name, value) in &self.references {
+            let line = dashed([(x.start, *value), (x.end, *value)], 2);
+            chart.draw_series(line)?.label(name).legend(legend(REFERENCE, scale));
+        }
+        for step in self.begins.iter().map(|step| *step as f64) {
+            chart.draw_series(dashed([(step, y.start), (step, y.end)], 1))?;
+            let place = (step, y.start + 0.04 * (y.end - y.start));
+            chart.draw_series([Text::new(" online", place, font(13).color(&REFERENCE))])?;
+        }
+        for (line, color) in self.lines.iter().zip(COLORS.iter().cycle()) {
+            let band = line.band();
+            if !band.is_empty() {
+                chart.draw_series([Polygon::new(band, color.mix(0.15))])?;
+            }
+            let points = line.points.iter().map(|(x, y)| (*x, y.value));
+            let drawn = LineSeries::new(points.clone(), color.stroke_width(2 * scale));
+            chart.draw_series(drawn)?.label(&line.label).legend(legend(*color, scale));
+            if points.len() <= MAX_MARKERS {
+                chart.draw_series(
+                    points.map(|point| Circle::new(point, 3 * scale, color.filled())),
+                )?;
+            }
+        }
         chart
             .configure_series_labels()
-            .position(position)
+            .position(SeriesLabelPosition::UpperLeft)
             .legend_area_size(26 * scale)
             .label_font(font(13))
             .background_style(WHITE.mix(0.8))
             .border_style(REFERENCE.mix(0.4))
             .draw()?;
-        Ok(())
-    }
-
-    /// Draws the references, and where online learning begins.
-    fn draw_dashed<DB: DrawingBackend>(&self, chart: &mut Chart<DB>, scale: u32) -> Drawn
-    where
-        DB::ErrorType: 'static,
-    {
-        let (x, y) = self.limits();
-        let dashed = |ends: [(f64, f64); 2], width| {
-            let style = REFERENCE.stroke_width(width * scale);
-            DashedLineSeries::new(ends, 6 * scale, 4 * scale, style)
-        };
-        for (name, y) in &self.references {
-            let line = dashed([(x.start, *y), (x.end, *y)], 2);
-            let drawn = chart.draw_series(line)?.label(name);
-            drawn.legend(legend(REFERENCE, scale));
-        }
-        let font = ("sans-serif", 13 * scale).into_font();
-        for step in self.begins.iter().map(|step| *step as f64) {
-            chart.draw_series(dashed([(step, y.start), (step, y.end)], 1))?;
-            let at = (step, y.start + 0.04 * (y.end - y.start));
-            chart.draw_series([Text::new(" online", at, font.color(&REFERENCE))])?;
-        }
+        area.present()?;
         Ok(())
     }
 
@@ -213,18 +170,15 @@ impl Plot {
         let first = points.peek().map_or(0.0, |(x, _)| *x);
         let mut x = if self.is_log { first } else { 0.0 }..first + 1e-9;
         let mut y = 0.0..0.01;
-        for (at, estimate) in points {
-            extend(&mut x, *at);
-            extend(&mut y, estimate.low.unwrap_or(estimate.value));
-            extend(&mut y, estimate.value);
-            extend(&mut y, estimate.high.unwrap_or(estimate.value));
+        for (x_value, Estimate { value, low, high }) in points {
+            extend(&mut x, *x_value);
+            [Some(*value), *low, *high].into_iter().flatten().for_each(|end| extend(&mut y, end));
         }
         for (_, value) in &self.references {
             extend(&mut y, *value);
         }
         let labels = (self.lines.len() + self.references.len()) as f64;
-        let room = 0.05 + 0.05 * labels * f64::from(!self.is_falling);
-        y.end += (y.end - y.start) * room;
+        y.end += (y.end - y.start) * (0.05 + 0.05 * labels);
         (x, y)
     }
 }
@@ -233,32 +187,13 @@ fn extend(range: &mut Range<f64>, value: f64) {
     *range = range.start.min(value)..range.end.max(value);
 }
 
-fn write(path: &Path, file: &[u8]) -> anyhow::Result<()> {
-    files::replace(path, file).with_context(|| format!("cannot write {}", path.display()))
-}
-
 impl Line {
-    fn draw<DB: DrawingBackend>(&self, chart: &mut Chart<DB>, color: RGBColor, scale: u32) -> Drawn
-    where
-        DB::ErrorType: 'static,
-    {
+    /// The upper edge of the intervals from left to right, and the lower one back.
+    fn band(&self) -> Vec<(f64, f64)> {
         let edge = |end: fn(&Estimate) -> Option<f64>| {
-            let points = self.points.iter();
-            points.filter_map(move |(x, y)| Some((*x, end(y)?)))
+            self.points.iter().filter_map(move |(x, y)| Some((*x, end(y)?)))
         };
-        let band = Vec::from_iter(edge(|y| y.high).chain(edge(|y| y.low).rev()));
-        if !band.is_empty() {
-            chart.draw_series([Polygon::new(band, color.mix(0.15))])?;
-        }
-        let points = Vec::from_iter(self.points.iter().map(|(x, y)| (*x, y.value)));
-        let line = LineSeries::new(points.clone(), color.stroke_width(2 * scale));
-        let drawn = chart.draw_series(line)?.label(&self.label);
-        drawn.legend(legend(color, scale));
-        if points.len() <= MAX_MARKERS {
-            let marker = |point| Circle::new(point, 3 * scale, color.filled());
-            chart.draw_series(points.into_iter().map(marker))?;
-        }
-        Ok(())
+        edge(|y| y.high).chain(edge(|y| y.low).rev()).collect()
     }
 }
 
@@ -274,4 +209,26 @@ static FONT: LazyLock<()> = LazyLock::new(|| {
 });
 
 #[cfg(test)]
-mod tests;
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn infinite_values_are_not_drawn() {
+        let huge = [1e200, 1e308, -1e308, f64::INFINITY, f64::NEG_INFINITY, f64::NAN];
+        let estimate =
+            |value: f64| Estimate { value, low: Some(-value), high: Some(value * value) };
+        let line = |huge: f64| Line {
+            label: "a line".to_owned(),
+            points: vec![(huge, estimate(1.0)), (1.0, estimate(huge)), (2.0, estimate(3.0))],
+        };
+        for is_log in [false, true] {
+            let mut plot = Plot { is_log, ..Plot::default() };
+            plot.references.extend(huge.map(|huge| ("a reference".to_owned(), huge)));
+            plot.lines.extend(huge.map(line));
+            let svg = plot.svg().unwrap();
+            assert!(svg.contains("a line") && svg.contains("a reference"), "{svg}");
+            assert!(!svg.contains("NaN"), "{svg}");
+        }
+    }
+}

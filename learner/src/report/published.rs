@@ -23,9 +23,9 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
     let ours = once_each(groups.iter().map(|group| &*group.method));
     let mut scores: Vec<Score> = Vec::new();
     for task in &tasks {
-        let of_task = groups.iter().find(|group| group.task == *task);
-        let all = of_task.into_iter().flat_map(|group| &group.published);
-        let in_table = all.filter(|score| score.tables.iter().any(|table| table == name));
+        let Some(group) = groups.iter().find(|group| group.task == *task) else { continue };
+        let published = group.published.iter();
+        let in_table = published.filter(|score| score.tables.iter().any(|table| table == name));
         scores.extend(in_table.map(|score| (*task, score)));
     }
     let theirs = methods(scores.iter());
@@ -40,14 +40,14 @@ pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Block> {
     for task in tasks {
         let mut row = vec![task.to_owned()];
         for method in &ours {
-            let is_it = |group: &&&GroupReport| group.task == task && group.method == *method;
+            let has_row = |group: &&&GroupReport| group.task == task && group.method == *method;
             // Complete runs come first.
-            let group = groups.iter().filter(is_it).min_by_key(|it| it.reached.is_some());
+            let group = groups.iter().filter(has_row).min_by_key(|group| group.reached.is_some());
             row.push(group.map_or("-".to_owned(), |group| notes.ours(group)));
         }
         for method in &theirs {
-            let is_it = |(of, score): &&Score| *of == task && score.method == *method;
-            let score = scores.iter().find(is_it);
+            let is_cell = |(row, score): &&Score| *row == task && score.method == *method;
+            let score = scores.iter().find(is_cell);
             row.push(score.map_or("-".to_owned(), |(_, score)| notes.theirs(score)));
         }
         table.push(row);
@@ -130,7 +130,7 @@ impl Footnotes {
         for (letter, reason) in self.lettered() {
             let (mut on, mut instead, mut selected) = (Vec::new(), Vec::new(), "");
             for score @ (task, published) in scores {
-                for remark in published.remarks.iter().filter(|it| it.reason == reason) {
+                for remark in published.remarks.iter().filter(|remark| remark.reason == reason) {
                     on.push(score);
                     if remark.selected {
                         selected = "selected by test returns: ";
@@ -142,7 +142,7 @@ impl Footnotes {
             let (methods, instead) = (methods(on.into_iter()).join(", "), instead.join(","));
             text += &format!("- {letter} ({methods}): {selected}{reason}{instead}\n");
         }
-        let is_selected = |(_, score): &&Score| score.remarks.iter().any(|it| it.selected);
+        let is_selected = |(_, score): &&Score| score.remarks.iter().any(|remark| remark.selected);
         let selected = methods(scores.iter().filter(is_selected)).join(", ");
         if select == Select::Best && !selected.is_empty() {
             text += &format!(

@@ -14,7 +14,7 @@ use tracing::warn;
 
 use super::groups::{self, GroupReport};
 use super::methods::{self, Comparison, MethodReport};
-use super::{published, tasks};
+use super::published;
 
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Report {
@@ -44,11 +44,11 @@ impl Report {
         };
         let (mut dirs, mut seen) = (Vec::new(), BTreeSet::new());
         for path in paths {
-            let found = walk(path, &mut note);
-            if found.is_empty() && paths.len() > 1 {
+            let below = walk(path, &mut note);
+            if below.is_empty() && paths.len() > 1 {
                 warn!("there is no run in {}", path.display());
             }
-            dirs.extend(found.into_iter().filter(|dir| seen.insert(dir.clone())));
+            dirs.extend(below.into_iter().filter(|dir| seen.insert(dir.clone())));
         }
         let mut runs = Vec::new();
         for dir in &dirs {
@@ -61,7 +61,7 @@ impl Report {
             // Fails with the reason.
             RunReport::read(dirs.first().unwrap_or(&paths[0]))?;
         }
-        tasks::tell_apart(&mut runs);
+        groups::tell_apart(&mut runs);
         let groups = groups::groups(&runs, select);
         let (study, comparisons) = methods::aggregate(&groups);
         let named = paths.iter().cloned().collect();
@@ -94,7 +94,7 @@ impl Report {
         if self.runs.len() > 1 && !self.study.is_empty() {
             blocks.extend(methods::tables(&self.study, &self.comparisons));
         }
-        let missing = |it: &String| format!("Not in this report: {it}.\n");
+        let missing = |reason: &String| format!("Not in this report: {reason}.\n");
         blocks.extend(paragraph(self.unreadable.iter().map(missing).collect()));
         let judgments = self.runs.iter().flat_map(|run| &run.judgments);
         blocks.extend(Ranking::from_judgments(judgments.cloned()).iter().flat_map(Ranking::blocks));
@@ -119,28 +119,28 @@ impl Report {
             value.map_or("-".to_owned(), Spread::text_with_population)
         }
         let mut columns: Vec<Column<GroupReport>> = vec![
-            ("task", Left, |it| it.task.clone()),
-            ("algorithm", Left, |it| it.agent.clone()),
+            ("task", Left, |group| group.task.clone()),
+            ("algorithm", Left, |group| group.agent.clone()),
             ("trained for", Right, GroupReport::steps_in_words),
-            ("seeds", Right, |it| {
-                let goals = it.goals.map(|goals| format!(", {goals} goals"));
-                it.seeds.len().to_string() + &goals.unwrap_or_default()
+            ("seeds", Right, |group| {
+                let goals = group.goals.map(|goals| format!(", {goals} goals"));
+                group.seeds.len().to_string() + &goals.unwrap_or_default()
             }),
-            ("scored in", Left, |it| {
-                let unit = (!it.normalized).then(|| format!(" ({}s)", it.measure()));
-                it.scored_in.clone() + &unit.unwrap_or_default()
+            ("scored in", Left, |group| {
+                let unit = (!group.normalized).then(|| format!(" ({}s)", group.measure()));
+                group.scored_in.clone() + &unit.unwrap_or_default()
             }),
         ];
         match self.select {
             Select::Last => columns.extend::<[Column<GroupReport>; 3]>([
-                ("last 3", Right, |it| spread(it.mean_last_3)),
-                ("last 5", Right, |it| spread(it.mean_last_5)),
-                ("last 50000 steps", Right, |it| spread(it.mean_last_50000_steps)),
+                ("last 3", Right, |group| spread(group.mean_last_3)),
+                ("last 5", Right, |group| spread(group.mean_last_5)),
+                ("last 50000 steps", Right, |group| spread(group.mean_last_50000_steps)),
             ]),
-            Select::Best => columns.push(("best evaluation", Right, |it| spread(it.best))),
+            Select::Best => columns.push(("best evaluation", Right, |group| spread(group.best))),
         }
         let differs = "what differs from other runs of the task and algorithm";
-        columns.push((differs, Left, |it| it.differs.join(", ")));
+        columns.push((differs, Left, |group| group.differs.join(", ")));
         let title = "Over seeds: mean ± standard deviation of the runs, divided by n - 1 (in parentheses: by n).\n";
         let table = Table::from_rows(&self.groups, &columns);
         [Block::Text(title.to_owned()), Block::Table(table)]

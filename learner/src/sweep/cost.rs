@@ -7,6 +7,7 @@ use std::time::Duration;
 use indicatif::{HumanBytes, HumanDuration};
 use quad_run::config::{Device, settings};
 use quad_run::counted;
+use quad_run::results::Spread;
 use quad_run::status::State;
 use rayon::ThreadPoolBuilder;
 use tracing::warn;
@@ -25,7 +26,7 @@ pub(crate) struct StudyCost {
     /// Remaining training time of all runs together.
     seconds: f64,
     /// Final disk space of all runs together.
-    bytes: u64,
+    bytes: f64,
     measured: usize,
 }
 
@@ -45,9 +46,12 @@ impl StudyCost {
                     warn!("{warning}");
                 }
             }
-            one_thread.install(|| RunCost::measure(&run.experiment, Device::Cpu, data))
+            let cost =
+                one_thread.install(|| RunCost::measure(&run.experiment, Device::Cpu, data))?;
+            anyhow::Ok((cost.step_seconds, cost.bytes(&run.experiment) as f64))
         };
-        let mut costs: BTreeMap<String, RunCost> = BTreeMap::new();
+        // Seconds of a step and bytes of a run.
+        let mut costs: BTreeMap<String, (f64, f64)> = BTreeMap::new();
         for (run, _) in runs {
             let key = configuration(run);
             if costs.len() == MAX_MEASURED || costs.contains_key(&key) {
@@ -60,32 +64,26 @@ impl StudyCost {
             });
             costs.insert(key, cost.unwrap_or_default());
         }
-        let known = costs.values().filter(|cost| cost.step_seconds > 0.0);
-        let measured = known.count();
-        let mean = |value: fn(&RunCost) -> f64| {
-            costs.values().map(value).sum::<f64>() / measured.max(1) as f64
-        };
-        let mean = RunCost {
-            step_seconds: mean(|cost| cost.step_seconds),
-            snapshot_bytes: mean(|cost| cost.snapshot_bytes as f64) as u64,
-            checkpoint_bytes: mean(|cost| cost.checkpoint_bytes as f64) as u64,
-            row_bytes: mean(|cost| cost.row_bytes as f64) as u64,
-        };
-        let mut all = Self { measured, ..Self::default() };
+        let (seconds, bytes): (Vec<_>, Vec<_>) =
+            costs.values().filter(|(seconds, _)| *seconds > 0.0).copied().unzip();
+        let mean = |values: &[f64]| Spread::new(values).map_or(0.0, |spread| spread.mean);
+        let typical = (mean(&seconds), mean(&bytes));
+        let mut study = Self { measured: seconds.len(), ..Self::default() };
         for (run, state) in runs {
-            let cost = costs.get(&configuration(run)).copied().unwrap_or(mean);
+            let (seconds, bytes) = costs.get(&configuration(run)).copied().unwrap_or(typical);
             let steps = run.experiment.total_steps();
-            all.step_seconds.insert(run.index, cost.step_seconds);
-            all.seconds += cost.step_seconds * (steps - state.step(steps).min(steps)) as f64;
-            all.bytes += cost.bytes(&run.experiment);
+            study.step_seconds.insert(run.index, seconds);
+            study.seconds += seconds * (steps - state.step(steps).min(steps)) as f64;
+            study.bytes += bytes;
         }
-        Ok(all)
+        Ok(study)
     }
 
     /// The cost in words, with this many runs at a time.
     pub fn text(&self, jobs: usize) -> String {
         let left = HumanDuration(Duration::from_secs_f64((self.seconds / jobs as f64).ceil()));
-        let (measured, bytes) = (counted(self.measured, "configuration"), HumanBytes(self.bytes));
+        let (measured, bytes) =
+            (counted(self.measured, "configuration"), HumanBytes(self.bytes as u64));
         format!(
             "training takes about {left}, {jobs} at a time (by a second's measurement of {measured}, each alone on one \
              thread); these runs take {bytes} of disk"

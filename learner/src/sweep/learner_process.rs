@@ -8,7 +8,7 @@ use std::process::{Command, ExitStatus};
 use std::time::Duration;
 
 use anyhow::Context;
-use quad_run::config::tables;
+use quad_run::config::{presets, tables};
 use quad_run::folder::RunDir;
 use quad_run::status::{Pace, State};
 use quad_runtime::{ENDED_AT_ONCE, FAILURE_FILE, LEAVE_WITHIN, UNFINISHED};
@@ -31,7 +31,6 @@ pub(crate) struct LearnerOptions {
     pub endpoint: String,
     /// Address of the page, for a single learner.
     pub http: Option<SocketAddr>,
-    pub http_hosts: Vec<String>,
 }
 
 #[derive(Clone)]
@@ -98,12 +97,12 @@ impl LearnerProcess {
     fn prepare(&self, options: &LearnerOptions) -> anyhow::Result<Command> {
         let Self { run, dir, .. } = self;
         let mut command = Command::new(std::env::current_exe()?);
-        command.args(["train", "--preset", &run.preset, "--run-dir"]);
-        command.arg(dir).args(["--connect", &options.endpoint]);
+        let named = if presets::is_path(&run.preset) { "--preset" } else { "--task" };
+        command.args(["train", named, &run.preset, "--connect", &options.endpoint, "--run-dir"]);
+        command.arg(dir);
         if let Some(address) = options.http {
             command.args(["--http", &address.to_string()]);
         }
-        command.args(options.http_hosts.iter().map(|host| format!("--http-hosts={host}")));
         for (key, value) in tables::keys(&run.changes) {
             command.args(["--set", &format!("{key}={value}")]);
         }

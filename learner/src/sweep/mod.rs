@@ -3,16 +3,12 @@
 //! All learners meet shared evaluators at a router in this process. The folder of a study,
 //! `runs/STUDY`, has a folder for each run.
 //!
-//! In reading order: `study` reads a file, `axes` are its lists of values, `rules` select
-//! combinations, `names` are those of runs; `cost` estimates; `scheduler` runs the learners, each a
-//! `learner_process`, and `display` shows them.
+//! In reading order: `study` reads a file, `combinations` are those of its lists of values; `cost`
+//! estimates; `scheduler` runs the learners, each a `learner_process`, and shows them.
 
-mod axes;
+mod combinations;
 mod cost;
-mod display;
 mod learner_process;
-mod names;
-mod rules;
 mod scheduler;
 mod study;
 

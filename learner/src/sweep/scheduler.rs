@@ -5,18 +5,18 @@ use std::path::PathBuf;
 use std::pin::pin;
 use std::time::{Duration, Instant};
 
-use indicatif::HumanDuration;
+use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use quad_run::status::{Pace, State};
-use quad_runtime::LEAVE_WITHIN;
+use quad_runtime::{LEAVE_WITHIN, clean};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time;
 use tokio_util::sync::CancellationToken;
+use tracing::info;
 
-use super::display::Display;
 use super::learner_process::{End, LearnerOptions, LearnerProcess};
 use super::study::PlannedRun;
-use crate::local_evaluators::LocalEvaluators;
+use crate::children::LocalEvaluators;
 
 pub(crate) struct Sweep {
     pub folder: PathBuf,
@@ -54,8 +54,9 @@ impl Sweep {
     pub async fn run(mut self) -> Outcome {
         let mut shutdown = pin!(quad_runtime::shutdown_signal(2 * LEAVE_WITHIN));
         let stop = CancellationToken::new();
-        let (count, display) = (self.waiting.len(), Display::new());
-        let mut ticker = time::interval(display.interval());
+        let (count, display) = (self.waiting.len(), display());
+        let seconds = if display.is_hidden() { 30 } else { 1 };
+        let mut ticker = time::interval(Duration::from_secs(seconds));
         ticker.tick().await; // The first tick is immediate.
         let (mut progress, begin) = (Progress::default(), Instant::now());
         let (mut learners, mut reading) = (JoinSet::new(), JoinSet::new());
@@ -72,28 +73,32 @@ impl Sweep {
                 break;
             }
             tokio::select! {
-                _ = ticker.tick() => match reading.is_empty() {
-                    true => drop(reading.spawn_blocking(read(&progress))),
-                    false => display.show(&self.lines(&progress, begin.elapsed())),
-                },
-                Some(line) = self.lines.recv() => display.print(&line),
+                // A hanging disk keeps the last lines.
+                _ = ticker.tick(), if reading.is_empty() => {
+                    let running = progress.running.iter();
+                    let dirs = running.map(|(index, (learner, _))| (*index, learner.dir.clone()));
+                    let dirs = Vec::from_iter(dirs);
+                    let read = |(index, dir): (usize, PathBuf)| (index, Pace::read(&dir));
+                    reading.spawn_blocking(move || Vec::from_iter(dirs.into_iter().map(read)));
+                }
+                Some(line) = self.lines.recv() => print(&display, &line),
                 Some(Ok((learner, end, pace))) = learners.join_next() => {
-                    display.print(&self.conclude(&learner, end, pace, &mut progress));
+                    print(&display, &self.conclude(&learner, end, pace, &mut progress));
                 }
                 Some(Ok(paces)) = reading.join_next() => {
                     for (index, pace) in paces {
-                        progress.running.entry(index).and_modify(|(_, known)| *known = pace);
+                        progress.running.entry(index).and_modify(|(_, last)| *last = pace);
                     }
-                    display.show(&self.lines(&progress, begin.elapsed()));
+                    show(&display, &self.lines(&progress, begin.elapsed()));
                 }
                 () = &mut shutdown, if !stop.is_cancelled() => {
-                    display.print("stopping; the runs at work save their checkpoints");
+                    print(&display, "stopping; the runs at work save their checkpoints");
                     self.waiting.clear();
                     stop.cancel();
                 }
             }
         }
-        display.finish();
+        display.finish_and_clear();
         self.evaluators.end().await;
         let unfinished = count - progress.complete - progress.failed.len();
         Outcome { unfinished, failed: progress.failed }
@@ -157,11 +162,25 @@ impl Sweep {
     }
 }
 
-fn read(progress: &Progress) -> impl FnOnce() -> Vec<(usize, Pace)> + use<> {
-    let mut dirs = Vec::new();
-    for (index, (learner, _)) in &progress.running {
-        dirs.push((*index, learner.dir.clone()));
+/// A line for each running learner and a total on a terminal; hidden where stderr is none.
+fn display() -> ProgressBar {
+    let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+    // The default style shows the message, too.
+    match ProgressStyle::with_template("{msg}") {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
     }
-    let read = |(index, dir): (usize, PathBuf)| (index, Pace::read(&dir));
-    move || dirs.into_iter().map(read).collect()
+}
+
+fn print(display: &ProgressBar, text: &str) {
+    if display.is_hidden() { info!("{text}") } else { display.println(clean(text)) }
+}
+
+/// Replaces the lines on a terminal.
+fn show(display: &ProgressBar, lines: &[String]) {
+    if display.is_hidden() {
+        lines.iter().for_each(|line| info!("{line}"));
+    } else {
+        display.set_message(lines.join("\n"));
+    }
 }

@@ -16,9 +16,7 @@ use serde::Deserialize;
 use toml::{Table, Value};
 use tracing::warn;
 
-use super::axes::{Combination, axes, combinations};
-use super::names;
-use super::rules;
+use super::combinations::{self, Combination};
 use crate::data::Source;
 
 /// Keys of [run] and [axes] that are no keys of an experiment: a run's preset, and a table of
@@ -132,31 +130,35 @@ impl Study {
 impl File {
     fn runs(&self, only: &[Table], set: &[Table]) -> Result<Vec<PlannedRun>, Problems> {
         let no_hints = |problems| (problems, BTreeSet::new());
-        let axes = axes(&self.axes).map_err(no_hints)?;
-        let all = combinations(&axes);
-        let (merged, mut problems) = (rules::merge(only), Vec::new());
-        for (name, tables) in [
+        let axes = combinations::axes(&self.axes).map_err(no_hints)?;
+        let combinations = combinations::combinations(&axes);
+        let (merged, mut problems) = (combinations::merge(only), Vec::new());
+        for (name, rules) in [
             ("a rule [[only]]", &self.only[..]),
             ("a rule [[except]]", &self.except),
             ("--only", slice::from_ref(&merged)),
         ] {
-            let found = tables.iter().filter_map(|rule| rules::problem(rule, &all));
-            problems.extend(found.map(|problem| format!("{name} {problem}")));
+            for problem in
+                rules.iter().filter_map(|rule| combinations::problem(rule, &combinations))
+            {
+                problems.push(format!("{name} {problem}"));
+            }
         }
         if !problems.is_empty() {
             return Err(no_hints(problems));
         }
         let is_run = |combination: &Combination<'_>| {
-            let any = |rules: &[Table]| rules.iter().any(|rule| rules::matches(rule, combination));
+            let any =
+                |rules: &[Table]| rules.iter().any(|rule| combinations::matches(rule, combination));
             (self.only.is_empty() || any(&self.only)) && !any(&self.except)
         };
         let (mut runs, mut hints) = (Vec::<PlannedRun>::new(), BTreeSet::new());
         let mut names_by_problem = BTreeMap::<String, Vec<String>>::new();
-        for (index, combination) in all.into_iter().filter(is_run).enumerate() {
-            if !rules::matches(&merged, &combination) {
+        for (index, combination) in combinations.into_iter().filter(is_run).enumerate() {
+            if !combinations::matches(&merged, &combination) {
                 continue;
             }
-            let name = names::name(&combination);
+            let name = combinations::name(&combination);
             let problem = match self.run(index, name.clone(), &combination, set) {
                 Ok(run) if runs.iter().any(|other| other.name == run.name) => {
                     "two runs have this name".to_owned()
@@ -172,14 +174,14 @@ impl File {
             };
             names_by_problem.entry(problem).or_default().push(name);
         }
-        if runs.is_empty() && names_by_problem.is_empty() {
-            return Err(no_hints(vec!["the rules leave no run".to_owned()]));
+        match (names_by_problem.is_empty(), runs.is_empty()) {
+            (true, true) => Err(no_hints(vec!["the rules leave no run".to_owned()])),
+            (true, false) => Ok(runs),
+            (false, _) => {
+                let line = |(problem, names): (_, Vec<_>)| format!("{}: {problem}", some(&names));
+                Err((names_by_problem.into_iter().map(line).collect(), hints))
+            }
         }
-        if names_by_problem.is_empty() {
-            return Ok(runs);
-        }
-        let line = |(problem, names): (_, Vec<_>)| format!("{}: {problem}", some_of(&names));
-        Err((names_by_problem.into_iter().map(line).collect(), hints))
     }
 
     fn run(
@@ -198,9 +200,9 @@ impl File {
             return Err(anyhow!("it needs one of task and preset"))
                 .hint("[run] may have it, or an axis");
         };
-        let known = Preset::read(preset).hint_of(ConfigError::hint)?;
-        let experiment = known.resolve(&changes).hint_of(ConfigError::hint)?;
-        let doubts = known.doubts(&experiment, &changes)?;
+        let read = Preset::read(preset).hint_of(ConfigError::hint)?;
+        let experiment = read.resolve(&changes).hint_of(ConfigError::hint)?;
+        let doubts = read.doubts(&experiment, &changes)?;
         let dataset = experiment.dataset.as_deref().context("it names no dataset");
         let source = Source::parse(dataset.hint("add to [run] a line dataset = \"FILE\"")?)?;
         source.check_environment(&experiment.environment)?;
@@ -251,14 +253,58 @@ fn set(table: &mut Table, key: &str, value: &Value) {
     }
 }
 
-fn some_of(names: &[String]) -> String {
-    let others = names.len().saturating_sub(3);
-    let first = names[..names.len() - others].join(", ");
-    match others {
+fn some(names: &[String]) -> String {
+    let rest = names.len().saturating_sub(3);
+    let first = names[..names.len() - rest].join(", ");
+    match rest {
         0 => first,
-        _ => format!("{first} and {}", counted(others, "other")),
+        _ => format!("{first} and {}", counted(rest, "other")),
     }
 }
 
 #[cfg(test)]
-mod tests;
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    /// The last run of a study with these axes.
+    fn last_run(axes: &str) -> PlannedRun {
+        let run = "run = { dataset = 'x.hdf5', steps = 7 }\nmethod.slow = { agent.gamma = 0.5 }";
+        let text =
+            format!("about = 'a question'\n{run}\naxes = {{ task = ['hopper-demo'], {axes} }}");
+        let file: File = toml::from_str(&text).unwrap();
+        file.runs(&[], &["agent.samples = 2".parse().unwrap()]).unwrap().pop().unwrap()
+    }
+
+    #[test]
+    fn changes_as_flags_give_the_same_experiment() {
+        let run = last_run(
+            "seed = [0, 3], method = ['slow'], agent.tau = [0.1, 2], agent.critic.hidden = [[8, 8]], precision = ['bf16']",
+        );
+        let mut changes = Table::new();
+        for (key, value) in tables::keys(&run.changes) {
+            let flag = format!("{key}={value}");
+            tables::merge(&mut changes, tables::parse_assignment(&flag).unwrap());
+        }
+        assert_eq!(quad_run::config::resolve(&run.preset, &changes).unwrap(), run.experiment);
+        let (agent, seed) = (&run.experiment.agent, run.experiment.seed);
+        let values = ["gamma", "tau", "samples"].map(|key| agent[key].to_string());
+        assert_eq!((values.join(" "), seed, run.experiment.steps), ("0.5 2.0 2".to_owned(), 3, 7));
+    }
+
+    #[test]
+    fn a_run_on_another_dataset_is_refused() {
+        let (run, folder) = (last_run("seed = [0]"), tempfile::tempdir().unwrap());
+        let state = |dataset: &str| {
+            let path = folder.path().join(dataset);
+            let mut config = crate::fixtures::config("run", 0);
+            config.experiment = run.experiment.clone();
+            config.experiment.dataset = Some(dataset.to_owned());
+            RunDir::create(&path, &config).unwrap();
+            run.state(&path)
+        };
+        assert_eq!(state("x.hdf5").unwrap(), State::Begun(0));
+        let error = state("y.hdf5").unwrap_err().to_string();
+        assert!(error.ends_with("than the study's: dataset"), "{error}");
+    }
+}

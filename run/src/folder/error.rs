@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 
 /// The action of [`RunDirError::Io`] that makes a new folder.
 pub(super) const CREATE: &str = "create";
+/// The action of [`RunDirError::Io`] that makes a file of the user's.
+pub(super) const SAVE: &str = "save";
 
 /// A run folder that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -40,7 +42,7 @@ impl RunDirError {
             Self::Occupied(_) => {
                 "give the command again to continue that run, or choose another folder by --run-dir"
             }
-            Self::Own(_) => "choose another file by --out",
+            Self::Own(_) => "choose another file",
             Self::Gone(_) => "put it back, and give the command again to continue; or begin anew",
             Self::Claimed(_) => {
                 "wait for the end of that learner; if it is gone, as with its host, remove that file"
@@ -55,6 +57,9 @@ impl RunDirError {
             }
             Self::Io { action: CREATE, .. } => {
                 "choose a folder that you may write to with --run-dir DIR"
+            }
+            Self::Io { action: SAVE, .. } => {
+                "name a file in a folder that is there and that you may write in"
             }
             Self::Io { source, .. } => match source.kind() {
                 ErrorKind::NotFound | ErrorKind::NotADirectory => {

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::error::{CREATE, RunDirError, content, io_error};
+use super::error::{CREATE, RunDirError, SAVE, content, io_error};
 use super::lines::{RunEndpoints, ScoreLine};
 use super::lock::Lock;
 use super::log::{Log, whole_lines};
@@ -56,6 +56,12 @@ impl RunDir {
         let mut runs = file.ancestors().skip(1).take(2).filter(|folder| Self::is_occupied(folder));
         let is_own = runs.any(|run| OWN.iter().any(|name| file.starts_with(run.join(name))));
         if is_own { Err(RunDirError::Own(out.to_owned())) } else { Ok(()) }
+    }
+
+    /// Makes or replaces a file that the user has named, unless a learner needs it.
+    pub fn write_named(out: &Path, file: &[u8]) -> Result<(), RunDirError> {
+        Self::refuse_own_file(out)?;
+        files::replace(out, file).map_err(io_error(SAVE, out))
     }
 
     /// Makes the folder, locks it and saves the configuration. Also returns `scores.jsonl`, which

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use quad_dataset::environment;
-use quad_protocol::{Hash, online_seed};
+use quad_protocol::{Episode, Hash, online_seed};
 
 use super::error::RunDirError;
 use super::experience::read_experience;
@@ -21,8 +21,12 @@ const IF_REPEATABLE: &str = "the run can be repeated bit for bit by evaluators w
 const LOGGED: &str = "the run can be repeated bit for bit from experience.log alone";
 
 /// Checks that each episode of a run's experience is there once and was played with the snapshot
-/// on disk. Also returns the promise that holds. `None` for an offline run.
-pub fn verify_experience(path: &Path) -> Result<Option<(Findings, &'static str)>, RunDirError> {
+/// on disk. Also returns the promise that holds. `None` for an offline run. An episode that training
+/// leaves out counts as one without rows.
+pub fn verify_experience(
+    path: &Path,
+    is_left_out: impl Fn(&Episode) -> bool,
+) -> Result<Option<(Findings, &'static str)>, RunDirError> {
     let (dir, config) = RunDir::open(path)?;
     let experiment = &config.experiment;
     let Some(online) = &experiment.online else { return Ok(None) };
@@ -34,9 +38,10 @@ pub fn verify_experience(path: &Path) -> Result<Option<(Findings, &'static str)>
     for episode in &episodes {
         let seed = episode.score.seed;
         let name = format!("step {}, seed {seed}", episode.step);
+        let rows = if is_left_out(episode) { 0 } else { episode.rewards.len() as u64 };
         match numbers.get(&seed) {
             None => findings.add("no episode of this run", name),
-            Some(j) if lengths.insert(*j, episode.rewards.len() as u64).is_some() => {
+            Some(j) if lengths.insert(*j, rows).is_some() => {
                 findings.add("recorded twice", name);
             }
             Some(_) => {}

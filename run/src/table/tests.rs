@@ -17,21 +17,18 @@ fn special_characters_are_escaped() {
 /// Names of tasks and runs may be those of another user's files.
 #[test]
 fn names_do_not_break_tables() {
-    for (name, text, markdown, latex) in [
-        ("[2cm]", "[2cm]", "[2cm]", "{}[2cm]"),
-        ("*", "*", "*", "{}*"),
-        ("a|b", "a|b", "a\\|b", "a|b"),
-        ("a\\|b", "a\\|b", "a\\\\\\|b", "a\\textbackslash{}|b"),
-        ("<b>", "<b>", "\\<b>", "$<$b$>$"),
-        ("a\nb\u{1b}[2J", "a b [2J", "a b [2J", "a b [2J"),
+    for (name, text, latex) in [
+        ("[2cm]", "[2cm]", "{}[2cm]"),
+        ("*", "*", "{}*"),
+        ("a\\b", "a\\b", "a\\textbackslash{}b"),
+        ("<b>", "<b>", "$<$b$>$"),
+        ("a\nb\u{1b}[2J", "a b [2J", "a b [2J"),
     ] {
         let mut table = Table::new(&[("task", Left)]);
         table.push([name.to_owned()]);
-        for (style, cell) in [
-            (Style::Text, text.to_owned()),
-            (Style::Markdown, format!("| {markdown:4} |")),
-            (Style::Latex, format!("{latex} \\\\")),
-        ] {
+        for (style, cell) in
+            [(Style::Text, text.to_owned()), (Style::Latex, format!("{latex} \\\\"))]
+        {
             let rendered = table.render(style);
             let has = rendered.lines().any(|line| line == cell);
             assert!(has, "{cell:?} is missing in {rendered:?}");

@@ -10,6 +10,7 @@ use anyhow::{Context, anyhow};
 use color_quant::NeuQuant;
 use gif::{Encoder, Frame, Repeat};
 use quad_run::files;
+use quad_run::folder::{RunDir, RunDirError};
 use quad_runtime::Hint;
 
 /// Pictures of a strip.
@@ -123,6 +124,7 @@ pub fn write(
         Format::Png => strip(drawn),
     };
     undrawn?;
+    RunDir::refuse_own_file(&output.path).hint_of(RunDirError::hint)?;
     film.and_then(|film| Ok(files::replace(&output.path, &film)?))
         .with_context(|| format!("cannot write {}", output.path.display()))
         .hint("choose a file with --out in a folder that you may write to, with enough space")

@@ -1,14 +1,95 @@
 //! Tests against servers that cut, lie, redirect, stall and serve garbage.
 
-mod server;
-
+use std::collections::VecDeque;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::{Arc, Mutex};
 use std::thread;
 
 use tempfile::TempDir;
 
 use super::*;
-use server::Answer::{self, Other, Send, Stall};
-use server::{Server, WHOLE};
+use Answer::{Other, Send, Stall};
+
+#[derive(Clone, Debug)]
+enum Answer {
+    /// Sends this many bytes of the requested part, and closes the connection.
+    Send(usize),
+    /// Sends this many bytes, and then nothing.
+    Stall(usize),
+    /// Sends a status line and headers, and then these bytes.
+    Other(String, Vec<u8>),
+}
+
+const WHOLE: Answer = Answer::Send(usize::MAX);
+
+struct Server {
+    url: String,
+    requests: Arc<Mutex<Vec<usize>>>,
+}
+
+impl Server {
+    /// First byte of each request.
+    fn requests(&self) -> Vec<usize> {
+        self.requests.lock().unwrap().clone()
+    }
+}
+
+/// Serves the content on a free port: one answer per request, the last of them forever.
+fn serve(answers: &[Answer]) -> Server {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("http://{}/file.hdf5", listener.local_addr().unwrap());
+    let requests = Arc::new(Mutex::new(Vec::new()));
+    let (log, mut answers) = (requests.clone(), VecDeque::from(answers.to_owned()));
+    thread::spawn(move || {
+        while let Ok((stream, _)) = listener.accept() {
+            let start = read_request(&stream);
+            log.lock().unwrap().push(start.unwrap_or(0));
+            let answer = answers.front().unwrap().clone();
+            if answers.len() > 1 {
+                answers.pop_front();
+            }
+            // The client may leave at any time.
+            thread::spawn(move || reply(stream, start, answer).ok());
+        }
+    });
+    Server { url, requests }
+}
+
+fn read_request(stream: &TcpStream) -> Option<usize> {
+    let lines = BufReader::new(stream).lines().map_while(Result::ok);
+    let lines = lines.take_while(|line| !line.is_empty());
+    let start = |line: String| {
+        let line = line.to_ascii_lowercase();
+        line.strip_prefix("range: bytes=")?.strip_suffix('-')?.parse().ok()
+    };
+    // Reads all lines: closing a connection with unread bytes would reset it.
+    lines.filter_map(start).last()
+}
+
+fn reply(mut stream: TcpStream, start: Option<usize>, answer: Answer) -> io::Result<()> {
+    let (content, first) = (content(), start.unwrap_or(0));
+    let (last, length) = (content.len() - 1, content.len() - first);
+    let head = match start {
+        None => "200 OK".to_owned(),
+        Some(first) => format!("206 Partial Content\r\nContent-Range: bytes {first}-{last}/*"),
+    };
+    let is_silent = matches!(answer, Stall(_));
+    let (head, body) = match answer {
+        Send(count) | Stall(count) => {
+            let body = content[first..first + count.min(length)].to_owned();
+            (format!("{head}\r\nContent-Length: {length}"), body)
+        }
+        Other(head, body) => (head, body),
+    };
+    write!(stream, "HTTP/1.1 {head}\r\nConnection: close\r\n\r\n")?;
+    stream.write_all(&body)?;
+    if is_silent {
+        // Ends when the client leaves.
+        let _ = stream.read(&mut [0])?;
+    }
+    Ok(())
+}
 
 /// A small file: HDF5 by its first bytes, and then numbers without a pattern.
 fn content() -> Vec<u8> {
@@ -20,10 +101,6 @@ fn garbage() -> Vec<u8> {
     let mut bytes = content();
     bytes[150_000] ^= 1;
     bytes
-}
-
-fn serve(answers: &[Answer]) -> Server {
-    Server::start(&content(), answers)
 }
 
 /// An answer of these bytes alone, even to a request for a part.
@@ -68,19 +145,8 @@ fn files(folder: &TempDir) -> Vec<String> {
     entries.map(|entry| name(entry).unwrap()).collect()
 }
 
-/// Fetches from a server with these answers, into a folder where an interrupted run has left a
-/// part; the file must be right in the end. Returns the first byte of each request.
-fn requests(silence: u64, left: &[u8], answers: &[Answer]) -> Vec<usize> {
-    let (folder, server) = (TempDir::new().unwrap(), serve(answers));
-    if !left.is_empty() {
-        fs::write(folder.path().join("file.hdf5.0123.partial"), left).unwrap();
-    }
-    let dataset = dataset(&[&server]);
-    let local = fetcher(silence).fetch(&dataset, folder.path()).unwrap();
-    assert!(fs::read(&local.path).unwrap() == content());
-    assert_eq!(dataset.sha256, Some(local.sha256));
-    assert_eq!(files(&folder), ["file.hdf5"], "nothing else is left");
-    server.requests()
+fn part(folder: &TempDir, bytes: &[u8]) {
+    fs::write(folder.path().join("file.hdf5.0123.partial"), bytes).unwrap();
 }
 
 #[test]
@@ -91,39 +157,33 @@ fn a_broken_connection_is_continued_where_it_broke() {
     let target = serve(&[Send(70_000), WHOLE]);
     let redirect = status(&format!("302 Found\r\nLocation: {}", target.url));
     let fifth = Send(50_000);
-    let fifths: &[usize] = &[0, 50_000, 100_000, 150_000, 200_000];
-    for (answers, expected) in [
-        (vec![fifth.clone(); 5], fifths),
-        (vec![Send(70_000), fifth, WHOLE], &[0, 70_000, 120_000]),
-        (vec![redirect; 2], &[0, 70_000]),
-        // Servers that cannot continue.
-        (vec![Send(70_000), page(content())], &[0, 70_000]),
-        (vec![Send(70_000), wrong_part, WHOLE], &[0, 70_000, 0]),
-        (vec![Send(70_000), status("416 No"), WHOLE], &[0, 70_000, 0]),
+    // The part that an interrupted run has left, the answers, and the first byte of each request.
+    for (left, answers, expected) in [
+        (&[][..], vec![fifth.clone(); 5], &[0, 50_000, 100_000, 150_000, 200_000][..]),
+        (&[], vec![Send(70_000), fifth, WHOLE], &[0, 70_000, 120_000]),
+        (&[], vec![redirect; 2], &[0, 70_000]),
+        // Silent servers, and some that cannot continue.
+        (&[], vec![Stall(1_000), Stall(0), WHOLE], &[0, 1_000, 1_000]),
+        (&[], vec![Send(70_000), page(content())], &[0, 70_000]),
+        (&[], vec![Send(70_000), wrong_part, WHOLE], &[0, 70_000, 0]),
+        (&[], vec![Send(70_000), status("416 No"), WHOLE], &[0, 70_000, 0]),
+        (&content()[..70_000], vec![WHOLE], &[70_000]),
+        (&content(), vec![WHOLE], &[]),
+        (&[7; 200_009], vec![WHOLE], &[0]),
     ] {
-        assert_eq!(requests(60, &[], &answers), expected, "{answers:?}");
+        let (folder, server) = (TempDir::new().unwrap(), serve(&answers));
+        if !left.is_empty() {
+            part(&folder, left);
+        }
+        let dataset = dataset(&[&server]);
+        let silence = if answers.iter().any(|answer| matches!(answer, Stall(_))) { 5 } else { 60 };
+        let local = fetcher(silence).fetch(&dataset, folder.path()).unwrap();
+        assert!(fs::read(&local.path).unwrap() == content());
+        assert_eq!(dataset.sha256, Some(local.sha256));
+        assert_eq!(files(&folder), ["file.hdf5"], "nothing else is left");
+        assert_eq!(server.requests(), expected, "{answers:?}");
     }
     assert_eq!(target.requests(), [0, 70_000], "a redirect keeps the range");
-}
-
-#[test]
-fn a_silent_server_is_asked_again() {
-    let starts = requests(5, &[], &[Stall(1_000), Stall(0), WHOLE]);
-    assert_eq!(starts, [0, 1_000, 1_000]);
-}
-
-#[test]
-fn the_part_of_an_interrupted_run_is_continued_if_it_fits() {
-    assert_eq!(requests(60, &content()[..70_000], &[WHOLE]), [70_000]);
-    assert!(requests(60, &content(), &[WHOLE]).is_empty());
-    let too_long = [7; 200_009];
-    assert_eq!(requests(60, &too_long, &[WHOLE]), [0]);
-    // A part of another file is noticed at the end, and costs an address.
-    let folder = TempDir::new().unwrap();
-    fs::write(folder.path().join("file.hdf5.0123.partial"), [7; 70_000]).unwrap();
-    let servers = [(); 2].map(|()| serve(&[WHOLE]));
-    fetch(&dataset(&servers.each_ref()), &folder).unwrap();
-    assert_eq!(servers.map(|server| server.requests()), [[70_000], [0]]);
 }
 
 #[test]
@@ -134,20 +194,20 @@ fn a_wrong_file_is_refused_and_deleted() {
         let body = [size.as_bytes(), bytes, b"\r\n0\r\n\r\n"].concat();
         Other("200 OK\r\nTransfer-Encoding: chunked".to_owned(), body)
     };
-    let known = dataset(&[]);
-    let (mut unknown, mut other) = (known.clone(), known.clone());
+    let sized = dataset(&[]);
+    let (mut unknown, mut other) = (sized.clone(), sized.clone());
     (unknown.bytes, unknown.sha256) = (None, None);
     other.sha256 = Some("01234567".repeat(8));
     let prefixed = [b"more", &content()[..]].concat();
     for (dataset, answer, words, count) in [
-        (&known, page(garbage()), "its SHA-256 is", 1),
+        (&sized, page(garbage()), "its SHA-256 is", 1),
         (&other, WHOLE, "must be 0123456701234567", 1),
-        (&known, sign_in(), "37 bytes, but must have 200008", 1),
+        (&sized, sign_in(), "37 bytes, but must have 200008", 1),
         // The size is not known in advance.
         (&unknown, sign_in(), "not an HDF5 file", 1),
         (&unknown, chunk(&content()), "does not say how large", 1),
-        (&known, chunk(&prefixed), "not an HDF5 file", 1),
-        (&known, chunk(&[0; 50]), "broke after 50 bytes", 4),
+        (&sized, chunk(&prefixed), "not an HDF5 file", 1),
+        (&sized, chunk(&[0; 50]), "broke after 50 bytes", 4),
     ] {
         let (folder, server) = (TempDir::new().unwrap(), serve(&[answer]));
         let mut dataset = dataset.clone();
@@ -163,35 +223,25 @@ fn a_wrong_file_is_refused_and_deleted() {
 }
 
 #[test]
-fn an_answer_without_the_file_leads_to_the_next_address() {
-    for (code, requests) in [("404 No", 1), ("403 No", 1), ("500 No", 4), ("429 No", 4)] {
-        let (bad, good) = (serve(&[status(code)]), serve(&[WHOLE]));
-        fetch(&dataset(&[&bad, &good]), &TempDir::new().unwrap()).unwrap();
-        let counts = [bad, good].map(|server| server.requests().len());
-        assert_eq!(counts, [requests, 1], "{code}");
-    }
-}
-
-#[test]
-fn a_mirror_is_tried_first_and_its_part_is_kept() {
-    let broken = vec![Send(70_000), status("500 No")];
-    for (answers, others) in [(vec![WHOLE], &[][..]), (broken, &[70_000])] {
-        let (mirror, other) = (serve(&answers), serve(&[WHOLE]));
+fn what_is_not_the_file_leads_from_a_mirror_to_the_next_address() {
+    let (start, wrong) = (&content()[..70_000], &[7; 70_000][..]);
+    let portal = page(b"<!DOCTYPE html>".to_vec());
+    for (part_of, answer, first, second) in [
+        (start, status("404 No"), vec![70_000], 70_000),
+        (start, status("403 No"), vec![70_000], 70_000),
+        (start, status("500 No"), vec![70_000; 4], 70_000),
+        (start, status("429 No"), vec![70_000; 4], 70_000),
+        (start, portal, vec![70_000], 70_000),
+        // A part of another file is noticed at the end.
+        (wrong, WHOLE, vec![70_000], 0),
+    ] {
+        let (folder, bad, good) = (TempDir::new().unwrap(), serve(&[answer]), serve(&[WHOLE]));
+        part(&folder, part_of);
         let mut fetcher = fetcher(60);
-        fetcher.mirror = Some(mirror.url.replace("file.hdf5", ""));
-        let folder = TempDir::new().unwrap();
-        fetcher.fetch(&dataset(&[&other]), folder.path()).unwrap();
-        assert_eq!(other.requests(), others);
+        fetcher.mirror = Some(bad.url.replace("file.hdf5", ""));
+        fetcher.fetch(&dataset(&[&good]), folder.path()).unwrap();
+        assert_eq!((bad.requests(), good.requests()), (first, vec![second]));
     }
-}
-
-#[test]
-fn a_page_in_place_of_the_file_costs_no_part() {
-    let folder = TempDir::new().unwrap();
-    fs::write(folder.path().join("file.hdf5.0123.partial"), &content()[..70_000]).unwrap();
-    let (portal, good) = (serve(&[page(b"<!DOCTYPE html>".to_vec())]), serve(&[WHOLE]));
-    fetch(&dataset(&[&portal, &good]), &folder).unwrap();
-    assert_eq!((portal.requests(), good.requests()), (vec![70_000], vec![70_000]));
 }
 
 #[test]
@@ -224,28 +274,15 @@ fn several_runs_can_fetch_one_file_at_once() {
 }
 
 #[test]
-fn offline_the_error_names_the_addresses() {
-    let folder = TempDir::new().unwrap();
-    // No server listens at port 9, and the name is reserved for belonging to no host.
-    let addresses = ["http://127.0.0.1:9/a.hdf5", "http://nowhere.invalid/a.hdf5"];
-    let mut dataset = dataset(&[]);
-    dataset.addresses = addresses.map(str::to_owned).into();
-    let error = fetch(&dataset, &folder).unwrap_err().to_string();
-    for address in addresses {
-        assert!(error.contains(&format!("\n  {address}: ")), "{error}");
-    }
-    assert!(error.contains("refused"), "{error}");
-    assert!(files(&folder).is_empty());
-}
-
-#[test]
-fn a_password_in_an_address_is_not_shown() {
+fn offline_the_error_names_the_addresses_without_passwords() {
+    // No server listens at port 9, and the last name is reserved for belonging to no host.
     for (address, shown) in [
         ("http://user:secret@127.0.0.1:9/folder", "http://…@127.0.0.1:9/folder"),
         ("http://user:se/cret@127.0.0.1:9", "http://…@127.0.0.1:9"),
         ("user:secret@127.0.0.1:9/folder", "…@127.0.0.1:9/folder"),
         ("ftp://user:secret@127.0.0.1:9", "ftp://…@127.0.0.1:9"),
         ("http://127.0.0.1:9", "http://127.0.0.1:9"),
+        ("http://nowhere.invalid", "http://nowhere.invalid"),
     ] {
         assert_eq!(without_password(address), shown);
         let folder = TempDir::new().unwrap();
@@ -255,5 +292,6 @@ fn a_password_in_an_address_is_not_shown() {
         let text = format!("{error:?}");
         assert!(text.contains(&format!("\n  {shown}/file.hdf5: ")), "{text}");
         assert!(!text.contains("cret"), "{text}");
+        assert!(files(&folder).is_empty());
     }
 }

@@ -1,6 +1,6 @@
 //! Tests of what `learner verify` says of experience.
 
-use quad_protocol::{Episode, Name, encode};
+use quad_protocol::{Name, encode};
 
 use super::*;
 use crate::config::resolve;
@@ -37,7 +37,8 @@ fn verified_with(
     snapshot.into_iter().for_each(|file| run.write_snapshot(10, file).unwrap());
     let frames = Vec::from_iter(episodes.iter().map(|episode| encode(episode).unwrap()));
     run.experience_log().unwrap().0.append(frames.iter().map(Vec::as_slice)).unwrap();
-    let (findings, promise) = verify_experience(run.path()).unwrap().unwrap();
+    let (findings, promise) =
+        verify_experience(run.path(), |episode| episode.rewards[0] > 1e6).unwrap().unwrap();
     (findings.to_string(), promise)
 }
 
@@ -52,6 +53,9 @@ fn what_is_missing_or_strange_is_named() {
     let missing =
         "2 of 4 environment steps are recorded\nnot recorded yet (1): 2 steps, from episode 1 on";
     assert_eq!(verified(&whole[..1]).0, missing);
+    let mut far = whole.clone();
+    far[0].rewards[0] = 1e9;
+    assert_eq!(verified(&far).0, missing.replace("episode 1", "episode 2"), "it is left out");
     let seed = whole[0].score.seed;
     // Training comes to no other after a gap, however many rows there are.
     let with = |seed| {
