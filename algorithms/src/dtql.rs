@@ -16,9 +16,9 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "dtql",
     presets: include_str!("../../presets/dtql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Dtql::new)),
+    ..Definition::PLAIN
 };
 
 /// Divisor of the data's actions before atanh, which is infinite at ±1.
@@ -137,8 +137,8 @@ impl Dtql {
         first_steps(self.context.total_steps, [phases.pretraining, phases.policy])[1]
     }
 
-    fn noise(&self, step: u64) -> Result<Noise> {
-        let shape = (self.context.batch_size, self.context.action_dim());
+    fn noise(&self, step: u64, b: usize) -> Result<Noise> {
+        let shape = (b, self.context.action_dim());
         let random = &mut self.context.random(step);
         Ok(Noise {
             cloning: Noising::draw(random, "bc", shape)?,
@@ -149,7 +149,7 @@ impl Dtql {
 
     /// V(s) toward an expectile of the smaller Q(s, a), and Q(s, a) toward r + γ·V(s'), both as
     /// they are before this step.
-    fn value_losses(&self, batch: &Minibatch) -> Result<[Loss; 2]> {
+    fn value_losses(&self, batch: &Batch) -> Result<[Loss; 2]> {
         let Networks { critic, value, .. } = &self.networks;
         let next = state_value(&value.detach(), &batch.next_observations)?;
         let targets = batch.target(*self.config.gamma, &next)?;
@@ -159,12 +159,12 @@ impl Dtql {
         let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * TWIN as f64)?;
         Ok([
             Loss::new("value_loss", value_loss).with("v_mean", v.mean_all()?),
-            Loss::of_critics(critic_loss, &targets)?,
+            Loss::critics(critic_loss, &targets)?,
         ])
     }
 
     /// μ_φ toward the data's actions.
-    fn bc_loss(&self, batch: &Minibatch, noising: &Noising) -> Result<Loss> {
+    fn bc_loss(&self, batch: &Batch, noising: &Noising) -> Result<Loss> {
         let diffusion = &self.networks.diffusion;
         let actions = &batch.actions;
         let learned = |clean| batch.within_episodes(clean, actions);
@@ -173,7 +173,7 @@ impl Dtql {
     }
 
     /// π_θ toward actions that the critics value and that μ_φ, which is fixed, denoises well.
-    fn actor_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+    fn actor_loss(&self, batch: &Batch, noise: &Noise) -> Result<Loss> {
         let Networks { actor, critic, diffusion, .. } = &self.networks;
         let distribution = actor.distribution(&batch.observations)?;
         let drawn = distribution.draw(&noise.policy)?;
@@ -185,9 +185,9 @@ impl Dtql {
         let mut loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         let (weight, mut likelihood) = (*self.config.likelihood, None);
         if weight > 0.0 {
-            let of_data = likelihood_loss(&distribution, batch)?;
-            loss = (loss + (&of_data * f64::from(weight))?)?;
-            likelihood = Some(of_data);
+            let likelihood_loss = likelihood_loss(&distribution, batch)?;
+            loss = (loss + (&likelihood_loss * f64::from(weight))?)?;
+            likelihood = Some(likelihood_loss);
         }
         let loss = Loss::new("actor_loss", loss).with("trust_loss", trust_loss);
         Ok(loss.with("q_loss", q_loss).with("likelihood_loss", likelihood))
@@ -212,7 +212,7 @@ fn denoising_loss(
 
 /// −E[log N(atanh(a/1.001))] of the data's actions, `[]`: not of a, whose density would also have
 /// the tanh's Jacobian, which does not depend on θ.
-fn likelihood_loss(distribution: &Normal, batch: &Minibatch) -> Result<Tensor> {
+fn likelihood_loss(distribution: &Normal, batch: &Batch) -> Result<Tensor> {
     let scaled = (&batch.actions / ROOM)?;
     let u = (((1.0 + &scaled)?.log()? - (1.0 - &scaled)?.log()?)? * 0.5)?;
     let Normal { mean, log_std } = distribution;
@@ -227,8 +227,8 @@ impl Algorithm for Dtql {
     }
 
     /// Critics and diffusion policy learn in both phases, the one-step policy in the second.
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
         let pretraining = self.pretraining();
         let steps = step.saturating_sub(pretraining);
         let decay = match self.config.cosine {
@@ -236,16 +236,16 @@ impl Algorithm for Dtql {
             false => 1.0,
         };
         let adam = AdamStep::after(step, *self.config.learning_rate * decay);
-        let of_values = AdamStep::after(step, *self.config.critic_learning_rate * decay);
-        let [value_loss, critic_loss] = self.value_losses(&batch)?;
-        let bc_loss = self.bc_loss(&batch, &noise.cloning)?;
+        let critic_adam = AdamStep::after(step, *self.config.critic_learning_rate * decay);
+        let [value_loss, critic_loss] = self.value_losses(batch)?;
+        let bc_loss = self.bc_loss(batch, &noise.cloning)?;
         let networks = &mut self.networks;
-        networks.value.minimize(&value_loss.value, of_values)?;
-        networks.critic.minimize(&critic_loss.value, of_values)?;
+        networks.value.minimize(&value_loss.value, critic_adam)?;
+        networks.critic.minimize(&critic_loss.value, critic_adam)?;
         networks.diffusion.minimize(&bc_loss.value, adam)?;
         let mut losses = vec![value_loss, critic_loss, bc_loss];
         if step >= pretraining {
-            let actor_loss = self.actor_loss(&batch, &noise)?;
+            let actor_loss = self.actor_loss(batch, &noise)?;
             let adam = AdamStep::after(step - pretraining, adam.rate);
             self.networks.actor.minimize(&actor_loss.value, adam)?;
             self.networks.critic.soft_update(*self.config.ema_rate)?;
@@ -256,12 +256,12 @@ impl Algorithm for Dtql {
         Ok(measured)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
-        let mut losses = Vec::from(self.value_losses(&batch)?);
-        losses.push(self.bc_loss(&batch, &noise.cloning)?);
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
+        let mut losses = Vec::from(self.value_losses(batch)?);
+        losses.push(self.bc_loss(batch, &noise.cloning)?);
         if step >= self.pretraining() {
-            losses.push(self.actor_loss(&batch, &noise)?);
+            losses.push(self.actor_loss(batch, &noise)?);
         }
         measured(&losses)
     }

@@ -22,8 +22,8 @@ pub(super) const DEFINITION: Definition = Definition {
         }),
         ..Reporting::PLAIN
     },
-    chunks: false,
     read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
+    ..Definition::PLAIN
 };
 
 /// (q − V)/α at which EQL's exponentials are cut off.

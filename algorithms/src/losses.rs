@@ -50,7 +50,7 @@ impl Loss {
     }
 
     /// The critics' loss, and the mean of their targets y `[B]`.
-    pub fn of_critics(value: Tensor, targets: &Tensor) -> Result<Self> {
+    pub fn critics(value: Tensor, targets: &Tensor) -> Result<Self> {
         Ok(Self::new("critic_loss", value).with("target_q_mean", targets.mean_all()?))
     }
 

@@ -12,9 +12,9 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "qc",
     presets: include_str!("../../presets/qc.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Qc::new)),
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -61,20 +61,20 @@ impl Qc {
     }
 
     /// The losses of critics and flow.
-    fn losses(&self, step: u64, indices: &[u32]) -> Result<[Loss; 2]> {
-        let (batch, random) = (self.context.batch(indices)?, &mut self.context.random(step));
+    fn losses(&self, step: u64, batch: &Batch) -> Result<[Loss; 2]> {
+        let random = &mut self.context.random(step);
         let (b, a) = batch.actions.dims2()?;
         let start = random.normal("start_noise", (b, a))?; // x_0
         let next_noise = random.normal("next_noise", (b * *self.config.candidates as usize, a))?;
         let times = random.tensor("times", (b, 1), |generator| generator.random::<f32>())?;
-        let targets = self.targets(&batch, &next_noise)?;
+        let targets = self.targets(batch, &next_noise)?;
         let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
-        let bc_loss = flow_loss(&self.networks.flow, &batch, &start, &times)?;
+        let bc_loss = flow_loss(&self.networks.flow, batch, &start, &times)?;
         Ok([critic_loss, Loss::new("bc_loss", bc_loss)])
     }
 
     /// y = r + γ·mask·Q̂(s', a'), `[B]`, with the best a' by Q of those from this noise, `[B·N, a]`.
-    fn targets(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
+    fn targets(&self, batch: &Batch, noise: &Tensor) -> Result<Tensor> {
         let Networks { critic, flow } = &self.networks;
         let flow = FlowActor::new(flow.detach(), *self.config.flow_steps);
         let drawn = flow.sample(&batch.next_observations, noise)?;
@@ -92,9 +92,9 @@ impl Qc {
 impl Algorithm for Qc {
     /// Both losses are those of the networks before the update, and so are the critics that the
     /// targets follow.
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
         let adam = AdamStep::after(step, *self.config.learning_rate);
-        let losses = self.losses(step, indices)?;
+        let losses = self.losses(step, batch)?;
         let [critic_loss, bc_loss] = &losses;
         let Networks { critic, flow } = &mut self.networks;
         critic.soft_update(*self.config.ema_rate)?;
@@ -103,8 +103,8 @@ impl Algorithm for Qc {
         measured(&losses)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        measured(&self.losses(step, indices)?)
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        measured(&self.losses(step, batch)?)
     }
 
     /// The flow, which chooses by the critics themselves.

@@ -13,9 +13,8 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "rlpd",
     presets: include_str!("../../presets/rlpd.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
     read: |table| Ok(start(Config::read(table)?, Rlpd::new)),
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -33,7 +32,7 @@ struct Config {
     critic: MlpConfig,
     /// Ensemble size K.
     critics: Count,
-    /// Critics of which the smallest value counts in the target, drawn anew in each step.
+    /// Size of the random critic subset in the target.
     target_critics: Count,
     gamma: UnitInterval,
     /// Reward the next action's entropy in the target.
@@ -52,8 +51,8 @@ struct Config {
 impl Config {
     fn read(table: &toml::Table) -> std::result::Result<Self, AgentError> {
         let config: Self = read(table)?;
-        let (of, most) = (*config.target_critics, *config.critics);
-        check("target_critics", of, of <= most, "at most agent.critics")?;
+        let (subset, most) = (*config.target_critics, *config.critics);
+        check("target_critics", subset, subset <= most, "at most agent.critics")?;
         Ok(config)
     }
 }
@@ -88,10 +87,9 @@ impl Rlpd {
         Ok(Self { config, context, networks })
     }
 
-    fn noise(&self, step: u64) -> Result<Noise> {
+    fn noise(&self, step: u64, b: usize) -> Result<Noise> {
         let Config { critics, target_critics, .. } = self.config;
-        let (mut random, shape) =
-            (self.context.random(step), (self.context.batch_size, 1, self.context.action_dim()));
+        let (mut random, shape) = (self.context.random(step), (b, 1, self.context.action_dim()));
         let next = random.normal("next_noise", shape)?;
         let policy = random.normal("policy_noise", shape)?;
         let critics = random.vector("target_critics", |generator| {
@@ -107,7 +105,7 @@ impl Rlpd {
     }
 
     /// Every critic toward r + γ·mask·(min Q̂_k(s', a') − α·log π(a'|s')).
-    fn critic_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+    fn critic_loss(&self, batch: &Batch, noise: &Noise) -> Result<Loss> {
         let Networks { actor, critic, .. } = &self.networks;
         let next = actor.constant_distribution(&batch.next_observations)?.draw(&noise.next)?;
         let values = batch.next_values(&critic.target, &next.actions.squeeze(1)?)?;
@@ -120,7 +118,7 @@ impl Rlpd {
 
     /// The policy toward large entropy and large Q by the mean of all critics; and its entropy, `[]`,
     /// a constant.
-    fn actor_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<(Loss, Tensor)> {
+    fn actor_loss(&self, batch: &Batch, noise: &Noise) -> Result<(Loss, Tensor)> {
         let Networks { actor, critic, .. } = &self.networks;
         let drawn = actor.distribution(&batch.observations)?.draw(&noise.policy)?;
         let q = batch.values_at(&critic.detach(), &drawn.actions.squeeze(1)?)?.mean(0)?;
@@ -134,17 +132,17 @@ impl Rlpd {
 
 impl Algorithm for Rlpd {
     /// The policy learns from the last of each `actor_every` batches, after the critics.
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
         let (mut rate, every) = (*self.config.learning_rate, *self.config.actor_every);
         if self.config.decay {
             rate *= cosine_decay(step, self.context.total_steps + self.context.online_steps);
         }
-        let mut losses = vec![self.critic_loss(&batch, &noise)?];
+        let mut losses = vec![self.critic_loss(batch, &noise)?];
         self.networks.critic.minimize(&losses[0].value, AdamStep::after(step, rate))?;
         self.networks.critic.soft_update(*self.config.ema_rate)?;
         if (step + 1).is_multiple_of(every) {
-            let (actor_loss, entropy) = self.actor_loss(&batch, &noise)?;
+            let (actor_loss, entropy) = self.actor_loss(batch, &noise)?;
             let adam = AdamStep::after(step / every, rate);
             let excess = (entropy + 0.5 * self.context.action_dim() as f64)?;
             let Networks { actor, log_alpha, .. } = &mut self.networks;
@@ -156,9 +154,9 @@ impl Algorithm for Rlpd {
         measured(&losses)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
-        measured(&[self.critic_loss(&batch, &noise)?, self.actor_loss(&batch, &noise)?.0])
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
+        measured(&[self.critic_loss(batch, &noise)?, self.actor_loss(batch, &noise)?.0])
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {

@@ -43,7 +43,6 @@ fn arrays() -> Arrays {
 fn context(seed: u64, device: &Device) -> Context {
     Context {
         transitions: Arc::new(Transitions::of(arrays()).unwrap()),
-        batch_size: BATCH,
         total_steps: STEPS,
         online_steps: 0,
         window: Window::ONE,
@@ -57,31 +56,39 @@ fn context(seed: u64, device: &Device) -> Context {
 /// Every algorithm with the hyper-parameters of each of its golden folders, whose networks are
 /// small.
 fn variants() -> Vec<(Definition, toml::Table)> {
-    let of = |golden: &golden::Golden| {
-        let definition = ALGORITHMS.iter().find(|known| golden.config["algorithm"] == known.name);
-        definition.map(|definition| (*definition, table(golden)))
+    let variant = |golden: &golden::Golden| {
+        let mut definitions = ALGORITHMS.iter();
+        let definition = definitions.find(|one| golden.config["algorithm"] == one.name)?;
+        Some((*definition, table(golden)))
     };
-    committed().iter().filter_map(of).collect()
+    committed().iter().filter_map(variant).collect()
 }
 
 /// The first variant of an algorithm.
 fn variant(name: &str) -> (Definition, toml::Table) {
-    variants().into_iter().find(|(known, _)| known.name == name).unwrap()
+    variants().into_iter().find(|(definition, _)| definition.name == name).unwrap()
+}
+
+/// An agent and what it learns from.
+fn start(definition: Definition, table: &toml::Table, context: &Context) -> (Agent, Examples) {
+    let agent = Agent::new(definition, table, context.clone()).unwrap();
+    let examples = agent.examples(context.transitions.clone()).unwrap();
+    (agent, examples)
 }
 
 fn agent(definition: Definition, table: &toml::Table, context: &Context) -> Agent {
-    let hyperparameters = Hyperparameters::new(&definition, table.clone()).unwrap();
-    Agent::new(definition, &hyperparameters, context.clone()).unwrap()
+    start(definition, table, context).0
 }
 
-/// The indices of update number `step`.
-fn indices(step: u64, agent: &Agent) -> Vec<u32> {
+/// The batch of update number `step`.
+fn batch(step: u64, examples: &Examples) -> Batch {
     let first = step as usize * BATCH;
-    (first..first + BATCH).map(|index| (index % agent.dataset_len()) as u32).collect()
+    let index = |index: usize| (index % examples.len()) as u32;
+    examples.batch(&Vec::from_iter((first..first + BATCH).map(index))).unwrap()
 }
 
-fn train(agent: &mut Agent, steps: u64) -> Vec<Vec<Option<f32>>> {
-    (0..steps).map(|_| agent.update(&indices(agent.step(), agent)).unwrap()).collect()
+fn train(agent: &mut Agent, examples: &Examples, steps: u64) -> Vec<Vec<Option<f32>>> {
+    (0..steps).map(|_| agent.update(&batch(agent.step(), examples)).unwrap()).collect()
 }
 
 #[test]
@@ -92,12 +99,12 @@ fn a_saved_state_resumes_bit_for_bit() {
         // A whole run, with all its phases; and steps after those from which on all networks move.
         for (first, total_steps) in [(0, STEPS), (1000, 2000)] {
             let context = Context { total_steps, ..context(3, device) };
-            let mut straight = agent(definition, &table, &context);
+            let (mut straight, examples) = start(definition, &table, &context);
             straight.skip_to(first);
             let (mut saved, mut expected) = (Vec::new(), Vec::new());
             for _ in 0..STEPS {
                 saved.push(straight.save().unwrap());
-                expected.extend(train(&mut straight, 1));
+                expected.extend(train(&mut straight, &examples, 1));
             }
             let end = straight.save().unwrap();
             assert!(end == straight.save().unwrap(), "saving is repeatable");
@@ -109,7 +116,7 @@ fn a_saved_state_resumes_bit_for_bit() {
                     (first + done as u64, true)
                 );
                 assert_eq!(
-                    train(&mut resumed, STEPS - done as u64),
+                    train(&mut resumed, &examples, STEPS - done as u64),
                     expected[done..],
                     "{}",
                     definition.name
@@ -124,7 +131,7 @@ fn a_saved_state_resumes_bit_for_bit() {
 fn an_unfit_state_is_refused() {
     let mut variants = variants().into_iter();
     let one = variants.next().unwrap();
-    let other = variants.find(|(known, _)| known.name != one.0.name).unwrap();
+    let other = variants.find(|(definition, _)| definition.name != one.0.name).unwrap();
     let context = context(3, &Device::Cpu);
     let saved = agent(one.0, &one.1, &context).save().unwrap();
     let refused = |definition, table: &toml::Table, bytes: &[u8]| {
@@ -149,9 +156,9 @@ fn weights_are_a_function_of_the_seed() {
     for (definition, table) in variants() {
         let run = |seed| {
             let context = context(seed, &Device::Cpu);
-            let mut agent = agent(definition, &table, &context);
+            let (mut agent, examples) = start(definition, &table, &context);
             let first = agent.policy("here").unwrap();
-            train(&mut agent, 3);
+            train(&mut agent, &examples, 3);
             (first, agent.policy("here").unwrap())
         };
         let (first, last) = run(1);
@@ -163,16 +170,15 @@ fn weights_are_a_function_of_the_seed() {
 
 #[test]
 fn metrics_are_those_of_the_table_and_finite_and_trained_weights_have_gradients() {
-    let mut found: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    let mut measured_names: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     for (definition, table) in variants() {
-        let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
+        let (mut agent, examples) = start(definition, &table, &context(0, &Device::Cpu));
         for step in 0..STEPS {
-            let indices = indices(step, &agent);
-            let measured = agent.algorithm.update(step, &indices).unwrap();
+            let measured = agent.algorithm.update(step, &batch(step, &examples)).unwrap();
             assert!(measured.iter().all(|(_, value)| value.is_finite()), "{measured:?}");
             let names = BTreeSet::from_iter(measured.iter().map(|(name, _)| *name));
             assert_eq!(names.len(), measured.len(), "{}: {measured:?}", definition.name);
-            found.entry(definition.name).or_default().extend(names);
+            measured_names.entry(definition.name).or_default().extend(names);
         }
         for (name, moment) in agent
             .algorithm
@@ -196,7 +202,11 @@ fn metrics_are_those_of_the_table_and_finite_and_trained_weights_have_gradients(
         }
     }
     for Definition { name, metrics, .. } in ALGORITHMS {
-        assert_eq!(found[*name], metrics.iter().map(|metric| metric.name).collect(), "{name}");
+        assert_eq!(
+            measured_names[*name],
+            metrics.iter().map(|metric| metric.name).collect(),
+            "{name}"
+        );
     }
 }
 
@@ -212,10 +222,10 @@ fn a_nan_reaches_a_metric() {
             .len();
         assert!(count > 1, "{}", definition.name);
         for network in 0..count {
-            let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
+            let (mut agent, examples) = start(definition, &table, &context(0, &Device::Cpu));
             let (name, weights) = agent.algorithm.state_dict().networks().swap_remove(network);
             weights.change(|values| values.slice_set(&(values * f64::NAN)?, 0, 0)).unwrap();
-            let values = train(&mut agent, STEPS);
+            let values = train(&mut agent, &examples, STEPS);
             // Target networks by which the policy acts, but from which nothing is learned.
             let unread = match definition.name {
                 "align-iql" | "diffusion-policy" | "idql" => name == "target_actor",
@@ -235,7 +245,7 @@ fn a_nan_reaches_a_metric() {
 
 /// The error of hyper-parameters that cannot be used.
 fn refusal(definition: &Definition, table: &toml::Table) -> String {
-    Hyperparameters::new(definition, table.clone()).unwrap_err().to_string()
+    definition.check(table).unwrap_err().to_string()
 }
 
 #[test]
@@ -276,31 +286,10 @@ fn data_without_examples_is_refused_with_a_hint() {
         if name == "sfbc" {
             table.insert("shortest_episode".to_owned(), 2.into());
         }
-        let context = Context { transitions: single.clone(), ..context(0, &Device::Cpu) };
-        let hyperparameters = Hyperparameters::new(&definition, table).unwrap();
-        let error = Agent::new(definition, &hyperparameters, context).err().unwrap();
+        let agent = Agent::new(definition, &table, context(0, &Device::Cpu)).unwrap();
+        let error = agent.examples(single.clone()).err().unwrap();
         assert!(error.to_string().contains(words) && error.hint().contains(hint), "{error}");
     }
-}
-
-/// Two of six transitions are the last of a truncated episode.
-#[test]
-fn transitions_without_a_next_action_are_left_out() {
-    let arrays = Arrays {
-        observation_dim: 1,
-        action_dim: 1,
-        observations: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.0],
-        actions: vec![0.0, 0.1, 0.2, 0.3, 0.4, 0.5],
-        rewards: vec![0.0; 6],
-        next_observations: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
-        terminals: vec![false, true, false, false, false, false],
-        timeouts: vec![false, false, false, true, false, true],
-    };
-    let transitions = Arc::new(Transitions::of(arrays).unwrap());
-    let context = Context { transitions, ..context(0, &Device::Cpu) };
-    let rows = context.with_next_action().unwrap();
-    let next = context.next_actions(&rows).unwrap().to_vec2::<f32>().unwrap();
-    assert_eq!((&rows[..], next.concat()), (&[0, 1, 2, 4][..], vec![0.1, 0.0, 0.3, 0.5]));
 }
 
 /// The networks whose optimizers or weights move in each step of a short run.
@@ -328,7 +317,7 @@ fn each_phase_trains_its_networks() {
     ] {
         let (definition, mut table) = variant(name);
         table.insert("phases".to_owned(), lengths.into());
-        let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
+        let (mut agent, examples) = start(definition, &table, &context(0, &Device::Cpu));
         assert_eq!(agent.phases(), phases);
         let moments = |agent: &mut Agent| -> BTreeMap<String, Vec<f32>> {
             let state = agent.algorithm.state_dict().save().unwrap().into_iter();
@@ -338,7 +327,7 @@ fn each_phase_trains_its_networks() {
         };
         for step in 0..STEPS {
             let before = moments(&mut agent);
-            train(&mut agent, 1);
+            train(&mut agent, &examples, 1);
             let after = moments(&mut agent);
             let moved = before.iter().filter(|(name, x)| after[*name] != **x);
             let networks =

@@ -109,8 +109,7 @@ impl Config {
     pub fn read(table: &toml::Table) -> Result<Self, AgentError> {
         let config: Self = read(table)?;
         check("tau", config.tau, config.tau > 0.0, "above 0 (`inf` is allowed)")?;
-        let (none, at) = (config.guidance == Guidance::None, config.guidance_at);
-        let holds = !none || at == GuidanceAt::Noisy;
+        let holds = config.guidance != Guidance::None || config.guidance_at == GuidanceAt::Noisy;
         check("guidance_at", "denoised", holds, "absent where agent.guidance is `none`")?;
         match (config.guidance, config.lambda) {
             (Guidance::Constant, None) => {

@@ -21,10 +21,10 @@ fn chunked(mut table: toml::Table, chunk: i64) -> toml::Table {
 /// Rows 0 to 9 of each twenty terminate, and 10 to 19 are truncated.
 #[test]
 fn windows_beyond_the_end_of_an_episode_are_masked() {
-    let mut context = context(0, &Device::Cpu);
-    context.window = Window { length: 3, gamma: 0.5, ..Window::ONE };
-    let data = arrays();
-    let batch = context.batch(&[0, 8, 18]).unwrap();
+    let window = Window { length: 3, gamma: 0.5, ..Window::ONE };
+    let transitions = context(0, &Device::Cpu).transitions;
+    let examples = Examples::new(transitions, Columns::Plain, window).unwrap();
+    let (data, batch) = (arrays(), examples.batch(&[0, 8, 18]).unwrap());
     let (r, a) = (&data.rewards, |row: usize| &data.actions[row * DIMS.1..][..DIMS.1]);
     let numbers = |tensor: &candle_core::Tensor| tensor.to_vec1::<f32>().unwrap();
     let rows = |tensor: &candle_core::Tensor| tensor.to_vec2::<f32>().unwrap();
@@ -44,12 +44,13 @@ fn windows_beyond_the_end_of_an_episode_are_masked() {
 
 #[test]
 fn a_policy_of_chunks_acts_step_by_step() {
-    let names = ALGORITHMS.iter().filter(|known| known.chunks).map(|known| known.name);
+    let names = ALGORITHMS.iter().filter(|one| one.chunks).map(|one| one.name);
     assert_eq!(Vec::from_iter(names), CLONING.map(|(name, _)| name));
-    for (definition, mut table) in variants().into_iter().filter(|(known, _)| known.chunks) {
+    for (definition, mut table) in variants().into_iter().filter(|one| one.0.chunks) {
         table.insert("history".to_owned(), 2.into());
-        let mut agent = agent(definition, &chunked(table, 4), &context(0, &Device::Cpu));
-        for values in train(&mut agent, STEPS) {
+        let table = chunked(table, 4);
+        let (mut agent, examples) = start(definition, &table, &context(0, &Device::Cpu));
+        for values in train(&mut agent, &examples, STEPS) {
             assert!(values.iter().flatten().all(|value| value.is_finite()), "{values:?}");
         }
         let file = agent.policy("here").unwrap();
@@ -80,13 +81,13 @@ fn actions_beyond_the_end_of_an_episode_do_not_decide_lambda() {
     let is_quad =
         |table: &toml::Table| table.get("guidance").and_then(toml::Value::as_str) == Some("quad");
     let (definition, table) = variants().into_iter().find(|(_, table)| is_quad(table)).unwrap();
-    let mut agent = agent(definition, &chunked(table, 2), &single_steps());
+    let (mut agent, examples) = start(definition, &chunked(table, 2), &single_steps());
     for (name, weights) in agent.algorithm.state_dict().networks() {
         if name == "actor" {
             weights.change(|values| values.slice_set(&(values * 0.0)?, 0, 0)).unwrap();
         }
     }
-    train(&mut agent, 1);
+    train(&mut agent, &examples, 1);
     let state = agent.algorithm.state_dict().save().unwrap();
     assert_eq!(state["nu_squared"].to_vec1::<f32>().unwrap(), [0.0]);
 }
@@ -96,16 +97,15 @@ fn actions_beyond_the_end_of_an_episode_do_not_decide_lambda() {
 fn actions_beyond_the_end_of_an_episode_are_not_cloned() {
     let context = single_steps();
     for (name, network) in CLONING {
-        let of_algorithm = variants().into_iter().filter(|(known, _)| known.name == name);
-        for (definition, table) in of_algorithm {
-            let mut agent = agent(definition, &chunked(table, 2), &context);
-            train(&mut agent, 3);
+        for (definition, table) in variants().into_iter().filter(|one| one.0.name == name) {
+            let (mut agent, examples) = start(definition, &chunked(table, 2), &context);
+            train(&mut agent, &examples, 3);
             let state = agent.algorithm.state_dict().save().unwrap();
             // The last layer's bias, one for each number of a chunk.
             let prefix = format!("adam_v.{network}.");
-            let is_last = |(known, x): &(&String, &candle_core::Tensor)| {
-                known.starts_with(&prefix)
-                    && known.ends_with("bias")
+            let is_last = |(moment, x): &(&String, &candle_core::Tensor)| {
+                moment.starts_with(&prefix)
+                    && moment.ends_with("bias")
                     && x.elem_count() == 2 * DIMS.1
             };
             let last = Vec::from_iter(state.iter().filter(is_last));

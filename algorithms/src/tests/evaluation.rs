@@ -19,10 +19,10 @@ fn stand_still(table: &mut toml::Table) {
 /// The losses of networks that are all different, in each phase.
 #[test]
 fn an_evaluation_measures_the_losses_of_an_update() {
-    let mut found: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    let mut measured: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     for (definition, mut table) in variants() {
         stand_still(&mut table);
-        let mut agent = agent(definition, &table, &context(3, &Device::Cpu));
+        let (mut agent, examples) = start(definition, &table, &context(3, &Device::Cpu));
         for (number, (_, weights)) in
             agent.algorithm.state_dict().networks().into_iter().enumerate()
         {
@@ -31,9 +31,9 @@ fn an_evaluation_measures_the_losses_of_an_update() {
                 .unwrap();
         }
         for step in 0..STEPS {
-            let indices = indices(0, &agent);
+            let batch = batch(0, &examples);
             let (updated, evaluated) =
-                (agent.update(&indices).unwrap(), agent.evaluate(&indices).unwrap());
+                (agent.update(&batch).unwrap(), agent.evaluate(&batch).unwrap());
             for ((metric, updated), evaluated) in
                 definition.metrics.iter().zip(updated).zip(evaluated)
             {
@@ -41,7 +41,7 @@ fn an_evaluation_measures_the_losses_of_an_update() {
                 let is_measured = updated.is_some()
                     || matches!((definition.name, step), ("td3-bc", 0) | ("rlpd", _));
                 assert_eq!(evaluated.is_some(), metric.held_out && is_measured, "{metric:?}");
-                found.entry(definition.name).or_default().extend(evaluated.map(|_| metric.name));
+                measured.entry(definition.name).or_default().extend(evaluated.map(|_| metric.name));
                 let pairs = updated.zip(evaluated);
                 assert!(
                     pairs.is_none_or(|(x, y)| (x - y).abs() <= 1e-5 * x.abs().max(1e-3)),
@@ -53,26 +53,30 @@ fn an_evaluation_measures_the_losses_of_an_update() {
         }
     }
     for Definition { name, metrics, .. } in
-        ALGORITHMS.iter().filter(|known| found.contains_key(known.name))
+        ALGORITHMS.iter().filter(|one| measured.contains_key(one.name))
     {
         let held_out = metrics.iter().filter(|metric| metric.held_out).map(|metric| metric.name);
-        assert_eq!(found[*name], held_out.collect(), "{name}");
+        assert_eq!(measured[*name], held_out.collect(), "{name}");
     }
 }
 
 #[test]
 fn an_evaluation_changes_nothing() {
     for (definition, table) in variants() {
-        let [mut measured, mut alone] =
-            [0, 1].map(|_| agent(definition, &table, &context(3, &Device::Cpu)));
+        let context = context(3, &Device::Cpu);
+        let (mut measured, examples) = start(definition, &table, &context);
+        let mut alone = agent(definition, &table, &context);
         for step in 0..STEPS {
             let before = measured.save().unwrap();
-            let [first, _, again] = [step + 1, step, step + 1].map(|step| {
-                let indices = indices(step, &measured);
-                measured.evaluate(&indices).unwrap()
-            });
+            let [first, _, again] = [step + 1, step, step + 1]
+                .map(|step| measured.evaluate(&batch(step, &examples)).unwrap());
             assert!(first == again && measured.save().unwrap() == before, "{}", definition.name);
-            assert_eq!(train(&mut measured, 1), train(&mut alone, 1), "{}", definition.name);
+            assert_eq!(
+                train(&mut measured, &examples, 1),
+                train(&mut alone, &examples, 1),
+                "{}",
+                definition.name
+            );
         }
         assert!(measured.save().unwrap() == alone.save().unwrap(), "{}", definition.name);
     }

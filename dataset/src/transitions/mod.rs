@@ -239,6 +239,11 @@ impl Transitions {
         self.dataset.next_action(index)
     }
 
+    /// True if the transition at `index < len()` ends its episode for good: it has no future reward.
+    pub fn terminates(&self, index: u32) -> bool {
+        self.dataset.terminates(index)
+    }
+
     /// Index range of each of the dataset's episodes; together they cover all its transitions.
     pub fn episodes(&self) -> Vec<Range<u32>> {
         self.dataset.episodes()

@@ -120,7 +120,7 @@ impl Rows {
         (is_next && self.goes_on[row as usize]).then_some(index + 1)
     }
 
-    fn terminates(&self, index: u32) -> bool {
+    pub fn terminates(&self, index: u32) -> bool {
         self.recording.terminals[self.starts[index as usize] as usize]
     }
 

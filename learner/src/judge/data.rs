@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow};
 use candle_core::Device;
-use quad_algorithms::{Context, Fqe};
+use quad_algorithms::{AlgorithmError, Columns, Context, Examples, Fqe};
 use quad_dataset::{
-    Batch, DatasetError, HoldOut, Normalize, ReadOptions, RewardRule, Split, Transitions, Window,
-    benchmarks, environment,
+    Batch, BatchSampler, DatasetError, HoldOut, Normalize, ReadOptions, RewardRule, Split,
+    Transitions, Window, benchmarks, environment,
 };
 use quad_policy::Precision;
 use quad_runtime::Hint;
@@ -112,7 +112,6 @@ impl Data {
     pub fn context(&self, seed: u64) -> Context {
         Context {
             transitions: self.training.clone(),
-            batch_size: BATCH_SIZE.min(self.training.len()),
             total_steps: 0,
             online_steps: 0,
             window: Window::ONE,
@@ -120,6 +119,18 @@ impl Data {
             precision: Precision::F32,
             device: Device::Cpu,
         }
+    }
+
+    /// The training transitions with these columns.
+    pub fn examples(&self, columns: Columns) -> anyhow::Result<Examples> {
+        let examples = Examples::new(self.training.clone(), columns, Window::ONE);
+        examples.hint_of(AlgorithmError::hint)
+    }
+
+    /// Draws batches of these examples.
+    pub fn sampler(&self, examples: &Examples, seed: u64) -> BatchSampler {
+        let batch_size = BATCH_SIZE.min(self.training.len());
+        BatchSampler::new(examples.len(), batch_size, seed, 0)
     }
 
     /// Mean discounted return of the judged episodes. The last step of a truncated episode counts
@@ -271,7 +282,7 @@ mod tests {
         let units = Units { offset: 100.0, scale: 10.0, least: 0.0, most: 1000.0 };
         let fqes = [0, 1].map(|seed| {
             let config = FqeConfig::with_discount(0.5).unwrap();
-            Fqe::of_behavior(config, units, data.context(seed)).unwrap()
+            Fqe::new(config, units, data.context(seed)).unwrap()
         });
         let recorded = data.recorded_value(&fqes, 0.5).unwrap();
         let last = gather(&data.held_out, &[5]);

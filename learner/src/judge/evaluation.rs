@@ -6,10 +6,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
-use quad_algorithms::{AlgorithmError, Fqe, FqeConfig, Units};
+use quad_algorithms::{Columns, Examples, Fqe, FqeConfig, Units};
 use quad_dataset::BatchSampler;
 use quad_run::results::Estimate;
-use quad_runtime::Hint;
 use rayon::ThreadPoolBuilder;
 
 use super::actions::Actions;
@@ -54,8 +53,8 @@ impl Evaluation<'_> {
     /// Evaluates the behavior policy, once for each seed.
     pub fn of_behavior(&self) -> anyhow::Result<Vec<(Fqe, LearningCurve)>> {
         self.for_each_seed(|seed| {
-            let mut fqe = self.behavior(seed)?;
-            let curve = self.train(&mut fqe, seed, &self.data.first.actions)?;
+            let (mut fqe, examples) = self.behavior(seed)?;
+            let curve = self.train(&mut fqe, &examples, seed, &self.data.first.actions)?;
             Ok((fqe, curve))
         })
     }
@@ -68,49 +67,54 @@ impl Evaluation<'_> {
     ) -> anyhow::Result<Vec<LearningCurve>> {
         self.for_each_seed(|seed| {
             let (config, context) = (self.config.clone(), self.data.context(seed));
-            let mut fqe = Fqe::new(config, self.units, context, actions.next.clone())?;
+            let mut fqe = Fqe::new(config, self.units, context)?;
             fqe.begin_with(&behavior[seed as usize])?;
-            self.train(&mut fqe, seed, &actions.first)
+            let examples = self.data.examples(Columns::Plain)?;
+            let examples = examples.with_next_actions(actions.next.clone());
+            self.train(&mut fqe, &examples, seed, &actions.first)
         })
     }
 
     /// Estimates how long an evaluation with all its seeds takes.
     pub fn time(&self) -> anyhow::Result<Duration> {
         let times = self.for_each_seed(|seed| {
-            let mut fqe = self.behavior(seed)?;
-            let mut sampler = self.sampler(&fqe, seed);
+            let (mut fqe, examples) = self.behavior(seed)?;
+            let mut sampler = self.data.sampler(&examples, seed);
             // Warm-up: the first updates also allocate memory.
-            updates(&mut fqe, &mut sampler, 0..TIMED)?;
+            updates(&mut fqe, &examples, &mut sampler, 0..TIMED)?;
             let begin = Instant::now();
-            updates(&mut fqe, &mut sampler, TIMED..2 * TIMED)?;
+            updates(&mut fqe, &examples, &mut sampler, TIMED..2 * TIMED)?;
             let times = self.budget.steps as f64 / TIMED as f64;
             Ok(begin.elapsed().mul_f64(times))
         })?;
         Ok(times.into_iter().max().unwrap_or_default())
     }
 
-    fn behavior(&self, seed: u64) -> anyhow::Result<Fqe> {
-        let context = self.data.context(seed);
-        Fqe::of_behavior(self.config.clone(), self.units, context).hint_of(AlgorithmError::hint)
+    /// An evaluation of the behavior policy at step 0, and the transitions whose next action is in the
+    /// data.
+    fn behavior(&self, seed: u64) -> anyhow::Result<(Fqe, Examples)> {
+        let fqe = Fqe::new(self.config.clone(), self.units, self.data.context(seed))?;
+        Ok((fqe, self.data.examples(Columns::NextActions)?))
     }
 
     /// `first`: actions in the judged episodes' first states.
-    fn train(&self, fqe: &mut Fqe, seed: u64, first: &[f32]) -> anyhow::Result<LearningCurve> {
+    fn train(
+        &self,
+        fqe: &mut Fqe,
+        examples: &Examples,
+        seed: u64,
+        first: &[f32],
+    ) -> anyhow::Result<LearningCurve> {
         let mut curve = LearningCurve::default();
-        let mut sampler = self.sampler(fqe, seed);
+        let mut sampler = self.data.sampler(examples, seed);
         let step = |point: usize| self.budget.steps * point as u64 / POINTS as u64;
         for point in 0..POINTS {
-            let loss = updates(fqe, &mut sampler, step(point)..step(point + 1))?;
+            let loss = updates(fqe, examples, &mut sampler, step(point)..step(point + 1))?;
             let values = fqe.values(&self.data.first.observations, first)?;
             curve.losses.push(loss);
             curve.values.push(mean(values));
         }
         Ok(curve)
-    }
-
-    fn sampler(&self, fqe: &Fqe, seed: u64) -> BatchSampler {
-        let batch_size = self.data.context(seed).batch_size;
-        BatchSampler::new(fqe.dataset_len(), batch_size, seed, 0)
     }
 
     /// Runs all seeds in parallel, each on its share of the cores: updates this small gain little
@@ -138,10 +142,15 @@ impl Evaluation<'_> {
 }
 
 /// Mean loss of these updates.
-fn updates(fqe: &mut Fqe, sampler: &mut BatchSampler, steps: Range<u64>) -> anyhow::Result<f64> {
+fn updates(
+    fqe: &mut Fqe,
+    examples: &Examples,
+    sampler: &mut BatchSampler,
+    steps: Range<u64>,
+) -> anyhow::Result<f64> {
     let mut losses = Vec::new();
     for step in steps {
-        let metrics = fqe.update(step, sampler.next_indices())?;
+        let metrics = fqe.update(step, &examples.batch(sampler.next_indices())?)?;
         let loss = metrics.iter().find(|(name, _)| *name == "critic_loss");
         losses.extend(loss.map(|(_, loss)| *loss));
     }
@@ -207,7 +216,7 @@ mod tests {
         let split = Split { training, held_out, episodes: Vec::from_iter(0..8) };
         let data = Data::of(split, String::new(), String::new()).unwrap();
         let config = FqeConfig::with_discount(0.5).unwrap();
-        let units = Units::of(&data.context(0), 0.5);
+        let units = Units::new(&data.training, 0.5);
         let budget = Budget { steps: 200, seeds: 1 };
         let evaluation = Evaluation { config, units, data: &data, budget };
         let (behavior, curves): (Vec<_>, Vec<_>) =

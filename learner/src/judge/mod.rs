@@ -58,7 +58,7 @@ pub(crate) fn judge(
         }
     }
     if !remaining.is_empty() {
-        let units = Units::of(&data.context(0), gamma.into());
+        let units = Units::new(&data.training, gamma.into());
         let evaluation = Evaluation { config, units, data: &data, budget };
         forecast(&evaluation, &remaining)?;
         judge_all(&evaluation, &remaining, &conditions, &mut judgments)?;

@@ -156,7 +156,7 @@ impl OnlineTraining {
     }
 
     /// The rows of gradient step `step`, the first of which is 1.
-    pub fn batch(&mut self, step: u64) -> &[u32] {
+    pub fn rows(&mut self, step: u64) -> &[u32] {
         let Self { transitions, sampler, .. } = self;
         sampler.indices(step, transitions.len(), transitions.experience_len())
     }

@@ -1,10 +1,10 @@
 //! One experiment, every value of which is checked.
 
-use quad_algorithms::{Definition, Hyperparameters};
+use quad_algorithms::Definition;
 use quad_dataset::{Normalize, RewardRule};
 use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
-use toml::Value;
+use toml::{Table, Value};
 
 use super::error::ConfigError;
 use super::hyperparameters;
@@ -61,7 +61,7 @@ pub struct Experiment {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub online: Option<Online>,
     /// Hyper-parameters of the algorithm.
-    pub agent: Hyperparameters,
+    pub agent: Table,
 }
 
 fn is_zero(share: &f64) -> bool {
@@ -193,11 +193,9 @@ impl Experiment {
             let most = MOST_EVALUATIONS;
             return Err(ConfigError::Evaluations { steps, interval, evaluations, most });
         }
-        let checked = Hyperparameters::new(&self.definition()?, self.agent.to_table());
         let algorithm = self.algorithm.clone();
-        self.agent =
-            checked.map_err(|source| ConfigError::Hyperparameters { algorithm, source })?;
-        Ok(())
+        let checked = self.definition()?.check(&self.agent);
+        checked.map_err(|source| ConfigError::Hyperparameters { algorithm, source })
     }
 }
 
