@@ -115,13 +115,13 @@ impl DiffusionUpdate for AlignIql {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
-        let (config, Networks { actor, critic }) = (&self.config, networks);
+        let config = &self.config;
         let adam = |rate: f32| AdamStep::after(step, rate);
         // IDQL's authors move only critics and V online.
         let decayed = *config.actor_learning_rate * context.decay(step, 0.0);
-        actor.adam.set_step(adam(decayed))?;
+        networks.actor.adam.set_step(adam(decayed))?;
         self.value.adam.set_step(adam(*config.value_learning_rate))?;
-        critic.adam.set_step(adam(*config.critic_learning_rate))
+        networks.critic.adam.set_step(adam(*config.critic_learning_rate))
     }
 
     fn update(
@@ -157,9 +157,9 @@ impl DiffusionUpdate for AlignIql {
     /// AlignIQL takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of
     /// the aligned policy, as a penalty.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let Networks { actor, critic } = networks;
         let value = (self.rule == Rule::Nearest).then_some(&*self.value);
-        let tensors = DiffusionPolicy::tensors(&actor.target, Some(&critic.target), value)?;
+        let (actor, critics) = (&networks.actor.target, &networks.critic.target);
+        let tensors = DiffusionPolicy::tensors(actor, Some(critics), value)?;
         Ok((Choice::new(*self.config.candidates, Aggregate::Min, self.rule), tensors))
     }
 

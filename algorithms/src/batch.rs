@@ -35,11 +35,17 @@ pub struct Batch {
 
 impl Inputs for Batch {
     fn tensors(&mut self) -> Vec<&mut Tensor> {
-        let Self { observations, actions, rewards, next_observations, masks, .. } = self;
-        let mut tensors = vec![observations, actions, rewards, next_observations, masks];
-        let columns =
-            [&mut self.within, &mut self.next_actions, &mut self.returns, &mut self.plans];
-        tensors.extend(columns.into_iter().flatten());
+        let mut tensors = vec![
+            &mut self.observations,
+            &mut self.actions,
+            &mut self.rewards,
+            &mut self.next_observations,
+            &mut self.masks,
+        ];
+        tensors.extend(&mut self.within);
+        tensors.extend(&mut self.next_actions);
+        tensors.extend(&mut self.returns);
+        tensors.extend(&mut self.plans);
         tensors
     }
 }

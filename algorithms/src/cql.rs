@@ -15,7 +15,7 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     read: |table| {
         let config: Config = read(table)?;
-        let columns = Columns::Returns { gamma: *config.gamma };
+        let columns = Columns::Returns(*config.gamma);
         Ok(Start { columns, ..start(config, Cql::new) })
     },
     ..Definition::PLAIN
@@ -87,7 +87,7 @@ impl Phases {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Cql(config: Config, init) {
         actor: Squashed = Squashed::new(&config.actor, GaussianPolicy::LOG_STD, init)?.with_map(
             [*config.log_std.multiplier, *config.log_std.offset],
             LAST_LAYER,
@@ -117,18 +117,7 @@ struct Noise {
     current: Tensor,
 }
 
-struct Cql {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Cql {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
     fn noise(&self, step: u64, b: usize) -> Result<Noise> {
         let (mut random, a) = (self.context.random(step), self.context.action_dim());
         let each = (b, *self.config.actions, a);
@@ -149,17 +138,16 @@ impl Cql {
         current: &Normal,
         noise: &Noise,
     ) -> Result<(Loss, Tensor)> {
-        let Networks { critic, log_alpha, .. } = &self.networks;
         let drawn = current.draw(&noise.policy)?;
         let log_density = drawn.log_density.squeeze(1)?;
         let gain = match self.config.phases.is_cloning(step, self.context.total_steps) {
             true => current.log_density(&self.actions(batch)?)?,
             false => {
                 let actions = drawn.actions.squeeze(1)?;
-                smallest(&batch.values_at(&critic.detach(), &actions)?)?
+                smallest(&batch.values_at(&self.critic.detach(), &actions)?)?
             }
         };
-        let alpha = log_alpha.values().detach().exp()?;
+        let alpha = self.log_alpha.values().detach().exp()?;
         let loss = (log_density.broadcast_mul(&alpha)? - gain)?.mean_all()?;
         let log_density = log_density.detach().mean_all()?;
         let loss = Loss::new("actor_loss", loss).with("entropy", log_density.neg()?);
@@ -195,8 +183,7 @@ impl Cql {
     /// a]`; `[B]`.
     fn targets(&self, batch: &Batch, next: &Normal, noise: &Tensor) -> Result<Tensor> {
         let actions = next.draw(noise)?.actions;
-        let critics = &self.networks.critic.target;
-        let q = smallest(&batch.next_values(critics, &actions.flatten(0, 1)?)?)?;
+        let q = smallest(&batch.next_values(&self.critic.target, &actions.flatten(0, 1)?)?)?;
         let best = largest(&q.reshape(((), *self.config.samples))?, 1)?;
         batch.target(*self.config.gamma, &best)
     }
@@ -217,7 +204,7 @@ impl Cql {
         let data = self.actions(batch)?.unsqueeze(1)?;
         let actions = [&data, &noise.uniform, &next.actions, &current.actions];
         let actions = Tensor::cat(&actions, 1)?.flatten(0, 1)?;
-        let q = batch.values_at(&self.networks.critic, &actions)?;
+        let q = batch.values_at(&self.critic, &actions)?;
         let q = q.reshape((TWIN, b, 1 + 3 * n))?;
         let data = q.narrow(2, 0, 1)?.squeeze(2)?;
         let uniform = Tensor::full(-(a as f32) * 2f32.ln(), (b, n), q.device())?;
@@ -238,8 +225,7 @@ impl Cql {
     /// up a gap above the threshold (dual gradient ascent, appendix).
     fn gap_weight(&mut self, gap: &Tensor, adam: AdamStep) -> Result<(Tensor, Option<Tensor>)> {
         let weight = f64::from(*self.config.weight);
-        let (Some(learned), Some(threshold)) =
-            (&mut self.networks.log_alpha_prime, self.config.threshold)
+        let (Some(learned), Some(threshold)) = (&mut self.log_alpha_prime, self.config.threshold)
         else {
             return Ok(((gap.ones_like()? * weight)?, None));
         };
@@ -264,31 +250,27 @@ impl Algorithm for Cql {
         let noise = self.noise(step, batch.size())?;
         let slow = AdamStep::after(step, *self.config.actor_learning_rate);
         let fast = AdamStep::after(step, *self.config.critic_learning_rate);
-        let actor = &self.networks.actor;
-        let current = actor.distribution(&batch.observations)?;
-        let next = actor.constant_distribution(&batch.next_observations)?;
+        let current = self.actor.distribution(&batch.observations)?;
+        let next = self.actor.constant_distribution(&batch.next_observations)?;
         let (actor_loss, log_density) = self.actor_loss(step, batch, &current, &noise)?;
-        self.networks.actor.minimize(&actor_loss.value, slow)?;
+        self.actor.minimize(&actor_loss.value, slow)?;
         // α holds the entropy at −(dimensions of an action).
         let excess = (log_density - self.context.action_dim() as f64)?;
-        let log_alpha = &mut self.networks.log_alpha;
-        let alpha_loss = (log_alpha.values().sum_all()? * excess)?.neg()?;
-        log_alpha.minimize(&alpha_loss, slow)?;
+        let alpha_loss = (self.log_alpha.values().sum_all()? * excess)?.neg()?;
+        self.log_alpha.minimize(&alpha_loss, slow)?;
 
         let (critic_loss, gap) = self.critic_loss(batch, &current.detach(), &next, &noise)?;
         let (weight, alpha_prime) = self.gap_weight(&gap.detach(), fast)?;
         let conservative = ((gap * weight)? * TWIN as f64)?;
-        let critic = &mut self.networks.critic;
-        critic.minimize(&(&critic_loss.value + conservative)?, fast)?;
-        critic.soft_update(*self.config.ema_rate)?;
+        self.critic.minimize(&(&critic_loss.value + conservative)?, fast)?;
+        self.critic.soft_update(*self.config.ema_rate)?;
         measured(&[actor_loss, critic_loss.with("alpha_prime", alpha_prime)])
     }
 
     fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
         let noise = self.noise(step, batch.size())?;
-        let actor = &self.networks.actor;
-        let current = actor.constant_distribution(&batch.observations)?;
-        let next = actor.constant_distribution(&batch.next_observations)?;
+        let current = self.actor.constant_distribution(&batch.observations)?;
+        let next = self.actor.constant_distribution(&batch.next_observations)?;
         let (actor_loss, _) = self.actor_loss(step, batch, &current, &noise)?;
         let (critic_loss, _) = self.critic_loss(batch, &current, &next, &noise)?;
         measured(&[actor_loss, critic_loss])
@@ -296,10 +278,10 @@ impl Algorithm for Cql {
 
     /// Acts by the tanh of the mean.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        self.networks.actor.policy()
+        self.actor.policy()
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize, Serializer};
 use toml::{Table, Value};
 
-use super::algorithm::Algorithm;
+use super::agent::Algorithm;
 use super::context::Context;
 use super::error::{AgentError, AlgorithmError, check};
 use super::examples::Columns;
@@ -24,8 +24,14 @@ pub struct Definition {
     pub presets: &'static str,
     /// The metrics of its updates; some are measured in one phase only.
     pub metrics: &'static [Metric],
-    /// Texts of reports about its runs, beside scores.
-    pub report: Reporting,
+    /// The hyper-parameter that tells its variants apart, if it has any.
+    pub variant: Option<Variant>,
+    /// The hyper-parameter over which its paper draws scores.
+    pub axis: Option<Axis>,
+    /// The hyper-parameter with the step after which the target actor moves, where that acts.
+    pub acts_after: Option<&'static str>,
+    /// Summary of a run's metrics.
+    pub summary: Option<Summarize>,
     /// True if it can learn chunks of actions (`agent.chunk`) from several observations
     /// (`agent.history`).
     pub chunks: bool,
@@ -40,7 +46,10 @@ impl Definition {
         name: "",
         presets: "",
         metrics: &[],
-        report: Reporting::PLAIN,
+        variant: None,
+        axis: None,
+        acts_after: None,
+        summary: None,
         chunks: false,
         read: |_| unreachable!("an algorithm reads its own table"),
     };
@@ -84,11 +93,11 @@ struct ChunkKeys {
 
 /// Takes these keys from an `[agent]` table: the chunk, and the windows of steps to learn it from.
 fn take_chunk(table: &mut Table) -> Result<(Chunk, Window), AgentError> {
-    let ChunkKeys { chunk, replan, history } = ChunkKeys::deserialize(table.clone())?;
-    let length = chunk.map_or(1, |length| *length);
-    let replan = replan.map_or(length, |replan| *replan);
+    let keys = ChunkKeys::deserialize(table.clone())?;
+    let length = keys.chunk.map_or(1, |length| *length);
+    let replan = keys.replan.map_or(length, |replan| *replan);
     check("replan", replan, replan <= length, "at most agent.chunk (--agent replan=K changes it)")?;
-    let history = history.map_or(1, |history| *history);
+    let history = keys.history.map_or(1, |history| *history);
     for key in ["chunk", "replan", "history"] {
         table.remove(key);
     }
@@ -160,24 +169,6 @@ macro_rules! metrics {
     };
 }
 pub(crate) use metrics;
-
-/// Texts of reports about an algorithm's runs, beside scores.
-#[derive(Clone, Copy)]
-pub struct Reporting {
-    /// The hyper-parameter that tells its variants apart, if it has any.
-    pub variant: Option<Variant>,
-    /// The hyper-parameter over which its paper draws scores.
-    pub axis: Option<Axis>,
-    /// The hyper-parameter with the step after which the target actor moves, where that acts.
-    pub acts_after: Option<&'static str>,
-    /// Summary of a run's metrics.
-    pub summary: Option<Summarize>,
-}
-
-impl Reporting {
-    /// For an algorithm with neither variants nor figures of its own.
-    pub const PLAIN: Self = Self { variant: None, axis: None, acts_after: None, summary: None };
-}
 
 /// The hyper-parameter that tells an algorithm's variants apart.
 #[derive(Clone, Copy)]

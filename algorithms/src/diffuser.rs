@@ -5,6 +5,7 @@
 //! docs/deviations.md says so.
 
 use super::batch::asked;
+use super::examples::Plans;
 use super::prelude::*;
 use quad_nn::{
     Layout, Reverse, Scaling, Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, Weights,
@@ -18,9 +19,12 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     read: |table| {
         let config = Config::read(table)?;
-        let (horizon, gamma) = (config.network.horizon, *config.gamma);
-        let columns = Columns::Plans { horizon, gamma, terminal_penalty: *config.terminal_penalty };
-        Ok(Start { columns, ..start(config, Diffuser::new) })
+        let plans = Plans {
+            horizon: config.network.horizon,
+            gamma: *config.gamma,
+            terminal_penalty: *config.terminal_penalty,
+        };
+        Ok(Start { columns: Columns::Plans(plans), ..start(config, Diffuser::new) })
     },
     ..Definition::PLAIN
 };

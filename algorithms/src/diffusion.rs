@@ -60,8 +60,7 @@ pub(super) struct Denoising {
 
 impl Inputs for Denoising {
     fn tensors(&mut self) -> Vec<&mut Tensor> {
-        let Self { t, epsilon, signal, deviation } = self;
-        vec![t, epsilon, signal, deviation]
+        vec![&mut self.t, &mut self.epsilon, &mut self.signal, &mut self.deviation]
     }
 }
 
@@ -96,17 +95,16 @@ impl Sampler<'_> {
     /// The noise of S sampled actions for each state of a batch, `[T, B·S, a]`: a^T, then that of
     /// the reverse steps from t = T down to 2.
     pub fn chain(&mut self, name: &str, samples: usize) -> Result<Tensor> {
-        let DiffusionShape { diffusion_steps, action_dim, .. } = *self.shape;
-        self.random.normal(name, (diffusion_steps, self.batch_size * samples, action_dim))
+        let (steps, a) = (self.shape.diffusion_steps, self.shape.action_dim);
+        self.random.normal(name, (steps, self.batch_size * samples, a))
     }
 
     /// Uniform t, and ε, for the actions of a batch.
     pub fn denoising(&mut self) -> Result<Denoising> {
-        let DiffusionShape { diffusion_steps, action_dim, .. } = *self.shape;
-        let epsilon = self.random.normal("epsilon", (self.batch_size, action_dim))?;
+        let (b, steps) = (self.batch_size, self.shape.diffusion_steps as u32);
+        let epsilon = self.random.normal("epsilon", (b, self.shape.action_dim))?;
         let t = self.random.vector("t", |generator| {
-            let mut draw = || generator.random_range(1..=diffusion_steps as u32);
-            Ok((0..self.batch_size).map(|_| draw()).collect())
+            Ok((0..b).map(|_| generator.random_range(1..=steps)).collect())
         })?;
         Denoising::new(&t, epsilon, self.actor.schedule())
     }
@@ -194,13 +192,13 @@ impl<U: DiffusionUpdate> Algorithm for Diffusion<U> {
             _ => self.noise(step, batch.size())?,
         };
         let inputs = (batch.clone(), noise);
-        let Self { update, networks, replay, context, .. } = self;
-        update.begin(networks, step, context)?;
-        replay.start(&context.device, &inputs, |(batch, noise)| {
+        let (update, networks) = (&mut self.update, &mut self.networks);
+        update.begin(networks, step, &self.context)?;
+        self.replay.start(&self.context.device, &inputs, |(batch, noise)| {
             update.update(networks, batch, noise)
         })?;
         update.end(networks, step)?;
-        if context.device.is_cuda() {
+        if self.context.device.is_cuda() {
             self.next = Some((step + 1, self.noise(step + 1, batch.size())?));
         }
         let (mut measured, others) = self.replay.computed()?;
@@ -209,11 +207,11 @@ impl<U: DiffusionUpdate> Algorithm for Diffusion<U> {
     }
 
     fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
-        let Self { update, networks, .. } = self;
         let noise = self.noise(step, batch.size())?;
-        let losses = update.losses(networks, batch, &noise.on(&self.context.device)?)?;
+        let on_device = noise.on(&self.context.device)?;
+        let losses = self.update.losses(&self.networks, batch, &on_device)?;
         let (mut measured, others) = Computed::new(&losses)?.read()?;
-        measured.extend(update.measure(networks, &noise, &others)?);
+        measured.extend(self.update.measure(&self.networks, &noise, &others)?);
         Ok(measured)
     }
 

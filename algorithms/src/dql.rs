@@ -140,10 +140,9 @@ impl DiffusionUpdate for Config {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, _: &Context) -> Result<()> {
-        let Networks { actor, critic } = networks;
         let adam = |rate: f32| AdamStep::after(step, rate).clipped(*self.gradient_clip);
-        critic.adam.set_step(adam(*self.critic_learning_rate))?;
-        actor.adam.set_step(adam(*self.actor_learning_rate))
+        networks.critic.adam.set_step(adam(*self.critic_learning_rate))?;
+        networks.actor.adam.set_step(adam(*self.actor_learning_rate))
     }
 
     /// Algorithm 1's loop, but for the target actor.
@@ -178,8 +177,8 @@ impl DiffusionUpdate for Config {
 
     /// The actor itself, not its EMA, which draws one of its candidates by the target critics' values.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let Networks { actor, critic } = networks;
-        let tensors = DiffusionPolicy::tensors(actor, Some(&critic.target), None)?;
+        let critics = Some(&networks.critic.target);
+        let tensors = DiffusionPolicy::tensors(&networks.actor, critics, None)?;
         let rule = Rule::softmax(*self.temperature);
         Ok((Choice::new(*self.candidates, Aggregate::Min, rule), tensors))
     }

@@ -75,7 +75,7 @@ struct Phases {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Dtql(config: Config, init) {
         /// π_θ.
         actor: Squashed = Squashed::new(&config.actor, SquashedActor::LOG_STD, init),
         /// The policy chooses by the target critics when it acts.
@@ -119,18 +119,7 @@ struct Noise {
     trust: Noising,
 }
 
-struct Dtql {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Dtql {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
     /// The step at which π_θ begins to learn.
     fn pretraining(&self) -> u64 {
         let phases = self.config.phases;
@@ -150,11 +139,10 @@ impl Dtql {
     /// V(s) toward an expectile of the smaller Q(s, a), and Q(s, a) toward r + γ·V(s'), both as
     /// they are before this step.
     fn value_losses(&self, batch: &Batch) -> Result<[Loss; 2]> {
-        let Networks { critic, value, .. } = &self.networks;
-        let next = state_value(&value.detach(), &batch.next_observations)?;
+        let next = state_value(&self.value.detach(), &batch.next_observations)?;
         let targets = batch.target(*self.config.gamma, &next)?;
-        let q = batch.values(critic)?;
-        let v = state_value(value, &batch.observations)?;
+        let q = batch.values(&self.critic)?;
+        let v = state_value(&self.value, &batch.observations)?;
         let value_loss = expectile_loss(&(smallest(&q.detach())? - &v)?, *self.config.expectile)?;
         let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * TWIN as f64)?;
         Ok([
@@ -165,22 +153,20 @@ impl Dtql {
 
     /// μ_φ toward the data's actions.
     fn bc_loss(&self, batch: &Batch, noising: &Noising) -> Result<Loss> {
-        let diffusion = &self.networks.diffusion;
         let actions = &batch.actions;
         let learned = |clean| batch.within_episodes(clean, actions);
-        let loss = denoising_loss(diffusion, &batch.observations, actions, noising, learned)?;
+        let loss = denoising_loss(&self.diffusion, &batch.observations, actions, noising, learned)?;
         Ok(Loss::new("bc_loss", loss))
     }
 
     /// π_θ toward actions that the critics value and that μ_φ, which is fixed, denoises well.
     fn actor_loss(&self, batch: &Batch, noise: &Noise) -> Result<Loss> {
-        let Networks { actor, critic, diffusion, .. } = &self.networks;
-        let distribution = actor.distribution(&batch.observations)?;
+        let distribution = self.actor.distribution(&batch.observations)?;
         let drawn = distribution.draw(&noise.policy)?;
-        let (actions, diffusion) = (drawn.actions.squeeze(1)?, diffusion.detach());
+        let (actions, diffusion) = (drawn.actions.squeeze(1)?, self.diffusion.detach());
         let trust_loss =
             denoising_loss(&diffusion, &batch.observations, &actions, &noise.trust, Ok)?;
-        let q = batch.values_at(&critic.detach(), &actions)?;
+        let q = batch.values_at(&self.critic.detach(), &actions)?;
         let q_loss = smallest(&q)?.mean_all()?.neg()?;
         let mut loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         let (weight, mut likelihood) = (*self.config.likelihood, None);
@@ -239,16 +225,15 @@ impl Algorithm for Dtql {
         let critic_adam = AdamStep::after(step, *self.config.critic_learning_rate * decay);
         let [value_loss, critic_loss] = self.value_losses(batch)?;
         let bc_loss = self.bc_loss(batch, &noise.cloning)?;
-        let networks = &mut self.networks;
-        networks.value.minimize(&value_loss.value, critic_adam)?;
-        networks.critic.minimize(&critic_loss.value, critic_adam)?;
-        networks.diffusion.minimize(&bc_loss.value, adam)?;
+        self.value.minimize(&value_loss.value, critic_adam)?;
+        self.critic.minimize(&critic_loss.value, critic_adam)?;
+        self.diffusion.minimize(&bc_loss.value, adam)?;
         let mut losses = vec![value_loss, critic_loss, bc_loss];
         if step >= pretraining {
             let actor_loss = self.actor_loss(batch, &noise)?;
             let adam = AdamStep::after(step - pretraining, adam.rate);
-            self.networks.actor.minimize(&actor_loss.value, adam)?;
-            self.networks.critic.soft_update(*self.config.ema_rate)?;
+            self.actor.minimize(&actor_loss.value, adam)?;
+            self.critic.soft_update(*self.config.ema_rate)?;
             losses.push(actor_loss);
         }
         let mut measured = measured(&losses)?;
@@ -270,12 +255,12 @@ impl Algorithm for Dtql {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let rule = Rule::softmax(*self.config.temperature);
         let choice = Choice::new(*self.config.candidates, Aggregate::Min, rule);
-        let (actor, critics) = (&self.networks.actor.network, &self.networks.critic.target);
+        let (actor, critics) = (&self.actor.network, &self.critic.target);
         let (shape, tensors) = ActorCriticShape::of(actor, critics)?;
         Ok((PolicyConfig::Squashed { shape, choice }, tensors))
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

@@ -12,32 +12,30 @@ use super::error::AlgorithmError;
 use super::returns::{calibrated, discounted};
 
 /// What an algorithm's table asks for beside (s, a, r, s') of all transitions.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug)]
 pub enum Columns {
     /// Nothing.
     Plain,
     /// The data's next actions, on the dataset alone. Leaves out transitions without one, but for the
     /// last of an episode that terminates.
     NextActions,
-    /// Cal-QL's returns, discounted by γ.
-    Returns {
-        /// γ.
-        gamma: f32,
-    },
+    /// Cal-QL's returns with this discount γ.
+    Returns(f32),
     /// Episodes of at least this many transitions.
-    Episodes {
-        /// The number.
-        shortest: usize,
-    },
-    /// Plans of H steps within an episode, or fewer where it terminates, and their returns.
-    Plans {
-        /// H.
-        horizon: usize,
-        /// Discount γ of returns.
-        gamma: f32,
-        /// What is taken off the reward of a step that terminates an episode.
-        terminal_penalty: f32,
-    },
+    Episodes(usize),
+    /// Plans and their returns.
+    Plans(Plans),
+}
+
+/// Plans of H steps within an episode, or fewer where it terminates.
+#[derive(Clone, Copy, Debug)]
+pub struct Plans {
+    /// H.
+    pub horizon: usize,
+    /// Discount γ of returns.
+    pub gamma: f32,
+    /// What is taken off the reward of a step that terminates an episode.
+    pub terminal_penalty: f32,
 }
 
 /// The examples of a dataset and of experience.
@@ -80,7 +78,7 @@ impl Examples {
         };
         let none = match columns {
             Columns::Plain => return Ok(examples),
-            Columns::Returns { gamma } => {
+            Columns::Returns(gamma) => {
                 examples.add_returns(data.episodes(), gamma);
                 return Ok(examples);
             }
@@ -89,16 +87,16 @@ impl Examples {
                 examples.rows = Some((0..data.len() as u32).filter(usable).collect());
                 AlgorithmError::NoNextAction
             }
-            Columns::Episodes { shortest } => {
+            Columns::Episodes(shortest) => {
                 let mut episodes = data.episodes();
                 episodes.retain(|episode| episode.len() >= shortest);
                 examples.rows = Some(episodes.into_iter().flatten().collect());
                 AlgorithmError::ShortEpisodes(shortest)
             }
-            Columns::Plans { horizon, gamma, terminal_penalty } => {
+            Columns::Plans(plans) => {
                 examples.units = data.standard_units();
-                examples.add_plans(horizon, gamma, terminal_penalty);
-                AlgorithmError::NoWindow(horizon)
+                examples.add_plans(plans);
+                AlgorithmError::NoWindow(plans.horizon)
             }
         };
         if examples.len() == 0 { Err(none) } else { Ok(examples) }
@@ -126,7 +124,7 @@ impl Examples {
         let mut batch = self.gather(&rows, indices)?;
         match self.columns {
             Columns::NextActions => batch.next_actions = Some(self.next_actions(&rows)?),
-            Columns::Plans { horizon, .. } => batch.plans = Some(self.plans(indices, horizon)?),
+            Columns::Plans(plans) => batch.plans = Some(self.plans(indices, plans.horizon)?),
             _ => {}
         }
         Ok(batch)
@@ -136,7 +134,7 @@ impl Examples {
     /// experience.
     pub fn online_batch(&mut self, rows: &[u32]) -> Result<Batch> {
         let data = self.transitions.clone();
-        if let Columns::Returns { gamma } = self.columns
+        if let Columns::Returns(gamma) = self.columns
             && self.returns.len() < data.len() + data.experience_len()
         {
             self.add_returns(data.experience_episodes(), gamma);
@@ -155,21 +153,10 @@ impl Examples {
     /// The windows that begin with these transitions, with the returns of these examples.
     fn gather(&self, rows: &[u32], indices: &[u32]) -> Result<Batch> {
         let (b, device) = (rows.len(), &Device::Cpu);
-        let mut batch = quad_dataset::Batch::default();
-        self.transitions.gather_windows(rows, self.window, &mut batch);
-        let within = match self.window.length {
-            1 => None,
-            length => {
-                let (a, width) = (self.transitions.action_dim(), batch.actions.len() / b);
-                debug_assert_eq!(width, a * length);
-                let row = |n: &usize| {
-                    let within = n * a;
-                    (0..width).map(move |i| f32::from(u8::from(i < within)))
-                };
-                let within = batch.steps.iter().flat_map(row).collect();
-                Some(Tensor::from_vec(within, (b, width), device)?)
-            }
-        };
+        let batch = self.transitions.gather_windows(rows, self.window);
+        let (a, length) = (self.transitions.action_dim(), self.window.length);
+        let row = |n: &usize| [vec![1.0; n * a], vec![0.0; (length - n) * a]].concat();
+        let within = (length > 1).then(|| batch.steps.iter().flat_map(row).collect());
         let table = |numbers: Vec<f32>| {
             let width = numbers.len() / b;
             Tensor::from_vec(numbers, (b, width), device)
@@ -183,7 +170,7 @@ impl Examples {
             rewards: column(batch.rewards)?,
             next_observations: table(batch.next_observations)?,
             masks: column(batch.masks)?,
-            within,
+            within: within.map(table).transpose()?,
             next_actions: None,
             returns: returns.map(column).transpose()?,
             plans: None,
@@ -217,15 +204,16 @@ impl Examples {
         }
     }
 
-    fn add_plans(&mut self, horizon: usize, gamma: f32, terminal_penalty: f32) {
+    fn add_plans(&mut self, plans: Plans) {
+        let horizon = plans.horizon as u32;
         let mut rows = Vec::new();
         for episode in self.transitions.episodes() {
             let (rewards, terminates) = episode_rewards(&self.transitions, episode.clone());
-            let last = if terminates { -f64::from(terminal_penalty) } else { 0.0 };
-            let returns = discounted(&rewards, gamma.into(), last);
+            let last = if terminates { -f64::from(plans.terminal_penalty) } else { 0.0 };
+            let returns = discounted(&rewards, plans.gamma.into(), last);
             for (row, value) in episode.clone().zip(returns) {
-                let length = (episode.end - row).min(horizon as u32);
-                if terminates || length == horizon as u32 {
+                let length = (episode.end - row).min(horizon);
+                if terminates || length == horizon {
                     rows.push(row);
                     self.lengths.push(length);
                     self.returns.push(value as f32);
@@ -239,15 +227,18 @@ impl Examples {
     /// of an episode there are zeros, in the data's units.
     fn plans(&self, indices: &[u32], horizon: usize) -> Result<Tensor> {
         let (o, a) = (self.transitions.observation_dim(), self.transitions.action_dim());
-        let (mut steps, mut numbers) = (quad_dataset::Batch::default(), Vec::new());
+        let mut numbers = Vec::new();
         for (index, row) in indices.iter().zip(self.rows(indices)) {
             let last = row + self.lengths[*index as usize];
-            self.transitions.gather(&Vec::from_iter(row..last), &mut steps);
+            let mut steps = self.transitions.gather(&Vec::from_iter(row..last));
             steps.actions.resize(horizon * a, 0.0);
             steps.observations.resize(horizon * o, 0.0);
-            let Scaling { actions, observations, .. } = &self.units;
-            actions.iter().for_each(|affine| affine.to_network(&mut steps.actions));
-            observations.iter().for_each(|affine| affine.to_network(&mut steps.observations));
+            for (units, numbers) in [
+                (&self.units.actions, &mut steps.actions),
+                (&self.units.observations, &mut steps.observations),
+            ] {
+                units.iter().for_each(|affine| affine.to_network(numbers));
+            }
             for (action, state) in steps.actions.chunks(a).zip(steps.observations.chunks(o)) {
                 numbers.extend_from_slice(action);
                 numbers.extend_from_slice(state);
@@ -259,8 +250,7 @@ impl Examples {
 
 /// The rewards of an episode, and if it terminates.
 pub(super) fn episode_rewards(transitions: &Transitions, episode: Range<u32>) -> (Vec<f32>, bool) {
-    let mut batch = quad_dataset::Batch::default();
-    transitions.gather(&Vec::from_iter(episode), &mut batch);
+    let batch = transitions.gather(&Vec::from_iter(episode));
     let terminates = batch.masks.last() == Some(&0.0);
     (batch.rewards, terminates)
 }
@@ -305,7 +295,7 @@ mod tests {
 
     #[test]
     fn returns_reach_to_the_end_of_episodes_and_follow_experience() {
-        let mut examples = examples(Columns::Returns { gamma: 0.5 });
+        let mut examples = examples(Columns::Returns(0.5));
         let mut expected = vec![3.0, 4.0, -2.0, -2.0, -3.0];
         assert_eq!(examples.returns, expected);
         for (rewards, terminated, more) in
@@ -325,8 +315,8 @@ mod tests {
     /// run past their end.
     #[test]
     fn plans_have_the_discounted_rewards_to_the_end_of_their_episode() {
-        let plans = Columns::Plans { horizon: 2, gamma: 0.5, terminal_penalty: 8.0 };
-        let examples = examples(plans);
+        let plans = Plans { horizon: 2, gamma: 0.5, terminal_penalty: 8.0 };
+        let examples = examples(Columns::Plans(plans));
         assert_eq!(examples.rows(&[0, 1, 2]), [0, 1, 2]);
         assert_eq!((examples.len(), &examples.lengths[..]), (3, &[2, 1, 2][..]));
         assert_eq!(examples.returns, [-1.0, -4.0, -1.5]);

@@ -46,7 +46,7 @@ struct Config {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Fql(config: Config, init) {
         /// The one-step policy π(s, z).
         actor: TrainState<Ensemble> = init.ensemble(EnsembleShape {
             outputs: init.context.action_dim(),
@@ -58,18 +58,7 @@ networks! {
     }
 }
 
-struct Fql {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Fql {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
     /// The losses of critics, flow and policy.
     fn losses(&self, step: u64, batch: &Batch) -> Result<[Loss; 3]> {
         let random = &mut self.context.random(step);
@@ -79,8 +68,8 @@ impl Fql {
         let next_noise = random.normal("next_noise", (b, a))?;
         let times = random.tensor("times", (b, 1), |generator| generator.random::<f32>())?;
         let targets = self.targets(batch, &next_noise)?;
-        let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
-        let bc_loss = flow_loss(&self.networks.flow, batch, &start, &times)?;
+        let critic_loss = batch.critic_loss(&self.critic, &targets)?;
+        let bc_loss = flow_loss(&self.flow, batch, &start, &times)?;
         let [distill_loss, q_loss] = self.actor_losses(batch, &policy_noise)?;
         let actor_loss = ((&distill_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         let actor_loss = Loss::new("actor_loss", actor_loss).with("distill_loss", distill_loss);
@@ -89,9 +78,9 @@ impl Fql {
 
     /// y = r + γ·mask·Q̂(s', π(s', z)), `[B]`.
     fn targets(&self, batch: &Batch, noise: &Tensor) -> Result<Tensor> {
-        let actions = OneStepActor::new(self.networks.actor.detach())
-            .sample(&batch.next_observations, noise)?;
-        let values = batch.next_values(&self.networks.critic.target, &actions)?;
+        let actions =
+            OneStepActor::new(self.actor.detach()).sample(&batch.next_observations, noise)?;
+        let values = batch.next_values(&self.critic.target, &actions)?;
         batch.target(*self.config.gamma, &reduced(&values, self.config.target)?)
     }
 
@@ -99,11 +88,11 @@ impl Fql {
     /// divided by the mean of |Q| with `normalize_q`; both `[]`.
     fn actor_losses(&self, batch: &Batch, noise: &Tensor) -> Result<[Tensor; 2]> {
         let observations = &batch.observations;
-        let actions = self.networks.actor.outputs(observations, noise)?.squeeze(0)?;
-        let flow = FlowActor::new(self.networks.flow.detach(), *self.config.flow_steps);
+        let actions = self.actor.outputs(observations, noise)?.squeeze(0)?;
+        let flow = FlowActor::new(self.flow.detach(), *self.config.flow_steps);
         let distill_loss = squared_error(&actions, &flow.sample(observations, noise)?)?;
         let actions = actions.clamp(-1f32, 1f32)?;
-        let q = batch.values_at(&self.networks.critic.detach(), &actions)?.mean(0)?;
+        let q = batch.values_at(&self.critic.detach(), &actions)?.mean(0)?;
         let mut q_loss = q.mean_all()?.neg()?;
         if self.config.normalize_q {
             q_loss = (q_loss / q.detach().abs()?.mean_all()?)?;
@@ -138,13 +127,12 @@ impl Algorithm for Fql {
         let adam = AdamStep::after(step, *self.config.learning_rate);
         let losses = self.losses(step, batch)?;
         let [critic_loss, bc_loss, actor_loss] = &losses;
-        let Networks { actor, critic, flow } = &mut self.networks;
         // The policy's gradient, by the critics as they are before their step.
         let gradients = Gradients::of(&actor_loss.value)?;
-        critic.soft_update(*self.config.ema_rate)?;
-        critic.minimize(&critic_loss.value, adam)?;
-        flow.minimize(&bc_loss.value, adam)?;
-        actor.apply_gradients(&gradients, adam)?;
+        self.critic.soft_update(*self.config.ema_rate)?;
+        self.critic.minimize(&critic_loss.value, adam)?;
+        self.flow.minimize(&bc_loss.value, adam)?;
+        self.actor.apply_gradients(&gradients, adam)?;
         measured(&losses)
     }
 
@@ -155,12 +143,12 @@ impl Algorithm for Fql {
     /// The one-step policy, which chooses by the target critics.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
-        let (actor, critics) = (&self.networks.actor, &self.networks.critic.target);
+        let (actor, critics) = (&self.actor, &self.critic.target);
         let (shape, tensors) = ActorCriticShape::of(actor, critics)?;
         Ok((PolicyConfig::OneStep { shape, choice }, tensors))
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

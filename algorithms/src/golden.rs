@@ -7,7 +7,7 @@ mod reader;
 use std::sync::Arc;
 
 use super::ALGORITHMS;
-use super::algorithm::{Algorithm, Measured};
+use super::agent::{Algorithm, Measured};
 use super::batch::Batch;
 use super::context::Context;
 use super::definition::{Definition, Metric};
@@ -106,7 +106,7 @@ fn transitions(golden: &Golden) -> Transitions {
         observation_dim: o,
         action_dim: a,
         observations: given("observations", o),
-        actions: given("actions", a).iter().map(|x| x.clamp(-1.0, 1.0)).collect(),
+        actions: given("actions", a),
         rewards: given("rewards", 1),
         next_observations: given("next_observations", o),
         timeouts: given("timeouts", terminals.len()).iter().map(|x| *x == 1.0).collect(),

@@ -123,20 +123,21 @@ impl<L: ImplicitLosses> InSample<L> {
 
     /// The policy toward actions of the data, the more so the better they are.
     fn actor_loss(&self, batch: &Batch, q: &Tensor) -> Result<Loss> {
-        let Networks { actor, value, .. } = &self.networks;
-        let v = state_value(&value.detach(), &batch.observations)?;
+        let networks = &self.networks;
+        let v = state_value(&networks.value.detach(), &batch.observations)?;
         let advantage = (q - &v)?;
-        let log_probability = actor.log_probability(&batch.observations, &batch.actions)?;
+        let log_probability =
+            networks.actor.log_probability(&batch.observations, &batch.actions)?;
         let loss = weighted(&self.losses.weights(&advantage)?, &log_probability)?;
         Ok(loss.with("v_mean", v.mean_all()?).with("advantage_mean", advantage.mean_all()?))
     }
 
     /// Q(s, a) toward r + γ·V(s').
     fn critic_loss(&self, batch: &Batch) -> Result<Loss> {
-        let Networks { critic, value, .. } = &self.networks;
-        let next = state_value(&value.detach(), &batch.next_observations)?;
+        let networks = &self.networks;
+        let next = state_value(&networks.value.detach(), &batch.next_observations)?;
         let targets = batch.target(*self.losses.common().gamma, &next)?;
-        let loss = self.losses.critic_loss(&batch.values(critic)?, &targets)?;
+        let loss = self.losses.critic_loss(&batch.values(&networks.critic)?, &targets)?;
         Loss::critics(loss, &targets)
     }
 }

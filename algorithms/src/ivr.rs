@@ -11,17 +11,14 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "ivr",
     presets: include_str!("../../presets/ivr.toml"),
     metrics: METRICS,
-    report: Reporting {
-        variant: Some(Variant {
-            key: "divergence",
-            called: |divergence| format!("ivr {divergence}"),
-            unused: |divergence| match divergence {
-                "sparse" => &["alpha.exponential"],
-                _ => &["alpha.sparse"],
-            },
-        }),
-        ..Reporting::PLAIN
-    },
+    variant: Some(Variant {
+        key: "divergence",
+        called: |divergence| format!("ivr {divergence}"),
+        unused: |divergence| match divergence {
+            "sparse" => &["alpha.exponential"],
+            _ => &["alpha.sparse"],
+        },
+    }),
     read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
     ..Definition::PLAIN
 };

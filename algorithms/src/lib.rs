@@ -19,7 +19,6 @@
 #![deny(unsafe_code)]
 
 mod agent;
-mod algorithm;
 mod align_iql;
 mod batch;
 mod context;
@@ -60,13 +59,12 @@ mod td3bc;
 mod values;
 mod xql;
 
-pub use agent::{Agent, StateError};
-pub use algorithm::{Algorithm, Measured};
+pub use agent::{Agent, Algorithm, Measured, StateError};
 pub use batch::Batch;
 pub use context::Context;
-pub use definition::{Axis, Definition, Metric, MetricsLine, Reporting, Start, Summary, Variant};
+pub use definition::{Axis, Definition, Metric, MetricsLine, Start, Summary, Variant};
 pub use error::{AgentError, AlgorithmError, in_words};
-pub use examples::{Columns, Examples};
+pub use examples::{Columns, Examples, Plans};
 pub use fqe::{Fqe, FqeConfig, Units};
 pub use state_dict::StateDict;
 pub use values::{Values, fits, merge};

@@ -4,7 +4,7 @@ use candle_core::{Result, Tensor};
 use quad_nn::mean_and_variance;
 use quad_policy::Aggregate;
 
-use super::algorithm::Measured;
+use super::agent::Measured;
 
 /// The smallest of the critics' values, `[K, B]` → `[B]`. (`min` ignores NaN; adding 0·sum keeps
 /// it.)

@@ -60,7 +60,7 @@ struct Phases {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Onestep(config: Config, init) {
         /// β.
         behavior: TrainState<Ensemble> =
             init.state_network(&config.behavior, 2 * init.context.action_dim()),
@@ -70,18 +70,7 @@ networks! {
     }
 }
 
-struct Onestep {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Onestep {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
     fn first_steps(&self) -> [u64; 3] {
         let phases = self.config.phases;
         let lengths = [phases.behavior, phases.critic, phases.policy];
@@ -99,7 +88,7 @@ impl Onestep {
 
     /// First phase: β toward the data's actions.
     fn behavior_loss(&self, batch: &Batch) -> Result<Loss> {
-        let (mean, log_std) = distribution(&self.networks.behavior, &batch.observations)?;
+        let (mean, log_std) = distribution(&self.behavior, &batch.observations)?;
         let log_probability = log_density(&batch.actions, &mean, &log_std)?;
         Ok(Loss::new("behavior_loss", log_probability.mean_all()?.neg()?))
     }
@@ -107,7 +96,7 @@ impl Onestep {
     /// Second phase: Q(s, a) toward r + γ·Q̂(s', a'), with the action a' that the data takes
     /// next.
     fn critic_loss(&self, batch: &Batch) -> Result<Loss> {
-        let critic = &self.networks.critic;
+        let critic = &self.critic;
         let next_actions = asked(&batch.next_actions)?;
         let next = batch.next_values(&critic.target, next_actions)?.squeeze(0)?;
         let targets = batch.target(*self.config.gamma, &next)?;
@@ -116,10 +105,10 @@ impl Onestep {
 
     /// Third phase: π toward actions of the data, the more so the better they are than β's.
     fn actor_loss(&self, step: u64, batch: &Batch) -> Result<Loss> {
-        let q = batch.values(&self.networks.critic.detach())?.squeeze(0)?;
+        let q = batch.values(&self.critic.detach())?.squeeze(0)?;
         let advantage = (q - self.value(step, &batch.observations)?)?;
         let weight = (&advantage * f64::from(*self.config.temperature))?.exp()?;
-        let (mean, log_std) = distribution(&self.networks.actor, &batch.observations)?;
+        let (mean, log_std) = distribution(&self.actor, &batch.observations)?;
         let log_probability = log_density(&batch.actions, &mean, &log_std)?;
         Ok(weighted(&weight, &log_probability)?.with("advantage_mean", advantage.mean_all()?))
     }
@@ -129,10 +118,10 @@ impl Onestep {
         let (b, samples) = (observations.dim(0)?, *self.config.samples);
         let shape = (b, samples, self.context.action_dim());
         let noise = self.context.random(step).normal("behavior_noise", shape)?;
-        let (mean, log_std) = distribution(&self.networks.behavior.detach(), observations)?;
+        let (mean, log_std) = distribution(&self.behavior.detach(), observations)?;
         let spread = noise.broadcast_mul(&log_std.exp()?.unsqueeze(1)?)?;
         let actions = spread.broadcast_add(&mean.unsqueeze(1)?)?.flatten(0, 1)?; // [B·S, a]
-        let critic = self.networks.critic.detach();
+        let critic = self.critic.detach();
         critic.values(observations, &actions)?.reshape((b, samples))?.mean(1)
     }
 }
@@ -154,19 +143,18 @@ impl Algorithm for Onestep {
         let (phase, steps) = phase(&self.first_steps(), step);
         let loss = self.loss(phase, step, batch)?;
         let adam = AdamStep::after(steps, *self.config.learning_rate);
-        let Networks { behavior, critic, actor } = &mut self.networks;
         match phase {
             0 => {
-                behavior.minimize(&loss.value, adam)?;
-                actor.network.soft_update(behavior, 1.0)?; // all the way
+                self.behavior.minimize(&loss.value, adam)?;
+                self.actor.network.soft_update(&self.behavior, 1.0)?; // all the way
             }
             1 => {
-                critic.minimize(&loss.value, adam)?;
+                self.critic.minimize(&loss.value, adam)?;
                 if (steps + 1).is_multiple_of(*self.config.ema_every) {
-                    critic.soft_update(*self.config.ema_rate)?;
+                    self.critic.soft_update(*self.config.ema_rate)?;
                 }
             }
-            _ => drop(actor.minimize(&loss.value, adam)?),
+            _ => drop(self.actor.minimize(&loss.value, adam)?),
         }
         measured(&[loss])
     }
@@ -178,10 +166,10 @@ impl Algorithm for Onestep {
 
     /// Acts by the mean.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        first_half_policy(&self.networks.actor)
+        first_half_policy(&self.actor)
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

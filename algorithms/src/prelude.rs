@@ -1,10 +1,10 @@
 //! The names that the file of an algorithm needs.
 
-pub(super) use super::algorithm::{Algorithm, Measured};
+pub(super) use super::agent::{Algorithm, Measured};
 pub(super) use super::batch::Batch;
 pub(super) use super::context::Context;
 pub(super) use super::definition::{
-    Definition, Metric, Reporting, Start, Variant, metrics, read, read_with, start,
+    Definition, Metric, Start, Variant, metrics, read, read_with, start,
 };
 pub(super) use super::error::{AgentError, AlgorithmError, check};
 pub(super) use super::examples::Columns;

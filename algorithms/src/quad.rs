@@ -22,13 +22,11 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "quad",
     presets: include_str!("../../presets/quad.toml"),
     metrics: METRICS,
-    report: Reporting {
-        // DAC and behavior cloning (none) have names of their own.
-        variant: Some(Variant { key: "guidance", called: str::to_owned, unused: config::unused }),
-        axis: Some(Axis { key: "tau", symbol: "τ" }),
-        acts_after: Some("actor_ema_start"),
-        summary: Some(summary::summarize),
-    },
+    // DAC and behavior cloning (none) have names of their own.
+    variant: Some(Variant { key: "guidance", called: str::to_owned, unused: config::unused }),
+    axis: Some(Axis { key: "tau", symbol: "τ" }),
+    acts_after: Some("actor_ema_start"),
+    summary: Some(summary::summarize),
     chunks: true,
     read: |table| Ok(start(Config::read(table)?, Quad::start)),
     ..Definition::PLAIN
@@ -153,11 +151,11 @@ impl DiffusionUpdate for Quad {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
-        let (config, Networks { actor, critic }) = (&self.config, networks);
+        let config = &self.config;
         let decay = context.decay(step, *config.online_rate);
         let adam = |rate| AdamStep::after(step, rate * decay).clipped(*config.gradient_clip);
-        critic.adam.set_step(adam(*config.critic_learning_rate))?;
-        actor.adam.set_step(adam(*config.actor_learning_rate))
+        networks.critic.adam.set_step(adam(*config.critic_learning_rate))?;
+        networks.actor.adam.set_step(adam(*config.actor_learning_rate))
     }
 
     /// Algorithm 1's loop, but for the target actor.
@@ -217,8 +215,8 @@ impl DiffusionUpdate for Quad {
     }
 
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let Networks { actor, critic } = networks;
-        let tensors = DiffusionPolicy::tensors(&actor.target, Some(&critic.target), None)?;
+        let (actor, critics) = (&networks.actor.target, &networks.critic.target);
+        let tensors = DiffusionPolicy::tensors(actor, Some(critics), None)?;
         Ok((Choice::best_of(*self.config.candidates), tensors)) // Eq. 25
     }
 

@@ -113,8 +113,8 @@ impl Returns {
 
     /// Adds what planning changes.
     pub fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {
-        let Self { values, targets, scale, .. } = self;
-        dict.with("values", values).with("targets", targets).with("scale", scale)
+        let dict = dict.with("values", &mut self.values).with("targets", &mut self.targets);
+        dict.with("scale", &mut self.scale)
     }
 }
 

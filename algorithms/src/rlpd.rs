@@ -58,7 +58,7 @@ impl Config {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Rlpd(config: Config, init) {
         actor: Squashed = Squashed::new(&config.actor, GaussianPolicy::LOG_STD, init),
         critic: WithTarget<Ensemble> = init.critics(*config.critics, &config.critic),
         /// log α, `[1]`.
@@ -75,25 +75,13 @@ struct Noise {
     critics: Tensor,
 }
 
-struct Rlpd {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Rlpd {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
     fn noise(&self, step: u64, b: usize) -> Result<Noise> {
-        let Config { critics, target_critics, .. } = self.config;
         let (mut random, shape) = (self.context.random(step), (b, 1, self.context.action_dim()));
         let next = random.normal("next_noise", shape)?;
         let policy = random.normal("policy_noise", shape)?;
         let critics = random.vector("target_critics", |generator| {
-            let drawn = sample(generator, *critics, *target_critics);
+            let drawn = sample(generator, *self.config.critics, *self.config.target_critics);
             Ok(drawn.into_iter().map(|index| index as u32).collect())
         })?;
         Ok(Noise { next, policy, critics: Tensor::new(critics, &self.context.device)? })
@@ -101,27 +89,25 @@ impl Rlpd {
 
     /// α, `[1]`.
     fn alpha(&self) -> Result<Tensor> {
-        self.networks.log_alpha.values().detach().exp()
+        self.log_alpha.values().detach().exp()
     }
 
     /// Every critic toward r + γ·mask·(min Q̂_k(s', a') − α·log π(a'|s')).
     fn critic_loss(&self, batch: &Batch, noise: &Noise) -> Result<Loss> {
-        let Networks { actor, critic, .. } = &self.networks;
-        let next = actor.constant_distribution(&batch.next_observations)?.draw(&noise.next)?;
-        let values = batch.next_values(&critic.target, &next.actions.squeeze(1)?)?;
+        let next = self.actor.constant_distribution(&batch.next_observations)?.draw(&noise.next)?;
+        let values = batch.next_values(&self.critic.target, &next.actions.squeeze(1)?)?;
         let mut q = smallest(&values.index_select(&noise.critics, 0)?)?;
         if self.config.entropy_backup {
             q = (q - next.log_density.squeeze(1)?.broadcast_mul(&self.alpha()?)?)?;
         }
-        batch.critic_loss(critic, &batch.target(*self.config.gamma, &q)?)
+        batch.critic_loss(&self.critic, &batch.target(*self.config.gamma, &q)?)
     }
 
     /// The policy toward large entropy and large Q by the mean of all critics; and its entropy, `[]`,
     /// a constant.
     fn actor_loss(&self, batch: &Batch, noise: &Noise) -> Result<(Loss, Tensor)> {
-        let Networks { actor, critic, .. } = &self.networks;
-        let drawn = actor.distribution(&batch.observations)?.draw(&noise.policy)?;
-        let q = batch.values_at(&critic.detach(), &drawn.actions.squeeze(1)?)?.mean(0)?;
+        let drawn = self.actor.distribution(&batch.observations)?.draw(&noise.policy)?;
+        let q = batch.values_at(&self.critic.detach(), &drawn.actions.squeeze(1)?)?.mean(0)?;
         let (alpha, log_density) = (self.alpha()?, drawn.log_density.squeeze(1)?);
         let entropy = log_density.detach().mean_all()?.neg()?;
         let loss = (log_density.broadcast_mul(&alpha)? - q)?.mean_all()?;
@@ -139,16 +125,15 @@ impl Algorithm for Rlpd {
             rate *= cosine_decay(step, self.context.total_steps + self.context.online_steps);
         }
         let mut losses = vec![self.critic_loss(batch, &noise)?];
-        self.networks.critic.minimize(&losses[0].value, AdamStep::after(step, rate))?;
-        self.networks.critic.soft_update(*self.config.ema_rate)?;
+        self.critic.minimize(&losses[0].value, AdamStep::after(step, rate))?;
+        self.critic.soft_update(*self.config.ema_rate)?;
         if (step + 1).is_multiple_of(every) {
             let (actor_loss, entropy) = self.actor_loss(batch, &noise)?;
             let adam = AdamStep::after(step / every, rate);
             let excess = (entropy + 0.5 * self.context.action_dim() as f64)?;
-            let Networks { actor, log_alpha, .. } = &mut self.networks;
-            actor.minimize(&actor_loss.value, adam)?;
-            let alpha_loss = (log_alpha.values().exp()?.sum_all()? * excess)?;
-            log_alpha.minimize(&alpha_loss, adam)?;
+            self.actor.minimize(&actor_loss.value, adam)?;
+            let alpha_loss = (self.log_alpha.values().exp()?.sum_all()? * excess)?;
+            self.log_alpha.minimize(&alpha_loss, adam)?;
             losses.push(actor_loss);
         }
         measured(&losses)
@@ -160,10 +145,10 @@ impl Algorithm for Rlpd {
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        self.networks.actor.policy()
+        self.actor.policy()
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

@@ -20,7 +20,7 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     read: |table| {
         let config = Config::read(table)?;
-        let columns = Columns::Episodes { shortest: *config.shortest_episode };
+        let columns = Columns::Episodes(*config.shortest_episode);
         Ok(Start { columns, ..start(config, Sfbc::new) })
     },
     ..Definition::PLAIN
@@ -115,7 +115,7 @@ struct Sfbc {
 impl Sfbc {
     fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
         let shortest = *config.shortest_episode;
-        let (transitions, columns) = (context.transitions.clone(), Columns::Episodes { shortest });
+        let (transitions, columns) = (context.transitions.clone(), Columns::Episodes(shortest));
         let examples = Examples::new(transitions, columns, Window::ONE)?;
         let (mut rewards, mut episodes) = (Vec::new(), Vec::new());
         for episode in context.transitions.episodes() {

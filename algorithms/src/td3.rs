@@ -87,13 +87,13 @@ impl<R: BcRegularizer> Td3<R> {
     /// action a'.
     fn targets(&self, step: u64, batch: &Batch) -> Result<Tensor> {
         let common = self.regularizer.common();
-        let Networks { actor, critic } = &self.networks;
         let noise = self.context.random(step).normal("target_noise", batch.actions.shape())?;
         let limit = f64::from(*common.target_noise_limit);
         let noise = (noise * f64::from(*common.target_noise))?.clamp(-limit, limit)?;
-        let actions =
-            (gaussian_mean(&actor.target, &batch.next_observations)? + noise)?.clamp(-1.0, 1.0)?;
-        let mut q = smallest(&batch.next_values(&critic.target, &actions)?)?;
+        let actions = (gaussian_mean(&self.networks.actor.target, &batch.next_observations)?
+            + noise)?
+            .clamp(-1.0, 1.0)?;
+        let mut q = smallest(&batch.next_values(&self.networks.critic.target, &actions)?)?;
         if let (Some(penalty), Some(next)) = (self.regularizer.penalty(), &batch.next_actions) {
             q = (q - ((actions - next)?.sqr()?.sum(1)? * f64::from(penalty))?)?;
         }

@@ -120,10 +120,11 @@ impl Config {
                 check("lambda", *lambda, false, "absent unless agent.guidance is `constant`")?
             }
         }
-        let Eta { initial, minimum, maximum, .. } = config.eta;
-        check("eta.maximum", *maximum, *maximum >= *minimum, "at least eta.minimum")?;
-        let within = (*minimum..=*maximum).contains(&*initial);
-        check("eta.initial", *initial, within, "between eta.minimum and eta.maximum")?;
+        let eta = config.eta;
+        let (initial, range) = (*eta.initial, *eta.minimum..=*eta.maximum);
+        check("eta.maximum", range.end(), range.start() <= range.end(), "at least eta.minimum")?;
+        let within = range.contains(&initial);
+        check("eta.initial", initial, within, "between eta.minimum and eta.maximum")?;
         Ok(config)
     }
 }

@@ -73,8 +73,8 @@ impl Averages {
     }
 
     pub fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {
-        let Self { nu_squared, lambda_means } = self;
-        dict.with("nu_squared", nu_squared).with("lambda_means", lambda_means)
+        let dict = dict.with("nu_squared", &mut self.nu_squared);
+        dict.with("lambda_means", &mut self.lambda_means)
     }
 
     /// Guidance by the target critics at noisy actions, for which the actor predicts this noise,

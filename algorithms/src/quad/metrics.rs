@@ -1,7 +1,7 @@
 //! The metrics of QUAD; those of λ and guidance over a batch are computed on the CPU.
 
 use super::guidance::Guide;
-use crate::algorithm::Measured;
+use crate::agent::Measured;
 use crate::definition::{Metric, metrics};
 use candle_core::Tensor;
 
@@ -37,12 +37,11 @@ const FIFTHS: [&str; 5] =
 /// The tensors from which [`measure_lambda`] computes: ν̂², `[]`; λ and σ², `[B]`; ḡ and the error ε_θ − ε,
 /// `[B, a]`.
 pub(super) fn lambda_inputs(guide: &Guide, error: Tensor) -> Vec<Tensor> {
-    let Guide { averages, lambda, sigma_squared, gradient, .. } = guide;
     vec![
-        averages.nu_squared.clone(),
-        lambda.clone(),
-        sigma_squared.clone(),
-        gradient.clone(),
+        guide.averages.nu_squared.clone(),
+        guide.lambda.clone(),
+        guide.sigma_squared.clone(),
+        guide.gradient.clone(),
         error,
     ]
 }

@@ -103,9 +103,7 @@ fn put<T: H5Type>(file: &hdf5::Group, array: &str, shape: &[usize], data: &[T]) 
 }
 
 fn all(transitions: &Transitions) -> Batch {
-    let mut batch = Batch::default();
-    transitions.gather(&Vec::from_iter(0..transitions.len() as u32), &mut batch);
-    batch
+    transitions.gather(&Vec::from_iter(0..transitions.len() as u32))
 }
 
 fn compare(path: &Path, environment: Environment, reference: &Path) {

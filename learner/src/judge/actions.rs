@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use quad_policy::{Policy, Scaling};
 use rayon::prelude::*;
 
-use super::data::{Data, gather};
+use super::data::Data;
 
 /// States per call of a policy, fewer if they take more than [`MEMORY`].
 const STATES: usize = 256;
@@ -26,7 +26,7 @@ pub(super) struct Actions {
 impl Actions {
     pub fn of(policy: &dyn Policy, data: &Data) -> anyhow::Result<Self> {
         let scaling = data.training.scaling();
-        let all = gather(&data.training, &Vec::from_iter(0..data.training.len() as u32));
+        let all = data.training.gather(&Vec::from_iter(0..data.training.len() as u32));
         let next = act(policy, scaling, &all.next_observations, 0)?;
         let first = act(policy, scaling, &data.first.observations, JUDGED)?;
         let compared = act(policy, scaling, &data.compared.observations, 2 * JUDGED)?;
@@ -35,8 +35,8 @@ impl Actions {
 
     /// Estimates how long [`Self::of`] takes, by a few states.
     pub fn time(policy: &dyn Policy, data: &Data) -> anyhow::Result<Duration> {
-        let all = data.training.len() + data.first.size + data.compared.size;
-        let timed = data.compared.size.min(STATES);
+        let all = data.training.len() + data.first.rewards.len() + data.compared.rewards.len();
+        let timed = data.compared.rewards.len().min(STATES);
         let observations = &data.compared.observations[..timed * policy.observation_dim()];
         let begin = Instant::now();
         act(policy, data.training.scaling(), observations, 0)?;

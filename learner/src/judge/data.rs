@@ -101,8 +101,8 @@ impl Data {
         Ok(Self {
             sha256,
             environment,
-            first: gather(&held_out, &starts),
-            compared: gather(&held_out, &compared),
+            first: held_out.gather(&starts),
+            compared: held_out.gather(&compared),
             training: Arc::new(split.training),
             episodes: split.episodes,
             held_out,
@@ -139,8 +139,8 @@ impl Data {
         let (o, a) = (self.held_out.observation_dim(), self.held_out.action_dim());
         let mut returns = Vec::new();
         for episode in self.held_out.recorded_episodes() {
-            let steps = gather(&self.held_out, &Vec::from_iter(episode));
-            let last = steps.size - 1;
+            let steps = self.held_out.gather(&Vec::from_iter(episode));
+            let last = steps.rewards.len() - 1;
             let mut value = f64::from(steps.rewards[last]);
             if steps.masks[last] != 0.0 {
                 let (s, a) = (&steps.observations[last * o..], &steps.actions[last * a..]);
@@ -208,12 +208,6 @@ pub(super) fn mean(values: impl IntoIterator<Item = impl Into<f64>>) -> f64 {
         sum += value.into();
     }
     sum / count
-}
-
-pub(super) fn gather(transitions: &Transitions, rows: &[u32]) -> Batch {
-    let mut batch = Batch::default();
-    transitions.gather(rows, &mut batch);
-    batch
 }
 
 #[cfg(test)]
@@ -285,7 +279,7 @@ mod tests {
             Fqe::new(config, units, data.context(seed)).unwrap()
         });
         let recorded = data.recorded_value(&fqes, 0.5).unwrap();
-        let last = gather(&data.held_out, &[5]);
+        let last = data.held_out.gather(&[5]);
         let values = fqes.map(|fqe| fqe.values(&last.observations, &last.actions).unwrap());
         let after = mean(values.concat());
         let expected = (2.0 + 2.0 + 2.0 + 2.0 + 2.0 + after / 4.0) / 2.0;

@@ -189,7 +189,6 @@ mod tests {
     use quad_dataset::{Arrays, Split, Transitions};
 
     use super::*;
-    use crate::judge::data::gather;
 
     /// Episodes of two steps, whose states are 0 and 1 and whose rewards are their actions, which are
     /// 0 on average.
@@ -224,7 +223,7 @@ mod tests {
         let value = |curves: &[LearningCurve]| estimate(curves, &units).values[0];
         assert!(value(&curves).abs() < 0.2, "{} of the behavior", value(&curves));
         let act = |states: &[f32]| Vec::from_iter(states.iter().map(|state| 0.8 - 1.2 * state));
-        let training = gather(&data.training, &Vec::from_iter(0..48));
+        let training = data.training.gather(&Vec::from_iter(0..48));
         let actions = Actions {
             next: act(&training.next_observations),
             first: act(&data.first.observations),

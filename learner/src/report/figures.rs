@@ -55,8 +55,8 @@ pub fn all(report: &Report) -> Vec<(String, Plot)> {
         }
         plots.push((name, curves(task, groups)));
     }
-    for Definition { name, report, .. } in ALGORITHMS {
-        let Some(axis) = report.axis else { continue };
+    for Definition { name, axis, .. } in ALGORITHMS {
+        let Some(axis) = *axis else { continue };
         plots.push((axis.key.to_owned(), over(axis, name, &by_task)));
     }
     plots.retain(|(_, plot)| !plot.is_empty());

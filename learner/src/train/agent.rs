@@ -62,8 +62,12 @@ pub(crate) fn resume(
 
 /// The origin of a run's snapshots; the step is set for each.
 pub(crate) fn origin(experiment: &Experiment) -> Origin {
-    let Experiment { environment, seed, episodes, .. } = experiment;
-    Origin { environment: environment.clone(), seed: *seed, step: 0, episodes: *episodes }
+    Origin {
+        environment: experiment.environment.clone(),
+        seed: experiment.seed,
+        step: 0,
+        episodes: experiment.episodes,
+    }
 }
 
 /// Checks that the device is present and can compute with this precision.

@@ -219,10 +219,12 @@ fn a_queue_that_the_disk_does_not_empty_keeps_all_rows_then_the_newest_checkpoin
     let checkpoint = |step: u64| Checkpoint { step, state: vec![step as u8] };
     for step in 1..=3 {
         let (values, held_out) = (vec![], vec![]);
-        queue.row(Row { step, seconds: 0.0, metrics: &[], values, held_out, online: Vec::new() });
-        queue.checkpoint(checkpoint(step));
+        let online = Vec::new();
+        let row = Row { step, seconds: 0.0, metrics: &[], values, held_out, online };
+        queue.push(Output::Rows(vec![row]));
+        queue.push(Output::Checkpoint(checkpoint(step)));
     }
-    queue.ended(Outcome::Completed);
+    queue.push(Output::Ended(Outcome::Completed));
     queue.close();
     assert!(matches!(queue.next(&beat), Some(Output::Rows(rows)) if rows.len() == 3));
     assert!(

@@ -16,7 +16,7 @@ use tracing::debug;
 use super::held_out::HeldOut;
 use super::metrics::TrainingMetrics;
 use super::online::{OnlineError, OnlineTraining};
-use super::output_queue::OutputQueue;
+use super::output_queue::{Output, OutputQueue};
 use super::results::{Means, Outcome, Row, STEPS_PER_ROW, TrainedPolicy, measured};
 
 /// Least time of training that is spent between two checkpoints for each second that one takes:
@@ -75,7 +75,7 @@ impl Training {
     /// fails.
     pub fn run(mut self, beat: &Heartbeat) -> anyhow::Result<()> {
         match self.train(beat) {
-            Ok(outcome) => self.queue.ended(outcome),
+            Ok(outcome) => self.queue.push(Output::Ended(outcome)),
             Err(error @ TrainError::Diverged { .. }) => {
                 self.metrics.diverged.set(1);
                 return Err(hinted(error, DIVERGED));
@@ -99,7 +99,7 @@ impl Training {
         while self.agent.step() < steps {
             if !self.online(beat)? {
                 let (checkpoint, _) = self.checkpoint(self.agent.step())?;
-                self.queue.checkpoint(checkpoint);
+                self.queue.push(Output::Checkpoint(checkpoint));
                 return Ok(Outcome::Stopped);
             }
             let begin = Instant::now();
@@ -135,13 +135,14 @@ impl Training {
                 let (values, held_out) = (means.take(), self.measure_held_out(step, is_last)?);
                 let online = self.online.as_ref().filter(|online| online.has_begun(step - 1));
                 let online = online.map_or(Vec::new(), OnlineTraining::row);
-                self.queue.row(Row { step, seconds, metrics, values, held_out, online });
+                let row = Row { step, seconds, metrics, values, held_out, online };
+                self.queue.push(Output::Rows(vec![row]));
             }
             if is_last || self.schedule.is_evaluated(step) || self.plays_online_with(step) {
                 self.save_policy(step, beat)?;
             }
             if let Some((checkpoint, pause)) = checkpoint {
-                self.queue.checkpoint(checkpoint);
+                self.queue.push(Output::Checkpoint(checkpoint));
                 next_checkpoint = Instant::now() + self.checkpoint_every.max(pause);
             }
             if stopped {
@@ -158,12 +159,14 @@ impl Training {
             return Ok(true);
         };
         loop {
-            online.take_openings().into_iter().for_each(|opening| self.queue.online(opening));
+            for opening in online.take_openings() {
+                self.queue.push(Output::Online(opening));
+            }
             if !online.is_due(step) {
                 return Ok(true);
             }
             if let Some(episode) = online.awaited() {
-                self.queue.waits(episode);
+                self.queue.push(Output::Waits(episode));
             }
             if !online.absorb_next(&self.stop, beat)? {
                 return Ok(false);
