@@ -66,7 +66,6 @@ fn experiment([task, algorithm]: [&str; 2], change: Change) -> Experiment {
 fn context(experiment: &Experiment, precision: Precision, device: &Device) -> Context {
     Context {
         transitions: Arc::new(transitions(2 * experiment.batch_size)),
-        batch_size: experiment.batch_size,
         total_steps: experiment.total_steps,
         online_steps: 0,
         window: Window::ONE,
@@ -121,11 +120,12 @@ fn updates(criterion: &mut Criterion) {
         for (name, which, change) in CONFIGURATIONS.into_iter().chain(others) {
             let experiment = experiment(which, change);
             let context = context(&experiment, precision, &device);
-            let hyperparameters = experiment.agent.clone().into();
-            let mut agent = Agent::new(experiment.definition, &hyperparameters, context)
+            let transitions = context.transitions.clone();
+            let mut agent = Agent::new(experiment.definition, &experiment.agent, context)
                 .expect("usable values");
+            let examples = agent.examples(transitions).expect("examples");
             let indices: Vec<u32> =
-                (0..experiment.batch_size).map(|i| (i % agent.dataset_len()) as u32).collect();
+                (0..experiment.batch_size).map(|i| (i % examples.len()) as u32).collect();
             let phases = agent.phases();
             for (i, start) in phases.iter().enumerate() {
                 agent.skip_to(*start);
@@ -135,7 +135,10 @@ fn updates(criterion: &mut Criterion) {
                     format!("{name}, phase {}", i + 1)
                 };
                 group.bench_function(name, |bencher| {
-                    bencher.iter(|| agent.update(&indices).expect("a step"))
+                    bencher.iter(|| {
+                        let batch = examples.batch(&indices).expect("a batch");
+                        agent.update(&batch).expect("a step")
+                    })
                 });
             }
         }

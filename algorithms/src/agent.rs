@@ -1,17 +1,52 @@
-//! A training agent: counts an algorithm's updates, publishes its policy, saves and loads its
-//! state.
+//! The interface between an algorithm and the learner; and an agent in training, which counts an
+//! algorithm's updates, publishes its policy, saves and loads its state.
 
-use crate::algorithm::{Algorithm, Measured};
+use crate::batch::Batch;
 use crate::context::Context;
-use crate::definition::{Definition, Hyperparameters, Metric};
+use crate::definition::{Definition, Metric};
 use crate::error::AlgorithmError;
+use crate::examples::{Columns, Examples};
 use crate::pool::run_awake;
+use crate::replay::Inputs;
+use crate::state_dict::StateDict;
 use candle_core::Device;
-use quad_dataset::{Names, Transitions};
-use quad_nn::Scaling;
-use quad_policy::{Chunk, Header, PolicyError, read_header, read_tensors, write_tensors};
+use quad_dataset::{Names, Transitions, Window};
+use quad_nn::{Scaling, Tensors};
+use quad_policy::{
+    Chunk, Header, PolicyConfig, PolicyError, read_header, read_tensors, write_tensors,
+};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
+use toml::Table;
+
+/// Metrics of an update by the names in the algorithm's table.
+pub type Measured = Vec<(&'static str, f32)>;
+
+/// The updates of an algorithm, its policy and its state.
+pub trait Algorithm: Send {
+    /// The first step of each training phase; updates of different phases take different times.
+    fn phases(&self) -> Vec<u64> {
+        vec![0]
+    }
+
+    /// True if an update takes batches from the CPU on any device: it copies them with its noise.
+    fn copies_batches(&self) -> bool {
+        false
+    }
+
+    /// Performs update number `step`, from 0. Its random numbers are a function of the run's seed and
+    /// `step`.
+    fn update(&mut self, step: u64, batch: &Batch) -> candle_core::Result<Measured>;
+
+    /// Computes the losses of update number `step` and changes nothing.
+    fn evaluate(&self, step: u64, batch: &Batch) -> candle_core::Result<Measured>;
+
+    /// The policy to be evaluated: its description and its tensors.
+    fn policy(&self) -> candle_core::Result<(PolicyConfig, Tensors)>;
+
+    /// Everything that updates change; with the step it determines the rest of the run.
+    fn state_dict(&mut self) -> StateDict<'_>;
+}
 
 /// Key of the counters in the metadata of a saved state.
 const COUNTERS: &str = "state";
@@ -21,7 +56,8 @@ pub struct Agent {
     definition: Definition,
     pub(super) algorithm: Box<dyn Algorithm>,
     device: Device,
-    transitions: Arc<Transitions>,
+    columns: Columns,
+    window: Window,
     /// The chunk that the policy knows as one action.
     chunk: Chunk,
     /// The maps between the data's units and the algorithm's, unless they are the same.
@@ -50,33 +86,36 @@ pub enum StateError {
 }
 
 impl Agent {
-    /// Makes an agent at step 0.
+    /// Makes an agent at step 0 with the hyper-parameters of an `[agent]` table.
     ///
     /// # Errors
     /// The hyper-parameters or the data cannot be used.
     pub fn new(
         definition: Definition,
-        hyperparameters: &Hyperparameters,
+        table: &Table,
         context: Context,
     ) -> Result<Self, AlgorithmError> {
-        let (device, transitions) = (context.device.clone(), context.transitions.clone());
-        let scaling = Some(transitions.scaling().clone());
+        let device = context.device.clone();
+        let scaling = Some(context.transitions.scaling().clone());
         let scaling = scaling.filter(|scaling| *scaling != Scaling::default());
-        let names = transitions.names().clone();
-        let (chunk, algorithm) = hyperparameters.start(&definition, context)?;
+        let names = context.transitions.names().clone();
+        let (chunk, window, start) = definition.read(table)?;
+        let columns = match start.columns {
+            Columns::Returns(_) if context.online_steps == 0 => Columns::Plain,
+            columns => columns,
+        };
+        let algorithm = (start.new)(Context { window, ..context })?;
         // Each thread has its own queue on a GPU: what this one made must be there for the next.
         device.synchronize()?;
-        Ok(Self { definition, algorithm, device, transitions, chunk, scaling, names, step: 0 })
+        Ok(Self { definition, algorithm, device, columns, window, chunk, scaling, names, step: 0 })
     }
 
-    /// The number of examples that batches are drawn from.
-    pub fn dataset_len(&self) -> usize {
-        self.algorithm.dataset_len(self.transitions.len())
-    }
-
-    /// The transitions of the dataset and of experience.
-    pub fn transitions(&self) -> &Arc<Transitions> {
-        &self.transitions
+    /// What it learns from in these transitions.
+    ///
+    /// # Errors
+    /// There is nothing.
+    pub fn examples(&self, transitions: Arc<Transitions>) -> Result<Examples, AlgorithmError> {
+        Examples::new(transitions, self.columns, self.window)
     }
 
     /// The algorithm's table of metrics, in the order of what [`Self::update`] returns.
@@ -99,29 +138,33 @@ impl Agent {
         self.step = step;
     }
 
-    /// Performs an update on the examples with these indices. Returns the metrics in the order of
-    /// their table; `None` for those that this update did not measure.
-    pub fn update(&mut self, indices: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
+    /// Performs an update. Returns the metrics in the order of their table; `None` for those that this
+    /// update did not measure.
+    pub fn update(&mut self, batch: &Batch) -> Result<Vec<Option<f32>>, AlgorithmError> {
         let (algorithm, step) = (&mut self.algorithm, self.step);
+        let copies = algorithm.copies_batches();
+        let batch = &batch.on(if copies { &Device::Cpu } else { &self.device })?;
         let measured = match self.device.is_cpu() {
-            true => run_awake(|| algorithm.update(step, indices))?,
-            false => algorithm.update(step, indices)?,
+            true => run_awake(|| algorithm.update(step, batch))?,
+            false => algorithm.update(step, batch)?,
         };
         self.step += 1;
         Ok(self.in_order(&measured).collect())
     }
 
-    /// Computes the losses of the last update on other examples, as [`Self::update`] returns them,
-    /// but only the metrics that are measured on held-out episodes. Changes nothing.
-    pub fn evaluate(&self, indices: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
-        let measured = self.algorithm.evaluate(self.step.saturating_sub(1), indices)?;
+    /// Computes the losses of the last update on another batch, as [`Self::update`] returns them, but
+    /// only the metrics that are measured on held-out episodes. Changes nothing.
+    pub fn evaluate(&self, batch: &Batch) -> Result<Vec<Option<f32>>, AlgorithmError> {
+        let batch = &batch.on(&self.device)?;
+        let measured = self.algorithm.evaluate(self.step.saturating_sub(1), batch)?;
         let values = self.in_order(&measured).zip(self.metrics());
         Ok(values.map(|(value, metric)| value.filter(|_| metric.held_out)).collect())
     }
 
     fn in_order(&self, measured: &Measured) -> impl Iterator<Item = Option<f32>> {
-        let of = |metric: &Metric| measured.iter().find(|(name, _)| *name == metric.name);
-        self.metrics().iter().map(move |metric| Some(of(metric)?.1))
+        let value =
+            move |metric: &Metric| Some(measured.iter().find(|(name, _)| *name == metric.name)?.1);
+        self.metrics().iter().map(value)
     }
 
     /// The file of the current policy, with its origin.

@@ -4,8 +4,7 @@
 //! takes the one whose Q is closest to V. Equations of critics and V are IQL's; what is left out,
 //! and what its authors' code does, is in docs/deviations.md.
 
-use super::denoising::Denoising;
-use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
+use super::diffusion::{Denoising, Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
 use super::iql::expectile_loss;
 use super::prelude::*;
 use quad_nn::Reverse;
@@ -15,11 +14,10 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "align-iql",
     presets: include_str!("../../presets/align-iql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
     read: |table| {
         Ok(start(read::<Config>(table)?, |config, context| config.start(Rule::Nearest, context)))
     },
+    ..Definition::PLAIN
 };
 
 pub(super) const METRICS: &[Metric] = &metrics! {
@@ -80,26 +78,26 @@ impl Config {
 }
 
 /// ε_θ toward the noise in the data's actions: DDPM's loss.
-fn bc_loss(networks: &Networks, batch: &Minibatch, noise: &Denoising) -> Result<Loss> {
+fn bc_loss(networks: &Networks, batch: &Batch, noise: &Denoising) -> Result<Loss> {
     let (_, predicted) = denoise(&networks.actor, batch, noise)?;
     Ok(Loss::new("bc_loss", (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?))
 }
 
 /// The smaller Q̂(s, a), `[B]`.
-fn q(networks: &Networks, batch: &Minibatch) -> Result<Tensor> {
+fn q(networks: &Networks, batch: &Batch) -> Result<Tensor> {
     smallest(&batch.values(&networks.critic.target)?)
 }
 
 impl AlignIql {
     /// V(s) toward an expectile of the smaller Q̂(s, a), `[B]`, IQL's Eq. 5.
-    fn value_loss(&self, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
+    fn value_loss(&self, batch: &Batch, q: &Tensor) -> Result<Loss> {
         let u = (q - state_value(&self.value, &batch.observations)?)?;
         Ok(Loss::new("value_loss", expectile_loss(&u, *self.config.expectile)?))
     }
 
     /// Q(s, a) toward r + γ·V(s'), IQL's Eq. 6. Also measures V and, with the smaller Q̂(s, a), the
     /// advantage.
-    fn critic_loss(&self, networks: &Networks, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
+    fn critic_loss(&self, networks: &Networks, batch: &Batch, q: &Tensor) -> Result<Loss> {
         let value = self.value.detach();
         let next = state_value(&value, &batch.next_observations)?;
         let targets = batch.target(*self.config.gamma, &next)?;
@@ -117,19 +115,19 @@ impl DiffusionUpdate for AlignIql {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
-        let (config, Networks { actor, critic }) = (&self.config, networks);
+        let config = &self.config;
         let adam = |rate: f32| AdamStep::after(step, rate);
         // IDQL's authors move only critics and V online.
         let decayed = *config.actor_learning_rate * context.decay(step, 0.0);
-        actor.adam.set_step(adam(decayed))?;
+        networks.actor.adam.set_step(adam(decayed))?;
         self.value.adam.set_step(adam(*config.value_learning_rate))?;
-        critic.adam.set_step(adam(*config.critic_learning_rate))
+        networks.critic.adam.set_step(adam(*config.critic_learning_rate))
     }
 
     fn update(
         &mut self,
         networks: &mut Networks,
-        batch: &Minibatch,
+        batch: &Batch,
         noise: &Denoising,
     ) -> Result<Vec<Loss>> {
         let bc_loss = bc_loss(networks, batch, noise)?;
@@ -146,12 +144,7 @@ impl DiffusionUpdate for AlignIql {
         Ok(vec![bc_loss, value_loss, critic_loss])
     }
 
-    fn losses(
-        &self,
-        networks: &Networks,
-        batch: &Minibatch,
-        noise: &Denoising,
-    ) -> Result<Vec<Loss>> {
+    fn losses(&self, networks: &Networks, batch: &Batch, noise: &Denoising) -> Result<Vec<Loss>> {
         let (bc_loss, q) = (bc_loss(networks, batch, noise)?, q(networks, batch)?);
         let value_loss = self.value_loss(batch, &q)?;
         Ok(vec![bc_loss, value_loss, self.critic_loss(networks, batch, &q)?])
@@ -164,9 +157,9 @@ impl DiffusionUpdate for AlignIql {
     /// AlignIQL takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of
     /// the aligned policy, as a penalty.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let Networks { actor, critic } = networks;
         let value = (self.rule == Rule::Nearest).then_some(&*self.value);
-        let tensors = DiffusionPolicy::tensors(&actor.target, Some(&critic.target), value)?;
+        let (actor, critics) = (&networks.actor.target, &networks.critic.target);
+        let tensors = DiffusionPolicy::tensors(actor, Some(critics), value)?;
         Ok((Choice::new(*self.config.candidates, Aggregate::Min, self.rule), tensors))
     }
 

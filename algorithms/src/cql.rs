@@ -4,7 +4,6 @@
 //! online is Cal-QL, which pushes values down no further than to the data's returns.
 //! Equations are that paper's; docs/deviations.md says which of several codes is followed.
 
-use super::calibration::MonteCarlo;
 use super::prelude::*;
 use super::squashed::{Normal, Squashed};
 use quad_nn::Weights;
@@ -14,9 +13,12 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "cql",
     presets: include_str!("../../presets/cql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
-    read: |table| Ok(start(read(table)?, Cql::new)),
+    read: |table| {
+        let config: Config = read(table)?;
+        let columns = Columns::Returns(*config.gamma);
+        Ok(Start { columns, ..start(config, Cql::new) })
+    },
+    ..Definition::PLAIN
 };
 
 /// Factor of the last layers' initial weights.
@@ -85,7 +87,7 @@ impl Phases {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Cql(config: Config, init) {
         actor: Squashed = Squashed::new(&config.actor, GaussianPolicy::LOG_STD, init)?.with_map(
             [*config.log_std.multiplier, *config.log_std.offset],
             LAST_LAYER,
@@ -115,31 +117,8 @@ struct Noise {
     current: Tensor,
 }
 
-struct Cql {
-    config: Config,
-    context: Context,
-    networks: Networks,
-    /// The lower bounds of Cal-QL, in an online run.
-    returns: Option<MonteCarlo>,
-}
-
 impl Cql {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        let returns = (context.online_steps > 0)
-            .then(|| MonteCarlo::new(&context.transitions, *config.gamma));
-        Ok(Self { config, context, networks, returns })
-    }
-
-    /// A batch, and the data's returns `[B]` from its transitions on, where they count.
-    fn batch(&self, indices: &[u32]) -> Result<(Minibatch, Option<Tensor>)> {
-        let returns =
-            self.returns.as_ref().map(|returns| returns.of(indices, &self.context.device));
-        Ok((self.context.batch(indices)?, returns.transpose()?))
-    }
-
-    fn noise(&self, step: u64) -> Result<Noise> {
-        let Context { batch_size: b, .. } = self.context;
+    fn noise(&self, step: u64, b: usize) -> Result<Noise> {
         let (mut random, a) = (self.context.random(step), self.context.action_dim());
         let each = (b, *self.config.actions, a);
         Ok(Noise {
@@ -155,21 +134,20 @@ impl Cql {
     fn actor_loss(
         &self,
         step: u64,
-        batch: &Minibatch,
+        batch: &Batch,
         current: &Normal,
         noise: &Noise,
     ) -> Result<(Loss, Tensor)> {
-        let Networks { critic, log_alpha, .. } = &self.networks;
         let drawn = current.draw(&noise.policy)?;
         let log_density = drawn.log_density.squeeze(1)?;
         let gain = match self.config.phases.is_cloning(step, self.context.total_steps) {
             true => current.log_density(&self.actions(batch)?)?,
             false => {
                 let actions = drawn.actions.squeeze(1)?;
-                smallest(&batch.values_at(&critic.detach(), &actions)?)?
+                smallest(&batch.values_at(&self.critic.detach(), &actions)?)?
             }
         };
-        let alpha = log_alpha.values().detach().exp()?;
+        let alpha = self.log_alpha.values().detach().exp()?;
         let loss = (log_density.broadcast_mul(&alpha)? - gain)?.mean_all()?;
         let log_density = log_density.detach().mean_all()?;
         let loss = Loss::new("actor_loss", loss).with("entropy", log_density.neg()?);
@@ -180,21 +158,21 @@ impl Cql {
     /// log Σ exp Q_k(s, ·) − Q_k(s, a).
     fn critic_loss(
         &self,
-        (batch, returns): &(Minibatch, Option<Tensor>),
+        batch: &Batch,
         current: &Normal,
         next: &Normal,
         noise: &Noise,
     ) -> Result<(Loss, Tensor)> {
         let targets = self.targets(batch, next, &noise.target)?;
-        let (q, gaps) = self.gaps(batch, returns.as_ref(), [current, next], noise)?;
+        let (q, gaps) = self.gaps(batch, [current, next], noise)?;
         let loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * TWIN as f64)?;
-        let (loss, gap) = (Loss::of_critics(loss, &targets)?, gaps.mean_all()?);
+        let (loss, gap) = (Loss::critics(loss, &targets)?, gaps.mean_all()?);
         Ok((loss.with("gap", gap.clone()), gap))
     }
 
     /// The data's actions, clipped in all steps of a run that clones: at ±1 the density of a
     /// squashed Gaussian has no limit.
-    fn actions(&self, batch: &Minibatch) -> Result<Tensor> {
+    fn actions(&self, batch: &Batch) -> Result<Tensor> {
         match self.config.phases.cloning {
             0 => batch.actions.clamp(-1.0, 1.0),
             _ => batch.actions.clamp(-0.999, 0.999),
@@ -203,54 +181,51 @@ impl Cql {
 
     /// y = r + γ·mask·max_a' min_k Q̂_k(s', a') over the actions drawn with this noise, `[B, S,
     /// a]`; `[B]`.
-    fn targets(&self, batch: &Minibatch, next: &Normal, noise: &Tensor) -> Result<Tensor> {
+    fn targets(&self, batch: &Batch, next: &Normal, noise: &Tensor) -> Result<Tensor> {
         let actions = next.draw(noise)?.actions;
-        let critics = &self.networks.critic.target;
-        let q = smallest(&batch.next_values(critics, &actions.flatten(0, 1)?)?)?;
+        let q = smallest(&batch.next_values(&self.critic.target, &actions.flatten(0, 1)?)?)?;
         let best = largest(&q.reshape(((), *self.config.samples))?, 1)?;
         batch.target(*self.config.gamma, &best)
     }
 
     /// Q_k(s, a) of the data's actions, and log Σ exp Q_k(s, ·) − Q_k(s, a): Eq. 4 with the sum
     /// over uniform actions and those of the policy at s and s', all at s, each divided by its
-    /// density (appendix F); `[K, B]` each. The policy's actions count as worth at least the `returns`
-    /// (Cal-QL).
+    /// density (appendix F); `[K, B]` each. The policy's actions count as worth at least the returns, in
+    /// a run with online steps (Cal-QL).
     fn gaps(
         &self,
-        batch: &Minibatch,
-        returns: Option<&Tensor>,
+        batch: &Batch,
         [current, next]: [&Normal; 2],
         noise: &Noise,
     ) -> Result<(Tensor, Tensor)> {
         let (b, n, a) = noise.uniform.dims3()?;
         let [next, current] = [next.draw(&noise.next)?, current.draw(&noise.current)?];
         // [B, 1 + 3N, a]: one pass through the critics for all.
-        let of_data = self.actions(batch)?.unsqueeze(1)?;
-        let actions = [&of_data, &noise.uniform, &next.actions, &current.actions];
+        let data = self.actions(batch)?.unsqueeze(1)?;
+        let actions = [&data, &noise.uniform, &next.actions, &current.actions];
         let actions = Tensor::cat(&actions, 1)?.flatten(0, 1)?;
-        let q = batch.values_at(&self.networks.critic, &actions)?;
+        let q = batch.values_at(&self.critic, &actions)?;
         let q = q.reshape((TWIN, b, 1 + 3 * n))?;
-        let of_data = q.narrow(2, 0, 1)?.squeeze(2)?;
+        let data = q.narrow(2, 0, 1)?.squeeze(2)?;
         let uniform = Tensor::full(-(a as f32) * 2f32.ln(), (b, n), q.device())?;
         let densities = Tensor::cat(&[&uniform, &next.log_density, &current.log_density], 1)?;
-        let mut others = q.narrow(2, 1, 3 * n)?;
-        if let Some(returns) = returns {
-            let of_policy = others.narrow(2, n, 2 * n)?;
-            let bounded = of_policy.broadcast_maximum(&returns.reshape((1, b, 1))?)?;
-            others = Tensor::cat(&[&others.narrow(2, 0, n)?, &bounded], 2)?;
+        let mut sampled = q.narrow(2, 1, 3 * n)?;
+        if let Some(returns) = &batch.returns {
+            let policy = sampled.narrow(2, n, 2 * n)?;
+            let bounded = policy.broadcast_maximum(&returns.reshape((1, b, 1))?)?;
+            sampled = Tensor::cat(&[&sampled.narrow(2, 0, n)?, &bounded], 2)?;
         }
-        let corrected = others.broadcast_sub(&densities)?;
+        let corrected = sampled.broadcast_sub(&densities)?;
         let least = self.config.least_gap.map_or(f32::NEG_INFINITY, |least| *least);
-        let gaps = (log_sum_exp(&corrected)? - &of_data)?.maximum(least)?;
-        Ok((of_data, gaps))
+        let gaps = (log_sum_exp(&corrected)? - &data)?.maximum(least)?;
+        Ok((data, gaps))
     }
 
     /// The weight of the gap in the critics' loss, α·α' with a threshold, else α; and α'. Moves α'
     /// up a gap above the threshold (dual gradient ascent, appendix).
     fn gap_weight(&mut self, gap: &Tensor, adam: AdamStep) -> Result<(Tensor, Option<Tensor>)> {
         let weight = f64::from(*self.config.weight);
-        let (Some(learned), Some(threshold)) =
-            (&mut self.networks.log_alpha_prime, self.config.threshold)
+        let (Some(learned), Some(threshold)) = (&mut self.log_alpha_prime, self.config.threshold)
         else {
             return Ok(((gap.ones_like()? * weight)?, None));
         };
@@ -271,51 +246,42 @@ fn log_sum_exp(x: &Tensor) -> Result<Tensor> {
 
 impl Algorithm for Cql {
     /// All losses are those of the networks before the update.
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        if let Some(returns) = &mut self.returns {
-            returns.follow(&self.context.transitions);
-        }
-        let (whole, noise) = (self.batch(indices)?, self.noise(step)?);
-        let batch = &whole.0;
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
         let slow = AdamStep::after(step, *self.config.actor_learning_rate);
         let fast = AdamStep::after(step, *self.config.critic_learning_rate);
-        let actor = &self.networks.actor;
-        let current = actor.distribution(&batch.observations)?;
-        let next = actor.constant_distribution(&batch.next_observations)?;
+        let current = self.actor.distribution(&batch.observations)?;
+        let next = self.actor.constant_distribution(&batch.next_observations)?;
         let (actor_loss, log_density) = self.actor_loss(step, batch, &current, &noise)?;
-        self.networks.actor.minimize(&actor_loss.value, slow)?;
+        self.actor.minimize(&actor_loss.value, slow)?;
         // α holds the entropy at −(dimensions of an action).
         let excess = (log_density - self.context.action_dim() as f64)?;
-        let log_alpha = &mut self.networks.log_alpha;
-        let alpha_loss = (log_alpha.values().sum_all()? * excess)?.neg()?;
-        log_alpha.minimize(&alpha_loss, slow)?;
+        let alpha_loss = (self.log_alpha.values().sum_all()? * excess)?.neg()?;
+        self.log_alpha.minimize(&alpha_loss, slow)?;
 
-        let (critic_loss, gap) = self.critic_loss(&whole, &current.detach(), &next, &noise)?;
+        let (critic_loss, gap) = self.critic_loss(batch, &current.detach(), &next, &noise)?;
         let (weight, alpha_prime) = self.gap_weight(&gap.detach(), fast)?;
         let conservative = ((gap * weight)? * TWIN as f64)?;
-        let critic = &mut self.networks.critic;
-        critic.minimize(&(&critic_loss.value + conservative)?, fast)?;
-        critic.soft_update(*self.config.ema_rate)?;
+        self.critic.minimize(&(&critic_loss.value + conservative)?, fast)?;
+        self.critic.soft_update(*self.config.ema_rate)?;
         measured(&[actor_loss, critic_loss.with("alpha_prime", alpha_prime)])
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (whole, noise) = (self.batch(indices)?, self.noise(step)?);
-        let batch = &whole.0;
-        let actor = &self.networks.actor;
-        let current = actor.constant_distribution(&batch.observations)?;
-        let next = actor.constant_distribution(&batch.next_observations)?;
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
+        let current = self.actor.constant_distribution(&batch.observations)?;
+        let next = self.actor.constant_distribution(&batch.next_observations)?;
         let (actor_loss, _) = self.actor_loss(step, batch, &current, &noise)?;
-        let (critic_loss, _) = self.critic_loss(&whole, &current, &next, &noise)?;
+        let (critic_loss, _) = self.critic_loss(batch, &current, &next, &noise)?;
         measured(&[actor_loss, critic_loss])
     }
 
     /// Acts by the tanh of the mean.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        self.networks.actor.policy()
+        self.actor.policy()
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

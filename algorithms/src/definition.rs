@@ -2,19 +2,18 @@
 //! of it.
 
 use std::collections::BTreeMap;
-use std::fmt;
-use std::ops::Deref;
-use std::sync::Arc;
 
+use quad_dataset::Window;
 use quad_policy::Chunk;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize, Serializer};
-use toml::Table;
+use toml::{Table, Value};
 
-use super::algorithm::Algorithm;
-use super::chunk;
+use super::agent::Algorithm;
 use super::context::Context;
-use super::error::{AgentError, AlgorithmError};
+use super::error::{AgentError, AlgorithmError, check};
+use super::examples::Columns;
+use super::hyperparameters::Count;
 
 /// An algorithm before it runs.
 #[derive(Clone, Copy)]
@@ -25,8 +24,14 @@ pub struct Definition {
     pub presets: &'static str,
     /// The metrics of its updates; some are measured in one phase only.
     pub metrics: &'static [Metric],
-    /// Texts of reports about its runs, beside scores.
-    pub report: Reporting,
+    /// The hyper-parameter that tells its variants apart, if it has any.
+    pub variant: Option<Variant>,
+    /// The hyper-parameter over which its paper draws scores.
+    pub axis: Option<Axis>,
+    /// The hyper-parameter with the step after which the target actor moves, where that acts.
+    pub acts_after: Option<&'static str>,
+    /// Summary of a run's metrics.
+    pub summary: Option<Summarize>,
     /// True if it can learn chunks of actions (`agent.chunk`) from several observations
     /// (`agent.history`).
     pub chunks: bool,
@@ -36,32 +41,89 @@ pub struct Definition {
 }
 
 impl Definition {
-    /// Reads an `[agent]` table: the chunk, and all else as the algorithm does.
-    fn start(&self, table: &Table) -> Result<(Chunk, Start), AgentError> {
+    /// An algorithm that learns single actions, with neither variants nor figures of its own.
+    pub const PLAIN: Self = Self {
+        name: "",
+        presets: "",
+        metrics: &[],
+        variant: None,
+        axis: None,
+        acts_after: None,
+        summary: None,
+        chunks: false,
+        read: |_| unreachable!("an algorithm reads its own table"),
+    };
+
+    /// Checks an `[agent]` table.
+    ///
+    /// # Errors
+    /// A key is missing, unknown, of the wrong type or out of range.
+    pub fn check(&self, table: &Table) -> Result<(), AgentError> {
+        self.read(table).map(drop)
+    }
+
+    /// Reads an `[agent]` table: the chunk and its windows, and all else as the algorithm does.
+    pub(super) fn read(&self, table: &Table) -> Result<(Chunk, Window, Start), AgentError> {
         let mut own = table.clone();
-        let (chunk, window) = chunk::take(&mut own)?;
+        let (chunk, window) = take_chunk(&mut own)?;
         if (chunk.length > 1 || chunk.history > 1) && !self.chunks {
             return Err(AgentError::NoChunks(self.name));
         }
-        let start = (self.read)(&own)?;
-        Ok((chunk, Arc::new(move |context| start(Context { window, ..context }))))
+        Ok((chunk, window, (self.read)(&own)?))
     }
 }
 
-/// Makes an algorithm at step 0 with hyper-parameters that were read before.
-pub type Start = Arc<dyn Fn(Context) -> Result<Box<dyn Algorithm>, AlgorithmError> + Send + Sync>;
+/// The keys of an `[agent]` table of a chunk: the actions of several steps in a row, which an
+/// algorithm learns as one action (Li, Zhou and Levine 2025, "Reinforcement Learning with Action
+/// Chunking"), in view of the last observations.
+///
+/// Batches have windows of steps in place of transitions, and nothing else of an algorithm changes:
+/// its networks know a chunk as one long action and a history as one long observation, its targets
+/// discount what follows a window by the steps in it, and what it predicts for actions beyond the end
+/// of an episode is not learned ([`Batch`](super::Batch)).
+#[derive(Deserialize)]
+struct ChunkKeys {
+    /// Steps h of a chunk; 1 if absent.
+    chunk: Option<Count>,
+    /// Steps that are executed of a chunk; all if absent.
+    replan: Option<Count>,
+    /// Observations that are seen at a time; 1 if absent.
+    history: Option<Count>,
+}
 
-/// Makes a [`Start`] of hyper-parameters and a constructor.
-pub(super) fn start<C, A, E>(
+/// Takes these keys from an `[agent]` table: the chunk, and the windows of steps to learn it from.
+fn take_chunk(table: &mut Table) -> Result<(Chunk, Window), AgentError> {
+    let keys = ChunkKeys::deserialize(table.clone())?;
+    let length = keys.chunk.map_or(1, |length| *length);
+    let replan = keys.replan.map_or(length, |replan| *replan);
+    check("replan", replan, replan <= length, "at most agent.chunk (--agent replan=K changes it)")?;
+    let history = keys.history.map_or(1, |history| *history);
+    for key in ["chunk", "replan", "history"] {
+        table.remove(key);
+    }
+    let number = |value: &Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
+    let gamma = table.get("gamma").and_then(number).unwrap_or(1.0) as f32;
+    Ok((Chunk { history, length, replan }, Window { history, length, gamma }))
+}
+
+/// Makes an algorithm at step 0 with hyper-parameters that were read before.
+pub struct Start {
+    /// What it asks of batches.
+    pub columns: Columns,
+    /// Its constructor.
+    pub new: Box<dyn FnOnce(Context) -> Result<Box<dyn Algorithm>, AlgorithmError>>,
+}
+
+/// A [`Start`] with plain batches from hyper-parameters and a constructor.
+pub(super) fn start<C: 'static, A: Algorithm + 'static, E>(
     config: C,
-    new: impl Fn(C, Context) -> Result<A, E> + Send + Sync + 'static,
+    new: impl FnOnce(C, Context) -> Result<A, E> + 'static,
 ) -> Start
 where
-    C: Clone + Send + Sync + 'static,
-    A: Algorithm + 'static,
     AlgorithmError: From<E>,
 {
-    Arc::new(move |context| Ok(Box::new(new(config.clone(), context)?)))
+    let new = |context| -> Result<Box<dyn Algorithm>, _> { Ok(Box::new(new(config, context)?)) };
+    Start { columns: Columns::Plain, new: Box::new(new) }
 }
 
 /// Reads a table of hyper-parameters, whose types check their ranges.
@@ -76,74 +138,6 @@ pub(super) fn read_with<C: DeserializeOwned, T: DeserializeOwned>(
 ) -> Result<T, AgentError> {
     read::<C>(table)?;
     read(table)
-}
-
-/// The hyper-parameters of an algorithm: the `[agent]` table of an experiment and, once it was
-/// checked, the same as the algorithm's own type.
-#[derive(Clone, Serialize, Deserialize)]
-#[serde(transparent)]
-pub struct Hyperparameters {
-    table: Table,
-    #[serde(skip)]
-    start: Option<(Chunk, Start)>,
-}
-
-impl Hyperparameters {
-    /// Reads a table for an algorithm.
-    ///
-    /// # Errors
-    /// A key is missing, unknown, of the wrong type or out of range.
-    pub fn new(definition: &Definition, table: Table) -> Result<Self, AgentError> {
-        Ok(Self { start: Some(definition.start(&table)?), table })
-    }
-
-    /// A copy of the table.
-    pub fn to_table(&self) -> Table {
-        self.table.clone()
-    }
-
-    /// The algorithm at step 0, and the chunk that its policy knows as one action. A table that comes
-    /// from a run's folder is read here.
-    ///
-    /// # Errors
-    /// The table cannot be used, the data has no examples for the algorithm, or candle fails.
-    pub fn start(
-        &self,
-        definition: &Definition,
-        context: Context,
-    ) -> Result<(Chunk, Box<dyn Algorithm>), AlgorithmError> {
-        let (chunk, start) = match &self.start {
-            Some(start) => start.clone(),
-            None => definition.start(&self.table)?,
-        };
-        Ok((chunk, start(context)?))
-    }
-}
-
-impl Deref for Hyperparameters {
-    type Target = Table;
-
-    fn deref(&self) -> &Table {
-        &self.table
-    }
-}
-
-impl From<Table> for Hyperparameters {
-    fn from(table: Table) -> Self {
-        Self { table, start: None }
-    }
-}
-
-impl PartialEq for Hyperparameters {
-    fn eq(&self, other: &Self) -> bool {
-        self.table == other.table
-    }
-}
-
-impl fmt::Debug for Hyperparameters {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.table.fmt(f)
-    }
 }
 
 /// A number that an update measures. Gauges, `metrics.jsonl`, the progress display and `learner
@@ -175,24 +169,6 @@ macro_rules! metrics {
     };
 }
 pub(crate) use metrics;
-
-/// Texts of reports about an algorithm's runs, beside scores.
-#[derive(Clone, Copy)]
-pub struct Reporting {
-    /// The hyper-parameter that tells its variants apart, if it has any.
-    pub variant: Option<Variant>,
-    /// The hyper-parameter over which its paper draws scores.
-    pub axis: Option<Axis>,
-    /// The hyper-parameter with the step after which the target actor moves, where that acts.
-    pub acts_after: Option<&'static str>,
-    /// Summary of a run's metrics.
-    pub summary: Option<Summarize>,
-}
-
-impl Reporting {
-    /// For an algorithm with neither variants nor figures of its own.
-    pub const PLAIN: Self = Self { variant: None, axis: None, acts_after: None, summary: None };
-}
 
 /// The hyper-parameter that tells an algorithm's variants apart.
 #[derive(Clone, Copy)]

@@ -4,24 +4,29 @@
 //! policy plans. Equations are that paper's; where its authors' code does otherwise,
 //! docs/deviations.md says so.
 
-mod windows;
-
+use super::batch::asked;
+use super::examples::Plans;
 use super::prelude::*;
-use candle_nn::loss::mse;
 use quad_nn::{
-    Layout, Reverse, Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, Weights,
+    Layout, Reverse, Scaling, Schedule, TrajectoryConfig, TrajectoryModel, TrajectoryValue, Weights,
 };
 use quad_policy::{DiffuserPolicy, DiffuserShape, ValueGuidance, with_first_state};
 use rand::Rng;
-use windows::{Batch, Windows};
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "diffuser",
     presets: include_str!("../../presets/diffuser.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
-    read: |table| Ok(start(Config::read(table)?, Diffuser::new)),
+    read: |table| {
+        let config = Config::read(table)?;
+        let plans = Plans {
+            horizon: config.network.horizon,
+            gamma: *config.gamma,
+            terminal_penalty: *config.terminal_penalty,
+        };
+        Ok(Start { columns: Columns::Plans(plans), ..start(config, Diffuser::new) })
+    },
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -103,26 +108,26 @@ fn with_target<N: Weighted>(
 struct Diffuser {
     config: Config,
     context: Context,
-    windows: Windows,
     schedule: Schedule,
+    /// Units of the plans.
+    units: Scaling,
     /// Weights of the model's loss, `[H, a + o]`.
     loss_weights: Tensor,
     networks: Networks,
 }
 
 impl Diffuser {
-    fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
+    fn new(config: Config, context: Context) -> Result<Self> {
         let (o, a) = (context.observation_dim(), context.action_dim());
         let horizon = config.network.horizon;
-        let windows = Windows::new(&context, horizon, *config.gamma, *config.terminal_penalty)?;
         let mut weights = vec![1.0; horizon * (a + o)];
         weights[..a].fill(*config.first_action_weight);
         weights[a..a + o].fill(0.0);
         Ok(Self {
+            units: context.transitions.standard_units(),
             schedule: Schedule::new(*config.diffusion_steps, Reverse::Cosine),
             loss_weights: Tensor::from_vec(weights, (horizon, a + o), &context.device)?,
             networks: Networks::new(&config.network, &mut Initializer::new(&context))?,
-            windows,
             config,
             context,
         })
@@ -130,65 +135,61 @@ impl Diffuser {
 
     /// The losses of the model and, as long as it learns, of the value network, on the same noisy
     /// windows.
-    fn losses(&self, step: u64, indices: &[u32]) -> Result<Vec<Loss>> {
-        let batch = self.windows.batch(indices, &self.context)?;
+    fn losses(&self, step: u64, batch: &Batch) -> Result<Vec<Loss>> {
+        let plans = asked(&batch.plans)?;
         let mut random = self.context.random(step);
-        let epsilon = random.normal("epsilon", batch.windows.shape())?;
+        let epsilon = random.normal("epsilon", plans.shape())?;
         let most = *self.config.diffusion_steps as u32;
         let t = random.vector("t", |generator| {
-            Ok((0..self.context.batch_size).map(|_| generator.random_range(1..=most)).collect())
+            Ok((0..batch.size()).map(|_| generator.random_range(1..=most)).collect())
         })?;
-        let noisy = self.noisy(&batch.windows, &t, &epsilon)?;
-        let mut losses = vec![self.model_loss(&batch, &noisy, &t)?];
+        let noisy = self.noisy(plans, &t, &epsilon)?;
+        let mut losses = vec![self.model_loss(batch, &noisy, &t)?];
         if step < *self.config.value_updates {
-            losses.push(self.value_loss(&batch, &noisy, &t)?);
+            losses.push(self.value_loss(batch, &noisy, &t)?);
         }
         Ok(losses)
     }
 
     /// xᵗ = √ᾱ_t·x⁰ + √(1 − ᾱ_t)·ε, `[B, H, a + o]`, but for the first state, which stays as it
     /// is.
-    fn noisy(&self, windows: &Tensor, t: &[u32], epsilon: &Tensor) -> Result<Tensor> {
-        let (signal, deviation) = self.schedule.noising(t, 1, windows.device())?;
-        let noisy = (windows.broadcast_mul(&signal.unsqueeze(2)?)?
+    fn noisy(&self, plans: &Tensor, t: &[u32], epsilon: &Tensor) -> Result<Tensor> {
+        let (signal, deviation) = self.schedule.noising(t, 1, plans.device())?;
+        let noisy = (plans.broadcast_mul(&signal.unsqueeze(2)?)?
             + epsilon.broadcast_mul(&deviation.unsqueeze(2)?)?)?;
         let (a, o) = (self.context.action_dim(), self.context.observation_dim());
-        let first = windows.narrow(1, 0, 1)?.squeeze(1)?;
+        let first = plans.narrow(1, 0, 1)?.squeeze(1)?;
         with_first_state(&noisy, &first.narrow(1, a, o)?)
     }
 
     /// The model toward the clean window, the first action above all.
     fn model_loss(&self, batch: &Batch, noisy: &Tensor, t: &[u32]) -> Result<Loss> {
-        let error = (self.networks.model.clean(noisy, t)? - &batch.windows)?.sqr()?;
+        let error = (self.networks.model.clean(noisy, t)? - asked(&batch.plans)?)?.sqr()?;
         let loss = error.broadcast_mul(&self.loss_weights)?.mean_all()?;
         let a = self.context.action_dim();
         let first_action = error.narrow(1, 0, 1)?.narrow(2, 0, a)?.mean_all()?;
         Ok(Loss::new("model_loss", loss)
             .with("first_action_loss", first_action)
-            .with("return_mean", batch.returns.mean_all()?))
+            .with("return_mean", asked(&batch.returns)?.mean_all()?))
     }
 
     /// The value network toward the return.
     fn value_loss(&self, batch: &Batch, noisy: &Tensor, t: &[u32]) -> Result<Loss> {
         let values = self.networks.value.values(noisy, t)?;
-        let loss = Loss::new("value_loss", mse(&values, &batch.returns)?);
+        let loss = Loss::new("value_loss", squared_error(&values, asked(&batch.returns)?)?);
         Ok(loss.with("value_mean", values.mean_all()?))
     }
 }
 
 impl Algorithm for Diffuser {
-    fn dataset_len(&self, _: usize) -> usize {
-        self.windows.count()
-    }
-
     fn phases(&self) -> Vec<u64> {
         let ends = Some(*self.config.value_updates).filter(|ends| *ends < self.context.total_steps);
         [0].into_iter().chain(ends).collect()
     }
 
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
         let adam = AdamStep::after(step, *self.config.learning_rate);
-        let losses = self.losses(step, indices)?;
+        let losses = self.losses(step, batch)?;
         let follows = step.is_multiple_of(*self.config.ema_every);
         let rate = if step < self.config.ema_start { 1.0 } else { *self.config.ema_rate };
         let Networks { model, value } = &mut self.networks;
@@ -205,8 +206,8 @@ impl Algorithm for Diffuser {
         measured(&losses)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        measured(&self.losses(step, indices)?)
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        measured(&self.losses(step, batch)?)
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
@@ -217,7 +218,7 @@ impl Algorithm for Diffuser {
             diffusion_steps: *self.config.diffusion_steps,
             guidance: self.config.guidance,
             replan_every: *self.config.replan_every,
-            units: self.windows.units().clone(),
+            units: self.units.clone(),
         };
         let Networks { model, value } = &self.networks;
         let tensors = DiffuserPolicy::tensors(&model.target, &value.target)?;

@@ -1,12 +1,10 @@
 //! Training of a diffusion policy with critics. An algorithm of this kind is a [`DiffusionUpdate`].
 
-use super::denoising::Denoising;
-use super::inputs::Inputs;
 use super::losses::Computed;
 use super::prelude::*;
 use super::random::Random;
-use super::replay::Replay;
-use quad_nn::NoisePredictor;
+use super::replay::{Inputs, Replay};
+use quad_nn::{NoisePredictor, Schedule};
 use quad_policy::DiffusionShape;
 use rand::Rng;
 
@@ -30,7 +28,7 @@ pub(super) fn noise_predictor(
 
 impl Networks {
     /// Actions of the target actor in the next states, `[B·S, a]`.
-    pub fn sample_next(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
+    pub fn sample_next(&self, batch: &Batch, noise: &Tensor) -> Result<Tensor> {
         self.actor.target.sample(&batch.next_observations, noise)
     }
 }
@@ -39,12 +37,50 @@ impl Networks {
 /// beyond the end of their episode, the noise itself.
 pub(super) fn denoise(
     actor: &NoisePredictor,
-    batch: &Minibatch,
+    batch: &Batch,
     noise: &Denoising,
 ) -> Result<(Tensor, Tensor)> {
     let noisy = noise.noisy(&batch.actions)?;
     let predicted = actor.predict(&batch.observations, &noisy, &noise.t)?;
     Ok((noisy, batch.within_episodes(predicted, &noise.epsilon)?))
+}
+
+/// Denoising steps and noise for the actions of a batch.
+#[derive(Clone)]
+pub(super) struct Denoising {
+    /// t in 1..=T, `[B]`.
+    pub t: Tensor,
+    /// ε, `[B, a]`.
+    pub epsilon: Tensor,
+    /// √ᾱ_t, in all columns of a row, `[B, a]`.
+    signal: Tensor,
+    /// √(1 − ᾱ_t), `[B, a]`.
+    pub deviation: Tensor,
+}
+
+impl Inputs for Denoising {
+    fn tensors(&mut self) -> Vec<&mut Tensor> {
+        vec![&mut self.t, &mut self.epsilon, &mut self.signal, &mut self.deviation]
+    }
+}
+
+impl Denoising {
+    pub fn new(t: &[u32], epsilon: Tensor, schedule: &Schedule) -> Result<Self> {
+        let (signal, deviation) = schedule.noising(t, epsilon.dim(1)?, epsilon.device())?;
+        let t = Tensor::new(t, epsilon.device())?;
+        Ok(Self { t, epsilon, signal, deviation })
+    }
+
+    /// √ᾱ_t·a + √(1 − ᾱ_t)·ε of actions a, all `[B, a]`.
+    pub fn noisy(&self, actions: &Tensor) -> Result<Tensor> {
+        (actions * &self.signal)? + (&self.epsilon * &self.deviation)?
+    }
+
+    /// The estimate of the clean actions in noisy ones, given a predicted noise ε: (a^t − √(1 −
+    /// ᾱ_t)·ε)/√ᾱ_t, clipped to ±1, all `[B, a]`.
+    pub fn clean(&self, noisy: &Tensor, predicted: &Tensor) -> Result<Tensor> {
+        ((noisy - (predicted * &self.deviation)?)? / &self.signal)?.clamp(-1f32, 1f32)
+    }
 }
 
 /// Draws the random numbers of a diffusion policy, on the CPU.
@@ -59,17 +95,16 @@ impl Sampler<'_> {
     /// The noise of S sampled actions for each state of a batch, `[T, B·S, a]`: a^T, then that of
     /// the reverse steps from t = T down to 2.
     pub fn chain(&mut self, name: &str, samples: usize) -> Result<Tensor> {
-        let DiffusionShape { diffusion_steps, action_dim, .. } = *self.shape;
-        self.random.normal(name, (diffusion_steps, self.batch_size * samples, action_dim))
+        let (steps, a) = (self.shape.diffusion_steps, self.shape.action_dim);
+        self.random.normal(name, (steps, self.batch_size * samples, a))
     }
 
     /// Uniform t, and ε, for the actions of a batch.
     pub fn denoising(&mut self) -> Result<Denoising> {
-        let DiffusionShape { diffusion_steps, action_dim, .. } = *self.shape;
-        let epsilon = self.random.normal("epsilon", (self.batch_size, action_dim))?;
+        let (b, steps) = (self.batch_size, self.shape.diffusion_steps as u32);
+        let epsilon = self.random.normal("epsilon", (b, self.shape.action_dim))?;
         let t = self.random.vector("t", |generator| {
-            let mut draw = || generator.random_range(1..=diffusion_steps as u32);
-            Ok((0..self.batch_size).map(|_| draw()).collect())
+            Ok((0..b).map(|_| generator.random_range(1..=steps)).collect())
         })?;
         Denoising::new(&t, epsilon, self.actor.schedule())
     }
@@ -89,7 +124,7 @@ pub(super) trait DiffusionUpdate: Send {
     fn update(
         &mut self,
         networks: &mut Networks,
-        batch: &Minibatch,
+        batch: &Batch,
         noise: &Self::Noise,
     ) -> Result<Vec<Loss>>;
 
@@ -98,12 +133,7 @@ pub(super) trait DiffusionUpdate: Send {
     }
 
     /// The losses that [`Self::update`] descends, without a step.
-    fn losses(
-        &self,
-        networks: &Networks,
-        batch: &Minibatch,
-        noise: &Self::Noise,
-    ) -> Result<Vec<Loss>>;
+    fn losses(&self, networks: &Networks, batch: &Batch, noise: &Self::Noise) -> Result<Vec<Loss>>;
 
     /// Metrics that are computed on the CPU, from the noise and the losses' other tensors.
     fn measure(&self, _: &Networks, _: &Self::Noise, _others: &[f32]) -> Result<Measured> {
@@ -124,7 +154,7 @@ pub(super) struct Diffusion<U: DiffusionUpdate> {
     shape: DiffusionShape,
     update: U,
     networks: Networks,
-    replay: Replay<(Minibatch, U::Noise)>,
+    replay: Replay<(Batch, U::Noise)>,
     /// The next step and its noise, if a GPU left the time to draw it.
     next: Option<(u64, U::Noise)>,
 }
@@ -144,40 +174,44 @@ impl<U: DiffusionUpdate> Diffusion<U> {
         Ok(Self { context, shape, update, networks, replay: Replay::default(), next: None })
     }
 
-    fn noise(&self, step: u64) -> Result<U::Noise> {
+    fn noise(&self, step: u64, batch_size: usize) -> Result<U::Noise> {
         let random = Random { device: Device::Cpu, ..self.context.random(step) };
-        let (batch_size, actor) = (self.context.batch_size, &self.networks.actor);
+        let actor = &self.networks.actor;
         self.update.noise(Sampler { random, batch_size, shape: &self.shape, actor })
     }
 }
 
 impl<U: DiffusionUpdate> Algorithm for Diffusion<U> {
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+    fn copies_batches(&self) -> bool {
+        true
+    }
+
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
         let noise = match self.next.take() {
-            Some((of, noise)) if of == step => noise,
-            _ => self.noise(step)?,
+            Some((next, noise)) if next == step => noise,
+            _ => self.noise(step, batch.size())?,
         };
-        let inputs = (self.context.batch_on(indices, &Device::Cpu)?, noise);
-        let Self { update, networks, replay, context, .. } = self;
-        update.begin(networks, step, context)?;
-        replay.start(&context.device, &inputs, |(batch, noise)| {
+        let inputs = (batch.clone(), noise);
+        let (update, networks) = (&mut self.update, &mut self.networks);
+        update.begin(networks, step, &self.context)?;
+        self.replay.start(&self.context.device, &inputs, |(batch, noise)| {
             update.update(networks, batch, noise)
         })?;
         update.end(networks, step)?;
-        if context.device.is_cuda() {
-            self.next = Some((step + 1, self.noise(step + 1)?));
+        if self.context.device.is_cuda() {
+            self.next = Some((step + 1, self.noise(step + 1, batch.size())?));
         }
         let (mut measured, others) = self.replay.computed()?;
         measured.extend(self.update.measure(&self.networks, &inputs.1, &others)?);
         Ok(measured)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let Self { update, networks, .. } = self;
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
-        let losses = update.losses(networks, &batch, &noise.on(&self.context.device)?)?;
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
+        let on_device = noise.on(&self.context.device)?;
+        let losses = self.update.losses(&self.networks, batch, &on_device)?;
         let (mut measured, others) = Computed::new(&losses)?.read()?;
-        measured.extend(update.measure(networks, &noise, &others)?);
+        measured.extend(self.update.measure(&self.networks, &noise, &others)?);
         Ok(measured)
     }
 

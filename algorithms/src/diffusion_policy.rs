@@ -4,7 +4,6 @@
 
 use super::diffusion::{Sampler, denoise, noise_predictor};
 use super::prelude::*;
-use candle_nn::loss::mse;
 use quad_nn::{NoisePredictor, Reverse};
 use quad_policy::{DiffusionPolicy, DiffusionShape};
 
@@ -12,9 +11,9 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "diffusion-policy",
     presets: include_str!("../../presets/diffusion-policy.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Cloning::new)),
+    ..Definition::PLAIN
 };
 
 /// The EMA's rate after n updates is n^−`EMA_POWER`, and at least `LEAST_EMA_RATE`.
@@ -69,14 +68,13 @@ impl Cloning {
     }
 
     /// Copies of an episode's last action are learned, too: they may be executed.
-    fn loss(&self, step: u64, indices: &[u32]) -> Result<Loss> {
-        let batch = Minibatch { within: None, ..self.context.batch(indices)? };
-        let actor = &self.networks.actor;
-        let random = self.context.random(step);
-        let noise =
-            Sampler { random, batch_size: indices.len(), shape: &self.shape, actor }.denoising()?;
+    fn loss(&self, step: u64, batch: &Batch) -> Result<Loss> {
+        let batch = Batch { within: None, ..batch.clone() };
+        let (random, batch_size) = (self.context.random(step), batch.size());
+        let (actor, shape) = (&self.networks.actor, &self.shape);
+        let noise = Sampler { random, batch_size, shape, actor }.denoising()?;
         let (_, predicted) = denoise(actor, &batch, &noise)?;
-        Ok(Loss::new("bc_loss", mse(&predicted, &noise.epsilon)?))
+        Ok(Loss::new("bc_loss", squared_error(&predicted, &noise.epsilon)?))
     }
 
     fn learning_rate(&self, step: u64) -> f32 {
@@ -90,8 +88,8 @@ impl Cloning {
 }
 
 impl Algorithm for Cloning {
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (loss, rate) = (self.loss(step, indices)?, self.learning_rate(step));
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let (loss, rate) = (self.loss(step, batch)?, self.learning_rate(step));
         let actor = &mut self.networks.actor;
         actor.minimize(&loss.value, AdamStep::after(step, rate))?;
         let ema_rate = (step.max(1) as f32).powf(-EMA_POWER);
@@ -101,8 +99,8 @@ impl Algorithm for Cloning {
         Ok(measured)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        measured(&[self.loss(step, indices)?])
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        measured(&[self.loss(step, batch)?])
     }
 
     /// The EMA's chunks as they are drawn.

@@ -3,11 +3,9 @@
 //! toward actions of large Q, by the gradient through its whole reverse chain. Equations are that
 //! paper's; where its authors' code does otherwise, docs/deviations.md says so.
 
-use super::denoising::Denoising;
-use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
-use super::inputs::Inputs;
+use super::diffusion::{Denoising, Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
 use super::prelude::*;
-use candle_nn::loss::mse;
+use super::replay::Inputs;
 use quad_nn::Reverse;
 use quad_policy::{DiffusionPolicy, DiffusionShape};
 use rand::Rng;
@@ -17,9 +15,8 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "dql",
     presets: include_str!("../../presets/dql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
     read: |table| Ok(start(read(table)?, Config::start)),
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -95,7 +92,7 @@ impl Config {
 
     /// y of Eq. 4, `[B]`: of several next actions each critic takes its best, then the smaller of
     /// the critics counts.
-    fn targets(&self, networks: &Networks, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
+    fn targets(&self, networks: &Networks, batch: &Batch, noise: &Tensor) -> Result<Tensor> {
         let next_actions = networks.sample_next(batch, noise)?;
         let q = batch.next_values(&networks.critic.target, &next_actions)?;
         let best = largest(&q.reshape((TWIN, (), *self.samples))?, 2)?;
@@ -103,16 +100,16 @@ impl Config {
     }
 
     /// Q(s, a) toward r + γ·min_k Q̂_k(s', a'), Eq. 4.
-    fn critic_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+    fn critic_loss(&self, networks: &Networks, batch: &Batch, noise: &Noise) -> Result<Loss> {
         let targets = self.targets(networks, batch, &noise.next)?;
         let error = batch.squared_error(&networks.critic, &targets)?;
-        Loss::of_critics((error * TWIN as f64)?, &targets)
+        Loss::critics((error * TWIN as f64)?, &targets)
     }
 
     /// The policy: cloned, Eq. 2, and moved toward what the critics value, Eq. 3.
-    fn actor_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+    fn actor_loss(&self, networks: &Networks, batch: &Batch, noise: &Noise) -> Result<Loss> {
         let (_, predicted) = denoise(&networks.actor, batch, &noise.denoising)?;
-        let bc_loss = mse(&predicted, &noise.denoising.epsilon)?;
+        let bc_loss = squared_error(&predicted, &noise.denoising.epsilon)?;
         let q_loss = q_loss(networks, batch, noise)?;
         let loss = (&bc_loss + (&q_loss * f64::from(*self.eta))?)?;
         Ok(Loss::new("actor_loss", loss).with("bc_loss", bc_loss).with("q_loss", q_loss))
@@ -121,7 +118,7 @@ impl Config {
 
 /// −E[Q_i(s, a⁰)]/E|Q_j(s, a⁰)| of actions from the whole chain, `[]`: the second term of Eq. 3,
 /// without η. Its gradient reaches the actor alone, and not by way of the divisor.
-fn q_loss(networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Tensor> {
+fn q_loss(networks: &Networks, batch: &Batch, noise: &Noise) -> Result<Tensor> {
     let actions = networks.actor.sample_with_gradient(&batch.observations, &noise.policy)?;
     let q = batch.values_at(&networks.critic.detach(), &actions)?;
     let q = q.index_select(&noise.raised, 0)?;
@@ -143,17 +140,16 @@ impl DiffusionUpdate for Config {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, _: &Context) -> Result<()> {
-        let Networks { actor, critic } = networks;
         let adam = |rate: f32| AdamStep::after(step, rate).clipped(*self.gradient_clip);
-        critic.adam.set_step(adam(*self.critic_learning_rate))?;
-        actor.adam.set_step(adam(*self.actor_learning_rate))
+        networks.critic.adam.set_step(adam(*self.critic_learning_rate))?;
+        networks.actor.adam.set_step(adam(*self.actor_learning_rate))
     }
 
     /// Algorithm 1's loop, but for the target actor.
     fn update(
         &mut self,
         networks: &mut Networks,
-        batch: &Minibatch,
+        batch: &Batch,
         noise: &Noise,
     ) -> Result<Vec<Loss>> {
         let critic_loss = self.critic_loss(networks, batch, noise)?;
@@ -167,7 +163,7 @@ impl DiffusionUpdate for Config {
         ])
     }
 
-    fn losses(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Vec<Loss>> {
+    fn losses(&self, networks: &Networks, batch: &Batch, noise: &Noise) -> Result<Vec<Loss>> {
         let critic_loss = self.critic_loss(networks, batch, noise)?;
         Ok(vec![critic_loss, self.actor_loss(networks, batch, noise)?])
     }
@@ -181,8 +177,8 @@ impl DiffusionUpdate for Config {
 
     /// The actor itself, not its EMA, which draws one of its candidates by the target critics' values.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let Networks { actor, critic } = networks;
-        let tensors = DiffusionPolicy::tensors(actor, Some(&critic.target), None)?;
+        let critics = Some(&networks.critic.target);
+        let tensors = DiffusionPolicy::tensors(&networks.actor, critics, None)?;
         let rule = Rule::softmax(*self.temperature);
         Ok((Choice::new(*self.candidates, Aggregate::Min, rule), tensors))
     }

@@ -16,9 +16,9 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "dtql",
     presets: include_str!("../../presets/dtql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Dtql::new)),
+    ..Definition::PLAIN
 };
 
 /// Divisor of the data's actions before atanh, which is infinite at ±1.
@@ -75,7 +75,7 @@ struct Phases {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Dtql(config: Config, init) {
         /// π_θ.
         actor: Squashed = Squashed::new(&config.actor, SquashedActor::LOG_STD, init),
         /// The policy chooses by the target critics when it acts.
@@ -119,26 +119,15 @@ struct Noise {
     trust: Noising,
 }
 
-struct Dtql {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Dtql {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
     /// The step at which π_θ begins to learn.
     fn pretraining(&self) -> u64 {
         let phases = self.config.phases;
         first_steps(self.context.total_steps, [phases.pretraining, phases.policy])[1]
     }
 
-    fn noise(&self, step: u64) -> Result<Noise> {
-        let shape = (self.context.batch_size, self.context.action_dim());
+    fn noise(&self, step: u64, b: usize) -> Result<Noise> {
+        let shape = (b, self.context.action_dim());
         let random = &mut self.context.random(step);
         Ok(Noise {
             cloning: Noising::draw(random, "bc", shape)?,
@@ -149,45 +138,42 @@ impl Dtql {
 
     /// V(s) toward an expectile of the smaller Q(s, a), and Q(s, a) toward r + γ·V(s'), both as
     /// they are before this step.
-    fn value_losses(&self, batch: &Minibatch) -> Result<[Loss; 2]> {
-        let Networks { critic, value, .. } = &self.networks;
-        let next = state_value(&value.detach(), &batch.next_observations)?;
+    fn value_losses(&self, batch: &Batch) -> Result<[Loss; 2]> {
+        let next = state_value(&self.value.detach(), &batch.next_observations)?;
         let targets = batch.target(*self.config.gamma, &next)?;
-        let q = batch.values(critic)?;
-        let v = state_value(value, &batch.observations)?;
+        let q = batch.values(&self.critic)?;
+        let v = state_value(&self.value, &batch.observations)?;
         let value_loss = expectile_loss(&(smallest(&q.detach())? - &v)?, *self.config.expectile)?;
         let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * TWIN as f64)?;
         Ok([
             Loss::new("value_loss", value_loss).with("v_mean", v.mean_all()?),
-            Loss::of_critics(critic_loss, &targets)?,
+            Loss::critics(critic_loss, &targets)?,
         ])
     }
 
     /// μ_φ toward the data's actions.
-    fn bc_loss(&self, batch: &Minibatch, noising: &Noising) -> Result<Loss> {
-        let diffusion = &self.networks.diffusion;
+    fn bc_loss(&self, batch: &Batch, noising: &Noising) -> Result<Loss> {
         let actions = &batch.actions;
         let learned = |clean| batch.within_episodes(clean, actions);
-        let loss = denoising_loss(diffusion, &batch.observations, actions, noising, learned)?;
+        let loss = denoising_loss(&self.diffusion, &batch.observations, actions, noising, learned)?;
         Ok(Loss::new("bc_loss", loss))
     }
 
     /// π_θ toward actions that the critics value and that μ_φ, which is fixed, denoises well.
-    fn actor_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
-        let Networks { actor, critic, diffusion, .. } = &self.networks;
-        let distribution = actor.distribution(&batch.observations)?;
+    fn actor_loss(&self, batch: &Batch, noise: &Noise) -> Result<Loss> {
+        let distribution = self.actor.distribution(&batch.observations)?;
         let drawn = distribution.draw(&noise.policy)?;
-        let (actions, diffusion) = (drawn.actions.squeeze(1)?, diffusion.detach());
+        let (actions, diffusion) = (drawn.actions.squeeze(1)?, self.diffusion.detach());
         let trust_loss =
             denoising_loss(&diffusion, &batch.observations, &actions, &noise.trust, Ok)?;
-        let q = batch.values_at(&critic.detach(), &actions)?;
+        let q = batch.values_at(&self.critic.detach(), &actions)?;
         let q_loss = smallest(&q)?.mean_all()?.neg()?;
         let mut loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         let (weight, mut likelihood) = (*self.config.likelihood, None);
         if weight > 0.0 {
-            let of_data = likelihood_loss(&distribution, batch)?;
-            loss = (loss + (&of_data * f64::from(weight))?)?;
-            likelihood = Some(of_data);
+            let likelihood_loss = likelihood_loss(&distribution, batch)?;
+            loss = (loss + (&likelihood_loss * f64::from(weight))?)?;
+            likelihood = Some(likelihood_loss);
         }
         let loss = Loss::new("actor_loss", loss).with("trust_loss", trust_loss);
         Ok(loss.with("q_loss", q_loss).with("likelihood_loss", likelihood))
@@ -212,7 +198,7 @@ fn denoising_loss(
 
 /// −E[log N(atanh(a/1.001))] of the data's actions, `[]`: not of a, whose density would also have
 /// the tanh's Jacobian, which does not depend on θ.
-fn likelihood_loss(distribution: &Normal, batch: &Minibatch) -> Result<Tensor> {
+fn likelihood_loss(distribution: &Normal, batch: &Batch) -> Result<Tensor> {
     let scaled = (&batch.actions / ROOM)?;
     let u = (((1.0 + &scaled)?.log()? - (1.0 - &scaled)?.log()?)? * 0.5)?;
     let Normal { mean, log_std } = distribution;
@@ -227,8 +213,8 @@ impl Algorithm for Dtql {
     }
 
     /// Critics and diffusion policy learn in both phases, the one-step policy in the second.
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
         let pretraining = self.pretraining();
         let steps = step.saturating_sub(pretraining);
         let decay = match self.config.cosine {
@@ -236,19 +222,18 @@ impl Algorithm for Dtql {
             false => 1.0,
         };
         let adam = AdamStep::after(step, *self.config.learning_rate * decay);
-        let of_values = AdamStep::after(step, *self.config.critic_learning_rate * decay);
-        let [value_loss, critic_loss] = self.value_losses(&batch)?;
-        let bc_loss = self.bc_loss(&batch, &noise.cloning)?;
-        let networks = &mut self.networks;
-        networks.value.minimize(&value_loss.value, of_values)?;
-        networks.critic.minimize(&critic_loss.value, of_values)?;
-        networks.diffusion.minimize(&bc_loss.value, adam)?;
+        let critic_adam = AdamStep::after(step, *self.config.critic_learning_rate * decay);
+        let [value_loss, critic_loss] = self.value_losses(batch)?;
+        let bc_loss = self.bc_loss(batch, &noise.cloning)?;
+        self.value.minimize(&value_loss.value, critic_adam)?;
+        self.critic.minimize(&critic_loss.value, critic_adam)?;
+        self.diffusion.minimize(&bc_loss.value, adam)?;
         let mut losses = vec![value_loss, critic_loss, bc_loss];
         if step >= pretraining {
-            let actor_loss = self.actor_loss(&batch, &noise)?;
+            let actor_loss = self.actor_loss(batch, &noise)?;
             let adam = AdamStep::after(step - pretraining, adam.rate);
-            self.networks.actor.minimize(&actor_loss.value, adam)?;
-            self.networks.critic.soft_update(*self.config.ema_rate)?;
+            self.actor.minimize(&actor_loss.value, adam)?;
+            self.critic.soft_update(*self.config.ema_rate)?;
             losses.push(actor_loss);
         }
         let mut measured = measured(&losses)?;
@@ -256,12 +241,12 @@ impl Algorithm for Dtql {
         Ok(measured)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
-        let mut losses = Vec::from(self.value_losses(&batch)?);
-        losses.push(self.bc_loss(&batch, &noise.cloning)?);
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
+        let mut losses = Vec::from(self.value_losses(batch)?);
+        losses.push(self.bc_loss(batch, &noise.cloning)?);
         if step >= self.pretraining() {
-            losses.push(self.actor_loss(&batch, &noise)?);
+            losses.push(self.actor_loss(batch, &noise)?);
         }
         measured(&losses)
     }
@@ -270,12 +255,12 @@ impl Algorithm for Dtql {
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let rule = Rule::softmax(*self.config.temperature);
         let choice = Choice::new(*self.config.candidates, Aggregate::Min, rule);
-        let (actor, critics) = (&self.networks.actor.network, &self.networks.critic.target);
+        let (actor, critics) = (&self.actor.network, &self.critic.target);
         let (shape, tensors) = ActorCriticShape::from_networks(actor, critics)?;
         Ok((PolicyConfig::Squashed { shape, choice }, tensors))
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

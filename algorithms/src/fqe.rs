@@ -8,7 +8,11 @@
 #[cfg(test)]
 mod tests;
 
+use super::batch::asked;
+use super::examples::episode_rewards;
 use super::prelude::*;
+use super::returns::discounted;
+use quad_dataset::Transitions;
 
 const SETTINGS: &str = "
 critic = { hidden = [256, 256], activation = \"relu\" }
@@ -57,24 +61,19 @@ pub struct Units {
 
 impl Units {
     /// The units and bounds of the data's rewards.
-    pub fn of(context: &Context, gamma: f64) -> Self {
-        let mut batch = quad_dataset::Batch::default();
-        context
-            .transitions
-            .gather(&Vec::from_iter(0..context.transitions.len() as u32), &mut batch);
-        let mut returns: Vec<f64> = batch.rewards.iter().map(|reward| f64::from(*reward)).collect();
-        for row in (0..returns.len() as u32).rev() {
-            if let Some(next) = context.transitions.next(row) {
-                returns[row as usize] += gamma * returns[next as usize];
+    pub fn new(transitions: &Transitions, gamma: f64) -> Self {
+        let (mut returns, mut low, mut high) = (Vec::new(), f64::INFINITY, f64::NEG_INFINITY);
+        for episode in transitions.episodes() {
+            let (rewards, _) = episode_rewards(transitions, episode);
+            returns.extend(discounted(&rewards, gamma, 0.0));
+            for reward in rewards.into_iter().map(f64::from) {
+                (low, high) = (low.min(reward), high.max(reward));
             }
         }
-        let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len() as f64;
+        let mean = |numbers: &[f64]| numbers.iter().sum::<f64>() / numbers.len() as f64;
         let offset = mean(&returns);
-        let scale =
-            mean(&Vec::from_iter(returns.iter().map(|value| (value - offset).powi(2)))).sqrt();
-        let rewards = batch.rewards.iter().map(|reward| f64::from(*reward));
-        let (low, high) = rewards
-            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), r| (low.min(r), high.max(r)));
+        let squares = Vec::from_iter(returns.iter().map(|value| (value - offset).powi(2)));
+        let scale = mean(&squares).sqrt();
         let forever = 1.0 / (1.0 - gamma);
         Self {
             offset,
@@ -97,54 +96,18 @@ pub struct Fqe {
     config: FqeConfig,
     units: Units,
     context: Context,
-    /// The transitions to learn from.
-    rows: Vec<u32>,
-    /// a' of each transition of the data, `[N, a]`.
-    next_actions: Tensor,
     networks: Networks,
 }
 
 impl Fqe {
-    /// An evaluation at step 0 of the policy that takes these actions, `[N, a]`, after the data's N
-    /// transitions.
-    pub fn new(
-        config: FqeConfig,
-        units: Units,
-        context: Context,
-        next_actions: Vec<f32>,
-    ) -> Result<Self> {
-        let rows = (0..context.transitions.len() as u32).collect();
-        let shape = (context.transitions.len(), context.action_dim());
-        let next_actions = Tensor::from_vec(next_actions, shape, &context.device)?;
-        Self::over(rows, config, units, context, next_actions)
-    }
-
-    /// An evaluation of the policy that recorded the data, on the transitions whose next action is
-    /// in the data.
+    /// An evaluation at step 0.
     ///
     /// # Errors
-    /// There is no such transition, or candle fails.
-    pub fn of_behavior(
-        config: FqeConfig,
-        units: Units,
-        context: Context,
-    ) -> std::result::Result<Self, AlgorithmError> {
-        let rows = context.with_next_action()?;
-        let next_actions =
-            context.next_actions(&Vec::from_iter(0..context.transitions.len() as u32))?;
-        Ok(Self::over(rows, config, units, context, next_actions)?)
-    }
-
-    fn over(
-        rows: Vec<u32>,
-        config: FqeConfig,
-        units: Units,
-        context: Context,
-        next_actions: Tensor,
-    ) -> Result<Self> {
+    /// Candle fails.
+    pub fn new(config: FqeConfig, units: Units, context: Context) -> Result<Self> {
         let mut networks = Networks::new(&config, &mut Initializer::new(&context))?;
         networks.critic.decay_weights(*config.weight_decay)?;
-        Ok(Self { config, units, context, rows, next_actions, networks })
+        Ok(Self { config, units, context, networks })
     }
 
     /// Takes the networks of another evaluation, such as the behavior's, from whose values a policy's
@@ -155,32 +118,24 @@ impl Fqe {
         critic.target.soft_update(&other.target, 1.0)
     }
 
-    /// The number of transitions that batches are drawn from.
-    pub fn dataset_len(&self) -> usize {
-        self.rows.len()
-    }
-
-    /// Performs update number `step`, from 0, on the transitions with these indices. Measures
+    /// Performs update number `step`, from 0, on a batch with the policy's next actions. Measures
     /// `critic_loss`, the mean over the batch of (Q(s, a) − y)² in the network's units, and
     /// `target_q_mean`, the mean of the targets y in the rewards'.
-    pub fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let rows = select(&self.rows, indices);
-        let batch = self.context.batch(&rows)?;
-        let rows = Tensor::from_vec(rows, indices.len(), &self.context.device)?;
-        let targets = self.targets(&batch, &self.next_actions.index_select(&rows, 0)?)?;
-        let of_network =
+    pub fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let targets = self.targets(batch)?;
+        let scaled =
             targets.affine(1.0 / self.units.scale, -self.units.offset / self.units.scale)?;
         let critic = &mut self.networks.critic;
-        let loss = batch.squared_error(critic, &of_network)?;
+        let loss = batch.squared_error(critic, &scaled)?;
         critic.minimize(&loss, AdamStep::after(step, *self.config.learning_rate))?;
         critic.soft_update(*self.config.ema_rate)?;
-        measured(&[Loss::of_critics(loss, &targets)?])
+        measured(&[Loss::critics(loss, &targets)?])
     }
 
     /// y = r + γ·mask·Q̂(s', a'), clipped to the bounds of the units; `[B]`.
-    fn targets(&self, batch: &Minibatch, next_actions: &Tensor) -> Result<Tensor> {
+    fn targets(&self, batch: &Batch) -> Result<Tensor> {
         let critic = &self.networks.critic.target;
-        let next = batch.next_values(critic, next_actions)?.squeeze(0)?;
+        let next = batch.next_values(critic, asked(&batch.next_actions)?)?.squeeze(0)?;
         let next = next.affine(self.units.scale, self.units.offset)?;
         batch
             .target(*self.config.gamma, &next)?

@@ -3,7 +3,6 @@
 //! steps. Its update is its authors' code's; equations are that paper's.
 
 use super::prelude::*;
-use candle_nn::loss::mse;
 use quad_policy::{ActorCriticShape, FlowActor, OneStepActor, flow_velocity};
 use rand::Rng;
 
@@ -11,9 +10,9 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "fql",
     presets: include_str!("../../presets/fql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Fql::new)),
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -47,7 +46,7 @@ struct Config {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Fql(config: Config, init) {
         /// The one-step policy π(s, z).
         actor: TrainState<Ensemble> = init.ensemble(EnsembleShape {
             outputs: init.context.action_dim(),
@@ -59,52 +58,41 @@ networks! {
     }
 }
 
-struct Fql {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Fql {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
     /// The losses of critics, flow and policy.
-    fn losses(&self, step: u64, indices: &[u32]) -> Result<[Loss; 3]> {
-        let (batch, random) = (self.context.batch(indices)?, &mut self.context.random(step));
+    fn losses(&self, step: u64, batch: &Batch) -> Result<[Loss; 3]> {
+        let random = &mut self.context.random(step);
         let (b, a) = batch.actions.dims2()?;
         let start = random.normal("start_noise", (b, a))?; // x_0
         let policy_noise = random.normal("policy_noise", (b, a))?;
         let next_noise = random.normal("next_noise", (b, a))?;
         let times = random.tensor("times", (b, 1), |generator| generator.random::<f32>())?;
-        let targets = self.targets(&batch, &next_noise)?;
-        let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
-        let bc_loss = flow_loss(&self.networks.flow, &batch, &start, &times)?;
-        let [distill_loss, q_loss] = self.actor_losses(&batch, &policy_noise)?;
+        let targets = self.targets(batch, &next_noise)?;
+        let critic_loss = batch.critic_loss(&self.critic, &targets)?;
+        let bc_loss = flow_loss(&self.flow, batch, &start, &times)?;
+        let [distill_loss, q_loss] = self.actor_losses(batch, &policy_noise)?;
         let actor_loss = ((&distill_loss * f64::from(*self.config.alpha))? + &q_loss)?;
         let actor_loss = Loss::new("actor_loss", actor_loss).with("distill_loss", distill_loss);
         Ok([critic_loss, Loss::new("bc_loss", bc_loss), actor_loss.with("q_loss", q_loss)])
     }
 
     /// y = r + γ·mask·Q̂(s', π(s', z)), `[B]`.
-    fn targets(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
-        let actions = OneStepActor::new(self.networks.actor.detach())
-            .sample(&batch.next_observations, noise)?;
-        let values = batch.next_values(&self.networks.critic.target, &actions)?;
+    fn targets(&self, batch: &Batch, noise: &Tensor) -> Result<Tensor> {
+        let actions =
+            OneStepActor::new(self.actor.detach()).sample(&batch.next_observations, noise)?;
+        let values = batch.next_values(&self.critic.target, &actions)?;
         batch.target(*self.config.gamma, &reduced(&values, self.config.target)?)
     }
 
     /// The squared distance of the one-step policy's actions to the flow's, and −Q of these actions,
     /// divided by the mean of |Q| with `normalize_q`; both `[]`.
-    fn actor_losses(&self, batch: &Minibatch, noise: &Tensor) -> Result<[Tensor; 2]> {
+    fn actor_losses(&self, batch: &Batch, noise: &Tensor) -> Result<[Tensor; 2]> {
         let observations = &batch.observations;
-        let actions = self.networks.actor.outputs(observations, noise)?.squeeze(0)?;
-        let flow = FlowActor::new(self.networks.flow.detach(), *self.config.flow_steps);
-        let distill_loss = mse(&actions, &flow.sample(observations, noise)?)?;
+        let actions = self.actor.outputs(observations, noise)?.squeeze(0)?;
+        let flow = FlowActor::new(self.flow.detach(), *self.config.flow_steps);
+        let distill_loss = squared_error(&actions, &flow.sample(observations, noise)?)?;
         let actions = actions.clamp(-1f32, 1f32)?;
-        let q = batch.values_at(&self.networks.critic.detach(), &actions)?.mean(0)?;
+        let q = batch.values_at(&self.critic.detach(), &actions)?.mean(0)?;
         let mut q_loss = q.mean_all()?.neg()?;
         if self.config.normalize_q {
             q_loss = (q_loss / q.detach().abs()?.mean_all()?)?;
@@ -122,46 +110,45 @@ pub(super) fn flow(layers: &MlpConfig, init: &mut Initializer) -> Result<TrainSt
 /// Mean of (v(s, x_t, t) − (a − x_0))², `[]`, with x_t = x_0 + t·(a − x_0) (FQL's Eq. 4).
 pub(super) fn flow_loss(
     flow: &Ensemble,
-    batch: &Minibatch,
+    batch: &Batch,
     start: &Tensor,
     times: &Tensor,
 ) -> Result<Tensor> {
     let velocity = (&batch.actions - start)?;
     let x = (start + velocity.broadcast_mul(times)?)?;
     let predicted = flow_velocity(flow, &batch.observations, &x, times)?;
-    mse(&batch.within_episodes(predicted, &velocity)?, &velocity)
+    squared_error(&batch.within_episodes(predicted, &velocity)?, &velocity)
 }
 
 impl Algorithm for Fql {
     /// All losses are those of the networks before the update, and so are the critics that the
     /// targets follow.
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
         let adam = AdamStep::after(step, *self.config.learning_rate);
-        let losses = self.losses(step, indices)?;
+        let losses = self.losses(step, batch)?;
         let [critic_loss, bc_loss, actor_loss] = &losses;
-        let Networks { actor, critic, flow } = &mut self.networks;
         // The policy's gradient, by the critics as they are before their step.
         let gradients = Gradients::of(&actor_loss.value)?;
-        critic.soft_update(*self.config.ema_rate)?;
-        critic.minimize(&critic_loss.value, adam)?;
-        flow.minimize(&bc_loss.value, adam)?;
-        actor.apply_gradients(&gradients, adam)?;
+        self.critic.soft_update(*self.config.ema_rate)?;
+        self.critic.minimize(&critic_loss.value, adam)?;
+        self.flow.minimize(&bc_loss.value, adam)?;
+        self.actor.apply_gradients(&gradients, adam)?;
         measured(&losses)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        measured(&self.losses(step, indices)?)
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        measured(&self.losses(step, batch)?)
     }
 
     /// The one-step policy, which chooses by the target critics.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
-        let (actor, critics) = (&self.networks.actor, &self.networks.critic.target);
+        let (actor, critics) = (&self.actor, &self.critic.target);
         let (shape, tensors) = ActorCriticShape::from_networks(actor, critics)?;
         Ok((PolicyConfig::OneStep { shape, choice }, tensors))
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

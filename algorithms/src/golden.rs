@@ -6,11 +6,14 @@ mod reader;
 
 use std::sync::Arc;
 
-use super::algorithm::{Algorithm, Measured};
+use super::ALGORITHMS;
+use super::agent::{Algorithm, Measured};
+use super::batch::Batch;
 use super::context::Context;
 use super::definition::{Definition, Metric};
+use super::examples::{Columns, Examples};
+use super::replay::Inputs;
 use super::state_dict::StateDict;
-use super::{ALGORITHMS, Hyperparameters};
 use candle_core::{D, DType, Device, Tensor};
 use quad_dataset::{Arrays, ReadOptions, Transitions, Window};
 use quad_nn::{
@@ -48,7 +51,8 @@ pub(super) fn check_update(
     measured: &Measured,
     state: Tensors,
 ) {
-    let value = |name| measured.iter().find(|(known, _)| *known == name).map_or(0.0, |of| of.1);
+    let value =
+        |name| measured.iter().find(|metric| metric.0 == name).map_or(0.0, |metric| metric.1);
     let in_folder = metrics.iter().filter(|Metric { name, .. }| {
         golden.expected.contains_key(*name) && !state.contains_key(*name)
     });
@@ -71,22 +75,6 @@ fn numbers(golden: &Golden, name: &str) -> Vec<f32> {
     golden.inputs[name].to_dtype(DType::F32).unwrap().flatten_all().unwrap().to_vec1().unwrap()
 }
 
-/// Random transitions in one episode, for an algorithm that learns from windows.
-fn episode((o, a): (usize, usize), n: usize) -> Arrays {
-    let numbers = |count: usize| Vec::from_iter((0..count).map(|i| (i as f32).sin()));
-    let states = numbers((n + 1) * o);
-    Arrays {
-        observation_dim: o,
-        action_dim: a,
-        next_observations: states[o..].to_vec(),
-        observations: states[..n * o].to_vec(),
-        actions: numbers(n * a),
-        rewards: numbers(n),
-        terminals: vec![false; n],
-        timeouts: (1..=n).map(|i| i == n).collect(),
-    }
-}
-
 /// The rows of a golden folder as episodes that may go on after a success, read as OGBench's are.
 fn episodes(golden: &Golden) -> Transitions {
     let name = format!("golden-{}-{:?}.npz", std::process::id(), std::thread::current().id());
@@ -101,51 +89,62 @@ fn episodes(golden: &Golden) -> Transitions {
     transitions.unwrap()
 }
 
-/// The transitions of a golden folder's batch, and their indices: each is an episode, unless the
-/// folder says where episodes end; with next actions, a second transition follows.
+/// The transitions of a golden folder's batch: each is an episode, unless the folder says where
+/// episodes end.
 fn transitions(golden: &Golden) -> Transitions {
-    let (o, a) = (golden.count("/observation_dim"), golden.count("/action_dim"));
-    if !golden.inputs.contains_key("observations") {
-        return Transitions::of(episode((o, a), 2 * golden.count("/agent/network/horizon")))
-            .unwrap();
-    }
     if golden.inputs.contains_key("ends") {
         return episodes(golden);
     }
-    let numbers = |name: &str| numbers(golden, name);
-    let given = |name: &str| golden.inputs.contains_key(name).then(|| numbers(name));
-    let terminals: Vec<bool> = numbers("masks").iter().map(|mask| *mask == 0.0).collect();
-    let n = terminals.len();
-    let timeouts =
-        given("timeouts").map_or(vec![true; n], |ends| ends.iter().map(|x| *x == 1.0).collect());
-    let mut arrays = Arrays {
+    let (o, a) = (golden.count("/observation_dim"), golden.count("/action_dim"));
+    // A folder of plans has no transitions.
+    let given = |name: &str, width: usize| match golden.inputs.contains_key(name) {
+        true => numbers(golden, name),
+        false => vec![1.0; width],
+    };
+    let terminals = Vec::from_iter(given("masks", 1).iter().map(|mask| *mask == 0.0));
+    Transitions::of(Arrays {
         observation_dim: o,
         action_dim: a,
-        observations: numbers("observations"),
-        actions: numbers("actions"),
-        rewards: numbers("rewards"),
-        next_observations: numbers("next_observations"),
-        timeouts,
+        observations: given("observations", o),
+        actions: given("actions", a),
+        rewards: given("rewards", 1),
+        next_observations: given("next_observations", o),
+        timeouts: given("timeouts", terminals.len()).iter().map(|x| *x == 1.0).collect(),
         terminals,
-    };
-    if let Some(next_actions) = given("next_actions") {
-        let alternate = |x: &[f32], y: &[f32], width: usize| {
-            x.chunks(width).zip(y.chunks(width)).flat_map(|(x, y)| [x, y].concat()).collect()
-        };
-        arrays.observations = alternate(&arrays.observations, &arrays.next_observations, o);
-        arrays.next_observations = alternate(&arrays.next_observations, &vec![0.0; n * o], o);
-        arrays.actions = alternate(&arrays.actions, &next_actions, a);
-        arrays.rewards = alternate(&arrays.rewards, &vec![0.0; n], 1);
-        arrays.terminals = arrays.terminals.iter().flat_map(|last| [*last, false]).collect();
-        arrays.timeouts = (0..2 * n).map(|row| row % 2 == 1).collect();
+    })
+    .unwrap()
+}
+
+/// The batch of a golden folder. Where that says where episodes end, it has windows of steps.
+pub(super) fn batch(golden: &Golden, window: Window) -> Batch {
+    let indices = Vec::from_iter(0..golden.count("/batch_size") as u32);
+    if golden.inputs.contains_key("ends") {
+        let transitions = Arc::new(episodes(golden));
+        let examples = Examples::new(transitions, Columns::Plain, window).unwrap();
+        return examples.batch(&indices).unwrap();
     }
-    Transitions::of(arrays).unwrap()
+    let given = |name: &str| golden.inputs.get(name).cloned();
+    let column = |name: &str| {
+        given(name)
+            .unwrap_or_else(|| Tensor::zeros((indices.len(), 1), DType::F32, &Device::Cpu).unwrap())
+    };
+    Batch {
+        observations: column("observations"),
+        actions: column("actions"),
+        rewards: column("rewards"),
+        next_observations: column("next_observations"),
+        masks: column("masks"),
+        within: None,
+        next_actions: given("next_actions"),
+        returns: given("returns"),
+        plans: given("windows"),
+        indices,
+    }
 }
 
 pub(super) fn context(golden: &Golden, device: &Device) -> Context {
     Context {
         transitions: Arc::new(transitions(golden)),
-        batch_size: golden.count("/batch_size"),
         total_steps: golden.count("/total_steps") as u64,
         online_steps: golden.config["online_steps"].as_u64().unwrap_or(0),
         window: Window::ONE,
@@ -161,12 +160,14 @@ pub(super) fn table(golden: &Golden) -> toml::Table {
 }
 
 fn check(definition: &Definition, golden: &Golden, device: &Device) {
-    let hyperparameters = Hyperparameters::new(definition, table(golden)).unwrap();
-    let (_, mut algorithm) = hyperparameters.start(definition, context(golden, device)).unwrap();
+    let (_, window, start) = definition.read(&table(golden)).unwrap();
+    let context = Context { window, ..context(golden, device) };
+    let mut algorithm = (start.new)(context).unwrap();
     load(golden, algorithm.state_dict());
     check_policy(golden, &*algorithm);
-    let indices = Vec::from_iter(0..golden.count("/batch_size") as u32);
-    let measured = algorithm.update(golden.count("/step") as u64, &indices).unwrap();
+    let batch = batch(golden, window);
+    let batch = if algorithm.copies_batches() { batch } else { batch.on(device).unwrap() };
+    let measured = algorithm.update(golden.count("/step") as u64, &batch).unwrap();
     check_update(golden, definition.metrics, &measured, algorithm.state_dict().save().unwrap());
 }
 
@@ -225,9 +226,9 @@ fn check_policy(golden: &Golden, algorithm: &dyn Algorithm) {
 fn check_all(goldens: &[Golden]) {
     for golden in goldens {
         let name = golden.config["algorithm"].as_str().unwrap();
-        let known = ALGORITHMS.iter().find(|known| known.name == name);
+        let definition = ALGORITHMS.iter().find(|definition| definition.name == name);
         devices().iter().for_each(|device| {
-            known.into_iter().for_each(|definition| check(definition, golden, device));
+            definition.into_iter().for_each(|definition| check(definition, golden, device));
         });
     }
 }
@@ -261,8 +262,8 @@ fn golden_reverse_steps() -> candle_core::Result<()> {
         let (mut clean, mut mean) = (Vec::new(), Vec::new());
         for t in 1..=shape.diffusion_steps {
             let x = actions.get(t - 1)?;
-            let all = Tensor::full(t as u32, x.dim(0)?, &Device::Cpu)?;
-            let epsilon = actor.predict(&observations, &x, &all)?;
+            let steps = Tensor::full(t as u32, x.dim(0)?, &Device::Cpu)?;
+            let epsilon = actor.predict(&observations, &x, &steps)?;
             clean.push(actor.schedule().clean(t, &x, &epsilon)?);
             mean.push(actor.schedule().reverse(t, &x, &epsilon, None)?);
         }

@@ -1,4 +1,5 @@
-//! Types of hyper-parameters that check their range when they are read.
+//! Types of hyper-parameters that check their range when they are read, and training phases whose
+//! lengths they give in proportion to the run's.
 
 use std::ops::Deref;
 
@@ -55,3 +56,34 @@ checked!(
     /// Actions that a policy draws in each state.
     Candidates(u32), |x| (1..=Choice::MOST_CANDIDATES).contains(&x), "a whole number from 1 to 10000"
 );
+
+/// The first step of each phase in a run of `total_steps`, for phases of these relative lengths.
+pub(super) fn first_steps<const N: usize>(total_steps: u64, lengths: [Steps; N]) -> [u64; N] {
+    let lengths = lengths.map(|length| u128::from(*length));
+    let whole: u128 = lengths.iter().sum();
+    std::array::from_fn(|phase| {
+        (u128::from(total_steps) * lengths[..phase].iter().sum::<u128>() / whole) as u64
+    })
+}
+
+/// The phase of a step, from 0, and the number of its steps before this one.
+pub(super) fn phase(first_steps: &[u64], step: u64) -> (usize, u64) {
+    let phase = first_steps.partition_point(|first| *first <= step) - 1;
+    (phase, step - first_steps[phase])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn phases_divide_a_run_of_any_length_in_proportion() {
+        let lengths = [500_000, 2_000_000, 100_000].map(Steps);
+        for (total_steps, expected) in
+            [(2_600_000, [0, 500_000, 2_500_000]), (600, [0, 115, 576]), (1, [0, 0, 0])]
+        {
+            assert_eq!(first_steps(total_steps, lengths), expected);
+        }
+        assert_eq!([(0, 0), (1, 3), (2, 9)], [0, 118, 585].map(|step| phase(&[0, 115, 576], step)));
+    }
+}

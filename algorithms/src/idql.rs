@@ -9,9 +9,9 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "idql",
     presets: include_str!("../../presets/idql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
     chunks: true,
     read: |table| {
         Ok(start(read::<Config>(table)?, |config, context| config.start(Rule::Best, context)))
     },
+    ..Definition::PLAIN
 };

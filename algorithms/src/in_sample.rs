@@ -66,7 +66,7 @@ pub(super) trait ImplicitLosses: Send {
 
     /// The states and actions that V is fitted to in update number `step`, if they are not the
     /// batch's.
-    fn pairs(&self, _: &Context, _step: u64, _: &Minibatch) -> Result<Option<(Tensor, Tensor)>> {
+    fn pairs(&self, _: &Context, _step: u64, _: &Batch) -> Result<Option<(Tensor, Tensor)>> {
         Ok(None)
     }
 
@@ -102,7 +102,7 @@ impl<L: ImplicitLosses> InSample<L> {
     }
 
     /// The smaller Q̂(s, a) of the batch, and the states and values that V is fitted to; `[n]`.
-    fn q(&self, step: u64, batch: &Minibatch) -> Result<(Tensor, (Tensor, Tensor))> {
+    fn q(&self, step: u64, batch: &Batch) -> Result<(Tensor, (Tensor, Tensor))> {
         let critics = &self.networks.critic.target;
         let q = smallest(&batch.values(critics)?)?;
         let fitted = match self.losses.pairs(&self.context, step, batch)? {
@@ -122,22 +122,23 @@ impl<L: ImplicitLosses> InSample<L> {
     }
 
     /// The policy toward actions of the data, the more so the better they are.
-    fn actor_loss(&self, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
-        let Networks { actor, value, .. } = &self.networks;
-        let v = state_value(&value.detach(), &batch.observations)?;
+    fn actor_loss(&self, batch: &Batch, q: &Tensor) -> Result<Loss> {
+        let networks = &self.networks;
+        let v = state_value(&networks.value.detach(), &batch.observations)?;
         let advantage = (q - &v)?;
-        let log_probability = actor.log_probability(&batch.observations, &batch.actions)?;
+        let log_probability =
+            networks.actor.log_probability(&batch.observations, &batch.actions)?;
         let loss = weighted(&self.losses.weights(&advantage)?, &log_probability)?;
         Ok(loss.with("v_mean", v.mean_all()?).with("advantage_mean", advantage.mean_all()?))
     }
 
     /// Q(s, a) toward r + γ·V(s').
-    fn critic_loss(&self, batch: &Minibatch) -> Result<Loss> {
-        let Networks { critic, value, .. } = &self.networks;
-        let next = state_value(&value.detach(), &batch.next_observations)?;
+    fn critic_loss(&self, batch: &Batch) -> Result<Loss> {
+        let networks = &self.networks;
+        let next = state_value(&networks.value.detach(), &batch.next_observations)?;
         let targets = batch.target(*self.losses.common().gamma, &next)?;
-        let loss = self.losses.critic_loss(&batch.values(critic)?, &targets)?;
-        Loss::of_critics(loss, &targets)
+        let loss = self.losses.critic_loss(&batch.values(&networks.critic)?, &targets)?;
+        Loss::critics(loss, &targets)
     }
 }
 
@@ -151,9 +152,8 @@ pub(super) fn weighted(weight: &Tensor, log_probability: &Tensor) -> Result<Loss
 }
 
 impl<L: ImplicitLosses> Algorithm for InSample<L> {
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let batch = self.context.batch(indices)?;
-        let (q, fitted) = self.q(step, &batch)?;
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let (q, fitted) = self.q(step, batch)?;
         let steps = self.losses.value_steps();
         let mut value_loss = self.value_loss(&fitted)?;
         for i in 0..steps {
@@ -165,14 +165,14 @@ impl<L: ImplicitLosses> Algorithm for InSample<L> {
             self.networks.value.minimize(&value_loss.value, adam)?;
         }
 
-        let actor_loss = self.actor_loss(&batch, &q)?;
+        let actor_loss = self.actor_loss(batch, &q)?;
         let decays = self.losses.actor_rate_decays();
         let decay = if decays { self.context.decay(step, 1.0) } else { 1.0 };
         let common = self.losses.common();
         let rate = *common.actor_learning_rate * decay;
         self.networks.actor.minimize(&actor_loss.value, AdamStep::after(step, rate))?;
 
-        let critic_loss = self.critic_loss(&batch)?;
+        let critic_loss = self.critic_loss(batch)?;
         let adam = AdamStep::after(step, *common.critic_learning_rate);
         self.networks.critic.minimize(&critic_loss.value, adam)?;
         self.networks.critic.soft_update(*common.ema_rate)?;
@@ -182,13 +182,12 @@ impl<L: ImplicitLosses> Algorithm for InSample<L> {
         Ok(measured)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let batch = self.context.batch(indices)?;
-        let (q, fitted) = self.q(step, &batch)?;
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        let (q, fitted) = self.q(step, batch)?;
         measured(&[
             self.value_loss(&fitted)?,
-            self.actor_loss(&batch, &q)?,
-            self.critic_loss(&batch)?,
+            self.actor_loss(batch, &q)?,
+            self.critic_loss(batch)?,
         ])
     }
 

@@ -9,9 +9,8 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "iql",
     presets: include_str!("../../presets/iql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
     read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &table(Helps {

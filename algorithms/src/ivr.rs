@@ -11,19 +11,16 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "ivr",
     presets: include_str!("../../presets/ivr.toml"),
     metrics: METRICS,
-    report: Reporting {
-        variant: Some(Variant {
-            key: "divergence",
-            called: |divergence| format!("ivr {divergence}"),
-            unused: |divergence| match divergence {
-                "sparse" => &["alpha.exponential"],
-                _ => &["alpha.sparse"],
-            },
-        }),
-        ..Reporting::PLAIN
-    },
-    chunks: false,
+    variant: Some(Variant {
+        key: "divergence",
+        called: |divergence| format!("ivr {divergence}"),
+        unused: |divergence| match divergence {
+            "sparse" => &["alpha.exponential"],
+            _ => &["alpha.sparse"],
+        },
+    }),
     read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
+    ..Definition::PLAIN
 };
 
 /// (q − V)/α at which EQL's exponentials are cut off.

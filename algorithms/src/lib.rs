@@ -3,51 +3,45 @@
 //! # Layout
 //!
 //! - [`Definition`]: an algorithm before it runs, a line of [`ALGORITHMS`]; [`Values`]: its presets.
-//! - [`Algorithm`]: the interface to the learner; [`Agent`]: an algorithm in training.
+//! - [`Algorithm`]: the interface to the learner; [`Agent`]: an algorithm in training;
+//!   [`Examples`]: what it learns from, in [`Batch`]es with the columns that it asks for.
 //! - `networks`: networks with optimizers and targets, which an algorithm declares once;
 //!   `state_dict`; `losses`; `hyperparameters`: types that check themselves; `random`; `context`:
-//!   the data and settings of a run; `chunk`: several steps at a time. `prelude` has the names of
-//!   these for an algorithm's file.
-//! - `returns` of recorded episodes, `phases` of a run; `calibration`: Cal-QL's; `fqe`: the
-//!   value of a policy, by the data alone; `replay`: updates as CUDA graphs of their `inputs`;
-//!   `pool`: threads that stay awake during an update.
+//!   the settings of a run. `prelude` has the names of these for an algorithm's file.
+//! - `returns` of recorded episodes; `fqe`: the value of a policy, by the data alone; `replay`:
+//!   updates as CUDA graphs of their inputs; `pool`: threads that stay awake during an update.
 //! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
-//!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`, with the noise of `denoising`; `gaussian` is
-//!   a policy of several. `fql` is the one to read first; `qc` shares its flow, and
-//!   `diffusion_policy` QUAD's noise predictor.
+//!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`; `gaussian` is a policy of several. `fql` is
+//!   the one to read first; `qc` shares its flow, and `diffusion_policy` QUAD's noise predictor.
 //!
 //! CONTRIBUTING.md says what a new algorithm needs.
 
 #![deny(unsafe_code)]
 
 mod agent;
-mod algorithm;
 mod align_iql;
-mod calibration;
-mod chunk;
+mod batch;
 mod context;
 mod cql;
 mod definition;
-mod denoising;
 mod diffuser;
 mod diffusion;
 mod diffusion_policy;
 mod dql;
 mod dtql;
 mod error;
+mod examples;
 mod fqe;
 mod fql;
 mod gaussian;
 mod hyperparameters;
 mod idql;
 mod in_sample;
-mod inputs;
 mod iql;
 mod ivr;
 mod losses;
 mod networks;
 mod onestep;
-mod phases;
 mod pool;
 mod prelude;
 mod qc;
@@ -65,13 +59,12 @@ mod td3bc;
 mod values;
 mod xql;
 
-pub use agent::{Agent, StateError};
-pub use algorithm::{Algorithm, Measured};
-pub use context::{Context, Minibatch};
-pub use definition::{
-    Axis, Definition, Hyperparameters, Metric, MetricsLine, Reporting, Start, Summary, Variant,
-};
+pub use agent::{Agent, Algorithm, Measured, StateError};
+pub use batch::Batch;
+pub use context::Context;
+pub use definition::{Axis, Definition, Metric, MetricsLine, Start, Summary, Variant};
 pub use error::{AgentError, AlgorithmError, in_words};
+pub use examples::{Columns, Examples, Plans};
 pub use fqe::{Fqe, FqeConfig, Units};
 pub use state_dict::StateDict;
 pub use values::{Values, fits, merge};

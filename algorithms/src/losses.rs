@@ -4,7 +4,7 @@ use candle_core::{Result, Tensor};
 use quad_nn::mean_and_variance;
 use quad_policy::Aggregate;
 
-use super::algorithm::Measured;
+use super::agent::Measured;
 
 /// The smallest of the critics' values, `[K, B]` → `[B]`. (`min` ignores NaN; adding 0·sum keeps
 /// it.)
@@ -50,7 +50,7 @@ impl Loss {
     }
 
     /// The critics' loss, and the mean of their targets y `[B]`.
-    pub fn of_critics(value: Tensor, targets: &Tensor) -> Result<Self> {
+    pub fn critics(value: Tensor, targets: &Tensor) -> Result<Self> {
         Ok(Self::new("critic_loss", value).with("target_q_mean", targets.mean_all()?))
     }
 

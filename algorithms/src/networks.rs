@@ -21,8 +21,9 @@ pub(super) fn state_value(value: &Ensemble, observations: &Tensor) -> Result<Ten
     value.state_values(observations)?.squeeze(0)
 }
 
-/// Declares the networks of an algorithm as a struct. `new` initializes them in this order, each
-/// from its own random stream; `state_dict` names them after their fields.
+/// Declares an algorithm with its hyper-parameters, context and networks, or, with a reference to what
+/// they need, a struct of networks alone. `new` initializes these in this order, each from its own
+/// random stream; a state dict names them after their fields.
 macro_rules! networks {
     ($(#[$meta:meta])* $vis:vis struct $name:ident($config:ident: &$type:ty, $init:ident) {
         $($(#[$doc:meta])* $field:ident: $network:ty = $make:expr,)*
@@ -40,6 +41,31 @@ macro_rules! networks {
             }
 
             $vis fn state_dict(&mut self) -> $crate::state_dict::StateDict<'_> {
+                $crate::state_dict::StateDict::default()
+                    $(.with(stringify!($field), &mut self.$field))*
+            }
+        }
+    };
+    ($vis:vis struct $name:ident($config:ident: $type:ty, $init:ident) {
+        $($(#[$doc:meta])* $field:ident: $network:ty = $make:expr,)*
+    }) => {
+        $vis struct $name {
+            config: $type,
+            context: $crate::context::Context,
+            $($(#[$doc])* $field: $network,)*
+        }
+
+        impl $name {
+            $vis fn new(
+                $config: $type,
+                context: $crate::context::Context,
+            ) -> candle_core::Result<Self> {
+                let $init = &mut $crate::networks::Initializer::new(&context);
+                $(let $field = $make?;)*
+                Ok(Self { $config, context, $($field),* })
+            }
+
+            fn networks(&mut self) -> $crate::state_dict::StateDict<'_> {
                 $crate::state_dict::StateDict::default()
                     $(.with(stringify!($field), &mut self.$field))*
             }

@@ -3,6 +3,7 @@
 //! value Q^β is learned from the data's own next actions, and β is improved once. No value of the
 //! improved policy is ever asked for.
 
+use super::batch::asked;
 use super::gaussian::{first_half_policy, log_density};
 use super::in_sample::weighted;
 use super::prelude::*;
@@ -11,9 +12,11 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "onestep",
     presets: include_str!("../../presets/onestep.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
-    read: |table| Ok(start(read(table)?, Onestep::new)),
+    read: |table| {
+        let start = start(read(table)?, Onestep::new);
+        Ok(Start { columns: Columns::NextActions, ..start })
+    },
+    ..Definition::PLAIN
 };
 
 /// Bounds of log σ.
@@ -57,7 +60,7 @@ struct Phases {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Onestep(config: Config, init) {
         /// β.
         behavior: TrainState<Ensemble> =
             init.state_network(&config.behavior, 2 * init.context.action_dim()),
@@ -67,21 +70,7 @@ networks! {
     }
 }
 
-struct Onestep {
-    config: Config,
-    context: Context,
-    /// The transitions to learn from.
-    rows: Vec<u32>,
-    networks: Networks,
-}
-
 impl Onestep {
-    fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
-        let rows = context.with_next_action()?;
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, rows, networks })
-    }
-
     fn first_steps(&self) -> [u64; 3] {
         let phases = self.config.phases;
         let lengths = [phases.behavior, phases.critic, phases.policy];
@@ -89,51 +78,50 @@ impl Onestep {
     }
 
     /// The loss of the network that learns in a phase.
-    fn loss(&self, phase: usize, step: u64, indices: &[u32]) -> Result<Loss> {
-        let rows = select(&self.rows, indices);
-        let batch = self.context.batch(&rows)?;
+    fn loss(&self, phase: usize, step: u64, batch: &Batch) -> Result<Loss> {
         match phase {
-            0 => self.behavior_loss(&batch),
-            1 => self.critic_loss(&batch, &self.context.next_actions(&rows)?),
-            _ => self.actor_loss(step, &batch),
+            0 => self.behavior_loss(batch),
+            1 => self.critic_loss(batch),
+            _ => self.actor_loss(step, batch),
         }
     }
 
     /// First phase: β toward the data's actions.
-    fn behavior_loss(&self, batch: &Minibatch) -> Result<Loss> {
-        let (mean, log_std) = distribution(&self.networks.behavior, &batch.observations)?;
+    fn behavior_loss(&self, batch: &Batch) -> Result<Loss> {
+        let (mean, log_std) = distribution(&self.behavior, &batch.observations)?;
         let log_probability = log_density(&batch.actions, &mean, &log_std)?;
         Ok(Loss::new("behavior_loss", log_probability.mean_all()?.neg()?))
     }
 
-    /// Second phase: Q(s, a) toward r + γ·Q̂(s', a'), with the action a' that the data takes next,
-    /// `[B, a]`.
-    fn critic_loss(&self, batch: &Minibatch, next_actions: &Tensor) -> Result<Loss> {
-        let critic = &self.networks.critic;
+    /// Second phase: Q(s, a) toward r + γ·Q̂(s', a'), with the action a' that the data takes
+    /// next.
+    fn critic_loss(&self, batch: &Batch) -> Result<Loss> {
+        let critic = &self.critic;
+        let next_actions = asked(&batch.next_actions)?;
         let next = batch.next_values(&critic.target, next_actions)?.squeeze(0)?;
         let targets = batch.target(*self.config.gamma, &next)?;
         batch.critic_loss(critic, &targets)
     }
 
     /// Third phase: π toward actions of the data, the more so the better they are than β's.
-    fn actor_loss(&self, step: u64, batch: &Minibatch) -> Result<Loss> {
-        let q = batch.values(&self.networks.critic.detach())?.squeeze(0)?;
+    fn actor_loss(&self, step: u64, batch: &Batch) -> Result<Loss> {
+        let q = batch.values(&self.critic.detach())?.squeeze(0)?;
         let advantage = (q - self.value(step, &batch.observations)?)?;
         let weight = (&advantage * f64::from(*self.config.temperature))?.exp()?;
-        let (mean, log_std) = distribution(&self.networks.actor, &batch.observations)?;
+        let (mean, log_std) = distribution(&self.actor, &batch.observations)?;
         let log_probability = log_density(&batch.actions, &mean, &log_std)?;
         Ok(weighted(&weight, &log_probability)?.with("advantage_mean", advantage.mean_all()?))
     }
 
     /// The mean of Q(s, ·) over actions that β draws, also beyond ±1; `[B]`.
     fn value(&self, step: u64, observations: &Tensor) -> Result<Tensor> {
-        let (b, samples) = (self.context.batch_size, *self.config.samples);
+        let (b, samples) = (observations.dim(0)?, *self.config.samples);
         let shape = (b, samples, self.context.action_dim());
         let noise = self.context.random(step).normal("behavior_noise", shape)?;
-        let (mean, log_std) = distribution(&self.networks.behavior.detach(), observations)?;
+        let (mean, log_std) = distribution(&self.behavior.detach(), observations)?;
         let spread = noise.broadcast_mul(&log_std.exp()?.unsqueeze(1)?)?;
         let actions = spread.broadcast_add(&mean.unsqueeze(1)?)?.flatten(0, 1)?; // [B·S, a]
-        let critic = self.networks.critic.detach();
+        let critic = self.critic.detach();
         critic.values(observations, &actions)?.reshape((b, samples))?.mean(1)
     }
 }
@@ -147,46 +135,41 @@ fn distribution(network: &Ensemble, observations: &Tensor) -> Result<(Tensor, Te
 }
 
 impl Algorithm for Onestep {
-    fn dataset_len(&self, _: usize) -> usize {
-        self.rows.len()
-    }
-
     fn phases(&self) -> Vec<u64> {
         self.first_steps().to_vec()
     }
 
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
         let (phase, steps) = phase(&self.first_steps(), step);
-        let loss = self.loss(phase, step, indices)?;
+        let loss = self.loss(phase, step, batch)?;
         let adam = AdamStep::after(steps, *self.config.learning_rate);
-        let Networks { behavior, critic, actor } = &mut self.networks;
         match phase {
             0 => {
-                behavior.minimize(&loss.value, adam)?;
-                actor.network.soft_update(behavior, 1.0)?; // all the way
+                self.behavior.minimize(&loss.value, adam)?;
+                self.actor.network.soft_update(&self.behavior, 1.0)?; // all the way
             }
             1 => {
-                critic.minimize(&loss.value, adam)?;
+                self.critic.minimize(&loss.value, adam)?;
                 if (steps + 1).is_multiple_of(*self.config.ema_every) {
-                    critic.soft_update(*self.config.ema_rate)?;
+                    self.critic.soft_update(*self.config.ema_rate)?;
                 }
             }
-            _ => drop(actor.minimize(&loss.value, adam)?),
+            _ => drop(self.actor.minimize(&loss.value, adam)?),
         }
         measured(&[loss])
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
         let (phase, _) = phase(&self.first_steps(), step);
-        measured(&[self.loss(phase, step, indices)?])
+        measured(&[self.loss(phase, step, batch)?])
     }
 
     /// Acts by the mean.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        first_half_policy(&self.networks.actor)
+        first_half_policy(&self.actor)
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

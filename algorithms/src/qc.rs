@@ -12,9 +12,9 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "qc",
     presets: include_str!("../../presets/qc.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
     chunks: true,
     read: |table| Ok(start(read(table)?, Qc::new)),
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -41,50 +41,38 @@ struct Config {
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Qc(config: Config, init) {
         critic: WithTarget<Ensemble> = init.critics(TWIN, &config.critic),
         /// The velocity v(s, x, t).
         flow: TrainState<Ensemble> = flow(&config.actor, init),
     }
 }
 
-struct Qc {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Qc {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
     /// The losses of critics and flow.
-    fn losses(&self, step: u64, indices: &[u32]) -> Result<[Loss; 2]> {
-        let (batch, random) = (self.context.batch(indices)?, &mut self.context.random(step));
+    fn losses(&self, step: u64, batch: &Batch) -> Result<[Loss; 2]> {
+        let random = &mut self.context.random(step);
         let (b, a) = batch.actions.dims2()?;
         let start = random.normal("start_noise", (b, a))?; // x_0
         let next_noise = random.normal("next_noise", (b * *self.config.candidates as usize, a))?;
         let times = random.tensor("times", (b, 1), |generator| generator.random::<f32>())?;
-        let targets = self.targets(&batch, &next_noise)?;
-        let critic_loss = batch.critic_loss(&self.networks.critic, &targets)?;
-        let bc_loss = flow_loss(&self.networks.flow, &batch, &start, &times)?;
+        let targets = self.targets(batch, &next_noise)?;
+        let critic_loss = batch.critic_loss(&self.critic, &targets)?;
+        let bc_loss = flow_loss(&self.flow, batch, &start, &times)?;
         Ok([critic_loss, Loss::new("bc_loss", bc_loss)])
     }
 
     /// y = r + γ·mask·Q̂(s', a'), `[B]`, with the best a' by Q of those from this noise, `[B·N, a]`.
-    fn targets(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
-        let Networks { critic, flow } = &self.networks;
-        let flow = FlowActor::new(flow.detach(), *self.config.flow_steps);
+    fn targets(&self, batch: &Batch, noise: &Tensor) -> Result<Tensor> {
+        let flow = FlowActor::new(self.flow.detach(), *self.config.flow_steps);
         let drawn = flow.sample(&batch.next_observations, noise)?;
         let target = self.config.target;
-        let q = reduced(&batch.next_values(&critic.detach(), &drawn)?, target)?;
+        let q = reduced(&batch.next_values(&self.critic.detach(), &drawn)?, target)?;
         let (n, b) = (*self.config.candidates, batch.rewards.dim(0)? as u32);
         let best = q.reshape((b as usize, n as usize))?.argmax(1)?;
         let firsts = Tensor::arange_step(0, b * n, n, noise.device())?;
         let best = drawn.index_select(&(best + firsts)?, 0)?;
-        let next = reduced(&batch.next_values(&critic.target, &best)?, target)?;
+        let next = reduced(&batch.next_values(&self.critic.target, &best)?, target)?;
         batch.target(*self.config.gamma, &next)
     }
 }
@@ -92,30 +80,29 @@ impl Qc {
 impl Algorithm for Qc {
     /// Both losses are those of the networks before the update, and so are the critics that the
     /// targets follow.
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
         let adam = AdamStep::after(step, *self.config.learning_rate);
-        let losses = self.losses(step, indices)?;
+        let losses = self.losses(step, batch)?;
         let [critic_loss, bc_loss] = &losses;
-        let Networks { critic, flow } = &mut self.networks;
-        critic.soft_update(*self.config.ema_rate)?;
-        critic.minimize(&critic_loss.value, adam)?;
-        flow.minimize(&bc_loss.value, adam)?;
+        self.critic.soft_update(*self.config.ema_rate)?;
+        self.critic.minimize(&critic_loss.value, adam)?;
+        self.flow.minimize(&bc_loss.value, adam)?;
         measured(&losses)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        measured(&self.losses(step, indices)?)
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        measured(&self.losses(step, batch)?)
     }
 
     /// The flow, which chooses by the critics themselves.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let choice = Choice::new(*self.config.candidates, self.config.target, Rule::Best);
-        let (flow, critics) = (&self.networks.flow, &self.networks.critic);
+        let (flow, critics) = (&self.flow, &self.critic);
         let (shape, tensors) = ActorCriticShape::from_networks(flow, critics)?;
         Ok((PolicyConfig::Flow { shape, flow_steps: *self.config.flow_steps, choice }, tensors))
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

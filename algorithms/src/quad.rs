@@ -4,36 +4,69 @@
 
 mod config;
 mod guidance;
-mod lambda;
 mod metrics;
-mod noise;
 mod summary;
 
 use super::definition::Axis;
-use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
+use super::diffusion::{Denoising, Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
 use super::prelude::*;
+use super::replay::Inputs;
 use super::state_dict::write;
 use config::{Config, Guidance, TargetReduce};
-use guidance::{Averages, Guide};
+use guidance::{Averages, Guide, shuffled};
 use metrics::METRICS;
-use noise::Noise;
-use quad_nn::{Reverse, pulled_error, squared_error};
+use quad_nn::{Reverse, pulled_error};
 use quad_policy::{DiffusionPolicy, DiffusionShape};
 
 pub(super) const DEFINITION: Definition = Definition {
     name: "quad",
     presets: include_str!("../../presets/quad.toml"),
     metrics: METRICS,
-    report: Reporting {
-        // DAC and behavior cloning (none) have names of their own.
-        variant: Some(Variant { key: "guidance", called: str::to_owned, unused: config::unused }),
-        axis: Some(Axis { key: "tau", symbol: "τ" }),
-        acts_after: Some("actor_ema_start"),
-        summary: Some(summary::of),
-    },
+    // DAC and behavior cloning (none) have names of their own.
+    variant: Some(Variant { key: "guidance", called: str::to_owned, unused: config::unused }),
+    axis: Some(Axis { key: "tau", symbol: "τ" }),
+    acts_after: Some("actor_ema_start"),
+    summary: Some(summary::summarize),
     chunks: true,
     read: |table| Ok(start(Config::read(table)?, Quad::start)),
+    ..Definition::PLAIN
 };
+
+#[derive(Clone)]
+struct Noise {
+    /// Noise of the sampled next actions, `[T, B·S, a]`.
+    next: Tensor,
+    /// t and ε of Eq. 5.
+    denoising: Denoising,
+    /// With guidance `shuffled`: the sample whose λ each sample takes, one of the same t, `[B]`.
+    permutation: Option<Tensor>,
+}
+
+impl Inputs for Noise {
+    fn tensors(&mut self) -> Vec<&mut Tensor> {
+        let mut tensors = self.denoising.tensors();
+        tensors.push(&mut self.next);
+        tensors.extend(&mut self.permutation);
+        tensors
+    }
+}
+
+impl Noise {
+    fn draw(config: &Config, mut sampler: Sampler<'_>) -> Result<Self> {
+        let next = sampler.chain("next_noise", *config.samples)?;
+        let denoising = sampler.denoising()?;
+        let permutation = match config.guidance {
+            Guidance::Shuffled => {
+                let t = denoising.t.to_vec1()?;
+                let shuffled = |generator: &mut _| Ok(shuffled(&t, generator));
+                let rows: Vec<u32> = sampler.random.vector("permutation", shuffled)?;
+                Some(Tensor::new(rows, &Device::Cpu)?)
+            }
+            _ => None,
+        };
+        Ok(Self { next, denoising, permutation })
+    }
+}
 
 struct Quad {
     config: Config,
@@ -59,7 +92,7 @@ impl Quad {
 
     /// y = r + γ·mask·(mean − ρ·std over the critics of each one's value of s') (Eq. 20), `[B]`. A
     /// critic's value of s' is the mean, or the largest, of its values of the sampled actions.
-    fn targets(&self, networks: &Networks, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
+    fn targets(&self, networks: &Networks, batch: &Batch, noise: &Tensor) -> Result<Tensor> {
         let next_actions = networks.sample_next(batch, noise)?;
         let q = batch.next_values(&networks.critic.target, &next_actions)?;
         let q = q.reshape((*self.config.critics, (), *self.config.samples))?;
@@ -71,7 +104,7 @@ impl Quad {
     }
 
     /// Every critic toward the lower confidence bound (Eq. 20).
-    fn critic_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+    fn critic_loss(&self, networks: &Networks, batch: &Batch, noise: &Noise) -> Result<Loss> {
         let targets = self.targets(networks, batch, &noise.next)?;
         batch.critic_loss(&networks.critic, &targets)
     }
@@ -80,7 +113,7 @@ impl Quad {
     fn actor_loss(
         &self,
         networks: &Networks,
-        batch: &Minibatch,
+        batch: &Batch,
         noise: &Noise,
     ) -> Result<(Loss, Option<Guide>)> {
         let (noisy, predicted) = denoise(&networks.actor, batch, &noise.denoising)?;
@@ -92,12 +125,12 @@ impl Quad {
             return Ok((Loss::new("actor_loss", loss).with("bc_loss", bc_loss), None));
         }
         let critics = &networks.critic.target;
-        let at = (&noisy, &predicted.detach());
-        let guide = self.averages.guide(&self.config, critics, batch, noise, at)?;
+        let noisy = (&noisy, &predicted.detach());
+        let guide = self.averages.guide(&self.config, critics, batch, noise, noisy)?;
         let gradient = (&guide.gradient * &noise.denoising.deviation)?;
         let pull = gradient.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
         let (loss, bc_loss) = pulled_error(&predicted, epsilon, &self.eta, &pull)?;
-        let others = lambda::inputs(&guide, error);
+        let others = metrics::lambda_inputs(&guide, error);
         let loss = Loss { others, ..Loss::new("actor_loss", loss).with("bc_loss", bc_loss) };
         Ok((loss.with("delta_share", guide.delta_share.clone()), Some(guide)))
     }
@@ -118,18 +151,18 @@ impl DiffusionUpdate for Quad {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
-        let (config, Networks { actor, critic }) = (&self.config, networks);
+        let config = &self.config;
         let decay = context.decay(step, *config.online_rate);
         let adam = |rate| AdamStep::after(step, rate * decay).clipped(*config.gradient_clip);
-        critic.adam.set_step(adam(*config.critic_learning_rate))?;
-        actor.adam.set_step(adam(*config.actor_learning_rate))
+        networks.critic.adam.set_step(adam(*config.critic_learning_rate))?;
+        networks.actor.adam.set_step(adam(*config.actor_learning_rate))
     }
 
     /// Algorithm 1's loop, but for the target actor.
     fn update(
         &mut self,
         networks: &mut Networks,
-        batch: &Minibatch,
+        batch: &Batch,
         noise: &Noise,
     ) -> Result<Vec<Loss>> {
         // Lines 4–7: the critics, and line 14: their EMA.
@@ -168,22 +201,22 @@ impl DiffusionUpdate for Quad {
         Ok(())
     }
 
-    fn losses(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Vec<Loss>> {
+    fn losses(&self, networks: &Networks, batch: &Batch, noise: &Noise) -> Result<Vec<Loss>> {
         let (actor_loss, _) = self.actor_loss(networks, batch, noise)?;
         Ok(vec![self.critic_loss(networks, batch, noise)?, actor_loss])
     }
 
-    fn measure(&self, networks: &Networks, noise: &Noise, of_guidance: &[f32]) -> Result<Measured> {
+    fn measure(&self, networks: &Networks, noise: &Noise, numbers: &[f32]) -> Result<Measured> {
         let (steps, delta) = (*self.config.diffusion_steps, *self.config.delta);
         let t = noise.denoising.t.to_vec1()?;
-        let mut measured = lambda::measure(of_guidance, &t, steps, delta);
+        let mut measured = metrics::measure_lambda(numbers, &t, steps, delta);
         measured.push(("learning_rate", networks.actor.adam.step().rate));
         Ok(measured)
     }
 
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
-        let Networks { actor, critic } = networks;
-        let tensors = DiffusionPolicy::tensors(&actor.target, Some(&critic.target), None)?;
+        let (actor, critics) = (&networks.actor.target, &networks.critic.target);
+        let tensors = DiffusionPolicy::tensors(actor, Some(critics), None)?;
         Ok((Choice::best_of(*self.config.candidates), tensors)) // Eq. 25
     }
 

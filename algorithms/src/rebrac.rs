@@ -10,9 +10,11 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "rebrac",
     presets: include_str!("../../presets/rebrac.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
-    read: |table| Ok(start(read_with::<Common, Config>(table)?, Td3::new)),
+    read: |table| {
+        let start = start(read_with::<Common, Config>(table)?, Td3::new);
+        Ok(Start { columns: Columns::NextActions, ..start })
+    },
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -48,13 +50,13 @@ impl BcRegularizer for Config {
     fn actor_loss(
         &self,
         actions: &Tensor,
-        of_data: &Tensor,
+        data: &Tensor,
         q: &Tensor,
         cloning: f64,
     ) -> Result<[Tensor; 2]> {
         let q = smallest(q)?;
         let weight = q.detach().abs()?.mean_all()?.recip()?;
-        let bc_loss = (actions - of_data)?.sqr()?.sum(1)?.mean_all()?;
+        let bc_loss = (actions - data)?.sqr()?.sum(1)?.mean_all()?;
         let penalty = f64::from(*self.actor_penalty) * cloning;
         Ok([((&bc_loss * penalty)? - (q.mean_all()? * weight)?)?, bc_loss])
     }

@@ -2,12 +2,34 @@
 //! replays that in those after it. It is hundreds of kernels, and the host takes longer to start one
 //! of them than the GPU to run it.
 
-use super::algorithm::Measured;
-use super::inputs::Inputs;
+use super::agent::Measured;
 use super::losses::{Computed, Loss, joined};
 use candle_core::{DType, Device, Result, Tensor};
 use quad_nn::{CudaGraph, overwrite};
 use std::thread::{ThreadId, current};
+
+/// Tensors that each update has anew, always the same number of them in the same shapes: those of a
+/// batch, and the noise.
+pub(super) trait Inputs: Clone {
+    fn tensors(&mut self) -> Vec<&mut Tensor>;
+
+    /// Copies them to a device.
+    fn on(&self, device: &Device) -> Result<Self> {
+        let mut inputs = self.clone();
+        for tensor in inputs.tensors() {
+            *tensor = tensor.to_device(device)?;
+        }
+        Ok(inputs)
+    }
+}
+
+impl<A: Inputs, B: Inputs> Inputs for (A, B) {
+    fn tensors(&mut self) -> Vec<&mut Tensor> {
+        let (mut tensors, more) = (self.0.tensors(), self.1.tensors());
+        tensors.extend(more);
+        tensors
+    }
+}
 
 /// State between two updates.
 struct Kept<I> {

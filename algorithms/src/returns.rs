@@ -1,9 +1,31 @@
-//! Returns of a dataset's episodes as a critic's targets: standardized, and planned anew with
-//! values of states.
+//! Returns of a dataset's episodes: discounted, as Cal-QL bounds values by them, and as SfBC's
+//! critics learn them: standardized, and planned anew with values of states.
 
 use super::state_dict::StateDict;
 use candle_core::{DType, Device, Result, Tensor};
 use std::ops::Range;
+
+/// Discounted sums of rewards to the end of an episode; `after` is added to the last reward.
+pub(super) fn discounted(rewards: &[f32], gamma: f64, mut after: f64) -> Vec<f64> {
+    let (mut returns, mut discount) = (vec![0.0; rewards.len()], 1.0);
+    for (value, reward) in returns.iter_mut().zip(rewards).rev() {
+        after = f64::from(*reward) + discount * after;
+        (*value, discount) = (after, gamma);
+    }
+    returns
+}
+
+/// The lower bounds of an episode's values in Cal-QL (Nakamoto et al. 2023, "Cal-QL: Calibrated
+/// Offline RL Pre-Training for Efficient Online Fine-Tuning"). One of two or more equal rewards that
+/// does not terminate has not reached its goal: its return is that of this reward forever, which γ <
+/// 1 makes finite.
+pub(super) fn calibrated(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f32> {
+    let failed = rewards.len() > 1 && !terminates;
+    if failed && gamma < 1.0 && rewards.iter().all(|reward| *reward == rewards[0]) {
+        return vec![(f64::from(rewards[0]) / (1.0 - gamma)) as f32; rewards.len()];
+    }
+    discounted(rewards, gamma, 0.0).into_iter().map(|value| value as f32).collect()
+}
 
 /// Least divisor of the returns.
 const LEAST_DEVIATION: f64 = 0.1;
@@ -91,8 +113,8 @@ impl Returns {
 
     /// Adds what planning changes.
     pub fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {
-        let Self { values, targets, scale, .. } = self;
-        dict.with("values", values).with("targets", targets).with("scale", scale)
+        let dict = dict.with("values", &mut self.values).with("targets", &mut self.targets);
+        dict.with("scale", &mut self.scale)
     }
 }
 
@@ -108,14 +130,20 @@ mod tests {
         let (targets, deviation): (Vec<f32>, f32) =
             (returns.targets.to_vec1().unwrap(), 0.96f32.sqrt());
         assert!((targets[4] - 1.8 / deviation).abs() < 1e-6, "{targets:?}");
-        let of_target = returns.unscaled(&returns.targets).unwrap().to_vec1::<f32>().unwrap();
-        assert!((of_target[4] - 4.0).abs() < 1e-6, "{of_target:?}");
+        let unscaled = returns.unscaled(&returns.targets).unwrap().to_vec1::<f32>().unwrap();
+        assert!((unscaled[4] - 4.0).abs() < 1e-6, "{unscaled:?}");
         // A value counts where it is larger, and so does it for what came before.
         let values = [0.0, 6.0, 0.0, 1.0, 4.5];
         assert_eq!(returns.planned(Some(&values)), [4.0, 6.0, 1.125, 2.25, 4.5]);
         returns.keep(&Tensor::new(&values[3..], &Device::Cpu).unwrap(), 3).unwrap();
         assert_eq!(returns.mean_value(2..5).unwrap(), Some(5.5 / 3.0));
         assert!(returns.planned(Some(&[0.0, f32::NAN, 0.0, 0.0, 0.0]))[0].is_nan());
+    }
+
+    #[test]
+    fn returns_without_a_discount_are_finite() {
+        assert_eq!(calibrated(&[0.0, 0.0], false, 1.0), [0.0, 0.0]);
+        assert_eq!(calibrated(&[1.0, 1.0], false, 1.0), [2.0, 1.0]);
     }
 
     #[test]

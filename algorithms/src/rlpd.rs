@@ -13,9 +13,8 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "rlpd",
     presets: include_str!("../../presets/rlpd.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
     read: |table| Ok(start(Config::read(table)?, Rlpd::new)),
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -33,7 +32,7 @@ struct Config {
     critic: MlpConfig,
     /// Ensemble size K.
     critics: Count,
-    /// Critics of which the smallest value counts in the target, drawn anew in each step.
+    /// Size of the random critic subset in the target.
     target_critics: Count,
     gamma: UnitInterval,
     /// Reward the next action's entropy in the target.
@@ -52,14 +51,14 @@ struct Config {
 impl Config {
     fn read(table: &toml::Table) -> std::result::Result<Self, AgentError> {
         let config: Self = read(table)?;
-        let (of, most) = (*config.target_critics, *config.critics);
-        check("target_critics", of, of <= most, "at most agent.critics")?;
+        let (subset, most) = (*config.target_critics, *config.critics);
+        check("target_critics", subset, subset <= most, "at most agent.critics")?;
         Ok(config)
     }
 }
 
 networks! {
-    struct Networks(config: &Config, init) {
+    struct Rlpd(config: Config, init) {
         actor: Squashed = Squashed::new(&config.actor, GaussianPolicy::LOG_STD, init),
         critic: WithTarget<Ensemble> = init.critics(*config.critics, &config.critic),
         /// log α, `[1]`.
@@ -76,26 +75,13 @@ struct Noise {
     critics: Tensor,
 }
 
-struct Rlpd {
-    config: Config,
-    context: Context,
-    networks: Networks,
-}
-
 impl Rlpd {
-    fn new(config: Config, context: Context) -> Result<Self> {
-        let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, networks })
-    }
-
-    fn noise(&self, step: u64) -> Result<Noise> {
-        let Config { critics, target_critics, .. } = self.config;
-        let (mut random, shape) =
-            (self.context.random(step), (self.context.batch_size, 1, self.context.action_dim()));
+    fn noise(&self, step: u64, b: usize) -> Result<Noise> {
+        let (mut random, shape) = (self.context.random(step), (b, 1, self.context.action_dim()));
         let next = random.normal("next_noise", shape)?;
         let policy = random.normal("policy_noise", shape)?;
         let critics = random.vector("target_critics", |generator| {
-            let drawn = sample(generator, *critics, *target_critics);
+            let drawn = sample(generator, *self.config.critics, *self.config.target_critics);
             Ok(drawn.into_iter().map(|index| index as u32).collect())
         })?;
         Ok(Noise { next, policy, critics: Tensor::new(critics, &self.context.device)? })
@@ -103,27 +89,25 @@ impl Rlpd {
 
     /// α, `[1]`.
     fn alpha(&self) -> Result<Tensor> {
-        self.networks.log_alpha.values().detach().exp()
+        self.log_alpha.values().detach().exp()
     }
 
     /// Every critic toward r + γ·mask·(min Q̂_k(s', a') − α·log π(a'|s')).
-    fn critic_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
-        let Networks { actor, critic, .. } = &self.networks;
-        let next = actor.constant_distribution(&batch.next_observations)?.draw(&noise.next)?;
-        let values = batch.next_values(&critic.target, &next.actions.squeeze(1)?)?;
+    fn critic_loss(&self, batch: &Batch, noise: &Noise) -> Result<Loss> {
+        let next = self.actor.constant_distribution(&batch.next_observations)?.draw(&noise.next)?;
+        let values = batch.next_values(&self.critic.target, &next.actions.squeeze(1)?)?;
         let mut q = smallest(&values.index_select(&noise.critics, 0)?)?;
         if self.config.entropy_backup {
             q = (q - next.log_density.squeeze(1)?.broadcast_mul(&self.alpha()?)?)?;
         }
-        batch.critic_loss(critic, &batch.target(*self.config.gamma, &q)?)
+        batch.critic_loss(&self.critic, &batch.target(*self.config.gamma, &q)?)
     }
 
     /// The policy toward large entropy and large Q by the mean of all critics; and its entropy, `[]`,
     /// a constant.
-    fn actor_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<(Loss, Tensor)> {
-        let Networks { actor, critic, .. } = &self.networks;
-        let drawn = actor.distribution(&batch.observations)?.draw(&noise.policy)?;
-        let q = batch.values_at(&critic.detach(), &drawn.actions.squeeze(1)?)?.mean(0)?;
+    fn actor_loss(&self, batch: &Batch, noise: &Noise) -> Result<(Loss, Tensor)> {
+        let drawn = self.actor.distribution(&batch.observations)?.draw(&noise.policy)?;
+        let q = batch.values_at(&self.critic.detach(), &drawn.actions.squeeze(1)?)?.mean(0)?;
         let (alpha, log_density) = (self.alpha()?, drawn.log_density.squeeze(1)?);
         let entropy = log_density.detach().mean_all()?.neg()?;
         let loss = (log_density.broadcast_mul(&alpha)? - q)?.mean_all()?;
@@ -134,38 +118,37 @@ impl Rlpd {
 
 impl Algorithm for Rlpd {
     /// The policy learns from the last of each `actor_every` batches, after the critics.
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
         let (mut rate, every) = (*self.config.learning_rate, *self.config.actor_every);
         if self.config.decay {
             rate *= cosine_decay(step, self.context.total_steps + self.context.online_steps);
         }
-        let mut losses = vec![self.critic_loss(&batch, &noise)?];
-        self.networks.critic.minimize(&losses[0].value, AdamStep::after(step, rate))?;
-        self.networks.critic.soft_update(*self.config.ema_rate)?;
+        let mut losses = vec![self.critic_loss(batch, &noise)?];
+        self.critic.minimize(&losses[0].value, AdamStep::after(step, rate))?;
+        self.critic.soft_update(*self.config.ema_rate)?;
         if (step + 1).is_multiple_of(every) {
-            let (actor_loss, entropy) = self.actor_loss(&batch, &noise)?;
+            let (actor_loss, entropy) = self.actor_loss(batch, &noise)?;
             let adam = AdamStep::after(step / every, rate);
             let excess = (entropy + 0.5 * self.context.action_dim() as f64)?;
-            let Networks { actor, log_alpha, .. } = &mut self.networks;
-            actor.minimize(&actor_loss.value, adam)?;
-            let alpha_loss = (log_alpha.values().exp()?.sum_all()? * excess)?;
-            log_alpha.minimize(&alpha_loss, adam)?;
+            self.actor.minimize(&actor_loss.value, adam)?;
+            let alpha_loss = (self.log_alpha.values().exp()?.sum_all()? * excess)?;
+            self.log_alpha.minimize(&alpha_loss, adam)?;
             losses.push(actor_loss);
         }
         measured(&losses)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.context.batch(indices)?, self.noise(step)?);
-        measured(&[self.critic_loss(&batch, &noise)?, self.actor_loss(&batch, &noise)?.0])
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        let noise = self.noise(step, batch.size())?;
+        measured(&[self.critic_loss(batch, &noise)?, self.actor_loss(batch, &noise)?.0])
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        self.networks.actor.policy()
+        self.actor.policy()
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict()
+        self.networks()
     }
 }

@@ -3,10 +3,11 @@
 //! returns; then returns are planned anew with what the critic says of the clone's actions, and
 //! another critic learns these. The policy takes the best of the clone's samples.
 
+use super::examples::{Examples, episode_rewards};
 use super::prelude::*;
 use super::random::{Purpose, stream};
 use super::returns::Returns;
-use quad_dataset::Batch;
+use quad_dataset::Window;
 use quad_nn::{ContinuousNoise, DpmSolver, ScoreNetwork, ScoreShape};
 use quad_policy::{ScorePolicy, ScorePolicyShape};
 use rand::Rng;
@@ -17,9 +18,12 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "sfbc",
     presets: include_str!("../../presets/sfbc.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
-    read: |table| Ok(start(Config::read(table)?, Sfbc::new)),
+    read: |table| {
+        let config = Config::read(table)?;
+        let columns = Columns::Episodes(*config.shortest_episode);
+        Ok(Start { columns, ..start(config, Sfbc::new) })
+    },
+    ..Definition::PLAIN
 };
 
 /// The earliest time whose noise is learned.
@@ -103,31 +107,27 @@ struct Sfbc {
     config: Config,
     context: Context,
     /// The transitions to learn from, episode by episode, and their returns.
-    rows: Vec<u32>,
+    examples: Examples,
     returns: Returns,
     networks: Networks,
 }
 
 impl Sfbc {
     fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
-        let mut all = context.transitions.episodes();
-        all.retain(|episode| episode.len() >= *config.shortest_episode);
-        let mut end = 0;
-        let place = |episode: &Range<u32>| {
-            let start = end;
-            end += episode.len();
-            start..end
-        };
-        let episodes = all.iter().map(place).collect();
-        let rows: Vec<u32> = all.into_iter().flatten().collect();
-        if rows.is_empty() {
-            return Err(AlgorithmError::ShortEpisodes(*config.shortest_episode));
+        let shortest = *config.shortest_episode;
+        let (transitions, columns) = (context.transitions.clone(), Columns::Episodes(shortest));
+        let examples = Examples::new(transitions, columns, Window::ONE)?;
+        let (mut rewards, mut episodes) = (Vec::new(), Vec::new());
+        for episode in context.transitions.episodes() {
+            if episode.len() >= shortest {
+                let first = rewards.len();
+                rewards.extend(episode_rewards(&context.transitions, episode).0);
+                episodes.push(first..rewards.len());
+            }
         }
-        let mut batch = Batch::default();
-        context.transitions.gather(&rows, &mut batch);
-        let returns = Returns::new(batch.rewards, episodes, *config.gamma)?;
+        let returns = Returns::new(rewards, episodes, *config.gamma)?;
         let networks = Networks::new(&config, &mut Initializer::new(&context))?;
-        Ok(Self { config, context, rows, returns, networks })
+        Ok(Self { config, context, examples, returns, networks })
     }
 
     /// The first steps of cloning, the first critic's round, planning and the second critic's.
@@ -138,14 +138,14 @@ impl Sfbc {
     }
 
     /// ε_θ toward the noise in the data's actions.
-    fn clone_behavior(&mut self, step: u64, batch: &Minibatch, adam: AdamStep) -> Result<Measured> {
-        let (mut random, rows) = (self.context.random(step), self.context.batch_size);
+    fn clone_behavior(&mut self, step: u64, batch: &Batch, adam: AdamStep) -> Result<Measured> {
+        let (mut random, rows) = (self.context.random(step), batch.size());
         let epsilon = random.normal("epsilon", batch.actions.shape())?;
         let t: Vec<f64> = random.vector("t", |generator| {
             Ok((0..rows).map(|_| generator.random_range(FIRST_TIME..1.0)).collect())
         })?;
-        let column = |of: fn(ContinuousNoise) -> f64| {
-            let numbers = t.iter().map(|t| of(ContinuousNoise::at(*t)) as f32);
+        let column = |factor: fn(ContinuousNoise) -> f64| {
+            let numbers = t.iter().map(|t| factor(ContinuousNoise::at(*t)) as f32);
             Tensor::from_vec(numbers.collect(), (rows, 1), &self.context.device)
         };
         let signal = batch.actions.broadcast_mul(&column(|noise| noise.signal)?)?;
@@ -157,14 +157,9 @@ impl Sfbc {
         measured(&[Loss::new("bc_loss", loss)])
     }
 
-    /// Q(s, a) toward the returns of the batch's transitions, which have these indices.
-    fn learn_returns(
-        &mut self,
-        batch: &Minibatch,
-        indices: &[u32],
-        adam: AdamStep,
-    ) -> Result<Measured> {
-        let indices = Tensor::from_slice(indices, indices.len(), &Device::Cpu)?;
+    /// Q(s, a) toward the returns of the batch's transitions.
+    fn learn_returns(&mut self, batch: &Batch, adam: AdamStep) -> Result<Measured> {
+        let indices = Tensor::from_slice(&batch.indices, batch.size(), &Device::Cpu)?;
         let targets = self.returns.targets.index_select(&indices, 0)?;
         let targets = targets.to_device(&self.context.device)?;
         let loss = batch.critic_loss(&self.networks.critic, &targets)?;
@@ -177,7 +172,7 @@ impl Sfbc {
         for first in states.clone().step_by(TOGETHER) {
             self.value(first..(first + TOGETHER).min(states.end))?;
         }
-        if states.end == self.rows.len() {
+        if states.end == self.examples.len() {
             self.returns.plan()?;
         }
         Ok(self.returns.mean_value(states)?.map(|mean| ("v_mean", mean)).into_iter().collect())
@@ -187,10 +182,11 @@ impl Sfbc {
     /// for the states in a range.
     fn value(&mut self, states: Range<usize>) -> Result<()> {
         let (first, Networks { actor, critic }) = (states.start, &self.networks);
-        let rows = &self.rows[states];
-        let observations = self.context.batch(rows)?.observations;
+        let states = Vec::from_iter(states.start as u32..states.end as u32);
+        let (rows, batch) = (self.examples.rows(&states), self.examples.batch(&states)?);
+        let observations = batch.observations.to_device(&self.context.device)?;
         let solver = DpmSolver::new(*self.config.evaluations);
-        let actions = actor.sample(&solver, &observations, &self.noise(rows)?)?;
+        let actions = actor.sample(&solver, &observations, &self.noise(&rows)?)?;
         let q = critic.detach().values(&observations, &actions)?.reshape((rows.len(), ()))?;
         let exponents = q.broadcast_sub(&q.max_keepdim(1)?)?;
         let weights = (exponents / f64::from(*self.config.planning_temperature))?.exp()?;
@@ -201,51 +197,46 @@ impl Sfbc {
     /// The noise of the clone's S actions in some states, `[states·S, a]`.
     fn noise(&self, rows: &[u32]) -> Result<Tensor> {
         let (count, a) = (*self.config.samples, self.context.action_dim());
-        let of = |row: &u32| {
+        let drawn = |row: &u32| {
             let mut generator = stream(self.context.seed, Purpose::Actions, u64::from(*row));
             (0..count * a).map(move |_| -> f32 { StandardNormal.sample(&mut generator) })
         };
         let mut random = self.context.random_for(Purpose::Actions, 0);
         let numbers =
-            random.vector("planning_noise", |_| Ok(rows.iter().flat_map(of).collect()))?;
+            random.vector("planning_noise", |_| Ok(rows.iter().flat_map(drawn).collect()))?;
         Tensor::from_vec(numbers, (rows.len() * count, a), &self.context.device)
     }
 }
 
 impl Algorithm for Sfbc {
-    fn dataset_len(&self, _: usize) -> usize {
-        self.rows.len()
-    }
-
     fn phases(&self) -> Vec<u64> {
         self.first_steps().to_vec()
     }
 
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
         let first_steps = self.first_steps();
         let (phase, steps) = phase(&first_steps, step);
-        let of_actor = AdamStep::after(steps, *self.config.actor_learning_rate);
-        let of_critic = AdamStep::after(steps, *self.config.critic_learning_rate);
         if phase == 2 {
             let [rows, length] =
-                [self.rows.len() as u64, first_steps[3] - first_steps[2]].map(u128::from);
+                [self.examples.len() as u64, first_steps[3] - first_steps[2]].map(u128::from);
             let before = |steps: u64| (u128::from(steps) * rows / length) as usize;
             return self.plan(before(steps)..before(steps + 1));
         }
-        let batch = self.context.batch(&select(&self.rows, indices))?;
         if phase == 0 {
-            return self.clone_behavior(step, &batch, of_actor);
+            let adam = AdamStep::after(steps, *self.config.actor_learning_rate);
+            return self.clone_behavior(step, batch, adam);
         }
         if phase == 3 && steps == 0 {
             // The second critic begins as the first did.
             let networks = Networks::new(&self.config, &mut Initializer::new(&self.context))?;
             self.networks.critic = networks.critic;
         }
-        self.learn_returns(&batch, indices, of_critic)
+        let adam = AdamStep::after(steps, *self.config.critic_learning_rate);
+        self.learn_returns(batch, adam)
     }
 
     /// Measures nothing: only the transitions that it learns from have returns.
-    fn evaluate(&self, _: u64, _: &[u32]) -> Result<Measured> {
+    fn evaluate(&self, _: u64, _: &Batch) -> Result<Measured> {
         Ok(Measured::new())
     }
 

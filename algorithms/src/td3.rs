@@ -46,7 +46,7 @@ pub(super) trait BcRegularizer: Send {
     fn actor_loss(
         &self,
         actions: &Tensor,
-        of_data: &Tensor,
+        data: &Tensor,
         q: &Tensor,
         cloning: f64,
     ) -> Result<[Tensor; 2]>;
@@ -65,54 +65,42 @@ networks! {
 pub(super) struct Td3<R> {
     regularizer: R,
     context: Context,
-    /// The transitions to learn from, where not all are.
-    rows: Option<Vec<u32>>,
     networks: Networks,
     /// The policy's last `actor_loss` and `bc_loss`, `[2]`.
-    of_actor: Tensor,
+    actor_losses: Tensor,
 }
 
 impl<R: BcRegularizer> Td3<R> {
-    pub fn new(regularizer: R, context: Context) -> std::result::Result<Self, AlgorithmError> {
-        let rows = regularizer.penalty().map(|_| context.with_next_action()).transpose()?;
+    pub fn new(regularizer: R, context: Context) -> Result<Self> {
         let networks = Networks::new(regularizer.common(), &mut Initializer::new(&context))?;
-        let of_actor = Tensor::zeros(2, DType::F32, &context.device)?;
-        Ok(Self { regularizer, context, rows, networks, of_actor })
+        let actor_losses = Tensor::zeros(2, DType::F32, &context.device)?;
+        Ok(Self { regularizer, context, networks, actor_losses })
     }
 
-    /// A batch, and the data's next actions where they count: online they do not.
-    fn batch(&self, step: u64, indices: &[u32]) -> Result<(Minibatch, Option<Tensor>)> {
-        let rows = self.rows.as_ref().filter(|_| self.context.online_share(step).is_none());
-        let Some(rows) = rows else { return Ok((self.context.batch(indices)?, None)) };
-        let rows = select(rows, indices);
-        Ok((self.context.batch(&rows)?, Some(self.context.next_actions(&rows)?)))
-    }
-
-    fn critic_loss(&self, step: u64, batch: &Minibatch, next: Option<&Tensor>) -> Result<Loss> {
-        let targets = self.targets(step, batch, next)?;
+    fn critic_loss(&self, step: u64, batch: &Batch) -> Result<Loss> {
+        let targets = self.targets(step, batch)?;
         let loss = batch.squared_error(&self.networks.critic, &targets)?;
-        Loss::of_critics((loss * TWIN as f64)?, &targets)
+        Loss::critics((loss * TWIN as f64)?, &targets)
     }
 
     /// y = r + γ·mask·(min_k Q̂_k(s', ã') − penalty·Σ (ã' − a')²), `[B]`, with the data's next
     /// action a'.
-    fn targets(&self, step: u64, batch: &Minibatch, next: Option<&Tensor>) -> Result<Tensor> {
+    fn targets(&self, step: u64, batch: &Batch) -> Result<Tensor> {
         let common = self.regularizer.common();
-        let Networks { actor, critic } = &self.networks;
-        let shape = (self.context.batch_size, self.context.action_dim());
-        let noise = self.context.random(step).normal("target_noise", shape)?;
+        let noise = self.context.random(step).normal("target_noise", batch.actions.shape())?;
         let limit = f64::from(*common.target_noise_limit);
         let noise = (noise * f64::from(*common.target_noise))?.clamp(-limit, limit)?;
-        let actions =
-            (gaussian_mean(&actor.target, &batch.next_observations)? + noise)?.clamp(-1.0, 1.0)?;
-        let mut q = smallest(&batch.next_values(&critic.target, &actions)?)?;
-        if let (Some(penalty), Some(next)) = (self.regularizer.penalty(), next) {
+        let actions = (gaussian_mean(&self.networks.actor.target, &batch.next_observations)?
+            + noise)?
+            .clamp(-1.0, 1.0)?;
+        let mut q = smallest(&batch.next_values(&self.networks.critic.target, &actions)?)?;
+        if let (Some(penalty), Some(next)) = (self.regularizer.penalty(), &batch.next_actions) {
             q = (q - ((actions - next)?.sqr()?.sum(1)? * f64::from(penalty))?)?;
         }
         batch.target(*common.gamma, &q)
     }
 
-    fn actor_losses(&self, step: u64, batch: &Minibatch) -> Result<[Tensor; 2]> {
+    fn actor_loss(&self, step: u64, batch: &Batch) -> Result<[Tensor; 2]> {
         let actions = gaussian_mean(&self.networks.actor, &batch.observations)?;
         let q = batch.values_at(&self.networks.critic.detach(), &actions)?;
         let least = f64::from(*self.regularizer.common().online_cloning);
@@ -123,20 +111,15 @@ impl<R: BcRegularizer> Td3<R> {
 }
 
 impl<R: BcRegularizer> Algorithm for Td3<R> {
-    fn dataset_len(&self, transitions: usize) -> usize {
-        self.rows.as_ref().map_or(transitions, Vec::len)
-    }
-
-    fn update(&mut self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, next) = self.batch(step, indices)?;
-        let mut losses = vec![self.critic_loss(step, &batch, next.as_ref())?];
+    fn update(&mut self, step: u64, batch: &Batch) -> Result<Measured> {
+        let mut losses = vec![self.critic_loss(step, batch)?];
         let common = self.regularizer.common();
         let every = *common.actor_every;
         let adam = AdamStep::after(step, *common.critic_learning_rate);
         self.networks.critic.minimize(&losses[0].value, adam)?;
         let first = R::FIRST % every;
         if step % every == first {
-            let [actor_loss, bc_loss] = self.actor_losses(step, &batch)?;
+            let [actor_loss, bc_loss] = self.actor_loss(step, batch)?;
             let Networks { actor, critic } = &mut self.networks;
             if R::LAGS {
                 actor.soft_update(*common.ema_rate)?;
@@ -147,19 +130,18 @@ impl<R: BcRegularizer> Algorithm for Td3<R> {
                 actor.soft_update(*common.ema_rate)?;
             }
             critic.soft_update(*common.ema_rate)?;
-            write(&self.of_actor, &joined([&actor_loss, &bc_loss])?.detach())?;
+            write(&self.actor_losses, &joined([&actor_loss, &bc_loss])?.detach())?;
         }
         if step >= first {
-            let [actor_loss, bc_loss] = [self.of_actor.get(0)?, self.of_actor.get(1)?];
+            let [actor_loss, bc_loss] = [self.actor_losses.get(0)?, self.actor_losses.get(1)?];
             losses.push(Loss::new("actor_loss", actor_loss).with("bc_loss", bc_loss));
         }
         measured(&losses)
     }
 
-    fn evaluate(&self, step: u64, indices: &[u32]) -> Result<Measured> {
-        let (batch, next) = self.batch(step, indices)?;
-        let [actor_loss, bc_loss] = self.actor_losses(step, &batch)?;
-        let critic_loss = self.critic_loss(step, &batch, next.as_ref())?;
+    fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
+        let [actor_loss, bc_loss] = self.actor_loss(step, batch)?;
+        let critic_loss = self.critic_loss(step, batch)?;
         measured(&[critic_loss, Loss::new("actor_loss", actor_loss).with("bc_loss", bc_loss)])
     }
 
@@ -168,6 +150,6 @@ impl<R: BcRegularizer> Algorithm for Td3<R> {
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {
-        self.networks.state_dict().with("of_actor", &mut self.of_actor)
+        self.networks.state_dict().with("of_actor", &mut self.actor_losses)
     }
 }

@@ -9,9 +9,8 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "td3-bc",
     presets: include_str!("../../presets/td3-bc.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
     read: |table| Ok(start(read_with::<Common, Config>(table)?, Td3::new)),
+    ..Definition::PLAIN
 };
 
 const METRICS: &[Metric] = &metrics! {
@@ -41,13 +40,13 @@ impl BcRegularizer for Config {
     fn actor_loss(
         &self,
         actions: &Tensor,
-        of_data: &Tensor,
+        data: &Tensor,
         q: &Tensor,
         cloning: f64,
     ) -> Result<[Tensor; 2]> {
         let q = q.get(0)?;
         let weight = (q.detach().abs()?.mean_all()?.recip()? * f64::from(*self.weight))?;
-        let bc_loss = (actions - of_data)?.sqr()?.mean_all()?;
+        let bc_loss = (actions - data)?.sqr()?.mean_all()?;
         Ok([((&bc_loss * cloning)? - (q.mean_all()? * weight)?)?, bc_loss])
     }
 }

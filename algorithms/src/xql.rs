@@ -10,9 +10,8 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "xql",
     presets: include_str!("../../presets/xql.toml"),
     metrics: METRICS,
-    report: Reporting::PLAIN,
-    chunks: false,
     read: |table| Ok(start(read_with::<Common, Config>(table)?, InSample::new)),
+    ..Definition::PLAIN
 };
 
 /// Bound of the noise on the actions that V sees.
@@ -76,7 +75,7 @@ impl ImplicitLosses for Config {
         &self,
         context: &Context,
         step: u64,
-        batch: &Minibatch,
+        batch: &Batch,
     ) -> Result<Option<(Tensor, Tensor)>> {
         let (n, noise) = (usize::from(self.random_actions), f64::from(*self.value_noise));
         if n == 0 && noise == 0.0 {

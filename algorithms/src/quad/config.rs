@@ -109,8 +109,7 @@ impl Config {
     pub fn read(table: &toml::Table) -> Result<Self, AgentError> {
         let config: Self = read(table)?;
         check("tau", config.tau, config.tau > 0.0, "above 0 (`inf` is allowed)")?;
-        let (none, at) = (config.guidance == Guidance::None, config.guidance_at);
-        let holds = !none || at == GuidanceAt::Noisy;
+        let holds = config.guidance != Guidance::None || config.guidance_at == GuidanceAt::Noisy;
         check("guidance_at", "denoised", holds, "absent where agent.guidance is `none`")?;
         match (config.guidance, config.lambda) {
             (Guidance::Constant, None) => {
@@ -121,10 +120,11 @@ impl Config {
                 check("lambda", *lambda, false, "absent unless agent.guidance is `constant`")?
             }
         }
-        let Eta { initial, minimum, maximum, .. } = config.eta;
-        check("eta.maximum", *maximum, *maximum >= *minimum, "at least eta.minimum")?;
-        let within = (*minimum..=*maximum).contains(&*initial);
-        check("eta.initial", *initial, within, "between eta.minimum and eta.maximum")?;
+        let eta = config.eta;
+        let (initial, range) = (*eta.initial, *eta.minimum..=*eta.maximum);
+        check("eta.maximum", range.end(), range.start() <= range.end(), "at least eta.minimum")?;
+        let within = range.contains(&initial);
+        check("eta.initial", initial, within, "between eta.minimum and eta.maximum")?;
         Ok(config)
     }
 }

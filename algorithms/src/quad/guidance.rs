@@ -1,12 +1,14 @@
 //! The critics' gradients at noisy actions, or at what these denoise to, and their weight: λ of
 //! Eq. 24, or a control in its place.
 
+use super::Noise;
 use super::config::{Config, Guidance, GuidanceAt};
-use super::noise::Noise;
-use crate::context::Minibatch;
+use crate::batch::Batch;
 use crate::state_dict::{StateDict, write};
 use candle_core::{DType, Device, Result, Tensor};
 use quad_nn::{Ensemble, mean_and_variance};
+use rand::Rng;
+use rand::seq::SliceRandom;
 
 /// λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24) of ν̂², `[]`, and σ², `[B]`, or the weight in its place, `[B]`;
 /// and the share of the batch in which δ decides λ, `[]`.
@@ -61,18 +63,18 @@ impl Averages {
         Ok(Self { nu_squared: Tensor::new(-1f32, device)?, lambda_means })
     }
 
-    /// Takes the values of others.
-    pub fn set(&self, others: &Self) -> Result<()> {
-        write(&self.nu_squared, &others.nu_squared)?;
-        if let (Some(means), Some(others)) = (&self.lambda_means, &others.lambda_means) {
-            write(means, others)?;
+    /// Overwrites them with newer ones.
+    pub fn set(&self, newer: &Self) -> Result<()> {
+        write(&self.nu_squared, &newer.nu_squared)?;
+        if let (Some(means), Some(newer)) = (&self.lambda_means, &newer.lambda_means) {
+            write(means, newer)?;
         }
         Ok(())
     }
 
     pub fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {
-        let Self { nu_squared, lambda_means } = self;
-        dict.with("nu_squared", nu_squared).with("lambda_means", lambda_means)
+        let dict = dict.with("nu_squared", &mut self.nu_squared);
+        dict.with("lambda_means", &mut self.lambda_means)
     }
 
     /// Guidance by the target critics at noisy actions, for which the actor predicts this noise,
@@ -81,22 +83,22 @@ impl Averages {
         &self,
         config: &Config,
         critics: &Ensemble,
-        batch: &Minibatch,
+        batch: &Batch,
         noise: &Noise,
         (noisy, predicted): (&Tensor, &Tensor),
     ) -> Result<Guide> {
         let values = batch.values(critics)?;
-        let at = match config.guidance_at {
+        let guided = match config.guidance_at {
             GuidanceAt::Noisy => noisy.clone(),
             GuidanceAt::Denoised => noise.denoising.clean(noisy, predicted)?,
         };
-        let gradients = critics.action_gradients(&batch.observations, &at)?;
+        let gradients = critics.action_gradients(&batch.observations, &guided)?;
         // Critics align in actions that are guided, not in those beyond the end of an episode.
-        let guided = |x: &Tensor| match &batch.within {
+        let within = |x: &Tensor| match &batch.within {
             Some(within) => x.broadcast_mul(within),
             None => Ok(x.clone()),
         };
-        let (gradients, predicted) = (guided(&gradients)?, guided(predicted)?);
+        let (gradients, predicted) = (within(&gradients)?, within(predicted)?);
         #[cfg(feature = "cuda")]
         if config.guidance == Guidance::Quad && noisy.device().is_cuda() {
             return self.guide_on_gpu(config, [&values, &gradients, &predicted]);
@@ -137,8 +139,11 @@ impl Averages {
 #[cfg(feature = "cuda")]
 impl Averages {
     /// Guidance from the critics' values and gradients, in one kernel.
-    fn guide_on_gpu(&self, config: &Config, of: [&Tensor; 3]) -> Result<Guide> {
-        let [values, gradients, predicted] = of;
+    fn guide_on_gpu(
+        &self,
+        config: &Config,
+        [values, gradients, predicted]: [&Tensor; 3],
+    ) -> Result<Guide> {
         let (rows, a) = predicted.dims2()?;
         let numbers = [config.tau, *config.delta, *config.nu_ema_rate];
         let numbers = quad_nn::guide([values, gradients, predicted, &self.nu_squared], numbers)?;
@@ -157,10 +162,43 @@ impl Averages {
 /// 0), and as before where the batch has no such t.
 fn means_by_step(before: &Tensor, lambda: &Tensor, t: &Tensor, config: &Config) -> Result<Tensor> {
     let steps = Tensor::arange(1, 1 + before.elem_count() as u32, t.device())?.unsqueeze(1)?;
-    let is_of = steps.broadcast_eq(&t.unsqueeze(0)?)?.to_dtype(DType::F32)?; // [T, B]
-    let count = is_of.sum(1)?;
-    let mean = (is_of.broadcast_mul(lambda)?.sum(1)? / count.maximum(1f32)?)?;
+    let is_at = steps.broadcast_eq(&t.unsqueeze(0)?)?.to_dtype(DType::F32)?; // [T, B]
+    let count = is_at.sum(1)?;
+    let mean = (is_at.broadcast_mul(lambda)?.sum(1)? / count.maximum(1f32)?)?;
     let rate = f64::from(*config.nu_ema_rate);
     let rate = before.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - rate, rate)?;
     before + ((mean - before)? * (rate * count.minimum(1f32)?)?)?
+}
+
+/// A permutation of a batch that leaves each sample's t as it is.
+pub(super) fn shuffled(t: &[u32], generator: &mut impl Rng) -> Vec<u32> {
+    let rows = || 0..t.len() as u32;
+    let mut givers = Vec::from_iter(rows());
+    givers.shuffle(generator);
+    // Both in the order of t: the n-th sample of a t takes from the n-th of the shuffled ones.
+    let mut takers = Vec::from_iter(rows());
+    takers.sort_by_key(|row| t[*row as usize]);
+    givers.sort_by_key(|row| t[*row as usize]);
+    let mut permutation = vec![0; t.len()];
+    takers.into_iter().zip(givers).for_each(|(taker, giver)| permutation[taker as usize] = giver);
+    permutation
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    #[test]
+    fn a_shuffle_permutes_the_samples_of_each_denoising_step() {
+        let t = Vec::from_iter((0..500).map(|row| row % 3 + 1));
+        let mut rows = shuffled(&t, &mut ChaCha8Rng::seed_from_u64(0));
+        assert!(rows.iter().zip(&t).all(|(row, step)| t[*row as usize] == *step));
+        // Of n things in random order one stays on average; of three t's three do.
+        let stay = rows.iter().zip(0..).filter(|(row, place)| *row == place);
+        assert!(stay.count() < 20);
+        rows.sort_unstable();
+        assert_eq!(rows, Vec::from_iter(0..500));
+    }
 }

@@ -13,7 +13,7 @@ const ONE: f64 = 0.99;
 
 /// Summarizes λ after the first tenth of the steps done so far, if there was any. `variant` is the
 /// run's guidance.
-pub(super) fn of(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
+pub(super) fn summarize(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
     let mut lines = Vec::from_iter(
         lines.iter().filter(|line| line.contains_key("variance_ratio") && variant != "none"),
     );
@@ -46,7 +46,7 @@ fn text(means: &BTreeMap<&str, f64>, from_step: u64, to_step: u64) -> String {
         [10, 50, 90].map(|percent| mean(&format!("lambda_quantile_{percent}")));
     let fifth = |fifth| means.get(&*format!("lambda_fifth_{fifth}"));
     let fifths = [1, 2, 3, 4, 5]
-        .map(|of| fifth(of).map_or_else(|| "–".to_owned(), |mean| format!("{mean:.3}")));
+        .map(|part| fifth(part).map_or_else(|| "–".to_owned(), |mean| format!("{mean:.3}")));
     format!(
         "λ in steps {from_step} to {to_step}: mean {:.3}, of a batch 10 % below {low:.3}, 50 % below {median:.3}, 90 % below \
          {high:.3}; {:.1} % above {ONE}\n\

@@ -13,18 +13,13 @@ const CLONING: [(&str, &str); 6] = [
     ("qc", "flow"),
 ];
 
-fn chunked(mut table: toml::Table, chunk: i64) -> toml::Table {
-    table.insert("chunk".to_owned(), chunk.into());
-    table
-}
-
 /// Rows 0 to 9 of each twenty terminate, and 10 to 19 are truncated.
 #[test]
 fn windows_beyond_the_end_of_an_episode_are_masked() {
-    let mut context = context(0, &Device::Cpu);
-    context.window = Window { length: 3, gamma: 0.5, ..Window::ONE };
-    let data = arrays();
-    let batch = context.batch(&[0, 8, 18]).unwrap();
+    let window = Window { length: 3, gamma: 0.5, ..Window::ONE };
+    let transitions = context(0, &Device::Cpu).transitions;
+    let examples = Examples::new(transitions, Columns::Plain, window).unwrap();
+    let (data, batch) = (arrays(), examples.batch(&[0, 8, 18]).unwrap());
     let (r, a) = (&data.rewards, |row: usize| &data.actions[row * DIMS.1..][..DIMS.1]);
     let numbers = |tensor: &candle_core::Tensor| tensor.to_vec1::<f32>().unwrap();
     let rows = |tensor: &candle_core::Tensor| tensor.to_vec2::<f32>().unwrap();
@@ -42,19 +37,28 @@ fn windows_beyond_the_end_of_an_episode_are_masked() {
     assert_eq!(rows(&learned)[2], [[0.0; 6].as_slice(), &[1.0; 3]].concat());
 }
 
+/// The variants of an algorithm with chunks of this many actions.
+fn chunked(name: &str, chunk: i64) -> Vec<Variant> {
+    let mut variants = variants();
+    variants.retain(|variant| variant.name == name);
+    for variant in &mut variants {
+        variant.table.insert("chunk".to_owned(), chunk.into());
+    }
+    variants
+}
+
 #[test]
 fn a_policy_of_chunks_acts_step_by_step() {
-    let names = ALGORITHMS.iter().filter(|known| known.chunks).map(|known| known.name);
-    assert_eq!(Vec::from_iter(names), CLONING.map(|(name, _)| name));
-    for (definition, mut table) in variants().into_iter().filter(|(known, _)| known.chunks) {
-        table.insert("history".to_owned(), 2.into());
-        let mut agent = agent(definition, &chunked(table, 4), &context(0, &Device::Cpu));
-        for values in train(&mut agent, STEPS) {
-            assert!(values.iter().flatten().all(|value| value.is_finite()), "{values:?}");
-        }
-        let file = agent.policy("here").unwrap();
-        let policy = load_policy(&file, Precision::F32).unwrap();
-        assert_eq!((policy.observation_dim(), policy.action_dim()), DIMS, "{}", definition.name);
+    let chunks = ALGORITHMS.iter().filter(|definition| definition.chunks);
+    let names = Vec::from_iter(chunks.map(|definition| definition.name));
+    assert_eq!(names, CLONING.map(|(name, _)| name));
+    for mut variant in names.into_iter().flat_map(|name| chunked(name, 4)) {
+        variant.table.insert("history".to_owned(), 2.into());
+        let mut trial = variant.start(&context(0, &Device::Cpu));
+        let values = trial.train(STEPS).concat();
+        assert!(values.iter().flatten().all(|value| value.is_finite()), "{values:?}");
+        let policy = load_policy(&trial.policy(), Precision::F32).unwrap();
+        assert_eq!((policy.observation_dim(), policy.action_dim()), DIMS, "{}", variant.name);
         let mut states = [policy.begin(1)];
         let mut act = |observation: f32| {
             let mut action = [0.0; DIMS.1];
@@ -62,7 +66,7 @@ fn a_policy_of_chunks_acts_step_by_step() {
             action
         };
         let first = act(0.5);
-        assert!((1..4).any(|_| act(0.5) != first), "{}", definition.name);
+        assert!((1..4).any(|_| act(0.5) != first), "{}", variant.name);
     }
 }
 
@@ -77,18 +81,12 @@ fn single_steps() -> Context {
 /// An actor that predicts no noise has no direction in which critics could align.
 #[test]
 fn actions_beyond_the_end_of_an_episode_do_not_decide_lambda() {
-    let is_quad =
-        |table: &toml::Table| table.get("guidance").and_then(toml::Value::as_str) == Some("quad");
-    let (definition, table) = variants().into_iter().find(|(_, table)| is_quad(table)).unwrap();
-    let mut agent = agent(definition, &chunked(table, 2), &single_steps());
-    for (name, weights) in agent.algorithm.state_dict().networks() {
-        if name == "actor" {
-            weights.change(|values| values.slice_set(&(values * 0.0)?, 0, 0)).unwrap();
-        }
-    }
-    train(&mut agent, 1);
-    let state = agent.algorithm.state_dict().save().unwrap();
-    assert_eq!(state["nu_squared"].to_vec1::<f32>().unwrap(), [0.0]);
+    let is_quad = |variant: &Variant| variant.table["guidance"].as_str() == Some("quad");
+    let variant = chunked("quad", 2).into_iter().find(is_quad).unwrap();
+    let mut trial = variant.start(&single_steps());
+    trial.scale(|_, network| if network == "actor" { 0.0 } else { 1.0 });
+    trial.train(1);
+    assert_eq!(trial.state("nu_squared")[""], [0.0]);
 }
 
 /// But in Diffusion Policy, which executes them.
@@ -96,22 +94,17 @@ fn actions_beyond_the_end_of_an_episode_do_not_decide_lambda() {
 fn actions_beyond_the_end_of_an_episode_are_not_cloned() {
     let context = single_steps();
     for (name, network) in CLONING {
-        let of_algorithm = variants().into_iter().filter(|(known, _)| known.name == name);
-        for (definition, table) in of_algorithm {
-            let mut agent = agent(definition, &chunked(table, 2), &context);
-            train(&mut agent, 3);
-            let state = agent.algorithm.state_dict().save().unwrap();
+        for variant in chunked(name, 2) {
+            let mut trial = variant.start(&context);
+            trial.train(3);
             // The last layer's bias, one for each number of a chunk.
-            let prefix = format!("adam_v.{network}.");
-            let is_last = |(known, x): &(&String, &candle_core::Tensor)| {
-                known.starts_with(&prefix)
-                    && known.ends_with("bias")
-                    && x.elem_count() == 2 * DIMS.1
+            let moments = trial.state(&format!("adam_v.{network}."));
+            let is_last = |(tensor, x): &(&String, &Vec<f32>)| {
+                tensor.ends_with("bias") && x.len() == 2 * DIMS.1
             };
-            let last = Vec::from_iter(state.iter().filter(is_last));
+            let last = Vec::from_iter(moments.iter().filter(is_last));
             assert_eq!(last.len(), 1, "{name}: {last:?}");
-            let moments: Vec<f32> = last[0].1.flatten_all().unwrap().to_vec1().unwrap();
-            let (learned, beyond) = moments.split_at(DIMS.1);
+            let (learned, beyond) = last[0].1.split_at(DIMS.1);
             let clones_copies = name == "diffusion-policy";
             assert!(learned.iter().all(|x| *x > 0.0), "{name}");
             assert!(beyond.iter().all(|x| (*x > 0.0) == clones_copies), "{name}");

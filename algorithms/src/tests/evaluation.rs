@@ -19,61 +19,44 @@ fn stand_still(table: &mut toml::Table) {
 /// The losses of networks that are all different, in each phase.
 #[test]
 fn an_evaluation_measures_the_losses_of_an_update() {
-    let mut found: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
-    for (definition, mut table) in variants() {
-        stand_still(&mut table);
-        let mut agent = agent(definition, &table, &context(3, &Device::Cpu));
-        for (number, (_, weights)) in
-            agent.algorithm.state_dict().networks().into_iter().enumerate()
-        {
-            weights
-                .change(|values| values.slice_set(&(values * (1.0 + 0.1 * number as f64))?, 0, 0))
-                .unwrap();
-        }
+    let mut measured: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    for mut variant in variants() {
+        stand_still(&mut variant.table);
+        let (name, mut trial) = (variant.name, variant.start(&context(3, &Device::Cpu)));
+        trial.scale(|number, _| 1.0 + 0.1 * number as f64);
+        let batch = trial.batch(0);
         for step in 0..STEPS {
-            let indices = indices(0, &agent);
-            let (updated, evaluated) =
-                (agent.update(&indices).unwrap(), agent.evaluate(&indices).unwrap());
-            for ((metric, updated), evaluated) in
-                definition.metrics.iter().zip(updated).zip(evaluated)
-            {
+            let updated = trial.agent.update(&batch).unwrap();
+            let evaluated = trial.agent.evaluate(&batch).unwrap();
+            for ((metric, x), y) in variant.definition.metrics.iter().zip(updated).zip(evaluated) {
                 // TD3+BC's policy first moves in its second update, RLPD's not in every one.
-                let is_measured = updated.is_some()
-                    || matches!((definition.name, step), ("td3-bc", 0) | ("rlpd", _));
-                assert_eq!(evaluated.is_some(), metric.held_out && is_measured, "{metric:?}");
-                found.entry(definition.name).or_default().extend(evaluated.map(|_| metric.name));
-                let pairs = updated.zip(evaluated);
-                assert!(
-                    pairs.is_none_or(|(x, y)| (x - y).abs() <= 1e-5 * x.abs().max(1e-3)),
-                    "{}, step {step}: {} is {updated:?} in the update, {evaluated:?} in the evaluation",
-                    definition.name,
-                    metric.name,
-                );
+                let is_measured =
+                    x.is_some() || matches!((name, step), ("td3-bc", 0) | ("rlpd", _));
+                assert_eq!(y.is_some(), metric.held_out && is_measured, "{metric:?}");
+                measured.entry(name).or_default().extend(y.map(|_| metric.name));
+                let close = |(x, y): (f32, f32)| (x - y).abs() <= 1e-5 * x.abs().max(1e-3);
+                let text = || format!("{name}, step {step}: {} is {x:?} and {y:?}", metric.name);
+                assert!(x.zip(y).is_none_or(close), "{}", text());
             }
         }
     }
-    for Definition { name, metrics, .. } in
-        ALGORITHMS.iter().filter(|known| found.contains_key(known.name))
-    {
-        let held_out = metrics.iter().filter(|metric| metric.held_out).map(|metric| metric.name);
-        assert_eq!(found[*name], held_out.collect(), "{name}");
+    for (name, measured) in measured {
+        let metrics = variant(name).definition.metrics.iter().filter(|metric| metric.held_out);
+        assert_eq!(measured, metrics.map(|metric| metric.name).collect(), "{name}");
     }
 }
 
 #[test]
 fn an_evaluation_changes_nothing() {
-    for (definition, table) in variants() {
-        let [mut measured, mut alone] =
-            [0, 1].map(|_| agent(definition, &table, &context(3, &Device::Cpu)));
+    for variant in variants() {
+        let [mut measured, mut alone] = [0, 1].map(|_| variant.start(&context(3, &Device::Cpu)));
         for step in 0..STEPS {
-            let before = measured.save().unwrap();
-            let [first, _, again] = [step + 1, step, step + 1].map(|step| {
-                let indices = indices(step, &measured);
-                measured.evaluate(&indices).unwrap()
-            });
-            assert!(first == again && measured.save().unwrap() == before, "{}", definition.name);
-            assert_eq!(train(&mut measured, 1), train(&mut alone, 1), "{}", definition.name);
+            let before = measured.save();
+            let [first, _, again] = [step + 1, step, step + 1]
+                .map(|step| measured.agent.evaluate(&measured.batch(step)).unwrap());
+            assert!(first == again && measured.save() == before, "{}", variant.name);
+            assert_eq!(measured.train(1), alone.train(1), "{}", variant.name);
         }
-        assert!(measured.save().unwrap() == alone.save().unwrap(), "{}", definition.name);
+        assert!(measured.save() == alone.save(), "{}", variant.name);
     }
 }

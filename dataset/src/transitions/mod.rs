@@ -49,7 +49,7 @@ pub struct Transitions {
     reward: RewardScaling,
     scaling: Scaling,
     /// For held-out transitions, the standard units of the training transitions.
-    of_training: Option<Scaling>,
+    training_units: Option<Scaling>,
 }
 
 /// Training and validation transitions.
@@ -118,7 +118,7 @@ impl Transitions {
         let mut training = new(recording);
         training.warnings = warnings;
         if let Some(held_out) = &mut held_out {
-            held_out.of_training = Some(training.standard_units());
+            held_out.training_units = Some(training.standard_units());
         }
         Ok(Split { training, held_out, episodes })
     }
@@ -141,7 +141,7 @@ impl Transitions {
             dataset,
             reward,
             scaling,
-            of_training: None,
+            training_units: None,
         }
     }
 
@@ -174,15 +174,15 @@ impl Transitions {
     /// Map of each dimension of the training transitions to mean 0 and standard deviation 1, or scale
     /// 0 if it is constant.
     pub fn standard_units(&self) -> Scaling {
-        if let Some(units) = &self.of_training {
+        if let Some(units) = &self.training_units {
             return units.clone();
         }
-        let all = &self.dataset.recording;
-        let is_transition = |row: usize| all.kinds[row] == RowKind::Transition;
-        let of = |values, width| Some(normalize::standard_units(values, width, is_transition));
+        let rows = &self.dataset.recording;
+        let is_transition = |row: usize| rows.kinds[row] == RowKind::Transition;
+        let units = |values, width| Some(normalize::standard_units(values, width, is_transition));
         Scaling {
-            observations: of(&all.observations, all.observation_dim),
-            actions: of(&all.actions, all.action_dim),
+            observations: units(&rows.observations, rows.observation_dim),
+            actions: units(&rows.actions, rows.action_dim),
             rewards: None,
         }
     }
@@ -219,23 +219,22 @@ impl Transitions {
     /// Index range of each episode that was added.
     pub fn experience_episodes(&self) -> Vec<Range<u32>> {
         let len = self.len() as u32;
-        let of_all = |episode: Range<u32>| len + episode.start..len + episode.end;
-        self.experience().episodes().into_iter().map(of_all).collect()
+        let after = |episode: Range<u32>| len + episode.start..len + episode.end;
+        self.experience().episodes().into_iter().map(after).collect()
     }
 
     fn experience(&self) -> RwLockReadGuard<'_, Rows> {
         self.experience.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Index of the next transition in the episode of `index < len()`.
-    pub fn next(&self, index: u32) -> Option<u32> {
-        self.dataset.next(index)
-    }
-
-    /// Next action a', taken in s'. Unlike [`next`](Self::next), it includes steps without a
-    /// transition.
+    /// Next action a', taken in s', also by a step without a transition.
     pub fn next_action(&self, index: u32) -> Option<&[f32]> {
         self.dataset.next_action(index)
+    }
+
+    /// True if the transition at `index < len()` ends its episode for good: it has no future reward.
+    pub fn terminates(&self, index: u32) -> bool {
+        self.dataset.terminates(index)
     }
 
     /// Index range of each of the dataset's episodes; together they cover all its transitions.
@@ -251,22 +250,30 @@ impl Transitions {
         episodes
     }
 
-    /// Copies the transitions at `indices` into `batch`.
-    pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
-        self.gather_windows(indices, Window::ONE, batch);
+    /// Copies the transitions at `indices`.
+    pub fn gather(&self, indices: &[u32]) -> Batch {
+        self.gather_windows(indices, Window::ONE)
     }
 
-    /// Copies the windows that begin with the transitions at `indices` into `batch`.
-    pub fn gather_windows(&self, indices: &[u32], window: Window, batch: &mut Batch) {
+    /// Copies the windows that begin with the transitions at `indices`.
+    pub fn gather_windows(&self, indices: &[u32], window: Window) -> Batch {
         let experience = self.experience();
-        batch.clear();
-        batch.size = indices.len();
+        let (n, o) = (indices.len(), window.history * self.observation_dim());
+        let mut batch = Batch {
+            observations: Vec::with_capacity(n * o),
+            actions: Vec::with_capacity(n * window.length * self.action_dim()),
+            rewards: Vec::with_capacity(n),
+            next_observations: Vec::with_capacity(n * o),
+            masks: Vec::with_capacity(n),
+            steps: Vec::with_capacity(n),
+        };
         for &index in indices {
             match index.checked_sub(self.len() as u32) {
-                None => self.dataset.copy_to(batch, index, window),
-                Some(place) => experience.copy_to(batch, place, window),
+                None => self.dataset.copy_to(&mut batch, index, window),
+                Some(place) => experience.copy_to(&mut batch, place, window),
             }
         }
+        batch
     }
 }
 

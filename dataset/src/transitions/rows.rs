@@ -30,7 +30,7 @@ impl Window {
 }
 
 /// Mini-batch of B transitions, or of B windows of n ≤ h transitions.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
     /// s_{t−k+1} … s_t, B × k·o.
     pub observations: Vec<f32>,
@@ -44,23 +44,6 @@ pub struct Batch {
     pub masks: Vec<f32>,
     /// n, B.
     pub steps: Vec<usize>,
-    /// Number of examples, B.
-    pub size: usize,
-}
-
-impl Batch {
-    pub(super) fn clear(&mut self) {
-        for array in [
-            &mut self.observations,
-            &mut self.actions,
-            &mut self.rewards,
-            &mut self.next_observations,
-            &mut self.masks,
-        ] {
-            array.clear();
-        }
-        self.steps.clear();
-    }
 }
 
 /// Rows of a dataset or of experience. An index counts transitions only.
@@ -74,7 +57,7 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    pub fn new(mut recording: Recording, of_rewards: RewardScaling, scaling: &Scaling) -> Self {
+    pub fn new(mut recording: Recording, reward_rule: RewardScaling, scaling: &Scaling) -> Self {
         let starts = Vec::from_iter(recording.transitions().map(|row| row as u32));
         let goes_on =
             Vec::from_iter((0..recording.rows()).map(|row| recording.recording_goes_on(row)));
@@ -84,7 +67,7 @@ impl Rows {
             *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT);
         }
         for reward in &mut recording.rewards {
-            *reward = of_rewards.apply(*reward) / scaling.rewards.unwrap_or(1.0);
+            *reward = reward_rule.apply(*reward) / scaling.rewards.unwrap_or(1.0);
         }
         Self { recording, starts, goes_on }
     }
@@ -120,7 +103,7 @@ impl Rows {
         (is_next && self.goes_on[row as usize]).then_some(index + 1)
     }
 
-    fn terminates(&self, index: u32) -> bool {
+    pub fn terminates(&self, index: u32) -> bool {
         self.recording.terminals[self.starts[index as usize] as usize]
     }
 
@@ -151,28 +134,28 @@ impl Rows {
 
     /// Adds the window that begins with the transition at `index`.
     pub fn copy_to(&self, batch: &mut Batch, index: u32, window: Window) {
-        let (all, row) = (&self.recording, |index: u32| self.starts[index as usize] as usize);
+        let (rows, row) = (&self.recording, |index: u32| self.starts[index as usize] as usize);
         for seen in self.history(index, window.history) {
-            batch.observations.extend_from_slice(all.observation(row(seen)));
+            batch.observations.extend_from_slice(rows.observation(row(seen)));
         }
-        batch.actions.extend_from_slice(all.action(row(index)));
+        batch.actions.extend_from_slice(rows.action(row(index)));
         let (mut last, mut reward, mut discount, mut steps) =
-            (index, all.rewards[row(index)], 1.0, 1);
+            (index, rows.rewards[row(index)], 1.0, 1);
         let mut terminated = self.terminates(index);
         for _ in 1..window.length {
             if let Some(next) = self.following(last) {
                 discount *= window.gamma;
-                reward += discount * all.rewards[row(next)];
+                reward += discount * rows.rewards[row(next)];
                 terminated |= self.terminates(next);
                 (last, steps) = (next, steps + 1);
             }
-            batch.actions.extend_from_slice(all.action(row(last)));
+            batch.actions.extend_from_slice(rows.action(row(last)));
         }
         batch.rewards.push(reward);
         for seen in self.history(last, window.history - 1) {
-            batch.next_observations.extend_from_slice(all.observation(row(seen)));
+            batch.next_observations.extend_from_slice(rows.observation(row(seen)));
         }
-        batch.next_observations.extend_from_slice(all.next_observation(row(last)));
+        batch.next_observations.extend_from_slice(rows.next_observation(row(last)));
         batch.masks.push(if terminated { 0.0 } else { discount });
         batch.steps.push(steps);
     }

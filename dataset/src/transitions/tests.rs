@@ -23,64 +23,53 @@ fn d4rl() -> Recording {
     recording
 }
 
+/// Actions are a hundredth of row numbers.
 #[test]
-fn episodes_end_at_timeouts_terminals_and_the_end_of_the_file() {
-    let transitions = transitions(d4rl());
-    assert_eq!(transitions.episodes(), [0..2, 2..4, 4..5]);
-    assert_eq!(transitions.recorded_episodes(), transitions.episodes());
-    let next: Vec<_> = (0..5).map(|index| transitions.next(index)).collect();
-    assert_eq!(next, [Some(1), None, Some(3), None, None]);
-}
-
-#[test]
-fn a_dropped_step_gives_its_action_to_the_transition_that_leads_to_it() {
-    let transitions = transitions(d4rl());
-    let action = |index| transitions.next_action(index).map(|action| action[0]);
-    let actions = Vec::from_iter((0..5).map(action));
-    let expected = [Some(0.01), Some(0.02), Some(0.04), None, Some(0.06)];
-    assert_eq!(actions, expected, "after a terminal there is none");
-}
-
-#[test]
-fn the_last_state_of_an_episode_is_no_step() {
-    let mut recording = recording(&[Transition, Transition, LastState, Transition, LastState]);
-    recording.ends[1] = true;
-    recording.ends[3] = true;
-    let transitions = transitions(recording);
-    assert_eq!(transitions.episodes(), [0..2, 2..3]);
-    assert_eq!((transitions.next_action(0), transitions.next_action(1)), (Some(&[0.01][..]), None));
-}
-
-#[test]
-fn an_episode_ends_at_the_goal_although_the_recording_goes_on() {
-    let mut recording = recording(&[Transition, Transition, Transition, Dropped]);
-    recording.goal = true;
-    recording.terminals[1] = true;
-    recording.ends[3] = true;
-    let transitions = transitions(recording);
-    assert_eq!(transitions.episodes(), [0..2, 2..3]);
-    assert_eq!(transitions.recorded_episodes(), transitions.episodes()[..1]);
-    assert!(transitions.next_action(1).is_none());
-}
-
-#[test]
-fn an_episode_after_one_that_reached_its_goal_is_one_of_the_recording() {
-    let mut recording =
-        recording(&[Transition, Transition, Dropped, Transition, Transition, Dropped]);
-    recording.goal = true;
-    (recording.terminals[0], recording.ends[2], recording.ends[5]) = (true, true, true);
-    let transitions = transitions(recording);
-    assert_eq!(transitions.episodes(), [0..1, 1..2, 2..4]);
-    assert_eq!(transitions.recorded_episodes(), [0..1, 2..4]);
-}
-
-#[test]
-fn rows_with_next_observations_of_their_own_follow_one_another_where_these_say_so() {
-    let mut recording = recording(&[Transition; 4]);
-    recording.store_next(vec![1.0, 9.0, 3.0, 4.0]);
-    let transitions = transitions(recording);
-    assert_eq!(transitions.episodes(), [0..2, 2..4]);
-    assert_eq!((transitions.next_action(1), transitions.next_action(3)), (None, None));
+fn episodes_and_next_actions_are_those_of_the_recording() {
+    let recorded_rows = |kinds: &[RowKind], terminals: &[usize], ends: &[usize], goal: bool| {
+        let mut recording = recording(kinds);
+        recording.goal = goal;
+        terminals.iter().for_each(|row| recording.terminals[*row] = true);
+        ends.iter().for_each(|row| recording.ends[*row] = true);
+        recording
+    };
+    let (t, d, last) = (Transition, Dropped, LastState);
+    let mut stored = recording(&[t; 4]);
+    stored.store_next(vec![1.0, 9.0, 3.0, 4.0]);
+    for (recording, episodes, recorded, next_actions) in [
+        // A timeout, a terminal and the end of the file. A dropped step gives its action.
+        (d4rl(), vec![0..2, 2..4, 4..5], vec![0..2, 2..4, 4..5], vec![1, 2, 4, 0, 6]),
+        // The last state of an episode is no step.
+        (
+            recorded_rows(&[t, t, last, t, last], &[], &[1, 3], false),
+            vec![0..2, 2..3],
+            vec![0..2, 2..3],
+            vec![1, 0, 0],
+        ),
+        // An episode ends at the goal although the recording goes on.
+        (
+            recorded_rows(&[t, t, t, d], &[1], &[3], true),
+            vec![0..2, 2..3],
+            vec![0..2],
+            vec![1, 0, 3],
+        ),
+        // An episode after one that reached its goal is one of the recording.
+        (
+            recorded_rows(&[t, t, d, t, t, d], &[0], &[2, 5], true),
+            vec![0..1, 1..2, 2..4],
+            vec![0..1, 2..4],
+            vec![0, 2, 4, 5],
+        ),
+        // Rows with next observations of their own follow one another where these say so.
+        (stored, vec![0..2, 2..4], vec![0..2, 2..4], vec![1, 0, 3, 0]),
+    ] {
+        let transitions = transitions(recording);
+        assert_eq!(transitions.episodes(), episodes);
+        assert_eq!(transitions.recorded_episodes(), recorded);
+        let action = |index| transitions.next_action(index).map_or(0.0, |action| 100.0 * action[0]);
+        let actions = (0..transitions.len() as u32).map(|index| action(index).round() as i32);
+        assert_eq!(Vec::from_iter(actions), next_actions);
+    }
 }
 
 /// Rewards and observations are row numbers, actions a hundredth of them.
@@ -90,9 +79,8 @@ fn windows_of_steps_end_with_their_episode() {
     let (observations, terminated) = (&[10.0, 11.0, 12.0, 13.0, 14.0], false);
     let (actions, rewards) = (&[0.1, 0.2, 0.3, 0.4], &[1.0, 2.0, 4.0, 8.0]);
     transitions.add_episode(OnlineEpisode { observations, actions, rewards, terminated }).unwrap();
-    let mut batch = Batch::default();
     let window = Window { length: 3, gamma: 0.5, ..Window::ONE };
-    transitions.gather_windows(&[5, 0, 2, 4, 7], window, &mut batch);
+    let batch = transitions.gather_windows(&[5, 0, 2, 4, 7], window);
     let expected = Batch {
         observations: vec![10.0, 0.0, 3.0, 5.0, 12.0],
         actions: [
@@ -108,14 +96,13 @@ fn windows_of_steps_end_with_their_episode() {
         // The third one's episode terminates, the others go on or are truncated.
         masks: vec![0.25, 0.5, 0.0, 1.0, 0.5],
         steps: vec![3, 2, 2, 1, 2],
-        size: 5,
     };
     assert_eq!(batch, expected);
 
-    transitions.gather_windows(&[5, 3, 7], Window { history: 3, ..window }, &mut batch);
-    let of_three = [[10.0, 10.0, 10.0], [3.0, 3.0, 4.0], [10.0, 11.0, 12.0]].concat();
+    let batch = transitions.gather_windows(&[5, 3, 7], Window { history: 3, ..window });
+    let seen = [[10.0, 10.0, 10.0], [3.0, 3.0, 4.0], [10.0, 11.0, 12.0]].concat();
     let next = [[11.0, 12.0, 13.0], [3.0, 4.0, 5.0], [12.0, 13.0, 14.0]].concat();
-    assert_eq!((batch.observations, batch.next_observations), (of_three, next));
+    assert_eq!((batch.observations, batch.next_observations), (seen, next));
     assert_eq!(batch.rewards, [3.0, 4.0, 8.0]);
 }
 
@@ -126,9 +113,8 @@ fn windows_go_over_a_success_that_does_not_end_the_episode() {
     (recording.terminals[1], recording.ends[3]) = (true, true);
     let transitions = transitions(recording);
     assert_eq!(transitions.episodes(), [0..2, 2..4]);
-    let mut batch = Batch::default();
     let window = Window { history: 2, length: 3, gamma: 0.5 };
-    transitions.gather_windows(&[0, 1, 2], window, &mut batch);
+    let batch = transitions.gather_windows(&[0, 1, 2], window);
     let expected = Batch {
         observations: vec![0.0, 0.0, 0.0, 1.0, 1.0, 2.0],
         actions: [[0.0, 0.01, 0.02], [0.01, 0.02, 0.03], [0.02, 0.03, 0.03]].concat(),
@@ -136,7 +122,6 @@ fn windows_go_over_a_success_that_does_not_end_the_episode() {
         next_observations: vec![2.0, 3.0, 3.0, 4.0, 3.0, 4.0],
         masks: vec![0.0, 0.0, 0.5],
         steps: vec![3, 3, 2],
-        size: 3,
     };
     assert_eq!(batch, expected);
 }
@@ -171,8 +156,7 @@ fn experience_follows_the_dataset_and_is_scaled_as_it_was() {
     assert_eq!(transitions.episodes(), [0..2, 2..4, 4..5]);
     assert_eq!(transitions.experience_episodes(), [5..7, 7..8]);
     let limit = 1.0 - 1e-5;
-    let mut batch = Batch::default();
-    transitions.gather(&[7, 1, 6, 5], &mut batch);
+    let batch = transitions.gather(&[7, 1, 6, 5]);
     let expected = Batch {
         observations: vec![20.0, 1.0, 11.0, 10.0],
         actions: vec![-limit, -2.0 / 3.0, limit, 0.5],
@@ -180,7 +164,6 @@ fn experience_follows_the_dataset_and_is_scaled_as_it_was() {
         next_observations: vec![21.0, 2.0, 12.0, 11.0],
         masks: vec![0.0, 1.0, 1.0, 1.0],
         steps: vec![1; 4],
-        size: 4,
     };
     let apart = batch.actions.iter().zip(&expected.actions).map(|(a, b)| (a - b).abs());
     assert!(apart.fold(0.0, f32::max) < 1e-6, "{batch:?}");

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_algorithms::Agent;
+use quad_algorithms::{Agent, Examples};
 use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
@@ -32,7 +32,7 @@ use crate::live::{
 };
 use crate::page;
 use crate::report::learning_curve;
-use crate::train::{HeldOut, begin, device};
+use crate::train::{HeldOut, begin, check_device};
 
 /// Time limit for the report of a run that is not complete.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
@@ -65,7 +65,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let begun = ExistingRun::open(&path, args.fresh)?;
     let outside = Outside::new(args, &experiment)?;
 
-    device::check(args.device, experiment.precision)?;
+    check_device(args.device, experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
     from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &dataset.sha256))?;
 
@@ -157,7 +157,7 @@ async fn run_to_end(
     info!("page: http://{}/", server.address);
     let (o, a) = (data.training.observation_dim(), data.training.action_dim());
     let task = Task::new(&experiment.environment, o, a);
-    let (agent, held_out) = begin_agent(config, data, first.as_ref())?;
+    let (agent, examples, held_out) = begin_agent(config, data, first.as_ref())?;
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
     let (dir, scores, past) = open_or_create(path, (begun, first), args.fresh, config)?;
@@ -172,6 +172,7 @@ async fn run_to_end(
         dir: &dir,
         task,
         agent,
+        examples,
         held_out,
         scores,
         past,
@@ -197,22 +198,22 @@ async fn run_to_end(
     Ok((dir, main_loop.run(opening).await))
 }
 
-/// The agent, which begins with the checkpoint of `--from`, and its metrics on held-out episodes.
+/// The agent, which begins with the checkpoint of `--from`, what it learns from, and its metrics on
+/// held-out episodes.
 fn begin_agent(
     config: &RunConfig,
     data: Split,
     first: Option<&Checkpoint>,
-) -> anyhow::Result<(Agent, Option<HeldOut>)> {
-    let (experiment, device) = (&config.experiment, config.run.device);
-    let mut agent = begin(experiment, device, data.training)?;
+) -> anyhow::Result<(Agent, Examples, Option<HeldOut>)> {
+    let experiment = &config.experiment;
+    let (mut agent, examples) = begin(experiment, config.run.device, data.training)?;
     if let Some(Checkpoint { state, .. }) = first {
         let loaded =
             agent.load(state).hint("networks stay as they are: leave out what changes them");
         loaded.context("the last checkpoint of --from does not fit")?;
     }
-    let held_out =
-        data.held_out.and_then(|data| HeldOut::new(experiment, device, data, &mut agent));
-    Ok((agent, held_out))
+    let held_out = data.held_out.and_then(|episodes| HeldOut::new(experiment, episodes, &agent));
+    Ok((agent, examples, held_out))
 }
 
 /// The run in the folder, or a new one; without a checkpoint of its own it begins with `first`.

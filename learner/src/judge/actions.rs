@@ -3,7 +3,7 @@
 use quad_policy::{Policy, Scaling};
 use rayon::prelude::*;
 
-use super::data::{Data, gather};
+use super::data::Data;
 
 /// States per call of a policy, fewer if they take more than [`MEMORY`].
 const STATES: usize = 256;
@@ -24,7 +24,7 @@ pub(super) struct Actions {
 impl Actions {
     pub fn new(policy: &dyn Policy, data: &Data) -> anyhow::Result<Self> {
         let scaling = data.training.scaling();
-        let training = gather(&data.training, &Vec::from_iter(0..data.training.len() as u32));
+        let training = data.training.gather(&Vec::from_iter(0..data.training.len() as u32));
         let next = act(policy, scaling, &training.next_observations, 0)?;
         let first = act(policy, scaling, &data.first.observations, JUDGED)?;
         let compared = act(policy, scaling, &data.compared.observations, 2 * JUDGED)?;

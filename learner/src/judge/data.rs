@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow};
 use candle_core::Device;
-use quad_algorithms::{Context, Fqe};
+use quad_algorithms::{AlgorithmError, Columns, Context, Examples, Fqe};
 use quad_dataset::{
-    Batch, DatasetError, HoldOut, Normalize, ReadOptions, RewardRule, Split, Transitions, Window,
-    benchmarks, environment,
+    Batch, BatchSampler, DatasetError, HoldOut, Normalize, ReadOptions, RewardRule, Split,
+    Transitions, Window, benchmarks, environment,
 };
 use quad_policy::Precision;
 use quad_run::results::statistics::mean;
@@ -101,8 +101,8 @@ impl Data {
         let compared = Vec::from_iter((0..count).map(|i| (i * held_out.len() / count) as u32));
         Ok(Self {
             conditions: Conditions { episodes: split.episodes, ..conditions },
-            first: gather(&held_out, &starts),
-            compared: gather(&held_out, &compared),
+            first: held_out.gather(&starts),
+            compared: held_out.gather(&compared),
             training: Arc::new(split.training),
             held_out,
         })
@@ -111,7 +111,6 @@ impl Data {
     pub fn context(&self, seed: u64) -> Context {
         Context {
             transitions: self.training.clone(),
-            batch_size: BATCH_SIZE.min(self.training.len()),
             total_steps: 0,
             online_steps: 0,
             window: Window::ONE,
@@ -121,14 +120,26 @@ impl Data {
         }
     }
 
+    /// The training transitions with these columns.
+    pub fn examples(&self, columns: Columns) -> anyhow::Result<Examples> {
+        let examples = Examples::new(self.training.clone(), columns, Window::ONE);
+        examples.hint_of(AlgorithmError::hint)
+    }
+
+    /// Draws batches of these examples.
+    pub fn sampler(&self, examples: &Examples, seed: u64) -> BatchSampler {
+        let batch_size = BATCH_SIZE.min(self.training.len());
+        BatchSampler::new(examples.len(), batch_size, seed, 0)
+    }
+
     /// Mean discounted return of the judged episodes. The last step of a truncated episode counts
     /// its estimated value: the mean of these evaluations of the behavior policy.
     pub fn recorded_value(&self, behavior: &[Fqe]) -> anyhow::Result<f64> {
         let (o, a) = (self.held_out.observation_dim(), self.held_out.action_dim());
         let mut returns = Vec::new();
         for episode in self.held_out.recorded_episodes() {
-            let steps = gather(&self.held_out, &Vec::from_iter(episode));
-            let last = steps.size - 1;
+            let steps = self.held_out.gather(&Vec::from_iter(episode));
+            let last = steps.rewards.len() - 1;
             let mut value = f64::from(steps.rewards[last]);
             if steps.masks[last] != 0.0 {
                 let (s, a) = (&steps.observations[last * o..], &steps.actions[last * a..]);

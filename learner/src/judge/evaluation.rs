@@ -4,11 +4,9 @@ use std::num::NonZero;
 use std::thread;
 
 use anyhow::anyhow;
-use quad_algorithms::{AlgorithmError, Fqe, FqeConfig, Units};
-use quad_dataset::BatchSampler;
+use quad_algorithms::{Columns, Examples, Fqe, FqeConfig, Units};
 use quad_run::results::Estimate;
 use quad_run::results::statistics::mean;
-use quad_runtime::Hint;
 use rayon::ThreadPoolBuilder;
 
 use super::actions::Actions;
@@ -44,17 +42,16 @@ type Evaluations = (Vec<Fqe>, Vec<LearningCurve>);
 impl<'a> Evaluation<'a> {
     pub fn new(data: &'a Data) -> anyhow::Result<Self> {
         let gamma = data.conditions.gamma;
-        let units = Units::of(&data.context(0), gamma.into());
+        let units = Units::new(&data.training, gamma.into());
         Ok(Self { data, config: FqeConfig::with_discount(gamma)?, units })
     }
 
     /// Evaluates the policy that recorded the data.
     pub fn behavior(&self) -> anyhow::Result<Evaluations> {
         self.for_each_seed(|seed| {
-            let context = self.data.context(seed);
-            let fqe = Fqe::of_behavior(self.config.clone(), self.units, context);
-            let fqe = fqe.hint_of(AlgorithmError::hint)?;
-            self.train(fqe, seed, &self.data.first.actions)
+            let fqe = Fqe::new(self.config.clone(), self.units, self.data.context(seed))?;
+            let examples = self.data.examples(Columns::NextActions)?;
+            self.train(fqe, &examples, seed, &self.data.first.actions)
         })
     }
 
@@ -62,9 +59,11 @@ impl<'a> Evaluation<'a> {
     pub fn policy(&self, actions: &Actions, behavior: &[Fqe]) -> anyhow::Result<Evaluations> {
         self.for_each_seed(|seed| {
             let (config, context) = (self.config.clone(), self.data.context(seed));
-            let mut fqe = Fqe::new(config, self.units, context, actions.next.clone())?;
+            let mut fqe = Fqe::new(config, self.units, context)?;
             fqe.begin_with(&behavior[seed as usize])?;
-            self.train(fqe, seed, &actions.first)
+            let examples = self.data.examples(Columns::Plain)?;
+            let examples = examples.with_next_actions(actions.next.clone());
+            self.train(fqe, &examples, seed, &actions.first)
         })
     }
 
@@ -72,17 +71,17 @@ impl<'a> Evaluation<'a> {
     fn train(
         &self,
         mut fqe: Fqe,
+        examples: &Examples,
         seed: u64,
         first: &[f32],
     ) -> anyhow::Result<(Fqe, LearningCurve)> {
-        let batch_size = self.data.context(seed).batch_size;
-        let mut sampler = BatchSampler::new(fqe.dataset_len(), batch_size, seed, 0);
+        let mut sampler = self.data.sampler(examples, seed);
         let mut curve = LearningCurve::default();
         let begin = |point: usize| self.data.conditions.steps * point as u64 / POINTS as u64;
         for point in 0..POINTS {
             let mut losses = Vec::new();
             for step in begin(point)..begin(point + 1) {
-                let metrics = fqe.update(step, sampler.next_indices())?;
+                let metrics = fqe.update(step, &examples.batch(sampler.next_indices())?)?;
                 let loss = metrics.iter().find(|(name, _)| *name == "critic_loss");
                 losses.extend(loss.map(|(_, loss)| *loss));
             }

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use quad_algorithms::Agent;
+use quad_algorithms::{Agent, Examples};
 use quad_dataset::{BatchSampler, Task, Transitions};
 use quad_run::config::{Experiment, RunConfig};
 use quad_run::folder::{Log, ResumePoint, RunDir};
@@ -43,6 +43,7 @@ pub(crate) struct Run<'a> {
     pub dir: &'a RunDir,
     pub task: Task,
     pub agent: Agent,
+    pub examples: Examples,
     pub held_out: Option<HeldOut>,
     /// The run's scores, open for appending.
     pub scores: Log,
@@ -69,14 +70,14 @@ impl Threads {
         health: &Health,
         events: &Events,
     ) -> anyhow::Result<Self> {
-        let Run { incarnation, config, dir, past, mut agent, .. } = run;
+        let Run { incarnation, config, dir, past, mut agent, examples, .. } = run;
         let ResumePoint { checkpoint, snapshots: saved, scores: earlier } = past;
         let experiment = &config.experiment;
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         if let Some(checkpoint) = checkpoint {
             resume(&mut agent, &checkpoint)?;
         }
-        let transitions = agent.transitions().clone();
+        let transitions = examples.transitions().clone();
         let rules = rules(&incarnation, experiment, run.task, &transitions);
         let experience = Experience::open(dir, experiment, step, transitions, &metrics.online)?;
         let (online, inbox, experience, episodes) = match experience {
@@ -110,10 +111,11 @@ impl Threads {
         let snapshots = spawn_alive(writer, events, beat, move |beat| snapshots.run(beat))?;
 
         let stop = Arc::new(AtomicBool::new(false));
-        let (rows, size) = (agent.dataset_len(), experiment.batch_size as usize);
-        let sampler = BatchSampler::new(rows, size, experiment.seed, step);
+        let size = experiment.batch_size as usize;
+        let sampler = BatchSampler::new(examples.len(), size, experiment.seed, step);
         let training = Training {
             sampler,
+            examples,
             agent,
             online,
             held_out: run.held_out,

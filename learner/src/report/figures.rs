@@ -60,8 +60,8 @@ pub fn figures(report: &Report) -> Vec<(String, Plot)> {
     };
     for (task, groups) in &by_task {
         push("curve", task, curves(task, groups));
-        for Definition { name, report, .. } in ALGORITHMS {
-            if let Some(axis) = report.axis {
+        for Definition { name, axis, .. } in ALGORITHMS {
+            if let Some(axis) = *axis {
                 push(axis.key, task, scores_over(axis, name, task, groups));
             }
         }

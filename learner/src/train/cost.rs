@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_algorithms::{Agent, AlgorithmError};
+use quad_algorithms::{Agent, AlgorithmError, Examples};
 use quad_dataset::{BatchSampler, Split};
 use quad_run::config::{Device, Experiment};
 use quad_run::folder::Checkpoint;
@@ -35,22 +35,18 @@ impl RunCost {
     /// that a run has in memory.
     pub fn measure(experiment: &Experiment, device: Device, data: Split) -> anyhow::Result<Self> {
         let numbers = data.training.observation_dim() + data.training.action_dim() + 1;
-        let mut agent = begin(experiment, device, data.training)?;
+        let (mut agent, mut examples) = begin(experiment, device, data.training)?;
         let held_out = data.held_out;
-        let held_out = held_out.and_then(|it| HeldOut::new(experiment, device, it, &mut agent));
-        let mut sampler = BatchSampler::new(
-            agent.dataset_len(),
-            experiment.batch_size as usize,
-            experiment.seed,
-            0,
-        );
-        let step_seconds = mean_step(&mut agent, &mut sampler, experiment.total_steps())?;
-        let state = agent.save()?;
-        held_out.map(|mut held_out| held_out.measure(&state)).transpose()?;
+        let held_out = held_out.and_then(|episodes| HeldOut::new(experiment, episodes, &agent));
+        let size = experiment.batch_size as usize;
+        let mut sampler = BatchSampler::new(examples.len(), size, experiment.seed, 0);
+        let steps = [experiment.steps, experiment.total_steps()];
+        let step_seconds = mean_step(&mut agent, &mut examples, &mut sampler, steps)?;
+        held_out.map(|mut held_out| held_out.measure(&agent)).transpose()?;
         Ok(Self {
             step_seconds,
             snapshot_bytes: agent.policy(origin(experiment))?.len() as u64,
-            checkpoint_bytes: state.len() as u64,
+            checkpoint_bytes: agent.save()?.len() as u64,
             row_bytes: (numbers * size_of::<f32>()) as u64,
         })
     }
@@ -75,14 +71,17 @@ impl RunCost {
     }
 }
 
-/// Mean seconds of a gradient step over a run of `steps`, weighted by the lengths of its phases.
+/// Mean seconds of a gradient step over a run with this number of steps on the dataset alone and in
+/// all, weighted by the lengths of its phases.
 pub(super) fn mean_step(
     agent: &mut Agent,
+    examples: &mut Examples,
     sampler: &mut BatchSampler,
-    steps: u64,
+    [offline, total]: [u64; 2],
 ) -> Result<f64, AlgorithmError> {
     let mut begins = agent.phases();
-    begins.push(steps);
+    begins.extend([offline, total]);
+    begins.sort_unstable();
     let phases = begins.windows(2).map(|phase| (phase[0], phase[1]));
     let phases = Vec::from_iter(phases.filter(|(begin, end)| begin < end));
     let mut seconds = 0.0;
@@ -92,7 +91,12 @@ pub(super) fn mean_step(
             if agent.step() == *end {
                 agent.skip_to(*begin);
             }
-            agent.update(sampler.next_indices())
+            let indices = sampler.next_indices();
+            let batch = match agent.step() < offline {
+                true => examples.batch(indices)?,
+                false => examples.online_batch(indices)?,
+            };
+            agent.update(&batch)
         };
         // The first step also allocates buffers.
         step()?;
@@ -103,5 +107,5 @@ pub(super) fn mean_step(
         }
         seconds += start.elapsed().as_secs_f64() / done as f64 * (end - begin) as f64;
     }
-    Ok(seconds / steps as f64)
+    Ok(seconds / total as f64)
 }

@@ -1,11 +1,12 @@
 //! Metrics on episodes that are kept out of training.
 
-use quad_algorithms::{Agent, AlgorithmError};
+use std::sync::Arc;
+
+use quad_algorithms::{Agent, AlgorithmError, Batch, Examples};
 use quad_dataset::{BatchSampler, Transitions};
-use quad_run::config::{Device, Experiment};
+use quad_run::config::Experiment;
 use tracing::{info, warn};
 
-use super::agent::new_agent;
 use super::results::{Means, STEPS_PER_ROW, held_out_name};
 
 /// Number of batches, the same for all measurements.
@@ -13,10 +14,9 @@ const BATCHES: usize = 4;
 /// Most measurements in a run, except that of the last step.
 const MEASUREMENTS: u64 = 100;
 
-/// An agent over the held-out episodes, which loads the state of the one that trains.
+/// Batches of the held-out episodes.
 pub(crate) struct HeldOut {
-    agent: Agent,
-    batches: Vec<Vec<u32>>,
+    batches: Vec<Batch>,
     /// Steps between two measurements.
     every: u64,
     has_warned: bool,
@@ -24,13 +24,8 @@ pub(crate) struct HeldOut {
 
 impl HeldOut {
     /// `None` if the algorithm cannot be measured on these transitions, or has no metric that can.
-    pub fn new(
-        experiment: &Experiment,
-        device: Device,
-        held_out: Transitions,
-        training: &mut Agent,
-    ) -> Option<Self> {
-        if !training.metrics().iter().any(|metric| metric.held_out) {
+    pub fn new(experiment: &Experiment, held_out: Transitions, agent: &Agent) -> Option<Self> {
+        if !agent.metrics().iter().any(|metric| metric.held_out) {
             info!(
                 "nothing is measured on held-out episodes: {} has no metric that is",
                 experiment.algorithm
@@ -38,25 +33,27 @@ impl HeldOut {
             return None;
         }
         let size = (experiment.batch_size as usize).min(held_out.len());
-        let loaded = new_agent(experiment, device, held_out, size).and_then(|mut agent| {
-            agent.load(&training.save()?)?;
-            Ok(agent)
+        let examples = agent.examples(Arc::new(held_out));
+        let held_out = examples.and_then(|examples| {
+            Self::draw(&examples, size, experiment.seed, experiment.total_steps())
         });
-        match loaded {
-            Ok(agent) => Some(Self::of(agent, size, experiment.seed, experiment.total_steps())),
-            Err(error) => {
-                info!("nothing is measured on held-out episodes: {error:#}");
-                None
-            }
-        }
+        let held_out = held_out.map_err(anyhow::Error::from);
+        held_out
+            .inspect_err(|error| info!("nothing is measured on held-out episodes: {error:#}"))
+            .ok()
     }
 
     /// Draws the batches by the seed, for a run of this many steps.
-    pub(super) fn of(agent: Agent, batch_size: usize, seed: u64, steps: u64) -> Self {
-        let mut sampler = BatchSampler::new(agent.dataset_len(), batch_size, seed, 0);
-        let batches = (0..BATCHES).map(|_| sampler.next_indices().to_vec()).collect();
+    pub(super) fn draw(
+        examples: &Examples,
+        batch_size: usize,
+        seed: u64,
+        steps: u64,
+    ) -> Result<Self, AlgorithmError> {
+        let mut sampler = BatchSampler::new(examples.len(), batch_size, seed, 0);
+        let batches = (0..BATCHES).map(|_| examples.batch(sampler.next_indices()));
         let every = steps.div_ceil(MEASUREMENTS).next_multiple_of(STEPS_PER_ROW);
-        Self { agent, batches, every, has_warned: false }
+        Ok(Self { batches: batches.collect::<Result<_, _>>()?, every, has_warned: false })
     }
 
     /// True if the row of this step has measurements.
@@ -64,23 +61,21 @@ impl HeldOut {
         is_last || step.is_multiple_of(self.every)
     }
 
-    /// Evaluates this state of the agent that trains: means over the batches, in the order of its
-    /// metrics. Leaves out those that are not finite, and warns of the first.
-    pub fn measure(&mut self, state: &[u8]) -> Result<Vec<Option<f32>>, AlgorithmError> {
-        // A state of this run was loaded at the beginning, and all are alike.
-        self.agent.load(state).map_err(candle_core::Error::wrap)?;
-        let mut means = Means::new(self.agent.metrics().len());
+    /// Means over the batches, in the order of the agent's metrics. Leaves out those that are not
+    /// finite, and warns of the first.
+    pub fn measure(&mut self, agent: &Agent) -> Result<Vec<Option<f32>>, AlgorithmError> {
+        let mut means = Means::new(agent.metrics().len());
         for batch in &self.batches {
-            means.add(&self.agent.evaluate(batch)?);
+            means.add(&agent.evaluate(batch)?);
         }
         let mut values = means.take();
-        for (metric, value) in self.agent.metrics().iter().zip(&mut values) {
+        for (metric, value) in agent.metrics().iter().zip(&mut values) {
             let Some(number) = value.take_if(|number| !number.is_finite()) else { continue };
             if !self.has_warned {
                 warn!(
                     "at gradient step {} {} is {number} and left out: a number of the held-out episodes is too large for \
                      32 bits, which the policy does not learn from. `learner datasets inspect` looks for outliers",
-                    self.agent.step(),
+                    agent.step(),
                     held_out_name(metric),
                 );
                 self.has_warned = true;

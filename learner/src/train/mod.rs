@@ -6,12 +6,11 @@
 //! it. The module `live` starts it.
 //!
 //! In reading order: `training` (the loop), `online` (the order of experience and gradient steps),
-//! `agent` and `device`, `held_out` (metrics on episodes that are kept out), `output_queue`,
-//! `metrics`, `results`. `cost` estimates the cost of a run, on its caller's thread.
+//! `agent`, `held_out` (metrics on episodes that are kept out), `output_queue`, `metrics`,
+//! `results`. `cost` estimates the cost of a run, on its caller's thread.
 
 mod agent;
 mod cost;
-pub(crate) mod device;
 mod held_out;
 mod metrics;
 mod online;
@@ -21,7 +20,7 @@ mod results;
 mod tests;
 mod training;
 
-pub(crate) use agent::{begin, origin, resume};
+pub(crate) use agent::{begin, check_device, origin, resume};
 pub(crate) use cost::RunCost;
 pub(crate) use held_out::HeldOut;
 pub(crate) use metrics::{OnlineMetrics, TrainingMetrics, metrics, register};

@@ -126,23 +126,27 @@ impl OnlineTraining {
 
     fn absorb(&mut self, episode: &Episode) -> Result<(), OnlineError> {
         let (number, metrics) = (self.schedule.next_episode(), &self.metrics);
-        let Episode { observations, actions, rewards, terminated, score, .. } = episode;
-        let rows = OnlineEpisode { observations, actions, rewards, terminated: *terminated };
+        let rows = OnlineEpisode {
+            observations: &episode.observations,
+            actions: &episode.actions,
+            rewards: &episode.rewards,
+            terminated: episode.terminated,
+        };
         let added = self.transitions.add_episode(rows);
         let far = added.map_err(|source| OnlineError::Rows { number, source })?;
-        self.schedule.absorb(if far.is_some() { 0 } else { rewards.len() as u64 });
+        self.schedule.absorb(if far.is_some() { 0 } else { episode.rewards.len() as u64 });
         if let Some(far) = far {
             warn!(
                 episode = number,
-                seed = score.seed,
+                seed = episode.score.seed,
                 "training leaves out an online episode: {far}"
             );
             metrics.left_out.inc();
         } else {
             metrics.rows.set(i64::try_from(self.schedule.rows()).unwrap_or(i64::MAX));
             metrics.episodes.inc();
-            metrics.episode_return.set(score.episode_return);
-            metrics.score.set(score.score);
+            metrics.episode_return.set(episode.score.episode_return);
+            metrics.score.set(episode.score.score);
         }
         Ok(())
     }
@@ -156,8 +160,8 @@ impl OnlineTraining {
     }
 
     /// The rows of gradient step `step`, the first of which is 1.
-    pub fn batch(&mut self, step: u64) -> &[u32] {
-        let Self { transitions, sampler, .. } = self;
-        sampler.indices(step, transitions.len(), transitions.experience_len())
+    pub fn rows(&mut self, step: u64) -> &[u32] {
+        let (len, experience) = (self.transitions.len(), self.transitions.experience_len());
+        self.sampler.indices(step, len, experience)
     }
 }

@@ -60,38 +60,25 @@ impl OutputQueue {
             beat.alive();
             waiting = self.wait(waiting, POLL);
         }
-        waiting.snapshots.push_back(Output::Snapshot(policy));
-        self.shared.1.notify_all();
+        drop(waiting);
+        self.push(Output::Snapshot(policy));
     }
 
-    /// Adds an online episode.
-    pub fn online(&self, opening: Opening) {
-        self.lock().snapshots.push_back(Output::Online(opening));
-        self.shared.1.notify_all();
-    }
-
-    /// Tells that training waits for this online episode from now on.
-    pub fn waits(&self, episode: u64) {
-        self.lock().snapshots.push_back(Output::Waits(episode));
-        self.shared.1.notify_all();
-    }
-
-    /// Adds a checkpoint, which replaces one that still waits.
-    pub fn checkpoint(&self, checkpoint: Checkpoint) {
-        self.lock().checkpoint = Some(checkpoint);
-        self.shared.1.notify_all();
-    }
-
-    /// Adds a line of `metrics.jsonl`.
-    pub fn row(&self, row: Row) {
-        let rows = &mut self.lock().rows;
-        rows.push(row);
-        rows.drain(..rows.len().saturating_sub(MOST_ROWS));
-        self.shared.1.notify_all();
-    }
-
-    pub fn ended(&self, outcome: Outcome) {
-        self.lock().ended = Some(outcome);
+    /// Adds output. A checkpoint replaces one that still waits.
+    pub fn push(&self, output: Output) {
+        let mut waiting = self.lock();
+        match output {
+            Output::Snapshot(_) | Output::Online(_) | Output::Waits(_) => {
+                waiting.snapshots.push_back(output)
+            }
+            Output::Checkpoint(checkpoint) => waiting.checkpoint = Some(checkpoint),
+            Output::Rows(rows) => {
+                waiting.rows.extend(rows);
+                let surplus = waiting.rows.len().saturating_sub(MOST_ROWS);
+                waiting.rows.drain(..surplus);
+            }
+            Output::Ended(outcome) => waiting.ended = Some(outcome),
+        }
         self.shared.1.notify_all();
     }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use quad_algorithms::{Agent, AlgorithmError};
+use quad_algorithms::{Agent, AlgorithmError, Examples};
 use quad_dataset::BatchSampler;
 use quad_policy::{NetworkError, PolicyError};
 use quad_protocol::Origin;
@@ -16,7 +16,7 @@ use tracing::debug;
 use super::held_out::HeldOut;
 use super::metrics::TrainingMetrics;
 use super::online::{OnlineError, OnlineTraining};
-use super::output_queue::OutputQueue;
+use super::output_queue::{Output, OutputQueue};
 use super::results::{Means, Outcome, Row, STEPS_PER_ROW, TrainedPolicy, measured};
 
 /// Least time of training that is spent between two checkpoints for each second that one takes:
@@ -39,7 +39,7 @@ pub(crate) enum TrainError {
 }
 
 impl TrainError {
-    fn at(step: u64) -> impl Fn(AlgorithmError) -> Self {
+    fn in_step(step: u64) -> impl Fn(AlgorithmError) -> Self {
         move |source| match source {
             AlgorithmError::Policy(error @ PolicyError::Network(NetworkError::NotFinite(_))) => {
                 Self::Diverged { step, what: error.to_string() }
@@ -52,7 +52,8 @@ impl TrainError {
 /// The loop of gradient steps and its connections to the other threads.
 pub(crate) struct Training {
     pub agent: Agent,
-    /// Batches of the dataset alone.
+    pub examples: Examples,
+    /// Examples of the dataset alone.
     pub sampler: BatchSampler,
     pub online: Option<OnlineTraining>,
     pub held_out: Option<HeldOut>,
@@ -74,7 +75,7 @@ impl Training {
     /// fails.
     pub fn run(mut self, beat: &Heartbeat) -> anyhow::Result<()> {
         match self.train(beat) {
-            Ok(outcome) => self.queue.ended(outcome),
+            Ok(outcome) => self.queue.push(Output::Ended(outcome)),
             Err(error @ TrainError::Diverged { .. }) => {
                 self.metrics.diverged.set(1);
                 return Err(hinted(error, DIVERGED));
@@ -98,17 +99,20 @@ impl Training {
         while self.agent.step() < steps {
             if !self.online(beat)? {
                 let (checkpoint, _) = self.checkpoint(self.agent.step())?;
-                self.queue.checkpoint(checkpoint);
+                self.queue.push(Output::Checkpoint(checkpoint));
                 return Ok(Outcome::Stopped);
             }
             let begin = Instant::now();
             let step = self.agent.step() + 1;
             let online = self.online.as_mut().filter(|online| online.has_begun(step - 1));
             let batch = match online {
-                Some(online) => online.batch(step),
-                None => self.sampler.next_indices(),
+                Some(online) => self.examples.online_batch(online.rows(step)),
+                None => self.examples.batch(self.sampler.next_indices()),
             };
-            let values = self.agent.update(batch).map_err(TrainError::at(step))?;
+            let values = batch.map_err(AlgorithmError::from);
+            let values = values
+                .and_then(|batch| self.agent.update(&batch))
+                .map_err(TrainError::in_step(step))?;
             let infinite = measured(metrics, &values).find(|(_, value)| !value.is_finite());
             if let Some((metric, value)) = infinite {
                 let what = format!("{} is {value}", metric.name);
@@ -129,15 +133,16 @@ impl Training {
             if step.is_multiple_of(STEPS_PER_ROW) || is_last || stopped {
                 let seconds = self.seconds_before + start.elapsed().as_secs_f64();
                 let (values, held_out) = (means.take(), self.measure_held_out(step, is_last)?);
-                let online = self.online.as_ref().filter(|it| it.has_begun(step - 1));
+                let online = self.online.as_ref().filter(|online| online.has_begun(step - 1));
                 let online = online.map_or(Vec::new(), OnlineTraining::row);
-                self.queue.row(Row { step, seconds, metrics, values, held_out, online });
+                let row = Row { step, seconds, metrics, values, held_out, online };
+                self.queue.push(Output::Rows(vec![row]));
             }
             if is_last || self.schedule.is_evaluated(step) || self.plays_online_with(step) {
                 self.save_policy(step, beat)?;
             }
             if let Some((checkpoint, pause)) = checkpoint {
-                self.queue.checkpoint(checkpoint);
+                self.queue.push(Output::Checkpoint(checkpoint));
                 next_checkpoint = Instant::now() + self.checkpoint_every.max(pause);
             }
             if stopped {
@@ -154,12 +159,14 @@ impl Training {
             return Ok(true);
         };
         loop {
-            online.take_openings().into_iter().for_each(|opening| self.queue.online(opening));
+            for opening in online.take_openings() {
+                self.queue.push(Output::Online(opening));
+            }
             if !online.is_due(step) {
                 return Ok(true);
             }
             if let Some(episode) = online.awaited() {
-                self.queue.waits(episode);
+                self.queue.push(Output::Waits(episode));
             }
             if !online.absorb_next(&self.stop, beat)? {
                 return Ok(false);
@@ -178,11 +185,9 @@ impl Training {
         step: u64,
         is_last: bool,
     ) -> Result<Vec<Option<f32>>, TrainError> {
-        let Some(held_out) = self.held_out.as_mut().filter(|it| it.is_due(step, is_last)) else {
-            return Ok(Vec::new());
-        };
-        let values = self.agent.save().and_then(|state| held_out.measure(&state));
-        let values = values.map_err(TrainError::at(step))?;
+        let held_out = self.held_out.as_mut().filter(|held_out| held_out.is_due(step, is_last));
+        let Some(held_out) = held_out else { return Ok(Vec::new()) };
+        let values = held_out.measure(&self.agent).map_err(TrainError::in_step(step))?;
         self.metrics.observe_held_out(&values);
         Ok(values)
     }
@@ -191,7 +196,7 @@ impl Training {
         let begin = Instant::now();
         debug!(step, "snapshot");
         self.origin.step = step;
-        let file = self.agent.policy(self.origin.clone()).map_err(TrainError::at(step))?;
+        let file = self.agent.policy(self.origin.clone()).map_err(TrainError::in_step(step))?;
         self.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
         let (evaluate, online) = (self.schedule.is_evaluated(step), self.plays_online_with(step));
         let policy = TrainedPolicy { step, file, evaluate, online };
@@ -206,7 +211,7 @@ impl Training {
     /// A number of the state is not finite.
     fn checkpoint(&mut self, step: u64) -> Result<(Checkpoint, Duration), TrainError> {
         let begin = Instant::now();
-        let state = self.agent.save().map_err(TrainError::at(step))?;
+        let state = self.agent.save().map_err(TrainError::in_step(step))?;
         let took = begin.elapsed();
         self.metrics.saving_seconds.inc_by(took.as_secs_f64());
         Ok((Checkpoint { step, state }, TRAINING_PER_SAVING * took))

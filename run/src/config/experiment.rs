@@ -1,10 +1,10 @@
 //! One experiment, every value of which is checked.
 
-use quad_algorithms::{Definition, Hyperparameters};
+use quad_algorithms::Definition;
 use quad_dataset::{Normalize, RewardRule};
 use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
-use toml::Value;
+use toml::{Table, Value};
 
 use super::error::ConfigError;
 use super::hyperparameters;
@@ -61,7 +61,7 @@ pub struct Experiment {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub online: Option<Online>,
     /// Hyper-parameters of the algorithm.
-    pub agent: Hyperparameters,
+    pub agent: Table,
 }
 
 fn is_zero(share: &f64) -> bool {
@@ -77,7 +77,7 @@ impl Experiment {
     /// The variant of the algorithm, as names of runs have it: a hyper-parameter's value, or the
     /// algorithm's name.
     pub fn variant(&self) -> Result<&str, ConfigError> {
-        let variant = self.definition()?.report.variant;
+        let variant = self.definition()?.variant;
         let value = variant.and_then(|variant| self.agent.get(variant.key)).and_then(Value::as_str);
         Ok(value.unwrap_or(&self.algorithm))
     }
@@ -85,14 +85,14 @@ impl Experiment {
     /// The variant's label in tables and figures.
     pub fn label(&self) -> Result<String, ConfigError> {
         let (definition, variant) = (self.definition()?, self.variant()?);
-        let label = definition.report.variant.map(|names| (names.called)(variant));
+        let label = definition.variant.map(|names| (names.called)(variant));
         Ok(label.unwrap_or_else(|| variant.to_owned()))
     }
 
     /// Name, variant and candidates of the algorithm: `quad, guidance dac, 10 candidates`.
     pub fn method(&self) -> Result<String, ConfigError> {
         let mut method = self.algorithm.clone();
-        if let Some(variant) = self.definition()?.report.variant {
+        if let Some(variant) = self.definition()?.variant {
             method += &format!(", {} {}", variant.key, self.variant()?);
         }
         if let Some(count) = self.agent.get("candidates").and_then(Value::as_integer) {
@@ -193,11 +193,9 @@ impl Experiment {
             let most = MOST_EVALUATIONS;
             return Err(ConfigError::Evaluations { steps, interval, evaluations, most });
         }
-        let checked = Hyperparameters::new(&self.definition()?, self.agent.to_table());
         let algorithm = self.algorithm.clone();
-        self.agent =
-            checked.map_err(|source| ConfigError::Hyperparameters { algorithm, source })?;
-        Ok(())
+        let checked = self.definition()?.check(&self.agent);
+        checked.map_err(|source| ConfigError::Hyperparameters { algorithm, source })
     }
 }
 

@@ -114,7 +114,7 @@ impl Preset {
         let not_given = self.task.and_then(|task| hyperparameters::not_given(&definition, task));
         let mut doubts = Vec::from_iter(not_given);
         let changed = Vec::from_iter(keys(changes).into_iter().map(|(key, _)| key));
-        if let Some(variant) = definition.report.variant {
+        if let Some(variant) = definition.variant {
             let (key, value) = (variant.key, experiment.variant()?);
             for unused in (variant.unused)(value).iter().map(|key| format!("agent.{key}")) {
                 if changed.contains(&unused) {
@@ -135,7 +135,7 @@ impl Preset {
             doubts.push(format!("{unused} has no effect without online steps (--online-steps N)"));
         }
         let steps = experiment.total_steps();
-        if let Some(key) = definition.report.acts_after
+        if let Some(key) = definition.acts_after
             && let Some(start) = experiment.agent.get(key).and_then(Value::as_integer)
             && steps <= start as u64
         {

@@ -56,7 +56,7 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
 pub fn as_given(run: &RunReport, with_variant: bool) -> Result<Experiment, ConfigError> {
     let table = |key: &str, value: toml::Value| toml::Table::from_iter([(key.to_owned(), value)]);
     let mut asked = table("algorithm", run.algorithm.as_str().into());
-    let variant = run.config.experiment.definition()?.report.variant;
+    let variant = run.config.experiment.definition()?.variant;
     if let Some(variant) = variant.filter(|_| with_variant) {
         let agent = table(variant.key, run.variant.as_str().into());
         asked.insert("agent".to_owned(), agent.into());

@@ -20,7 +20,7 @@ impl RunReport {
     pub fn read(path: &Path) -> Result<Self, RunDirError> {
         let mut report = Self::scored(path)?;
         let definition = report.config.experiment.definition();
-        if let Some(summary) = definition.map_err(unusable(path))?.report.summary {
+        if let Some(summary) = definition.map_err(unusable(path))?.summary {
             report.summary = summary(&read_metrics(path)?, &report.variant);
         }
         Ok(report)

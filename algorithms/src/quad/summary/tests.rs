@@ -18,7 +18,7 @@ fn lines(lambda: impl Fn(u64) -> f64) -> Vec<MetricsLine> {
 #[test]
 fn a_run_whose_lambda_stays_near_one_is_called_dac() {
     let is_called_dac = |lines: &[MetricsLine], variant: &str| {
-        let Summary { text, json, .. } = of(lines, variant).unwrap();
+        let Summary { text, json, .. } = summarize(lines, variant).unwrap();
         let says = text.contains("this run is DAC to within 1 %");
         assert_eq!(says, json["is_dac"] == true && variant != "dac");
         says
@@ -31,7 +31,7 @@ fn a_run_whose_lambda_stays_near_one_is_called_dac() {
 #[test]
 fn lambda_is_summarized_after_the_first_tenth() {
     let Summary { text, json, .. } =
-        of(&lines(|number| if number % 2 == 0 { 0.5 } else { 0.75 }), "quad").unwrap();
+        summarize(&lines(|number| if number % 2 == 0 { 0.5 } else { 0.75 }), "quad").unwrap();
     for words in [
         "steps 201 to 2000: mean 0.625, of a batch 10 % below 0.125",
         "50.0 % above 0.99",
@@ -55,7 +55,7 @@ fn lambda_is_summarized_after_the_first_tenth() {
 fn a_run_without_lambda_has_no_summary_of_it() {
     let other = MetricsLine::from([("step".to_owned(), 100.0), ("critic_loss".to_owned(), 1.0)]);
     assert_eq!(
-        (of(&[], "quad"), of(&[other], "quad"), of(&lines(|_| 0.0), "none")),
+        (summarize(&[], "quad"), summarize(&[other], "quad"), summarize(&lines(|_| 0.0), "none"),),
         (None, None, None)
     );
 }

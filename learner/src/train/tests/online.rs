@@ -77,7 +77,7 @@ fn train(
             }
             assert!(online.absorb_next(&stop, &beat()).unwrap());
         }
-        batches.push(online.batch(step + 1).to_vec());
+        batches.push(online.rows(step + 1).to_vec());
     }
     (openings, batches)
 }
@@ -140,7 +140,10 @@ fn an_episode_with_a_glitch_counts_as_one_without_rows_also_after_a_restart() {
     let (mut whole, inbox) = online(&[]);
     let (openings, batches) = train(&mut whole, &inbox, &episodes, BEGIN);
     assert_eq!(batches, expected);
-    assert_eq!(Vec::from_iter(openings.iter().map(|it| it.episode)), Vec::from_iter(0..11));
+    assert_eq!(
+        Vec::from_iter(openings.iter().map(|opening| opening.episode)),
+        Vec::from_iter(0..11)
+    );
     for from in BEGIN..experiment().total_steps() {
         let (mut resumed, inbox) = online(&episodes);
         resumed.resume(from).unwrap();
