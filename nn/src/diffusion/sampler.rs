@@ -8,6 +8,7 @@ use crate::layers::network::{Network, rows_of};
 use crate::layers::workspace::with_workspace;
 use crate::shape::{NoiseShape, TIME_EMBEDDING, TIME_FEATURES};
 use candle_core::Tensor;
+use quad_kernels::Precision;
 use quad_kernels::narrow::FirstLayer;
 use quad_kernels::product::product;
 use rayon::prelude::*;
@@ -41,7 +42,7 @@ impl Architecture {
         let mut shifts = vec![0.0; shape.diffusion_steps * width];
         let before = shape.observation_dim + shape.action_dim;
         let kernel = network.first_kernel(before, TIME_EMBEDDING);
-        product(&embedding, kernel, &mut shifts, TIME_EMBEDDING, width);
+        product(Precision::F32, &embedding, kernel, &mut shifts, TIME_EMBEDDING, width);
         for row in shifts.chunks_exact_mut(width) {
             row.iter_mut().zip(network.bias(0)).for_each(|(x, b)| *x += b);
         }

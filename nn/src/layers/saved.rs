@@ -93,27 +93,29 @@ impl SavedActivations {
         input: &[f32],
         output_gradient: &[f32],
     ) {
-        layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias, norm }| {
-            let x = match layer {
-                0 => input,
-                _ => self.of_member(&self.x[layer - 1], layer - 1, member),
-            };
-            let columns = bias.len();
-            let gradient = match self.slope.get(layer) {
-                Some(delta) => self.of_member(delta, layer, member),
-                None => &output_gradient[member * self.rows * columns..][..self.rows * columns],
-            };
-            let inputs = kernel.len() / columns;
-            // A single network is split, for all threads to work.
-            let rows = if self.members == 1 { inputs.min(TILE) } else { inputs };
-            kernel.par_chunks_mut(rows * columns).enumerate().for_each(|(i, kernel)| {
-                outer_rows(x, gradient, kernel, (i * rows, inputs), columns);
-            });
-            column_sums(gradient, bias);
-            for (i, out) in norm.into_iter().flatten().enumerate() {
-                self.sum_over_tiles(layer, member, i, out);
-            }
-        });
+        layers.into_par_iter().for_each(
+            |LayerMut { layer, member, precision, kernel, bias, norm }| {
+                let x = match layer {
+                    0 => input,
+                    _ => self.of_member(&self.x[layer - 1], layer - 1, member),
+                };
+                let columns = bias.len();
+                let gradient = match self.slope.get(layer) {
+                    Some(delta) => self.of_member(delta, layer, member),
+                    None => &output_gradient[member * self.rows * columns..][..self.rows * columns],
+                };
+                let inputs = kernel.len() / columns;
+                // A single network is split, for all threads to work.
+                let rows = if self.members == 1 { inputs.min(TILE) } else { inputs };
+                kernel.par_chunks_mut(rows * columns).enumerate().for_each(|(i, kernel)| {
+                    outer_rows(precision, x, gradient, kernel, (i * rows, inputs), columns);
+                });
+                column_sums(gradient, bias);
+                for (i, out) in norm.into_iter().flatten().enumerate() {
+                    self.sum_over_tiles(layer, member, i, out);
+                }
+            },
+        );
     }
 
     /// The gradient of a norm's scales (0) or shifts (1): the sum of the tiles' parts.

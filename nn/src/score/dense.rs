@@ -7,6 +7,7 @@ use crate::layers::plain;
 use crate::slices::{has_fast_implementation, read_all};
 use crate::weights::TensorSpec;
 use candle_core::{Result, Tensor, bail};
+use quad_kernels::Precision;
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_kernels::product::product;
 use rayon::prelude::*;
@@ -20,6 +21,8 @@ pub(crate) struct Dense {
     pub outputs: usize,
     /// f; `None` is the identity.
     pub activation: Option<Activation>,
+    /// Arithmetic of the products with the kernel.
+    pub precision: Precision,
 }
 
 impl Dense {
@@ -96,7 +99,7 @@ impl Dense {
     pub fn apply(&self, weights: &[f32], x: &[f32], out: &mut [f32], slope: Option<&mut [f32]>) {
         let (kernel, n) = (self.kernel(weights), self.outputs);
         let bias = &weights[self.start + kernel.len()..][..n];
-        product(x, kernel, out, self.inputs, n);
+        product(self.precision, x, kernel, out, self.inputs, n);
         match (self.activation, slope) {
             (Some(f), Some(slope)) => activate_with_slope(f, out, bias, slope),
             (Some(f), None) => activate(f, out, bias),

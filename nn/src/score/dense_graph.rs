@@ -176,13 +176,14 @@ impl DenseGraph {
                     if layer.is_active() {
                         multiply(&mut delta, &slopes[i]);
                     }
-                    let (k, n) = (layer.inputs, layer.outputs);
+                    let (precision, k, n) = (layer.precision, layer.inputs, layer.outputs);
                     let (kernel, bias) = of_weights[layer.range()].split_at_mut(k * n);
-                    outer(&values[*x], &delta, kernel, k, n);
+                    outer(precision, &values[*x], &delta, kernel, k, n);
                     column_sums(&delta, bias);
                     if *x >= self.inputs {
                         scratch.resize(values[*x].len(), 0.0);
-                        product_transposed(&delta, layer.kernel(weights), &mut scratch, k, n);
+                        let kernel = layer.kernel(weights);
+                        product_transposed(precision, &delta, kernel, &mut scratch, k, n);
                         deposit(&mut gradients[*x], &scratch);
                     }
                 }

@@ -8,6 +8,7 @@ use crate::score::dpm_solver::DpmSolver;
 use crate::weighted::weighted;
 use crate::weights::{Layout, TensorSpec, Weights};
 use candle_core::{Device, Result, Tensor, bail};
+use quad_kernels::Precision;
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use std::f64::consts::TAU;
@@ -17,6 +18,8 @@ use std::sync::Arc;
 const FREQUENCIES: usize = 16;
 /// Standard deviation of the random frequencies.
 const SPREAD: f32 = 30.0;
+/// Number of inputs: the state, features of time and the action.
+const INPUTS: usize = 3;
 /// Length of the embeddings of state and time.
 const EMBEDDING: usize = 2 * FREQUENCIES;
 
@@ -35,34 +38,39 @@ pub struct ScoreShape {
 /// Builds the graph and the layout of its weights.
 struct GraphBuilder<'a> {
     layers: &'a MlpConfig,
+    precision: Precision,
     specs: Vec<TensorSpec>,
     start: usize,
     steps: Vec<Step>,
 }
 
 impl<'a> GraphBuilder<'a> {
-    fn new(layers: &'a MlpConfig) -> Self {
+    fn new(layers: &'a MlpConfig, precision: Precision) -> Self {
         let (specs, steps) = (Vec::new(), Vec::new());
-        Self { layers, specs, start: 0, steps }
+        Self { layers, precision: precision.in_effect(), specs, start: 0, steps }
     }
 
-    /// Adds a step. Returns the number of its value; 0 to 2 are the inputs.
+    /// Adds a step. Returns the number of its value; the first are the inputs.
     fn step(&mut self, step: Step) -> usize {
         self.steps.push(step);
-        2 + self.steps.len()
+        INPUTS - 1 + self.steps.len()
     }
 
     /// The next layer in the vector of weights.
     fn dense(&mut self, name: &str, (inputs, outputs): (usize, usize), active: bool) -> Dense {
         let activation = active.then_some(self.layers.activation);
-        let layer = Dense { start: self.start, inputs, outputs, activation };
+        let precision = Precision::F32;
+        let layer = Dense { start: self.start, inputs, outputs, activation, precision };
         self.start = layer.range().end;
         self.specs.extend(layer.specs(name, self.layers.initial));
         layer
     }
 
-    /// Adds a step with a layer of value `x`, plus value `added`.
-    fn apply(&mut self, layer: Dense, x: usize, added: Option<usize>) -> usize {
+    /// Adds a step with a layer of value `x`, plus value `added`. Inputs are not rounded.
+    fn apply(&mut self, mut layer: Dense, x: usize, added: Option<usize>) -> usize {
+        if x >= INPUTS {
+            layer.precision = self.precision;
+        }
         self.step(Step::Dense { layer, x, added })
     }
 
@@ -95,9 +103,9 @@ impl<'a> GraphBuilder<'a> {
 }
 
 /// The network of (state, features of time, actions) and the layout of its weights.
-fn build(shape: &ScoreShape) -> (DenseGraph, Layout) {
+fn build(shape: &ScoreShape, precision: Precision) -> (DenseGraph, Layout) {
     let (widths, a) = (&shape.layers.hidden, shape.action_dim);
-    let mut of = GraphBuilder::new(&shape.layers);
+    let mut of = GraphBuilder::new(&shape.layers, precision);
     let narrowest = widths.last().copied().unwrap_or(1);
     let state = of.layer("state", 0, (shape.observation_dim, EMBEDDING), true);
     let time = of.layer("time", 1, (EMBEDDING, EMBEDDING), false);
@@ -140,7 +148,7 @@ impl ScoreShape {
 
     /// Tensors of the layers, each with `.kernel` `[in, out]` and `.bias` `[out]`.
     pub fn layout(&self) -> Layout {
-        build(self).1
+        build(self, Precision::F32).1
     }
 
     /// Draws frequencies, `[16]`, normal with a standard deviation of 30.
@@ -161,9 +169,15 @@ impl ScoreShape {
 }
 
 impl ScoreNetwork {
-    /// A network with weights of the shape's layout and `frequencies` `[16]` on the CPU.
-    pub fn new(shape: ScoreShape, weights: Weights, frequencies: Tensor) -> Self {
-        let graph = Arc::new(build(&shape).0);
+    /// A network with weights of the shape's layout and `frequencies` `[16]` on the CPU, whose
+    /// products are in this precision.
+    pub fn new(
+        shape: ScoreShape,
+        weights: Weights,
+        frequencies: Tensor,
+        precision: Precision,
+    ) -> Self {
+        let graph = Arc::new(build(&shape, precision).0);
         Self { shape, graph, weights, frequencies }
     }
 
@@ -239,7 +253,7 @@ mod tests {
         let shape = ScoreShape { observation_dim, action_dim, layers };
         let weights = weights(shape.layout(), generator);
         let frequencies = ScoreShape::frequencies(generator)?;
-        Ok(ScoreNetwork::new(shape, weights, frequencies))
+        Ok(ScoreNetwork::new(shape, weights, frequencies, Precision::F32))
     }
 
     /// Rows fill several tiles and chunks, or none.
