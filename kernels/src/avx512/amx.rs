@@ -48,10 +48,10 @@ impl Configuration {
     /// For sums of `upper` and `lower` rows: tiles 0 to 3 are the sums, 4 and 5 the rows of `a`, 6
     /// and 7 of `b`.
     fn new(upper: usize, lower: usize) -> Self {
-        let (upper, lower, all) = (upper as u8, lower as u8, TILE as u8);
+        let (upper, lower, whole) = (upper as u8, lower as u8, TILE as u8);
         let (mut row_bytes, mut rows) = ([0; 16], [0; 16]);
         row_bytes[..8].fill(64);
-        rows[..8].copy_from_slice(&[upper, upper, lower, lower, upper, lower, all, all]);
+        rows[..8].copy_from_slice(&[upper, upper, lower, lower, upper, lower, whole, whole]);
         Configuration { palette: 1, start: 0, reserved: [0; 14], row_bytes, rows }
     }
 }

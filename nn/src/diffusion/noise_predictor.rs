@@ -162,8 +162,8 @@ impl NoisePredictor {
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
         let mut actions = noise.get(0)?;
         for t in (1..=steps).rev() {
-            let all = Tensor::full(t as u32, rows, noise.device())?;
-            let epsilon = self.predict(&observations, &actions, &all)?;
+            let times = Tensor::full(t as u32, rows, noise.device())?;
+            let epsilon = self.predict(&observations, &actions, &times)?;
             let z = (t > 1).then(|| noise.get(steps - t + 1)).transpose()?;
             actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
         }

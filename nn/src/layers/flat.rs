@@ -121,16 +121,16 @@ impl Layers {
         member: usize,
     ) -> Option<[&'a [f32]; 2]> {
         let (inputs, outputs) = self.shape(layer);
-        let of = |kind| {
+        let vector = |kind| {
             let before = (self.members * (inputs + kind) + member) * outputs;
             &weights[self.offsets[layer] + before..][..outputs]
         };
-        self.is_normed(layer).then(|| [of(1), of(2)])
+        self.is_normed(layer).then(|| [vector(1), vector(2)])
     }
 
     /// Splits the layers' range of a vector, so that each layer can be written by another thread.
     pub fn split_mut<'a>(&self, mut rest: &'a mut [f32]) -> Vec<LayerMut<'a>> {
-        let mut all = Vec::with_capacity(self.count() * self.members);
+        let mut split = Vec::with_capacity(self.count() * self.members);
         for layer in 0..self.count() {
             let ((inputs, outputs), precision) = (self.shape(layer), self.precision(layer));
             let (kernels, behind) = rest.split_at_mut(self.members * inputs * outputs);
@@ -142,12 +142,12 @@ impl Layers {
             let mut norms = scales.chunks_exact_mut(outputs).zip(shifts.chunks_exact_mut(outputs));
             let members =
                 kernels.chunks_exact_mut(inputs * outputs).zip(biases.chunks_exact_mut(outputs));
-            all.extend(members.enumerate().map(|(member, (kernel, bias))| {
+            split.extend(members.enumerate().map(|(member, (kernel, bias))| {
                 let norm = norms.next().map(|(scale, shift)| [scale, shift]);
                 LayerMut { layer, member, precision, kernel, bias, norm }
             }));
         }
-        all
+        split
     }
 
     /// The tensors `{prefix}{layer}.kernel` and `.bias`, and with a norm `.scale` and `.shift`; with

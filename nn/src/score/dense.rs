@@ -49,11 +49,13 @@ impl Dense {
     /// is added to the first rows/n rows, and so on. Differentiable in plain operations only.
     pub fn forward(&self, weights: &Tensor, x: &Tensor, added: Option<&Tensor>) -> Result<Tensor> {
         let ((rows, width), n) = (x.dims2()?, self.outputs);
-        let of_added = added.map_or(Ok((rows, n)), Tensor::dims2)?;
-        let fits = of_added.0 > 0 && rows > 0 && rows.is_multiple_of(of_added.0) && of_added.1 == n;
-        if width != self.inputs || !fits {
+        let (added_rows, added_width) = added.map_or(Ok((rows, n)), Tensor::dims2)?;
+        let fits = added_rows > 0 && rows > 0 && rows.is_multiple_of(added_rows);
+        if width != self.inputs || added_width != n || !fits {
             let sizes = (self.inputs, n);
-            bail!("a layer of {sizes:?} numbers got {rows} × {width} and {of_added:?}");
+            bail!(
+                "a layer of {sizes:?} numbers got {rows} × {width} and {added_rows} × {added_width}"
+            );
         }
         if !has_fast_implementation(weights.device()) {
             return self.plain(weights, x, added);
@@ -62,7 +64,7 @@ impl Dense {
             Some(added) => added.contiguous()?,
             None => Tensor::zeros((0, n), x.dtype(), x.device())?,
         };
-        let repeat = rows / of_added.0;
+        let repeat = rows / added_rows;
         let out = read_all([weights, &x.contiguous()?, &added], |[weights, x, added]| {
             let mut out = vec![0.0; rows * n];
             out.par_chunks_mut(TILE * n).enumerate().for_each(|(i, out)| {

@@ -105,30 +105,30 @@ impl<'a> GraphBuilder<'a> {
 /// The network of (state, features of time, actions) and the layout of its weights.
 fn build(shape: &ScoreShape, precision: Precision) -> (DenseGraph, Layout) {
     let (widths, a) = (&shape.layers.hidden, shape.action_dim);
-    let mut of = GraphBuilder::new(&shape.layers, precision);
+    let mut builder = GraphBuilder::new(&shape.layers, precision);
     let narrowest = widths.last().copied().unwrap_or(1);
-    let state = of.layer("state", 0, (shape.observation_dim, EMBEDDING), true);
-    let time = of.layer("time", 1, (EMBEDDING, EMBEDDING), false);
-    let both = of.step(Step::Concat(state, time));
-    let mixed = of.layer("mix.0", both, (2 * EMBEDDING, narrowest), true);
-    let condition = (of.layer("mix.1", mixed, (narrowest, narrowest), true), narrowest);
+    let state = builder.layer("state", 0, (shape.observation_dim, EMBEDDING), true);
+    let time = builder.layer("time", 1, (EMBEDDING, EMBEDDING), false);
+    let both = builder.step(Step::Concat(state, time));
+    let mixed = builder.layer("mix.0", both, (2 * EMBEDDING, narrowest), true);
+    let condition = (builder.layer("mix.1", mixed, (narrowest, narrowest), true), narrowest);
     let (mut x, mut width, mut skips) = (2, a, Vec::new());
     for (i, outputs) in widths.iter().enumerate() {
-        x = of.block(&format!("down.{i}"), x, (width, *outputs), condition);
+        x = builder.block(&format!("down.{i}"), x, (width, *outputs), condition);
         width = *outputs;
         skips.push(x);
     }
-    x = of.block("middle", x, (narrowest, narrowest), condition);
+    x = builder.block("middle", x, (narrowest, narrowest), condition);
     // Each block reads the block before it and the downward block of that width.
     for (i, pair) in widths.windows(2).rev().enumerate() {
-        let both = of.step(Step::Concat(skips.pop().unwrap_or(x), x));
-        x = of.block(&format!("up.{i}"), both, (2 * pair[1], pair[0]), condition);
+        let both = builder.step(Step::Concat(skips.pop().unwrap_or(x), x));
+        x = builder.block(&format!("up.{i}"), both, (2 * pair[1], pair[0]), condition);
     }
-    let both = of.step(Step::Concat(skips.pop().unwrap_or(x), x));
+    let both = builder.step(Step::Concat(skips.pop().unwrap_or(x), x));
     let widest = widths.first().copied().unwrap_or(1);
-    of.layer("last", both, (2 * widest, a), false);
+    builder.layer("last", both, (2 * widest, a), false);
     let inputs = vec![shape.observation_dim, EMBEDDING, a];
-    (DenseGraph::new(inputs, of.steps, of.start), Layout::new(of.specs))
+    (DenseGraph::new(inputs, builder.steps, builder.start), Layout::new(builder.specs))
 }
 
 /// A noise predictor in continuous time, and its weights.
@@ -162,9 +162,9 @@ impl ScoreShape {
         let (widths, widest) = (&self.layers.hidden, self.layers.widest());
         // Outputs of the downward blocks; and of one block its input, which is two outputs, and
         // three steps.
-        let of_row = widths.iter().sum::<usize>() + 6 * widest;
-        let of_state = 4 * EMBEDDING + 4 * widest;
-        rows * of_row as u128 + states * of_state as u128
+        let row_floats = widths.iter().sum::<usize>() + 6 * widest;
+        let state_floats = 4 * EMBEDDING + 4 * widest;
+        rows * row_floats as u128 + states * state_floats as u128
     }
 }
 
@@ -216,7 +216,9 @@ impl ScoreNetwork {
         let row = |t: &f64| {
             let angles = frequencies.iter().map(|frequency| TAU * t * f64::from(*frequency));
             let angles = Vec::from_iter(angles);
-            [f64::sin, f64::cos].map(|of| Vec::from_iter(angles.iter().map(|x| of(*x)))).concat()
+            [f64::sin, f64::cos]
+                .map(|wave| Vec::from_iter(angles.iter().map(|x| wave(*x))))
+                .concat()
         };
         let features: Vec<f32> = t.iter().flat_map(row).map(|x| x as f32).collect();
         Tensor::from_vec(features, (t.len(), EMBEDDING), device)
@@ -268,8 +270,9 @@ mod tests {
             let predict = || network.predict(&observations, &actions, &t);
             let (fast, plain) = (predict()?, plainly(predict)?);
             assert_within(1e-4, "values", &fast, &plain);
-            let [of_fast, of_plain] = [fast, plain.clone()].map(|x| gradient(&x, &network.weights));
-            assert_within(1e-4, "gradients", &of_fast?, &of_plain?);
+            let [fast_gradient, plain_gradient] =
+                [fast, plain.clone()].map(|x| gradient(&x, &network.weights));
+            assert_within(1e-4, "gradients", &fast_gradient?, &plain_gradient?);
             let constant = network.detach().predict(&observations, &actions, &t)?;
             assert_within(1e-4, "constants", &constant, &plain);
         }

@@ -26,8 +26,8 @@ pub(crate) fn convolve(
     if has_fast_implementation(x.device()) {
         return x.apply_op3(&kernel.contiguous()?, &bias.contiguous()?, shape);
     }
-    let of_step = |step| (0..taps).map(move |tap| (step * stride + tap) as u32);
-    let places = Tensor::from_iter((0..shape.steps()).flat_map(of_step), x.device())?;
+    let step_places = |step| (0..taps).map(move |tap| (step * stride + tap) as u32);
+    let places = Tensor::from_iter((0..shape.steps()).flat_map(step_places), x.device())?;
     let rows = (batch * shape.steps(), taps * inputs);
     let padded = x.pad_with_zeros(1, taps / 2, taps / 2)?;
     let unfolded = padded.index_select(&places, 1)?.reshape(rows)?;
@@ -191,14 +191,18 @@ impl CustomOp3 for Convolution {
             let tensor = |numbers: Option<Vec<f32>>, of: &Tensor| {
                 numbers.map(|numbers| Tensor::from_vec(numbers, of.shape(), device)).transpose()
             };
-            let of_x = x.track_op().then(|| self.input_gradient(kernel_numbers, g));
-            let of_kernel = kernel.track_op().then(|| self.kernel_gradient(x_numbers, g));
-            let of_bias = bias.track_op().then(|| {
+            let x_gradient = x.track_op().then(|| self.input_gradient(kernel_numbers, g));
+            let kernel_gradient = kernel.track_op().then(|| self.kernel_gradient(x_numbers, g));
+            let bias_gradient = bias.track_op().then(|| {
                 let mut sums = vec![0.0; self.outputs];
                 column_sums(g, &mut sums);
                 sums
             });
-            Ok((tensor(of_x, x)?, tensor(of_kernel, kernel)?, tensor(of_bias, bias)?))
+            Ok((
+                tensor(x_gradient, x)?,
+                tensor(kernel_gradient, kernel)?,
+                tensor(bias_gradient, bias)?,
+            ))
         })?
     }
 }
