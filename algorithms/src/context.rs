@@ -22,7 +22,7 @@ pub struct Context {
     pub window: Window,
     /// Seed of initial weights and noise.
     pub seed: u64,
-    /// Precision of forward passes without a gradient.
+    /// Precision of products between hidden layers.
     pub precision: Precision,
     /// Device of all tensors.
     pub device: Device,

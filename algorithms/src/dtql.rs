@@ -88,7 +88,8 @@ networks! {
                 action_dim: init.context.action_dim(),
                 layers: config.diffusion.clone(),
             };
-            init.network(&shape.layout(), |weights| Denoiser::new(&shape, weights))
+            let precision = init.context.precision;
+            init.network(&shape.layout(), |weights| Denoiser::new(&shape, weights, precision))
         },
     }
 }

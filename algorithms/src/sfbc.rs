@@ -97,7 +97,9 @@ networks! {
             let draw = |generator: &mut _| ScoreShape::frequencies(generator)?.to_vec1::<f32>();
             let frequencies = random.vector("frequencies", draw)?;
             let frequencies = Tensor::new(frequencies, &Device::Cpu)?;
-            init.network(&shape.layout(), |weights| ScoreNetwork::new(shape, weights, frequencies))
+            let precision = init.context.precision;
+            let network = |weights| ScoreNetwork::new(shape.clone(), weights, frequencies, precision);
+            init.network(&shape.layout(), network)
         },
         critic: TrainState<Ensemble> = init.ensemble(init.shape(&config.critic)),
     }

@@ -28,7 +28,7 @@ ROLLOUT_STEPS = 4
 PEAK_CALLS, PEAK_ROWS, PEAK_WIDTH = 1000, 128, 256
 # In kernels/benches/kernels.rs: which to run, ours, and what a library does in its place.
 KERNELS, OURS = "/20 in turn$|/mish", ("ours", "mish")
-LIBRARIES = {"gemm": "gemm", "gemm in f32": "gemm, f32", "mish by std's exp": "std's exp"}
+LIBRARIES = {"gemm": "gemm", "mish by std's exp": "std's exp"}
 PYTHON, JAX_STEP = ".deps/venv/bin/python", "algorithms/benches/jax_step.py"
 # Asked for fewer instructions than the CPU has, JAX's compiler keeps to them, too. Its library of products takes what it finds.
 ONLY_AVX2 = os.environ.get("QUAD_INSTRUCTIONS") == "avx2"
@@ -142,7 +142,7 @@ def measure_algorithms(count, some):
     rounds = {name: [] for name in some or names.splitlines() if name not in CONFIGURATIONS}
     for _ in range(count):
         for name, moments in rounds.items():
-            moments.append({"jax": min(peer.measure(name).values()), "ours": criterion("update", f"^update/{name}$")})
+            moments.append({"jax": min(peer.measure(name).values()), "ours": criterion("update", f"^update(, bf16)?/{name}$")})
     return rounds
 
 
@@ -210,11 +210,15 @@ def updates(all_rounds):
 
 
 def algorithms(all_rounds):
-    rows = [["gradient step", "f32", "JAX, tuned", "ratio"]]
+    rows = [["gradient step", "JAX, tuned", "f32", "over JAX", "bf16", "over JAX"]]
     for name, rounds in all_rounds.items():
-        ours, jax = (lambda x: x["ours"][f"update/{name}"]), (lambda x: x["jax"])
-        times = [f"{1e3 * median(rounds, of):.2f} ms" for of in (ours, jax)]
-        rows.append([name, *times, f"{median(rounds, lambda x: jax(x) / ours(x)):.2f} ×"])
+        row = [name, f"{1e3 * median(rounds, lambda x: x['jax']):.2f} ms"]
+        for group in ("update", "update, bf16"):
+            if f"{group}/{name}" in rounds[0]["ours"]:
+                ours = lambda x, group=group: x["ours"][f"{group}/{name}"]
+                ratio = median(rounds, lambda x: x["jax"] / ours(x))
+                row += [f"{1e3 * median(rounds, ours):.2f} ms", f"{ratio:.2f} ×"]
+        rows.append([*row, *[""] * (len(rows[0]) - len(row))])
     table(*rows)
 
 

@@ -10,6 +10,7 @@ use criterion::{
     BenchmarkGroup, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main,
 };
 use quad_kernels::Buffer;
+use quad_kernels::Precision::{Bf16, F32};
 use quad_kernels::activation::Activation::Mish;
 use quad_kernels::activation::{activate, activate_with_slope};
 use quad_kernels::product::{Matrix, Packed, by_gemm, outer, product, product_transposed};
@@ -89,40 +90,41 @@ fn compare(
 }
 
 /// A layer's forward pass, the gradient that it passes on, and that of its weights: the hidden
-/// layers of the paper's networks and of the demonstration's, and the first layer.
+/// layers of the paper's networks and of the demonstration's, and the first layer, which is never
+/// rounded. The library has no product of rounded factors and multiplies in f32.
 fn products(criterion: &mut Criterion) {
-    for [m, k, n] in [[128, 256, 256], [128, 128, 128], [128, 11, 256]] {
-        let (name, orders) = (format!("product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
-        compare(criterion, (&name, [m, k, n]), orders, &|_, x, weights, out| {
-            product(x, weights, out, k, n)
-        });
-    }
-    for [m, k, n] in [[128, 256, 256], [128, 128, 128]] {
-        let name = format!("product with the transpose, {m} × {n} × {k}");
-        let orders = (AS_IT_IS, TRANSPOSED, 1);
-        compare(criterion, (&name, [m, n, k]), orders, &|_, g, weights, out| {
-            product_transposed(g, weights, out, k, n)
-        });
-    }
-    for [m, k, n] in [[128, 256, 256], [256, 256, 256], [128, 128, 128]] {
-        let name = format!("outer product of {m} rows, {k} × {n}");
-        let orders = (TRANSPOSED, AS_IT_IS, IN_TURN);
-        compare(criterion, (&name, [k, m, n]), orders, &|_, x, g, out| outer(x, g, out, k, n));
-    }
-    // As a policy acts: for ten episodes on one thread, for ten candidates.
-    for [m, k, n] in [[100, 256, 256], [10, 256, 256]] {
-        let pack = |seed| Packed::new(numbers(k * n, seed).first(k * n), k, n);
-        let Some(packed) = (1..=IN_TURN).map(pack).collect::<Option<Vec<_>>>() else { return };
-        let (name, orders) = (format!("packed product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
-        compare(criterion, (&name, [m, k, n]), orders, &|i, x, _, out| packed[i].product(x, out));
-    }
-    // The library has no product of rounded operands and multiplies in f32; nor has a CPU that
-    // gains nothing by it.
-    for [m, k, n] in [[32, 256, 256], [32, 128, 128]] {
-        let round = |seed| Packed::rounded(numbers(k * n, seed).first(k * n), k, n);
-        let Some(rounded) = (1..=IN_TURN).map(round).collect::<Option<Vec<_>>>() else { return };
-        let (name, orders) = (format!("bf16 product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
-        compare(criterion, (&name, [m, k, n]), orders, &|i, x, _, out| rounded[i].product(x, out));
+    for precision in [F32, Bf16].into_iter().filter(|precision| precision.is_available()) {
+        let named = |name: String| format!("{name}, {}", precision.name());
+        for [m, k, n] in [[128, 256, 256], [128, 128, 128], [128, 11, 256]] {
+            let (name, orders) = (format!("product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
+            compare(criterion, (&named(name), [m, k, n]), orders, &|_, x, weights, out| {
+                product(precision, x, weights, out, k, n)
+            });
+        }
+        for [m, k, n] in [[128, 256, 256], [128, 128, 128]] {
+            let name = format!("product with the transpose, {m} × {n} × {k}");
+            let orders = (AS_IT_IS, TRANSPOSED, 1);
+            compare(criterion, (&named(name), [m, n, k]), orders, &|_, g, weights, out| {
+                product_transposed(precision, g, weights, out, k, n)
+            });
+        }
+        for [m, k, n] in [[128, 256, 256], [256, 256, 256], [128, 128, 128]] {
+            let name = format!("outer product of {m} rows, {k} × {n}");
+            let orders = (TRANSPOSED, AS_IT_IS, IN_TURN);
+            compare(criterion, (&named(name), [k, m, n]), orders, &|_, x, g, out| {
+                outer(precision, x, g, out, k, n)
+            });
+        }
+        // As a policy acts: for ten episodes on one thread, for ten candidates.
+        for [m, k, n] in [[100, 256, 256], [10, 256, 256]] {
+            let pack = |seed| Packed::new(precision, numbers(k * n, seed).first(k * n), k, n);
+            let Some(packed) = (1..=IN_TURN).map(pack).collect::<Option<Vec<_>>>() else { return };
+            let name = format!("packed product, {m} × {k} × {n}");
+            let orders = (AS_IT_IS, AS_IT_IS, 1);
+            compare(criterion, (&named(name), [m, k, n]), orders, &|i, x, _, out| {
+                packed[i].product(x, out)
+            });
+        }
     }
 }
 

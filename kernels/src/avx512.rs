@@ -5,7 +5,7 @@
 //! side at a time is copied or transposed, into the nearest cache.
 
 use std::arch::x86_64::{
-    _MM_HINT_T0, _mm_prefetch, _mm512_castpd_ps, _mm512_castps_pd, _mm512_fmadd_ps,
+    __m512, _MM_HINT_T0, _mm_prefetch, _mm512_castpd_ps, _mm512_castps_pd, _mm512_fmadd_ps,
     _mm512_loadu_ps, _mm512_set1_ps, _mm512_setzero_ps, _mm512_shuffle_f32x4, _mm512_store_ps,
     _mm512_storeu_ps, _mm512_unpackhi_pd, _mm512_unpackhi_ps, _mm512_unpacklo_pd,
     _mm512_unpacklo_ps,
@@ -226,15 +226,22 @@ pub(crate) unsafe fn multiply_packed(
     }
 }
 
-/// `to = fromᵀ` for 16 × 16 numbers.
+/// Loads 16 rows of 16 numbers.
 #[inline]
 #[target_feature(enable = "avx512f")]
-unsafe fn transpose(from: *const f32, from_row: usize, to: *mut f32, to_row: usize) {
+unsafe fn load_square(from: *const f32, row: usize) -> [__m512; LANES] {
     let mut rows = [_mm512_setzero_ps(); LANES];
-    for (i, row) in rows.iter_mut().enumerate() {
+    for (i, register) in rows.iter_mut().enumerate() {
         // SAFETY: the caller vouches for 16 rows of 16.
-        *row = unsafe { _mm512_loadu_ps(from.add(i * from_row)) };
+        *register = unsafe { _mm512_loadu_ps(from.add(i * row)) };
     }
+    rows
+}
+
+/// Stores the transpose of 16 × 16 elements.
+#[inline]
+#[target_feature(enable = "avx512f")]
+unsafe fn store_transposed(rows: [__m512; LANES], to: *mut f32, to_row: usize) {
     // Quarter q of `quads[4·g + c]` is column 4·q + c of the rows 4·g..4·g + 4.
     let mut quads = rows;
     for g in (0..LANES).step_by(4) {
@@ -261,7 +268,7 @@ unsafe fn transpose(from: *const f32, from_row: usize, to: *mut f32, to_row: usi
             _mm512_shuffle_f32x4::<ODD>(odd, next_odd),
         ];
         for (q, column) in columns.into_iter().enumerate() {
-            // SAFETY: and for as many to write to.
+            // SAFETY: the caller vouches for 16 rows of 16 to write to.
             unsafe { _mm512_storeu_ps(to.add((4 * q + c) * to_row), column) };
         }
     }
@@ -290,7 +297,8 @@ pub(crate) unsafe fn multiply_transposed(
         unsafe {
             for p in (0..n).step_by(LANES) {
                 for half in [0, LANES] {
-                    transpose(b.add((j + half) * n + p), n, block.add(p * COLUMNS + half), COLUMNS);
+                    let rows = load_square(b.add((j + half) * n + p), n);
+                    store_transposed(rows, block.add(p * COLUMNS + half), COLUMNS);
                 }
             }
             let ahead = Ahead { first: b.wrapping_add((j + COLUMNS) * n), row: COLUMNS };

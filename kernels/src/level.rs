@@ -59,8 +59,8 @@ impl Level {
             match env::var_os(VARIABLE) {
                 Some(asked) if asked == only.name() => available.min(only),
                 Some(asked) if !asked.is_empty() => {
-                    let known = only.name();
-                    let text = format!("{VARIABLE} is {asked:?}, not {known}, and is ignored");
+                    let name = only.name();
+                    let text = format!("{VARIABLE} is {asked:?}, not {name}, and is ignored");
                     writeln!(io::stderr(), "{text}").ok();
                     available
                 }

@@ -3,8 +3,8 @@
 //!
 //! # Layout
 //!
-//! - [`product`]: dense products on one thread, in f32 and in bfloat16; `packed`: their right-hand
-//!   sides, packed once; `avx512`, `avx2`: products faster than a library's
+//! - [`product`]: dense products on one thread, in f32 and in bfloat16 ([`Precision`]); `packed`:
+//!   their right-hand sides, packed once; `avx512`, `avx2`: products faster than a library's
 //!   (kernels/benches/README.md).
 //! - [`activation`]: activations and their derivatives; [`narrow`]: the first and last layer of a
 //!   network; [`norm`]: layer norm, forward and backward.
@@ -37,9 +37,11 @@ pub mod norm;
 pub mod optimizer;
 #[cfg(target_arch = "x86_64")]
 mod packed;
+mod precision;
 pub mod product;
 pub mod scaling;
 mod vectorized;
 
 pub use buffer::Buffer;
 pub use level::Level;
+pub use precision::Precision;

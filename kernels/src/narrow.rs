@@ -8,17 +8,17 @@ use crate::vectorized::vectorized;
 /// Numbers of one AVX-512 register.
 const LANES: usize = 16;
 
-/// `acc + Σ_j coefficients[j] · vectors[j·stride + at ..][..LANES]`.
+/// `acc + Σ_j coefficients[j] · vectors[j·stride + column ..][..LANES]`.
 #[inline(always)]
 fn combine(
     mut acc: [f32; LANES],
     coefficients: &[f32],
     vectors: &[f32],
     stride: usize,
-    at: usize,
+    column: usize,
 ) -> [f32; LANES] {
     for (j, c) in coefficients.iter().enumerate() {
-        let v = &vectors[j * stride + at..][..LANES];
+        let v = &vectors[j * stride + column..][..LANES];
         for l in 0..LANES {
             acc[l] = c.mul_add(v[l], acc[l]);
         }
@@ -33,18 +33,18 @@ fn combine_one(
     coefficients: &[f32],
     vectors: &[f32],
     stride: usize,
-    at: usize,
+    column: usize,
 ) -> f32 {
     for (j, c) in coefficients.iter().enumerate() {
-        acc = c.mul_add(vectors[j * stride + at], acc);
+        acc = c.mul_add(vectors[j * stride + column], acc);
     }
     acc
 }
 
 #[inline(always)]
-fn load(x: &[f32], at: usize) -> [f32; LANES] {
+fn load(x: &[f32], column: usize) -> [f32; LANES] {
     let mut lanes = [0.0; LANES];
-    lanes.copy_from_slice(&x[at..at + LANES]);
+    lanes.copy_from_slice(&x[column..column + LANES]);
     lanes
 }
 
@@ -70,14 +70,14 @@ impl FirstLayer<'_> {
         &self.actions[row * action_dim..][..action_dim]
     }
 
-    /// base + shift + a · kernel of one row, [`LANES`] columns from `at` on.
+    /// base + shift + a · kernel of one row, [`LANES`] columns from `column` on.
     #[inline(always)]
-    fn before_activation(&self, base: &[f32], a: &[f32], at: usize) -> [f32; LANES] {
-        let (mut sum, shift) = (load(base, at), load(self.shift, at));
+    fn before_activation(&self, base: &[f32], a: &[f32], column: usize) -> [f32; LANES] {
+        let (mut sum, shift) = (load(base, column), load(self.shift, column));
         for l in 0..LANES {
             sum[l] += shift[l];
         }
-        combine(sum, a, self.kernel, self.shift.len(), at)
+        combine(sum, a, self.kernel, self.shift.len(), column)
     }
 }
 
@@ -88,15 +88,16 @@ fn first_rows(layer: &FirstLayer<'_>, out: &mut [f32], f: impl Fn(f32) -> f32) {
         let a = layer.action(row);
         let base = &layer.base[row / layer.repeat * width..][..width];
         let whole = width - width % LANES;
-        for at in (0..whole).step_by(LANES) {
-            let acc = layer.before_activation(base, a, at);
-            let out = &mut out[at..at + LANES];
+        for column in (0..whole).step_by(LANES) {
+            let acc = layer.before_activation(base, a, column);
+            let out = &mut out[column..column + LANES];
             for l in 0..LANES {
                 out[l] = f(acc[l]);
             }
         }
-        for at in whole..width {
-            out[at] = f(combine_one(base[at] + layer.shift[at], a, layer.kernel, width, at));
+        for column in whole..width {
+            out[column] =
+                f(combine_one(base[column] + layer.shift[column], a, layer.kernel, width, column));
         }
     }
 }
@@ -122,15 +123,15 @@ vectorized! {
         let n = vectors.len() / width;
         for (slope, c) in slope.chunks_exact_mut(width).zip(coefficients.chunks_exact(n)) {
             let whole = width - width % LANES;
-            for at in (0..whole).step_by(LANES) {
-                let acc = combine([0.0; LANES], c, vectors, width, at);
-                let slope = &mut slope[at..at + LANES];
+            for column in (0..whole).step_by(LANES) {
+                let acc = combine([0.0; LANES], c, vectors, width, column);
+                let slope = &mut slope[column..column + LANES];
                 for l in 0..LANES {
                     slope[l] *= acc[l];
                 }
             }
-            for (at, slope) in slope.iter_mut().enumerate().skip(whole) {
-                *slope *= combine_one(0.0, c, vectors, width, at);
+            for (column, slope) in slope.iter_mut().enumerate().skip(whole) {
+                *slope *= combine_one(0.0, c, vectors, width, column);
             }
         }
     }
@@ -144,8 +145,8 @@ vectorized! {
             for ((out, v), offset) in out.iter_mut().zip(vectors.chunks_exact(width)).zip(offset) {
                 let whole = width - width % LANES;
                 let mut acc = [0.0_f32; LANES];
-                for at in (0..whole).step_by(LANES) {
-                    let (x, v) = (load(x, at), load(v, at));
+                for column in (0..whole).step_by(LANES) {
+                    let (x, v) = (load(x, column), load(v, column));
                     for l in 0..LANES {
                         acc[l] = x[l].mul_add(v[l], acc[l]);
                     }
@@ -154,8 +155,8 @@ vectorized! {
                 for l in acc {
                     sum += l;
                 }
-                for at in whole..width {
-                    sum = x[at].mul_add(v[at], sum);
+                for column in whole..width {
+                    sum = x[column].mul_add(v[column], sum);
                 }
                 *out = sum;
             }

@@ -69,13 +69,13 @@ vectorized! {
         let (sums, rows) = saved.split_at_mut(2 * width);
         let (inverse, normed) = rows.split_at(delta.len() / width);
         sums.fill(0.0);
-        let (of_scale, of_shift) = sums.split_at_mut(width);
+        let (scale_gradient, shift_gradient) = sums.split_at_mut(width);
         let rows = delta.chunks_exact_mut(width).zip(normed.chunks_exact(width));
         for ((delta, normed), inverse) in rows.zip(inverse) {
-            let columns = of_scale.iter_mut().zip(of_shift.iter_mut()).zip(scale);
-            for ((delta, normed), ((of_scale, of_shift), scale)) in delta.iter_mut().zip(normed).zip(columns) {
-                *of_scale += *delta * normed;
-                *of_shift += *delta;
+            let columns = scale_gradient.iter_mut().zip(shift_gradient.iter_mut()).zip(scale);
+            for ((delta, normed), ((scale_gradient, shift_gradient), scale)) in delta.iter_mut().zip(normed).zip(columns) {
+                *scale_gradient += *delta * normed;
+                *shift_gradient += *delta;
                 *delta *= scale;
             }
             let center = mean(delta, delta, |delta, _| delta);
@@ -121,8 +121,8 @@ mod tests {
             for (y, exact) in y.iter().zip(all(&x, &scale)) {
                 assert!(near(*y, exact, 1e-5), "{width}: {y} for {exact}");
             }
-            let mut of_x = delta.clone();
-            normalize_backward(&mut of_x, &scale, &mut saved);
+            let mut x_gradient = delta.clone();
+            normalize_backward(&mut x_gradient, &scale, &mut saved);
             let loss = |x: &[f32], scale: &[f32]| -> f64 {
                 all(x, scale).iter().zip(&delta).map(|(y, delta)| y * f64::from(*delta)).sum()
             };
@@ -132,12 +132,15 @@ mod tests {
                 below[i] -= 0.01;
                 (loss(&above) - loss(&below)) / 0.02
             };
-            for (i, of_x) in of_x.iter().enumerate() {
-                assert!(near(*of_x, slope(&x, i, &|x| loss(x, &scale)), 1e-3), "{width}, x {i}");
+            for (i, x_gradient) in x_gradient.iter().enumerate() {
+                assert!(
+                    near(*x_gradient, slope(&x, i, &|x| loss(x, &scale)), 1e-3),
+                    "{width}, x {i}"
+                );
             }
             for i in 0..width {
-                let of_scale = slope(&scale, i, &|scale| loss(&x, scale));
-                assert!(near(saved[i], of_scale, 1e-3), "{width}, scale {i}");
+                let scale_gradient = slope(&scale, i, &|scale| loss(&x, scale));
+                assert!(near(saved[i], scale_gradient, 1e-3), "{width}, scale {i}");
                 let sum: f32 = delta.chunks(width).map(|row| row[i]).sum();
                 assert!((saved[width + i] - sum).abs() < 1e-5, "{width}, shift {i}");
             }

@@ -4,6 +4,7 @@ use crate::avx2;
 use crate::avx512::bf16::Rounded;
 use crate::avx512::{self, LANES, Line};
 use crate::level::Level;
+use crate::precision::Precision;
 
 /// A matrix `k × n` in blocks of columns, so that products copy nothing.
 pub struct Packed(Blocks);
@@ -14,9 +15,15 @@ enum Blocks {
 }
 
 impl Packed {
-    /// Packs a row-major matrix; `None` if this CPU gains nothing, or the matrix is not whole blocks.
-    pub fn new(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
+    /// Packs a row-major matrix, rounded where [`Precision::Bf16`] applies; `None` if this CPU gains
+    /// nothing, or the matrix is not whole blocks.
+    pub fn new(precision: Precision, matrix: &[f32], k: usize, n: usize) -> Option<Self> {
         assert_eq!(matrix.len(), k * n, "the matrix's shape");
+        if precision == Precision::Bf16
+            && let Some(rounded) = Rounded::new(matrix, k, n)
+        {
+            return Some(Self(Blocks::Bf16(rounded)));
+        }
         let columns = match Level::in_use() {
             Level::Avx512 => avx512::COLUMNS,
             Level::Avx2 => avx2::COLUMNS,
@@ -36,16 +43,6 @@ impl Packed {
             }
         }
         Some(Self(Blocks::F32 { lines, k, n }))
-    }
-
-    /// Packs a matrix rounded to bfloat16, as the left side will be; sums are in f32.
-    pub fn rounded(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
-        Some(Self(Blocks::Bf16(Rounded::new(matrix, k, n)?)))
-    }
-
-    /// True for a matrix rounded to bfloat16.
-    pub fn is_rounded(&self) -> bool {
-        matches!(self.0, Blocks::Bf16(_))
     }
 
     /// `c[m × n] = a[m × k] · self`, row-major.

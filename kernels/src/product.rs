@@ -1,6 +1,8 @@
 //! Dense products on one thread, all matrices row-major.
 //!
-//! Callers run tiles in parallel; a single product uses one thread.
+//! Callers run tiles in parallel; a single product uses one thread. With [`Precision::Bf16`] a product
+//! rounds its factors where they are whole blocks of 32 in width and in the length of sums; others
+//! would gain too little.
 
 use gemm::{Parallelism, gemm};
 #[cfg(target_arch = "x86_64")]
@@ -14,6 +16,7 @@ use crate::avx512;
 use crate::level::Level;
 #[cfg(target_arch = "x86_64")]
 pub use crate::packed::Packed;
+use crate::precision::Precision;
 
 /// The left or right side of a product.
 #[derive(Clone, Copy)]
@@ -33,6 +36,13 @@ const FEW: usize = 256;
 
 /// First element, column stride, row stride.
 type Strided = (*const f32, isize, isize);
+
+#[cfg(target_arch = "x86_64")]
+impl From<Strided> for avx512::Strided<f32> {
+    fn from((first, column, row): Strided) -> Self {
+        Self { first, row: row as usize, column: column as usize }
+    }
+}
 
 impl Matrix<'_> {
     fn strided(self, rows: usize, columns: usize) -> Strided {
@@ -90,12 +100,37 @@ unsafe fn by_avx2(avx2: V3, [m, n, k]: [usize; 3], out: &mut [f32], a: Strided, 
     }
 }
 
+/// Computes the product in bf16 if that is asked for, and CPU and sizes allow. Returns true if so.
+#[cfg_attr(not(target_arch = "x86_64"), expect(unused_variables))]
+fn multiply_rounded(
+    precision: Precision,
+    [m, k, n]: [usize; 3],
+    a: Matrix,
+    b: Matrix,
+    out: &mut [f32],
+) -> bool {
+    #[cfg(target_arch = "x86_64")]
+    if precision == Precision::Bf16 {
+        let [a, b] = [a.strided(m, k), b.strided(k, n)].map(avx512::Strided::from);
+        assert_eq!(out.len(), m * n, "the product's shape");
+        let serves = avx512::bf16::serves([m, k, n], a);
+        if serves {
+            // SAFETY: the CPU can; as in `by_gemm`.
+            unsafe { avx512::bf16::multiply([m, k, n], a, b, out.as_mut_ptr()) };
+        }
+        return serves;
+    }
+    false
+}
+
 /// The product by AVX-512, if the CPU and the width allow, or by `gemm`.
-fn multiply([m, k, n]: [usize; 3], a: Matrix, b: &[f32], out: &mut [f32]) {
+fn multiply(precision: Precision, [m, k, n]: [usize; 3], a: Matrix, b: &[f32], out: &mut [f32]) {
+    if multiply_rounded(precision, [m, k, n], a, Matrix::RowMajor(b), out) {
+        return;
+    }
     #[cfg(target_arch = "x86_64")]
     if avx512::serves(n) {
-        let ((first, column, row), b) = (a.strided(m, k), Matrix::RowMajor(b).strided(k, n));
-        let a = avx512::Strided { first, row: row as usize, column: column as usize };
+        let (a, b) = (a.strided(m, k).into(), Matrix::RowMajor(b).strided(k, n));
         assert_eq!(out.len(), m * n, "the product's shape");
         // SAFETY: as in `by_gemm`.
         return unsafe { avx512::multiply(m, n, k, a, b.0, out.as_mut_ptr()) };
@@ -103,8 +138,8 @@ fn multiply([m, k, n]: [usize; 3], a: Matrix, b: &[f32], out: &mut [f32]) {
     by_gemm([m, k, n], a, Matrix::RowMajor(b), out);
 }
 
-/// True if this CPU multiplies rounded operands ([`Packed::rounded`]) faster than f32.
-pub fn rounding_is_faster() -> bool {
+/// True if this CPU multiplies in bf16 faster than in f32.
+pub(crate) fn rounding_is_faster() -> bool {
     #[cfg(target_arch = "x86_64")]
     let available = avx512::bf16::available();
     #[cfg(not(target_arch = "x86_64"))]
@@ -114,7 +149,7 @@ pub fn rounding_is_faster() -> bool {
 
 /// The instructions of products, in f32 or `rounded`. Other instructions add in another order, and
 /// so give other last bits.
-pub fn instructions(rounded: bool) -> &'static str {
+pub(crate) fn instructions(rounded: bool) -> &'static str {
     #[cfg(target_arch = "x86_64")]
     let names = if rounded { avx512::bf16::instructions() } else { Level::in_use().name() };
     #[cfg(not(target_arch = "x86_64"))]
@@ -123,8 +158,8 @@ pub fn instructions(rounded: bool) -> &'static str {
 }
 
 /// `out[m × n] = x[m × k] · w[k × n]`.
-pub fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
-    multiply([x.len() / k, k, n], Matrix::RowMajor(x), w, out);
+pub fn product(precision: Precision, x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
+    multiply(precision, [x.len() / k, k, n], Matrix::RowMajor(x), w, out);
 }
 
 /// No kernels are packed on other architectures.
@@ -133,16 +168,8 @@ pub enum Packed {}
 
 #[cfg(not(target_arch = "x86_64"))]
 impl Packed {
-    pub fn new(_: &[f32], _: usize, _: usize) -> Option<Self> {
+    pub fn new(_: Precision, _: &[f32], _: usize, _: usize) -> Option<Self> {
         None
-    }
-
-    pub fn rounded(_: &[f32], _: usize, _: usize) -> Option<Self> {
-        None
-    }
-
-    pub fn is_rounded(&self) -> bool {
-        match *self {}
     }
 
     pub fn product(&self, _: &[f32], _: &mut [f32]) {
@@ -152,8 +179,18 @@ impl Packed {
 
 /// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's backward pass through `product`. The bits of a
 /// row do not depend on the number of rows.
-pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
-    let m = g.len() / n;
+pub fn product_transposed(
+    precision: Precision,
+    g: &[f32],
+    w: &[f32],
+    out: &mut [f32],
+    k: usize,
+    n: usize,
+) {
+    let (m, left, right) = (g.len() / n, Matrix::RowMajor(g), Matrix::TransposeOf(w));
+    if multiply_rounded(precision, [m, n, k], left, right, out) {
+        return;
+    }
     #[cfg(target_arch = "x86_64")]
     if avx512::serves(n) && avx512::serves(k) {
         assert!(g.len() == m * n && w.len() == k * n, "operands of a product");
@@ -166,36 +203,37 @@ pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: us
     let least = (FEW / k + 1).max(2);
     if m < least {
         let rows = [g, &vec![0.0; (least - m) * n][..]].concat();
-        let mut all = vec![0.0; least * k];
-        by_gemm([least, n, k], Matrix::RowMajor(&rows), Matrix::TransposeOf(w), &mut all);
-        return out.copy_from_slice(&all[..m * k]);
+        let mut products = vec![0.0; least * k];
+        by_gemm([least, n, k], Matrix::RowMajor(&rows), right, &mut products);
+        return out.copy_from_slice(&products[..m * k]);
     }
-    by_gemm([m, n, k], Matrix::RowMajor(g), Matrix::TransposeOf(w), out);
+    by_gemm([m, n, k], left, right, out);
 }
 
 /// `out[k × n] = x[m × k]ᵀ · g[m × n]`: the gradient of `w` in `product`.
-pub fn outer(x: &[f32], g: &[f32], out: &mut [f32], k: usize, n: usize) {
-    outer_rows(x, g, out, (0, k), n);
+pub fn outer(precision: Precision, x: &[f32], g: &[f32], out: &mut [f32], k: usize, n: usize) {
+    outer_rows(precision, x, g, out, (0, k), n);
 }
 
 /// The rows of [`outer`]'s result from `from` on, as many as fit into `out`.
-pub fn outer_rows(x: &[f32], g: &[f32], out: &mut [f32], (from, k): (usize, usize), n: usize) {
-    multiply([out.len() / n, x.len() / k, n], Matrix::TransposeOfColumns(x, from, k), g, out);
+pub fn outer_rows(
+    precision: Precision,
+    x: &[f32],
+    g: &[f32],
+    out: &mut [f32],
+    (from, k): (usize, usize),
+    n: usize,
+) {
+    let sizes = [out.len() / n, x.len() / k, n];
+    multiply(precision, sizes, Matrix::TransposeOfColumns(x, from, k), g, out);
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use Precision::{Bf16, F32};
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
-
-    fn assert_close(what: &str, out: &[f32], expected: impl Fn(usize) -> f64) {
-        for (i, x) in out.iter().enumerate() {
-            let exact = expected(i);
-            let error = (f64::from(*x) - exact).abs() / exact.abs().max(1.0);
-            assert!(error < 1e-5, "{what} at {i}: {x} for {exact}");
-        }
-    }
 
     /// Whole blocks of rows and others, columns for AVX-512 and others.
     #[test]
@@ -205,46 +243,55 @@ mod tests {
             (0..len).map(|_| generator.random_range(-1.0..1.0)).collect()
         };
         let small = [[1, 3, 1], [5, 14, 32], [7, 11, 23], [12, 32, 64], [16, 33, 32]];
-        let large = [[29, 64, 96], [41, 96, 32], [9, 512, 32], [7, 32, 512], [256, 256, 32]];
+        let large =
+            [[29, 64, 96], [41, 96, 32], [9, 512, 32], [7, 32, 512], [32, 96, 64], [256, 256, 32]];
         for [m, k, n] in small.into_iter().chain(large) {
             let (x, w, g) = (numbers(m * k), numbers(k * n), numbers(m * n));
             let sum = |len: usize, term: &dyn Fn(usize) -> (f32, f32)| -> f64 {
                 (0..len).map(term).map(|(a, b)| f64::from(a) * f64::from(b)).sum()
             };
             let what = format!("{m} × {k} × {n}");
-            let mut out = vec![f32::NAN; m * n];
-            product(&x, &w, &mut out, k, n);
-            let exact = |i: usize| sum(k, &|p| (x[i / n * k + p], w[p * n + i % n]));
-            assert_close(&what, &out, exact);
-            if let Some(packed) = Packed::new(&w, k, n) {
-                out.fill(f32::NAN);
-                packed.product(&x, &mut out);
-                assert_close(&format!("{what}, packed"), &out, exact);
+            for precision in [F32, Bf16] {
+                // Rounding two factors changes their product by at most a part in 2^7.
+                let close =
+                    |name: &str, out: &[f32], len, term: &dyn Fn(usize, usize) -> (f32, f32)| {
+                        for (i, x) in out.iter().enumerate() {
+                            let exact = sum(len, &|p| term(i, p));
+                            let terms = sum(len, &|p| (term(i, p).0.abs(), term(i, p).1.abs()));
+                            let bound = if precision == F32 { 1e-5 } else { terms / 128.0 };
+                            let error = (f64::from(*x) - exact).abs();
+                            assert!(
+                                error <= bound * exact.abs().max(1.0),
+                                "{name} in {precision:?}, {what} at {i}: {x} for {exact}"
+                            );
+                        }
+                    };
+                let mut out = vec![f32::NAN; m * n];
+                let term = |i: usize, p: usize| (x[i / n * k + p], w[p * n + i % n]);
+                product(precision, &x, &w, &mut out, k, n);
+                close("product", &out, k, &term);
+                if let Some(packed) = Packed::new(precision, &w, k, n) {
+                    let unpacked = std::mem::replace(&mut out, vec![f32::NAN; m * n]);
+                    packed.product(&x, &mut out);
+                    close("packed product", &out, k, &term);
+                    let same = out == unpacked || !k.is_multiple_of(32) || !n.is_multiple_of(32);
+                    assert!(same || Level::in_use() != Level::Avx512, "{what}, {precision:?}");
+                }
+                let mut out = vec![f32::NAN; m * k];
+                product_transposed(precision, &g, &w, &mut out, k, n);
+                close("product with the transpose", &out, n, &|i, p| {
+                    (g[i / k * n + p], w[i % k * n + p])
+                });
+                let mut out = vec![f32::NAN; k * n];
+                outer(precision, &x, &g, &mut out, k, n);
+                close("outer product", &out, m, &|i, p| (x[p * k + i / n], g[p * n + i % n]));
+                let (whole, from) = (out.clone(), k / 64 * 32);
+                let (above, below) = out.split_at_mut(from * n);
+                above.fill(f32::NAN);
+                outer_rows(precision, &x, &g, above, (0, k), n);
+                outer_rows(precision, &x, &g, below, (from, k), n);
+                assert_eq!(out, whole, "{what}, outer product in two parts");
             }
-            if let Some(rounded) = Packed::rounded(&w, k, n) {
-                out.fill(f32::NAN);
-                rounded.product(&x, &mut out);
-            }
-            // Rounding changes each term by at most a part in 2^8.
-            let terms = |i: usize| sum(k, &|p| (x[i / n * k + p].abs(), w[p * n + i % n].abs()));
-            for (i, x) in out.iter().enumerate() {
-                let error = (f64::from(*x) - exact(i)).abs();
-                assert!(error <= terms(i) / 256.0 + 1e-5, "{what} in bf16 at {i}");
-            }
-            let mut out = vec![f32::NAN; m * k];
-            product_transposed(&g, &w, &mut out, k, n);
-            let exact = |i: usize| sum(n, &|p| (g[i / k * n + p], w[i % k * n + p]));
-            assert_close(&format!("{what}, transposed"), &out, exact);
-            let mut out = vec![f32::NAN; k * n];
-            outer(&x, &g, &mut out, k, n);
-            let exact = |i: usize| sum(m, &|p| (x[p * k + i / n], g[p * n + i % n]));
-            assert_close(&format!("{what}, outer"), &out, exact);
-            let (whole, from) = (out.clone(), k / 3);
-            let (above, below) = out.split_at_mut(from * n);
-            above.fill(f32::NAN);
-            outer_rows(&x, &g, above, (0, k), n);
-            outer_rows(&x, &g, below, (from, k), n);
-            assert_eq!(out, whole, "{what}, outer in two parts");
         }
     }
 
@@ -258,14 +305,16 @@ mod tests {
         };
         for (k, n) in [(17, 64), (40, 256), (48, 48), (256, 40), (64, 64)] {
             let (g, w) = (numbers(128 * n), numbers(k * n));
-            let rows = |m: usize| {
-                let mut out = vec![f32::NAN; m * k];
-                product_transposed(&g[..m * n], &w, &mut out, k, n);
-                out
-            };
-            let all = rows(128);
-            for m in [1, 2, 6, 15, 70] {
-                assert_eq!(rows(m), all[..m * k], "{m} rows, {k} × {n}");
+            for precision in [F32, Bf16] {
+                let rows = |m: usize| {
+                    let mut out = vec![f32::NAN; m * k];
+                    product_transposed(precision, &g[..m * n], &w, &mut out, k, n);
+                    out
+                };
+                let whole = rows(128);
+                for m in [1, 2, 6, 15, 70] {
+                    assert_eq!(rows(m), whole[..m * k], "{m} rows, {k} × {n}, {precision:?}");
+                }
             }
         }
     }

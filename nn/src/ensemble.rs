@@ -5,12 +5,12 @@ use crate::error::NetworkError;
 use crate::layers::mlp::Mlp;
 use crate::layers::packed::Packing;
 use crate::layers::plain;
-use crate::precision::Precision;
 use crate::shape::EnsembleShape;
 use crate::slices::read_all;
 use crate::weighted::weighted;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Error, Result, Tensor, Var, bail};
+use quad_kernels::Precision;
 
 /// An ensemble and its weights.
 pub struct Ensemble {
@@ -23,12 +23,10 @@ pub struct Ensemble {
 weighted!(Ensemble, networks);
 
 impl Ensemble {
-    /// An ensemble with weights of the shape's layout. `precision` applies where no gradient is
-    /// taken.
+    /// An ensemble with weights of the shape's layout, whose products are in this precision.
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
-        let networks = Mlp::new(shape.layers(), "");
-        let packing = Packing::new(precision);
-        Self { shape, networks, weights, packing }
+        let networks = Mlp::new(shape.layers().with_precision(precision), "");
+        Self { shape, networks, weights, packing: Packing::default() }
     }
 
     /// Loads an ensemble that acts, removing its tensors from `tensors`.
@@ -49,17 +47,17 @@ impl Ensemble {
 
     /// Copies the networks with constant weights, as target networks.
     pub fn copy(&self) -> Result<Self> {
-        Ok(Self::new(self.shape.clone(), self.weights.copy()?, self.packing.precision))
+        Ok(self.with_weights(self.weights.copy()?))
     }
 
     /// The same networks with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
-        Self {
-            shape: self.shape.clone(),
-            networks: self.networks.clone(),
-            weights: self.weights.detach(),
-            packing: Packing::new(self.packing.precision),
-        }
+        self.with_weights(self.weights.detach())
+    }
+
+    fn with_weights(&self, weights: Weights) -> Self {
+        let (shape, networks) = (self.shape.clone(), self.networks.clone());
+        Self { shape, networks, weights, packing: Packing::default() }
     }
 
     /// The outputs, `[K, rows, outputs]`, for `observations` `[n, o]` and `actions` `[rows, a]`,

@@ -7,7 +7,6 @@ use crate::diffusion::schedule::Reverse;
 use crate::ensemble::Ensemble;
 use crate::gradients::gradient::Gradients;
 use crate::layers::config::{InitScheme, MlpConfig, NormEpsilon};
-use crate::precision::Precision;
 use crate::shape::{EnsembleShape, NoiseShape};
 use crate::slices::{has_fast_implementation, modify, plainly};
 use crate::statistics::mean_and_variance;
@@ -17,6 +16,7 @@ use crate::testing::{
 use crate::weighted::Weighted;
 use crate::weights::Weights;
 use candle_core::{Device, Result, Tensor, Var};
+use quad_kernels::Precision;
 use quad_kernels::activation::Activation;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -231,18 +231,34 @@ fn adam_ema_and_statistics_match_plain_operations() -> Result<()> {
 fn bf16_is_close_to_f32_and_follows_the_weights() -> Result<()> {
     let generator = &mut ChaCha8Rng::seed_from_u64(3);
     let shape = EnsembleShape::critics(3, (11, 3), &MlpConfig::mish(&[64; 3]));
-    let exact = ensemble(generator, &shape);
-    let mut rounded = Ensemble::new(shape, exact.weights().copy()?, Precision::Bf16);
-    let (s, a) = (tensor(generator, (50, 11)), tensor(generator, (50, 3)));
-    let values = |ensemble: &Ensemble| numbers(&ensemble.values(&s, &a).unwrap());
-    let (x, y) = (values(&exact.detach()), values(&rounded));
-    let difference = x.iter().zip(&y).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
+    let weights = ensemble(generator, &shape).weights().values().detach();
+    let (s, a) = (tensor(generator, (192, 11)), Var::from_tensor(&tensor(generator, (192, 3)))?);
+    let network = |precision| {
+        let weights = Weights::trainable(shape.layout(), &weights)?;
+        Result::Ok(Ensemble::new(shape.clone(), weights, precision))
+    };
+    let results = |precision| {
+        let network = network(precision)?;
+        let values = network.values(&s, &a)?;
+        let gradients = Gradients::of(&loss(&values)?)?;
+        let constants = network.detach().values(&s, &a.detach())?;
+        let weights_gradient = gradients.with_respect_to(network.weights())?.copy()?;
+        let actions_gradient = gradients.store.get(&a).unwrap().clone();
+        let by_members = network.action_gradients(&s, &a)?;
+        Result::Ok([values, constants, weights_gradient, actions_gradient, by_members])
+    };
     let rounds = Precision::Bf16.is_available() && has_fast_implementation(&Device::Cpu);
-    assert_eq!(difference > 0.0, rounds);
-    assert!(difference < 0.02, "values differ by {difference}");
-    assert_eq!(values(&rounded.detach()), y);
-    rounded.weights_mut().change(|values| modify(values, |x| x.fill(0.0)))?;
-    assert!(values(&rounded).iter().all(|q| *q == 0.0), "old kernels were used");
+    for (x, y) in results(Precision::F32)?.iter().zip(&results(Precision::Bf16)?) {
+        let size = |x: &Tensor| Result::Ok(x.sqr()?.sum_all()?.to_scalar::<f32>()?.sqrt());
+        let distance = size(&(x - y)?)? / size(x)?;
+        assert_eq!(distance > 0.0, rounds);
+        assert!(distance < 0.01, "{distance}");
+    }
+    let mut changed = network(Precision::Bf16)?.detach();
+    changed.values(&s, &a.detach())?;
+    changed.weights_mut().change(|values| modify(values, |x| x.fill(0.0)))?;
+    let values = numbers(&changed.values(&s, &a.detach())?);
+    assert!(values.iter().all(|q| *q == 0.0), "old kernels were used");
     Ok(())
 }
 

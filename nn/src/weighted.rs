@@ -48,7 +48,7 @@ macro_rules! weighted {
             }
 
             fn weights_mut(&mut self) -> &mut crate::weights::Weights {
-                self.packing = Packing::new(self.packing.precision);
+                self.packing = Default::default();
                 &mut self.weights
             }
         }

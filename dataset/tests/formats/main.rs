@@ -112,10 +112,7 @@ fn put<T: H5Type>(file: &hdf5::Group, array: &str, shape: &[usize], data: &[T]) 
 }
 
 fn batch(transitions: &Transitions) -> Batch {
-    let mut batch = Batch::default();
-    let indices = Vec::from_iter(0..transitions.len() as u32);
-    transitions.gather(&indices, &mut batch);
-    batch
+    transitions.gather(&Vec::from_iter(0..transitions.len() as u32))
 }
 
 fn compare(path: &Path, environment: Environment, reference: &Path) {

@@ -48,49 +48,50 @@ impl Configuration {
     /// For sums of `upper` and `lower` rows: tiles 0 to 3 are the sums, 4 and 5 the rows of `a`, 6
     /// and 7 of `b`.
     fn new(upper: usize, lower: usize) -> Self {
-        let (upper, lower, all) = (upper as u8, lower as u8, TILE as u8);
+        let (upper, lower, whole) = (upper as u8, lower as u8, TILE as u8);
         let (mut row_bytes, mut rows) = ([0; 16], [0; 16]);
         row_bytes[..8].fill(64);
-        rows[..8].copy_from_slice(&[upper, upper, lower, lower, upper, lower, all, all]);
+        rows[..8].copy_from_slice(&[upper, upper, lower, lower, upper, lower, whole, whole]);
         Configuration { palette: 1, start: 0, reserved: [0; 14], row_bytes, rows }
     }
 }
 
-/// `c = a·b` for `m` rows and `n` columns of pairs; `b` in blocks of [`COLUMNS`] columns, one after
-/// the other.
+/// `c = a·b` for `m` rows and one block of columns, `b` being `pairs` × [`COLUMNS`].
 ///
 /// # Safety
-/// [`available`] must hold, `pairs` be a multiple of 16 and `n` one of [`COLUMNS`], and the three
-/// matrices must span that many elements.
-pub(super) unsafe fn multiply(
+/// [`available`] must hold, `pairs` be a multiple of 16, and the three matrices must span that many
+/// elements.
+pub(super) unsafe fn panel(
     m: usize,
-    n: usize,
     pairs: usize,
     a: Strided<Pair>,
     b: *const Pair,
     c: *mut f32,
+    c_row: usize,
 ) {
     // Blocks of nearly equal height, each of two halves of nearly equal height.
     let blocks = m.div_ceil(ROWS);
+    let mut configured = (0, 0);
     for i in 0..blocks {
         let (from, to) = (i * m / blocks, (i + 1) * m / blocks);
         let upper = (to - from).div_ceil(2);
         // The halves of a single row are both this row.
         let lower = (to - from - upper).max(1);
-        let configuration = Configuration::new(upper, lower);
         // SAFETY: rows from..to are inside, those of the lower half are the last of them.
         unsafe {
-            asm!("ldtilecfg [{}]", in(reg) &raw const configuration, options(nostack, readonly));
-            for j in (0..n).step_by(COLUMNS) {
-                block(
-                    pairs,
-                    [a.first.add(from * a.row), a.first.add((to - lower) * a.row)],
-                    a.row,
-                    b.add(j * pairs),
-                    [c.add(from * n + j), c.add((to - lower) * n + j)],
-                    n,
-                );
+            if configured != (upper, lower) {
+                configured = (upper, lower);
+                let configuration = Configuration::new(upper, lower);
+                asm!("ldtilecfg [{}]", in(reg) &raw const configuration, options(nostack, readonly));
             }
+            block(
+                pairs,
+                [a.first.add(from * a.row), a.first.add((to - lower) * a.row)],
+                a.row,
+                b,
+                [c.add(from * c_row), c.add((to - lower) * c_row)],
+                c_row,
+            );
         }
     }
     if blocks > 0 {

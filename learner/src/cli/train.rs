@@ -137,7 +137,7 @@ struct OverrideArgs {
     /// Seed of initial weights, batches, noise and the episodes of evaluations
     #[arg(long, value_name = "N", value_parser = parse_count)]
     seed: Option<i64>,
-    /// Precision of forward passes without gradient: f32, or bf16, which rounds and is faster on
+    /// Precision of products between hidden layers: f32, or bf16, which rounds and is faster on
     /// CPUs with AMX or AMD's AVX512-BF16
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,

@@ -205,9 +205,3 @@ pub(super) fn distance(data: &[f32], policy: &[f32], action_dim: usize) -> f64 {
 pub(super) fn mean_f32(values: &[f32]) -> f64 {
     mean(&Vec::from_iter(values.iter().map(|value| f64::from(*value))))
 }
-
-pub(super) fn gather(transitions: &Transitions, rows: &[u32]) -> Batch {
-    let mut batch = Batch::default();
-    transitions.gather(rows, &mut batch);
-    batch
-}

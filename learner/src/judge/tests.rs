@@ -6,7 +6,7 @@ use quad_policy::{Affine, EpisodeState, Policy, PolicyError, Precision, Scaling}
 use quad_run::results::statistics::mean;
 
 use super::actions::{act, scaled};
-use super::data::{COMPARED, distance, gather, mean_f32, shared};
+use super::data::{COMPARED, distance,  mean_f32, shared};
 use super::evaluation::{LAST, LearningCurve, POINTS};
 use super::*;
 
@@ -141,7 +141,7 @@ fn runs_are_judged_in_the_episodes_that_all_have_held_out() {
 fn truncated_episodes_continue_by_the_estimate() {
     let rewards = |row: usize| [2.0, 4.0, 8.0][row % 3];
     let held_out = transitions(6, 3, rewards, &[1]);
-    let last = gather(&held_out, &[5]);
+    let last = held_out.gather(&[5]);
     let data = data(transitions(3, 3, rewards, &[0]), held_out);
     let units = Units { offset: 100.0, scale: 10.0, least: 0.0, most: 1000.0 };
     let fqes = [0, 1].map(|seed| {
@@ -171,7 +171,7 @@ fn a_policy_has_its_own_value_not_the_behaviors() {
     let (behavior, curves) = evaluation.behavior().unwrap();
     assert!(value(&curves).abs() < 0.2, "{} of the behavior", value(&curves));
     let act = |states: &[f32]| Vec::from_iter(states.iter().map(|state| 0.8 - 1.2 * state));
-    let training = gather(&data.training, &Vec::from_iter(0..48));
+    let training = data.training.gather(&Vec::from_iter(0..48));
     let actions = Actions {
         next: act(&training.next_observations),
         first: act(&data.first.observations),

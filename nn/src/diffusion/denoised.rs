@@ -31,8 +31,8 @@ impl NoisePredictor {
     ) -> Result<Denoised> {
         let rows = actions.dim(0)?;
         let observations = &repeat_rows(observations, rows / observations.dim(0)?.max(1))?;
-        let all = Tensor::full(t as u32, rows, actions.device())?;
-        let epsilon = self.predict(observations, actions, &all)?.detach();
+        let times = Tensor::full(t as u32, rows, actions.device())?;
+        let epsilon = self.predict(observations, actions, &times)?.detach();
         let actions = self.schedule().clean(t, actions, &epsilon)?.clamp(-1f32, 1f32)?;
         let gradients = critics.action_gradients(observations, &actions)?;
         Ok(Denoised { epsilon, actions, gradients })

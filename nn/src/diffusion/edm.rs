@@ -9,6 +9,7 @@ use crate::shape::TIME_FEATURES;
 use crate::weighted::weighted;
 use crate::weights::{Layout, Weights};
 use candle_core::{Device, Result, Tensor};
+use quad_kernels::Precision;
 use rand::Rng;
 
 /// Standard deviation of clean actions, σ_data.
@@ -129,11 +130,11 @@ pub struct Denoiser {
 weighted!(Denoiser);
 
 impl Denoiser {
-    /// A denoiser with weights of the shape's layout.
-    pub fn new(shape: &DenoiserShape, weights: Weights) -> Self {
+    /// A denoiser with weights of the shape's layout, whose products are in this precision.
+    pub fn new(shape: &DenoiserShape, weights: Weights, precision: Precision) -> Self {
         let time = Mlp::new(shape.time_layers(), "time.");
         let input = Mlp::new(shape.input_layers(), "input.");
-        let trunk = Mlp::new(shape.trunk_layers(), "trunk.");
+        let trunk = Mlp::new(shape.trunk_layers().with_precision(precision), "trunk.");
         Self { time, input, trunk, weights }
     }
 

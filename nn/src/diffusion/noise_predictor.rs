@@ -5,12 +5,12 @@ use crate::diffusion::schedule::Schedule;
 use crate::layers::mlp::Mlp;
 use crate::layers::packed::Packing;
 use crate::layers::plain;
-use crate::precision::Precision;
 use crate::shape::{NoiseShape, TIME_FEATURES};
 use crate::slices::read_all;
 use crate::weighted::weighted;
 use crate::weights::Weights;
 use candle_core::{Result, Tensor, bail};
+use quad_kernels::Precision;
 use std::sync::{Arc, OnceLock};
 
 /// A noise predictor and its weights.
@@ -33,12 +33,11 @@ pub(crate) fn sinusoids(x: f64) -> impl Iterator<Item = f32> {
 weighted!(NoisePredictor, architecture.trunk);
 
 impl NoisePredictor {
-    /// A noise predictor with weights of the shape's layout. `precision` applies where no gradient
-    /// is taken.
+    /// A noise predictor with weights of the shape's layout, whose products are in this precision.
     pub fn new(shape: NoiseShape, weights: Weights, precision: Precision) -> Self {
         let architecture = Architecture {
             time: Mlp::new(shape.time_layers(), "time."),
-            trunk: Mlp::new(shape.trunk_layers(), "trunk."),
+            trunk: Mlp::new(shape.trunk_layers().with_precision(precision), "trunk."),
             schedule: Schedule::new(shape.diffusion_steps, shape.reverse),
             features: (0..=shape.diffusion_steps).flat_map(|t| sinusoids(t as f64)).collect(),
             features_tensor: OnceLock::new(),
@@ -46,8 +45,7 @@ impl NoisePredictor {
             steps_tensor: OnceLock::new(),
             shape,
         };
-        let (architecture, packing) = (Arc::new(architecture), Packing::new(precision));
-        Self { architecture, weights, packing }
+        Self { architecture: Arc::new(architecture), weights, packing: Packing::default() }
     }
 
     /// Sizes and hidden layers.
@@ -107,8 +105,7 @@ impl NoisePredictor {
     /// The same network with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
         let (architecture, weights) = (self.architecture.clone(), self.weights.detach());
-        let packing = Packing::new(self.packing.precision);
-        Self { architecture, weights, packing }
+        Self { architecture, weights, packing: Packing::default() }
     }
 
     /// Draws actions `[rows, a]` by the reverse process (DDPM), without gradients.
@@ -165,8 +162,8 @@ impl NoisePredictor {
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
         let mut actions = noise.get(0)?;
         for t in (1..=steps).rev() {
-            let all = Tensor::full(t as u32, rows, noise.device())?;
-            let epsilon = self.predict(&observations, &actions, &all)?;
+            let times = Tensor::full(t as u32, rows, noise.device())?;
+            let epsilon = self.predict(&observations, &actions, &times)?;
             let z = (t > 1).then(|| noise.get(steps - t + 1)).transpose()?;
             actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
         }

@@ -3,11 +3,12 @@
 
 use crate::diffusion::schedule::Schedule;
 use crate::layers::flat::TILE;
-use crate::layers::mlp::{Kernels, Mlp, of_member};
+use crate::layers::mlp::{Kernels, Mlp, member_kernels};
 use crate::layers::network::{Network, rows_of};
 use crate::layers::workspace::with_workspace;
 use crate::shape::{NoiseShape, TIME_EMBEDDING, TIME_FEATURES};
 use candle_core::Tensor;
+use quad_kernels::Precision;
 use quad_kernels::narrow::FirstLayer;
 use quad_kernels::product::product;
 use rayon::prelude::*;
@@ -41,7 +42,7 @@ impl Architecture {
         let mut shifts = vec![0.0; shape.diffusion_steps * width];
         let before = shape.observation_dim + shape.action_dim;
         let kernel = network.first_kernel(before, TIME_EMBEDDING);
-        product(&embedding, kernel, &mut shifts, TIME_EMBEDDING, width);
+        product(Precision::F32, &embedding, kernel, &mut shifts, TIME_EMBEDDING, width);
         for row in shifts.chunks_exact_mut(width) {
             row.iter_mut().zip(network.bias(0)).for_each(|(x, b)| *x += b);
         }
@@ -58,17 +59,17 @@ impl Architecture {
     ) -> Vec<f32> {
         let (o, a) = (self.shape.observation_dim, self.shape.action_dim);
         let steps = self.shape.diffusion_steps;
-        let packed = of_member(packed, 0);
+        let packed = member_kernels(packed, 0);
         let network = Network { packed, ..self.trunk.network(weights, 0) };
         let (shifts, width) = (self.shifts(weights), network.width());
         let kernel = network.first_kernel(o, a);
-        let all = noise.len() / steps;
-        let (rows, repeat) = (all / a, all / a / states);
+        let numbers = noise.len() / steps;
+        let (rows, repeat) = (numbers / a, numbers / a / states);
         // A small batch is cut finer, so that every thread works.
         let share = rows.div_ceil(rayon::current_num_threads()).clamp(1, TILE);
         let states = (share / repeat).max(1);
         let tile = states * repeat * a;
-        let mut actions = vec![0.0; all];
+        let mut actions = vec![0.0; numbers];
         actions.par_chunks_mut(tile).enumerate().for_each(|(i, actions)| {
             let observations = rows_of(observations, i * states, states, o);
             let len = observations.len() / o * width;
@@ -82,7 +83,7 @@ impl Architecture {
                         network.forward(first, work, epsilon);
                         let z = match t {
                             1 => &[],
-                            _ => &noise[(steps - t + 1) * all + i * tile..][..actions.len()],
+                            _ => &noise[(steps - t + 1) * numbers + i * tile..][..actions.len()],
                         };
                         self.schedule.reverse_in_place(t, actions, epsilon, z);
                     }

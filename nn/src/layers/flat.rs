@@ -6,6 +6,7 @@
 
 use crate::layers::config::MlpConfig;
 use crate::weights::{Init, TensorSpec};
+use quad_kernels::Precision;
 use std::ops::Range;
 
 /// Rows of one task: weights and activations of a tile stay in a core's own cache.
@@ -17,6 +18,8 @@ pub(crate) struct Layers {
     /// Number of networks, K.
     pub members: usize,
     pub config: MlpConfig,
+    /// Arithmetic of the products between hidden layers.
+    precision: Precision,
     widths: Vec<usize>,
     /// Start of each layer, and the end of the last.
     offsets: Vec<usize>,
@@ -26,6 +29,7 @@ pub(crate) struct Layers {
 pub(crate) struct LayerMut<'a> {
     pub layer: usize,
     pub member: usize,
+    pub precision: Precision,
     pub kernel: &'a mut [f32],
     pub bias: &'a mut [f32],
     /// Scale and shift of a norm.
@@ -42,13 +46,31 @@ impl Layers {
     ) -> Self {
         let widths = [&[inputs], &config.hidden[..], &[outputs]].concat();
         let offsets = vec![start];
-        let mut layers = Self { members, config, widths, offsets };
+        let precision = Precision::F32;
+        let mut layers = Self { members, config, precision, widths, offsets };
         for layer in 0..layers.count() {
             let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
             let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;
             layers.offsets.push(layers.offsets[layer] + members * numbers);
         }
         layers
+    }
+
+    /// These layers with products in this precision, if the CPU has it.
+    pub fn with_precision(self, precision: Precision) -> Self {
+        Self { precision: precision.in_effect(), ..self }
+    }
+
+    /// Arithmetic of the products with a layer's kernel. Inputs and outputs are not rounded: their
+    /// products are few.
+    pub fn precision(&self, layer: usize) -> Precision {
+        let is_inner = layer > 0 && layer + 1 < self.count();
+        if is_inner { self.precision } else { Precision::F32 }
+    }
+
+    /// True if products between hidden layers round their factors.
+    pub fn is_rounded(&self) -> bool {
+        self.precision(1) == Precision::Bf16
     }
 
     pub fn count(&self) -> usize {
@@ -99,18 +121,18 @@ impl Layers {
         member: usize,
     ) -> Option<[&'a [f32]; 2]> {
         let (inputs, outputs) = self.shape(layer);
-        let of = |kind| {
+        let vector = |kind| {
             let before = (self.members * (inputs + kind) + member) * outputs;
             &weights[self.offsets[layer] + before..][..outputs]
         };
-        self.is_normed(layer).then(|| [of(1), of(2)])
+        self.is_normed(layer).then(|| [vector(1), vector(2)])
     }
 
     /// Splits the layers' range of a vector, so that each layer can be written by another thread.
     pub fn split_mut<'a>(&self, mut rest: &'a mut [f32]) -> Vec<LayerMut<'a>> {
-        let mut all = Vec::with_capacity(self.count() * self.members);
+        let mut split = Vec::with_capacity(self.count() * self.members);
         for layer in 0..self.count() {
-            let (inputs, outputs) = self.shape(layer);
+            let ((inputs, outputs), precision) = (self.shape(layer), self.precision(layer));
             let (kernels, behind) = rest.split_at_mut(self.members * inputs * outputs);
             let (biases, behind) = behind.split_at_mut(self.members * outputs);
             let norms = if self.is_normed(layer) { self.members * outputs } else { 0 };
@@ -120,12 +142,12 @@ impl Layers {
             let mut norms = scales.chunks_exact_mut(outputs).zip(shifts.chunks_exact_mut(outputs));
             let members =
                 kernels.chunks_exact_mut(inputs * outputs).zip(biases.chunks_exact_mut(outputs));
-            all.extend(members.enumerate().map(|(member, (kernel, bias))| {
+            split.extend(members.enumerate().map(|(member, (kernel, bias))| {
                 let norm = norms.next().map(|(scale, shift)| [scale, shift]);
-                LayerMut { layer, member, kernel, bias, norm }
+                LayerMut { layer, member, precision, kernel, bias, norm }
             }));
         }
-        all
+        split
     }
 
     /// The tensors `{prefix}{layer}.kernel` and `.bias`, and with a norm `.scale` and `.shift`; with

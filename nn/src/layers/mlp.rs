@@ -23,7 +23,7 @@ use std::sync::Arc;
 pub(crate) type Kernels = Vec<Vec<Packed>>;
 
 /// Packed kernels of one member.
-pub(crate) fn of_member(packed: Option<&Kernels>, member: usize) -> Option<&[Packed]> {
+pub(crate) fn member_kernels(packed: Option<&Kernels>, member: usize) -> Option<&[Packed]> {
     packed.and_then(|packed| packed.get(member)).map(Vec::as_slice)
 }
 
@@ -97,7 +97,7 @@ impl Mlp {
         let rows = out.len() / (self.layers.members * outputs);
         out.par_chunks_mut(rows * outputs).enumerate().for_each(|(member, out)| {
             let network =
-                Network { packed: of_member(packed, member), ..self.network(weights, member) };
+                Network { packed: member_kernels(packed, member), ..self.network(weights, member) };
             out.par_chunks_mut(TILE * outputs).enumerate().for_each(|(i, out)| {
                 let x = rows_of(x, i * TILE, TILE, inputs);
                 with_workspace(|work| {
@@ -203,13 +203,13 @@ impl Operation {
         if width == 0 {
             return Ok(None);
         }
-        let mut of_members = vec![0.0; members * rows * width];
-        of_members.par_chunks_mut(rows * width).enumerate().for_each(|(member, out)| {
+        let mut members_gradients = vec![0.0; members * rows * width];
+        members_gradients.par_chunks_mut(rows * width).enumerate().for_each(|(member, out)| {
             let delta = saved.first_delta(member);
             self.mlp.network(weights, member).input_gradient(delta, (self.constant, width), out);
         });
         let mut sum = vec![0.0; rows * inputs];
-        for member in of_members.chunks_exact(rows * width) {
+        for member in members_gradients.chunks_exact(rows * width) {
             for (sum, x) in sum.chunks_exact_mut(inputs).zip(member.chunks_exact(width)) {
                 sum[self.constant..].iter_mut().zip(x).for_each(|(sum, x)| *sum += x);
             }
@@ -250,10 +250,10 @@ impl CustomOp2 for Operation {
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let Some(saved) = &self.saved else { return Ok((None, None)) };
         let (x, gradient) = (x.contiguous()?, gradient.contiguous()?);
-        let of_input = read_all([weights, &x, &gradient], |[weights, x, gradient]| {
+        let inputs_gradient = read_all([weights, &x, &gradient], |[weights, x, gradient]| {
             self.backward(weights, x, gradient, &mut saved.lock())
         })??;
         let tensor = |numbers| Tensor::from_vec(numbers, x.shape(), x.device());
-        Ok((None, of_input.map(tensor).transpose()?))
+        Ok((None, inputs_gradient.map(tensor).transpose()?))
     }
 }

@@ -5,7 +5,6 @@
 
 use crate::layers::flat::{Layers, TILE};
 use crate::layers::workspace::{Activations, Workspace};
-use crate::precision::Precision;
 use quad_kernels::Buffer;
 use quad_kernels::activation::{activate, activate_with_slope, multiply};
 use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
@@ -58,7 +57,14 @@ impl<'a> Network<'a> {
 
     /// `out[states × width] = x · kernel` for the first `inputs` inputs, without the bias.
     pub fn first_part(&self, x: &[f32], inputs: usize, out: &mut [f32]) {
-        product(x, self.first_kernel(0, inputs), out, inputs, self.width());
+        product(
+            self.layers.precision(0),
+            x,
+            self.first_kernel(0, inputs),
+            out,
+            inputs,
+            self.width(),
+        );
     }
 
     /// The transposed kernel of the output layer, `outputs × width`.
@@ -80,14 +86,10 @@ impl<'a> Network<'a> {
     }
 
     /// Packs the kernels between hidden layers; `None` where packing gains nothing.
-    pub fn pack(&self, precision: Precision) -> Option<Vec<Packed>> {
+    pub fn pack(&self) -> Option<Vec<Packed>> {
         let pack = |layer| {
-            let (kernel, (inputs, outputs)) = (self.kernel(layer), self.layers.shape(layer));
-            let rounded = match precision {
-                Precision::F32 => None,
-                Precision::Bf16 => Packed::rounded(kernel, inputs, outputs),
-            };
-            rounded.or_else(|| Packed::new(kernel, inputs, outputs))
+            let (inputs, outputs) = self.layers.shape(layer);
+            Packed::new(self.layers.precision(layer), self.kernel(layer), inputs, outputs)
         };
         (1..self.last()).map(pack).collect()
     }
@@ -98,8 +100,10 @@ impl<'a> Network<'a> {
         let action_dim = input.kernel.len() / width;
         let [x, y] = &mut work.pair;
         let output = self.output_rows(&mut work.output);
-        let rounded = self.packed.is_some_and(|kernels| kernels.iter().any(Packed::is_rounded));
-        let block = if rounded { BLOCK } else { TILE };
+        let block = match self.packed {
+            Some(_) if self.layers.is_rounded() => BLOCK,
+            _ => TILE,
+        };
         let states = (block / input.repeat).max(1);
         let rows = states * input.repeat;
         for (i, (base, out)) in
@@ -129,7 +133,14 @@ impl<'a> Network<'a> {
                 let (x, y) = (x.sized(count * inputs), y.sized(count * width));
                 match self.packed {
                     Some(kernels) => kernels[layer - 1].product(x, y),
-                    None => product(x, self.kernel(layer), y, inputs, width),
+                    None => product(
+                        self.layers.precision(layer),
+                        x,
+                        self.kernel(layer),
+                        y,
+                        inputs,
+                        width,
+                    ),
                 }
                 let bias =
                     self.normalize(layer, y, || work.norm_scratch.sized(saved_len(count, width)));
@@ -156,7 +167,7 @@ impl<'a> Network<'a> {
             let (inputs, width) = self.layers.shape(layer);
             let (before, here) = saved.x.split_at_mut(layer);
             let x = before.last().map_or(input, |x| &**x);
-            product(x, self.kernel(layer), here[0], inputs, width);
+            product(self.layers.precision(layer), x, self.kernel(layer), here[0], inputs, width);
             let bias = self.normalize(layer, here[0], || saved.norm[layer]);
             activate_with_slope(self.layers.config.activation, here[0], bias, saved.slope[layer]);
             self.normalize_after(layer, here[0], || saved.norm[layer]);
@@ -228,7 +239,14 @@ impl<'a> Network<'a> {
             let (below, above) = slope.split_at_mut(layer);
             let (below, above) = (&mut *below[layer - 1], &*above[0]);
             let temporary = work.pair[0].sized(below.len());
-            product_transposed(above, self.kernel(layer), temporary, inputs, width);
+            product_transposed(
+                self.layers.precision(layer),
+                above,
+                self.kernel(layer),
+                temporary,
+                inputs,
+                width,
+            );
             through_norm(layer - 1, after, temporary);
             multiply(below, temporary);
             through_norm(layer - 1, !after, below);
@@ -241,7 +259,7 @@ impl<'a> Network<'a> {
         match count {
             // A library's product is slow at few columns.
             0..=NARROW => dots(first, kernel, &[0.0; NARROW][..count], out, width),
-            _ => product_transposed(first, kernel, out, count, width),
+            _ => product_transposed(self.layers.precision(0), first, kernel, out, count, width),
         }
     }
 }

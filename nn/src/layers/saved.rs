@@ -46,9 +46,9 @@ impl SavedActivations {
     /// Splits the activations and `out`, `K × rows × outputs`, into tiles.
     pub fn tiles<'a>(&'a mut self, out: &'a mut [f32]) -> Vec<Tile<'a>> {
         let (members, rows) = (self.members, self.rows);
-        let cut = |all: &'a mut [f32]| {
-            let width = all.len() / (members * rows);
-            all.chunks_mut(rows * width).flat_map(move |member| member.chunks_mut(TILE * width))
+        let cut = |numbers: &'a mut [f32]| {
+            let width = numbers.len() / (members * rows);
+            numbers.chunks_mut(rows * width).flat_map(move |member| member.chunks_mut(TILE * width))
         };
         let each_member = rows.div_ceil(TILE);
         let tile = |(i, out)| {
@@ -58,16 +58,16 @@ impl SavedActivations {
         let mut tiles: Vec<_> = cut(out).enumerate().map(tile).collect();
         for ((x, slope), width) in self.x.iter_mut().zip(&mut self.slope).zip(&self.widths) {
             let len = members * rows * width;
-            let of_tiles = cut(x.sized(len)).zip(cut(slope.sized(len)));
-            for (tile, (x, slope)) in tiles.iter_mut().zip(of_tiles) {
+            let parts = cut(x.sized(len)).zip(cut(slope.sized(len)));
+            for (tile, (x, slope)) in tiles.iter_mut().zip(parts) {
                 tile.activations.x.push(x);
                 tile.activations.slope.push(slope);
             }
         }
         for (layer, (norm, width)) in self.norm.iter_mut().zip(&self.widths).enumerate() {
             let full = saved_len(TILE, *width);
-            let of_tiles = norm.sized(members * each_member * full).chunks_exact_mut(full);
-            for (tile, norm) in tiles.iter_mut().zip(of_tiles) {
+            let parts = norm.sized(members * each_member * full).chunks_exact_mut(full);
+            for (tile, norm) in tiles.iter_mut().zip(parts) {
                 let rows = tile.activations.x[layer].len() / width;
                 tile.activations.norm.push(&mut norm[..saved_len(rows, *width)]);
             }
@@ -75,14 +75,14 @@ impl SavedActivations {
         tiles
     }
 
-    fn of_member<'a>(&self, buffer: &'a Buffer, layer: usize, member: usize) -> &'a [f32] {
+    fn member_rows<'a>(&self, buffer: &'a Buffer, layer: usize, member: usize) -> &'a [f32] {
         let len = self.rows * self.widths[layer];
         &buffer.first(self.members * len)[member * len..][..len]
     }
 
     /// After the backward pass: the gradient before a member's first activation, `rows × width`.
     pub fn first_delta(&self, member: usize) -> &[f32] {
-        self.of_member(&self.slope[0], 0, member)
+        self.member_rows(&self.slope[0], 0, member)
     }
 
     /// After the backward pass: writes the gradients of all layers. `input` is `rows × inputs`,
@@ -93,27 +93,29 @@ impl SavedActivations {
         input: &[f32],
         output_gradient: &[f32],
     ) {
-        layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias, norm }| {
-            let x = match layer {
-                0 => input,
-                _ => self.of_member(&self.x[layer - 1], layer - 1, member),
-            };
-            let columns = bias.len();
-            let gradient = match self.slope.get(layer) {
-                Some(delta) => self.of_member(delta, layer, member),
-                None => &output_gradient[member * self.rows * columns..][..self.rows * columns],
-            };
-            let inputs = kernel.len() / columns;
-            // A single network is split, for all threads to work.
-            let rows = if self.members == 1 { inputs.min(TILE) } else { inputs };
-            kernel.par_chunks_mut(rows * columns).enumerate().for_each(|(i, kernel)| {
-                outer_rows(x, gradient, kernel, (i * rows, inputs), columns);
-            });
-            column_sums(gradient, bias);
-            for (i, out) in norm.into_iter().flatten().enumerate() {
-                self.sum_over_tiles(layer, member, i, out);
-            }
-        });
+        layers.into_par_iter().for_each(
+            |LayerMut { layer, member, precision, kernel, bias, norm }| {
+                let x = match layer {
+                    0 => input,
+                    _ => self.member_rows(&self.x[layer - 1], layer - 1, member),
+                };
+                let columns = bias.len();
+                let gradient = match self.slope.get(layer) {
+                    Some(delta) => self.member_rows(delta, layer, member),
+                    None => &output_gradient[member * self.rows * columns..][..self.rows * columns],
+                };
+                let inputs = kernel.len() / columns;
+                // A single network is split, for all threads to work.
+                let rows = if self.members == 1 { inputs.min(TILE) } else { inputs };
+                kernel.par_chunks_mut(rows * columns).enumerate().for_each(|(i, kernel)| {
+                    outer_rows(precision, x, gradient, kernel, (i * rows, inputs), columns);
+                });
+                column_sums(gradient, bias);
+                for (i, out) in norm.into_iter().flatten().enumerate() {
+                    self.sum_over_tiles(layer, member, i, out);
+                }
+            },
+        );
     }
 
     /// The gradient of a norm's scales (0) or shifts (1): the sum of the tiles' parts.

@@ -72,15 +72,15 @@ impl Workspace {
             let each = buffers.iter_mut().zip(widths);
             each.map(|(buffer, width)| buffer.sized(len(*width))).collect()
         }
-        let mut all = [&mut self.x, &mut self.slope, &mut self.norm].map(std::mem::take);
-        let [x, slope, norm] = &mut all;
+        let mut taken = [&mut self.x, &mut self.slope, &mut self.norm].map(std::mem::take);
+        let [x, slope, norm] = &mut taken;
         let widths = &layers.config.hidden[..];
         let normed = if layers.config.norm { widths } else { &[] };
         let x = sized(x, widths, |width| rows * width);
         let slope = sized(slope, widths, |width| rows * width);
         let norm = sized(norm, normed, |width| saved_len(rows, width));
         let result = work(&mut Activations { x, slope, norm }, self);
-        [self.x, self.slope, self.norm] = all;
+        [self.x, self.slope, self.norm] = taken;
         result
     }
 }

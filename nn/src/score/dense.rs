@@ -7,6 +7,7 @@ use crate::layers::plain;
 use crate::slices::{has_fast_implementation, read_all};
 use crate::weights::TensorSpec;
 use candle_core::{Result, Tensor, bail};
+use quad_kernels::Precision;
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_kernels::product::product;
 use rayon::prelude::*;
@@ -20,6 +21,8 @@ pub(crate) struct Dense {
     pub outputs: usize,
     /// f; `None` is the identity.
     pub activation: Option<Activation>,
+    /// Arithmetic of the products with the kernel.
+    pub precision: Precision,
 }
 
 impl Dense {
@@ -46,11 +49,13 @@ impl Dense {
     /// is added to the first rows/n rows, and so on. Differentiable in plain operations only.
     pub fn forward(&self, weights: &Tensor, x: &Tensor, added: Option<&Tensor>) -> Result<Tensor> {
         let ((rows, width), n) = (x.dims2()?, self.outputs);
-        let of_added = added.map_or(Ok((rows, n)), Tensor::dims2)?;
-        let fits = of_added.0 > 0 && rows > 0 && rows.is_multiple_of(of_added.0) && of_added.1 == n;
-        if width != self.inputs || !fits {
+        let (added_rows, added_width) = added.map_or(Ok((rows, n)), Tensor::dims2)?;
+        let fits = added_rows > 0 && rows > 0 && rows.is_multiple_of(added_rows);
+        if width != self.inputs || added_width != n || !fits {
             let sizes = (self.inputs, n);
-            bail!("a layer of {sizes:?} numbers got {rows} × {width} and {of_added:?}");
+            bail!(
+                "a layer of {sizes:?} numbers got {rows} × {width} and {added_rows} × {added_width}"
+            );
         }
         if !has_fast_implementation(weights.device()) {
             return self.plain(weights, x, added);
@@ -59,7 +64,7 @@ impl Dense {
             Some(added) => added.contiguous()?,
             None => Tensor::zeros((0, n), x.dtype(), x.device())?,
         };
-        let repeat = rows / of_added.0;
+        let repeat = rows / added_rows;
         let out = read_all([weights, &x.contiguous()?, &added], |[weights, x, added]| {
             let mut out = vec![0.0; rows * n];
             out.par_chunks_mut(TILE * n).enumerate().for_each(|(i, out)| {
@@ -96,7 +101,7 @@ impl Dense {
     pub fn apply(&self, weights: &[f32], x: &[f32], out: &mut [f32], slope: Option<&mut [f32]>) {
         let (kernel, n) = (self.kernel(weights), self.outputs);
         let bias = &weights[self.start + kernel.len()..][..n];
-        product(x, kernel, out, self.inputs, n);
+        product(self.precision, x, kernel, out, self.inputs, n);
         match (self.activation, slope) {
             (Some(f), Some(slope)) => activate_with_slope(f, out, bias, slope),
             (Some(f), None) => activate(f, out, bias),

@@ -70,7 +70,7 @@ struct Chunk {
     slopes: Vec<Vec<f32>>,
     /// Gradient of each value; empty until one has reached it.
     gradients: Vec<Vec<f32>>,
-    of_weights: Vec<f32>,
+    weights_gradient: Vec<f32>,
 }
 
 impl DenseGraph {
@@ -104,11 +104,11 @@ impl DenseGraph {
             let (graph, buffer, chunks) = (self.clone(), buffer.clone(), self.pool.lend());
             return values.apply_op2(&x, Operation { graph, buffer, chunks });
         }
-        let mut known: Vec<Option<Tensor>> = inputs.iter().cloned().map(Some).collect();
+        let mut computed: Vec<Option<Tensor>> = inputs.iter().cloned().map(Some).collect();
         for (step, done) in self.steps.iter().zip(&self.done) {
             let value = |number: usize| {
                 let missing = || Error::Msg("a value was dropped too early".into());
-                known[number].as_ref().ok_or_else(missing)
+                computed[number].as_ref().ok_or_else(missing)
             };
             let next = match step {
                 Step::Dense { layer, x, added } => {
@@ -116,11 +116,11 @@ impl DenseGraph {
                 }
                 Step::Concat(one, other) => Tensor::cat(&[value(*one)?, value(*other)?], 1)?,
             };
-            known.push(Some(next));
+            computed.push(Some(next));
             // Frees their memory.
-            done.iter().for_each(|number| known[*number] = None);
+            done.iter().for_each(|number| computed[*number] = None);
         }
-        known.pop().flatten().map_or_else(|| bail!("a network without layers"), Ok)
+        computed.pop().flatten().map_or_else(|| bail!("a network without layers"), Ok)
     }
 
     /// The output of some rows of the concatenated inputs.
@@ -128,13 +128,14 @@ impl DenseGraph {
         let (values, slopes) = (&mut chunk.values, &mut chunk.slopes);
         values.resize_with(self.widths.len(), Vec::new);
         slopes.resize_with(self.steps.len(), Vec::new);
-        let of_inputs = &self.widths[..self.inputs];
-        let all: usize = of_inputs.iter().sum();
-        let rows = x.len() / all;
+        let input_widths = &self.widths[..self.inputs];
+        let inputs_width: usize = input_widths.iter().sum();
+        let rows = x.len() / inputs_width;
         let mut from = 0;
-        for (value, width) in values.iter_mut().zip(of_inputs) {
+        for (value, width) in values.iter_mut().zip(input_widths) {
             value.clear();
-            x.chunks_exact(all).for_each(|row| value.extend_from_slice(&row[from..from + width]));
+            x.chunks_exact(inputs_width)
+                .for_each(|row| value.extend_from_slice(&row[from..from + width]));
             from += width;
         }
         for (i, step) in self.steps.iter().enumerate() {
@@ -162,10 +163,10 @@ impl DenseGraph {
 
     /// After [`Self::forward_chunk`]: the gradient of all weights, given the output's.
     fn backward_chunk(&self, weights: &[f32], gradient: &[f32], chunk: &mut Chunk) {
-        let Chunk { values, slopes, gradients, of_weights } = chunk;
+        let Chunk { values, slopes, gradients, weights_gradient } = chunk;
         gradients.resize_with(self.widths.len(), Vec::new);
         gradients.iter_mut().for_each(Vec::clear);
-        of_weights.resize(self.len, 0.0);
+        weights_gradient.resize(self.len, 0.0);
         gradients[self.widths.len() - 1].extend_from_slice(gradient);
         let mut scratch = Vec::new();
         for (i, step) in self.steps.iter().enumerate().rev() {
@@ -176,13 +177,14 @@ impl DenseGraph {
                     if layer.is_active() {
                         multiply(&mut delta, &slopes[i]);
                     }
-                    let (k, n) = (layer.inputs, layer.outputs);
-                    let (kernel, bias) = of_weights[layer.range()].split_at_mut(k * n);
-                    outer(&values[*x], &delta, kernel, k, n);
+                    let (precision, k, n) = (layer.precision, layer.inputs, layer.outputs);
+                    let (kernel, bias) = weights_gradient[layer.range()].split_at_mut(k * n);
+                    outer(precision, &values[*x], &delta, kernel, k, n);
                     column_sums(&delta, bias);
                     if *x >= self.inputs {
                         scratch.resize(values[*x].len(), 0.0);
-                        product_transposed(&delta, layer.kernel(weights), &mut scratch, k, n);
+                        let kernel = layer.kernel(weights);
+                        product_transposed(precision, &delta, kernel, &mut scratch, k, n);
                         deposit(&mut gradients[*x], &scratch);
                     }
                 }
@@ -264,7 +266,7 @@ impl CustomOp2 for Operation {
             out.par_chunks_mut(TOGETHER).enumerate().for_each(|(i, out)| {
                 out.fill(0.0);
                 for chunk in chunks.iter() {
-                    add(out, rows_of(&chunk.of_weights, i * TOGETHER, TOGETHER, 1));
+                    add(out, rows_of(&chunk.weights_gradient, i * TOGETHER, TOGETHER, 1));
                 }
             });
         })?;

@@ -8,6 +8,7 @@ use crate::score::dpm_solver::DpmSolver;
 use crate::weighted::weighted;
 use crate::weights::{Layout, TensorSpec, Weights};
 use candle_core::{Device, Result, Tensor, bail};
+use quad_kernels::Precision;
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use std::f64::consts::TAU;
@@ -17,6 +18,8 @@ use std::sync::Arc;
 const FREQUENCIES: usize = 16;
 /// Standard deviation of the random frequencies.
 const SPREAD: f32 = 30.0;
+/// Number of inputs: the state, features of time and the action.
+const INPUTS: usize = 3;
 /// Length of the embeddings of state and time.
 const EMBEDDING: usize = 2 * FREQUENCIES;
 
@@ -35,34 +38,39 @@ pub struct ScoreShape {
 /// Builds the graph and the layout of its weights.
 struct GraphBuilder<'a> {
     layers: &'a MlpConfig,
+    precision: Precision,
     specs: Vec<TensorSpec>,
     start: usize,
     steps: Vec<Step>,
 }
 
 impl<'a> GraphBuilder<'a> {
-    fn new(layers: &'a MlpConfig) -> Self {
+    fn new(layers: &'a MlpConfig, precision: Precision) -> Self {
         let (specs, steps) = (Vec::new(), Vec::new());
-        Self { layers, specs, start: 0, steps }
+        Self { layers, precision: precision.in_effect(), specs, start: 0, steps }
     }
 
-    /// Adds a step. Returns the number of its value; 0 to 2 are the inputs.
+    /// Adds a step. Returns the number of its value; the first are the inputs.
     fn step(&mut self, step: Step) -> usize {
         self.steps.push(step);
-        2 + self.steps.len()
+        INPUTS - 1 + self.steps.len()
     }
 
     /// The next layer in the vector of weights.
     fn dense(&mut self, name: &str, (inputs, outputs): (usize, usize), active: bool) -> Dense {
         let activation = active.then_some(self.layers.activation);
-        let layer = Dense { start: self.start, inputs, outputs, activation };
+        let precision = Precision::F32;
+        let layer = Dense { start: self.start, inputs, outputs, activation, precision };
         self.start = layer.range().end;
         self.specs.extend(layer.specs(name, self.layers.initial));
         layer
     }
 
-    /// Adds a step with a layer of value `x`, plus value `added`.
-    fn apply(&mut self, layer: Dense, x: usize, added: Option<usize>) -> usize {
+    /// Adds a step with a layer of value `x`, plus value `added`. Inputs are not rounded.
+    fn apply(&mut self, mut layer: Dense, x: usize, added: Option<usize>) -> usize {
+        if x >= INPUTS {
+            layer.precision = self.precision;
+        }
         self.step(Step::Dense { layer, x, added })
     }
 
@@ -95,32 +103,32 @@ impl<'a> GraphBuilder<'a> {
 }
 
 /// The network of (state, features of time, actions) and the layout of its weights.
-fn build(shape: &ScoreShape) -> (DenseGraph, Layout) {
+fn build(shape: &ScoreShape, precision: Precision) -> (DenseGraph, Layout) {
     let (widths, a) = (&shape.layers.hidden, shape.action_dim);
-    let mut of = GraphBuilder::new(&shape.layers);
+    let mut builder = GraphBuilder::new(&shape.layers, precision);
     let narrowest = widths.last().copied().unwrap_or(1);
-    let state = of.layer("state", 0, (shape.observation_dim, EMBEDDING), true);
-    let time = of.layer("time", 1, (EMBEDDING, EMBEDDING), false);
-    let both = of.step(Step::Concat(state, time));
-    let mixed = of.layer("mix.0", both, (2 * EMBEDDING, narrowest), true);
-    let condition = (of.layer("mix.1", mixed, (narrowest, narrowest), true), narrowest);
+    let state = builder.layer("state", 0, (shape.observation_dim, EMBEDDING), true);
+    let time = builder.layer("time", 1, (EMBEDDING, EMBEDDING), false);
+    let both = builder.step(Step::Concat(state, time));
+    let mixed = builder.layer("mix.0", both, (2 * EMBEDDING, narrowest), true);
+    let condition = (builder.layer("mix.1", mixed, (narrowest, narrowest), true), narrowest);
     let (mut x, mut width, mut skips) = (2, a, Vec::new());
     for (i, outputs) in widths.iter().enumerate() {
-        x = of.block(&format!("down.{i}"), x, (width, *outputs), condition);
+        x = builder.block(&format!("down.{i}"), x, (width, *outputs), condition);
         width = *outputs;
         skips.push(x);
     }
-    x = of.block("middle", x, (narrowest, narrowest), condition);
+    x = builder.block("middle", x, (narrowest, narrowest), condition);
     // Each block reads the block before it and the downward block of that width.
     for (i, pair) in widths.windows(2).rev().enumerate() {
-        let both = of.step(Step::Concat(skips.pop().unwrap_or(x), x));
-        x = of.block(&format!("up.{i}"), both, (2 * pair[1], pair[0]), condition);
+        let both = builder.step(Step::Concat(skips.pop().unwrap_or(x), x));
+        x = builder.block(&format!("up.{i}"), both, (2 * pair[1], pair[0]), condition);
     }
-    let both = of.step(Step::Concat(skips.pop().unwrap_or(x), x));
+    let both = builder.step(Step::Concat(skips.pop().unwrap_or(x), x));
     let widest = widths.first().copied().unwrap_or(1);
-    of.layer("last", both, (2 * widest, a), false);
+    builder.layer("last", both, (2 * widest, a), false);
     let inputs = vec![shape.observation_dim, EMBEDDING, a];
-    (DenseGraph::new(inputs, of.steps, of.start), Layout::new(of.specs))
+    (DenseGraph::new(inputs, builder.steps, builder.start), Layout::new(builder.specs))
 }
 
 /// A noise predictor in continuous time, and its weights.
@@ -140,7 +148,7 @@ impl ScoreShape {
 
     /// Tensors of the layers, each with `.kernel` `[in, out]` and `.bias` `[out]`.
     pub fn layout(&self) -> Layout {
-        build(self).1
+        build(self, Precision::F32).1
     }
 
     /// Draws frequencies, `[16]`, normal with a standard deviation of 30.
@@ -154,16 +162,22 @@ impl ScoreShape {
         let (widths, widest) = (&self.layers.hidden, self.layers.widest());
         // Outputs of the downward blocks; and of one block its input, which is two outputs, and
         // three steps.
-        let of_row = widths.iter().sum::<usize>() + 6 * widest;
-        let of_state = 4 * EMBEDDING + 4 * widest;
-        rows * of_row as u128 + states * of_state as u128
+        let row_floats = widths.iter().sum::<usize>() + 6 * widest;
+        let state_floats = 4 * EMBEDDING + 4 * widest;
+        rows * row_floats as u128 + states * state_floats as u128
     }
 }
 
 impl ScoreNetwork {
-    /// A network with weights of the shape's layout and `frequencies` `[16]` on the CPU.
-    pub fn new(shape: ScoreShape, weights: Weights, frequencies: Tensor) -> Self {
-        let graph = Arc::new(build(&shape).0);
+    /// A network with weights of the shape's layout and `frequencies` `[16]` on the CPU, whose
+    /// products are in this precision.
+    pub fn new(
+        shape: ScoreShape,
+        weights: Weights,
+        frequencies: Tensor,
+        precision: Precision,
+    ) -> Self {
+        let graph = Arc::new(build(&shape, precision).0);
         Self { shape, graph, weights, frequencies }
     }
 
@@ -202,7 +216,9 @@ impl ScoreNetwork {
         let row = |t: &f64| {
             let angles = frequencies.iter().map(|frequency| TAU * t * f64::from(*frequency));
             let angles = Vec::from_iter(angles);
-            [f64::sin, f64::cos].map(|of| Vec::from_iter(angles.iter().map(|x| of(*x)))).concat()
+            [f64::sin, f64::cos]
+                .map(|wave| Vec::from_iter(angles.iter().map(|x| wave(*x))))
+                .concat()
         };
         let features: Vec<f32> = t.iter().flat_map(row).map(|x| x as f32).collect();
         Tensor::from_vec(features, (t.len(), EMBEDDING), device)
@@ -239,7 +255,7 @@ mod tests {
         let shape = ScoreShape { observation_dim, action_dim, layers };
         let weights = weights(shape.layout(), generator);
         let frequencies = ScoreShape::frequencies(generator)?;
-        Ok(ScoreNetwork::new(shape, weights, frequencies))
+        Ok(ScoreNetwork::new(shape, weights, frequencies, Precision::F32))
     }
 
     /// Rows fill several tiles and chunks, or none.
@@ -254,8 +270,9 @@ mod tests {
             let predict = || network.predict(&observations, &actions, &t);
             let (fast, plain) = (predict()?, plainly(predict)?);
             assert_within(1e-4, "values", &fast, &plain);
-            let [of_fast, of_plain] = [fast, plain.clone()].map(|x| gradient(&x, &network.weights));
-            assert_within(1e-4, "gradients", &of_fast?, &of_plain?);
+            let [fast_gradient, plain_gradient] =
+                [fast, plain.clone()].map(|x| gradient(&x, &network.weights));
+            assert_within(1e-4, "gradients", &fast_gradient?, &plain_gradient?);
             let constant = network.detach().predict(&observations, &actions, &t)?;
             assert_within(1e-4, "constants", &constant, &plain);
         }

@@ -4,6 +4,7 @@
 
 use crate::slices::{has_fast_implementation, read_all, slice};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
+use quad_kernels::Precision::F32;
 use quad_kernels::activation::column_sums;
 use quad_kernels::product::{outer, product, product_transposed};
 use rayon::prelude::*;
@@ -25,8 +26,8 @@ pub(crate) fn convolve(
     if has_fast_implementation(x.device()) {
         return x.apply_op3(&kernel.contiguous()?, &bias.contiguous()?, shape);
     }
-    let of_step = |step| (0..taps).map(move |tap| (step * stride + tap) as u32);
-    let places = Tensor::from_iter((0..shape.steps()).flat_map(of_step), x.device())?;
+    let step_places = |step| (0..taps).map(move |tap| (step * stride + tap) as u32);
+    let places = Tensor::from_iter((0..shape.steps()).flat_map(step_places), x.device())?;
     let rows = (batch * shape.steps(), taps * inputs);
     let padded = x.pad_with_zeros(1, taps / 2, taps / 2)?;
     let unfolded = padded.index_select(&places, 1)?.reshape(rows)?;
@@ -120,8 +121,8 @@ impl Convolution {
         let tiles = out.par_chunks_mut(tile * self.steps() * outputs);
         tiles.zip(x.par_chunks(tile * size)).for_each(|(out, x)| {
             match self.taps {
-                1 => product(x, kernel, out, width, outputs),
-                taps => product(&self.unfold(x, 0..taps), kernel, out, width, outputs),
+                1 => product(F32, x, kernel, out, width, outputs),
+                taps => product(F32, &self.unfold(x, 0..taps), kernel, out, width, outputs),
             }
             for row in out.chunks_exact_mut(outputs) {
                 row.iter_mut().zip(bias).for_each(|(x, b)| *x += b);
@@ -138,10 +139,10 @@ impl Convolution {
         let gradients = gradient.par_chunks(tile * self.steps() * outputs);
         tiles.zip(gradients).for_each(|(out, gradient)| {
             if self.taps == 1 {
-                return product_transposed(gradient, kernel, out, width, outputs);
+                return product_transposed(F32, gradient, kernel, out, width, outputs);
             }
             let mut unfolded = vec![0.0; gradient.len() / outputs * width];
-            product_transposed(gradient, kernel, &mut unfolded, width, outputs);
+            product_transposed(F32, gradient, kernel, &mut unfolded, width, outputs);
             self.fold(&unfolded, out);
         });
         out
@@ -151,8 +152,8 @@ impl Convolution {
         let (inputs, outputs) = (self.inputs, self.outputs);
         let mut out = vec![0.0; self.taps * inputs * outputs];
         out.par_chunks_mut(inputs * outputs).enumerate().for_each(|(tap, out)| match self.taps {
-            1 => outer(x, gradient, out, inputs, outputs),
-            _ => outer(&self.unfold(x, tap..tap + 1), gradient, out, inputs, outputs),
+            1 => outer(F32, x, gradient, out, inputs, outputs),
+            _ => outer(F32, &self.unfold(x, tap..tap + 1), gradient, out, inputs, outputs),
         });
         out
     }
@@ -190,14 +191,18 @@ impl CustomOp3 for Convolution {
             let tensor = |numbers: Option<Vec<f32>>, of: &Tensor| {
                 numbers.map(|numbers| Tensor::from_vec(numbers, of.shape(), device)).transpose()
             };
-            let of_x = x.track_op().then(|| self.input_gradient(kernel_numbers, g));
-            let of_kernel = kernel.track_op().then(|| self.kernel_gradient(x_numbers, g));
-            let of_bias = bias.track_op().then(|| {
+            let x_gradient = x.track_op().then(|| self.input_gradient(kernel_numbers, g));
+            let kernel_gradient = kernel.track_op().then(|| self.kernel_gradient(x_numbers, g));
+            let bias_gradient = bias.track_op().then(|| {
                 let mut sums = vec![0.0; self.outputs];
                 column_sums(g, &mut sums);
                 sums
             });
-            Ok((tensor(of_x, x)?, tensor(of_kernel, kernel)?, tensor(of_bias, bias)?))
+            Ok((
+                tensor(x_gradient, x)?,
+                tensor(kernel_gradient, kernel)?,
+                tensor(bias_gradient, bias)?,
+            ))
         })?
     }
 }

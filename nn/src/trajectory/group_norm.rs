@@ -106,9 +106,9 @@ impl NormedMish {
         for (out, (g, slope)) in out.iter_mut().zip(gradient.iter().zip(&slope)) {
             *out = g * slope;
         }
-        let (of_scale, of_shift) = sums.split_at_mut(self.channels);
-        add_rows(of_scale, out, &normed, |delta, x| delta * x);
-        add_rows(of_shift, out, &normed, |delta, _| delta);
+        let (scale_gradient, shift_gradient) = sums.split_at_mut(self.channels);
+        add_rows(scale_gradient, out, &normed, |delta, x| delta * x);
+        add_rows(shift_gradient, out, &normed, |delta, _| delta);
         // The gradient before scale and shift, then through the moments.
         let mean_of = |sums: &[f32]| {
             let mut scaled = sums.to_vec();
@@ -116,7 +116,7 @@ impl NormedMish {
             self.spread(&mut scaled);
             scaled
         };
-        let (along, mean) = (mean_of(of_scale), mean_of(of_shift));
+        let (along, mean) = (mean_of(scale_gradient), mean_of(shift_gradient));
         let rows = normed.chunks_exact(self.channels);
         for (out, normed) in out.chunks_exact_mut(self.channels).zip(rows) {
             for (i, (out, x)) in out.iter_mut().zip(normed).enumerate() {
@@ -173,11 +173,11 @@ impl CustomOp3 for NormedMish {
         })?;
         let mut both = vec![0.0; 2 * self.channels];
         add_rows(&mut both, &sums, &sums, |x, _| x);
-        let of_shift = both.split_off(self.channels);
+        let shift_gradient = both.split_off(self.channels);
         let tensor = |numbers: Vec<f32>, of: &Tensor| {
             Tensor::from_vec(numbers, of.shape(), of.device()).map(Some)
         };
-        Ok((tensor(out, x)?, tensor(both, scale)?, tensor(of_shift, shift)?))
+        Ok((tensor(out, x)?, tensor(both, scale)?, tensor(shift_gradient, shift)?))
     }
 }
 

@@ -69,7 +69,7 @@ impl ScorePolicy {
         check_range("evaluations", shape.evaluations, MOST_EVALUATIONS)?;
         let frequencies = take(tensors, FREQUENCIES.to_owned(), &[ScoreShape::FREQUENCIES])?;
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
-        let network = ScoreNetwork::new(shape.actor(), weights, frequencies);
+        let network = ScoreNetwork::new(shape.actor(), weights, frequencies, Precision::F32);
         let solver = DpmSolver::new(shape.evaluations);
         let precision = Precision::F32;
         let critic = Ensemble::take(shape.critic(), tensors, CRITIC, precision)?;

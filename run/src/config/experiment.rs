@@ -52,7 +52,7 @@ pub struct Experiment {
     pub seed: u64,
     /// Transitions per gradient step, B.
     pub batch_size: u32,
-    /// Precision of forward passes without gradient.
+    /// Precision of products between hidden layers.
     #[serde(default)]
     pub precision: Precision,
     /// Name of the learning algorithm.

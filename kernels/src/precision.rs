@@ -1,18 +1,20 @@
-//! The precision of forward passes without gradients.
+//! The precision of products.
 
+use crate::product::{instructions, rounding_is_faster};
 use serde::de::{self, IntoDeserializer};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
-/// Arithmetic of the wide products in networks without gradients.
+/// Arithmetic of the products between hidden layers: forward, and the gradients of inputs and of
+/// weights. All else is f32: the first and the last layer, activations, losses, optimizers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
     /// f32 throughout.
     #[default]
     F32,
-    /// Operands rounded to bfloat16 (8 bits of mantissa), sums in f32. Faster on AMD's CPUs with
-    /// AVX512-BF16, several times on those with AMX; others compute in f32.
+    /// Factors rounded to bfloat16 (8 bits of mantissa), sums in f32 (Micikevicius et al. 2018).
+    /// Twice as fast on AMD's CPUs with AVX512-BF16, more on those with AMX; others compute in f32.
     Bf16,
 }
 
@@ -31,14 +33,14 @@ impl Precision {
 
     /// The precision that this CPU computes with if this one is requested.
     pub fn in_effect(self) -> Self {
-        if quad_kernels::product::rounding_is_faster() { self } else { Precision::F32 }
+        if rounding_is_faster() { self } else { Precision::F32 }
     }
 
     /// The precision in effect and its instructions, e.g. `bf16-amx`, as on the wire and in
     /// `scores.jsonl`. Two CPUs compute the same bits only if this is the same.
     pub fn arithmetic(self) -> String {
         let precision = self.in_effect();
-        let instructions = quad_kernels::product::instructions(precision == Precision::Bf16);
+        let instructions = instructions(precision == Precision::Bf16);
         format!("{}-{instructions}", precision.name())
     }
 
