@@ -173,29 +173,28 @@ fn set_hidden(table: &mut toml::Table, widths: &[i64]) {
 /// 5 %, most by less than 1 %.
 #[test]
 fn updates_in_bf16_are_close_to_those_in_f32_and_resume_bit_for_bit() {
-    for (definition, mut table) in variants() {
-        set_hidden(&mut table, &[64; 3]);
-        let exact = Context { batch_size: 192, ..context(3, &Device::Cpu) };
+    for mut variant in variants() {
+        set_hidden(&mut variant.table, &[64; 3]);
+        let (variant, name) = (&variant, variant.name);
+        let exact = context(3, &Device::Cpu);
         let rounded = Context { precision: Precision::Bf16, ..exact.clone() };
-        for start in agent(definition, &table, &exact).phases() {
-            let update = |agent: &mut Agent| {
-                let indices = (0..192).map(|i| i % agent.dataset_len() as u32);
-                agent.update(&Vec::from_iter(indices)).unwrap()
+        for start in variant.start(&exact).agent.phases() {
+            let update = |trial: &mut Trial| {
+                let indices = (0..192).map(|index| index % trial.examples.len() as u32);
+                let batch = trial.examples.batch(&Vec::from_iter(indices)).unwrap();
+                trial.agent.update(&batch).unwrap()
             };
             let updated = |context| {
-                let mut agent = agent(definition, &table, context);
-                agent.skip_to(start);
-                update(&mut agent);
-                agent
+                let mut trial = variant.start(context);
+                trial.agent.skip_to(start);
+                update(&mut trial);
+                trial
             };
-            let moments = |mut agent: Agent| {
+            let moments = |mut trial: Trial| {
                 let mut networks: BTreeMap<String, Vec<f32>> = BTreeMap::new();
-                for (name, moment) in agent.algorithm.state_dict().save().unwrap() {
-                    if let Some(name) = name.strip_prefix("adam_m.") {
-                        let network = name.split('.').next().unwrap().to_owned();
-                        let moment = moment.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-                        networks.entry(network).or_default().extend(moment);
-                    }
+                for (tensor, moment) in trial.state("adam_m.") {
+                    let network = tensor.split('.').next().unwrap().to_owned();
+                    networks.entry(network).or_default().extend(moment);
                 }
                 networks
             };
@@ -205,16 +204,14 @@ fn updates_in_bf16_are_close_to_those_in_f32_and_resume_bit_for_bit() {
                 let pairs = expected.iter().zip(&moments[network]);
                 let distance = size(&Vec::from_iter(pairs.map(|(x, y)| x - y))) / size(expected);
                 // ReBRAC's first actions are nearly equal, and IVR weights by small differences.
-                let is_sensitive = ["ivr", "rebrac"].contains(&definition.name);
-                let bound = if is_sensitive { 0.15 } else { 0.05 };
-                assert!(distance < bound, "{}, {network}: {distance}", definition.name);
+                let bound = if ["ivr", "rebrac"].contains(&name) { 0.15 } else { 0.05 };
+                assert!(distance < bound, "{name}, {network}: {distance}");
             }
             let mut straight = updated(&rounded);
-            let saved = straight.save().unwrap();
-            let mut resumed = agent(definition, &table, &rounded);
-            resumed.load(&saved).unwrap();
-            assert_eq!(update(&mut resumed), update(&mut straight), "{}", definition.name);
-            assert!(resumed.save().unwrap() == straight.save().unwrap(), "{}", definition.name);
+            let mut resumed = variant.start(&rounded);
+            resumed.agent.load(&straight.save()).unwrap();
+            assert_eq!(update(&mut resumed), update(&mut straight), "{name}");
+            assert!(resumed.save() == straight.save(), "{name}");
         }
     }
 }
@@ -291,7 +288,8 @@ fn metrics_are_those_of_the_table_and_finite_and_trained_weights_have_gradients(
 fn a_nan_reaches_a_metric() {
     for variant in variants() {
         let start = || variant.start(&context(0, &Device::Cpu));
-        let networks = start().agent.algorithm.state_dict().networks();
+        let mut trial = start();
+        let networks = trial.agent.algorithm.state_dict().networks();
         let networks = Vec::from_iter(networks.into_iter().map(|(network, _)| network));
         assert!(networks.len() > 1, "{}", variant.name);
         for broken in networks {

@@ -123,7 +123,7 @@ fn compare(path: &Path, environment: Environment, reference: &Path) {
     assert_eq!(recorded.rewards, array("raw_rewards"));
     let transitions = read(path, environment, RewardRule::Locomotion);
     let batch = batch(&transitions);
-    assert_eq!(batch.size, transitions.len());
+    assert_eq!(batch.steps.len(), transitions.len());
     assert_eq!(batch.observations, array("observations"));
     assert_eq!(batch.actions, array("actions"));
     assert_eq!(batch.next_observations, array("next_observations"));

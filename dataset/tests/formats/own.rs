@@ -23,7 +23,7 @@ fn the_ten_lines_of_the_page_write_what_is_read() {
 
     let transitions = read(&folder.path().join("my-robot.hdf5"), None, RewardRule::AsIs);
     let batch = batch(&transitions);
-    assert_eq!(batch.size, 12);
+    assert_eq!(batch.steps.len(), 12);
     // `peers.py write-log` has the same formulas: s = 10 i + j, s' = s + 5, a = ±1/2, r = i.
     for i in 0..12 {
         let state = [0.0, 1.0, 2.0, 3.0, 4.0].map(|j| 10.0 * i as f32 + j);

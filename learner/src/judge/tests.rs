@@ -6,7 +6,7 @@ use quad_policy::{Affine, EpisodeState, Policy, PolicyError, Precision, Scaling}
 use quad_run::results::statistics::mean;
 
 use super::actions::{act, scaled};
-use super::data::{COMPARED, distance,  mean_f32, shared};
+use super::data::{COMPARED, distance, mean_f32, shared};
 use super::evaluation::{LAST, LearningCurve, POINTS};
 use super::*;
 
@@ -146,7 +146,7 @@ fn truncated_episodes_continue_by_the_estimate() {
     let units = Units { offset: 100.0, scale: 10.0, least: 0.0, most: 1000.0 };
     let fqes = [0, 1].map(|seed| {
         let config = FqeConfig::with_discount(0.5).unwrap();
-        Fqe::of_behavior(config, units, data.context(seed)).unwrap()
+        Fqe::new(config, units, data.context(seed)).unwrap()
     });
     let recorded = data.recorded_value(&fqes).unwrap();
     let values = fqes.map(|fqe| mean_f32(&fqe.values(&last.observations, &last.actions).unwrap()));
