@@ -16,9 +16,9 @@ pub(crate) fn accept(
     environment: Option<&EnvironmentSpec>,
     normalized: bool,
 ) -> Result<(), Problem> {
-    let outside = if normalized { None } else { actions_outside(recording) };
-    let mut problems = problems(recording, environment).into_iter().chain(outside);
-    problems.next().map_or(Ok(()), Err)
+    let outside = || actions_outside(recording).filter(|_| !normalized);
+    let problem = problems(recording, environment).into_iter().next();
+    problem.or_else(outside).map_or(Ok(()), Err)
 }
 
 /// Problems of a recording as data of an environment, most severe first.
@@ -33,10 +33,12 @@ pub(crate) fn problems(
         problems.push(Problem::NoTransitions(rows));
     }
     if let Some(spec) = environment.filter(|_| rows > 0) {
-        let found = [("observations", o, spec.observation_dim), ("actions", a, spec.action_dim)];
-        for (array, found, expected) in found.into_iter().filter(|(_, found, dim)| found != dim) {
-            let environment = spec.name.clone();
-            problems.push(Problem::Width(array, found, environment, expected));
+        for (array, width, expected) in
+            [("observations", o, spec.observation_dim), ("actions", a, spec.action_dim)]
+        {
+            if width != expected {
+                problems.push(Problem::Width(array, width, spec.name.clone(), expected));
+            }
         }
     }
     let names = &recording.names;
@@ -50,7 +52,7 @@ pub(crate) fn problems(
         ("rewards", &recording.rewards, 1),
     ] {
         // A final state has nothing but an observation.
-        let wrong = of_numbers(values, width, |row, value| {
+        let wrong = wrong_numbers(values, width, |row, value| {
             let counts = column == "observations" || recording.is_step(row);
             (counts && !value.is_finite()).then_some(RowProblem::NotFinite(value))
         });
@@ -66,12 +68,12 @@ pub(crate) fn problems(
 
 /// The first name that is empty, has control characters, or is that of several columns.
 fn wrong_name(attribute: &'static str, names: &[String]) -> Option<Problem> {
-    let same = |name: &String| (0..names.len()).filter(|i| names[*i] == *name).collect::<Vec<_>>();
-    let is_wrong = |name: &&String| {
-        name.trim().is_empty() || name.contains(char::is_control) || same(name).len() > 1
-    };
-    let name = names.iter().find(is_wrong)?;
-    Some(Problem::Name(attribute, name.clone(), named(&same(name), &[])))
+    names.iter().find_map(|name| {
+        let same = Vec::from_iter((0..names.len()).filter(|i| names[*i] == *name));
+        let is_text = !name.trim().is_empty() && !name.contains(char::is_control);
+        let columns = named(&same, &[]);
+        (!is_text || same.len() > 1).then(|| Problem::Name(attribute, name.clone(), columns))
+    })
 }
 
 /// Rows whose stored next observation is not the following row's, and true if they are refused.
@@ -86,7 +88,7 @@ pub(crate) fn strays(recording: &Recording) -> Option<(Problem, bool)> {
 
 /// Actions outside [-1, 1]; refused unless actions are normalized.
 pub(crate) fn actions_outside(recording: &Recording) -> Option<Problem> {
-    let outside = of_numbers(&recording.actions, recording.action_dim, |row, value| {
+    let outside = wrong_numbers(&recording.actions, recording.action_dim, |row, value| {
         let is_outside = value.is_finite() && value.abs() > 1.0 + ACTION_TOLERANCE;
         (recording.is_step(row) && is_outside).then_some(RowProblem::ActionOutside(value))
     });
@@ -94,7 +96,7 @@ pub(crate) fn actions_outside(recording: &Recording) -> Option<Problem> {
 }
 
 /// Each row with a wrong number, and the problem of the first.
-fn of_numbers(
+fn wrong_numbers(
     values: &[f32],
     width: usize,
     problem: impl Fn(usize, f32) -> Option<RowProblem>,
@@ -112,7 +114,6 @@ pub(crate) fn first(
     mut wrong: impl Iterator<Item = (usize, RowProblem)>,
 ) -> Option<Problem> {
     let (row, problem) = wrong.next()?;
-    let rows = 1 + wrong.count();
     let (array, row) = recording.place(column, row);
-    Some(Problem::Rows { array, row, rows, problem })
+    Some(Problem::Rows(array, row, 1 + wrong.count(), problem))
 }

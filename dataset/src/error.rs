@@ -16,7 +16,8 @@ pub struct DatasetError {
 
 impl DatasetError {
     pub(crate) fn new(path: impl Into<PathBuf>, problem: impl Into<Problem>) -> Self {
-        Self { path: path.into(), problem: problem.into() }
+        let (path, problem) = (path.into(), problem.into());
+        Self { path, problem }
     }
 
     /// Advice on how to fix it.
@@ -57,12 +58,14 @@ pub enum Problem {
     Name(&'static str, String, String),
     #[error("array `{0}` {1}")]
     Array(String, #[source] ArrayProblem),
-    #[error("array `{array}`, row {row}: {problem}{}", such_rows(*.rows))]
-    Rows { array: String, row: usize, rows: usize, problem: RowProblem },
+    /// Array, first such row, number of such rows, and their problem.
+    #[error("array `{0}`, row {1}: {3}{such}", such = such_rows(*.2))]
+    Rows(String, usize, usize, RowProblem),
     #[error("{0} episodes, but metadata.json says {1}")]
     Episodes(usize, usize),
-    #[error("recorded in `{claimed}`, which is not `{expected}`")]
-    OtherEnvironment { claimed: String, expected: String, is_simulated: bool },
+    /// The last is true if the recorded environment is simulated here.
+    #[error("recorded in `{0}`, which is not `{1}`")]
+    OtherEnvironment(String, String, bool),
     #[error("recorded in `OGBench`, which is not `{0}`")]
     OtherMaze(String),
     #[error("`{0}` has {1} numbers a row, but `{2}` has {3}")]
@@ -109,36 +112,8 @@ pub enum ArrayProblem {
 }
 
 impl ArrayProblem {
-    pub(crate) fn of(self, array: &str) -> Problem {
+    pub(crate) fn in_array(self, array: &str) -> Problem {
         Problem::Array(array.to_owned(), self)
-    }
-
-    fn hint(&self, array: &str) -> String {
-        let hint = match self {
-            Self::Missing(there) => return missing(array, there),
-            Self::Unreadable(source) if source.to_string().contains(NEWER) => {
-                return format!("a newer HDF5 library wrote it: {REWRITE}");
-            }
-            Self::Unreadable(_) | Self::UnreadableNpz(_) => DAMAGED,
-            Self::Group => {
-                "write what is in the group as columns of one array; in a Minari folder, observations may be a Dict of arrays, and of a Dict of Dicts `quad-convert FOLDER --out my-robot.hdf5` makes one row, with quad_rl installed"
-            }
-            Self::DiscreteActions => {
-                "store continuous actions as float32; where they leave [-1, 1], `learner train --normalize actions` scales them"
-            }
-            Self::Axes(_) => {
-                "each row is a number or a row of numbers: flatten what has more axes, and make numbers of images first, as an encoder does"
-            }
-            Self::Rows(found, _) | Self::Shape(found, _) if matches!(found[..], [rows, columns] if rows < columns) => {
-                TRANSPOSED
-            }
-            Self::Type(..) | Self::Rows(..) | Self::Shape(..) => ARRAYS,
-            Self::Oversized(..) => {
-                "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
-            }
-            Self::Filter(_) | Self::Elsewhere => REWRITE,
-        };
-        hint.to_owned()
     }
 }
 
@@ -161,26 +136,8 @@ pub enum RowProblem {
 }
 
 impl RowProblem {
-    pub(crate) fn at(self, array: &str, row: usize) -> Problem {
-        let (array, rows, problem) = (array.to_owned(), 1, self);
-        Problem::Rows { array, row, rows, problem }
-    }
-
-    fn hint(&self) -> &'static str {
-        match self {
-            Self::NotFinite(_) => {
-                "leave out or repair these rows: a single one would spoil every weight"
-            }
-            Self::NotBoolean(_) => {
-                "a flag is 0 or 1: of a discount, write 1 where it is 0, and else 0 (docs/data.md says what each flag means)"
-            }
-            Self::ActionOutside(_) => {
-                "`learner train --normalize actions` trains on them: it maps the least and the largest of each number to ±1, and the policy's actions back"
-            }
-            Self::Stray | Self::Leap(_) | Self::Reset => {
-                "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for rows in any other order set the attribute `layout` as docs/data.md describes"
-            }
-        }
+    pub(crate) fn in_row(self, array: &str, row: usize) -> Problem {
+        Problem::Rows(array.to_owned(), row, 1, self)
     }
 }
 
@@ -193,20 +150,6 @@ pub enum Load {
     Python(&'static str),
     /// Advice on getting the file that this one stands for.
     Get(&'static str),
-}
-
-impl Load {
-    fn hint(self) -> String {
-        match self {
-            Self::Convert(command) => format!(
-                "with quad_rl installed, `{command} --out my-robot.hdf5` makes a file that is read (docs/data.md)"
-            ),
-            Self::Python(advice) => format!(
-                "{advice}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
-            ),
-            Self::Get(advice) => advice.to_owned(),
-        }
-    }
 }
 
 /// The shape of an array; that of one number a row has no second axis.
@@ -232,29 +175,75 @@ fn missing(array: &str, there: &[String]) -> String {
         }
         false => ARRAYS,
     };
-    let more = if there.len() > MOST_NAMES { ", …" } else { "" };
-    match &there[..there.len().min(MOST_NAMES)] {
-        [] => advice.to_owned(),
-        some => format!("in its place are {}{more}; {advice}", some.join(", ")),
+    match there.len() {
+        0 => advice.to_owned(),
+        1..=MOST_NAMES => format!("in its place are {}; {advice}", there.join(", ")),
+        _ => format!("in its place are {}, …; {advice}", there[..MOST_NAMES].join(", ")),
     }
 }
 
 impl Problem {
     /// Advice on how to fix it.
     pub fn hint(&self) -> String {
+        use {ArrayProblem as A, RowProblem as R};
         let hint = match self {
-            Self::OtherEnvironment { claimed, is_simulated: true, .. } => {
+            Self::OtherEnvironment(claimed, _, true) => {
                 return format!("choose a task in {claimed}, or another dataset");
             }
-            Self::OtherEnvironment { expected, .. } => {
+            Self::OtherEnvironment(_, expected, false) => {
                 return format!(
                     "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a name of \
                      your own, without evaluations: --task own-data --env NAME"
                 );
             }
-            Self::Foreign(_, load) => return load.hint(),
-            Self::Array(array, problem) => return problem.hint(array),
-            Self::Rows { problem, .. } => problem.hint(),
+            Self::Foreign(_, Load::Convert(command)) => {
+                return format!(
+                    "with quad_rl installed, `{command} --out my-robot.hdf5` makes a file that is read (docs/data.md)"
+                );
+            }
+            Self::Foreign(_, Load::Python(advice)) => {
+                return format!(
+                    "{advice}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
+                );
+            }
+            Self::Foreign(_, Load::Get(advice)) => advice,
+            Self::Array(array, A::Missing(there)) => return missing(array, there),
+            Self::Array(_, A::Unreadable(source)) if source.to_string().contains(NEWER) => {
+                return format!("a newer HDF5 library wrote it: {REWRITE}");
+            }
+            Self::Array(_, A::Unreadable(_) | A::UnreadableNpz(_))
+            | Self::Truncated { .. }
+            | Self::DamagedHdf5(_)
+            | Self::DamagedNpz(_) => DAMAGED,
+            Self::Array(_, A::Group) => {
+                "write what is in the group as columns of one array; in a Minari folder, observations may be a Dict of arrays, and of a Dict of Dicts `quad-convert FOLDER --out my-robot.hdf5` makes one row, with quad_rl installed"
+            }
+            Self::Array(_, A::DiscreteActions) => {
+                "store continuous actions as float32; where they leave [-1, 1], `learner train --normalize actions` scales them"
+            }
+            Self::Array(_, A::Axes(_)) => {
+                "each row is a number or a row of numbers: flatten what has more axes, and make numbers of images first, as an encoder does"
+            }
+            Self::Array(_, A::Rows(shape, _) | A::Shape(shape, _)) if matches!(shape[..], [rows, columns] if rows < columns) => {
+                TRANSPOSED
+            }
+            Self::Array(_, A::Type(..) | A::Rows(..) | A::Shape(..)) => ARRAYS,
+            Self::Array(_, A::Oversized(..)) => {
+                "the file is damaged, or most of these rows were never written: fetch or copy it again, or write only the rows that there are"
+            }
+            Self::Array(_, A::Filter(_) | A::Elsewhere) => REWRITE,
+            Self::Rows(.., R::NotFinite(_)) => {
+                "leave out or repair these rows: a single one would spoil every weight"
+            }
+            Self::Rows(.., R::NotBoolean(_)) => {
+                "a flag is 0 or 1: of a discount, write 1 where it is 0, and else 0 (docs/data.md says what each flag means)"
+            }
+            Self::Rows(.., R::ActionOutside(_)) => {
+                "`learner train --normalize actions` trains on them: it maps the least and the largest of each number to ±1, and the policy's actions back"
+            }
+            Self::Rows(.., R::Stray | R::Leap(_) | R::Reset) => {
+                "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for rows in any other order set the attribute `layout` as docs/data.md describes"
+            }
             Self::OtherMaze(_) => {
                 "choose one of its own tasks, such as antmaze-large-navigate-singletask-task1-v0, or another dataset"
             }
@@ -268,7 +257,6 @@ impl Problem {
             Self::UnknownFolder => {
                 "give one file, or the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0; with quad_rl installed, `quad-convert FOLDER … --episode file` makes a file of a folder of tables (docs/data.md)"
             }
-            Self::Truncated { .. } | Self::DamagedHdf5(_) | Self::DamagedNpz(_) => DAMAGED,
             Self::Locked(_) => {
                 "close it in that program; if none has it open, set HDF5_USE_FILE_LOCKING=FALSE and try again"
             }

@@ -4,7 +4,7 @@ use quad_kernels::scaling::{Affine, Scaling};
 use serde::{Deserialize, Serialize};
 
 use crate::recording::{Recording, RowKind};
-use crate::statistics::Summary;
+use crate::statistics::{Range, Summary};
 use crate::tables::reward::RewardScaling;
 
 /// Standard deviation of float32's last bit, relative to the number.
@@ -32,18 +32,22 @@ enum Column {
 
 impl From<Vec<Column>> for Normalize {
     fn from(columns: Vec<Column>) -> Self {
-        let is = |column| columns.contains(&column);
-        let (actions, observations) = (is(Column::Actions), is(Column::Observations));
-        Self { actions, observations, rewards: is(Column::Rewards) }
+        let has = |column| columns.contains(&column);
+        Self {
+            actions: has(Column::Actions),
+            observations: has(Column::Observations),
+            rewards: has(Column::Rewards),
+        }
     }
 }
 
 impl From<Normalize> for Vec<Column> {
-    fn from(Normalize { actions, observations, rewards }: Normalize) -> Self {
-        let actions = actions.then_some(Column::Actions);
-        let observations = observations.then_some(Column::Observations);
-        let rewards = rewards.then_some(Column::Rewards);
-        actions.into_iter().chain(observations).chain(rewards).collect()
+    fn from(normalize: Normalize) -> Self {
+        let mut columns = Vec::new();
+        columns.extend(normalize.actions.then_some(Column::Actions));
+        columns.extend(normalize.observations.then_some(Column::Observations));
+        columns.extend(normalize.rewards.then_some(Column::Rewards));
+        columns
     }
 }
 
@@ -51,11 +55,11 @@ impl Normalize {
     /// Offsets and scales for a recording of finite numbers. Statistics of observations and rewards
     /// are over transitions, those of actions also over dropped steps.
     pub(crate) fn scaling(self, recording: &Recording, rule: RewardScaling) -> Scaling {
-        let Recording { observation_dim, action_dim, observations, actions, kinds, .. } = recording;
-        let is_transition = |row: usize| kinds[row] == RowKind::Transition;
+        let (o, a) = (recording.observation_dim, recording.action_dim);
+        let is_transition = |row: usize| recording.kinds[row] == RowKind::Transition;
         let is_step = |row: usize| recording.is_step(row);
-        let states = || standard_units(observations, *observation_dim, is_transition);
-        let actions = || unit_ranges(&Summary::of_columns(actions, *action_dim, is_step));
+        let states = || standard_units(&recording.observations, o, is_transition);
+        let actions = || unit_ranges(&Range::columns(&recording.actions, a, is_step));
         let rms = self.rewards.then(|| rule.rms(recording) as f32);
         Scaling {
             observations: self.observations.then(states),
@@ -84,20 +88,18 @@ pub(crate) fn standard_units(
     width: usize,
     counts: impl Fn(usize) -> bool,
 ) -> Affine {
-    let of = |summary: &Summary| match summary.deviation <= ROUNDING * summary.rms {
+    let map = |summary: &Summary| match summary.deviation <= ROUNDING * summary.rms {
         true => (summary.min as f32, 0.0),
         false => (summary.mean as f32, summary.deviation as f32),
     };
-    let columns = Summary::of_columns(values, width, counts);
-    let (offset, scale) = columns.iter().map(of).unzip();
+    let columns = Summary::columns(values, width, counts);
+    let (offset, scale) = columns.iter().map(map).unzip();
     Affine { offset, scale }
 }
 
 /// Map of each column from its range to [-1, 1].
-fn unit_ranges(columns: &[Summary]) -> Affine {
-    let of = |Summary { min, max, .. }: &Summary| {
-        (((min + max) / 2.0) as f32, ((max - min) / 2.0) as f32)
-    };
-    let (offset, scale) = columns.iter().map(of).unzip();
+fn unit_ranges(ranges: &[Range]) -> Affine {
+    let map = |Range { min, max }: &Range| (((min + max) / 2.0) as f32, ((max - min) / 2.0) as f32);
+    let (offset, scale) = ranges.iter().map(map).unzip();
     Affine { offset, scale }
 }

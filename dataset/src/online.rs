@@ -3,6 +3,7 @@
 
 use crate::error::{ArrayProblem, Problem};
 use crate::recording::{Names, Recording, RowKind, named};
+use crate::statistics::Range;
 
 /// Largest distance of a number from its column's range in the dataset, relative to its width.
 const FAR: f64 = 1000.0;
@@ -24,14 +25,19 @@ impl OnlineEpisode<'_> {
     /// n, if all arrays are of n ≥ 1 steps.
     pub(crate) fn steps(&self, o: usize, a: usize) -> Result<usize, Problem> {
         let n = self.rewards.len();
-        let arrays =
-            [("observations", self.observations, n + 1, o), ("actions", self.actions, n, a)];
-        for (array, numbers, rows, width) in arrays {
-            if numbers.len() != rows * width {
-                return Err(ArrayProblem::Shape(vec![numbers.len()], [rows, width]).of(array));
+        let (observations, actions) = (self.observations.len(), self.actions.len());
+        let (states, steps) = ([n + 1, o], [n, a]);
+        for (array, length, shape) in
+            [("observations", observations, states), ("actions", actions, steps)]
+        {
+            if length != shape[0] * shape[1] {
+                return Err(ArrayProblem::Shape(vec![length], shape).in_array(array));
             }
         }
-        if n == 0 { Err(Problem::NoTransitions(0)) } else { Ok(n) }
+        match n {
+            0 => Err(Problem::NoTransitions(0)),
+            _ => Ok(n),
+        }
     }
 
     /// The steps and the last state as n + 1 rows.
@@ -55,9 +61,6 @@ impl OnlineEpisode<'_> {
     }
 }
 
-/// Smallest and largest number of a column.
-type Range = [f32; 2];
-
 /// Ranges of a dataset's columns.
 pub(crate) struct Ranges {
     observations: Vec<Range>,
@@ -68,13 +71,12 @@ pub(crate) struct Ranges {
 impl Ranges {
     /// The ranges of a recording of finite numbers that is not scaled yet.
     pub(crate) fn new(recording: &Recording) -> Self {
-        let Recording { observation_dim, action_dim, observations, actions, rewards, .. } =
-            recording;
+        let (o, a) = (recording.observation_dim, recording.action_dim);
         let is_step = |row| recording.is_step(row);
         Self {
-            observations: ranges(observations, *observation_dim, |_| true),
-            actions: ranges(actions, *action_dim, is_step),
-            rewards: ranges(rewards, 1, is_step),
+            observations: Range::columns(&recording.observations, o, |_| true),
+            actions: Range::columns(&recording.actions, a, is_step),
+            rewards: Range::columns(&recording.rewards, 1, is_step),
         }
     }
 
@@ -91,31 +93,26 @@ impl Ranges {
             let far = |index: usize| is_far(ranges[index % ranges.len()], numbers[index]);
             let index = (0..numbers.len()).find(|index| far(*index))?;
             let (row, column) = (index / ranges.len(), index % ranges.len());
-            let (value, [low, high]) = (numbers[index], ranges[column]);
+            let Range { min, max } = ranges[column];
             Some(format!(
-                "array `{array}`, row {row}, {}: {value:e}, far outside the dataset's range of {low} to {high}",
-                named(&[column], names)
+                "array `{array}`, row {row}, {}: {:e}, far outside the dataset's range of {} to {}",
+                named(&[column], names),
+                numbers[index],
+                min as f32,
+                max as f32
             ))
         })
     }
 }
 
-fn ranges(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<Range> {
-    let mut ranges = vec![[f32::INFINITY, f32::NEG_INFINITY]; width];
-    for (_, values) in values.chunks_exact(width.max(1)).enumerate().filter(|(row, _)| counts(*row))
-    {
-        for (range, &value) in ranges.iter_mut().zip(values) {
-            *range = [range[0].min(value), range[1].max(value)];
-        }
-    }
-    ranges
-}
-
 /// A range that is narrower than a thousandth of its numbers' size, or of 1, counts as this size:
 /// what hardly moved in the data may move online.
 fn is_far(range: Range, value: f32) -> bool {
-    let ([low, high], value) = (range.map(f64::from), f64::from(value));
-    let size = low.abs().max(high.abs()).max(1.0);
-    let width = if high - low > size / FAR { high - low } else { size };
-    (low - value).max(value - high) > FAR * width
+    let (Range { min, max }, value) = (range, f64::from(value));
+    let size = min.abs().max(max.abs()).max(1.0);
+    let width = match max - min > size / FAR {
+        true => max - min,
+        false => size,
+    };
+    (min - value).max(value - max) > FAR * width
 }

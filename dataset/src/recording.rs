@@ -1,7 +1,7 @@
 //! Rows of a dataset in file order, whatever its format.
 
 use crate::same_state::SameState;
-use crate::statistics::Episode;
+use crate::statistics::EpisodeReturn;
 
 /// The attribute of the names of observation columns, and that of action columns.
 pub(crate) const OBSERVATION_NAMES: &str = "observation_names";
@@ -62,12 +62,26 @@ pub(crate) struct Recording {
 }
 
 impl Recording {
+    /// Next observations of the source, used or not.
+    fn stored_next_observations(&self) -> Option<&Vec<f32>> {
+        let unused = self.unused_next_observations.as_ref();
+        self.next_observations.as_ref().or(unused)
+    }
+
+    /// The recording with [`Self::same_state`] measured.
+    pub(crate) fn with_same_state(mut self) -> Self {
+        if let Some(next) = self.stored_next_observations() {
+            self.same_state = SameState::between(&self.observations, next, self.observation_dim);
+        }
+        self
+    }
+
     pub(crate) fn rows(&self) -> usize {
         self.rewards.len()
     }
 
     pub(crate) fn observation(&self, row: usize) -> &[f32] {
-        self.row_of(&self.observations, row)
+        self.state(&self.observations, row)
     }
 
     pub(crate) fn action(&self, row: usize) -> &[f32] {
@@ -77,18 +91,23 @@ impl Recording {
     /// State after a row's step.
     pub(crate) fn next_observation(&self, row: usize) -> &[f32] {
         match &self.next_observations {
-            Some(stored) => self.row_of(stored, row),
+            Some(stored) => self.state(stored, row),
             None => self.observation(row + 1),
         }
     }
 
-    fn row_of<'a>(&self, observations: &'a [f32], row: usize) -> &'a [f32] {
+    fn state<'a>(&self, observations: &'a [f32], row: usize) -> &'a [f32] {
         &observations[row * self.observation_dim..(row + 1) * self.observation_dim]
     }
 
     /// True if an action is taken in a row; false in an episode's final state, and after the end.
     pub(crate) fn is_step(&self, row: usize) -> bool {
         row < self.rows() && self.kinds[row] != RowKind::LastState
+    }
+
+    /// Rows in which an action is taken.
+    pub(crate) fn steps(&self) -> impl Iterator<Item = usize> {
+        (0..self.rows()).filter(|&row| self.is_step(row))
     }
 
     /// Rows that start a transition.
@@ -99,21 +118,26 @@ impl Recording {
     /// True where the episode has reached its goal in an earlier row.
     pub(crate) fn past_goal(&self) -> Vec<bool> {
         let mut is_past = false;
-        let of_row = |row: usize| {
+        let was_past = |row: usize| {
             let was_past = is_past;
             is_past = self.goal && !self.ends[row] && (is_past || self.terminals[row]);
             was_past
         };
-        (0..self.rows()).map(of_row).collect()
+        (0..self.rows()).map(was_past).collect()
     }
 
-    /// Length and return of each episode, dropped steps included.
-    pub(crate) fn episodes(&self) -> Vec<Episode> {
-        let mut episodes = Vec::new();
-        let mut open = Episode::default();
-        for row in (0..self.rows()).filter(|&row| self.is_step(row)) {
-            open.push(f64::from(self.rewards[row]), self.goal);
+    /// Length and return of each episode, dropped steps included. Rewards after the first positive
+    /// one do not count if there is a goal.
+    pub(crate) fn episodes(&self) -> Vec<EpisodeReturn> {
+        let (mut episodes, mut open) = (Vec::new(), EpisodeReturn::default());
+        let mut is_reached = false;
+        for row in self.steps() {
+            let reward = f64::from(self.rewards[row]);
+            open.length += 1;
+            open.sum += if is_reached { 0.0 } else { reward };
+            is_reached |= self.goal && reward > 0.0;
             if self.ends[row] {
+                is_reached = false;
                 episodes.push(std::mem::take(&mut open));
             }
         }
@@ -159,23 +183,25 @@ impl Recording {
             return self.next_observations.is_none() || !self.jumps(row);
         }
         let (start, next) = (self.observation(following), self.observation(row + 1));
-        let square: f64 = start.iter().zip(next).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-        square.sqrt() <= SAME_OBSERVATION
+        let apart = start.iter().zip(next).map(|(a, b)| f64::from(a - b));
+        apart.map(|x| x.powi(2)).sum::<f64>().sqrt() <= SAME_OBSERVATION
     }
 
     /// True if a row's stored next observation is not the state in which the following row starts.
     pub(crate) fn jumps(&self, row: usize) -> bool {
-        let unused = self.unused_next_observations.as_ref();
-        let stored = self.next_observations.as_ref().or(unused);
-        let stored = stored.filter(|_| row + 1 < self.rows());
-        stored.is_some_and(|stored| {
-            self.same_state.differ(self.row_of(stored, row), self.observation(row + 1))
-        })
+        match self.stored_next_observations() {
+            Some(stored) if row + 1 < self.rows() => {
+                let (next, start) = (self.state(stored, row), self.observation(row + 1));
+                self.same_state.differ(next, start)
+            }
+            _ => false,
+        }
     }
 
     /// Appends a final state to all columns but the observations.
     pub(crate) fn push_last_state(&mut self) {
-        self.actions.resize(self.actions.len() + self.action_dim, 0.0);
+        let numbers = self.actions.len() + self.action_dim;
+        self.actions.resize(numbers, 0.0);
         self.rewards.push(0.0);
         self.kinds.push(RowKind::LastState);
         for flags in [&mut self.terminals, &mut self.timeouts, &mut self.ends] {
@@ -227,19 +253,18 @@ pub(crate) mod tests {
 
     impl Recording {
         pub(crate) fn store_next(&mut self, next: Vec<f32>) {
-            self.same_state =
-                SameState::between(&self.observations, Some(&next), self.observation_dim);
             self.next_observations = Some(next);
+            *self = std::mem::take(self).with_same_state();
         }
     }
 
     #[test]
     fn rows_are_found_again_in_their_part() {
         let mut recording = recording(&[Transition; 6]);
-        let found = |recording: &Recording| recording.place("rewards", 4);
-        assert_eq!(found(&recording), ("rewards".to_owned(), 4));
-        recording.parts = vec![(0, "episode_0".to_owned()), (3, "episode_1".to_owned())];
-        assert_eq!(found(&recording), ("episode_1/rewards".to_owned(), 1));
+        assert_eq!(recording.place("rewards", 4), ("rewards".into(), 4));
+        recording.parts = vec![(0, "episode_0".into()), (3, "episode_1".into())];
+        let place = recording.place("rewards", 4);
+        assert_eq!(place, ("episode_1/rewards".into(), 1));
     }
 
     #[test]

@@ -15,14 +15,8 @@ const MOST: f64 = 0.5;
 const QUARTILES: f64 = 20.0;
 
 impl SameState {
-    /// Measures observations before and after each row's step, both N × `width`, if the latter are
-    /// stored.
-    pub(crate) fn between(
-        observations: &[f32],
-        next_observations: Option<&[f32]>,
-        width: usize,
-    ) -> Self {
-        let Some(next_observations) = next_observations else { return Self::default() };
+    /// Measures observations before and after each row's step, both N × `width`.
+    pub(crate) fn between(observations: &[f32], next_observations: &[f32], width: usize) -> Self {
         let (mut squares, mut counts) = (vec![0.0; width], vec![0.0_f64; width]);
         for (i, (from, to)) in observations.iter().zip(next_observations).enumerate() {
             let square = (f64::from(*to) - f64::from(*from)).powi(2);
@@ -31,8 +25,9 @@ impl SameState {
                 counts[i % width] += 1.0;
             }
         }
-        let steps = squares.iter().zip(counts).map(|(sum, count)| (sum / count).sqrt());
-        let mut same = Self { steps: steps.collect(), tolerance: 0.0 };
+        let means = squares.iter().zip(counts).map(|(sum, count)| sum / count);
+        let (steps, tolerance) = (means.map(f64::sqrt).collect(), 0.0);
+        let mut same = Self { steps, tolerance };
         let following = observations.chunks_exact(width).skip(1);
         let pairs = next_observations.chunks_exact(width).zip(following);
         let mut distances = Vec::from_iter(pairs.map(|(next, start)| same.distance(next, start)));
@@ -79,10 +74,10 @@ mod tests {
                 state = [state[0] + 0.1 * reset, state[1] - 0.1 * reset];
             }
         }
-        let same = SameState::between(&observations, Some(&next_observations), 2);
+        let same = SameState::between(&observations, &next_observations, 2);
         let differs = |row: &usize| {
-            let (next, start) = (2 * row, 2 * row + 2);
-            same.differ(&next_observations[next..next + 2], &observations[start..start + 2])
+            let (next, start) = (&next_observations[2 * row..], &observations[2 * row + 2..]);
+            same.differ(&next[..2], &start[..2])
         };
         (0..1199).filter(differs).collect()
     }
@@ -91,11 +86,10 @@ mod tests {
     fn resets_are_told_from_noise_in_any_unit() {
         let expected = Vec::from_iter((29..1199).step_by(30));
         for unit in [1e-6, 1.0, 1e6] {
-            for (reset, noise) in [(20.0, 0.0), (0.05, 0.0), (20.0, 0.001), (2.0, 0.03), (5.0, 0.1)]
-            {
-                assert_eq!(ends(reset, noise, unit), expected, "{reset}, {noise}, {unit}");
+            let resets = [20.0, 0.05, 20.0, 2.0, 5.0, 1.2];
+            for (reset, noise) in resets.into_iter().zip([0.0, 0.0, 0.001, 0.03, 0.1, 0.2]) {
+                assert_eq!(ends(reset, noise, unit), expected, "{reset}, {noise}");
             }
-            assert_eq!(ends(1.2, 0.2, unit), expected, "a reset of a step is none of the noise");
             assert_eq!(ends(0.001, 0.0, unit), [0; 0], "no reset, but rounding");
         }
     }

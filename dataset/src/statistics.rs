@@ -1,5 +1,7 @@
 //! Summary statistics of numbers, and the lengths and returns of episodes.
 
+use serde::Serialize;
+
 /// Statistics of some numbers; NaN without numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Summary {
@@ -12,7 +14,7 @@ pub(crate) struct Summary {
 }
 
 impl Summary {
-    pub(crate) fn of(values: &[f64]) -> Self {
+    pub(crate) fn new(values: &[f64]) -> Self {
         let count = values.len() as f64;
         let mean = values.iter().sum::<f64>() / count;
         let square_around =
@@ -27,7 +29,7 @@ impl Summary {
     }
 
     /// Statistics of each column's finite numbers in the rows that count.
-    pub(crate) fn of_columns(
+    pub(crate) fn columns(
         values: &[f32],
         width: usize,
         counts: impl Fn(usize) -> bool,
@@ -35,26 +37,49 @@ impl Summary {
         let column = |column: usize| {
             let values = values.iter().skip(column).step_by(width).enumerate();
             let values = values.filter(|(row, value)| counts(*row) && value.is_finite());
-            Self::of(&Vec::from_iter(values.map(|(_, value)| f64::from(*value))))
+            Self::new(&Vec::from_iter(values.map(|(_, value)| f64::from(*value))))
         };
         (0..width).map(column).collect()
     }
 }
 
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct Episode {
-    pub(crate) length: usize,
-    pub(crate) sum: f64,
-    reached: bool,
+/// Smallest and largest of some numbers; NaN without numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[allow(missing_docs)] // The names say what each is.
+pub struct Range {
+    pub min: f64,
+    pub max: f64,
 }
 
-impl Episode {
-    /// Adds a step. With a `goal`, rewards after the first positive one do not count.
-    pub(crate) fn push(&mut self, reward: f64, goal: bool) {
-        self.length += 1;
-        if !self.reached {
-            self.sum += reward;
+impl Range {
+    /// Ranges of each column's finite numbers in the rows that count.
+    pub(crate) fn columns(
+        values: &[f32],
+        width: usize,
+        counts: impl Fn(usize) -> bool,
+    ) -> Vec<Self> {
+        let mut ranges = vec![Self::over(&[]); width];
+        let rows = values.chunks_exact(width.max(1)).enumerate();
+        for (_, values) in rows.filter(|(row, _)| counts(*row)) {
+            for (range, value) in ranges.iter_mut().zip(values) {
+                if value.is_finite() {
+                    range.min = range.min.min(f64::from(*value));
+                    range.max = range.max.max(f64::from(*value));
+                }
+            }
         }
-        self.reached |= goal && reward > 0.0;
+        ranges
     }
+
+    pub(crate) fn over(ranges: &[Self]) -> Self {
+        let min = ranges.iter().map(|range| range.min);
+        let max = ranges.iter().map(|range| range.max);
+        Self { min: min.fold(f64::NAN, f64::min), max: max.fold(f64::NAN, f64::max) }
+    }
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct EpisodeReturn {
+    pub(crate) length: usize,
+    pub(crate) sum: f64,
 }

@@ -15,9 +15,10 @@ impl<T> Array<T> {
         let width = match shape[..] {
             [_] => 1,
             [_, width] if width > 0 => width,
-            _ => return Err(ArrayProblem::Axes(shape).of(name)),
+            _ => return Err(ArrayProblem::Axes(shape).in_array(name)),
         };
-        Ok(Self { name: name.to_owned(), shape, width, values })
+        let name = name.to_owned();
+        Ok(Self { name, shape, width, values })
     }
 
     pub(crate) fn rows(&self) -> usize {
@@ -28,17 +29,17 @@ impl<T> Array<T> {
         &self.values[row * self.width..(row + 1) * self.width]
     }
 
-    pub(crate) fn of_rows(self, rows: usize) -> Result<Self, Problem> {
+    pub(crate) fn with_rows(self, rows: usize) -> Result<Self, Problem> {
         match self.rows() == rows {
             true => Ok(self),
-            false => Err(ArrayProblem::Rows(self.shape, rows).of(&self.name)),
+            false => Err(ArrayProblem::Rows(self.shape, rows).in_array(&self.name)),
         }
     }
 
     pub(crate) fn sized(self, rows: usize, width: usize) -> Result<Vec<T>, Problem> {
         match (self.rows(), self.width) == (rows, width) {
             true => Ok(self.values),
-            false => Err(ArrayProblem::Shape(self.shape, [rows, width]).of(&self.name)),
+            false => Err(ArrayProblem::Shape(self.shape, [rows, width]).in_array(&self.name)),
         }
     }
 }
@@ -48,16 +49,18 @@ impl Array<f32> {
     pub(crate) fn into_flags(self, rows: usize) -> Result<Vec<bool>, Problem> {
         let array = self.name.clone();
         let values = self.sized(rows, 1)?;
-        match values.iter().position(|&value| value != 0.0 && value != 1.0) {
+        let is_other = |value: &f32| *value != 0.0 && *value != 1.0;
+        match values.iter().position(is_other) {
             None => Ok(values.into_iter().map(|value| value == 1.0).collect()),
-            Some(row) => Err(RowProblem::NotBoolean(values[row]).at(&array, row)),
+            Some(row) => Err(RowProblem::NotBoolean(values[row]).in_row(&array, row)),
         }
     }
 }
 
 /// Refuses a shape of more numbers than `most`, or of more rows than indices, in a file of `bytes`.
 pub(crate) fn check_size(shape: &[usize], most: u64, bytes: u64) -> Result<(), ArrayProblem> {
-    let claimed = shape.iter().fold(1u64, |product, &axis| product.saturating_mul(axis as u64));
+    let axes = shape.iter().map(|axis| *axis as u64);
+    let claimed = axes.fold(1, u64::saturating_mul);
     match claimed > most || shape.first().is_some_and(|&rows| rows > u32::MAX as usize) {
         true => Err(ArrayProblem::Oversized(shape.to_vec(), bytes)),
         false => Ok(()),

@@ -7,9 +7,8 @@ use hdf5::types::VarLenUnicode;
 use crate::checks;
 use crate::error::{ArrayProblem, DatasetError, Problem};
 use crate::formats::hdf5_file::Hdf5File;
-use crate::formats::new_file::{Column, NewFile, text};
+use crate::formats::new_file::{NewFile, text};
 use crate::recording::{ACTION_NAMES, Names, OBSERVATION_NAMES, Recording, RowKind};
-use crate::same_state::SameState;
 
 /// Value of the root attribute `layout` that distinguishes this layout from D4RL's.
 pub(super) const LAYOUT: &str = "transitions";
@@ -38,7 +37,7 @@ pub struct Arrays {
 impl Arrays {
     pub(crate) fn into_recording(self) -> Result<Recording, Problem> {
         let (rows, o, a) = (self.rewards.len(), self.observation_dim, self.action_dim);
-        for (array, width, found) in [
+        for (array, width, length) in [
             ("observations", o, self.observations.len()),
             ("actions", a, self.actions.len()),
             ("next_observations", o, self.next_observations.len()),
@@ -46,19 +45,18 @@ impl Arrays {
             ("timeouts", 1, self.timeouts.len()),
         ] {
             if width == 0 {
-                return Err(ArrayProblem::Axes(vec![rows, 0]).of(array));
+                return Err(ArrayProblem::Axes(vec![rows, 0]).in_array(array));
             }
-            if found != rows * width {
-                return Err(ArrayProblem::Shape(vec![found], [rows, width]).of(array));
+            if length != rows * width {
+                return Err(ArrayProblem::Shape(vec![length], [rows, width]).in_array(array));
             }
         }
         let ends = (0..rows).map(|row| self.terminals[row] || self.timeouts[row]);
-        Ok(Recording {
+        let recording = Recording {
             observation_dim: o,
             action_dim: a,
             kinds: vec![RowKind::Transition; rows],
             ends: ends.collect(),
-            same_state: SameState::between(&self.observations, Some(&self.next_observations), o),
             observations: self.observations,
             actions: self.actions,
             rewards: self.rewards,
@@ -67,7 +65,8 @@ impl Arrays {
             terminal_array: "terminals",
             timeouts: self.timeouts,
             ..Recording::default()
-        })
+        };
+        Ok(recording.with_same_state())
     }
 }
 
@@ -76,7 +75,7 @@ impl Arrays {
 pub(super) fn read_own(file: &Hdf5File) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
-    let actions = file.actions("actions")?.of_rows(rows)?;
+    let actions = file.actions("actions")?.with_rows(rows)?;
     let has_timeouts = file.has("timeouts");
     let arrays = Arrays {
         observation_dim,
@@ -93,8 +92,8 @@ pub(super) fn read_own(file: &Hdf5File) -> Result<Recording, Problem> {
     };
     let mut recording = arrays.into_recording()?;
     if !has_timeouts {
-        recording.ends =
-            (0..rows).map(|row| recording.terminals[row] || recording.jumps(row)).collect();
+        let ends = (0..rows).map(|row| recording.terminals[row] || recording.jumps(row));
+        recording.ends = ends.collect();
     }
     recording.names.observations = file.names(OBSERVATION_NAMES, observation_dim)?;
     recording.names.actions = file.names(ACTION_NAMES, recording.action_dim)?;
@@ -112,31 +111,27 @@ pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result
     if let Some(problem) = checks::problems(&recording, None).into_iter().next() {
         return Err(error(problem));
     }
-    let file = NewFile::create(path)?;
-    write(&file, &recording).map_err(|source| file.failed(source))?;
-    file.finish()
-}
-
-fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
-    let layout = file.hdf5.new_attr::<VarLenUnicode>().create("layout")?;
-    layout.write_scalar(&text(LAYOUT)?)?;
-    let Names { observations, actions } = &recording.names;
-    for (name, texts) in [(OBSERVATION_NAMES, observations), (ACTION_NAMES, actions)] {
-        let texts = texts.iter().map(|name| text(name)).collect::<Result<Vec<_>, _>>()?;
-        if !texts.is_empty() {
-            file.hdf5.new_attr_builder().with_data(&texts).create(name)?;
+    NewFile::write(path, |file| {
+        let layout = file.hdf5.new_attr::<VarLenUnicode>().create("layout")?;
+        layout.write_scalar(&text(LAYOUT)?)?;
+        let names = &recording.names;
+        for (attribute, names) in
+            [(OBSERVATION_NAMES, &names.observations), (ACTION_NAMES, &names.actions)]
+        {
+            let texts = names.iter().map(|name| text(name));
+            let texts = texts.collect::<hdf5::Result<Vec<_>>>()?;
+            if !texts.is_empty() {
+                let builder = file.hdf5.new_attr_builder();
+                builder.with_data(&texts).create(attribute)?;
+            }
         }
-    }
-    let (o, a) = (Some(recording.observation_dim), Some(recording.action_dim));
-    let next_observations = recording.next_observations.as_deref().unwrap_or_default();
-    for (name, width, values) in [
-        ("observations", o, &*recording.observations),
-        ("actions", a, &recording.actions),
-        ("rewards", None, &recording.rewards),
-        ("next_observations", o, next_observations),
-    ] {
-        Column::create::<f32>(file, name, width)?.append(values)?;
-    }
-    Column::create::<bool>(file, "terminals", None)?.append(&recording.terminals)?;
-    Column::create::<bool>(file, "timeouts", None)?.append(&recording.timeouts)
+        let (o, a) = (Some(recording.observation_dim), Some(recording.action_dim));
+        file.put("observations", o, &recording.observations)?;
+        file.put("actions", a, &recording.actions)?;
+        file.put("rewards", None, &recording.rewards)?;
+        let next = recording.next_observations.as_deref();
+        file.put("next_observations", o, next.unwrap_or_default())?;
+        file.put("terminals", None, &recording.terminals)?;
+        file.put("timeouts", None, &recording.timeouts)
+    })
 }

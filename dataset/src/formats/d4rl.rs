@@ -3,7 +3,6 @@
 use crate::error::Problem;
 use crate::formats::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
-use crate::same_state::SameState;
 use crate::tables::environment::EnvironmentSpec;
 
 /// Reads a file as D4RL's `qlearning_dataset` does: the next observation is the following row's,
@@ -19,14 +18,15 @@ pub(super) fn read(
 ) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let rows = observations.rows();
-    let actions = file.actions("actions")?.of_rows(rows)?;
+    let actions = file.actions("actions")?.with_rows(rows)?;
     let terminals = file.flags("terminals", rows)?;
     let mut doubts = Vec::new();
     let timeouts = if file.has("timeouts") {
         file.flags("timeouts", rows)?
     } else if file.has("episode_terminals") {
         let ends = file.flags("episode_terminals", rows)?;
-        ends.into_iter().zip(&terminals).map(|(end, terminal)| end && !terminal).collect()
+        let ends = ends.into_iter().zip(&terminals);
+        ends.map(|(end, terminal)| end && !terminal).collect()
     } else {
         let (timeouts, end) = match environment {
             Some(spec) => {
@@ -49,21 +49,16 @@ pub(super) fn read(
         true => RowKind::Dropped,
         false => RowKind::Transition,
     };
-    let stored = file.has("next_observations");
-    let stored = stored.then(|| file.table("next_observations", rows, observations.width));
-    let unused_next_observations: Option<Vec<f32>> = stored.transpose()?;
     let mut recording = Recording {
-        same_state: SameState::between(
-            &observations.values,
-            unused_next_observations.as_deref(),
-            observations.width,
-        ),
+        unused_next_observations: match file.has("next_observations") {
+            true => Some(file.table("next_observations", rows, observations.width)?),
+            false => None,
+        },
         observation_dim: observations.width,
         action_dim: actions.width,
         observations: observations.values,
         actions: actions.values,
         rewards: file.table("rewards", rows, 1)?,
-        unused_next_observations,
         kinds: (0..rows).map(kind).collect(),
         ends: ends.collect(),
         terminals,
@@ -73,6 +68,7 @@ pub(super) fn read(
         doubts,
         ..Recording::default()
     };
+    recording = recording.with_same_state();
     for row in 0..rows {
         recording.ends[row] |= recording.terminals[row] && recording.jumps(row);
     }

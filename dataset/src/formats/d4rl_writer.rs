@@ -6,7 +6,7 @@ use hdf5::H5Type;
 
 use crate::error::{DatasetError, Problem, RowProblem};
 use crate::formats::new_file::{CHUNK_ROWS, Column, NewFile, text};
-use crate::formats::recorded::Row;
+use crate::formats::recorded::RecordedStep;
 use crate::online::OnlineEpisode;
 use crate::tables::environment::EnvironmentSpec;
 
@@ -27,14 +27,12 @@ pub struct D4rlWriter {
     environment: &'static EnvironmentSpec,
     file: NewFile,
     rows: usize,
-    columns: Vec<Buffered>,
+    /// Each with up to one chunk of rows not yet written.
+    columns: Vec<(Column, Vec<f32>)>,
 }
 
-/// Column with up to one chunk of rows not yet written.
-struct Buffered {
-    column: Column,
-    is_flag: bool,
-    buffer: Vec<f32>,
+fn is_flag(array: &str) -> bool {
+    matches!(array, "terminals" | "timeouts")
 }
 
 impl D4rlWriter {
@@ -44,47 +42,70 @@ impl D4rlWriter {
         environment: &'static EnvironmentSpec,
     ) -> Result<Self, DatasetError> {
         let file = NewFile::create(path.as_ref())?;
-        let columns = columns(&file, environment).map_err(|source| file.failed(source))?;
+        let [o, a] = [environment.observation_dim, environment.action_dim].map(Some);
+        let create = |(name, width)| {
+            let column = match is_flag(name) {
+                true => Column::create::<bool>(&file, name, width)?,
+                false => Column::create::<f32>(&file, name, width)?,
+            };
+            Ok((column, Vec::new()))
+        };
+        let columns = file.hdf5.create_group("infos").and_then(|_| {
+            let columns = [
+                ("observations", o),
+                ("actions", a),
+                ("next_observations", o),
+                ("rewards", None),
+                ("infos/qpos", Some(environment.qpos_dim)),
+                ("infos/qvel", Some(environment.qvel_dim)),
+                ("terminals", None),
+                ("timeouts", None),
+            ];
+            columns.into_iter().map(create).collect()
+        });
+        let columns = columns.map_err(|source| file.failed(source))?;
         Ok(Self { environment, file, rows: 0, columns })
     }
 
-    /// Appends a row. Other dimensions and numbers not finite in float32 are refused.
-    pub fn push(&mut self, row: &Row) -> Result<(), DatasetError> {
+    /// Appends a step. Other dimensions and numbers not finite in float32 are refused.
+    pub fn push(&mut self, step: &RecordedStep) -> Result<(), DatasetError> {
         let number = |flag: bool| [f64::from(u8::from(flag))];
-        // In the order of `columns`.
+        // In the order of the columns.
         let values = [
-            row.observation,
-            row.action,
-            row.next_observation,
-            &[row.reward],
-            row.qpos,
-            row.qvel,
-            &number(row.terminal),
-            &number(row.timeout),
+            step.observation,
+            step.action,
+            step.next_observation,
+            &[step.reward],
+            step.qpos,
+            step.qvel,
+            &number(step.terminal),
+            &number(step.timeout),
         ];
-        let problem = self
-            .columns
-            .iter()
-            .zip(values)
-            .find_map(|(column, values)| self.problem(&column.column, values));
-        if let Some(problem) = problem {
-            return Err(DatasetError::new(self.file.path(), problem));
+        for ((column, _), values) in self.columns.iter().zip(values) {
+            let checked = self.check(column, values);
+            checked.map_err(|problem| DatasetError::new(self.file.path(), problem))?;
         }
-        for (column, values) in self.columns.iter_mut().zip(values) {
-            column.buffer.extend(values.iter().map(|&value| value as f32));
+        for ((_, buffer), values) in self.columns.iter_mut().zip(values) {
+            buffer.extend(values.iter().map(|&value| value as f32));
         }
         self.rows += 1;
-        if self.rows.is_multiple_of(CHUNK_ROWS) { self.flush() } else { Ok(()) }
+        match self.rows.is_multiple_of(CHUNK_ROWS) {
+            true => self.flush(),
+            false => Ok(()),
+        }
     }
 
-    fn problem(&self, column: &Column, values: &[f64]) -> Option<Problem> {
-        let (array, found, expected) = (column.name, values.len(), column.width.unwrap_or(1));
-        if found != expected {
+    fn check(&self, column: &Column, values: &[f64]) -> Result<(), Problem> {
+        let (array, width, expected) = (column.name, values.len(), column.width.unwrap_or(1));
+        if width != expected {
             let environment = self.environment.name.clone();
-            return Some(Problem::Width(array, found, environment, expected));
+            return Err(Problem::Width(array, width, environment, expected));
         }
-        let value = values.iter().map(|value| *value as f32).find(|value| !value.is_finite())?;
-        Some(RowProblem::NotFinite(value).at(array, self.rows))
+        let mut values = values.iter().map(|value| *value as f32);
+        match values.find(|value| !value.is_finite()) {
+            Some(value) => Err(RowProblem::NotFinite(value).in_row(array, self.rows)),
+            None => Ok(()),
+        }
     }
 
     /// Number of rows so far.
@@ -102,44 +123,15 @@ impl D4rlWriter {
     }
 
     fn flush(&mut self) -> Result<(), DatasetError> {
-        let flushed = self.columns.iter_mut().try_for_each(Buffered::flush);
-        flushed.map_err(|source| self.file.failed(source))
-    }
-}
-
-fn columns(file: &NewFile, spec: &EnvironmentSpec) -> hdf5::Result<Vec<Buffered>> {
-    file.hdf5.create_group("infos")?;
-    let (o, a) = (Some(spec.observation_dim), Some(spec.action_dim));
-    let columns = [
-        ("observations", o),
-        ("actions", a),
-        ("next_observations", o),
-        ("rewards", None),
-        ("infos/qpos", Some(spec.qpos_dim)),
-        ("infos/qvel", Some(spec.qvel_dim)),
-        ("terminals", None),
-        ("timeouts", None),
-    ];
-    let create = |(name, width)| {
-        let is_flag = matches!(name, "terminals" | "timeouts");
-        let column = match is_flag {
-            true => Column::create::<bool>(file, name, width)?,
-            false => Column::create::<f32>(file, name, width)?,
-        };
-        let buffer = Vec::new();
-        Ok(Buffered { column, is_flag, buffer })
-    };
-    columns.into_iter().map(create).collect()
-}
-
-impl Buffered {
-    fn flush(&mut self) -> hdf5::Result<()> {
-        let flags = || Vec::from_iter(self.buffer.iter().map(|value| *value == 1.0));
-        match self.is_flag {
-            true => self.column.append(&flags())?,
-            false => self.column.append(&self.buffer)?,
+        for (column, buffer) in &mut self.columns {
+            let flags = || Vec::from_iter(buffer.iter().map(|value| *value == 1.0));
+            let appended = match is_flag(column.name) {
+                true => column.append(&flags()),
+                false => column.append(buffer),
+            };
+            appended.map_err(|source| self.file.failed(source))?;
+            buffer.clear();
         }
-        self.buffer.clear();
         Ok(())
     }
 }
@@ -167,11 +159,12 @@ pub fn write_experience(
     episodes: &[(OnlineEpisode<'_>, &[u32])],
 ) -> Result<(), DatasetError> {
     let path = path.as_ref();
-    let [mut observations, mut actions, mut next_observations, mut rewards] =
-        [const { Vec::new() }; 4];
+    let [mut observations, mut next_observations] = [const { Vec::new() }; 2];
+    let [mut actions, mut rewards] = [const { Vec::new() }; 2];
     let [mut terminals, mut timeouts, mut interventions] = [const { Vec::new() }; 3];
     for (rows, acted) in episodes {
-        let n = rows.steps(o, a).map_err(|problem| DatasetError::new(path, problem))?;
+        let error = |problem| DatasetError::new(path, problem);
+        let n = rows.steps(o, a).map_err(error)?;
         observations.extend_from_slice(&rows.observations[..n * o]);
         actions.extend_from_slice(rows.actions);
         next_observations.extend_from_slice(&rows.observations[o..]);
@@ -180,25 +173,17 @@ pub fn write_experience(
         timeouts.extend((1..=n).map(|step| step == n && !rows.terminated));
         interventions.extend((0..n as u32).map(|step| acted.binary_search(&step).is_ok()));
     }
-    let file = NewFile::create(path)?;
-    let write = || {
-        for (name, width, values) in [
-            ("observations", Some(o), &observations),
-            ("actions", Some(a), &actions),
-            ("next_observations", Some(o), &next_observations),
-            ("rewards", None, &rewards),
-        ] {
-            Column::create::<f32>(&file, name, width)?.append(values)?;
-        }
-        for (name, flags) in [("terminals", &terminals), ("timeouts", &timeouts)] {
-            Column::create::<bool>(&file, name, None)?.append(flags)?;
-        }
+    NewFile::write(path, |file| {
+        file.put("observations", Some(o), &observations)?;
+        file.put("actions", Some(a), &actions)?;
+        file.put("next_observations", Some(o), &next_observations)?;
+        file.put("rewards", None, &rewards)?;
+        file.put("terminals", None, &terminals)?;
+        file.put("timeouts", None, &timeouts)?;
         if interventions.contains(&true) {
             file.hdf5.create_group("infos")?;
-            Column::create::<bool>(&file, "infos/intervention", None)?.append(&interventions)?;
+            file.put("infos/intervention", None, &interventions)?;
         }
-        write_metadata(&file, environment, metadata)
-    };
-    write().map_err(|source| file.failed(source))?;
-    file.finish()
+        write_metadata(file, environment, metadata)
+    })
 }

@@ -23,7 +23,9 @@ const MATLAB: Load = Python(
 );
 const PICKLE: Load =
     Python("load it by pickle.load, if you trust who wrote it: a pickle can run any program");
-
+const GZIP: Load = Get("unpack it by gunzip");
+const LFS: Load = Get("`git lfs pull` fetches the file");
+const SQLITE: &str = "a SQLite database, as ROS 2's bags (.db3) are";
 const ROS: Load = Python(
     "load it by the library rosbags, and take of all topics what was the latest at each command",
 );
@@ -40,19 +42,20 @@ const STARTS: [(&[u8], &str, Load); 13] = [
     (b"MATLAB", "a MATLAB file", MATLAB),
     (b"#ROSBAG", "a ROS bag", ROS),
     (b"\x89MCAP", "an MCAP file, as ROS 2 records them", ROS),
-    (b"SQLite format 3", "a SQLite database, as ROS 2's bags (.db3) are", ROS),
-    (b"\x1f\x8b", "a file compressed by gzip", Get("unpack it by gunzip")),
-    (b"version https://git-lfs", "a pointer of Git LFS", Get("`git lfs pull` fetches the file")),
+    (b"SQLite format 3", SQLITE, ROS),
+    (b"\x1f\x8b", "a file compressed by gzip", GZIP),
+    (b"version https://git-lfs", "a pointer of Git LFS", LFS),
 ];
 
 /// A file in a folder, name of the folder's format, and remedy.
 const FOLDERS: [(&str, &str, Load); 4] = [
     (".zgroup", "a Zarr store", ZARR),
     ("zarr.json", "a Zarr store", ZARR),
-    ("features.json", "a dataset of TensorFlow, as RLDS's are", TENSORFLOW),
+    ("features.json", RLDS, TENSORFLOW),
     ("metadata.yaml", "a ROS 2 bag", ROS),
 ];
 
+const RLDS: &str = "a dataset of TensorFlow, as RLDS's are";
 const ZARR: Load = Python("load it by zarr.open");
 const TENSORFLOW: Load = Python("load it by tensorflow_datasets.builder_from_directory");
 
@@ -68,11 +71,12 @@ pub(crate) fn start_of(path: &Path) -> io::Result<(File, Vec<u8>)> {
 }
 
 /// The problem with a file that is neither HDF5 nor zip, by its first [`START`] bytes.
-pub(crate) fn of_start(start: &[u8]) -> Problem {
+pub(crate) fn from_start(start: &[u8]) -> Problem {
     if let Some((_, what, load)) = STARTS.iter().find(|(bytes, _, _)| start.starts_with(bytes)) {
         return foreign(*what, *load);
     }
-    let chunk = start.utf8_chunks().next().map_or("", |chunk| chunk.valid());
+    let mut chunks = start.utf8_chunks();
+    let chunk = chunks.next().map_or("", |chunk| chunk.valid());
     // The last character may be cut off.
     let text = if start.len() - chunk.len() < 4 { chunk } else { "" };
     let first_line = text.lines().next().unwrap_or_default();
@@ -89,7 +93,7 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
     }
 }
 
-pub(crate) fn of_folder(folder: &Path) -> Problem {
+pub(crate) fn from_folder(folder: &Path) -> Problem {
     let text = |file: &str, key: &str| {
         let json: Value = serde_json::from_slice(&fs::read(folder.join(file)).ok()?).ok()?;
         json[key].as_str().map(str::to_owned)
@@ -102,15 +106,15 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
     }
     let format = |file| text(file, "data_format").filter(|format| format != "hdf5");
     let Some(format) = format("data/metadata.json").or_else(|| format("metadata.json")) else {
-        let known = FOLDERS.iter().find(|(file, _, _)| folder.join(file).exists());
-        return known.map_or(Problem::UnknownFolder, |(_, what, load)| foreign(*what, *load));
+        let format = FOLDERS.iter().find(|(file, _, _)| folder.join(file).exists());
+        return format.map_or(Problem::UnknownFolder, |(_, what, load)| foreign(*what, *load));
     };
     let load = Convert("quad-convert FOLDER");
     foreign(format!("a Minari dataset stored as {format}"), load)
 }
 
 /// The problem with an HDF5 file of robomimic's layout.
-pub(crate) fn of_robomimic(has_rewards: bool) -> Problem {
+pub(crate) fn robomimic(has_rewards: bool) -> Problem {
     match has_rewards {
         true => foreign("a robomimic file", Convert("quad-convert FILE --observations KEY …")),
         false => foreign(
@@ -121,7 +125,7 @@ pub(crate) fn of_robomimic(has_rewards: bool) -> Problem {
 }
 
 /// The problem with a zip archive of these files, if they are not OGBench's.
-pub(crate) fn of_archive(files: &[impl AsRef<str>]) -> Option<Problem> {
+pub(crate) fn from_archive(files: &[impl AsRef<str>]) -> Option<Problem> {
     let has = |ending: &str| files.iter().any(|name| name.as_ref().ends_with(ending));
     if has("timeouts.npy") {
         // In OGBench's layout all ends are `terminals`, and those of the task are in `masks`.

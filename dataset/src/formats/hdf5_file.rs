@@ -45,8 +45,8 @@ impl Hdf5File {
     fn checked(path: &Path) -> Result<Self, Problem> {
         let (plain, start) = foreign::start_of(path)?;
         let bytes = plain.metadata()?.len();
-        if Format::of(&start) != Some(Format::Hdf5) {
-            return Err(foreign::of_start(&start));
+        if Format::from_start(&start) != Some(Format::Hdf5) {
+            return Err(foreign::from_start(&start));
         }
         let refused = |source| refusal(&plain, &start, bytes, source);
         let file = hdf5::File::open(path).map_err(refused)?;
@@ -80,23 +80,20 @@ impl Hdf5File {
         Some(text_in(&*self.file.attr(name).ok()?).unwrap_or_default())
     }
 
-    /// Root attribute of `expected` texts; empty if absent.
-    pub(crate) fn names(
-        &self,
-        name: &'static str,
-        expected: usize,
-    ) -> Result<Vec<String>, Problem> {
+    /// Root attribute of `count` texts; empty if absent.
+    pub(crate) fn names(&self, name: &'static str, count: usize) -> Result<Vec<String>, Problem> {
         let Ok(holder) = self.file.attr(name) else { return Ok(Vec::new()) };
         let texts = texts_in(&holder).unwrap_or_default();
-        match texts.len() == expected {
+        match texts.len() == count {
             true => Ok(texts),
-            false => Err(Problem::Names(name, texts.len(), expected)),
+            false => Err(Problem::Names(name, texts.len(), count)),
         }
     }
 
     /// Rows and width of an array.
     pub(crate) fn size(&self, array: &str) -> Result<(usize, usize), Problem> {
-        let dataset = self.dataset(array).map_err(|problem| problem.of(array))?;
+        let dataset = self.dataset(array);
+        let dataset = dataset.map_err(|problem| problem.in_array(array))?;
         let empty = Array::<f32>::new(array, dataset.shape(), Vec::new())?;
         Ok((empty.rows(), empty.width))
     }
@@ -128,7 +125,10 @@ impl Hdf5File {
             TypeDescriptor::Float(_) => Ok(dataset.read_raw::<f32>()?),
             // A damaged file may hold any byte, which is undefined behavior in a `bool`. HDF5's
             // conversion saturates, so no other value becomes 0 or 1.
-            _ => Ok(dataset.read_raw::<i8>()?.into_iter().map(f32::from).collect()),
+            _ => {
+                let bytes = dataset.read_raw::<i8>()?;
+                Ok(bytes.into_iter().map(f32::from).collect())
+            }
         });
         flags?.into_flags(rows)
     }
@@ -147,14 +147,15 @@ impl Hdf5File {
             check_size(&dataset.shape(), most, self.bytes)?;
             Ok((dataset.shape(), values(&dataset, descriptor)?))
         };
-        let (shape, values) = read().map_err(|problem: ArrayProblem| problem.of(array))?;
+        let (shape, values) = read().map_err(|problem: ArrayProblem| problem.in_array(array))?;
         Array::new(array, shape, values)
     }
 
     fn dataset(&self, array: &str) -> Result<hdf5::Dataset, ArrayProblem> {
         if !self.has(array) {
-            let group = array.rsplit_once('/').map_or("/", |(group, _)| group);
-            return Err(ArrayProblem::Missing(self.members(group).unwrap_or_default()));
+            let (group, _) = array.rsplit_once('/').unwrap_or(("/", array));
+            let members = self.members(group).unwrap_or_default();
+            return Err(ArrayProblem::Missing(members));
         }
         let problem = |source: hdf5::Error| match self.file.group(array) {
             Ok(_) => ArrayProblem::Group,
@@ -188,7 +189,7 @@ fn descriptor(
     dataset: &hdf5::Dataset,
     expected: &'static str,
 ) -> Result<TypeDescriptor, ArrayProblem> {
-    let wrong = |found: String| ArrayProblem::Type(found, expected);
+    let wrong = |name: String| ArrayProblem::Type(name, expected);
     let datatype = dataset.dtype()?;
     // `to_descriptor` reads an enum's member into 8 bytes, whatever its size in the file.
     if datatype.size() > MAX_ELEMENT_BYTES {

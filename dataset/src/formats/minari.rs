@@ -5,6 +5,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
+use serde_json::Value;
 
 use crate::error::{DatasetError, Problem};
 use crate::formats::array::Array;
@@ -41,11 +42,6 @@ pub(crate) struct Metadata {
     total_episodes: Option<usize>,
 }
 
-#[derive(Deserialize)]
-struct EnvironmentId {
-    id: String,
-}
-
 impl Metadata {
     pub(super) fn read(data_file: &Path) -> Result<Self, DatasetError> {
         let path = data_file.with_file_name("metadata.json");
@@ -59,8 +55,10 @@ impl Metadata {
 
     /// Name in the table of environments if its simulation is known, else Gymnasium's id.
     pub(super) fn environment(&self) -> Option<String> {
-        let EnvironmentId { id } = serde_json::from_str(self.env_spec.as_ref()?).ok()?;
-        Some(environment::find_gymnasium(&id).map_or(id, |environment| environment.name.clone()))
+        let json: Value = serde_json::from_str(self.env_spec.as_ref()?).ok()?;
+        let id = json["id"].as_str()?;
+        let spec = environment::find_gymnasium(id);
+        Some(spec.map_or(id, |spec| spec.name.as_str()).to_owned())
     }
 }
 
@@ -68,7 +66,9 @@ impl Metadata {
 /// concatenated in the order of [`parts`].
 pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Problem> {
     let mut recording = Recording { terminal_array: "terminations", ..Recording::default() };
-    let episodes = episodes(file);
+    let names = file.members("/").unwrap_or_default();
+    let number = |name: &String| name.strip_prefix(EPISODE)?.parse::<usize>().ok();
+    let episodes = names.iter().filter_map(number).count();
     let expected = metadata.total_episodes.unwrap_or(episodes);
     if expected != episodes {
         return Err(Problem::Episodes(episodes, expected));
@@ -77,12 +77,6 @@ pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Pr
         append(file, &format!("{EPISODE}{episode}"), &mut recording)?;
     }
     Ok(recording)
-}
-
-fn episodes(file: &Hdf5File) -> usize {
-    let numbers = file.members("/").unwrap_or_default();
-    let number = |name: &String| name.strip_prefix(EPISODE)?.parse::<usize>().ok();
-    numbers.iter().filter_map(number).count()
 }
 
 /// Appends an episode of T steps as T + 1 rows, the last of which is its final state.
@@ -106,14 +100,15 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
     recording.terminals.extend(terminals);
     recording.timeouts.extend(timeouts);
     recording.ends.extend((1..=steps).map(|step| step == steps));
-    recording.kinds.resize(recording.ends.len(), RowKind::Transition);
+    let kinds = vec![RowKind::Transition; steps];
+    recording.kinds.extend(kinds);
     recording.push_last_state();
     Ok(())
 }
 
 fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, Problem> {
     let Some(members) = file.members(name) else { return file.numbers(name) };
-    let read = |part: String| file.numbers(&format!("{name}/{part}"))?.of_rows(rows);
+    let read = |part: String| file.numbers(&format!("{name}/{part}"))?.with_rows(rows);
     let columns = parts(members).into_iter().map(read);
     let columns: Vec<Array<f32>> = columns.collect::<Result<_, _>>()?;
     let row = |row: usize| columns.iter().flat_map(move |column| column.row(row));

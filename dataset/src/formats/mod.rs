@@ -17,12 +17,30 @@ use std::path::{Path, PathBuf};
 use self::hdf5_file::Hdf5File;
 use self::npz_file::NpzFile;
 use crate::error::{DatasetError, Problem};
+use crate::normalize::Normalize;
 use crate::recording::Recording;
 use crate::tables::benchmarks::{self, Format};
 use crate::tables::environment::{self, EnvironmentSpec};
 use crate::tables::maze::MazeTask;
+use crate::tables::reward::RewardRule;
 
 pub use minari::minari_folder;
+
+/// Options of [`Transitions::read`](crate::Transitions::read).
+#[derive(Clone, Copy, Debug, Default)]
+pub struct ReadOptions {
+    /// Environment that provides dimensions, time limit and reference returns. Without it the
+    /// dimensions are the source's, and a file without timeouts has none.
+    pub environment: Option<&'static EnvironmentSpec>,
+    /// Maze task that replaces the source's rewards and masks.
+    pub task: Option<MazeTask>,
+    /// Map from the source's rewards to those that are trained on.
+    pub reward: RewardRule,
+    /// Columns to normalize. Actions that are not normalized must be within [-1, 1].
+    pub normalize: Normalize,
+    /// Steps of a chunk that will be learned; 0 if that is not known.
+    pub chunk: usize,
+}
 
 /// The file with the data: `main_data.hdf5` of a Minari folder, else the path itself.
 pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {
@@ -30,7 +48,7 @@ pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {
     if !path.is_dir() {
         return Ok(path.to_owned());
     }
-    minari::data_file(path).ok_or_else(|| DatasetError::new(path, foreign::of_folder(path)))
+    minari::data_file(path).ok_or_else(|| DatasetError::new(path, foreign::from_folder(path)))
 }
 
 pub(crate) enum Source {
@@ -49,7 +67,7 @@ impl Source {
             return Ok(Self::Minari(Hdf5File::open(&file)?, metadata));
         }
         let (_, start) = foreign::start_of(path).map_err(|source| error(source.into()))?;
-        if Format::of(&start) == Some(Format::Npz) {
+        if Format::from_start(&start) == Some(Format::Npz) {
             return Ok(Self::OgBench(NpzFile::open(path)?));
         }
         let file = Hdf5File::open(path)?;
@@ -61,7 +79,7 @@ impl Source {
         let groups = file.members("data").unwrap_or_default();
         if let Some(name) = groups.iter().find(|name| name.starts_with("demo_")) {
             let has_rewards = file.has(&format!("data/{name}/rewards"));
-            return Err(error(foreign::of_robomimic(has_rewards)));
+            return Err(error(foreign::robomimic(has_rewards)));
         }
         if path.ends_with(minari::DATA_FILE) || file.has("episode_0") {
             return Ok(Self::Minari(file, minari::Metadata::read(path)?));
@@ -100,7 +118,7 @@ impl Source {
             return Ok(());
         }
         let is_simulated = simulation.is_ok();
-        Err(Problem::OtherEnvironment { claimed, expected, is_simulated })
+        Err(Problem::OtherEnvironment(claimed, expected, is_simulated))
     }
 
     /// Reads all rows. `environment` gives the time limit and goal of a D4RL file; `task` replaces

@@ -46,8 +46,9 @@ impl NewFile {
         };
         // The earliest format is read by all HDF5 versions, and its groups have no timestamps.
         let mut builder = hdf5::File::with_options();
-        let hdf5 = builder.with_fapl(|access| access.libver_earliest()).create(&partial);
-        let hdf5 = hdf5.map_err(|source| DatasetError::new(path, Problem::Write(source)))?;
+        let builder = builder.with_fapl(|access| access.libver_earliest());
+        let error = |source| DatasetError::new(path, Problem::Write(source));
+        let hdf5 = builder.create(&partial).map_err(error)?;
         let path = path.to_owned();
         Ok(Self { path, partial, hdf5 })
     }
@@ -58,6 +59,26 @@ impl NewFile {
 
     pub(crate) fn failed(&self, source: hdf5::Error) -> DatasetError {
         DatasetError::new(&self.partial, Problem::Write(source))
+    }
+
+    /// Writes a whole file.
+    pub(crate) fn write(
+        path: &Path,
+        content: impl FnOnce(&Self) -> hdf5::Result<()>,
+    ) -> Result<(), DatasetError> {
+        let file = Self::create(path)?;
+        content(&file).map_err(|source| file.failed(source))?;
+        file.finish()
+    }
+
+    /// Writes a whole array of rows of `width` numbers or, with `None`, of one number each.
+    pub(crate) fn put<T: H5Type>(
+        &self,
+        name: &'static str,
+        width: Option<usize>,
+        values: &[T],
+    ) -> hdf5::Result<()> {
+        Column::create::<T>(self, name, width)?.append(values)
     }
 
     /// Closes and renames the file; its columns must be dropped before.

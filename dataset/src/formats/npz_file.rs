@@ -25,7 +25,7 @@ impl NpzFile {
             ZipArchive::new(BufReader::new(file)).map_err(|source| error(source.into()))?;
         let path = path.to_owned();
         let files = Vec::from_iter(archive.file_names().filter_map(Result::ok));
-        match foreign::of_archive(&files) {
+        match foreign::from_archive(&files) {
             Some(problem) => Err(error(problem)),
             None => Ok(Self { path, archive }),
         }
@@ -49,28 +49,15 @@ impl NpzFile {
         self.read(array, true)
     }
 
-    pub(crate) fn table(
-        &mut self,
-        array: &str,
-        rows: usize,
-        width: usize,
-    ) -> Result<Vec<f32>, Problem> {
-        self.numbers(array)?.sized(rows, width)
-    }
-
-    pub(crate) fn flags(&mut self, array: &str, rows: usize) -> Result<Vec<bool>, Problem> {
-        self.numbers(array)?.into_flags(rows)
-    }
-
     fn read(&mut self, array: &str, continuous: bool) -> Result<Array<f32>, Problem> {
         if !self.has(array) {
             let names = self.archive.file_names().filter_map(Result::ok);
             let there = names.filter_map(|name| Some(name.strip_suffix(".npy")?.to_owned()));
-            return Err(ArrayProblem::Missing(there.collect()).of(array));
+            return Err(ArrayProblem::Missing(there.collect()).in_array(array));
         }
         let entry = self.archive.by_name(&entry(array))?;
         let (shape, values) =
-            values(entry.size(), entry, continuous).map_err(|problem| problem.of(array))?;
+            values(entry.size(), entry, continuous).map_err(|problem| problem.in_array(array))?;
         Array::new(array, shape, values)
     }
 }
@@ -92,8 +79,10 @@ fn values(
     let values = floats(file)?;
     // The checksum is compared at the end of the entry.
     io::copy(&mut reader, &mut io::sink())?;
-    let values = if is_by_columns { by_rows(&shape, &values) } else { values };
-    Ok((shape, values))
+    match is_by_columns {
+        true => Ok((shape.clone(), by_rows(&shape, &values))),
+        false => Ok((shape, values)),
+    }
 }
 
 fn entry(array: &str) -> String {
@@ -101,8 +90,9 @@ fn entry(array: &str) -> String {
 }
 
 fn holds_whole_numbers(dtype: &DType) -> bool {
+    use TypeChar::{Bool, Int, Uint};
     let DType::Plain(element) = dtype else { return false };
-    matches!(element.type_char(), TypeChar::Bool | TypeChar::Int | TypeChar::Uint)
+    matches!(element.type_char(), Bool | Int | Uint)
 }
 
 fn floats(file: NpyFile<impl Read>) -> Result<Vec<f32>, ArrayProblem> {
@@ -130,15 +120,17 @@ fn convert<T: Deserialize>(
 ) -> Result<Vec<f32>, ArrayProblem> {
     let dtype = file.dtype();
     let values = file.data::<T>().map_err(|_| wrong_type(&dtype))?;
-    Ok(values.map(|value| value.map(&to_f32)).collect::<io::Result<_>>()?)
+    let values = values.map(|value| value.map(&to_f32));
+    Ok(values.collect::<io::Result<_>>()?)
 }
 
-fn wrong_type(found: &DType) -> ArrayProblem {
-    ArrayProblem::Type(found.descr(), "numbers or booleans")
+fn wrong_type(dtype: &DType) -> ArrayProblem {
+    ArrayProblem::Type(dtype.descr(), "numbers or booleans")
 }
 
 /// Row-major copy of a column-major array.
 fn by_rows(shape: &[usize], values: &[f32]) -> Vec<f32> {
     let rows = shape.first().copied().unwrap_or(0);
-    (0..rows).flat_map(|row| values.iter().skip(row).step_by(rows.max(1)).copied()).collect()
+    let row = |row| values.iter().skip(row).step_by(rows.max(1));
+    (0..rows).flat_map(row).copied().collect()
 }

@@ -8,7 +8,7 @@ use crate::tables::environment::{self, EnvironmentSpec};
 
 /// Recorded step in float64.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Row<'a> {
+pub struct RecordedStep<'a> {
     /// s, before the step.
     pub observation: &'a [f64],
     /// a, as applied.
@@ -47,10 +47,13 @@ pub fn matching_environments(
     path: impl AsRef<Path>,
 ) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
     let file = Hdf5File::open(path.as_ref())?;
-    let sizes = file.size("observations").and_then(|(_, o)| Ok((o, file.size("actions")?.1)));
-    let sizes = sizes.map_err(|problem| DatasetError::new(file.path(), problem))?;
-    let fits = |spec: &&EnvironmentSpec| (spec.observation_dim, spec.action_dim) == sizes;
-    Ok(environment::all().iter().filter(fits).collect())
+    let width = |array| match file.size(array) {
+        Ok((_, width)) => Ok(width),
+        Err(problem) => Err(DatasetError::new(file.path(), problem)),
+    };
+    let sizes = (width("observations")?, width("actions")?);
+    let specs = environment::all().iter();
+    Ok(specs.filter(|spec| spec.sizes() == sizes).collect())
 }
 
 const GOAL_DIM: usize = 2;
@@ -62,27 +65,34 @@ impl RecordedRows {
         environment: &'static EnvironmentSpec,
     ) -> Result<Self, DatasetError> {
         let file = Hdf5File::open(path.as_ref())?;
-        Self::of(&file, environment).map_err(|problem| DatasetError::new(file.path(), problem))
-    }
-
-    fn of(file: &Hdf5File, environment: &'static EnvironmentSpec) -> Result<Self, Problem> {
-        let (rows, _) = file.size("actions")?;
-        let table = |array, width| finite(file, array, rows, width);
-        let stored = file.has("next_observations");
-        let stored = stored.then(|| table("next_observations", environment.observation_dim));
-        let goals = environment.maze.map(|_| table("infos/goal", GOAL_DIM));
-        Ok(Self {
-            environment,
-            observations: table("observations", environment.observation_dim)?,
-            actions: table("actions", environment.action_dim)?,
-            next_observations: stored.transpose()?,
-            rewards: table("rewards", 1)?,
-            terminals: file.flags("terminals", rows)?,
-            timeouts: file.flags("timeouts", rows)?,
-            qpos: table("infos/qpos", environment.qpos_dim)?,
-            qvel: table("infos/qvel", environment.qvel_dim)?,
-            goals: goals.transpose()?,
-        })
+        let table = |array: &str, rows, width| -> Result<_, Problem> {
+            let values: Vec<f64> = file.table(array, rows, width)?;
+            match values.iter().position(|value| !value.is_finite()) {
+                None => Ok(values),
+                Some(i) => Err(RowProblem::NotFinite(values[i] as f32).in_row(array, i / width)),
+            }
+        };
+        let read = || -> Result<_, Problem> {
+            let (rows, _) = file.size("actions")?;
+            let o = environment.observation_dim;
+            let stored = file.has("next_observations");
+            let stored = stored.then(|| table("next_observations", rows, o));
+            let goals = || table("infos/goal", rows, GOAL_DIM);
+            let goals = environment.maze.map(|_| goals());
+            Ok(Self {
+                environment,
+                observations: table("observations", rows, o)?,
+                actions: table("actions", rows, environment.action_dim)?,
+                next_observations: stored.transpose()?,
+                rewards: table("rewards", rows, 1)?,
+                terminals: file.flags("terminals", rows)?,
+                timeouts: file.flags("timeouts", rows)?,
+                qpos: table("infos/qpos", rows, environment.qpos_dim)?,
+                qvel: table("infos/qvel", rows, environment.qvel_dim)?,
+                goals: goals.transpose()?,
+            })
+        };
+        read().map_err(|problem| DatasetError::new(file.path(), problem))
     }
 
     /// Number of rows.
@@ -96,18 +106,18 @@ impl RecordedRows {
     }
 
     /// Row `i < len()`.
-    pub fn row(&self, i: usize) -> Row<'_> {
+    pub fn row(&self, i: usize) -> RecordedStep<'_> {
         let spec = self.environment;
-        let at = |width: usize| i * width..(i + 1) * width;
-        Row {
-            observation: &self.observations[at(spec.observation_dim)],
-            action: &self.actions[at(spec.action_dim)],
+        let columns = |width: usize| i * width..(i + 1) * width;
+        RecordedStep {
+            observation: &self.observations[columns(spec.observation_dim)],
+            action: &self.actions[columns(spec.action_dim)],
             next_observation: self.next_observation(i),
             reward: self.rewards[i],
             terminal: self.terminals[i],
             timeout: self.timeouts[i],
-            qpos: &self.qpos[at(spec.qpos_dim)],
-            qvel: &self.qvel[at(spec.qvel_dim)],
+            qpos: &self.qpos[columns(spec.qpos_dim)],
+            qvel: &self.qvel[columns(spec.qvel_dim)],
         }
     }
 
@@ -128,15 +138,7 @@ impl RecordedRows {
     }
 
     /// Iterates over all rows.
-    pub fn iter(&self) -> impl Iterator<Item = Row<'_>> {
+    pub fn iter(&self) -> impl Iterator<Item = RecordedStep<'_>> {
         (0..self.len()).map(|i| self.row(i))
-    }
-}
-
-fn finite(file: &Hdf5File, array: &str, rows: usize, width: usize) -> Result<Vec<f64>, Problem> {
-    let values: Vec<f64> = file.table(array, rows, width)?;
-    match values.iter().position(|value| !value.is_finite()) {
-        None => Ok(values),
-        Some(i) => Err(RowProblem::NotFinite(values[i] as f32).at(array, i / width)),
     }
 }

@@ -1,22 +1,20 @@
 //! Summary of a dataset for its user: statistics, histograms and problems.
 
-mod histogram;
 mod page;
 
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::error::{DatasetError, Problem};
-use crate::formats::Source;
-use crate::read_options::ReadOptions;
-use crate::statistics::Summary;
+use crate::error::DatasetError;
+use crate::formats::{ReadOptions, Source};
+use crate::statistics::{Range, Summary};
 use crate::tables::benchmarks;
 use crate::tables::environment::{self, EnvironmentSpec};
 use crate::tables::reward::{RewardRule, RewardScaling};
 use crate::{checks, warnings};
 
-pub use histogram::Histogram;
+pub use page::Histogram;
 
 /// Statistics and problems of a dataset: lengths of episodes in steps, and ranges of the numbers in a
 /// column or in all. Numbers that are not finite are excluded; a statistic of no numbers is NaN, null
@@ -78,39 +76,9 @@ pub struct Scores {
     pub max_score: f64,
 }
 
-impl Scores {
-    fn of(returns: Summary, spec: &EnvironmentSpec) -> Self {
-        Self {
-            min_score: spec.normalized_score(returns.min),
-            mean_score: spec.normalized_score(returns.mean),
-            max_score: spec.normalized_score(returns.max),
-        }
-    }
-}
-
-/// Smallest and largest of some numbers.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-#[allow(missing_docs)] // The names say what each is.
-pub struct Range {
-    pub min: f64,
-    pub max: f64,
-}
-
-impl Range {
-    fn of_columns(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Vec<Self> {
-        let columns = Summary::of_columns(values, width, counts).into_iter();
-        columns.map(|Summary { min, max, .. }| Self { min, max }).collect()
-    }
-
-    fn constant(ranges: &[Self]) -> Vec<usize> {
-        (0..ranges.len()).filter(|&i| ranges[i].min == ranges[i].max).collect()
-    }
-
-    fn over(ranges: &[Self]) -> Self {
-        let min = ranges.iter().map(|range| range.min).fold(f64::NAN, f64::min);
-        let max = ranges.iter().map(|range| range.max).fold(f64::NAN, f64::max);
-        Self { min, max }
-    }
+fn constant(ranges: &[Range]) -> Vec<usize> {
+    let is_constant = |i: &usize| ranges[*i].min == ranges[*i].max;
+    (0..ranges.len()).filter(is_constant).collect()
 }
 
 /// Summarizes a dataset of any format. Bad numbers are listed as problems; only an unreadable
@@ -128,41 +96,44 @@ pub fn inspect(
     let recording = source.read(spec, task)?;
 
     let other = environment.and_then(|environment| source.check_environment(environment).err());
-    let refused: Vec<Problem> =
-        other.into_iter().chain(checks::problems(&recording, spec)).collect();
-    let doubts = warnings::warnings(&recording, &ReadOptions { reward, ..ReadOptions::default() });
-
-    let with_hint = |problem: &Problem| format!("{problem}; {}", problem.hint());
+    let refused = other.into_iter().chain(checks::problems(&recording, spec));
+    let refused = Vec::from_iter(refused.map(|problem| format!("{problem}; {}", problem.hint())));
+    let options = ReadOptions { reward, ..ReadOptions::default() };
+    let doubts = warnings::warnings(&recording, &options);
 
     let episodes = recording.episodes();
-    let lengths: Vec<f64> = episodes.iter().map(|episode| episode.length as f64).collect();
-    let returns: Vec<f64> =
-        episodes.iter().map(|episode| episode.sum).filter(|sum| sum.is_finite()).collect();
-    let (length, sum) = (Summary::of(&lengths), Summary::of(&returns));
+    let lengths = Vec::from_iter(episodes.iter().map(|episode| episode.length as f64));
+    let returns = episodes.iter().map(|episode| episode.sum);
+    let returns = Vec::from_iter(returns.filter(|sum| sum.is_finite()));
+    let (length, sum) = (Summary::new(&lengths), Summary::new(&returns));
     let steps: f64 = lengths.iter().sum();
     let share = |flags: &[bool]| flags.iter().filter(|&&flag| flag).count() as f64 / steps;
     let is_step = |row: usize| recording.is_step(row);
-    let action_ranges = Range::of_columns(&recording.actions, recording.action_dim, is_step);
-    let observation_ranges =
-        Range::of_columns(&recording.observations, recording.observation_dim, |_| true);
-    let reward_ranges = Range::of_columns(&recording.rewards, 1, is_step);
+    let (o, a) = (recording.observation_dim, recording.action_dim);
+    let action_ranges = Range::columns(&recording.actions, a, is_step);
+    let observation_ranges = Range::columns(&recording.observations, o, |_| true);
+    let reward_ranges = Range::columns(&recording.rewards, 1, is_step);
     Ok(Inspection {
         path: path.into(),
         format: source.format(),
         environment: spec.map(|spec| spec.name.clone()).or(claimed),
         transitions: recording.transitions().count(),
         episodes: episodes.len(),
-        observation_dim: recording.observation_dim,
-        action_dim: recording.action_dim,
+        observation_dim: o,
+        action_dim: a,
         min_length: length.min,
         mean_length: length.mean,
         max_length: length.max,
         min_return: sum.min,
         mean_return: sum.mean,
         max_return: sum.max,
-        scores: spec.map(|spec| Scores::of(sum, spec)),
-        constant_observations: Range::constant(&observation_ranges),
-        constant_actions: Range::constant(&action_ranges),
+        scores: spec.map(|spec| Scores {
+            min_score: spec.normalized_score(sum.min),
+            mean_score: spec.normalized_score(sum.mean),
+            max_score: spec.normalized_score(sum.max),
+        }),
+        constant_observations: constant(&observation_ranges),
+        constant_actions: constant(&action_ranges),
         reward_size: RewardScaling::default().rms(&recording),
         observation_names: recording.names.observations,
         action_names: recording.names.actions,
@@ -173,9 +144,9 @@ pub fn inspect(
         observation_ranges,
         terminals: share(&recording.terminals),
         timeouts: share(&recording.timeouts),
-        returns: Histogram::of(&returns),
-        lengths: Histogram::of(&lengths),
+        returns: Histogram::new(&returns),
+        lengths: Histogram::new(&lengths),
         refused: !refused.is_empty(),
-        problems: refused.iter().map(with_hint).chain(doubts).collect(),
+        problems: [refused, doubts].concat(),
     })
 }

@@ -1,6 +1,7 @@
 //! Tables of D4RL and OGBench, from `benchmarks.toml`.
 
 use std::collections::BTreeMap;
+use std::iter;
 use std::sync::LazyLock;
 
 use serde::Deserialize;
@@ -43,7 +44,7 @@ pub enum Format {
 
 impl Format {
     /// Format of a file with these first bytes.
-    pub fn of(start: &[u8]) -> Option<Self> {
+    pub fn from_start(start: &[u8]) -> Option<Self> {
         match start {
             [0x89, b'H', b'D', b'F', b'\r', b'\n', 0x1a, b'\n', ..] => Some(Self::Hdf5),
             [b'P', b'K', ..] => Some(Self::Npz),
@@ -132,20 +133,20 @@ struct Place {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Table {
+struct Tables {
     robot: Vec<Robot>,
     maze: BTreeMap<String, Vec<String>>,
     benchmark: Vec<Benchmark>,
 }
 
 #[allow(clippy::expect_used)] // The table is part of the program; the test here reads it.
-static TABLE: LazyLock<Table> = LazyLock::new(|| {
+static TABLES: LazyLock<Tables> = LazyLock::new(|| {
     toml::from_str(include_str!("../../benchmarks.toml")).expect("the embedded table is valid")
 });
 
 /// All benchmarks.
 pub fn all() -> &'static [Benchmark] {
-    &TABLE.benchmark
+    &TABLES.benchmark
 }
 
 /// Benchmark of the given name.
@@ -172,28 +173,29 @@ pub(super) fn environments() -> &'static [BenchmarkEnvironment] {
 }
 
 pub(super) fn environment(name: &str) -> Option<&'static BenchmarkEnvironment> {
-    environments().iter().find(|one| one.name == name)
+    let mut environments = environments().iter();
+    environments.find(|environment| environment.name == name)
 }
 
 /// Task that labels an environment's datasets with rewards, if they have none.
 pub fn relabeling(environment: &str) -> Option<MazeTask> {
     let environment = self::environment(environment)?;
-    environment.task.filter(|_| environment.benchmark.rules.relabel)
+    let is_relabeled = environment.benchmark.rules.relabel;
+    environment.task.filter(|_| is_relabeled)
 }
 
 impl Benchmark {
     fn environments(&'static self) -> impl Iterator<Item = BenchmarkEnvironment> {
-        let of_place = move |family: &'static Family, place| {
+        let places =
+            |family: &'static Family| family.places.iter().map(move |place| (family, place));
+        let places = self.family.iter().flat_map(places);
+        places.flat_map(move |(family, place)| {
+            let default = (family.default_task.unwrap_or(1), String::new());
             let numbers = 1..=self.tasks_per_place.unwrap_or(0);
             let tasks = numbers.map(|number| (number, format!("-task{number}")));
-            let default = (family.default_task.unwrap_or(1), String::new());
-            let tasks = [default].into_iter().chain(tasks);
+            let tasks = iter::once(default).chain(tasks);
             tasks.map(move |(number, suffix)| self.environment(family, place, number, suffix))
-        };
-        let of_family = move |family: &'static Family| {
-            family.places.iter().flat_map(move |place| of_place(family, place))
-        };
-        self.family.iter().flat_map(of_family)
+        })
     }
 
     fn environment(
@@ -204,12 +206,12 @@ impl Benchmark {
         suffix: String,
     ) -> BenchmarkEnvironment {
         let name = |suffix| fill(&self.names.environment, &place.name, "", suffix);
-        let name_of_maze = place.maze.as_deref();
-        let cells = name_of_maze.and_then(|maze| self.cells.get(maze)?.get(number - 1));
+        let maze_name = place.maze.as_deref();
+        let cells = maze_name.and_then(|maze| self.cells.get(maze)?.get(number - 1));
         let center = |[row, column]: Cell| [column, row].map(|i| (f64::from(i) - 1.0) * CELL);
         let is_robot = |robot: &&Robot| Some(&robot.name) == family.robot.as_ref();
-        let robot = TABLE.robot.iter().find(is_robot);
-        let maze = robot.zip(name_of_maze.and_then(|maze| TABLE.maze.get(maze)));
+        let robot = TABLES.robot.iter().find(is_robot);
+        let maze = robot.zip(maze_name.and_then(|maze| TABLES.maze.get(maze)));
         BenchmarkEnvironment {
             name: name(&suffix),
             benchmark: self,
@@ -235,15 +237,20 @@ impl BenchmarkEnvironment {
     /// Reward rule of the benchmark for tasks in mazes, else none.
     pub fn reward(&self) -> RewardRule {
         let reward = self.benchmark.rules.reward;
-        if self.task.is_some() { reward } else { RewardRule::AsIs }
+        self.task.map_or(RewardRule::AsIs, |_| reward)
     }
 
-    fn datasets(&self) -> impl Iterator<Item = (&'static str, String)> {
-        let template = self.benchmark.names.dataset.as_deref();
-        let of = move |data: &'static String| {
-            Some((&**data, fill(template?, &self.place.name, data, "")))
-        };
-        self.place.data.iter().filter_map(of)
+    /// The task on the place's dataset of this name.
+    fn task(&self, data: &str) -> Option<BenchmarkTask> {
+        let (names, place) = (&self.benchmark.names, &self.place.name);
+        Some(BenchmarkTask {
+            name: fill(names.task.as_ref()?, place, data, &self.suffix),
+            benchmark: self.benchmark,
+            environment: self.name.clone(),
+            dataset: fill(names.dataset.as_ref()?, place, data, ""),
+            maze: self.task,
+            is_default: self.suffix.is_empty(),
+        })
     }
 }
 
@@ -272,20 +279,8 @@ pub struct BenchmarkTask {
 pub fn tasks() -> impl Iterator<Item = BenchmarkTask> {
     let places = environments().chunk_by(|one, other| std::ptr::eq(one.place, other.place));
     places.flat_map(|place| {
-        place[0].datasets().flat_map(move |(data, dataset)| {
-            place.iter().filter_map(move |environment| {
-                let benchmark = environment.benchmark;
-                let (template, suffix) = (benchmark.names.task.as_ref()?, &environment.suffix);
-                Some(BenchmarkTask {
-                    name: fill(template, &environment.place.name, data, suffix),
-                    benchmark,
-                    environment: environment.name.clone(),
-                    dataset: dataset.clone(),
-                    maze: environment.task,
-                    is_default: suffix.is_empty(),
-                })
-            })
-        })
+        let datasets = place[0].place.data.iter();
+        datasets.flat_map(move |data| place.iter().filter_map(move |one| one.task(data)))
     })
 }
 
@@ -295,16 +290,16 @@ mod tests {
 
     #[test]
     fn rows_become_tasks() {
-        for (place, task, [x, y, goal_x, goal_y], reach, measured) in [
-            ("antmaze-large", "", [0.0, 0.0, 36.0, 24.0], 0.5, 0),
-            ("antmaze-giant", "-task4", [8.0, 28.0, 44.0, 16.0], 0.5, 0),
-            ("pointmaze-large", "-task4", [28.0, 8.0, 12.0, 16.0], 1.0, 0),
-            ("humanoidmaze-medium", "-task3", [8.0, 16.0, 4.0, 12.0], 0.5, 0),
-            ("antsoccer-arena", "", [20.0, 20.0, 0.0, 20.0], 0.5, 15),
+        for (place, task, start, goal, reach, measured) in [
+            ("antmaze-large", "", [0.0, 0.0], [36.0, 24.0], 0.5, 0),
+            ("antmaze-giant", "-task4", [8.0, 28.0], [44.0, 16.0], 0.5, 0),
+            ("pointmaze-large", "-task4", [28.0, 8.0], [12.0, 16.0], 1.0, 0),
+            ("antsoccer-arena", "", [20.0, 20.0], [0.0, 20.0], 0.5, 15),
         ] {
-            let task = relabeling(&format!("{place}-singletask{task}-v0")).unwrap();
-            assert_eq!((task.start, task.goal), ([x, y], [goal_x, goal_y]), "{place}");
-            assert_eq!((task.reach, task.measured), (reach, measured), "{place}");
+            let name = format!("{place}-singletask{task}-v0");
+            let task = relabeling(&name).unwrap();
+            assert_eq!((task.start, task.goal), (start, goal), "{name}");
+            assert_eq!((task.reach, task.measured), (reach, measured));
         }
         for name in [
             "antmaze-large-singletask-task6-v0",
@@ -333,22 +328,16 @@ mod tests {
 
     #[test]
     fn tasks_and_datasets_are_those_that_are_published() {
-        let all = Vec::from_iter(tasks());
-        assert_eq!(all.len(), 42 * 6);
-        let mut found = [36 + 1, 42 * 6 - 1]
-            .into_iter()
-            .flat_map(|at| [&*all[at].name, &*all[at].environment, &*all[at].dataset]);
-        for name in [
-            "antmaze-medium-navigate-singletask-task1-v0",
-            "antmaze-medium-singletask-task1-v0",
-            "antmaze-medium-navigate-v0",
-            "puzzle-4x6-noisy-singletask-task5-v0",
-            "puzzle-4x6-singletask-task5-v0",
-            "puzzle-4x6-noisy-v0",
-        ] {
-            assert_eq!(found.next(), Some(name));
-        }
+        let tasks = Vec::from_iter(tasks());
+        assert_eq!(tasks.len(), 42 * 6);
+        let names = [37, 251].map(|number| {
+            let task: &BenchmarkTask = &tasks[number];
+            [&*task.name, &task.environment, &task.dataset].join(" ")
+        });
+        let medium = "antmaze-medium-navigate-singletask-task1-v0 antmaze-medium-singletask-task1-v0 antmaze-medium-navigate-v0";
+        let noisy = "puzzle-4x6-noisy-singletask-task5-v0 puzzle-4x6-singletask-task5-v0 puzzle-4x6-noisy-v0";
+        assert_eq!(names, [medium, noisy]);
         let unpublished = "antmaze-giant-explore-singletask-v0";
-        assert!(all.iter().all(|task| task.name != unpublished));
+        assert!(tasks.iter().all(|task| task.name != unpublished));
     }
 }

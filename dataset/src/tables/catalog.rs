@@ -1,5 +1,6 @@
 //! Downloadable datasets: `datasets.toml`, and those named by rules of [`benchmarks`].
 
+use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
 use serde::Deserialize;
@@ -29,22 +30,16 @@ pub struct NamedDataset {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Table {
-    collection: Vec<Collection>,
-}
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
 struct Collection {
     benchmark: String,
     license: String,
     folders: Vec<String>,
-    dataset: Vec<Row>,
+    dataset: Vec<Entry>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Row {
+struct Entry {
     name: String,
     environment: String,
     file: String,
@@ -52,36 +47,48 @@ struct Row {
     sha256: Option<String>,
 }
 
-impl Row {
+impl Entry {
     fn hosted(
         self,
         benchmark: &'static Benchmark,
-        Host { license, folders }: &Host,
+        license: &str,
+        folders: &[String],
     ) -> NamedDataset {
-        let Self { name, environment, file, bytes, sha256 } = self;
-        let addresses = folders.iter().map(|folder| format!("{folder}{file}")).collect();
-        let license = license.clone();
-        NamedDataset { name, benchmark, environment, file, bytes, sha256, license, addresses }
+        let address = |folder: &String| format!("{folder}{}", self.file);
+        NamedDataset {
+            benchmark,
+            license: license.to_owned(),
+            addresses: folders.iter().map(address).collect(),
+            name: self.name,
+            environment: self.environment,
+            file: self.file,
+            bytes: self.bytes,
+            sha256: self.sha256,
+        }
     }
 }
 
 #[allow(clippy::expect_used)] // The tables are part of the program; the first test here reads them.
 static DATASETS: LazyLock<Vec<NamedDataset>> = LazyLock::new(|| {
-    let table: Table =
+    let table: BTreeMap<String, Vec<Collection>> =
         toml::from_str(include_str!("../../datasets.toml")).expect("the embedded table is valid");
-    let listed = table.collection.into_iter().flat_map(
-        |Collection { benchmark, license, folders, dataset }| {
-            let benchmark = benchmarks::find(&benchmark).expect("a collection is of a benchmark");
-            let host = Host { license, folders };
-            dataset.into_iter().map(move |row| row.hosted(benchmark, &host))
-        },
-    );
+    let listed = table.into_values().flatten().flat_map(|collection| {
+        let benchmark = benchmarks::find(&collection.benchmark);
+        let benchmark = benchmark.expect("a collection is of a benchmark");
+        let entries = collection.dataset.into_iter();
+        entries.map(move |entry| entry.hosted(benchmark, &collection.license, &collection.folders))
+    });
     let named = benchmarks::tasks().filter(|task| task.is_default && task.maze.is_some());
     let named = named.filter_map(|task| {
-        let (name, environment) = (task.dataset, task.environment);
-        let file = format!("{name}.{}", task.benchmark.format.extension());
-        let row = Row { name, environment, file, bytes: None, sha256: None };
-        Some(row.hosted(task.benchmark, task.benchmark.host.as_ref()?))
+        let Host { license, folders } = task.benchmark.host.as_ref()?;
+        let entry = Entry {
+            file: format!("{}.{}", task.dataset, task.benchmark.format.extension()),
+            name: task.dataset,
+            environment: task.environment,
+            bytes: None,
+            sha256: None,
+        };
+        Some(entry.hosted(task.benchmark, license, folders))
     });
     listed.chain(named).collect()
 });
@@ -109,29 +116,27 @@ mod tests {
     #[test]
     fn the_table_is_consistent() {
         for dataset in all() {
-            let NamedDataset { name, file, sha256, addresses, .. } = dataset;
-            let found = (find(name), find_file(file));
-            assert_eq!(found, (Some(dataset), Some(dataset)), "names are unique");
+            let (name, file) = (&dataset.name, &dataset.file);
+            assert_eq!([find(name), find_file(file)], [Some(dataset); 2], "unique");
+            let addresses = &dataset.addresses;
             assert!(!addresses.is_empty() && !dataset.license.is_empty(), "{name}");
             let is_address = |url: &String| url.starts_with("http") && url.ends_with(file);
             assert!(addresses.iter().all(is_address), "{name}");
             let is_digit = |digit| matches!(digit, '0'..='9' | 'a'..='f');
-            let is_digest = |text: &String| text.len() == 64 && text.chars().all(is_digit);
-            assert!(sha256.as_ref().is_none_or(is_digest), "{name}: {sha256:?}");
-            assert!(sha256.is_none() || dataset.bytes.is_some(), "{name}");
-            let is_simulated = environment::find(&dataset.environment).is_ok();
-            assert!(
-                is_simulated || benchmarks::relabeling(&dataset.environment).is_some(),
-                "{name}"
-            );
-            assert!(
-                name.starts_with(&*simulation_of(&dataset.environment)) || sha256.is_none(),
-                "{name}"
-            );
+            let environment = &dataset.environment;
+            if let Some(digest) = &dataset.sha256 {
+                assert!(digest.len() == 64 && digest.chars().all(is_digit), "{name}");
+                assert!(dataset.bytes.is_some(), "{name}");
+                assert!(name.starts_with(&*simulation_of(environment)), "{name}");
+            }
+            let is_simulated = environment::find(environment).is_ok();
+            let is_relabeled = benchmarks::relabeling(environment).is_some();
+            assert!(is_simulated || is_relabeled, "{name}");
         }
         assert_eq!(all().len(), 54);
         let address =
             "https://rail.eecs.berkeley.edu/datasets/ogbench/antsoccer-medium-stitch-v0.npz";
-        assert_eq!(find("antsoccer-medium-stitch-v0").unwrap().addresses, [address]);
+        let stitch = find("antsoccer-medium-stitch-v0").unwrap();
+        assert_eq!(stitch.addresses, [address]);
     }
 }

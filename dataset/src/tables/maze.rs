@@ -59,7 +59,8 @@ impl MazeTask {
     /// Replaces rewards and masks by those of this task, evaluated in the state before each step.
     pub(crate) fn label(&self, recording: &mut Recording) {
         for row in 0..recording.rows() {
-            let position = recording.observation(row).get(self.measured..self.measured + 2);
+            let state = recording.observation(row);
+            let position = state.get(self.measured..self.measured + 2);
             let is_reached = position.is_some_and(|position| {
                 self.is_reached([position[0], position[1]].map(f64::from), self.goal)
             });

@@ -32,7 +32,7 @@ pub enum RewardRule {
 
 /// Affine map `(r - subtract) · times`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RewardScaling {
+pub(crate) struct RewardScaling {
     subtract: f64,
     times: f64,
 }
@@ -48,21 +48,21 @@ impl RewardScaling {
     pub(crate) fn rms(self, recording: &Recording) -> f64 {
         let rewards = recording.transitions().map(|row| recording.rewards[row]);
         let rewards = rewards.map(|reward| f64::from(self.apply(reward)));
-        Summary::of(&Vec::from_iter(rewards.filter(|reward| reward.is_finite()))).rms
+        Summary::new(&Vec::from_iter(rewards.filter(|reward| reward.is_finite()))).rms
     }
 
     /// The training reward.
-    pub fn apply(self, reward: f32) -> f32 {
+    pub(crate) fn apply(self, reward: f32) -> f32 {
         ((f64::from(reward) - self.subtract) * self.times) as f32
     }
 }
 
 impl RewardRule {
     /// The rule's map, given the trajectory returns; `None` if a division by their range is by 0.
-    pub fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
+    pub(crate) fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
         let (subtract, times) = match self {
             Self::Locomotion => {
-                let Summary { min, max, .. } = Summary::of(returns);
+                let Summary { min, max, .. } = Summary::new(returns);
                 if min == max {
                     return None;
                 }
@@ -85,7 +85,7 @@ mod tests {
     #[test]
     fn each_name_says_what_its_rule_does_to_rewards_of_0_and_1() {
         // The returns range from -1 to 3.
-        for (name, of_0, of_1) in [
+        for (name, reward_0, reward_1) in [
             ("locomotion", 0.0, 250.0),
             ("as-is", 0.0, 1.0),
             ("subtract-1", -1.0, 0.0),
@@ -95,7 +95,8 @@ mod tests {
         ] {
             let rule: RewardRule = serde_json::from_value(name.into()).unwrap();
             let scaling = rule.scaling(&[3.0, -1.0, 0.5]).unwrap();
-            assert_eq!((scaling.apply(0.0), scaling.apply(1.0)), (of_0, of_1), "{name}");
+            assert_eq!(scaling.apply(0.0), reward_0, "{name}");
+            assert_eq!(scaling.apply(1.0), reward_1, "{name}");
         }
     }
 }

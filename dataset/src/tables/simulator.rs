@@ -86,17 +86,17 @@ pub struct Healthy {
     pub pitch: (f64, f64),
     /// Limit of all positions except x and z, and of all velocities.
     #[serde(default)]
-    pub others: Option<f64>,
+    pub limit: Option<f64>,
 }
 
 impl Healthy {
     /// True if an episode continues in a state; false with NaN.
     pub fn contains(&self, qpos: &[f64], qvel: &[f64]) -> bool {
         let within = |(min, max): (f64, f64), value: f64| value > min && value < max;
-        let mut others = qpos[2..].iter().chain(qvel);
+        let mut limited = qpos[2..].iter().chain(qvel);
         within(self.z, qpos[1])
             && within(self.pitch, qpos[2])
-            && self.others.is_none_or(|limit| others.all(|value| value.abs() < limit))
+            && self.limit.is_none_or(|limit| limited.all(|value| value.abs() < limit))
     }
 }
 

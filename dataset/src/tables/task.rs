@@ -50,13 +50,13 @@ mod tests {
 
     #[test]
     fn scores_of_an_unknown_environment_are_its_returns() {
-        let known = Task::from(environment::find("hopper").unwrap());
-        assert_eq!([-20.272305, 3234.3].map(|sum| known.score(sum)), [0.0, 100.0]);
-        assert_eq!((known.max_episode_steps(), known.is_normalized()), (Some(1000), true));
-        let unknown = Task::new("my-robot", 5, 2);
-        assert_eq!(
-            (unknown.score(3234.3), unknown.max_episode_steps(), unknown.is_normalized()),
-            (3234.3, None, false)
-        );
+        let hopper = Task::from(environment::find("hopper").unwrap());
+        let own = Task::new("my-robot", 5, 2);
+        let returns = [-20.272305, 3234.3];
+        for (task, scores, limit) in [(hopper, [0.0, 100.0], Some(1000)), (own, returns, None)] {
+            assert_eq!(returns.map(|sum| task.score(sum)), scores);
+            assert_eq!(task.max_episode_steps(), limit);
+            assert_eq!(task.is_normalized(), limit.is_some());
+        }
     }
 }

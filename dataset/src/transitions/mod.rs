@@ -12,11 +12,10 @@ use std::sync::{PoisonError, RwLock, RwLockReadGuard};
 use quad_kernels::scaling::Scaling;
 
 use crate::error::{DatasetError, Problem};
-use crate::formats::Source;
 use crate::formats::arrays::Arrays;
+use crate::formats::{ReadOptions, Source};
 use crate::normalize;
 use crate::online::{OnlineEpisode, Ranges};
-use crate::read_options::ReadOptions;
 use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
 use crate::tables::reward::RewardScaling;

@@ -1,6 +1,6 @@
 //! Summary statistics of a dataset.
 
-use crate::statistics::{Episode, Summary};
+use crate::statistics::{EpisodeReturn, Summary};
 use crate::tables::environment::EnvironmentSpec;
 
 /// Size of a dataset and quality of its behavior policy, by the recorded rewards.
@@ -24,9 +24,9 @@ impl Statistics {
     pub(super) fn new(
         environment: Option<&EnvironmentSpec>,
         transitions: usize,
-        episodes: &[Episode],
+        episodes: &[EpisodeReturn],
     ) -> Self {
-        let returns = Summary::of(&Vec::from_iter(episodes.iter().map(|episode| episode.sum)));
+        let returns = Summary::new(&Vec::from_iter(episodes.iter().map(|episode| episode.sum)));
         Self {
             transitions,
             episodes: episodes.len(),

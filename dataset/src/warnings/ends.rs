@@ -1,7 +1,7 @@
 //! Flags with another meaning than the end of a task: masks, discounts, lasting successes.
 
 use super::percent;
-use crate::recording::{Recording, RowKind};
+use crate::recording::Recording;
 
 const FEWEST: usize = 10;
 /// Largest plausible fraction of terminals: episodes of two steps.
@@ -12,7 +12,7 @@ pub(super) const MOST_AFTER_GOAL: f64 = 0.8;
 const RESET: f64 = 0.5;
 
 pub(super) fn meaning(recording: &Recording) -> Option<String> {
-    let steps = recording.kinds.iter().filter(|kind| **kind != RowKind::LastState).count();
+    let steps = recording.steps().count();
     let array = recording.terminal_array;
     if recording.goal {
         let after = recording.past_goal().iter().filter(|past| **past).count();
@@ -35,7 +35,7 @@ fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
     };
     let flags = &recording.terminals;
     let inner = (0..recording.rows()).filter(inner);
-    let (set, others): (Vec<usize>, _) = inner.partition(|row| flags[*row]);
+    let (set, unset): (Vec<usize>, _) = inner.partition(|row| flags[*row]);
     let terminals = flags.iter().filter(|terminal| **terminal).count();
     let again = set.iter().filter(|row| flags[**row + 1]).count();
     let is_most = terminals as f64 > MOST_TERMINALS * steps as f64;
@@ -45,7 +45,7 @@ fn stays_set(recording: &Recording, steps: usize) -> Option<String> {
     {
         return None;
     }
-    let is_mask = is_most && (others.is_empty() || step_length(recording, &others) >= RESET);
+    let is_mask = is_most && (unset.is_empty() || step_length(recording, &unset) >= RESET);
     let cause = match is_mask {
         true => "a mask or a discount (1 − done) in place of the flag? write 1 − it",
         false => "a success that stays set after the goal? end each episode at the first such row",
@@ -63,10 +63,11 @@ fn step_length(recording: &Recording, rows: &[usize]) -> f64 {
     let width = recording.observation_dim;
     let square = |x: f64| if x.is_finite() { x * x } else { 0.0 };
     let length = |i: usize| {
-        let at = |row: usize| f64::from(recording.observations[row * width + i]);
-        let mean = rows.iter().map(|row| at(*row)).sum::<f64>() / rows.len() as f64;
-        let variance: f64 = rows.iter().map(|row| square(at(*row) - mean)).sum();
-        let steps: f64 = rows.iter().map(|row| square(at(row + 1) - at(*row))).sum();
+        let value = |row: usize| f64::from(recording.observations[row * width + i]);
+        let mean = rows.iter().map(|row| value(*row)).sum::<f64>() / rows.len() as f64;
+        let variance: f64 = rows.iter().map(|row| square(value(*row) - mean)).sum();
+        let step = |row: &usize| square(value(row + 1) - value(*row));
+        let steps: f64 = rows.iter().map(step).sum();
         (variance > 0.0).then(|| steps / (2.0 * variance))
     };
     let mut lengths: Vec<f64> = (0..width).filter_map(length).collect();

@@ -25,15 +25,15 @@ pub(super) fn observations(recording: &Recording) -> Option<String> {
     if rows.len() < FEWEST.max(10 * (o + a)) {
         return None;
     }
-    let columns = |width: usize, at: &dyn Fn(usize, usize) -> f32| -> Columns {
-        let column = |i| rows.iter().map(|row| f64::from(at(*row, i))).collect();
+    let columns = |width: usize, number: &dyn Fn(usize, usize) -> f32| -> Columns {
+        let column = |i| rows.iter().map(|row| f64::from(number(*row, i))).collect();
         (0..width).map(column).collect()
     };
     let states = columns(o, &|row, i| recording.observation(row)[i]);
     let constant = vec![vec![1.0; rows.len()]];
     let given = basis(constant.iter().chain(&states).cloned());
-    let mut steps =
-        columns(o, &|row, i| recording.observation(row + 1)[i] - recording.observation(row)[i]);
+    let state = |row: usize, i: usize| recording.observation(row)[i];
+    let mut steps = columns(o, &|row, i| state(row + 1, i) - state(row, i));
     for (step, state) in steps.iter_mut().zip(&states) {
         *step = without(std::mem::take(step), &given);
         if square(step) <= ROUNDING.powi(2) * square(state) {
@@ -44,17 +44,18 @@ pub(super) fn observations(recording: &Recording) -> Option<String> {
     let own = columns(a, &|row, i| recording.action(row)[i]);
     let next = columns(a, &|row, i| recording.action(row + 1)[i]);
 
-    let of_mean = basis(constant.into_iter());
+    let mean = basis(constant.into_iter());
     let sum = |basis: &Columns| -> f64 {
-        own.iter().map(|action| square(&without(action.clone(), basis))).sum()
+        let rest = |action: &Vec<f64>| square(&without(action.clone(), basis));
+        own.iter().map(rest).sum()
     };
     let [own_share, next_share] = [&own, &next].map(|actions| {
         let basis = basis(actions.iter().map(|action| without(action.clone(), &given)));
         let rest = |step: &Vec<f64>| square(&without(step.clone(), &basis)) / square(step);
-        steps.iter().map(|step| 1.0 - rest(step)).fold(0.0, f64::max)
+        let shares = steps.iter().map(|step| 1.0 - rest(step));
+        shares.fold(0.0, f64::max)
     });
-    let is_late =
-        next_share > EXPLAINED.max(TIMES * own_share) && sum(&given) > FREE * sum(&of_mean);
+    let is_late = next_share > EXPLAINED.max(TIMES * own_share) && sum(&given) > FREE * sum(&mean);
     is_late.then(|| {
         format!(
             "array `observations`: one row late? actions explain {:.0} % of the step before their row and {:.0} % of their own, as if \

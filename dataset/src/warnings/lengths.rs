@@ -29,7 +29,7 @@ pub(super) fn single_steps(recording: &Recording) -> Option<String> {
 /// Terminals that stand exactly where the longest episodes end.
 pub(super) fn time_limit(recording: &Recording) -> Option<String> {
     let (mut lengths, mut length, mut longest) = (Vec::new(), 0, 0);
-    for row in (0..recording.rows()).filter(|&row| recording.is_step(row)) {
+    for row in recording.steps() {
         length += 1;
         match (recording.ends[row], recording.terminals[row]) {
             // The recording goes on after a goal.
@@ -53,7 +53,8 @@ pub(super) fn time_limit(recording: &Recording) -> Option<String> {
 
 /// A chunk of more steps than any episode has.
 pub(super) fn chunks(recording: &Recording, chunk: usize) -> Option<String> {
-    let longest = recording.episodes().iter().map(|episode| episode.length).max()?;
+    let episodes = recording.episodes();
+    let longest = episodes.iter().map(|episode| episode.length).max()?;
     (chunk > longest).then(|| {
         format!(
             "no episode has the {chunk} steps of a chunk, the longest {longest}: the actions after these are not in the data; \

@@ -1,18 +1,16 @@
 //! Warnings about data that training accepts but that is probably wrong. A warning names the array,
 //! the fraction or number of rows, a likely cause, and a remedy.
 
-mod copied;
 mod ends;
 mod late;
 mod lengths;
 mod resets;
-mod rest;
 mod rewards;
+mod rows;
 mod sizes;
-mod unwritten;
 
 use crate::checks;
-use crate::read_options::ReadOptions;
+use crate::formats::ReadOptions;
 use crate::recording::Recording;
 use crate::tables::reward::RewardRule;
 
@@ -23,12 +21,15 @@ const ENOUGH: usize = 20_000;
 pub(crate) fn warnings(recording: &Recording, run: &ReadOptions) -> Vec<String> {
     let outside = checks::actions_outside(recording).filter(|_| !run.normalize.actions);
     let outside = outside.map(|problem| format!("{problem}; {}", problem.hint()));
-    let doubts = recording.doubts.iter().cloned().chain(of_ends(recording));
-    let doubts = doubts.chain(lengths::chunks(recording, run.chunk)).chain(outside);
-    doubts.chain(of_numbers(recording, run)).collect()
+    let mut warnings = recording.doubts.clone();
+    warnings.extend(end_warnings(recording));
+    warnings.extend(lengths::chunks(recording, run.chunk));
+    warnings.extend(outside);
+    warnings.extend(number_warnings(recording, run));
+    warnings
 }
 
-fn of_ends(recording: &Recording) -> Vec<String> {
+fn end_warnings(recording: &Recording) -> Vec<String> {
     if let Some(warning) = ends::meaning(recording).or_else(|| lengths::single_steps(recording)) {
         return vec![warning];
     }
@@ -45,12 +46,14 @@ fn of_ends(recording: &Recording) -> Vec<String> {
     warnings
 }
 
-fn of_numbers(recording: &Recording, run: &ReadOptions) -> Vec<String> {
+fn number_warnings(recording: &Recording, run: &ReadOptions) -> Vec<String> {
     let (normalize, rule) = (run.normalize, run.reward);
-    let copied = copied::actions(recording);
-    let rest = rest::observations(recording);
-    let is_other = copied.is_some() || rest.is_some();
-    let late = (!is_other).then(|| late::observations(recording)).flatten();
+    let copied = rows::copied_actions(recording);
+    let resting = rows::resting_observations(recording);
+    let late = match (&copied, &resting) {
+        (None, None) => late::observations(recording),
+        _ => None,
+    };
     let mut warnings = Vec::from_iter(rewards::alike(recording));
     if warnings.is_empty() {
         warnings.extend(rewards::after_goal(recording));
@@ -59,8 +62,8 @@ fn of_numbers(recording: &Recording, run: &ReadOptions) -> Vec<String> {
             warnings.extend(rewards::size(recording));
         }
     }
-    warnings.extend(unwritten::rows(recording));
-    warnings.extend(copied.into_iter().chain(rest).chain(late));
+    warnings.extend(rows::unwritten(recording));
+    warnings.extend(copied.into_iter().chain(resting).chain(late));
     warnings.extend(sizes::columns(recording, normalize));
     warnings
 }
@@ -82,6 +85,7 @@ impl Recording {
     /// Rows that lead to the following one, at most [`ENOUGH`].
     fn some_that_go_on(&self) -> Vec<usize> {
         let rows = (0..self.rows()).step_by(self.rows().div_ceil(ENOUGH).max(1));
-        rows.filter(|&row| self.goes_on(row) && !self.jumps(row)).collect()
+        let leads_on = |row: &usize| self.goes_on(*row) && !self.jumps(*row);
+        rows.filter(leads_on).collect()
     }
 }

@@ -3,7 +3,7 @@
 //! Resets are among the longest steps, with each dimension scaled by its root mean square step.
 //! Near a correct flag, the longest of three neighboring steps is the flag's.
 
-use super::rest;
+use super::rows;
 use crate::checks;
 use crate::error::RowProblem;
 use crate::recording::{Recording, RowKind};
@@ -28,9 +28,12 @@ const LONGEST_STEP: f32 = 1.0;
 fn ends(recording: &Recording) -> Vec<usize> {
     let is_last = |row: usize| recording.kinds[row] == RowKind::LastState;
     // Groups per episode cannot be shifted; a final state ends its episode, not the row before.
+    let is_reset = |row: &usize| {
+        let is_end = recording.ends[*row] || is_last(*row);
+        is_end && recording.parts.is_empty() && !is_last(row + 1)
+    };
     let inner = 1..recording.rows().saturating_sub(2);
-    let inner = inner.filter(|row| recording.parts.is_empty() && !is_last(row + 1));
-    inner.filter(|&row| recording.ends[row] || is_last(row)).collect()
+    inner.filter(is_reset).collect()
 }
 
 pub(super) fn out_of_step(recording: &Recording) -> Vec<String> {
@@ -50,8 +53,9 @@ pub(super) fn out_of_step(recording: &Recording) -> Vec<String> {
     }
     let (timeouts, terminals): (Vec<usize>, _) =
         ends.into_iter().partition(|&row| recording.timeouts[row]);
-    let terminals = judged(recording.terminal_array, &terminals);
-    terminals.into_iter().chain(judged("timeouts", &timeouts)).collect()
+    let mut warnings = Vec::from_iter(judged(recording.terminal_array, &terminals));
+    warnings.extend(judged("timeouts", &timeouts));
+    warnings
 }
 
 /// Counts the offsets of resets, which are longer than `limit`, from flags.
@@ -62,13 +66,13 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
             (0..3).max_by(|&a, &b| lengths[row + a - 1].total_cmp(&lengths[row + b - 1]))?;
         resets[longest] += usize::from(lengths[row + longest - 1] > limit);
     }
-    let [before, at, after] = resets;
+    let [before, own, after] = resets;
     let (beside, side, late, up) = match before > after {
         true => (before, "before", "late", "up"),
         false => (after, "after", "early", "down"),
     };
     let is_proof =
-        beside >= FEWEST && beside * SMALLEST_SHARE >= flags.len() && at * EXCEPTION <= beside;
+        beside >= FEWEST && beside * SMALLEST_SHARE >= flags.len() && own * EXCEPTION <= beside;
     is_proof.then(|| {
         format!(
             "array `{name}`: one row {late}, out of step with the resets: states jump at the row {side} ({beside} of {}), \
@@ -82,23 +86,25 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
 pub(super) fn missed(recording: &Recording) -> Option<String> {
     let leap = |&row: &usize| {
         let (from, to) = (recording.observation(row), recording.observation(row + 1));
-        let apart = from.iter().zip(to).take(2).map(|(from, to)| (to - from).powi(2));
-        apart.sum::<f32>().sqrt() > LONGEST_STEP
+        let apart = from.iter().zip(to).take(2).map(|(from, to)| to - from);
+        apart.map(|x| x.powi(2)).sum::<f32>().sqrt() > LONGEST_STEP
     };
     let leaps = recording.inside().filter(|row| recording.goal && leap(row));
     let leaps = leaps.map(|row| (row, RowProblem::Leap(LONGEST_STEP)));
     let problem = checks::first(recording, "observations", leaps).or_else(|| {
-        let resets = unmarked(recording).into_iter().map(|row| (row, RowProblem::Reset));
+        let resets = unmarked(recording).into_iter();
+        let resets = resets.map(|row| (row, RowProblem::Reset));
         checks::first(recording, "observations", resets)
     })?;
-    Some(format!("{problem}; are timeouts missing, or out of step with the resets?"))
+    let question = "are timeouts missing, or out of step with the resets?";
+    Some(format!("{problem}; {question}"))
 }
 
 /// Rows whose step is as long as those at ends, far longer than those beside it, and rarely so.
 fn unmarked(recording: &Recording) -> Vec<usize> {
     let (ends, lengths) = (ends(recording), lengths(recording));
     // A sensor slower than control leaps, too.
-    if ends.len() < FEWEST || rest::observations(recording).is_some() {
+    if ends.len() < FEWEST || rows::resting_observations(recording).is_some() {
         return Vec::new();
     }
     let mut resets = Vec::from_iter(ends.iter().map(|&row| lengths[row][0]));
@@ -124,8 +130,9 @@ fn unmarked(recording: &Recording) -> Vec<usize> {
 /// dimensions, and of all but the one that moves most, which may be an angle that wraps around.
 fn lengths(recording: &Recording) -> Vec<[f64; 2]> {
     let square = |row: usize, i: usize| {
-        let (from, to) = (recording.observation(row)[i], recording.observation(row + 1)[i]);
-        let square = (f64::from(to) - f64::from(from)).powi(2);
+        let from = f64::from(recording.observation(row)[i]);
+        let to = f64::from(recording.observation(row + 1)[i]);
+        let square = (to - from).powi(2);
         if square.is_finite() { square } else { 0.0 }
     };
     let steps = 0..recording.rows().saturating_sub(1);
@@ -157,8 +164,8 @@ mod tests {
             recording.ends[row] = row % 30 == 29;
         }
         recording.terminal_array = "masks";
-        let warnings = out_of_step(&recording);
-        let [warning] = &warnings[..] else { panic!("{warnings:?}") };
-        assert!(warning.starts_with("array `terminals`: one row late"), "{warning}");
+        let warnings = out_of_step(&recording).concat();
+        let start = "array `terminals`: one row late";
+        assert!(warnings.starts_with(start), "{warnings}");
     }
 }

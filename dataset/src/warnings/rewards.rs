@@ -15,17 +15,15 @@ const SMALLEST: f32 = 0.01;
 /// Fraction of the rows after reaching the goal that must be at the goal.
 const STAYS: f64 = 0.9;
 
-/// Reward of each step, and true at the end of an episode.
-fn steps(recording: &Recording) -> impl Iterator<Item = (f32, bool)> {
-    let rows = (0..recording.rows()).filter(|&row| recording.is_step(row));
-    rows.map(|row| (recording.rewards[row], recording.ends[row]))
+fn rewards(recording: &Recording) -> impl Iterator<Item = f32> {
+    recording.steps().map(|row| recording.rewards[row])
 }
 
 pub(super) fn alike(recording: &Recording) -> Option<String> {
-    let (first, _) = steps(recording).next()?;
-    let rewards = || steps(recording).map(|(reward, _)| reward);
-    let (least, most) = (rewards().fold(first, f32::min), rewards().fold(first, f32::max));
-    let is_finite = rewards().all(f32::is_finite);
+    let first = rewards(recording).next()?;
+    let least = rewards(recording).fold(first, f32::min);
+    let most = rewards(recording).fold(first, f32::max);
+    let is_finite = rewards(recording).all(f32::is_finite);
     let but = match recording.terminals.contains(&true) && first != 0.0 {
         true => " but how soon an episode terminates",
         false => "; `--algorithm diffusion-policy` clones without rewards",
@@ -39,31 +37,31 @@ pub(super) fn alike(recording: &Recording) -> Option<String> {
 
 /// Sparse goal rewards in recordings that mostly continue after the goal.
 pub(super) fn after_goal(recording: &Recording) -> Option<String> {
-    let (first, _) = steps(recording).next()?;
-    let (other, _) = steps(recording).find(|(reward, _)| *reward != first)?;
+    let first = rewards(recording).next()?;
+    let other = rewards(recording).find(|reward| *reward != first)?;
     let high = first.max(other);
     // Goal tasks are checked by their flags.
-    if recording.goal || steps(recording).any(|(reward, _)| reward != first && reward != other) {
+    if recording.goal || rewards(recording).any(|reward| reward != first && reward != other) {
         return None;
     }
-    let (mut all, mut after, mut stay) = (0, 0, 0);
+    let (mut count, mut after, mut stay) = (0, 0, 0);
     // A goal's reward is low, then high.
     let (mut starts_low, mut is_reached) = (None, false);
-    for (reward, ends) in steps(recording) {
-        let is_high = reward == high;
-        all += 1;
+    for row in recording.steps() {
+        let is_high = recording.rewards[row] == high;
+        count += 1;
         after += usize::from(is_reached);
         stay += usize::from(is_reached && is_high);
         is_reached |= *starts_low.get_or_insert(!is_high) && is_high;
-        if ends {
+        if recording.ends[row] {
             (starts_low, is_reached) = (None, false);
         }
     }
-    (after as f64 > MOST_AFTER_GOAL * all as f64 && stay as f64 > STAYS * after as f64).then(|| {
+    (after as f64 > MOST_AFTER_GOAL * count as f64 && stay as f64 > STAYS * after as f64).then(|| {
         format!(
             "array `rewards`: {} of the rows come after the first reward of {high} in their episode, as if after its goal, so few lead \
              to it; if the task is over there, end each episode at that row with `{}`",
-            percent(after, all),
+            percent(after, count),
             recording.terminal_array
         )
     })
@@ -71,8 +69,8 @@ pub(super) fn after_goal(recording: &Recording) -> Option<String> {
 
 pub(super) fn size(recording: &Recording) -> Option<String> {
     let size = RewardScaling::default().rms(recording);
-    let rewards = recording.transitions().map(|row| recording.rewards[row].abs());
-    let largest = rewards.fold(0.0, f32::max);
+    let reward = |row: usize| recording.rewards[row].abs();
+    let largest = recording.transitions().map(reward).fold(0.0, f32::max);
     let weights = match size > LARGEST {
         true => "exp(β · advantage) is then 0 or cut off",
         false if largest > 0.0 && largest < SMALLEST => {
@@ -81,7 +79,7 @@ pub(super) fn size(recording: &Recording) -> Option<String> {
         false => return None,
     };
     let sums = recording.episodes().into_iter().map(|episode| episode.sum);
-    let returns = Summary::of(&Vec::from_iter(sums));
+    let returns = Summary::new(&Vec::from_iter(sums));
     Some(format!(
         "array `rewards`: of size {} a step (root mean square; episodes return {} to {}), where methods are made for about 1: \
          {weights}; `learner train --normalize rewards` divides them by it",

@@ -20,14 +20,17 @@ const FAR: f32 = 10.0;
 const ROUNDING: f64 = 1e-6;
 
 pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String> {
-    let Recording { observation_dim, action_dim, observations, actions, kinds, names, .. } =
-        recording;
+    let (o, a) = (recording.observation_dim, recording.action_dim);
+    let names = &recording.names;
     let mut warnings = Vec::new();
-    let is_transition = |row: usize| kinds[row] == RowKind::Transition;
-    let columns = Summary::of_columns(observations, *observation_dim, is_transition);
+    let is_transition = |row: usize| recording.kinds[row] == RowKind::Transition;
+    let columns = Summary::columns(&recording.observations, o, is_transition);
     let is_large = |column: &Summary| (column.rms > LARGEST).then_some(column.rms);
     let large = most(&columns, is_large);
-    let errors = large.as_ref().and_then(|(large, _)| errors(recording, large));
+    let errors = match &large {
+        Some((large, _)) => errors(recording, large),
+        None => None,
+    };
     let is_scaled = normalize.observations || errors.is_some();
     warnings.extend(errors);
     warnings.extend(large.filter(|_| !is_scaled).map(|(large, largest)| {
@@ -40,26 +43,27 @@ pub(super) fn columns(recording: &Recording, normalize: Normalize) -> Vec<String
     if !normalize.observations {
         warnings.extend(small("observations", &columns, &names.observations));
     }
-    let columns = Summary::of_columns(actions, *action_dim, |row| recording.is_step(row));
+    let columns = Summary::columns(&recording.actions, a, |row| recording.is_step(row));
     if !normalize.actions {
         warnings.extend(small("actions", &columns, &names.actions));
     }
     // Outside of [-1, 1] they must be normalized.
     let is_outside = |column: &Summary| column.min < -1.0 || column.max > 1.0;
     if normalize.actions || columns.iter().any(is_outside) {
-        warnings.extend((0..*action_dim).find_map(|column| outliers(recording, column)));
+        warnings.extend((0..a).find_map(|column| outliers(recording, column)));
     }
     warnings
 }
 
 /// A few actions that alone set a column's range, which normalization maps to [-1, 1].
 fn outliers(recording: &Recording, column: usize) -> Option<String> {
-    let steps = (0..recording.rows()).filter(|&row| recording.is_step(row));
-    let values = Vec::from_iter(steps.map(|row| (row, recording.action(row)[column])));
+    let value = |row: usize| (row, recording.action(row)[column]);
+    let values = Vec::from_iter(recording.steps().map(value));
     let mut sorted = Vec::from_iter(values.iter().map(|(_, value)| *value));
     sorted.sort_unstable_by(f32::total_cmp);
     let few = (ERRORS / 2.0 * sorted.len() as f64).ceil() as usize;
-    let (low, high) = (sorted.get(few)?, sorted.get(sorted.len().checked_sub(few + 1)?)?);
+    let last = sorted.len().checked_sub(few + 1)?;
+    let (low, high) = (*sorted.get(few)?, sorted[last]);
     let is_far = |value: f32| high > low && (value - (low + high) / 2.0).abs() > FAR * (high - low);
     let far = Vec::from_iter(values.iter().filter(|(_, value)| is_far(*value)));
     let (row, value) = **far.first()?;
@@ -75,8 +79,9 @@ fn outliers(recording: &Recording, column: usize) -> Option<String> {
 /// A few rows that alone make these columns large.
 fn errors(recording: &Recording, large: &[usize]) -> Option<String> {
     let error = |row: usize| {
-        let of = |&column: &usize| (row, column, recording.observation(row)[column]);
-        large.iter().map(of).find(|(_, _, value)| f64::from(value.abs()) > LARGEST)
+        let number = |&column: &usize| (row, column, recording.observation(row)[column]);
+        let mut numbers = large.iter().map(number);
+        numbers.find(|(_, _, value)| f64::from(value.abs()) > LARGEST)
     };
     let errors = Vec::from_iter(recording.transitions().filter_map(error));
     let is_few = errors.len() as f64 <= ERRORS * recording.transitions().count() as f64;
@@ -105,7 +110,8 @@ fn small(array: &str, columns: &[Summary], names: &[String]) -> Option<String> {
 
 /// Columns with a value, and the largest value.
 fn most(columns: &[Summary], value: impl Fn(&Summary) -> Option<f64>) -> Option<(Vec<usize>, f64)> {
-    let found = columns.iter().enumerate().filter_map(|(i, column)| Some((i, value(column)?)));
-    let (found, values): (Vec<usize>, Vec<f64>) = found.unzip();
-    Some((found, values.into_iter().reduce(f64::max)?))
+    let value = |(i, column)| Some((i, value(column)?));
+    let values = columns.iter().enumerate().filter_map(value);
+    let (columns, values): (Vec<usize>, Vec<f64>) = values.unzip();
+    Some((columns, values.into_iter().reduce(f64::max)?))
 }

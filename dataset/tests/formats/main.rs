@@ -8,7 +8,8 @@ use hdf5::H5Type;
 use ndarray::ArrayViewD;
 use quad_dataset::benchmarks::relabeling;
 use quad_dataset::{
-    Arrays, Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Transitions, environment,
+    Arrays, Batch, DatasetError, EnvironmentSpec, Normalize, ReadOptions, RewardRule, Transitions,
+    environment,
 };
 use tempfile::{TempDir, tempdir};
 
@@ -31,7 +32,8 @@ fn hopper() -> &'static EnvironmentSpec {
 
 /// Folder of recordings next to the repository, if present.
 fn shared(path: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared").join(path);
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let path = here.join("../../shared").join(path);
     let exists = path.exists();
     if !exists {
         eprintln!("skipped, because {} is missing", path.display());
@@ -51,6 +53,12 @@ fn options(environment: Environment, reward: RewardRule) -> ReadOptions {
     ReadOptions { environment, task, reward, ..ReadOptions::default() }
 }
 
+/// What to normalize, by letters: actions, observations, rewards.
+fn normalize(columns: &str) -> Normalize {
+    let [actions, observations, rewards] = ["a", "o", "r"].map(|letter| columns.contains(letter));
+    Normalize { actions, observations, rewards }
+}
+
 fn read(path: &Path, environment: Environment, reward: RewardRule) -> Transitions {
     Transitions::read(path, &options(environment, reward)).unwrap()
 }
@@ -66,8 +74,8 @@ fn assert_refused(path: &Path, environment: Environment, message: &str, hint: &s
 
 /// Checks the end of a message and a part of its hint.
 fn assert_error(error: &DatasetError, message: &str, hint: &str) {
-    let (found, advice) = (error.to_string(), error.hint());
-    assert!(found.ends_with(message), "{found}, not {message}");
+    let (text, advice) = (error.to_string(), error.hint());
+    assert!(text.ends_with(message), "{text}, not {message}");
     assert!(advice.contains(hint), "{advice}, not {hint}");
 }
 
@@ -99,12 +107,14 @@ fn write(path: &Path, arrays: &Arrays) -> hdf5::File {
 
 fn put<T: H5Type>(file: &hdf5::Group, array: &str, shape: &[usize], data: &[T]) {
     let view = ArrayViewD::from_shape(shape, data).unwrap();
-    file.new_dataset_builder().with_data(view).create(array).unwrap();
+    let builder = file.new_dataset_builder().with_data(view);
+    builder.create(array).unwrap();
 }
 
-fn all(transitions: &Transitions) -> Batch {
+fn batch(transitions: &Transitions) -> Batch {
     let mut batch = Batch::default();
-    transitions.gather(&Vec::from_iter(0..transitions.len() as u32), &mut batch);
+    let indices = Vec::from_iter(0..transitions.len() as u32);
+    transitions.gather(&indices, &mut batch);
     batch
 }
 
@@ -112,24 +122,21 @@ fn compare(path: &Path, environment: Environment, reference: &Path) {
     let reference = hdf5::File::open(reference).unwrap();
     let array = |name: &str| reference.dataset(name).unwrap().read_raw::<f32>().unwrap();
 
+    let recorded = batch(&read(path, environment, RewardRule::AsIs));
+    assert_eq!(recorded.rewards, array("raw_rewards"));
     let transitions = read(path, environment, RewardRule::Locomotion);
-    let batch = all(&transitions);
+    let batch = batch(&transitions);
     assert_eq!(batch.size, transitions.len());
     assert_eq!(batch.observations, array("observations"));
     assert_eq!(batch.actions, array("actions"));
     assert_eq!(batch.next_observations, array("next_observations"));
     assert_eq!(batch.masks, array("masks"));
     assert_close("rewards", &batch.rewards, &array("rewards"));
-    assert_eq!(all(&read(path, environment, RewardRule::AsIs)).rewards, array("raw_rewards"));
 
     let ours = transitions.statistics();
-    let figures = [
-        ours.transitions as f64,
-        ours.episodes as f64,
-        ours.return_mean,
-        ours.return_min,
-        ours.return_max,
-    ];
+    let counts = [ours.transitions as f64, ours.episodes as f64];
+    let returns = [ours.return_mean, ours.return_min, ours.return_max];
+    let figures = [&counts[..], &returns].concat();
     let theirs = reference.dataset("statistics").unwrap();
     for (ours, theirs) in figures.iter().zip(theirs.read_raw::<f64>().unwrap()) {
         assert!((ours - theirs).abs() <= 1e-9 * theirs.abs(), "{figures:?}");
@@ -166,15 +173,18 @@ fn peers_in(folder: &Path, arguments: &[&str]) -> bool {
     };
     if !python.exists() {
         let required = std::env::var("QUAD_REQUIRE_PEERS").is_ok_and(|value| value == "1");
-        assert!(!required, "{} is missing; deploy/setup.sh --tests makes it", python.display());
-        eprintln!("skipped, because {} is missing", python.display());
+        let python = python.display();
+        assert!(!required, "{python} is missing; deploy/setup.sh --tests makes it");
+        eprintln!("skipped, because {python} is missing");
         return false;
     }
     let mut command = Command::new(python);
-    command.arg(here.join("tests/formats/peers.py")).args(arguments);
-    command.current_dir(folder).env("MINARI_DATASETS_PATH", folder);
+    command.arg(here.join("tests/formats/peers.py"));
+    command.args(arguments).current_dir(folder);
+    command.env("MINARI_DATASETS_PATH", folder);
     let output = command.output().unwrap();
     let complaint = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "peers.py {arguments:?}:\n{complaint}");
+    let has_run = output.status.success();
+    assert!(has_run, "peers.py {arguments:?}:\n{complaint}");
     true
 }

@@ -3,7 +3,7 @@ use std::collections::BTreeSet;
 use quad_dataset::{RewardRule, Transitions, benchmarks, environment};
 use tempfile::{TempDir, tempdir};
 
-use crate::{all, assert_refused, compare, hopper, options, peers, try_read, written};
+use crate::{assert_refused, batch, compare, hopper, options, peers, try_read, written};
 
 fn archive(variant: &str) -> Option<(TempDir, std::path::PathBuf)> {
     written("write-ogbench", variant, "made-up-singletask-v0.npz")
@@ -11,9 +11,11 @@ fn archive(variant: &str) -> Option<(TempDir, std::path::PathBuf)> {
 
 #[test]
 fn whatever_way_it_is_stored() {
-    let Some((folder, path)) = archive("raw") else { return };
+    let file = archive("raw");
+    let Some((folder, path)) = file else { return };
     let out = folder.path().join("reference.hdf5");
-    assert!(peers(&["ogbench-reference", path.to_str().unwrap(), out.to_str().unwrap()]));
+    let [from, to] = [&path, &out].map(|path| path.to_str().unwrap());
+    assert!(peers(&["ogbench-reference", from, to]));
     compare(&path, Some(hopper()), &out);
     for variant in ["fortran", "regular", "compact"] {
         let (_folder, path) = archive(variant).unwrap();
@@ -35,32 +37,36 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
         let file = hdf5::File::open(folder.path().join(format!("{name}.hdf5"))).unwrap();
         let array = |array: &str| file.dataset(array).unwrap().read_raw::<f32>().unwrap();
         let task = benchmarks::relabeling(&name);
-        assert_eq!(task.unwrap().start.map(|x| x as f32).to_vec(), array("start"), "{name}");
+        let start = task.unwrap().start.map(|x| x as f32);
+        assert_eq!(array("start"), start, "{name}");
         let mut options = options(environment::find(&name).ok(), RewardRule::Subtract1);
         options.task = task;
         let path = folder.path().join(format!("{place}.npz"));
         let transitions = Transitions::read(path, &options).unwrap();
-        let batch = all(&transitions);
-        assert_eq!((batch.rewards, &batch.masks), (array("rewards"), &array("masks")), "{name}");
+        let batch = batch(&transitions);
+        assert_eq!(batch.rewards, array("rewards"), "{name}");
+        assert_eq!(batch.masks, array("masks"), "{name}");
         let reached = batch.masks.iter().filter(|mask| **mask == 0.0).count();
         assert!((10..150).contains(&reached), "{name}: {reached}");
         // One trajectory in six is around one of five goals, with return 1.
-        assert!((0.1..0.7).contains(&transitions.statistics().return_mean), "{name}");
+        let mean = transitions.statistics().return_mean;
+        assert!((0.1..0.7).contains(&mean), "{name}: {mean}");
     }
 }
 
 #[test]
 fn files_that_are_refused() {
+    let goals = "array `rewards` is missing";
     let discrete =
         "array `actions` holds whole numbers, but only continuous actions can be learned";
     let maze = "recorded in `OGBench`, which is not `antmaze-medium`";
-    let task = "antmaze-large-navigate-singletask-task1-v0";
     for (variant, name, message, hint) in [
-        ("goals", "hopper", "array `rewards` is missing", "quad-convert ogbench:NAME"),
-        ("maze", "antmaze-medium", maze, task),
+        ("goals", "hopper", goals, "quad-convert ogbench:NAME"),
+        ("maze", "antmaze-medium", maze, "antmaze-large-navigate"),
         ("discrete", "hopper", discrete, "float32"),
     ] {
-        let Some((_folder, path)) = archive(variant) else { return };
+        let file = archive(variant);
+        let Some((_folder, path)) = file else { return };
         assert_refused(&path, environment::find(name).ok(), message, hint);
         assert_eq!(try_read(&path, None).is_ok(), variant == "maze");
     }
@@ -68,13 +74,16 @@ fn files_that_are_refused() {
 
 #[test]
 fn cut_short_and_damaged_inside() {
-    let Some((_folder, path)) = archive("raw") else { return };
+    let file = archive("raw");
+    let Some((_folder, path)) = file else { return };
     let mut whole = std::fs::read(&path).unwrap();
     for length in [4, whole.len() / 2, whole.len() - 1] {
         std::fs::write(&path, &whole[..length]).unwrap();
-        assert_refused(&path, Some(hopper()), "a damaged or incomplete npz archive", "again");
+        let message = "a damaged or incomplete npz archive";
+        assert_refused(&path, Some(hopper()), message, "again");
     }
     whole[300..340].fill(7);
     std::fs::write(&path, whole).unwrap();
-    assert_refused(&path, Some(hopper()), "array `observations` cannot be read", "damaged");
+    let message = "array `observations` cannot be read";
+    assert_refused(&path, Some(hopper()), message, "damaged");
 }

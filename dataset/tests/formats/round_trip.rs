@@ -2,43 +2,46 @@ use std::fs;
 use std::path::Path;
 
 use quad_dataset::{
-    D4rlWriter, Metadata, OnlineEpisode, RecordedRows, RewardRule, Row, environment,
+    D4rlWriter, Metadata, OnlineEpisode, RecordedRows, RecordedStep, RewardRule, environment,
     recorded_environment, write_experience,
 };
 
-use crate::{all, assert_error, hopper, peers, read, scratch};
+use crate::{assert_error, batch, hopper, peers, read, scratch};
 
 const ROWS: usize = 10_000;
 const METADATA: Metadata<'_> = Metadata { algorithm: "formula", iteration: 12, seed: 34 };
 
-/// Numbers exact in float32; `peers.py check-written` has the same formulas.
-struct OwnedRow([Vec<f64>; 5]);
+/// The numbers of row `i`, exact in float32; `peers.py check-written` has the same formulas.
+fn numbers(i: usize) -> [Vec<f64>; 5] {
+    let i = i as f64;
+    let numbers =
+        |n: u32, value: &dyn Fn(f64) -> f64| (0..n).map(|j| value(f64::from(j))).collect();
+    [
+        numbers(11, &|j| i + j / 16.0),
+        numbers(3, &|j| ((i * 3.0 + j) % 7.0 - 3.0) / 4.0),
+        numbers(11, &|j| i + 1.0 + j / 16.0),
+        numbers(6, &|j| -i - j / 16.0),
+        numbers(6, &|j| j - i / 32.0),
+    ]
+}
 
-impl OwnedRow {
-    fn new(i: usize) -> Self {
-        let list =
-            |n: usize, value: &dyn Fn(f64) -> f64| Vec::from_iter((0..n).map(|j| value(j as f64)));
-        let i = i as f64;
-        Self([
-            list(11, &|j| i + j / 16.0),
-            list(3, &|j| ((i * 3.0 + j) % 7.0 - 3.0) / 4.0),
-            list(11, &|j| i + 1.0 + j / 16.0),
-            list(6, &|j| -i - j / 16.0),
-            list(6, &|j| j - i / 32.0),
-        ])
-    }
-
-    fn row(&self, i: usize) -> Row<'_> {
-        let [observation, action, next_observation, qpos, qvel] = &self.0;
-        let (reward, terminal, timeout) = (i as f64 / 8.0, i % 50 == 49, i % 70 == 69);
-        Row { observation, action, next_observation, reward, terminal, timeout, qpos, qvel }
+fn step(i: usize, numbers: &[Vec<f64>; 5]) -> RecordedStep<'_> {
+    RecordedStep {
+        observation: &numbers[0],
+        action: &numbers[1],
+        next_observation: &numbers[2],
+        reward: i as f64 / 8.0,
+        terminal: i % 50 == 49,
+        timeout: i % 70 == 69,
+        qpos: &numbers[3],
+        qvel: &numbers[4],
     }
 }
 
 fn writer(path: &Path, rows: usize) -> D4rlWriter {
     let mut writer = D4rlWriter::create(path, hopper()).unwrap();
     for i in 0..rows {
-        writer.push(&OwnedRow::new(i).row(i)).unwrap();
+        writer.push(&step(i, &numbers(i))).unwrap();
     }
     assert_eq!(writer.rows(), rows);
     writer
@@ -50,7 +53,7 @@ fn assert_written(writer: D4rlWriter, path: &Path, rows: usize) {
     let recorded = RecordedRows::read(path, hopper()).unwrap();
     assert_eq!(recorded.len(), rows);
     for (i, row) in recorded.iter().enumerate() {
-        assert_eq!(row, OwnedRow::new(i).row(i), "row {i}");
+        assert_eq!(row, step(i, &numbers(i)), "row {i}");
     }
 }
 
@@ -80,14 +83,19 @@ fn the_file_has_its_name_only_when_it_is_finished() {
 fn a_row_that_would_spoil_the_file_is_refused_as_a_whole() {
     let (_folder, path) = scratch("rows.hdf5");
     let mut writer = writer(&path, 1);
-    let good = OwnedRow::new(1);
-    let short = Row { action: &[0.0; 2], ..good.row(1) };
+    let mut numbers = numbers(1);
+    let mut refused = |column: usize, row: Vec<f64>, message: &str| {
+        let good = std::mem::replace(&mut numbers[column], row);
+        assert_error(&writer.push(&step(1, &numbers)).unwrap_err(), message, "");
+        numbers[column] = good;
+    };
     let message = "`actions` has 2 numbers a row, but `hopper` has 3";
-    assert_error(&writer.push(&short).unwrap_err(), message, "");
-    for (value, found) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (1e39, "inf")] {
-        let row = Row { qvel: &[0.0, 0.0, value, 0.0, 0.0, 0.0], ..good.row(1) };
-        let message = format!("array `infos/qvel`, row 1: {found} is not a finite float32");
-        assert_error(&writer.push(&row).unwrap_err(), &message, "");
+    refused(1, vec![0.0; 2], message);
+    let message = "array `infos/qvel`, row 1: NaN is not a finite float32";
+    refused(4, vec![0.0, 0.0, f64::NAN, 0.0, 0.0, 0.0], message);
+    for value in [f64::INFINITY, 1e39] {
+        let message = "array `infos/qvel`, row 1: inf is not a finite float32";
+        refused(4, vec![value; 6], message);
     }
     assert_written(writer, &path, 1);
 }
@@ -96,10 +104,10 @@ fn a_row_that_would_spoil_the_file_is_refused_as_a_whole() {
 fn experience_is_read_as_it_was_played() {
     let (_folder, path) = scratch("experience.hdf5");
     let numbers = |from: f32, count: usize| Vec::from_iter((0..count).map(|i| from + i as f32));
-    let (long, short, actions) = (numbers(0.0, 4 * 29), numbers(500.0, 3 * 29), vec![0.5; 3 * 8]);
+    let (long, short) = (numbers(0.0, 4 * 29), numbers(500.0, 3 * 29));
     let episode = |observations, rewards: &'static [f32], terminated| OnlineEpisode {
         observations,
-        actions: &actions[..rewards.len() * 8],
+        actions: &[0.5; 3 * 8][..rewards.len() * 8],
         rewards,
         terminated,
     };
@@ -108,20 +116,23 @@ fn experience_is_read_as_it_was_played() {
     let umaze = environment::find("antmaze-umaze").unwrap();
     let episodes = [failed, reached, reached, failed];
     write_experience(&path, &umaze.name, (29, 8), &METADATA, &episodes).unwrap();
-    assert_eq!(recorded_environment(&path).unwrap().as_deref(), Some("antmaze-umaze"));
+    let recorded = recorded_environment(&path).unwrap().unwrap();
+    assert_eq!(recorded, "antmaze-umaze");
     let transitions = read(&path, Some(umaze), RewardRule::AsIs);
     // Each truncated episode's last step makes no transition.
     assert_eq!(transitions.recorded_episodes(), [0..2, 2..4, 4..6, 6..8]);
     assert_eq!(transitions.statistics().score_mean, Some(50.0));
-    let batch = all(&transitions);
+    let batch = batch(&transitions);
     assert_eq!(batch.masks, [1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 1.0]);
     assert_eq!(batch.observations[2 * 29..4 * 29], short[..2 * 29]);
     assert_eq!(batch.next_observations[..2 * 29], long[29..3 * 29]);
     let file = hdf5::File::open(&path).unwrap();
-    let marks = file.dataset("infos/intervention").unwrap().read_raw::<bool>().unwrap();
+    let marks = file.dataset("infos/intervention").unwrap();
     let marked = [true, false, true];
-    assert_eq!(marks, [&marked[..], &[false; 4], &marked].concat());
+    let expected = [&marked[..], &[false; 4], &marked].concat();
+    assert_eq!(marks.read_raw::<bool>().unwrap(), expected);
 
     let error = write_experience(&path, "ant", (27, 8), &METADATA, &episodes).unwrap_err();
-    assert_error(&error, "array `observations` has shape [116], but must have [4, 27]", "");
+    let message = "array `observations` has shape [116], but must have [4, 27]";
+    assert_error(&error, message, "");
 }

@@ -7,8 +7,8 @@ use std::path::Path;
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::find;
 use quad_dataset::{
-    ArrayProblem, DatasetError, EnvironmentSpec, Problem, RecordedRows, Row, matching_environments,
-    recorded_environment,
+    ArrayProblem, DatasetError, EnvironmentSpec, Problem, RecordedRows, RecordedStep,
+    matching_environments, recorded_environment,
 };
 use quad_runtime::Hint;
 use rayon::prelude::*;
@@ -134,7 +134,7 @@ struct RowError {
     terminal_differs: bool,
 }
 
-fn replay(environment: &mut Simulation, row: &Row<'_>, goal: Option<&[f64]>) -> RowError {
+fn replay(environment: &mut Simulation, row: &RecordedStep<'_>, goal: Option<&[f64]>) -> RowError {
     if let Some(goal) = goal {
         environment.set_goal(goal);
     }

@@ -80,7 +80,7 @@ impl Source {
     pub fn doubt(&self, path: &Path, environment: &str) -> Option<String> {
         let spec = environment::find(environment).ok().filter(|_| self.entry().is_none())?;
         let named = quad_dataset::recorded_environment(path).ok()?;
-        let other = &spec.of_same_sizes().filter(|_| named.is_none())?.name;
+        let other = &spec.same_sized().filter(|_| named.is_none())?.name;
         let path = path.display();
         Some(format!(
             "{path} names no environment: it is taken for {environment}'s, but {other} has the same sizes"

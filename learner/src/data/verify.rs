@@ -21,7 +21,7 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
     let format = dataset.benchmark.format;
     file.by_ref().take(16).read_to_end(&mut start)?;
     // Some servers send a web page instead of an error.
-    if Format::of(&start) != Some(format) {
+    if Format::from_start(&start) != Some(format) {
         return Ok(Err(format!("it is not an {}", format.name())));
     }
     let found = sha256(path)?;

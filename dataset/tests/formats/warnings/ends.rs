@@ -1,63 +1,54 @@
-use quad_dataset::Arrays;
-
 use super::{O, assert_warned, cart, mass, warnings};
 
 #[test]
 fn a_mask_or_a_discount_in_place_of_the_flag() {
     for own in [false, true] {
         let mut mask = mass(60, 0.1);
-        mask.terminals.iter_mut().for_each(|terminal| *terminal = !*terminal);
+        mask.terminals.iter_mut().for_each(|flag| *flag = !*flag);
         let part = "a mask or a discount (1 − done) in place of the flag? write 1 − it";
         assert_warned(&mask, own, "array `terminals`: says in 9", part);
         // A mask of truncated episodes is 1 everywhere.
         mask.terminals.fill(true);
-        assert_warned(&mask, own, "array `terminals`: says in 100 % of the rows", part);
+        let start = "array `terminals`: says in 100 % of the rows";
+        assert_warned(&mask, own, start, part);
     }
 }
 
 #[test]
-fn a_success_that_stays_set() {
-    for own in [false, true] {
-        let (mut cart, mut since) = (cart(false), 0);
-        for row in 0..cart.rewards.len() {
-            since += 1;
-            cart.terminals[row] = since > 30;
-            if cart.timeouts[row] {
-                since = 0;
-            }
+fn a_success_that_stays_set_and_rows_after_the_goal() {
+    let (mut set, mut reached, mut number) = (cart(false), cart(false), 0);
+    for row in 0..set.rewards.len() {
+        reached.rewards[row] = f32::from(number >= 3);
+        set.terminals[row] = number >= 30;
+        number += 1;
+        if reached.terminals[row] || reached.timeouts[row] {
+            number = 0;
         }
-        let part = "a success that stays set after the goal? end each episode at the first";
-        assert_warned(&cart, own, "array `terminals`: says in", part);
-    }
-}
-
-#[test]
-fn rows_after_the_goal() {
-    let (mut cart, mut number) = (cart(false), 0);
-    for row in 0..cart.rewards.len() {
-        cart.rewards[row] = f32::from(number >= 3);
-        number = if cart.terminals[row] || cart.timeouts[row] { 0 } else { number + 1 };
     }
     for own in [false, true] {
-        assert_warned(&cart, own, "array `rewards`: 90.6", "few lead to it");
+        let part = "a success that stays set after the goal? end each episode at the first";
+        assert_warned(&set, own, "array `terminals`: says in", part);
+        assert_warned(&reached, own, "array `rewards`: 90.6", "few lead to it");
     }
     // A fall has a cost, and most rows are before it.
-    cart.rewards = cart.terminals.iter().map(|fall| f32::from(!fall)).collect();
-    assert_eq!(warnings(&cart, true), [""; 0]);
+    let falls = reached.terminals.iter();
+    reached.rewards = falls.map(|fall| f32::from(!fall)).collect();
+    assert_eq!(warnings(&reached, true), [""; 0]);
 }
 
 #[test]
 fn flags_that_are_a_row_out_of_step_with_the_resets() {
-    type Flags = fn(&mut Arrays) -> &mut Vec<bool>;
-    let (terminals, timeouts): (Flags, Flags) =
-        (|arrays| &mut arrays.terminals, |arrays| &mut arrays.timeouts);
-    for (flags, name) in [(terminals, "terminals"), (timeouts, "timeouts")] {
-        for own in [false, true] {
-            let mut cart = cart(false);
-            flags(&mut cart).rotate_right(1);
-            assert_warned(&cart, own, &format!("array `{name}`: one row late"), "");
-            flags(&mut cart).rotate_left(2);
-            assert_warned(&cart, own, &format!("array `{name}`: one row early"), "");
+    for (name, own) in [("terminals", false), ("timeouts", false), ("timeouts", true)] {
+        let mut cart = cart(false);
+        for (rows, side) in [(1_isize, "late"), (-2, "early")] {
+            let flags = match name {
+                "terminals" => &mut cart.terminals,
+                _ => &mut cart.timeouts,
+            };
+            let length = flags.len() as isize;
+            flags.rotate_right(rows.rem_euclid(length) as usize);
+            let start = format!("array `{name}`: one row {side}");
+            assert_warned(&cart, own, &start, "");
         }
     }
     // Without visible resets, flags cannot be judged.

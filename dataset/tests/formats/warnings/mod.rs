@@ -11,7 +11,7 @@ use quad_dataset::{Arrays, Names, Normalize, ReadOptions, Transitions, inspect, 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{scratch, write};
+use crate::{scratch, steps, write};
 
 const O: usize = 4;
 
@@ -21,7 +21,7 @@ type State = [f32; O];
 type Step = ([f32; 2], State, f32, bool);
 
 fn empty() -> Arrays {
-    Arrays { observation_dim: O, action_dim: 2, ..Arrays::default() }
+    steps(0, O, 2)
 }
 
 /// Appends an episode of at most `length` steps, which starts in `state`.
@@ -50,8 +50,8 @@ fn record(
 fn mass(length: usize, seconds: f32) -> Arrays {
     let (mut random, mut arrays) = (ChaCha8Rng::seed_from_u64(5), empty());
     for _ in 0..30 {
-        let state = [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0), 0.0, 0.0];
-        record(&mut arrays, length, state, |[x, y, vx, vy]| {
+        let [x, y] = [0; 2].map(|_| random.random_range(-1.0..1.0));
+        record(&mut arrays, length, [x, y, 0.0, 0.0], |[x, y, vx, vy]| {
             let noise = [0; 2].map(|_| random.random_range(-0.5_f32..0.5));
             let push = [-x - 1.5 * vx + noise[0], -y - 1.5 * vy + noise[1]];
             let action = push.map(|push| push.clamp(-1.0, 1.0));
@@ -78,16 +78,31 @@ fn cart(kept: bool) -> Arrays {
             next.iter_mut().for_each(|x| *x = 0.99 * *x + draw(0.02));
             next[0] += 0.02 * action[0];
             (state, number) = (next, number + 1);
-            (action, next, -next[0].abs(), number == length && episode % 3 == 0)
+            let is_over = number == length && episode % 3 == 0;
+            (action, next, -next[0].abs(), is_over)
         });
     }
     arrays
+}
+
+/// Cuts the rows, or appends zeros.
+fn resize(arrays: &mut Arrays, rows: usize) {
+    arrays.observations.resize(rows * O, 0.0);
+    arrays.next_observations.resize(rows * O, 0.0);
+    arrays.actions.resize(rows * 2, 0.0);
+    arrays.rewards.resize(rows, 0.0);
+    arrays.terminals.resize(rows, false);
+    arrays.timeouts.resize(rows, false);
 }
 
 fn observe(arrays: &mut Arrays, change: impl Fn(&mut [f32])) {
     for values in [&mut arrays.observations, &mut arrays.next_observations] {
         values.chunks_exact_mut(O).for_each(&change);
     }
+}
+
+fn act(arrays: &mut Arrays, change: impl Fn(&mut [f32])) {
+    arrays.actions.chunks_exact_mut(2).for_each(change);
 }
 
 /// Writes the custom layout if `own`, else D4RL's.
@@ -107,7 +122,8 @@ fn problems(arrays: &Arrays, own: bool) -> Vec<String> {
 /// Problems of data that training accepts, which says the same.
 fn warnings(arrays: &Arrays, own: bool) -> Vec<String> {
     let problems = problems(arrays, own);
-    assert_eq!(training_warnings(arrays, own, Normalize::default()), problems);
+    let warnings = training_warnings(arrays, own, Normalize::default());
+    assert_eq!(warnings, problems);
     problems
 }
 
@@ -115,15 +131,19 @@ fn training_warnings(arrays: &Arrays, own: bool, normalize: Normalize) -> Vec<St
     let (_folder, path) = scratch("cart.hdf5");
     write_as(&path, arrays, own);
     let options = ReadOptions { normalize, ..ReadOptions::default() };
-    Transitions::read(&path, &options).unwrap().warnings().to_vec()
+    let transitions = Transitions::read(&path, &options).unwrap();
+    transitions.warnings().to_vec()
 }
 
 /// Checks the start of the only warning, and a part of it.
+pub(super) fn assert_one(warnings: &[String], start: &str, part: &str) {
+    let [warning] = warnings else { panic!("{warnings:?}") };
+    assert!(warning.starts_with(start), "{warning}, not {start}");
+    assert!(warning.contains(part), "{warning}, not {part}");
+}
+
 fn assert_warned(arrays: &Arrays, own: bool, start: &str, part: &str) {
-    let warnings = warnings(arrays, own);
-    assert_eq!(warnings.len(), 1, "{warnings:?}");
-    let warning = &warnings[0];
-    assert!(warning.starts_with(start) && warning.contains(part), "{warning}, not {start}…{part}");
+    assert_one(&warnings(arrays, own), start, part);
 }
 
 fn assert_sound(name: &str, arrays: &Arrays) {

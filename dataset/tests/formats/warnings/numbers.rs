@@ -1,13 +1,14 @@
-use quad_dataset::{Arrays, Inspection, Normalize, inspect};
+use quad_dataset::{Arrays, inspect};
 
-use super::{O, assert_warned, cart, observe, training_warnings, warnings, write_as};
-use crate::scratch;
+use super::{
+    O, act, assert_one, assert_warned, cart, observe, training_warnings, warnings, write_as,
+};
+use crate::{normalize, scratch};
 
-const NONE: Normalize = Normalize { actions: false, observations: false, rewards: false };
-
-/// Nothing is wrong if training normalizes.
-fn assert_remedied(arrays: &Arrays, normalize: Normalize) {
-    assert_eq!(training_warnings(arrays, true, normalize), [""; 0]);
+/// Nothing is wrong if training normalizes these columns.
+fn assert_remedied(arrays: &Arrays, columns: &str) {
+    let warnings = training_warnings(arrays, true, normalize(columns));
+    assert_eq!(warnings, [""; 0]);
 }
 
 #[test]
@@ -25,12 +26,11 @@ fn rewards_that_are_all_alike() {
     cart.rewards[70] = 1e-1;
     assert_eq!(warnings(&cart, false), [""; 0]);
     let mut rise = |step: f64| {
-        for (row, reward) in cart.rewards.iter_mut().enumerate() {
-            *reward = (0.1 + step * row as f64) as f32;
-        }
+        let rewards = (0..cart.rewards.len()).map(|row| (0.1 + step * row as f64) as f32);
+        cart.rewards = rewards.collect();
         warnings(&cart, false)
     };
-    assert!(rise(1e-9)[0].starts_with("array `rewards`: all are alike (0.1)"));
+    assert_one(&rise(1e-9), "array `rewards`: all are alike (0.1)", "");
     assert_eq!(rise(1e-7), [""; 0]);
 }
 
@@ -38,22 +38,23 @@ fn rewards_that_are_all_alike() {
 fn observations_too_large_or_too_small_to_train_on_as_they_are() {
     let mut cart = cart(false);
     observe(&mut cart, |row| {
-        (row[1], row[2], row[3]) = (1e6 + 1e3 * row[1], 50.0 + 1e-4 * row[2], 90.0 * row[3])
+        row[1] = 1e6 + 1e3 * row[1];
+        row[2] = 50.0 + 1e-4 * row[2];
+        row[3] *= 90.0;
     });
-    let found = warnings(&cart, true);
-    for (warning, start) in found.iter().zip([
-        "array `observations`: far from ±1 in column 1, of size 999980, which",
-        "array `observations`: hardly changes in column 2, by a standard deviation of",
-    ]) {
-        assert!(warning.starts_with(start), "{warning}, not {start}");
-        assert!(warning.contains("--normalize observations"), "{warning}");
-    }
-    assert_eq!(found.len(), 2);
-    assert_remedied(&cart, Normalize { observations: true, ..NONE });
-    observe(&mut cart, |row| (row[1], row[2]) = (1e-6 * (row[1] - 1e6), 0.0));
-    assert_warned(&cart, true, "array `observations`: hardly changes in column 1", "");
+    let warnings = warnings(&cart, true);
+    assert_eq!(warnings.len(), 2);
+    let start = "array `observations`: far from ±1 in column 1, of size 999980, which";
+    assert_one(&warnings[..1], start, "--normalize observations");
+    let start = "array `observations`: hardly changes in column 2, by a standard deviation of";
+    assert_one(&warnings[1..], start, "--normalize observations");
+    assert_remedied(&cart, "o");
+    observe(&mut cart, |row| row[1] = 1e-6 * (row[1] - 1e6));
+    observe(&mut cart, |row| row[2] = 0.0);
+    let start = "array `observations`: hardly changes in column 1";
+    assert_warned(&cart, true, start, "");
     observe(&mut cart, |row| row[1] *= 1e4);
-    assert_eq!(warnings(&cart, true), [""; 0]);
+    assert_eq!(super::warnings(&cart, true), [""; 0]);
 }
 
 #[test]
@@ -64,30 +65,25 @@ fn a_few_rows_far_from_all_others() {
     cart.next_observations[6 * O + 1] = 1e6;
     let start = "array `observations`, row 7: 1000000 in column 1, far from nearly all other rows;";
     assert_warned(&cart, true, start, "a sensor's error");
-    let normalize = Normalize { observations: true, ..NONE };
-    assert!(training_warnings(&cart, true, normalize)[0].starts_with(start));
+    let warnings = training_warnings(&cart, true, normalize("o"));
+    assert!(warnings[0].starts_with(start), "{warnings:?}");
 }
 
 #[test]
-fn actions_too_small_to_learn() {
-    let mut cart = cart(false);
-    cart.actions.chunks_exact_mut(2).for_each(|action| action[1] *= 1e-4);
+fn actions_too_small_to_learn_or_one_that_alone_sets_the_range() {
+    let mut small = cart(false);
+    act(&mut small, |action| action[1] *= 1e-4);
     let start = "array `actions`: hardly changes in column 1";
-    assert_warned(&cart, true, start, "--normalize actions");
-    assert_remedied(&cart, Normalize { actions: true, ..NONE });
-}
+    assert_warned(&small, true, start, "--normalize actions");
+    assert_remedied(&small, "a");
 
-#[test]
-fn an_action_that_alone_sets_the_range() {
     let mut cart = cart(false);
     cart.actions[7 * 2 + 1] = 200.0;
     let start =
         "array `actions`, row 7: 200 in column 1, far from nearly all other rows; normalized";
-    let normalize = Normalize { actions: true, ..NONE };
-    let warnings = training_warnings(&cart, true, normalize);
-    assert!(warnings.len() == 1 && warnings[0].starts_with(start), "{warnings:?}");
+    assert_one(&training_warnings(&cart, true, normalize("a")), start, "");
     cart.actions[7 * 2 + 1] = 2.0;
-    assert_remedied(&cart, normalize);
+    assert_remedied(&cart, "a");
 }
 
 #[test]
@@ -95,11 +91,12 @@ fn rewards_of_a_size_that_methods_are_not_made_for() {
     let mut cart = cart(false);
     let scale = |cart: &mut Arrays, by: f32| cart.rewards.iter_mut().for_each(|x| *x *= by);
     scale(&mut cart, 400.0);
-    assert_warned(&cart, true, "array `rewards`: of size", "episodes return -");
-    assert_warned(&cart, true, "array `rewards`", "`learner train --normalize rewards`");
-    assert_remedied(&cart, Normalize { rewards: true, ..NONE });
+    let start = "array `rewards`: of size";
+    assert_warned(&cart, true, start, "episodes return -");
+    assert_warned(&cart, true, start, "`learner train --normalize rewards`");
+    assert_remedied(&cart, "r");
     scale(&mut cart, 1e-6);
-    assert_warned(&cart, false, "array `rewards`", "1 for good and bad actions alike");
+    assert_warned(&cart, false, start, "1 for good and bad actions alike");
     // Rare rewards of ordinary size are not small.
     cart.rewards.fill(0.0);
     cart.rewards[100] = 1.0;
@@ -111,14 +108,18 @@ fn numbers_that_never_change_are_named() {
     let (_folder, path) = scratch("cart.hdf5");
     let mut cart = cart(false);
     observe(&mut cart, |row| (row[1], row[3]) = (0.1, 90.0));
-    cart.actions.chunks_exact_mut(2).for_each(|action| action[1] = 0.3);
+    act(&mut cart, |action| action[1] = 0.3);
     assert_eq!(warnings(&cart, true), [""; 0]);
     write_as(&path, &cart, true);
     let inspection = inspect(&path, None).unwrap();
+    assert_eq!(inspection.constant_observations, [1, 3]);
+    assert_eq!(inspection.constant_actions, [1]);
     let page = inspection.to_string();
-    let Inspection { constant_observations, constant_actions, .. } = inspection;
-    assert_eq!((constant_observations, constant_actions), (vec![1, 3], vec![1]));
-    assert!(page.contains("observations  4 numbers; constant: columns 1, 3\n"), "{page}");
-    assert!(page.contains("actions       2 numbers; constant: column 1\n"), "{page}");
-    assert!(page.contains("rewards       of size 0."), "{page}");
+    for line in [
+        "observations  4 numbers; constant: columns 1, 3\n",
+        "actions       2 numbers; constant: column 1\n",
+        "rewards       of size 0.",
+    ] {
+        assert!(page.contains(line), "{page}");
+    }
 }

@@ -2,12 +2,15 @@ use quad_dataset::{Arrays, inspect};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{O, assert_sound, assert_warned, empty, mass, problems, record, warnings};
+use super::{
+    O, act, assert_one, assert_sound, assert_warned, empty, mass, problems, record, resize,
+    warnings,
+};
 use crate::{put, scratch, write};
 
 /// Sound data with the observation of each row taken `from` another, by the row and its number in
 /// the episode.
-fn moved(sound: Arrays, from: impl Fn(usize, usize) -> usize) -> Arrays {
+fn moved(mut sound: Arrays, from: impl Fn(usize, usize) -> usize) -> Arrays {
     let rows = sound.rewards.len();
     let (mut observations, mut start) = (Vec::new(), 0);
     for row in 0..rows {
@@ -17,13 +20,32 @@ fn moved(sound: Arrays, from: impl Fn(usize, usize) -> usize) -> Arrays {
             start = row + 1;
         }
     }
-    let mut next_observations = observations[O..].to_vec();
-    next_observations.extend_from_within((rows - 2) * O..);
-    Arrays { observations, next_observations, ..sound }
+    sound.next_observations = observations[O..].to_vec();
+    sound.next_observations.extend_from_within((rows - 2) * O..);
+    sound.observations = observations;
+    sound
 }
 
 fn any(warnings: &[String], start: &str) -> bool {
     warnings.iter().any(|warning| warning.starts_with(start))
+}
+
+/// The rows of `arrays` in the order in which `place` says where they are taken from, but not their
+/// flags.
+pub(super) fn reordered(arrays: &Arrays, place: impl Fn(usize) -> usize) -> Arrays {
+    let rows = arrays.rewards.len();
+    let mut reordered = arrays.clone();
+    for row in 0..rows {
+        let from = place(row);
+        let states = |row: usize| row * O..(row + 1) * O;
+        reordered.observations[states(row)].copy_from_slice(&arrays.observations[states(from)]);
+        let next = &arrays.next_observations[states(from)];
+        reordered.next_observations[states(row)].copy_from_slice(next);
+        let actions = &arrays.actions[2 * from..][..2];
+        reordered.actions[2 * row..][..2].copy_from_slice(actions);
+        reordered.rewards[row] = arrays.rewards[from];
+    }
+    reordered
 }
 
 #[test]
@@ -37,7 +59,7 @@ fn observations_that_rest_while_actions_change() {
     }
     // A robot at rest is commanded to rest.
     let mut still = moved(mass(60, 0.1), |row, number| row - number % 10);
-    still.actions.chunks_exact_mut(2).for_each(|action| action.copy_from_slice(&[0.25, 0.5]));
+    act(&mut still, |action| action.copy_from_slice(&[0.25, 0.5]));
     assert!(!any(&warnings(&still, true), rests));
 }
 
@@ -53,20 +75,9 @@ fn next_observations_that_are_the_rows_own() {
 fn rows_that_were_never_written() {
     let mut arrays = mass(60, 0.1);
     let rows = arrays.rewards.len() + 100;
-    for (values, width) in [
-        (&mut arrays.observations, O),
-        (&mut arrays.next_observations, O),
-        (&mut arrays.actions, 2),
-        (&mut arrays.rewards, 1),
-    ] {
-        values.resize(rows * width, 0.0);
-    }
-    for flags in [&mut arrays.terminals, &mut arrays.timeouts] {
-        flags.resize(rows, false);
-    }
-    for own in [false, true] {
-        assert!(any(&problems(&arrays, own), "array `observations`: 0 in the last 100 rows ("));
-    }
+    resize(&mut arrays, rows);
+    let start = "array `observations`: 0 in the last 100 rows (";
+    assert!(any(&problems(&arrays, false), start) && any(&problems(&arrays, true), start));
     arrays.timeouts[rows - 1] = true;
     assert!(!any(&problems(&arrays, true), "array `observations`: 0 in"));
 }
@@ -77,7 +88,8 @@ fn actions_that_are_the_state() {
     for (unit, own) in [(1.0, false), (1.0, true), (100.0, true), (degrees, true)] {
         let mut copied = mass(60, 0.1);
         let states = copied.observations.chunks_exact(O);
-        copied.actions = states.flat_map(|state| [unit * state[1], unit * state[0]]).collect();
+        let actions = states.flat_map(|state| [unit * state[1], unit * state[0]]);
+        copied.actions = actions.collect();
         let start = "array `actions`: columns 0, 1 copied from columns 1, 0 of the same row's observation (in 100.0 %";
         assert!(any(&problems(&copied, own), start));
     }
@@ -94,8 +106,8 @@ fn actions_that_are_the_state() {
         gripper.actions[row * 2 + 1] = open(row + 1);
     }
     for arrays in [commands, gripper] {
-        let problems = problems(&arrays, true);
-        assert!(!problems.iter().any(|problem| problem.contains("copied")), "{problems:?}");
+        let problems = problems(&arrays, true).concat();
+        assert!(!problems.contains("copied"), "{problems}");
     }
 }
 
@@ -104,12 +116,11 @@ fn observations_that_are_a_row_late() {
     for (length, seconds) in [(60, 0.1), (300, 0.02)] {
         let sound = mass(length, seconds);
         assert_sound("mass", &sound);
-        let is_last = Vec::from_iter(
-            (0..sound.rewards.len()).map(|row| sound.terminals[row] || sound.timeouts[row]),
-        );
-        let late = moved(sound, |row, _| if is_last[row] { row } else { row + 1 });
+        let is_last = |row: usize| sound.terminals[row] || sound.timeouts[row];
+        let late = moved(sound.clone(), |row, _| row + usize::from(!is_last(row)));
         for own in [false, true] {
-            assert!(any(&problems(&late, own), "array `observations`: one row late?"));
+            let problems = problems(&late, own);
+            assert!(any(&problems, "array `observations`: one row late?"));
         }
     }
 }
@@ -118,32 +129,22 @@ fn observations_that_are_a_row_late() {
 fn rows_out_of_order_are_not_called_late() {
     let (mut random, mut sound) = (ChaCha8Rng::seed_from_u64(5), empty());
     for _ in 0..30 {
-        let state = [random.random_range(-2.0..2.0), random.random_range(-2.0..2.0), 0.0, 0.0];
-        record(&mut sound, 40, state, |[x, y, ..]| {
+        let [x, y] = [0; 2].map(|_| random.random_range(-2.0..2.0));
+        record(&mut sound, 40, [x, y, 0.0, 0.0], |[x, y, ..]| {
             // The next action says where the next state is.
-            let mut act = |x: f32| -0.4 * x + random.random_range(-0.2_f32..0.2);
-            let action = [act(x), act(y)];
-            (action, [x + 0.1 * action[0], y + 0.1 * action[1], 0.0, 0.0], -x.hypot(y), false)
+            let action = [x, y].map(|x| -0.4 * x + random.random_range(-0.2_f32..0.2));
+            let next = [x + 0.1 * action[0], y + 0.1 * action[1], 0.0, 0.0];
+            (action, next, -x.hypot(y), false)
         });
     }
     let rows = sound.rewards.len();
     let place = |row: usize| row * 7919 % rows;
-    let shuffled = |values: &[f32], width: usize| -> Vec<f32> {
-        (0..rows).flat_map(|row| values[place(row) * width..][..width].to_vec()).collect()
-    };
-    let next_observations = shuffled(&sound.next_observations, O);
-    let arrays = Arrays {
-        observations: shuffled(&sound.observations, O),
-        actions: shuffled(&sound.actions, 2),
-        rewards: shuffled(&sound.rewards, 1),
-        timeouts: (0..rows).map(|row| sound.timeouts[place(row)]).collect(),
-        ..sound.clone()
-    };
+    let mut arrays = reordered(&sound, place);
+    arrays.timeouts = (0..rows).map(|row| sound.timeouts[place(row)]).collect();
     let (_folder, path) = scratch("shuffled.hdf5");
-    let file = write(&path, &arrays);
-    put(&file, "next_observations", &[rows, O], &next_observations);
+    let (file, next) = (write(&path, &arrays), &arrays.next_observations);
+    put(&file, "next_observations", &[rows, O], next);
     drop(file);
     let problems = inspect(&path, None).unwrap().problems;
-    let [problem] = &problems[..] else { panic!("{problems:?}") };
-    assert!(problem.starts_with("array `next_observations`, row 0: not the"), "{problem}");
+    assert_one(&problems, "array `next_observations`, row 0: not the", "");
 }

@@ -1,6 +1,6 @@
 //! Mixes episodes of a search's policies, from the first to the last, into one dataset.
 
-use quad_dataset::{D4rlWriter, DatasetError, EnvironmentSpec, Recipe, Row};
+use quad_dataset::{D4rlWriter, DatasetError, EnvironmentSpec, Recipe, RecordedStep};
 use quad_runtime::{Hint, ProgressBar};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -130,7 +130,7 @@ impl Recorder {
     fn write(&self, writer: &mut D4rlWriter) -> Result<(), DatasetError> {
         for ((action, step), states) in self.steps.iter().zip(self.states.windows(2)) {
             let [observation, qpos, qvel] = &states[0];
-            writer.push(&Row {
+            writer.push(&RecordedStep {
                 observation,
                 action,
                 next_observation: &states[1][0],
