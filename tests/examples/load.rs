@@ -20,6 +20,7 @@ use quad_runtime::open_router;
 use quad_tests::made_up::{claim, client, name};
 use quad_tests::setting::{ENDLESS, Setting};
 use quad_tests::system::Scratch;
+use tokio::task::JoinSet;
 use tokio::time::sleep;
 use zenoh::Session;
 
@@ -146,16 +147,18 @@ async fn main() {
     let alone = learner.process.peak_memory();
     let times = Times::default();
     let episode = Duration::from_millis(episode.parse().unwrap_or(0));
+    let mut evaluators = JoinSet::new();
     for number in 0..count.parse().unwrap() {
         let (session, times) = (client(&endpoint).await, times.clone());
         let name = name(&format!("light-{number}"));
-        tokio::spawn(Evaluator { name, session, episode, times }.work());
+        evaluators.spawn(Evaluator { name, session, episode, times }.work());
     }
     sleep(Duration::from_secs(5)).await;
     *times.lock().unwrap() = Default::default();
     let rows = learner.metric("experience_rows", "").unwrap();
     sleep(MEASURED).await;
     let rows = learner.metric("experience_rows", "").unwrap() - rows;
+    evaluators.shutdown().await;
     let seconds = MEASURED.as_secs_f64();
     for (kind, times) in ["claims", "deliveries"].iter().zip(&mut *times.lock().unwrap()) {
         times.sort_unstable();
