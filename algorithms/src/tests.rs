@@ -230,8 +230,11 @@ fn metrics_are_those_of_the_table_and_finite_and_trained_weights_have_gradients(
 fn a_nan_reaches_a_metric() {
     for variant in variants() {
         let start = || variant.start(&context(0, &Device::Cpu));
-        let networks = start().agent.algorithm.state_dict().networks();
-        let networks = Vec::from_iter(networks.into_iter().map(|(network, _)| network));
+        let names = |mut trial: Trial| {
+            let networks = trial.agent.algorithm.state_dict().networks();
+            Vec::from_iter(networks.into_iter().map(|(network, _)| network))
+        };
+        let networks = names(start());
         assert!(networks.len() > 1, "{}", variant.name);
         for broken in networks {
             let mut trial = start();
