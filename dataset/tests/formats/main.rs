@@ -112,7 +112,7 @@ fn compare(path: &Path, environment: Environment, reference: &Path) {
 
     let transitions = read(path, environment, RewardRule::Locomotion);
     let batch = all(&transitions);
-    assert_eq!(batch.size, transitions.len());
+    assert_eq!(batch.rewards.len(), transitions.len());
     assert_eq!(batch.observations, array("observations"));
     assert_eq!(batch.actions, array("actions"));
     assert_eq!(batch.next_observations, array("next_observations"));

@@ -27,7 +27,7 @@ fn the_ten_lines_of_the_page_write_what_is_read() {
 
     let transitions = read(&folder.path().join("my-robot.hdf5"), None, RewardRule::AsIs);
     let batch = all(&transitions);
-    let sizes = (batch.size, transitions.observation_dim(), transitions.action_dim());
+    let sizes = (batch.rewards.len(), transitions.observation_dim(), transitions.action_dim());
     assert_eq!(sizes, (12, 5, 2));
     // `peers.py write-log` has the same formulas: s = 10 i + j, s' = s + 5, a = ±1/2, r = i.
     for i in 0..12 {
