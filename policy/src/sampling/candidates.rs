@@ -54,8 +54,7 @@ impl CandidatePolicy {
         if choice.rule == Rule::Nearest && networks.value.is_none() {
             return Err(PolicyError::NoValue);
         }
-        let mut unvalued = Choice::best_of(1);
-        unvalued.guidance = choice.guidance;
+        let unvalued = Choice { guidance: choice.guidance, ..Choice::best_of(1) };
         if choice != unvalued && networks.critics.is_none() {
             return Err(PolicyError::NoCritics);
         }
@@ -106,8 +105,7 @@ impl CandidatePolicy {
         let (critics, rows) = (self.networks.critics.as_ref(), actions.dim(0)?);
         let critics = critics.ok_or(PolicyError::NoCritics)?;
         let values = critics.values(observations, actions)?;
-        let values = read(&values, <[f32]>::to_vec)?;
-        Ok(self.choice.aggregate.reduce(&values, rows))
+        Ok(read(&values, |values: &[f32]| self.choice.aggregate.reduce(values, rows))?)
     }
 
     /// The numbers that the choice's rule compares: values Q, or −(Q − V)² for the rule `nearest`.
