@@ -104,7 +104,21 @@ impl World {
             let frames_written = self.rng.random_range(0..=frames.len());
             drop(self.disk.append(&scores[..written], &frames[..frames_written]));
         }
+        self.lose_snapshot();
         self.publish();
+    }
+
+    /// Loses the newest snapshot, at times, as if it had not been synchronized. Training, which goes
+    /// on from an earlier step, makes it again; until then its scores come too early.
+    fn lose_snapshot(&mut self) {
+        let checkpoint = self.disk.checkpoint.map_or(0, |state| state.step);
+        let before = checkpoint.max(self.settings.offline_steps);
+        let newest = self.disk.snapshots.last_entry().filter(|newest| *newest.key() > before);
+        if let Some(newest) = newest
+            && self.rng.random_bool(0.5)
+        {
+            newest.remove();
+        }
     }
 
     /// A query of an evaluator, or of a stranger, arrives.
