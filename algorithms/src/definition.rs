@@ -106,12 +106,14 @@ fn take_chunk(table: &mut Table) -> Result<(Chunk, Window), AgentError> {
     Ok((Chunk { history, length, replan }, Window { history, length, gamma }))
 }
 
+type Constructor = dyn FnOnce(Context) -> Result<Box<dyn Algorithm>, AlgorithmError>;
+
 /// Makes an algorithm at step 0 with hyper-parameters that were read before.
 pub struct Start {
     /// What it asks of batches.
     pub columns: Columns,
     /// Its constructor.
-    pub new: Box<dyn FnOnce(Context) -> Result<Box<dyn Algorithm>, AlgorithmError>>,
+    pub new: Box<Constructor>,
 }
 
 /// A [`Start`] with plain batches from hyper-parameters and a constructor.

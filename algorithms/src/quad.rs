@@ -29,7 +29,6 @@ pub(super) const DEFINITION: Definition = Definition {
     summary: Some(summary::summarize),
     chunks: true,
     read: |table| Ok(start(Config::read(table)?, Quad::start)),
-    ..Definition::PLAIN
 };
 
 #[derive(Clone)]

@@ -204,7 +204,8 @@ mod tests {
     fn episodes_that_contradict_themselves_or_are_not_finite_are_refused() {
         assert_eq!(decode::<Episode>(&encode(&episode()).unwrap()).unwrap(), episode());
         assert_eq!(episode().dims(), (2, 1));
-        let changes: [(fn(&mut Episode), &str); 11] = [
+        type Change = fn(&mut Episode);
+        let changes: [(Change, &str); 11] = [
             (|episode| episode.rewards.clear(), "length is not the number of its rewards"),
             (|episode| episode.score.length = 3, "length is not the number of its rewards"),
             (|episode| episode.observations.truncate(5), "arrays have different lengths"),

@@ -61,8 +61,9 @@ fn code(role: &str, signal: Option<Signal>) -> Option<i32> {
 }
 
 fn ready() {
-    println!("ready");
-    std::io::stdout().flush().unwrap();
+    let mut output = std::io::stdout();
+    writeln!(output, "ready").unwrap();
+    output.flush().unwrap();
 }
 
 fn counts_each_signal_once() {

@@ -13,8 +13,10 @@ use quad_tests::disk::HANGS;
 pub extern "C" fn fsync(file: c_int) -> c_int {
     let path = fs::read_link(Path::new("/proc/self/fd").join(file.to_string())).unwrap_or_default();
     let hangs = std::env::var(HANGS).is_ok_and(|start| path.to_string_lossy().starts_with(&start));
-    while hangs {
-        park();
+    if hangs {
+        loop {
+            park();
+        }
     }
     // SAFETY: it takes a descriptor, of whatever kind, and touches no memory of the program.
     unsafe { libc::syscall(libc::SYS_fsync, file) as c_int }

@@ -25,6 +25,7 @@ fn d4rl() -> Recording {
 
 /// Actions are a hundredth of row numbers.
 #[test]
+#[allow(clippy::single_range_in_vec_init)] // It is one episode.
 fn episodes_and_next_actions_are_those_of_the_recording() {
     let recorded_rows = |kinds: &[RowKind], terminals: &[usize], ends: &[usize], goal: bool| {
         let mut recording = recording(kinds);

@@ -88,8 +88,8 @@ fn actions_reach_from_least_to_largest() {
     assert_eq!(scaling.observations, None);
     assert_eq!(batch.observations, arrays().observations);
     assert_eq!(batch.rewards, arrays().rewards);
-    assert_eq!(transitions.episodes(), [0..4], "as without scaling");
-    assert_eq!(normalized(arrays(), "ao").episodes(), [0..4]);
+    assert_eq!(transitions.episodes().len(), 1, "as without scaling");
+    assert_eq!(normalized(arrays(), "ao").episodes().len(), 1);
 }
 
 #[test]

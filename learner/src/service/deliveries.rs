@@ -55,7 +55,8 @@ impl<Q> Service<Q> {
     /// True if a flush would do something.
     pub fn has_deliveries(&self) -> bool {
         let Deliveries { reports, pieces, .. } = &self.deliveries;
-        !(reports.is_empty() && pieces.is_empty()) && !self.deliveries.is_busy()
+        let waits = !reports.is_empty() || !pieces.is_empty();
+        waits && !self.deliveries.is_busy()
     }
 
     /// Without an answer the evaluator tries again.

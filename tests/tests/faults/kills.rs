@@ -1,7 +1,7 @@
 //! Programs that are killed and a router that dies change no bit of a run.
 
 use quad_tests::router::Router;
-use quad_tests::setting::{SHORT, Setting};
+use quad_tests::setting::Setting;
 use quad_tests::system::Scratch;
 use quad_tests::wait_until;
 
@@ -13,7 +13,6 @@ const SETTING: Setting = Setting {
     candidates: 20,
     hidden: 64,
     online_steps: 10_000,
-    ..SHORT
 };
 const STEPS: u64 = SETTING.steps + 2 * SETTING.online_steps;
 const FAULTS: u64 = 12;

@@ -48,11 +48,11 @@ async fn flood(session: &Session, step: u64) -> Vec<LivelinessToken> {
         let evaluator = format!("flood-{number}");
         let claim = encode(&made_up::claim(&evaluator, 1, "moon")).unwrap();
         let progress = encode(&made_up::progress(&run, "flood", number)).unwrap();
-        put(session, &keys::progress(&run, &name("flood")), &progress).await;
+        put(session, &keys::progress(&run, name("flood")), &progress).await;
         ask(session, &jobs, &claim).await;
         ask(session, &scores, &encode(&made_up::report(&run, step, number)).unwrap()).await;
         ask(session, &weights, &[]).await;
-        let token = keys::live_evaluator(&run, &name(&evaluator));
+        let token = keys::live_evaluator(&run, name(&evaluator));
         tokens.push(session.liveliness().declare_token(token).await.unwrap());
         if number % 100 == 0 {
             // Larger than any message of their kind.
