@@ -1,52 +1,22 @@
-//! The interface between an algorithm and the learner; and an agent in training, which counts an
-//! algorithm's updates, publishes its policy, saves and loads its state.
+//! An agent in training, which counts an algorithm's updates, publishes its policy, saves and loads
+//! its state.
 
+use crate::algorithm::Algorithm;
 use crate::batch::Batch;
 use crate::context::Context;
 use crate::definition::{Definition, Metric};
 use crate::error::AlgorithmError;
 use crate::examples::{Columns, Examples};
+use crate::losses::Measured;
 use crate::pool::run_awake;
 use crate::replay::Inputs;
-use crate::state_dict::StateDict;
 use candle_core::Device;
 use quad_dataset::{Names, Transitions, Window};
-use quad_nn::{Scaling, Tensors};
-use quad_policy::{
-    Chunk, Header, PolicyConfig, PolicyError, read_header, read_tensors, write_tensors,
-};
+use quad_nn::Scaling;
+use quad_policy::{Chunk, Header, PolicyError, read_header, read_tensors, write_tensors};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 use toml::Table;
-
-/// Metrics of an update by the names in the algorithm's table.
-pub type Measured = Vec<(&'static str, f32)>;
-
-/// The updates of an algorithm, its policy and its state.
-pub trait Algorithm: Send {
-    /// The first step of each training phase; updates of different phases take different times.
-    fn phases(&self) -> Vec<u64> {
-        vec![0]
-    }
-
-    /// True if an update takes batches from the CPU on any device: it copies them with its noise.
-    fn copies_batches(&self) -> bool {
-        false
-    }
-
-    /// Performs update number `step`, from 0. Its random numbers are a function of the run's seed and
-    /// `step`.
-    fn update(&mut self, step: u64, batch: &Batch) -> candle_core::Result<Measured>;
-
-    /// Computes the losses of update number `step` and changes nothing.
-    fn evaluate(&self, step: u64, batch: &Batch) -> candle_core::Result<Measured>;
-
-    /// The policy to be evaluated: its description and its tensors.
-    fn policy(&self) -> candle_core::Result<(PolicyConfig, Tensors)>;
-
-    /// Everything that updates change; with the step it determines the rest of the run.
-    fn state_dict(&mut self) -> StateDict<'_>;
-}
 
 /// Key of the counters in the metadata of a saved state.
 const COUNTERS: &str = "state";

@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize, Serializer};
 use toml::{Table, Value};
 
-use super::agent::Algorithm;
+use super::algorithm::Algorithm;
 use super::context::Context;
 use super::error::{AgentError, AlgorithmError, check};
 use super::examples::Columns;

@@ -7,11 +7,12 @@ mod reader;
 use std::sync::Arc;
 
 use super::ALGORITHMS;
-use super::agent::{Algorithm, Measured};
+use super::algorithm::Algorithm;
 use super::batch::Batch;
 use super::context::Context;
 use super::definition::{Definition, Metric};
 use super::examples::{Columns, Examples};
+use super::losses::Measured;
 use super::replay::Inputs;
 use super::state_dict::StateDict;
 use candle_core::{D, DType, Device, Tensor};

@@ -19,6 +19,7 @@
 #![deny(unsafe_code)]
 
 mod agent;
+mod algorithm;
 mod align_iql;
 mod batch;
 mod context;
@@ -59,13 +60,15 @@ mod td3bc;
 mod values;
 mod xql;
 
-pub use agent::{Agent, Algorithm, Measured, StateError};
+pub use agent::{Agent, StateError};
+pub use algorithm::Algorithm;
 pub use batch::Batch;
 pub use context::Context;
 pub use definition::{Axis, Definition, Metric, MetricsLine, Start, Summary, Variant};
 pub use error::{AgentError, AlgorithmError, in_words};
 pub use examples::{Columns, Examples, Plans};
 pub use fqe::{Fqe, FqeConfig, Units};
+pub use losses::Measured;
 pub use state_dict::StateDict;
 pub use values::{Values, fits, merge};
 

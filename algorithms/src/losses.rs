@@ -4,7 +4,8 @@ use candle_core::{Result, Tensor};
 use quad_nn::mean_and_variance;
 use quad_policy::Aggregate;
 
-use super::agent::Measured;
+/// Metrics of an update by the names in the algorithm's table.
+pub type Measured = Vec<(&'static str, f32)>;
 
 /// The smallest of the critics' values, `[K, B]` → `[B]`. (`min` ignores NaN; adding 0·sum keeps
 /// it.)

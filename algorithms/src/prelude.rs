@@ -1,6 +1,6 @@
 //! The names that the file of an algorithm needs.
 
-pub(super) use super::agent::{Algorithm, Measured};
+pub(super) use super::algorithm::Algorithm;
 pub(super) use super::batch::Batch;
 pub(super) use super::context::Context;
 pub(super) use super::definition::{
@@ -12,7 +12,7 @@ pub(super) use super::hyperparameters::{
     Candidates, Count, Finite, NotNegative, OpenUnit, Positive, Rate, Steps, UnitInterval,
     first_steps, phase,
 };
-pub(super) use super::losses::{Loss, largest, lower_bound, measured, reduced, smallest};
+pub(super) use super::losses::{Loss, Measured, largest, lower_bound, measured, reduced, smallest};
 pub(super) use super::networks::{
     Initializer, TWIN, TrainState, WithTarget, networks, state_value,
 };

@@ -5,16 +5,17 @@
 mod config;
 mod guidance;
 mod metrics;
+mod noise;
 mod summary;
 
 use super::definition::Axis;
-use super::diffusion::{Denoising, Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
+use super::diffusion::{Diffusion, DiffusionUpdate, Networks, Sampler, denoise};
 use super::prelude::*;
-use super::replay::Inputs;
 use super::state_dict::write;
 use config::{Config, Guidance, TargetReduce};
-use guidance::{Averages, Guide, shuffled};
+use guidance::{Averages, Guide};
 use metrics::METRICS;
+use noise::Noise;
 use quad_nn::{Reverse, pulled_error};
 use quad_policy::{DiffusionPolicy, DiffusionShape};
 
@@ -30,42 +31,6 @@ pub(super) const DEFINITION: Definition = Definition {
     chunks: true,
     read: |table| Ok(start(Config::read(table)?, Quad::start)),
 };
-
-#[derive(Clone)]
-struct Noise {
-    /// Noise of the sampled next actions, `[T, B·S, a]`.
-    next: Tensor,
-    /// t and ε of Eq. 5.
-    denoising: Denoising,
-    /// With guidance `shuffled`: the sample whose λ each sample takes, one of the same t, `[B]`.
-    permutation: Option<Tensor>,
-}
-
-impl Inputs for Noise {
-    fn tensors(&mut self) -> Vec<&mut Tensor> {
-        let mut tensors = self.denoising.tensors();
-        tensors.push(&mut self.next);
-        tensors.extend(&mut self.permutation);
-        tensors
-    }
-}
-
-impl Noise {
-    fn draw(config: &Config, mut sampler: Sampler<'_>) -> Result<Self> {
-        let next = sampler.chain("next_noise", *config.samples)?;
-        let denoising = sampler.denoising()?;
-        let permutation = match config.guidance {
-            Guidance::Shuffled => {
-                let t = denoising.t.to_vec1()?;
-                let shuffled = |generator: &mut _| Ok(shuffled(&t, generator));
-                let rows: Vec<u32> = sampler.random.vector("permutation", shuffled)?;
-                Some(Tensor::new(rows, &Device::Cpu)?)
-            }
-            _ => None,
-        };
-        Ok(Self { next, denoising, permutation })
-    }
-}
 
 struct Quad {
     config: Config,

@@ -2,8 +2,7 @@
 //! replays that in those after it. It is hundreds of kernels, and the host takes longer to start one
 //! of them than the GPU to run it.
 
-use super::agent::Measured;
-use super::losses::{Computed, Loss, joined};
+use super::losses::{Computed, Loss, Measured, joined};
 use candle_core::{DType, Device, Result, Tensor};
 use quad_nn::{CudaGraph, overwrite};
 use std::thread::{ThreadId, current};

@@ -1,6 +1,8 @@
 //! The precision of products.
 
-use crate::product::{instructions, rounding_is_faster};
+#[cfg(target_arch = "x86_64")]
+use crate::avx512;
+use crate::level::Level;
 use serde::de::{self, IntoDeserializer};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
@@ -56,4 +58,23 @@ impl FromStr for Precision {
     fn from_str(name: &str) -> Result<Self, Self::Err> {
         Self::deserialize(name.into_deserializer())
     }
+}
+
+/// True if this CPU multiplies in bf16 faster than in f32.
+fn rounding_is_faster() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    let available = avx512::bf16::available();
+    #[cfg(not(target_arch = "x86_64"))]
+    let available = false;
+    available
+}
+
+/// The instructions of products, in f32 or `rounded`. Other instructions add in another order, and
+/// so give other last bits.
+fn instructions(rounded: bool) -> &'static str {
+    #[cfg(target_arch = "x86_64")]
+    let names = if rounded { avx512::bf16::instructions() } else { Level::in_use().name() };
+    #[cfg(not(target_arch = "x86_64"))]
+    let names = if rounded { "none" } else { Level::in_use().name() };
+    names
 }

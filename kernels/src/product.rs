@@ -138,25 +138,6 @@ fn multiply(precision: Precision, [m, k, n]: [usize; 3], a: Matrix, b: &[f32], o
     by_gemm([m, k, n], a, Matrix::RowMajor(b), out);
 }
 
-/// True if this CPU multiplies in bf16 faster than in f32.
-pub(crate) fn rounding_is_faster() -> bool {
-    #[cfg(target_arch = "x86_64")]
-    let available = avx512::bf16::available();
-    #[cfg(not(target_arch = "x86_64"))]
-    let available = false;
-    available
-}
-
-/// The instructions of products, in f32 or `rounded`. Other instructions add in another order, and
-/// so give other last bits.
-pub(crate) fn instructions(rounded: bool) -> &'static str {
-    #[cfg(target_arch = "x86_64")]
-    let names = if rounded { avx512::bf16::instructions() } else { Level::in_use().name() };
-    #[cfg(not(target_arch = "x86_64"))]
-    let names = if rounded { "none" } else { Level::in_use().name() };
-    names
-}
-
 /// `out[m × n] = x[m × k] · w[k × n]`.
 pub fn product(precision: Precision, x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     multiply(precision, [x.len() / k, k, n], Matrix::RowMajor(x), w, out);

@@ -12,7 +12,7 @@ use pyo3::types::PyDict;
 use quad_policy::{Choice, EpisodeState, Policy, PolicyError};
 
 use crate::arrays::Rows;
-use crate::policy_error;
+use crate::error::policy_error;
 
 /// Memory of one call of a policy, bytes; more rows are split. An action does not depend on other rows.
 const MEMORY: u64 = 256 << 20;

@@ -9,7 +9,7 @@ use quad_dataset::{Arrays, DatasetError, Names, benchmarks, inspect, write_own};
 use quad_run::results::RunReport;
 use quad_runtime::one_line;
 
-use crate::with_hint;
+use crate::error::with_hint;
 
 fn refused(error: &DatasetError) -> PyErr {
     with_hint(error, &error.hint())

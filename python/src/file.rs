@@ -6,7 +6,7 @@ use quad_policy::{Header, Policy, PolicyError, Precision, load_policy};
 use quad_protocol::Origin;
 use serde_json::{Value, json};
 
-use crate::with_hint;
+use crate::error::with_hint;
 
 pub const HINT: &str = "a policy is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this version writes them";
 

@@ -1,14 +1,12 @@
 //! The critics' gradients at noisy actions, or at what these denoise to, and their weight: λ of
 //! Eq. 24, or a control in its place.
 
-use super::Noise;
 use super::config::{Config, Guidance, GuidanceAt};
+use super::noise::Noise;
 use crate::batch::Batch;
 use crate::state_dict::{StateDict, write};
 use candle_core::{DType, Device, Result, Tensor};
 use quad_nn::{Ensemble, mean_and_variance};
-use rand::Rng;
-use rand::seq::SliceRandom;
 
 /// λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24) of ν̂², `[]`, and σ², `[B]`, or the weight in its place, `[B]`;
 /// and the share of the batch in which δ decides λ, `[]`.
@@ -168,37 +166,4 @@ fn means_by_step(before: &Tensor, lambda: &Tensor, t: &Tensor, config: &Config) 
     let rate = f64::from(*config.nu_ema_rate);
     let rate = before.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - rate, rate)?;
     before + ((mean - before)? * (rate * count.minimum(1f32)?)?)?
-}
-
-/// A permutation of a batch that leaves each sample's t as it is.
-pub(super) fn shuffled(t: &[u32], generator: &mut impl Rng) -> Vec<u32> {
-    let rows = || 0..t.len() as u32;
-    let mut givers = Vec::from_iter(rows());
-    givers.shuffle(generator);
-    // Both in the order of t: the n-th sample of a t takes from the n-th of the shuffled ones.
-    let mut takers = Vec::from_iter(rows());
-    takers.sort_by_key(|row| t[*row as usize]);
-    givers.sort_by_key(|row| t[*row as usize]);
-    let mut permutation = vec![0; t.len()];
-    takers.into_iter().zip(givers).for_each(|(taker, giver)| permutation[taker as usize] = giver);
-    permutation
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use rand::SeedableRng;
-    use rand_chacha::ChaCha8Rng;
-
-    #[test]
-    fn a_shuffle_permutes_the_samples_of_each_denoising_step() {
-        let t = Vec::from_iter((0..500).map(|row| row % 3 + 1));
-        let mut rows = shuffled(&t, &mut ChaCha8Rng::seed_from_u64(0));
-        assert!(rows.iter().zip(&t).all(|(row, step)| t[*row as usize] == *step));
-        // Of n things in random order one stays on average; of three t's three do.
-        let stay = rows.iter().zip(0..).filter(|(row, place)| *row == place);
-        assert!(stay.count() < 20);
-        rows.sort_unstable();
-        assert_eq!(rows, Vec::from_iter(0..500));
-    }
 }

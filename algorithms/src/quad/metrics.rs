@@ -1,8 +1,8 @@
 //! The metrics of QUAD; those of λ and guidance over a batch are computed on the CPU.
 
 use super::guidance::Guide;
-use crate::agent::Measured;
 use crate::definition::{Metric, metrics};
+use crate::losses::Measured;
 use candle_core::Tensor;
 
 pub(super) const METRICS: &[Metric] = &metrics! {

@@ -12,6 +12,7 @@ use zenoh::Wait;
 use zenoh::liveliness::LivelinessToken;
 
 use super::connection::{ANSWER_TIMEOUT, Connection, QueryError, blocking};
+use super::delivery::Owed;
 use super::discovery::{Learners, RunKey};
 use super::duty::{Duty, Note, Step};
 use super::evaluate::Evaluator;
@@ -107,7 +108,7 @@ impl RunClient {
                 }
                 self.duty.claimed(reply, rand::random_range(0.5..1.0), Instant::now());
             }
-            Step::Play(job) => match evaluator.evaluate(&job, self).await {
+            Step::Play(job) => match self.play(&job, evaluator).await {
                 Ok(owed) => self.duty.played(Ok(owed)),
                 Err(error) => {
                     self.connection.metrics.job("failed");
@@ -118,6 +119,10 @@ impl RunClient {
             step => self.deliver(step, ANSWER_TIMEOUT).await?,
         }
         Ok(())
+    }
+
+    async fn play(&self, job: &Job, evaluator: &mut Evaluator) -> anyhow::Result<Owed> {
+        evaluator.evaluate(job, &self.connection, self.snapshot(job)).await
     }
 
     /// Ends a turn in which the learner has not answered: the run rests, and another of its

@@ -12,7 +12,6 @@ use zenoh::qos::CongestionControl;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 use zenoh::{Session, Wait};
 
-use super::snapshot::is_named_by;
 use crate::metrics::Metrics;
 
 /// A learner answers in milliseconds. Other runs wait no longer than this for one that hangs.
@@ -217,4 +216,11 @@ fn is_from(followed: u64, incarnation: u64) -> Result<(), &'static str> {
         true => Ok(()),
         false => Err("other_incarnation"),
     }
+}
+
+/// Compares everything but the file, whose hash decoding has verified.
+pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
+    let origin = (&snapshot.run, snapshot.incarnation);
+    origin == (&job.run, job.incarnation)
+        && (snapshot.step, snapshot.hash) == (job.step, job.weights)
 }

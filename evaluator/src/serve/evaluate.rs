@@ -10,7 +10,7 @@ use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 use tracing::info;
 
-use super::client::RunClient;
+use super::connection::Connection;
 use super::delivery::Owed;
 use super::job::{self, Done, JobError, Played};
 use crate::metrics::Metrics;
@@ -34,19 +34,25 @@ pub struct Evaluator {
 }
 
 impl Evaluator {
-    /// Runs all episodes of `job`, which the learner of `client` has given out.
-    pub async fn evaluate(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<Owed> {
+    /// Runs all episodes of `job`, which the learner at `connection` has given out. Awaits its
+    /// `snapshot` if another policy was loaded last.
+    pub async fn evaluate(
+        &mut self,
+        job: &Job,
+        connection: &Connection,
+        snapshot: impl Future<Output = anyhow::Result<Arc<Snapshot>>>,
+    ) -> anyhow::Result<Owed> {
         let metrics = self.metrics.clone();
         let reject = |error: &JobError| metrics.rejected(error.label());
         job::check(job, &*self.environments).inspect_err(reject)?;
         // The learner grants time to load the policy as long as there are reports.
-        client.connection.publish_progress(job, 0, 0);
+        connection.publish_progress(job, 0, 0);
         let policy = {
-            let mut loading = std::pin::pin!(self.policy(job, client));
+            let mut loading = std::pin::pin!(self.policy(job, snapshot));
             loop {
                 tokio::select! {
                     policy = &mut loading => break policy?,
-                    () = sleep(heartbeat(job)) => client.connection.publish_progress(job, 0, 0),
+                    () = sleep(heartbeat(job)) => connection.publish_progress(job, 0, 0),
                 }
             }
         };
@@ -54,14 +60,17 @@ impl Evaluator {
         let arithmetic = Name::new(policy.precision().arithmetic())?;
         let doing = if job.exploration.is_some() { "playing" } else { "evaluating" };
         info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "{doing}");
-        let report =
-            |done: Done| client.connection.publish_progress(job, done.steps, done.episodes);
+        let report = |done: Done| connection.publish_progress(job, done.steps, done.episodes);
         let played = self.roll_out(job, policy, report).await?;
         Ok(Owed::new(job, self.name.clone(), arithmetic, played)?)
     }
 
     /// The policy of `job`, kept from the last job or loaded from a snapshot.
-    async fn policy(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<Arc<dyn Policy>> {
+    async fn policy(
+        &mut self,
+        job: &Job,
+        snapshot: impl Future<Output = anyhow::Result<Arc<Snapshot>>>,
+    ) -> anyhow::Result<Arc<dyn Policy>> {
         let name = job.environment.clone();
         if let Some((weights, environment, policy)) = &self.policy
             && (*weights, environment) == (job.weights, &name)
@@ -70,7 +79,7 @@ impl Evaluator {
         }
         // Freed before the next policy is built: an evaluator holds one policy.
         self.policy = None;
-        let (snapshot, precision) = (client.snapshot(job).await?, self.precision);
+        let (snapshot, precision) = (snapshot.await?, self.precision);
         let (wanted, sizes) = (name.clone(), self.environments.sizes(&name));
         let load = move || load(&snapshot, (&wanted, sizes), precision);
         let policy: Arc<dyn Policy> = tokio::task::spawn_blocking(load)

@@ -11,7 +11,7 @@ use zenoh::pubsub::Subscriber;
 use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
-use super::connection::blocking;
+use super::connection::{blocking, is_named_by};
 use super::discovery::RunKey;
 use crate::metrics::Metrics;
 
@@ -20,13 +20,6 @@ const MAX_BYTES: usize = 256 << 20;
 /// Label of a snapshot from a learner process that is not followed. It is no fault: after a restart,
 /// the new process is followed when the current job is done.
 const OTHER_INCARNATION: &str = "other_incarnation";
-
-/// Compares everything but the file, whose hash decoding has verified.
-pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
-    let origin = (&snapshot.run, snapshot.incarnation);
-    origin == (&job.run, job.incarnation)
-        && (snapshot.step, snapshot.hash) == (job.step, job.weights)
-}
 
 type Kept = VecDeque<(RunKey, Arc<Snapshot>)>;
 

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use quad_protocol::{EpisodeScore, Hash, JobReply};
 use tracing::{debug, warn};
 
-use super::main_loop::{Event, Events};
+use super::events::{Event, Events};
 use super::metrics::Metrics;
 use super::requests::Request;
 use crate::service::{Answer, Count, End, Input, Order, OtherWeights, Service};

@@ -7,7 +7,7 @@ use prometheus::IntGauge;
 use quad_runtime::Heartbeat;
 use tracing::warn;
 
-use super::main_loop::Events;
+use super::events::Events;
 
 /// Interval of reminders in the log.
 const REMIND: Duration = Duration::from_secs(60);

@@ -11,7 +11,7 @@ use tracing::info;
 use zenoh::Session;
 use zenoh::sample::{Sample, SampleKind};
 
-use super::main_loop::{Event, Events};
+use super::events::{Event, Events};
 
 /// Zenoh takes five seconds to remove the token of a learner that lost its connection, and longer
 /// on a busy machine.

@@ -3,12 +3,11 @@
 use std::mem;
 use std::time::{Duration, Instant};
 
-use quad_protocol::EpisodeScore;
 use quad_run::counted;
 use quad_run::folder::RunDir;
 use quad_run::results::Spread;
 use quad_runtime::{Endpoints, Health, Heartbeat, LEAVE_WITHIN, shutdown_signal};
-use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender};
+use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::task::{JoinHandle, LocalSet};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{error, warn};
@@ -16,6 +15,7 @@ use tracing::{error, warn};
 use super::disk::Writer;
 use super::display::{Display, REDRAW, advice};
 use super::duplicate::Incarnation;
+use super::events::Event;
 use super::metrics::Metrics;
 use super::network::{Connected, OpeningSession, Wire, connect};
 use super::threads::{STUCK, Threads};
@@ -28,36 +28,6 @@ const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// After this time a failed run gives up output that waits for the disk: the disk may be in
 /// trouble, too.
 const LAST_WRITES: Duration = Duration::from_secs(15);
-
-/// A report of another thread to the main loop.
-#[derive(Debug)]
-pub(crate) enum Event {
-    /// A line for the user. Lines that the network can cause are sent once for each step, name or
-    /// period, so the queue stays short.
-    Line(String),
-    /// A snapshot is ready to be evaluated.
-    Published { step: u64 },
-    /// All episodes of an evaluation are scored.
-    Evaluated { step: u64, scores: Vec<EpisodeScore> },
-    /// No gradient step will follow, and all output of training is on the disk.
-    TrainingEnded(Outcome),
-    /// The run cannot continue.
-    Failed(anyhow::Error),
-}
-
-/// Sends events, which get lost once the main loop has ended.
-#[derive(Clone, Debug)]
-pub(crate) struct Events(pub UnboundedSender<Event>);
-
-impl Events {
-    pub fn send(&self, event: Event) {
-        self.0.send(event).ok();
-    }
-
-    pub fn line(&self, text: impl Into<String>) {
-        self.send(Event::Line(text.into()));
-    }
-}
 
 #[derive(Debug)]
 pub(crate) enum Ending {

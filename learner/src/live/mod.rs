@@ -7,7 +7,7 @@
 //!
 //! In reading order:
 //!
-//! - `threads` starts (with `spawn`) and ends the threads, which report to `main_loop`; `network`
+//! - `threads` starts (with `spawn`) and ends the threads, which report `events` to `main_loop`; `network`
 //!   opens the session meanwhile and declares everything on it, and `duplicate` looks for another
 //!   learner of the same name.
 //! - `snapshots` is the thread that writes the output of training, and publishes snapshots through
@@ -22,6 +22,7 @@ mod carrier;
 mod disk;
 mod display;
 mod duplicate;
+mod events;
 mod experience;
 mod main_loop;
 mod metrics;
@@ -37,7 +38,8 @@ mod weights;
 
 pub(crate) use display::Display;
 pub(crate) use duplicate::Incarnation;
-pub(crate) use main_loop::{Ending, Events, MainLoop};
+pub(crate) use events::Events;
+pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;
 pub(crate) use network::{OpeningSession, open_network};
 pub(crate) use page_state::PageState;

@@ -12,7 +12,7 @@ use tracing::debug;
 
 use super::carrier::Carrier;
 use super::disk::DiskStatus;
-use super::main_loop::Event;
+use super::events::Event;
 use super::metrics::unix_time;
 use super::weights::Weights;
 use crate::service::{Input, Opening, OtherWeights};

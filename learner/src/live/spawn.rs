@@ -10,7 +10,7 @@ use std::thread::{self, JoinHandle};
 use anyhow::anyhow;
 use quad_runtime::{Heartbeat, stay_in_background};
 
-use super::main_loop::{Event, Events};
+use super::events::{Event, Events};
 
 /// Starts a thread that reports that it is alive, and when it is done. If it panics, `/healthz`
 /// says so.

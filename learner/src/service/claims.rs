@@ -7,7 +7,7 @@ use quad_protocol::{Job, JobReply, JobRequest, Name};
 
 use super::Service;
 use super::evaluation::{Evaluation, Key};
-use super::leases::OpenJob;
+use super::open_job::OpenJob;
 
 /// Time after which an evaluator without a job asks again: the larger of this time, and the second
 /// one for each evaluator, so that hundreds of idle ones do not keep the learner busy. A new

@@ -1,55 +1,18 @@
 //! Deliveries: score reports, and online episodes in pieces. They wait for the disk, are checked,
 //! written together, and then acknowledged.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 use std::mem;
 
-use quad_protocol::{CodecError, Episode, EpisodeScore, Piece, ScoreReport};
+use quad_protocol::{CodecError, Episode, Piece, ScoreReport};
 use quad_run::folder::ScoreLine;
 
 use super::Service;
 use super::message::{Answer, Count, Frame, Order};
+use super::queue::Deliveries;
 
-/// Most deliveries that wait for the disk; the senders of more try again.
-const MOST_WAITING: usize = 1024;
 /// Most deliveries of a kind that are written together.
 const MOST_TOGETHER: usize = 256;
-
-/// Deliveries between their arrival and their acknowledgment.
-#[derive(Debug)]
-pub(super) struct Deliveries<Q> {
-    /// Those that wait for the disk.
-    reports: VecDeque<(Q, ScoreReport)>,
-    pieces: VecDeque<(Q, Piece)>,
-    /// Number of frames that are decoded.
-    pub decoding: usize,
-    /// Reports that are written, or about to be, with their new scores.
-    pub writing_scores: Vec<(Q, ScoreReport, Vec<EpisodeScore>)>,
-    /// Online episodes that are written, or about to be.
-    pub writing_episodes: Vec<(Frame<Q>, Box<Episode>)>,
-    appending: bool,
-}
-
-impl<Q> Deliveries<Q> {
-    pub fn new() -> Self {
-        Self {
-            reports: VecDeque::new(),
-            pieces: VecDeque::new(),
-            decoding: 0,
-            writing_scores: Vec::new(),
-            writing_episodes: Vec::new(),
-            appending: false,
-        }
-    }
-
-    fn is_busy(&self) -> bool {
-        self.decoding > 0 || self.appending
-    }
-
-    fn is_full(&self) -> bool {
-        self.reports.len() + self.pieces.len() >= MOST_WAITING
-    }
-}
 
 impl<Q> Service<Q> {
     /// True if a flush would do something.

@@ -12,8 +12,8 @@
 //! An online episode is handed out like an evaluation's, but alone, before all others, and as often
 //! as it takes. Its rows arrive in pieces.
 //!
-//! In reading order: `message` (what it takes and orders); `evaluation` (episodes of one snapshot);
-//! `claims` (jobs for evaluators) and `leases` (their end); `deliveries` (from their arrival to
+//! In reading order: `message` (what it takes and orders); its state: `evaluation` (episodes of one
+//! snapshot), `open_job`, `online_episode` and `queue`; `claims` (jobs for evaluators) and `leases` (their end); `deliveries` (from their arrival to
 //! their acknowledgment), which are `scores` or `online` episodes; `evaluators` and `patience`
 //! (who is there); `online_schedule` is training's, of online episodes and gradient steps.
 
@@ -24,8 +24,11 @@ mod evaluators;
 mod leases;
 mod message;
 mod online;
+mod online_episode;
 mod online_schedule;
+mod open_job;
 mod patience;
+mod queue;
 mod scores;
 #[cfg(test)]
 mod tests;
@@ -40,14 +43,14 @@ use quad_run::config::Schedule;
 use quad_run::counted;
 use quad_run::folder::SavedScores;
 
-use self::deliveries::Deliveries;
 use self::evaluation::{Evaluation, Key};
 use self::evaluators::Evaluators;
-use self::leases::OpenJob;
 pub use self::message::{Answer, Count, End, Frame, Input, Order, OtherWeights};
-use self::online::OnlineEpisode;
+use self::online_episode::OnlineEpisode;
 pub use self::online_schedule::{OnlineSchedule, Opening};
+use self::open_job::OpenJob;
 use self::patience::{Patience, Verdict};
+use self::queue::Deliveries;
 
 /// Number of evaluations without scores from which on the evaluators are called slow.
 const BEHIND: usize = 3;

@@ -10,7 +10,7 @@ use quad_protocol::{EpisodeScore, Hash, Origin};
 use quad_run::files;
 use quad_runtime::Hint;
 
-use super::{MOST_EPISODES, ScoreArgs};
+use super::args::{MOST_EPISODES, ScoreArgs};
 use crate::sim::{self, Environment, EnvironmentError, Rollout, Simulation};
 
 const SNAPSHOT: &str = "pass files like RUN/snapshots/step_000020000.safetensors; \
