@@ -30,7 +30,7 @@ def test_the_cart_learns_online(tmp_path):
     example = (DOCS / "../examples/online.py").read_text()
     for usual, here in [
         ("workers=2", f'workers=1, connect="{endpoint}"'),
-        ("run_dir", f'listen="{endpoint}", threads=1, run_dir'),
+        ("run_dir", f'listen="{endpoint}", run_dir'),
         ("record(100)", "record(20)"),
         ("2_000", "10"),
         ("5_000", "120"),
