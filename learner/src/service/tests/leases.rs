@@ -37,13 +37,15 @@ fn progress_of_others_is_refused_and_extends_nothing() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
     bench.job("b", 0);
-    let good = progress(&job, "a", 10);
-    for (message, refusal) in [
-        (Progress { evaluator: name("b"), ..good.clone() }, "unknown_job"),
-        (Progress { job: 99, ..good.clone() }, "unknown_job"),
-        (Progress { run: name("other"), ..good.clone() }, "unknown_run"),
-        (Progress { incarnation: 1, ..good }, "unknown_incarnation"),
-    ] {
+    let refusals: [(fn(&mut Progress), _); 4] = [
+        (|progress| progress.evaluator = name("b"), "unknown_job"),
+        (|progress| progress.job = 99, "unknown_job"),
+        (|progress| progress.run = name("other"), "unknown_run"),
+        (|progress| progress.incarnation = 1, "unknown_incarnation"),
+    ];
+    for (change, refusal) in refusals {
+        let mut message = progress(&job, "a", 10);
+        change(&mut message);
         assert_eq!(bench.progress(&message, 9), Some(refusal));
     }
     assert_eq!(bench.expire(10), 2);

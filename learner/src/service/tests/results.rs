@@ -7,6 +7,8 @@ use super::*;
 
 const FULL: &str = "no space left";
 const SEED: u64 = 100;
+/// Bytes of the longest frame: a thousand steps and a state, each of 16 numbers.
+const LONGEST: u32 = 1001 * 16 * 4 + 1024;
 
 /// An online episode of two steps.
 fn episode(reward: f32) -> Episode {
@@ -103,15 +105,15 @@ fn an_episode_that_does_not_fit_its_opening_is_refused() {
         bench.handle(Input::Piece(0, pieces(&episode, 30_000).remove(0)), 0);
         assert_eq!(rejected(&bench.flush(Ok(()))), Some(refusal));
     }
-    // A piece of the longest frame: a thousand steps and a state, each of 16 numbers.
-    let length = 1001 * 16 * 4 + 1024;
-    let piece = pieces(&episode(1.0), 200).remove(0);
-    for (piece, refusal) in [
-        (Piece { length, ..piece.clone() }, None),
-        (Piece { length: length + 1, ..piece.clone() }, Some("impossible_rows")),
-        (Piece { run: name("other"), ..piece.clone() }, Some("unknown_run")),
-        (Piece { seed: 102, ..piece }, Some("unknown_online")),
-    ] {
+    let changes: [(fn(&mut Piece), _); 4] = [
+        (|piece| piece.length = LONGEST, None),
+        (|piece| piece.length = LONGEST + 1, Some("impossible_rows")),
+        (|piece| piece.run = name("other"), Some("unknown_run")),
+        (|piece| piece.seed = 102, Some("unknown_online")),
+    ];
+    for (change, refusal) in changes {
+        let mut piece = pieces(&episode(1.0), 200).remove(0);
+        change(&mut piece);
         bench.handle(Input::Piece(0, piece), 0);
         assert_eq!(rejected(&bench.flush(Ok(()))), refusal);
     }
@@ -147,28 +149,34 @@ fn scores_are_acknowledged_once_they_are_on_the_disk() {
     assert_eq!(bench.pending(), 9);
 }
 
+/// Gives the first episode this return, and the score of it.
+fn set_return(report: &mut ScoreReport, episode_return: f64) {
+    report.episodes[0] = score(report.episodes[0].seed, episode_return);
+}
+
 #[test]
 fn a_report_that_fits_no_evaluation_is_refused() {
     let mut bench = Bench::new();
     let good = report(&bench.job("a", 0), "a");
-    let scores = |scores| ScoreReport { episodes: scores, ..good.clone() };
-    let first = score(seeds(1000)[0], 500.0);
-    for (bad, refusal) in [
-        (ScoreReport { run: name("other"), ..good.clone() }, "unknown_run"),
-        (ScoreReport { step: 3500, ..good.clone() }, "not_open_yet"),
-        (ScoreReport { step: 1500, ..good.clone() }, "unknown_step"),
-        (ScoreReport { step: 4000, ..good.clone() }, "unknown_step"),
-        (ScoreReport { step: 2000, ..good.clone() }, "unknown_weights"),
-        (ScoreReport { weights: hash(2000), ..good.clone() }, "unknown_weights"),
-        (scores(vec![score(11, 0.0)]), "unknown_seed"),
-        (scores(vec![first; 2]), "unknown_seed"),
-        (scores(vec![EpisodeScore { length: 0, ..first }]), "impossible_episode"),
-        (scores(vec![EpisodeScore { length: 1001, ..first }]), "impossible_episode"),
-        (scores(vec![EpisodeScore { score: 99.0, ..first }]), "impossible_episode"),
-        (scores(vec![score(first.seed, f64::NAN)]), "impossible_episode"),
-        (scores(vec![score(first.seed, f64::INFINITY)]), "impossible_episode"),
-        (scores(vec![score(first.seed, -1e200)]), "impossible_episode"),
-    ] {
+    let refusals: [(fn(&mut ScoreReport), _); 14] = [
+        (|report| report.run = name("other"), "unknown_run"),
+        (|report| report.step = 3500, "not_open_yet"),
+        (|report| report.step = 1500, "unknown_step"),
+        (|report| report.step = 4000, "unknown_step"),
+        (|report| report.step = 2000, "unknown_weights"),
+        (|report| report.weights = hash(2000), "unknown_weights"),
+        (|report| report.episodes[0].seed = 11, "unknown_seed"),
+        (|report| report.episodes[1] = report.episodes[0], "unknown_seed"),
+        (|report| report.episodes[0].length = 0, "impossible_episode"),
+        (|report| report.episodes[0].length = 1001, "impossible_episode"),
+        (|report| report.episodes[0].score = 99.0, "impossible_episode"),
+        (|report| set_return(report, f64::NAN), "impossible_episode"),
+        (|report| set_return(report, f64::INFINITY), "impossible_episode"),
+        (|report| set_return(report, -1e200), "impossible_episode"),
+    ];
+    for (change, refusal) in refusals {
+        let mut bad = good.clone();
+        change(&mut bad);
         assert_eq!(rejected(&bench.deliver(bad)), Some(refusal));
     }
     assert_eq!(bench.pending(), 14);

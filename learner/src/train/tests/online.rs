@@ -82,6 +82,17 @@ fn train(
     (openings, batches)
 }
 
+/// A run that is resumed at any step opens no episode again, and has the same batches.
+fn assert_resumes(episodes: &[Episode], batches: &[Vec<u32>]) {
+    for from in BEGIN..experiment().total_steps() {
+        let (mut resumed, inbox) = online(episodes);
+        resumed.resume(from).unwrap();
+        let rest = batches[(from - BEGIN) as usize..].to_vec();
+        let trained = train(&mut resumed, &inbox, episodes, from);
+        assert_eq!(trained, (vec![], rest), "from step {from}");
+    }
+}
+
 #[test]
 fn the_rows_decide_which_snapshot_plays_and_which_steps_follow() {
     let (mut online, inbox) = online(&[]);
@@ -112,16 +123,7 @@ fn online_training_continues_from_any_step_as_if_it_had_not_stopped() {
     let episodes = episodes();
     let (mut whole, inbox) = online(&[]);
     let (_, batches) = train(&mut whole, &inbox, &episodes, BEGIN);
-    for from in BEGIN..experiment().total_steps() {
-        let (mut resumed, inbox) = online(&episodes);
-        resumed.resume(from).unwrap();
-        let rest = batches[(from - BEGIN) as usize..].to_vec();
-        assert_eq!(
-            train(&mut resumed, &inbox, &episodes, from),
-            (vec![], rest),
-            "from step {from}"
-        );
-    }
+    assert_resumes(&episodes, &batches);
     let (mut resumed, _) = online(&episodes[..1]);
     assert!(resumed.resume(experiment().total_steps()).is_err(), "experience is missing");
 }
@@ -144,16 +146,7 @@ fn an_episode_with_a_glitch_counts_as_one_without_rows_also_after_a_restart() {
         Vec::from_iter(openings.iter().map(|opening| opening.episode)),
         Vec::from_iter(0..11)
     );
-    for from in BEGIN..experiment().total_steps() {
-        let (mut resumed, inbox) = online(&episodes);
-        resumed.resume(from).unwrap();
-        let rest = expected[(from - BEGIN) as usize..].to_vec();
-        assert_eq!(
-            train(&mut resumed, &inbox, &episodes, from),
-            (vec![], rest),
-            "from step {from}"
-        );
-    }
+    assert_resumes(&episodes, &batches);
 }
 
 #[test]
