@@ -63,18 +63,6 @@ fn experiment([task, algorithm]: [&str; 2], change: Change) -> Experiment {
     Experiment { definition, agent, batch_size, total_steps }
 }
 
-fn context(experiment: &Experiment, precision: Precision, device: &Device) -> Context {
-    Context {
-        transitions: Arc::new(transitions(2 * experiment.batch_size)),
-        total_steps: experiment.total_steps,
-        online_steps: 0,
-        window: Window::ONE,
-        seed: 0,
-        precision,
-        device: device.clone(),
-    }
-}
-
 fn numbers(len: usize) -> Vec<f32> {
     let mut generator = ChaCha8Rng::seed_from_u64(len as u64);
     (0..len).map(|_| generator.random_range(-1.0..1.0)).collect()
@@ -119,8 +107,16 @@ fn updates(criterion: &mut Criterion) {
             .map(|known| (known.name, [TASK, known.name], None));
         for (name, which, change) in CONFIGURATIONS.into_iter().chain(others) {
             let experiment = experiment(which, change);
-            let context = context(&experiment, precision, &device);
-            let transitions = context.transitions.clone();
+            let transitions = Arc::new(transitions(2 * experiment.batch_size));
+            let context = Context {
+                transitions: transitions.clone(),
+                total_steps: experiment.total_steps,
+                online_steps: 0,
+                window: Window::ONE,
+                seed: 0,
+                precision,
+                device: device.clone(),
+            };
             let mut agent = Agent::new(experiment.definition, &experiment.agent, context)
                 .expect("usable values");
             let examples = agent.examples(transitions).expect("examples");
@@ -149,37 +145,28 @@ fn updates(criterion: &mut Criterion) {
 /// Products and activations per second, on all threads: 1000 tiles of 128 × 256 on each.
 fn peaks(criterion: &mut Criterion) {
     const REPEAT: usize = 1000;
-    let (rows, width, threads) = (128, 256, 0..rayon::current_num_threads());
+    type Tile = (Vec<f32>, Vec<f32>, Vec<f32>);
+    let (rows, width, zero) = (128, 256, [0.0; 256]);
     let mut group = criterion.benchmark_group("peak");
     group.sample_size(10);
-    let mut tiles: Vec<_> = threads
-        .clone()
-        .map(|_| (numbers(rows * width), numbers(width * width), vec![0.0_f32; rows * width]))
-        .collect();
-    let product = |(x, w, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
-        for _ in 0..REPEAT {
-            by_gemm([rows, width, width], RowMajor(x), RowMajor(w), out);
-        }
+    let tile: Tile = (numbers(rows * width), numbers(width * width), vec![0.0; rows * width]);
+    let mut tiles = vec![tile; rayon::current_num_threads()];
+    let mut measure = |name: &str, work: &(dyn Fn(&mut Tile) + Sync)| {
+        group.bench_function(name, |bencher| {
+            bencher
+                .iter(|| tiles.par_iter_mut().for_each(|tile| (0..REPEAT).for_each(|_| work(tile))))
+        });
     };
-    group.bench_function("product", |bencher| {
-        bencher.iter(|| tiles.par_iter_mut().for_each(product))
+    measure("product", &|(x, w, out)| {
+        by_gemm([rows, width, width], RowMajor(x), RowMajor(w), out);
     });
-    let zero = vec![0.0; width];
-    let mish = |(x, _, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
-        for _ in 0..REPEAT {
-            out.copy_from_slice(x);
-            activate(Activation::Mish, out, &zero);
-        }
-    };
-    group.bench_function("mish", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(mish)));
-    let slope = |(x, w, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
-        for _ in 0..REPEAT {
-            out.copy_from_slice(x);
-            activate_with_slope(Activation::Mish, out, &zero, &mut w[..rows * width]);
-        }
-    };
-    group.bench_function("mish and slope", |bencher| {
-        bencher.iter(|| tiles.par_iter_mut().for_each(slope))
+    measure("mish", &|(x, _, out)| {
+        out.copy_from_slice(x);
+        activate(Activation::Mish, out, &zero);
+    });
+    measure("mish and slope", &|(x, w, out)| {
+        out.copy_from_slice(x);
+        activate_with_slope(Activation::Mish, out, &zero, &mut w[..rows * width]);
     });
     group.finish();
 }

@@ -13,6 +13,8 @@ use rand_chacha::ChaCha8Rng;
 
 mod chunks;
 mod evaluation;
+mod precision;
+mod refusals;
 
 const DIMS: (usize, usize) = (11, 3);
 /// A whole run, with each phase of those that have some.
@@ -158,84 +160,6 @@ fn a_saved_state_resumes_bit_for_bit() {
     }
 }
 
-/// Sets the hidden layers of all networks.
-fn set_hidden(table: &mut toml::Table, widths: &[i64]) {
-    for (key, value) in table {
-        match value {
-            toml::Value::Table(table) => set_hidden(table, widths),
-            value if key == "hidden" => *value = widths.to_vec().into(),
-            _ => {}
-        }
-    }
-}
-
-/// The gradients of each network's first update, in the optimizer's first moments, differ by at most
-/// 5 %, most by less than 1 %.
-#[test]
-fn updates_in_bf16_are_close_to_those_in_f32_and_resume_bit_for_bit() {
-    for mut variant in variants() {
-        set_hidden(&mut variant.table, &[64; 3]);
-        let (variant, name) = (&variant, variant.name);
-        let exact = context(3, &Device::Cpu);
-        let rounded = Context { precision: Precision::Bf16, ..exact.clone() };
-        for start in variant.start(&exact).agent.phases() {
-            let update = |trial: &mut Trial| {
-                let indices = (0..192).map(|index| index % trial.examples.len() as u32);
-                let batch = trial.examples.batch(&Vec::from_iter(indices)).unwrap();
-                trial.agent.update(&batch).unwrap()
-            };
-            let updated = |context| {
-                let mut trial = variant.start(context);
-                trial.agent.skip_to(start);
-                update(&mut trial);
-                trial
-            };
-            let moments = |mut trial: Trial| {
-                let mut networks: BTreeMap<String, Vec<f32>> = BTreeMap::new();
-                for (tensor, moment) in trial.state("adam_m.") {
-                    let network = tensor.split('.').next().unwrap().to_owned();
-                    networks.entry(network).or_default().extend(moment);
-                }
-                networks
-            };
-            let [expected, moments] = [&exact, &rounded].map(|context| moments(updated(context)));
-            let size = |x: &[f32]| x.iter().map(|x| x * x).sum::<f32>().sqrt();
-            for (network, expected) in expected.iter().filter(|(_, x)| size(x) > 0.0) {
-                let pairs = expected.iter().zip(&moments[network]);
-                let distance = size(&Vec::from_iter(pairs.map(|(x, y)| x - y))) / size(expected);
-                // ReBRAC's first actions are nearly equal, and IVR weights by small differences.
-                let bound = if ["ivr", "rebrac"].contains(&name) { 0.15 } else { 0.05 };
-                assert!(distance < bound, "{name}, {network}: {distance}");
-            }
-            let mut straight = updated(&rounded);
-            let mut resumed = variant.start(&rounded);
-            resumed.agent.load(&straight.save()).unwrap();
-            assert_eq!(update(&mut resumed), update(&mut straight), "{name}");
-            assert!(resumed.save() == straight.save(), "{name}");
-        }
-    }
-}
-
-#[test]
-fn an_unfit_state_is_refused() {
-    let (iql, mut wider) = (variant("iql"), variant("iql"));
-    wider.table["actor"]["hidden"] = vec![25].into();
-    let context = context(3, &Device::Cpu);
-    let mut trial = iql.start(&context);
-    let (saved, policy) = (trial.save(), trial.policy());
-    for (variant, bytes, words) in [
-        (variant("quad"), &saved[..], "is of the algorithm iql, this run is of quad"),
-        (wider, &saved, "shape"),
-        (variant("iql"), b"", ""),
-        (variant("iql"), b"nonsense", ""),
-        (variant("iql"), &saved[..saved.len() - 1], ""),
-        (variant("iql"), &policy, "`state`"),
-    ] {
-        let error = variant.start(&context).agent.load(bytes).unwrap_err().to_string();
-        assert!(error.contains(words), "{error}");
-    }
-}
-
 #[test]
 fn weights_are_a_function_of_the_seed() {
     for variant in variants() {
@@ -310,46 +234,6 @@ fn a_nan_reaches_a_metric() {
     }
 }
 
-#[test]
-fn an_error_names_the_hyper_parameter() {
-    for definition in ALGORITHMS {
-        let mut values = Values::of(definition).for_task(None);
-        let agent = values.remove("agent").unwrap().as_table().unwrap().clone();
-        for key in agent.keys().filter(|key| agent[*key].is_float()) {
-            for (value, words) in
-                [(Some("much"), format!("in `{key}`")), (None, format!("missing field `{key}`"))]
-            {
-                let mut table = agent.clone();
-                table.remove(key);
-                table.extend(value.map(|value| (key.clone(), value.into())));
-                let error = definition.check(&table).unwrap_err().to_string();
-                assert!(error.contains(&words), "{} {key}: {error}", definition.name);
-            }
-        }
-    }
-}
-
-#[test]
-fn data_without_examples_is_refused_with_a_hint() {
-    let mut single = arrays();
-    (single.terminals, single.timeouts) = (vec![false; 10 * BATCH], vec![true; 10 * BATCH]);
-    let single = Arc::new(Transitions::of(single).unwrap());
-    for (name, words, hint) in [
-        ("onestep", "has a next action", "datasets inspect"),
-        ("rebrac", "has a next action", "datasets inspect"),
-        ("sfbc", "transitions (agent.shortest_episode)", "shortest_episode=1"),
-        ("diffuser", "plans ahead", "network.horizon=8"),
-    ] {
-        let mut variant = variant(name);
-        if name == "sfbc" {
-            variant.table["shortest_episode"] = 2.into();
-        }
-        let trial = variant.start(&context(0, &Device::Cpu));
-        let error = trial.agent.examples(single.clone()).err().unwrap();
-        assert!(error.to_string().contains(words) && error.hint().contains(hint), "{error}");
-    }
-}
-
 /// The networks whose optimizers or weights move in each step of a short run.
 #[test]
 fn each_phase_trains_its_networks() {
@@ -387,33 +271,5 @@ fn each_phase_trains_its_networks() {
             let networks = Vec::from_iter(BTreeSet::from_iter(networks));
             assert_eq!(networks, expected[phase], "{name}, step {step}");
         }
-    }
-}
-
-#[test]
-fn contradictory_hyper_parameters_are_refused() {
-    for (name, change, words) in [
-        ("sfbc", toml::toml! { averaged = 7 }, "at most agent.candidates"),
-        ("sfbc", toml::toml! { actor.norm = true }, "actor.norm"),
-        ("diffuser", toml::toml! { replan_every = 1000 }, "at most agent.network.horizon"),
-        ("diffuser", toml::toml! { network.groups = 0 }, "agent.network.groups is 0"),
-        ("quad", toml::toml! { eta.maximum = -1.0 }, "at least 0"),
-        ("quad", toml::toml! { eta.initial = 1e9 }, "between eta.minimum and eta.maximum"),
-        (
-            "quad",
-            toml::toml! { guidance = "none" guidance_at = "denoised" },
-            "agent.guidance_at is denoised, but must be absent",
-        ),
-        ("quad", toml::toml! { chunk = 0 }, "a whole number from 1"),
-        ("idql", toml::toml! { chunk = 3 replan = 4 }, "agent.replan is 4, but must be at most"),
-        ("fql", toml::toml! { replan = 2 }, "at most agent.chunk"),
-        ("xql", toml::toml! { random_actions = 300 }, "a whole number from 0 to 255"),
-        ("iql", toml::toml! { chunk = 2 }, "iql learns single actions"),
-        ("iql", toml::toml! { history = 2 }, "so agent.chunk and agent.history must be 1"),
-    ] {
-        let mut variant = variant(name);
-        merge(&mut variant.table, change);
-        let error = variant.definition.check(&variant.table).unwrap_err().to_string();
-        assert!(error.contains(words), "{name}: {error}");
     }
 }

@@ -1,4 +1,5 @@
-//! Tests of chunks of actions. The golden folder `fql-chunks` compares the numbers of an update.
+//! Tests of chunks of actions. The golden folder `fql-chunks` compares the numbers of an update, its
+//! targets and masks included.
 
 use super::*;
 use quad_policy::{Precision, load_policy};
@@ -12,30 +13,6 @@ const CLONING: [(&str, &str); 6] = [
     ("idql", "actor"),
     ("qc", "flow"),
 ];
-
-/// Rows 0 to 9 of each twenty terminate, and 10 to 19 are truncated.
-#[test]
-fn windows_beyond_the_end_of_an_episode_are_masked() {
-    let window = Window { length: 3, gamma: 0.5, ..Window::ONE };
-    let transitions = context(0, &Device::Cpu).transitions;
-    let examples = Examples::new(transitions, Columns::Plain, window).unwrap();
-    let (data, batch) = (arrays(), examples.batch(&[0, 8, 18]).unwrap());
-    let (r, a) = (&data.rewards, |row: usize| &data.actions[row * DIMS.1..][..DIMS.1]);
-    let numbers = |tensor: &candle_core::Tensor| tensor.to_vec1::<f32>().unwrap();
-    let rows = |tensor: &candle_core::Tensor| tensor.to_vec2::<f32>().unwrap();
-    let next = candle_core::Tensor::new(&[8f32, 8.0, 8.0], &Device::Cpu).unwrap();
-    let targets = numbers(&batch.target(0.5, &next).unwrap());
-    let expected =
-        [r[0] + 0.5 * r[1] + 0.25 * r[2] + 1.0, r[8] + 0.5 * r[9], r[18] + 0.5 * r[19] + 2.0];
-    let apart = targets.iter().zip(expected).map(|(x, y)| (x - y).abs());
-    assert!(apart.fold(0.0, f32::max) < 1e-6, "{targets:?} for {expected:?}");
-    assert_eq!(rows(&batch.actions)[1], [a(8), a(9), a(9)].concat());
-    let beyond = [[1.0; 6].as_slice(), &[0.0; 3]].concat();
-    assert_eq!(rows(&batch.within.clone().unwrap()), [vec![1.0; 9], beyond.clone(), beyond]);
-    let (zeros, ones) = (batch.actions.zeros_like().unwrap(), batch.actions.ones_like().unwrap());
-    let learned = batch.within_episodes(zeros, &ones).unwrap();
-    assert_eq!(rows(&learned)[2], [[0.0; 6].as_slice(), &[1.0; 3]].concat());
-}
 
 /// The variants of an algorithm with chunks of this many actions.
 fn chunked(name: &str, chunk: i64) -> Vec<Variant> {
