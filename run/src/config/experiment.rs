@@ -1,12 +1,12 @@
 //! One experiment, every value of which is checked.
 
-use quad_algorithms::Definition;
+use quad_algorithms::{AgentError, Definition};
 use quad_dataset::{Normalize, RewardRule};
 use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use super::error::ConfigError;
+use super::error::{ConfigError, check_ranges};
 use super::hyperparameters;
 use super::online::Online;
 use super::schedule::Schedule;
@@ -149,21 +149,19 @@ impl Experiment {
 
     /// Checks the numbers that are no hyper-parameters.
     pub(crate) fn check_ranges(&self) -> Result<(), ConfigError> {
-        for (field, value, least, most) in [
+        check_ranges(&[
             ("steps", self.steps, 0, MOST),
             ("eval_interval", self.eval_interval, 0, MOST),
             ("seed", self.seed, 0, MOST),
             ("episodes", self.episodes.into(), 1, MOST_EPISODES),
             ("batch_size", self.batch_size.into(), 1, MOST_BATCH),
-        ] {
-            if !(least..=most).contains(&value) {
-                let range = format!("from {least} to {most}");
-                return Err(ConfigError::out_of_range(field, value, &range));
-            }
-        }
+        ])?;
         self.online.as_ref().map_or(Ok(()), Online::check_ranges)?;
         if self.total_steps() == 0 {
-            return Err(ConfigError::NoSteps);
+            return Err(ConfigError::new(
+                "a run of 0 steps without online steps learns nothing",
+                "--steps N learns from the dataset alone, --online-steps N from experience too",
+            ));
         }
         match self.hold_out {
             0.0..1.0 => Ok(()),
@@ -190,12 +188,24 @@ impl Experiment {
         let (steps, interval) = (self.total_steps(), self.eval_interval);
         let evaluations = self.schedule().evaluations();
         if evaluations > MOST_EVALUATIONS {
-            let most = MOST_EVALUATIONS;
-            return Err(ConfigError::Evaluations { steps, interval, evaluations, most });
+            return Err(ConfigError::new(
+                format!(
+                    "{steps} steps with an evaluation every {interval} are {evaluations} evaluations"
+                ),
+                format!("choose a larger eval_interval, for at most {MOST_EVALUATIONS}"),
+            ));
         }
-        let algorithm = self.algorithm.clone();
-        let checked = self.definition()?.check(&self.agent);
-        checked.map_err(|source| ConfigError::Hyperparameters { algorithm, source })
+        self.definition()?.check(&self.agent).map_err(|error| {
+            let problem = format!("algorithm {}", self.algorithm);
+            let config_error = match error {
+                AgentError::NoChunks(_) => {
+                    let names = hyperparameters::names_where(|algorithm| algorithm.chunks);
+                    ConfigError::new(problem, format!("leave it out, or choose one of {names}"))
+                }
+                _ => ConfigError::keys(problem),
+            };
+            config_error.with_source(error)
+        })
     }
 }
 

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::error::ConfigError;
+use super::error::{ConfigError, check_ranges};
 
 /// Learning from experience, after the gradient steps on the dataset alone.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -53,20 +53,21 @@ impl Online {
 
     pub(super) fn check_ranges(&self) -> Result<(), ConfigError> {
         const MOST: u64 = 1_000_000_000;
-        for (field, value, least, most) in [
+        check_ranges(&[
             ("online.steps", self.steps, 0, MOST),
             ("online.updates_per_step", self.updates_per_step.into(), 1, 1000),
             ("online.lag", self.lag.into(), 1, 1000),
             ("online.snapshot_interval", self.snapshot_interval, 1, MOST),
-        ] {
-            if !(least..=most).contains(&value) {
-                let range = format!("from {least} to {most}");
-                return Err(ConfigError::out_of_range(field, value, &range));
-            }
-        }
+        ])?;
         if self.warmup >= self.steps {
-            let Self { steps, warmup, .. } = *self;
-            return Err(ConfigError::Warmup { steps, warmup });
+            let (steps, warmup) = (self.steps, self.warmup);
+            return Err(ConfigError::new(
+                format!(
+                    "online learning of {steps} environment steps ends within its warm-up of {warmup}"
+                ),
+                "gradient steps begin after the warm-up: give more --online-steps, or a shorter warm-up by \
+                 --set online.warmup=N",
+            ));
         }
         for (field, value) in
             [("online.share", self.share.unwrap_or(1.0)), ("online.noise", self.noise)]

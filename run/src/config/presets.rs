@@ -17,6 +17,8 @@ use super::run_config::RunConfig;
 use super::tables::{keys, merge};
 use super::tasks::{self, Task};
 
+const PRINT: &str = "`learner presets TASK` prints the keys that a preset may have";
+
 /// A task, or a file that may change one.
 pub struct Preset {
     /// The task's name, or the file's without folder and extension; part of the names of runs.
@@ -36,19 +38,20 @@ impl Preset {
             let task = Some(task);
             return Ok(Self { label, task, own });
         }
-        let name = || preset.to_owned();
-        let text = std::fs::read_to_string(preset)
-            .map_err(|source| ConfigError::Unreadable { preset: name(), source })?;
-        let mut own: Table =
-            text.parse().map_err(|source| ConfigError::NotToml { preset: name(), source })?;
+        let error = |problem| ConfigError::new(problem, PRINT);
+        let text = std::fs::read_to_string(preset).map_err(|source| {
+            error(format!("cannot read the preset {preset}")).with_source(source)
+        })?;
+        let mut own: Table = text.parse().map_err(|source: toml::de::Error| {
+            error(format!("preset {preset} is not TOML")).with_source(source)
+        })?;
         let task = own.remove("task").map(|task| tasks::named(&text_of(&task))).transpose();
+        let task = task.map_err(|source| {
+            let problem = format!("preset {preset} cannot be used");
+            ConfigError::new(problem, source.hint()).with_source(source)
+        })?;
         let stem = Path::new(preset).file_stem().and_then(|stem| stem.to_str());
-        Ok(Self {
-            label: stem.unwrap_or("preset").to_owned(),
-            task: task
-                .map_err(|error| ConfigError::Preset { preset: name(), source: Box::new(error) })?,
-            own,
-        })
+        Ok(Self { label: stem.unwrap_or("preset").to_owned(), task, own })
     }
 
     /// The settings of a run, as `own` keys.
@@ -85,19 +88,27 @@ impl Preset {
         merge(&mut table, changes.clone());
         table.insert("algorithm".to_owned(), definition.name.into());
         if table.contains_key("online") && !has_online {
-            return Err(ConfigError::NotOnline(definition.name));
+            let can = |other: &Definition| Values::of(other).for_task(None).contains_key("online");
+            let names = hyperparameters::names_where(can);
+            return Err(ConfigError::new(
+                format!("{} learns from a dataset alone, not online", definition.name),
+                format!("leave out --online-steps, or choose one of {names}"),
+            ));
         }
         let Some(environment) = table.get("environment") else {
-            return Err(ConfigError::NoEnvironment(self.label.clone()));
+            return Err(ConfigError::new(
+                format!("preset {} names neither a task nor an environment", self.label),
+                "begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks",
+            ));
         };
         if !table.contains_key("reward")
             && let Ok(rule) = Value::try_from(environment::reward_rule(&text_of(environment)))
         {
             table.insert("reward".to_owned(), rule);
         }
-        let mut experiment = Experiment::deserialize(table).map_err(|error| ConfigError::Keys {
-            preset: self.label.clone(),
-            reason: in_words(&error),
+        let mut experiment = Experiment::deserialize(table).map_err(|error| {
+            let (preset, reason) = (&self.label, in_words(&error));
+            ConfigError::keys(format!("these settings of {preset} cannot be used: {reason}"))
         })?;
         experiment.check()?;
         Ok(experiment)
@@ -169,10 +180,18 @@ fn check_places(table: &Table, changes: &Table) -> Result<(), ConfigError> {
         changes.keys().find(is_misplaced).cloned()
     };
     if let Some(key) = misplaced(changes, table, &below) {
-        return Err(ConfigError::Hyperparameter(key));
+        return Err(ConfigError::new(
+            format!("{key} is a hyper-parameter"),
+            format!("--agent {key}=VALUE changes it; in a file it is below [agent]"),
+        ));
     }
-    let key = misplaced(&below_changes, &below, table);
-    key.map_or(Ok(()), |key| Err(ConfigError::NoHyperparameter(key)))
+    if let Some(key) = misplaced(&below_changes, &below, table) {
+        return Err(ConfigError::new(
+            format!("{key} is no hyper-parameter"),
+            format!("--set {key}=VALUE changes it; in a file it is above [agent]"),
+        ));
+    }
+    Ok(())
 }
 
 /// True if a preset is the path of a file, not the name of a task.
@@ -222,40 +241,13 @@ mod tests {
     #[test]
     fn doubts_name_changes_without_effect_and_an_actor_that_does_not_move() {
         let preset = Preset::read("hopper-demo").unwrap();
-        for (changes, expected) in [
-            (
-                "agent = { guidance = 'dac', tau = 0.5, eta.threshold = 1.0 }",
-                Some("agent.tau has no effect on a policy with guidance dac"),
-            ),
-            (
-                "agent = { guidance = 'none', eta = { threshold = 1.0, initial = 2.0 } }",
-                Some("agent.eta.threshold has no effect on a policy with guidance none"),
-            ),
-            (
-                "algorithm = 'ivr'\nagent = { divergence = 'sparse', alpha.exponential = 2.0 }",
-                Some("agent.alpha.exponential has no effect on a policy with divergence sparse"),
-            ),
-            (
-                "agent.critic.norm_after = true",
-                Some("agent.critic.norm_after has no effect without agent.critic.norm = true"),
-            ),
-            ("agent.critic = { norm = true, norm_after = true }", None),
-            (
-                "online.warmup = 100",
-                Some("online.warmup has no effect without online steps (--online-steps N)"),
-            ),
-            ("online = { steps = 5000, warmup = 100 }", None),
-            ("steps = 1001\nagent.tau = 0.5", None),
-            ("agent = { guidance = 'shuffled', tau = 0.5 }", None),
-            // The task's own τ has no effect, either, but the changes do not name it.
-            ("agent.guidance = 'dac'", None),
-            // Its actor acts, not the target actor.
-            ("algorithm = 'dql'\nsteps = 1000", None),
-        ] {
-            let changes: Table = changes.parse().unwrap();
+        // An unnamed τ of the task has no doubt, nor has DQL, whose actor acts, not the target actor.
+        for line in include_str!("presets/doubts.txt").lines() {
+            let (changes, expected) = line.split_once(" =>").unwrap();
+            let changes: Table = changes.replace("\\n", "\n").parse().unwrap();
             let experiment = preset.resolve(&changes).unwrap();
             let doubts = preset.doubts(&experiment, &changes).unwrap();
-            assert_eq!(doubts, Vec::from_iter(expected), "{changes}");
+            assert_eq!(doubts.join("; "), expected.trim_start(), "{changes}");
         }
     }
 }
