@@ -20,7 +20,7 @@ pub(super) enum OnlineEpisode {
 #[derive(Debug, Default)]
 pub(super) struct Partial {
     /// Hash of the whole frame.
-    pub hash: Option<Hash>,
+    hash: Option<Hash>,
     /// The first bytes of the frame; none while it is given out.
     pub bytes: Vec<u8>,
     /// True while the whole frame is decoded or written.

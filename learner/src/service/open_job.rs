@@ -21,11 +21,11 @@ pub(super) struct OpenJob {
     /// True if a claim for another job has come under its evaluator's name.
     pub asked_again: bool,
     /// Longest time without progress.
-    pub patience: Duration,
-    pub handed_out: Instant,
+    patience: Duration,
+    handed_out: Instant,
     pub lease_until: Instant,
     /// Environment steps and episodes of the last accepted progress.
-    pub done: (u64, u32),
+    done: (u64, u32),
 }
 
 impl OpenJob {

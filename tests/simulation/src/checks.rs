@@ -8,8 +8,8 @@ use crate::arithmetic::score;
 use crate::world::World;
 
 impl World {
-    /// A new job has episodes that are not on the disk. Nobody else plays them, but for one who is
-    /// slow with an online episode.
+    /// A new job has episodes that are not on the disk. No other evaluator plays them, but for one
+    /// that is slow with an online episode.
     pub fn check_job(&mut self, job: &Job) -> Result<(), String> {
         let Some(alive) = &mut self.learner.alive else { return Ok(()) };
         if job.id <= alive.last_job {

@@ -20,6 +20,11 @@ pub fn query(world: &mut World) -> Query {
     };
     let step = rng.random_range(0..=steps);
     let (incarnation, job) = (world.learner.incarnation, rng.random_range(0..20));
+    let piece = |seed, hash, length, offset, bytes| {
+        let (evaluator, run) = (evaluator.clone(), name("run"));
+        let piece = Piece { evaluator, run, incarnation, job, seed, hash, length, offset, bytes };
+        Query::Piece(piece)
+    };
     match rng.random_range(0..6) {
         0 => {
             let environments = vec![["robot", "other"][rng.random_range(0..2)].to_owned()];
@@ -54,19 +59,8 @@ pub fn query(world: &mut World) -> Query {
             let bytes = vec![7; rng.random_range(1..200)];
             let length = rng.random_range(bytes.len()..2000) as u32;
             let offset = rng.random_range(0..=length - bytes.len() as u32);
-            let (seed, hash) = (online_seed(0, rng.random_range(0..6)), Hash::new(b"guessed"));
-            let run = name("run");
-            Query::Piece(Piece {
-                evaluator,
-                run,
-                incarnation,
-                job,
-                seed,
-                hash,
-                length,
-                offset,
-                bytes,
-            })
+            let seed = online_seed(0, rng.random_range(0..6));
+            piece(seed, Hash::new(b"guessed"), length, offset, bytes)
         }
         // A whole episode, of other weights or of another seed.
         _ => {
@@ -78,18 +72,7 @@ pub fn query(world: &mut World) -> Query {
             };
             let episode = play(settings, (step, weights), played, Exploration::Uniform, 0);
             let bytes = encode(&episode).expect("its numbers are finite");
-            let (hash, length, run) = (Hash::new(&bytes), bytes.len() as u32, name("run"));
-            Query::Piece(Piece {
-                evaluator,
-                run,
-                incarnation,
-                job,
-                seed,
-                hash,
-                length,
-                offset: 0,
-                bytes,
-            })
+            piece(seed, Hash::new(&bytes), bytes.len() as u32, 0, bytes)
         }
     }
 }

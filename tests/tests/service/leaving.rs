@@ -16,7 +16,7 @@ fn an_unread_stderr_blocks_neither_work_nor_exit() {
     let scratch = Scratch::new();
     let (_unread, stderr) = std::io::pipe().unwrap();
     let mut filler = stderr.try_clone().unwrap();
-    // Blocks as soon as the pipe is full, for as long as nobody reads.
+    // Blocks once the pipe is full: this test never reads it.
     std::thread::spawn(move || while filler.write(&[b'.'; 1000]).is_ok() {});
     for (run, setting, code) in [("short", SHORT, 0), ("endless", ENDLESS, 75)] {
         let dir = scratch.path().join(run);
