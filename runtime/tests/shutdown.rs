@@ -2,8 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::env;
-use std::io::{BufRead, BufReader, Write};
-use std::process::{Command, Stdio, exit};
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Stdio};
 use std::thread::sleep;
 use std::time::Duration;
 
@@ -23,23 +23,13 @@ fn signals() {
     match env::var(ROLE).as_deref() {
         Ok("early") => {
             unfinished_at_signal();
-            ready();
+            println!("ready");
             sleep(Duration::from_secs(300));
-        }
-        Ok("listening") => {
-            unfinished_at_signal();
-            runtime().block_on(async {
-                let shutdown = shutdown_signal(LEAVE_WITHIN);
-                ready();
-                shutdown.await;
-            });
-            exit(7);
         }
         Ok(_) => counts_each_signal_once(),
         Err(_) => {
             for signal in SIGNALS {
                 assert_eq!(code("early", Some(signal)), Some(75), "{signal:?}");
-                assert_eq!(code("listening", Some(signal)), Some(7), "{signal:?}");
             }
             assert_eq!(code("again", None), Some(0));
         }
@@ -58,12 +48,6 @@ fn code(role: &str, signal: Option<Signal>) -> Option<i32> {
     }
     lines.for_each(drop);
     process.wait().unwrap().code()
-}
-
-fn ready() {
-    let mut output = std::io::stdout();
-    writeln!(output, "ready").unwrap();
-    output.flush().unwrap();
 }
 
 fn counts_each_signal_once() {

@@ -213,34 +213,20 @@ impl RunClient {
 
     /// Delivers the results, or hands the job back, before this evaluator ends.
     pub async fn leave(mut self) {
-        let is_episode = self.duty.owes_episode();
-        let until = Instant::now() + if is_episode { LEAVE_EPISODE } else { LEAVE };
-        let mut answered = false;
+        let time = if self.duty.owes_episode() { LEAVE_EPISODE } else { LEAVE };
+        let until = Instant::now() + time;
         self.duty.leave();
         self.duty.begin_turn();
         while let Some(step) = self.duty.next(0) {
-            let hands_back = matches!(step, Step::HandBack { .. });
             let done = timeout_at(until.into(), self.deliver(step, LEAVE / 2)).await;
-            let run = &self.connection.run;
-            let late = |_| Err(QueryError::NoAnswer(keys::experience(run)));
+            let late = |_| Err(QueryError::NoAnswer(keys::experience(&self.connection.run)));
             let Err(error) = done.unwrap_or_else(late) else { continue };
-            // A learner that answers with an error has received the scores and may still save them.
-            // If the job went back now, others would run it again. An episode of a robot or a person
-            // cannot be run again.
-            let unusable = matches!(error, QueryError::Unusable { .. });
-            answered |= unusable && !is_episode && !hands_back;
-            let is_late = Instant::now() + RETRY > until;
-            match hands_back {
-                true if is_late => return,
-                false if is_late || !(unusable || is_episode) => {
-                    warn!(%run, "the learner has not acknowledged the results: {error}");
-                    if answered {
-                        return;
-                    }
-                    self.duty.drop_results();
-                }
-                _ => tokio::time::sleep(RETRY).await,
+            let answered = matches!(error, QueryError::Unusable { .. });
+            self.warn(&error.into());
+            if !self.duty.leaving_failed(answered, Instant::now() + RETRY > until) {
+                return;
             }
+            tokio::time::sleep(RETRY).await;
         }
     }
 

@@ -342,12 +342,18 @@ impl Duty {
         (self.leaving, self.delivered_again) = (true, true);
     }
 
-    /// Gives results up that could not be delivered: the job goes back.
-    pub fn drop_results(&mut self) {
-        self.state = match mem::take(&mut self.state) {
-            State::Owing(job, _) => State::Returning(job, None),
-            other => other,
+    /// A leaving evaluator's step has failed, `answered` by the learner's error or not at all: results are
+    /// tried again, then the job goes back. False if it is too late for that, too.
+    pub fn leaving_failed(&mut self, answered: bool, is_late: bool) -> bool {
+        let again = match self.state {
+            State::Owing(_, Owed::Scores(_)) => answered && !is_late,
+            _ => !is_late,
         };
+        if !again && let State::Owing(job, _) = mem::take(&mut self.state) {
+            self.state = State::Returning(job, None);
+            return true;
+        }
+        again
     }
 }
 
@@ -361,3 +367,6 @@ fn take_like(early: &mut VecDeque<ScoreReport>, job: &Job) -> Option<ScoreReport
 fn hand_back(job: &Job, failed: Option<String>) -> Step {
     Step::HandBack { job: job.id, incarnation: job.incarnation, failed }
 }
+
+#[cfg(test)]
+mod tests;

@@ -112,7 +112,8 @@ fn write_verified() {
 }
 
 /// The experience of the runs of export-data.trycmd: three episodes, in the first of which a person
-/// acted twice; the first with a sensor's glitch; and one without observations, of another user's.
+/// acted twice, and the same without that person; the first with a sensor's glitch; one of another
+/// precision; a wrong and a doubled seed; and one without observations, of another user's.
 fn write_experience() {
     let append = |run: &str, episode: &Episode| {
         let (mut log, _) = RunDir::at(Path::new(run)).experience_log().unwrap();
@@ -134,6 +135,16 @@ fn write_experience() {
         episode.observations = smooth((rows + 1) * 11, 0.37);
         episode.actions = smooth(rows * 3, 1.3);
         episode.rewards = smooth(rows, 0.1);
+        for run in ["plain", "mixed", "strange"] {
+            let mut episode = episode.clone();
+            match (run, number) {
+                ("mixed", 1) => episode.precision = Name::new("f32-avx2").unwrap(),
+                ("strange", 1) => episode.score.seed = 1,
+                ("strange", 2) => episode.score.seed = online_seed(5, 0),
+                _ => {}
+            }
+            append(&format!("online/{run}"), &episode);
+        }
         if number == 0 {
             episode.interventions = vec![3, 4];
         }

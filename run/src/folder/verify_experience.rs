@@ -72,6 +72,3 @@ pub fn verify_experience(
     };
     Ok(Some((findings, promise)))
 }
-
-#[cfg(test)]
-mod tests;

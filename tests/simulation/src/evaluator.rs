@@ -89,7 +89,7 @@ impl World {
         }
         evaluator.alive = false;
         let gone_after = Duration::from_millis(self.rng.random_range(0..10_000));
-        self.announce_evaluator_after(number, gone_after);
+        self.after(gone_after, Event::Token(number));
         let back_after = Duration::from_millis(self.rng.random_range(10..20_000));
         self.after(back_after, Event::StartEvaluator(number));
     }

@@ -58,10 +58,6 @@ impl World {
     /// Shows the learner whether an evaluator is there.
     pub fn announce_evaluator(&mut self, number: usize) {
         let pause = Duration::from_millis(self.rng.random_range(1..100));
-        self.announce_evaluator_after(number, pause);
-    }
-
-    pub fn announce_evaluator_after(&mut self, number: usize, pause: Duration) {
         self.after(pause, Event::Token(number));
     }
 
@@ -70,7 +66,7 @@ impl World {
         self.record(|| format!("e{number} is cut off: {cut}"));
         self.evaluators[number].cut = cut;
         let pause = if cut { NOTICED.mul_f64(self.rng.random()) } else { Duration::ZERO };
-        self.announce_evaluator_after(number, pause);
+        self.after(pause, Event::Token(number));
         self.tell_evaluator_of_learner(number);
     }
 }

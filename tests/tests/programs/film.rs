@@ -26,8 +26,12 @@ fn frames(path: &Path) -> ((u16, u16), Vec<Vec<u8>>) {
     options.set_color_output(gif::ColorOutput::RGBA);
     let mut decoder = options.read_info(BufReader::new(File::open(path).unwrap())).unwrap();
     let size = (decoder.width(), decoder.height());
-    let next = || decoder.read_next_frame().unwrap().map(|frame| frame.buffer.to_vec());
-    (size, std::iter::from_fn(next).collect())
+    let mut frames = Vec::new();
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        assert_eq!(frame.delay, 4, "hundredths of a second");
+        frames.push(frame.buffer.to_vec());
+    }
+    (size, frames)
 }
 
 /// Width and height, and the picture, 3 bytes a pixel.

@@ -7,7 +7,7 @@ use quad_protocol::keys;
 use quad_runtime::open_router;
 use quad_tests::made_up::name;
 use quad_tests::process::signal;
-use quad_tests::setting::{ENDLESS, SHORT};
+use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::Scratch;
 use quad_tests::{eventually, wait_until};
 
@@ -81,4 +81,21 @@ async fn a_learner_that_waits_for_another_reports_failures_and_stops() {
     learner.process.wait_for_log("waiting to see if it is gone");
     learner.process.signal("TERM");
     learner.process.assert_ends(75);
+}
+
+#[test]
+fn an_evaluator_told_to_leave_hands_its_job_back() {
+    let scratch = Scratch::new();
+    // Jobs that take seconds.
+    let learner = scratch.learner("run", Setting { candidates: 200, hidden: 256, ..ENDLESS });
+    let mut number = 0;
+    eventually("a job is handed back", || {
+        number += 1;
+        let mut evaluator = scratch.evaluator(&format!("evaluator-{number}"), &learner.endpoint());
+        evaluator.wait_for_log("evaluating");
+        evaluator.signal("TERM");
+        // A busy machine may take longer than it has.
+        assert!(matches!(evaluator.wait().code(), Some(0 | 75)));
+        learner.metric("jobs_total", "outcome=\"handed_back\"").filter(|jobs| *jobs > 0.0)
+    });
 }

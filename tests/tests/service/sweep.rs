@@ -77,13 +77,12 @@ impl Study {
     }
 }
 
-/// The process that a sweep has started by a command line with a word that ends like this: a run's
-/// learner, or an evaluator, whose word is `serve`.
-fn child(sweep: &Process, end: &str) -> u32 {
+/// The learner that a sweep has started for a run.
+fn child(sweep: &Process, run: &str) -> u32 {
     let line = |id: &u32| fs::read_to_string(format!("/proc/{id}/cmdline")).unwrap_or_default();
-    eventually(&format!("{end} has started"), || {
+    eventually(&format!("{run} has started"), || {
         let mut children = children(sweep.id()).into_iter();
-        children.find(|id| line(id).split('\0').any(|word| word.ends_with(end)))
+        children.find(|id| line(id).split('\0').any(|word| word.ends_with(run)))
     })
 }
 
@@ -122,17 +121,6 @@ fn a_sweep_resumes_and_a_failed_run_ends_no_other() {
     for run in RUNS {
         verify(&study.dir(run), &[Path::new("--same-as"), &undisturbed.dir(run)]);
     }
-}
-
-/// Its runs would train, and each wait ten minutes for an evaluator.
-#[test]
-fn a_sweep_whose_only_evaluator_is_killed_gets_another() {
-    let study = Study::new();
-    let mut sweep = study.sweep("--jobs 1 --evaluators 1");
-    study.wait_for(RUNS[0]);
-    signal("KILL", child(&sweep, "serve"));
-    sweep.assert_ends(0);
-    sweep.assert_said("an evaluator has ended (signal: 9");
 }
 
 #[test]

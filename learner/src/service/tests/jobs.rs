@@ -3,33 +3,13 @@
 use super::*;
 
 #[test]
-fn jobs_go_out_oldest_step_first_and_no_episode_twice() {
-    let mut bench = Bench::empty(7, BTreeMap::new());
-    bench.connect(2);
-    bench.open_evaluation(2000);
-    bench.open_evaluation(1000);
-    for (evaluator, step, range) in
-        [("a", 1000, 0..5), ("b", 1000, 5..7), ("c", 2000, 0..5), ("d", 2000, 5..7)]
-    {
-        let job = bench.job(evaluator, 0);
-        assert_eq!(
-            (job.step, &job.seeds[..], job.weights),
-            (step, &seeds(step)[range], hash(step))
-        );
-        assert_eq!((job.incarnation, job.environment_seed), (INCARNATION, 5));
-    }
-    assert!(matches!(bench.claim("e", 0, 0), JobReply::Wait { .. }));
-    assert_eq!(bench.pending(), 14);
-}
-
-#[test]
 fn an_evaluator_without_work_asks_again_the_later_the_more_there_are() {
     let pause = |bench: &mut Bench| match bench.claim("a", 0, 0) {
         JobReply::Wait { milliseconds, .. } => milliseconds,
         reply => panic!("{reply:?}"),
     };
     for (present, idle, between) in [(0, 500, 100), (1, 500, 100), (8, 800, 160)] {
-        let mut bench = Bench::empty(7, BTreeMap::new());
+        let mut bench = Bench::empty(7);
         bench.connect(present);
         assert_eq!(pause(&mut bench), idle);
         bench.open_online(0);
@@ -63,13 +43,13 @@ fn a_repeated_claim_gets_the_same_job_and_another_claim_waits() {
 fn jobs_are_larger_when_more_episodes_wait() {
     // Half of a share of 100 episodes, of 80, of 60.
     for (present, sizes) in [(1, [20; 3]), (4, [12, 11, 9]), (11, [5; 3])] {
-        let mut bench = Bench::empty(100, BTreeMap::new());
+        let mut bench = Bench::empty(100);
         bench.open_evaluation(1000);
         bench.connect(present);
         assert_eq!(["a", "b", "c"].map(|evaluator| bench.job(evaluator, 0).seeds.len()), sizes);
     }
     // One of the episodes may have crashed the lost evaluator.
-    let mut bench = Bench::empty(100, BTreeMap::new());
+    let mut bench = Bench::empty(100);
     bench.open_evaluation(1000);
     assert_eq!(bench.job("a", 0).seeds.len(), 20);
     bench.handle(Input::Left(name("a")), 0);

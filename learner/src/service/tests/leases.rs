@@ -5,7 +5,7 @@ use super::*;
 #[test]
 fn the_more_evaluators_the_less_often_each_reports_progress() {
     for (present, expected) in [(0, 1000), (25, 1000), (50, 2000), (400, 16_000), (1000, 20_000)] {
-        let mut bench = Bench::empty(7, BTreeMap::new());
+        let mut bench = Bench::empty(7);
         bench.open_evaluation(1000);
         bench.connect(present);
         assert_eq!(bench.job("a", 0).progress_milliseconds, expected, "{present}");

@@ -10,10 +10,8 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::{
     EpisodeScore, Exploration, Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReport,
-    episode_seeds,
 };
 use quad_run::config::Schedule;
-use quad_run::folder::SavedScores;
 
 use super::{Answer, Count, Input, Opening, Order, Rules, Service};
 
@@ -29,15 +27,15 @@ struct Bench {
 impl Bench {
     /// Evaluations of steps 1000 and 2000, of seven episodes each, for two evaluators.
     fn new() -> Self {
-        let mut bench = Self::empty(7, BTreeMap::new());
+        let mut bench = Self::empty(7);
         bench.connect(2);
         bench.open_evaluation(1000);
         bench.open_evaluation(2000);
         bench
     }
 
-    /// A run without evaluations, with the scores of earlier incarnations.
-    fn empty(episodes: u32, earlier: BTreeMap<u64, SavedScores>) -> Self {
+    /// A run without evaluations.
+    fn empty(episodes: u32) -> Self {
         let start = Instant::now();
         let rules = Rules {
             run: name("run"),
@@ -50,7 +48,7 @@ impl Bench {
             job_episodes: [5, 20],
             lease: LEASE,
         };
-        Self { service: Service::new(rules, earlier, &[], start), start }
+        Self { service: Service::new(rules, BTreeMap::new(), &[], start), start }
     }
 
     fn handle(&mut self, input: Input<u32>, seconds: u64) -> Vec<Order<u32>> {
@@ -120,19 +118,16 @@ impl Bench {
         expired.unwrap_or(0)
     }
 
-    /// Lets the disk take what has arrived, or refuse it. Returns the other orders.
-    fn flush(&mut self, disk: Result<(), String>) -> Vec<Order<u32>> {
+    /// Lets the disk take what has arrived. Returns the other orders.
+    fn flush(&mut self) -> Vec<Order<u32>> {
         let (mut done, mut orders) = (Vec::new(), self.handle(Input::Flush, 0));
-        while !orders.is_empty() {
-            let order = orders.remove(0);
+        while let Some(order) = orders.pop() {
             orders.extend(match order {
                 Order::Decode(frame) => {
                     let episode = frame.decode();
                     self.handle(Input::Decoded(frame, episode), 0)
                 }
-                Order::Append { .. } => {
-                    self.handle(Input::Appended([disk.clone(), disk.clone()]), 0)
-                }
+                Order::Append { .. } => self.handle(Input::Appended([Ok(()), Ok(())]), 0),
                 order => {
                     done.push(order);
                     Vec::new()
@@ -144,7 +139,7 @@ impl Bench {
 
     fn deliver(&mut self, report: ScoreReport) -> Vec<Order<u32>> {
         self.handle(Input::Scores(0, report), 0);
-        self.flush(Ok(()))
+        self.flush()
     }
 
     fn pending(&self) -> usize {
@@ -173,11 +168,6 @@ fn name(text: &str) -> Name {
 
 fn hash(step: u64) -> Hash {
     Hash::new(&step.to_le_bytes())
-}
-
-/// The seeds of an evaluation.
-fn seeds(step: u64) -> Vec<u64> {
-    episode_seeds(5, step, 7)
 }
 
 fn score(seed: u64, episode_return: f64) -> EpisodeScore {

@@ -1,11 +1,11 @@
 //! Tests of results, from their arrival to their acknowledgment.
 
-use quad_protocol::{Episode, Piece, PieceReply, ScoreReply, encode};
+use quad_protocol::{Episode, Piece, encode};
+use quad_run::folder::SavedScores;
 
 use super::super::{End, OtherWeights};
 use super::*;
 
-const FULL: &str = "no space left";
 const SEED: u64 = 100;
 /// Bytes of the longest frame: a thousand steps and a state, each of 16 numbers.
 const LONGEST: u32 = 1001 * 16 * 4 + 1024;
@@ -21,10 +21,10 @@ fn episode(reward: f32) -> Episode {
     }
 }
 
-/// An episode's frame in pieces of so many bytes.
-fn pieces(episode: &Episode, most: usize) -> Vec<Piece> {
+/// An episode's frame in one piece.
+fn piece(episode: &Episode) -> Piece {
     let frame = encode(episode).unwrap();
-    let piece = |(number, bytes): (usize, &[u8])| Piece {
+    Piece {
         evaluator: name("a"),
         run: name("run"),
         incarnation: INCARNATION,
@@ -32,58 +32,31 @@ fn pieces(episode: &Episode, most: usize) -> Vec<Piece> {
         seed: SEED,
         hash: Hash::new(&frame),
         length: frame.len() as u32,
-        offset: (number * most) as u32,
-        bytes: bytes.to_vec(),
-    };
-    frame.chunks(most).enumerate().map(piece).collect()
+        offset: 0,
+        bytes: frame,
+    }
+}
+
+fn deliver_piece(bench: &mut Bench, piece: Piece) -> Vec<Order<u32>> {
+    bench.handle(Input::Piece(0, piece), 0);
+    bench.flush()
 }
 
 /// Delivers the online episode with the seed 100.
 pub(super) fn deliver_episode(bench: &mut Bench) {
-    bench.handle(Input::Piece(0, pieces(&episode(1.0), 30_000).remove(0)), 0);
-    let orders = bench.flush(Ok(()));
+    let orders = deliver_piece(bench, piece(&episode(1.0)));
     assert!(orders.iter().any(|order| matches!(order, Order::Learn { number: 0, .. })));
 }
 
-/// The answers to queries about pieces, by query; `None` if it is to be tried again.
-fn answers(orders: &[Order<u32>]) -> Vec<(u32, Option<PieceReply>)> {
-    let answer = |order: &Order<u32>| match order {
-        Order::Reply(query, Answer::Piece(reply)) => Some((*query, Some(reply.clone()))),
-        Order::Reply(query, Answer::TryAgain(_)) => Some((*query, None)),
-        _ => None,
-    };
-    orders.iter().filter_map(answer).collect()
-}
-
 #[test]
-fn an_episode_is_learned_from_once_and_other_bits_are_counted() {
-    let (mut bench, incarnation) = (Bench::new(), INCARNATION);
+fn an_episode_that_comes_again_with_other_bits_is_counted() {
+    let mut bench = Bench::new();
     bench.open_online(0);
-    let [first, last] = pieces(&episode(1.0), 200).try_into().unwrap();
-    let [other, _] = pieces(&episode(2.0), 200).try_into().unwrap();
-    let resume = |offset| Some(PieceReply::Continue { incarnation, offset });
-    for (piece, offset) in [(&last, 0), (&first, 200)] {
-        bench.handle(Input::Piece(1, piece.clone()), 0);
-        assert_eq!(answers(&bench.flush(Ok(()))), [(1, resume(offset))]);
-    }
-    // The last piece comes twice, and another evaluator's first.
-    for (query, piece) in [(1, &last), (2, &last), (3, &other)] {
-        bench.handle(Input::Piece(query, piece.clone()), 0);
-    }
-    let refused = bench.flush(Err(FULL.to_owned()));
-    assert_eq!(answers(&refused), [(2, resume(200)), (3, resume(0)), (1, None)]);
-
-    let recorded = |duplicate| Some(PieceReply::Recorded { incarnation, duplicate });
-    for (piece, duplicate, differs) in
-        [(&last, false, false), (&last, true, false), (&other, true, true)]
-    {
-        bench.handle(Input::Piece(1, piece.clone()), 0);
-        let orders = bench.flush(Ok(()));
-        assert_eq!(answers(&orders), [(1, recorded(duplicate))]);
-        let is_learned = orders.iter().any(|order| matches!(order, Order::Learn { number: 0, .. }));
-        assert_eq!(is_learned, !duplicate);
-        let counted = |order: &Order<u32>| matches!(order, Order::Count(Count::Difference));
-        assert_eq!(orders.iter().any(counted), differs);
+    deliver_episode(&mut bench);
+    for (reward, differs) in [(1.0, false), (2.0, true)] {
+        let orders = deliver_piece(&mut bench, piece(&episode(reward)));
+        let is_counted = |order: &Order<u32>| matches!(order, Order::Count(Count::Difference));
+        assert_eq!(orders.iter().any(is_counted), differs);
     }
 }
 
@@ -102,8 +75,7 @@ fn an_episode_that_does_not_fit_its_opening_is_refused() {
     for (change, refusal) in refusals {
         let mut episode = episode(1.0);
         change(&mut episode);
-        bench.handle(Input::Piece(0, pieces(&episode, 30_000).remove(0)), 0);
-        assert_eq!(rejected(&bench.flush(Ok(()))), Some(refusal));
+        assert_eq!(rejected(&deliver_piece(&mut bench, piece(&episode))), Some(refusal));
     }
     let changes: [(fn(&mut Piece), _); 4] = [
         (|piece| piece.length = LONGEST, None),
@@ -112,41 +84,10 @@ fn an_episode_that_does_not_fit_its_opening_is_refused() {
         (|piece| piece.seed = 102, Some("unknown_online")),
     ];
     for (change, refusal) in changes {
-        let mut piece = pieces(&episode(1.0), 200).remove(0);
+        let mut piece = piece(&episode(1.0));
         change(&mut piece);
-        bench.handle(Input::Piece(0, piece), 0);
-        assert_eq!(rejected(&bench.flush(Ok(()))), refusal);
+        assert_eq!(rejected(&deliver_piece(&mut bench, piece)), refusal);
     }
-}
-
-#[test]
-fn scores_are_acknowledged_once_they_are_on_the_disk() {
-    let mut bench = Bench::new();
-    let job = bench.job("a", 0);
-    let part = ScoreReport { episodes: vec![score(job.seeds[0], 500.0)], ..report(&job, "a") };
-    let replies = |orders: Vec<Order<u32>>| {
-        Vec::from_iter(orders.into_iter().filter_map(|order| match order {
-            Order::Reply(_, Answer::Scores(ScoreReply::Recorded { new, duplicates, .. })) => {
-                Some((new, duplicates))
-            }
-            Order::Reply(_, Answer::TryAgain(reason)) => {
-                assert_eq!(reason, "it could not be saved, try again: no space left");
-                Some((0, 0))
-            }
-            _ => None,
-        }))
-    };
-    // Two evaluators have run the same episode.
-    for (disk, expected) in [
-        (Err(FULL.to_owned()), [(0, 0), (0, 0)]),
-        (Ok(()), [(1, 0), (4, 1)]),
-        (Ok(()), [(0, 1), (0, 5)]),
-    ] {
-        bench.handle(Input::Scores(1, part.clone()), 0);
-        bench.handle(Input::Scores(2, report(&job, "b")), 0);
-        assert_eq!(replies(bench.flush(disk)), expected);
-    }
-    assert_eq!(bench.pending(), 9);
 }
 
 /// Gives the first episode this return, and the score of it.
@@ -185,28 +126,16 @@ fn a_report_that_fits_no_evaluation_is_refused() {
 }
 
 #[test]
-fn scores_of_an_earlier_incarnation_count_unless_the_weights_differ() {
-    let saved = |step, episodes| {
-        let weights = hash(step).to_string();
-        (step, SavedScores { weights, episodes })
-    };
-    let scores = |step| Vec::from_iter(seeds(step).into_iter().map(|seed| score(seed, 4.0)));
-    let reversed = scores(2000).into_iter().rev().collect();
-    let mut bench =
-        Bench::empty(7, [saved(1000, scores(1000)[1..].to_vec()), saved(2000, reversed)].into());
-    assert!(bench.open_evaluation(1000).is_empty());
-    assert_eq!(bench.pending(), 1);
-    let [Order::Evaluated { step: 2000, scores: complete, earlier: true }] =
-        &bench.open_evaluation(2000)[..]
-    else {
-        panic!("it is complete");
-    };
-    assert_eq!(*complete, scores(2000));
+fn a_step_of_other_weights_than_were_scored_ends_the_run() {
+    let mut bench = Bench::empty(7);
+    let saved = SavedScores { weights: hash(1000).to_string(), episodes: Vec::new() };
+    bench.service.earlier.insert(1000, saved);
+    bench.open_evaluation(2000);
     assert!(bench.open_evaluation(2000).is_empty(), "again");
-    assert_eq!(bench.pending(), 1);
-    let weights = hash(1);
-    let orders = bench.handle(Input::Snapshot { step: 1000, weights }, 0);
-    let scored = hash(1000).to_string();
-    let error = OtherWeights { step: 1000, trained: weights, scored };
-    assert!(matches!(&orders[..], [Order::End(End::OtherWeights(other))] if *other == error));
+    let trained = hash(1);
+    for step in [1000, 2000] {
+        let orders = bench.handle(Input::Snapshot { step, weights: trained }, 0);
+        let error = OtherWeights { step, trained, scored: hash(step).to_string() };
+        assert!(matches!(&orders[..], [Order::End(End::OtherWeights(other))] if *other == error));
+    }
 }

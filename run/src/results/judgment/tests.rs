@@ -117,23 +117,6 @@ fn a_judgment_replaces_an_earlier_one_of_its_step_and_conditions() {
 }
 
 #[test]
-fn a_caveat_stands_beside_a_rank_and_older_files_have_none() {
-    let folder = tempfile::tempdir().unwrap();
-    let run = RunDir::at(folder.path());
-    save(&run, 20, 1.0);
-    let mut file: serde_json::Value = run.read_json(FILE).unwrap();
-    assert_eq!(file[0].as_object_mut().unwrap().remove("caveat"), None);
-    let mut judged = pair([8.0, 10.0], [12.0, 14.0], 10.0);
-    judged[1].caveat = Some("it executes 2 actions of a chunk".to_owned());
-    judged[1].save(&run).unwrap();
-    assert_eq!(Judgment::read_all(&run).unwrap()[0].caveat, judged[1].caveat);
-    let text =
-        Ranking::from_judgments(judged)[0].blocks().map(|block| block.render(Style::Text)).concat();
-    let line = text.lines().find(|line| line.contains("a chunk")).unwrap();
-    assert!(line.starts_with("   1  b @ 20 "), "{text}");
-}
-
-#[test]
 fn concurrent_judges_lose_no_judgment() {
     let folder = tempfile::tempdir().unwrap();
     let run = &RunDir::at(folder.path());
