@@ -4,18 +4,18 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Context;
-use clap::{Args, CommandFactory, Parser, Subcommand, value_parser};
+use clap::{Args, CommandFactory, Parser, Subcommand};
 use clap_complete::Shell;
 use quad_dataset::environment::{self, EnvironmentSpec};
-use quad_run::folder::{RunDir, RunDirError};
 use quad_runtime::{Hint, certificates_folder, json, print};
 
 use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
 use crate::sim::Simulations;
+use crate::tools::collect::{self, CollectArgs};
 use crate::tools::film::{self, FilmArgs};
 use crate::tools::score::{self, ScoreArgs};
-use crate::tools::{collect, verify};
+use crate::tools::verify;
 
 /// Runs policies in MuJoCo, and records datasets there.
 #[derive(Debug, Parser)]
@@ -38,27 +38,6 @@ enum Command {
         /// The shell
         shell: Shell,
     },
-}
-
-/// Record a dataset of mediocre behavior to learn from, without a download
-///
-/// Trains linear policies by augmented random search, from policies that fall at once to policies
-/// that move well, and mixes noisy episodes of all of them into one file in D4RL's layout (HDF5).
-/// This takes one to two minutes on two cores. The same seed makes the same data.
-#[derive(Debug, Args)]
-struct CollectArgs {
-    /// Environment to act in, such as hopper
-    #[arg(long, value_name = "NAME", value_parser = collect::environment)]
-    env: &'static EnvironmentSpec,
-    /// File to write; it appears when it is complete
-    #[arg(long, value_name = "FILE")]
-    out: PathBuf,
-    /// Least number of transitions; the last episode is recorded to its end
-    #[arg(long, value_name = "N", default_value = "100000", value_parser = value_parser!(u32).range(1..))]
-    transitions: u32,
-    /// Seed of all random numbers
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    seed: u64,
 }
 
 /// Replay a recorded file one step at a time from its own states, and measure how far the
@@ -96,10 +75,8 @@ impl Cli {
             Command::Score(args) => print(&score::score(&args)?),
             Command::Film(args) => print(&film::film(&args)?),
             Command::Collect(args) => {
-                let (out, transitions) = (&args.out, args.transitions as usize);
-                RunDir::refuse_own_file(out).hint_of(RunDirError::hint)?;
-                let summary = collect::collect(args.env, out, transitions, args.seed)?;
-                print(&format!("{}: {summary}", out.display()))
+                let summary = collect::collect(&args)?;
+                print(&format!("{}: {summary}", args.out.display()))
             }
             Command::VerifyDataset(args) => {
                 let spec = args.env.map_or_else(|| verify::environment_of(&args.file), Ok);

@@ -11,7 +11,7 @@ use crate::online::OnlineEpisode;
 use crate::tables::environment::EnvironmentSpec;
 
 /// Origin of the rows, stored under `metadata/`.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Metadata<'a> {
     /// Name of the algorithm that acted.
     pub algorithm: &'a str,
@@ -19,6 +19,10 @@ pub struct Metadata<'a> {
     pub iteration: i64,
     /// Seed that reproduces the file.
     pub seed: u64,
+    /// Run of the policy that acted, if a policy of a run did.
+    pub run: Option<&'a str>,
+    /// BLAKE3 of the policy's file.
+    pub weights: Option<&'a str>,
 }
 
 /// File being written, at `<path>.partial` until [`finish`](Self::finish) renames it. An unfinished
@@ -144,6 +148,11 @@ fn write_metadata(file: &NewFile, environment: &str, metadata: &Metadata) -> hdf
     put(&group, "algorithm", &text(metadata.algorithm)?)?;
     put(&group, "environment", &text(environment)?)?;
     put(&group, "iteration", &metadata.iteration)?;
+    for (name, value) in [("run", metadata.run), ("weights", metadata.weights)] {
+        if let Some(value) = value {
+            put(&group, name, &text(value)?)?;
+        }
+    }
     put(&group, "seed", &metadata.seed)
 }
 

@@ -369,7 +369,7 @@ def check_written(path, n):
             members = {ours.get_member_name(k): ours.get_member_value(k) for k in range(ours.get_nmembers())}
             assert members == {b"FALSE": 0, b"TRUE": 1} and ours.get_super() == h5py.h5t.STD_I8LE, (name, members)
         metadata = {name: value[()] for name, value in file["metadata"].items()}
-        assert metadata == {"algorithm": b"formula", "environment": b"hopper", "iteration": 12, "seed": 34}, metadata
+        assert metadata == {"algorithm": b"formula", "environment": b"hopper", "iteration": 12, "run": b"mine", "seed": 34, "weights": b"0f"}, metadata
 
 
 if __name__ == "__main__":

@@ -9,7 +9,13 @@ use quad_dataset::{
 use crate::{assert_error, batch, hopper, peers, read, scratch};
 
 const ROWS: usize = 10_000;
-const METADATA: Metadata<'_> = Metadata { algorithm: "formula", iteration: 12, seed: 34 };
+const METADATA: Metadata<'_> = Metadata {
+    algorithm: "formula",
+    iteration: 12,
+    seed: 34,
+    run: Some("mine"),
+    weights: Some("0f"),
+};
 
 /// The numbers of row `i`, exact in float32; `peers.py check-written` has the same formulas.
 fn numbers(i: usize) -> [Vec<f64>; 5] {

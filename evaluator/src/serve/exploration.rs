@@ -12,29 +12,37 @@ pub fn explore(
     states: &mut [EpisodeState],
     actions: &mut [f32],
 ) -> Result<(), PolicyError> {
-    let width = policy.action_dim();
     match rule {
-        Exploration::Uniform => policy.change_actions(actions, &mut |actions| {
-            for (action, state) in actions.chunks_exact_mut(width).zip(&mut *states) {
-                action.fill_with(|| (2.0 * state.uniform() - 1.0) as f32);
-            }
-        }),
+        Exploration::Uniform => {
+            policy.change_actions(actions, &mut |actions| draw_uniform(states, actions));
+        }
         Exploration::Policy { noise } => {
             policy.explore(observations, states, actions)?;
             if noise > 0.0 {
-                let mut normal = vec![0.0; width];
-                policy.change_actions(actions, &mut |actions| {
-                    for (action, state) in actions.chunks_exact_mut(width).zip(&mut *states) {
-                        state.fill_normal(&mut normal);
-                        for (x, z) in action.iter_mut().zip(&normal) {
-                            *x = (*x + noise * z).clamp(-1.0, 1.0);
-                        }
-                    }
-                });
+                policy.change_actions(actions, &mut |actions| add_noise(noise, states, actions));
             }
         }
     }
     Ok(())
+}
+
+/// Fills in actions of n states, `n × action_dim`, drawn uniformly within ±1.
+pub fn draw_uniform(states: &mut [EpisodeState], actions: &mut [f32]) {
+    let width = actions.len() / states.len();
+    for (action, state) in actions.chunks_exact_mut(width).zip(states) {
+        action.fill_with(|| (2.0 * state.uniform() - 1.0) as f32);
+    }
+}
+
+/// Adds normal noise of this standard deviation to actions of n states, then clips them to ±1.
+pub fn add_noise(std: f32, states: &mut [EpisodeState], actions: &mut [f32]) {
+    let mut normal = vec![0.0; actions.len() / states.len()];
+    for (action, state) in actions.chunks_exact_mut(normal.len()).zip(states) {
+        state.fill_normal(&mut normal);
+        for (x, z) in action.iter_mut().zip(&normal) {
+            *x = (*x + std * z).clamp(-1.0, 1.0);
+        }
+    }
 }
 
 #[cfg(test)]

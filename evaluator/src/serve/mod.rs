@@ -25,7 +25,7 @@ pub mod delivery;
 mod discovery;
 pub mod duty;
 mod evaluate;
-mod exploration;
+pub(crate) mod exploration;
 #[cfg(test)]
 pub(crate) mod fixtures;
 mod job;

@@ -14,22 +14,23 @@ use super::environment::{Environment, EnvironmentError};
 /// Episodes that have ended leave the batch. An episode's score is a function of its seed and the
 /// policy, if the policy treats its rows independently; so each episode has its own policy state
 /// `S`.
-pub struct Rollout<S> {
+pub struct Rollout<S, E: ?Sized = dyn Environment> {
     observation_dim: usize,
     action_dim: usize,
-    live: Vec<Live>,
+    live: Vec<Live<E>>,
     /// Policy state of each live episode.
     states: Vec<S>,
     /// [live, observation_dim]
     observations: Vec<f32>,
     /// [live, action_dim]
     actions: Vec<f32>,
-    /// Ended episodes, with their indices among the seeds.
-    ended: Vec<(usize, EpisodeScore, Option<Episode>)>,
+    /// Ended episodes, in the order of their ends.
+    ended: Vec<Live<E>>,
 }
 
-struct Live {
-    environment: Box<dyn Environment>,
+struct Live<E: ?Sized> {
+    environment: Box<E>,
+    /// Index among the seeds.
     index: usize,
     score: EpisodeScore,
     record: Option<Episode>,
@@ -47,11 +48,11 @@ pub struct Stepped {
     pub physics: Duration,
 }
 
-impl<S> Rollout<S> {
+impl<S, E: Environment + ?Sized> Rollout<S, E> {
     /// Starts an episode per seed, each in an environment that `make` makes and with a policy state
     /// that `begin` makes. The pair has the policy's sizes of an observation and an action.
     pub fn new(
-        mut make: impl FnMut() -> Result<Box<dyn Environment>, EnvironmentError>,
+        mut make: impl FnMut() -> Result<Box<E>, EnvironmentError>,
         (observation_dim, action_dim): (usize, usize),
         seeds: &[u64],
         begin: impl FnMut(u64) -> S,
@@ -91,10 +92,10 @@ impl<S> Rollout<S> {
     ///
     /// `select` fails before any episode advances. After any other error the batch is unusable: an
     /// environment has failed, or a return or score is not finite.
-    pub fn step<E: From<EnvironmentError>>(
+    pub fn step<F: From<EnvironmentError>>(
         &mut self,
-        select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), E>,
-    ) -> Result<Stepped, E> {
+        select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), F>,
+    ) -> Result<Stepped, F> {
         let start = Instant::now();
         self.observe()?;
         self.actions.resize(self.live.len() * self.action_dim, 0.0);
@@ -138,7 +139,7 @@ impl<S> Rollout<S> {
                         record.observations.extend(last);
                     }
                 }
-                self.ended.push((episode.index, score, episode.record));
+                self.ended.push(episode);
             }
         }
         Ok((before - self.live.len()) as u32)
@@ -150,20 +151,32 @@ impl<S> Rollout<S> {
 
     /// Scores of the ended episodes, in the order of the seeds.
     pub fn into_scores(self) -> Vec<EpisodeScore> {
-        self.into_records().into_iter().map(|(score, _)| score).collect()
+        self.into_ended().map(|episode| episode.score).collect()
     }
 
     /// Scores of the ended episodes in the order of the seeds, and the episodes if they were
     /// [recorded](Self::recording).
-    pub fn into_records(mut self) -> Vec<(EpisodeScore, Option<Episode>)> {
-        self.ended.sort_unstable_by_key(|&(index, ..)| index);
-        self.ended.into_iter().map(|(_, score, record)| (score, record)).collect()
+    pub fn into_records(self) -> Vec<(EpisodeScore, Option<Episode>)> {
+        self.into_ended().map(|episode| (episode.score, episode.record)).collect()
+    }
+
+    /// The environments of the ended episodes, in the order of the seeds.
+    pub fn into_environments(self) -> Vec<E>
+    where
+        E: Sized,
+    {
+        self.into_ended().map(|episode| *episode.environment).collect()
+    }
+
+    fn into_ended(mut self) -> impl Iterator<Item = Live<E>> {
+        self.ended.sort_unstable_by_key(|episode| episode.index);
+        self.ended.into_iter()
     }
 }
 
 /// The observation of an environment, rounded.
 fn observe(
-    environment: &dyn Environment,
+    environment: &(impl Environment + ?Sized),
     expected: usize,
 ) -> Result<impl Iterator<Item = f32>, EnvironmentError> {
     let observation = environment.observation();
@@ -174,7 +187,7 @@ fn observe(
     }
 }
 
-impl Live {
+impl<E: Environment + ?Sized> Live<E> {
     fn step(&mut self, action: &[f32]) -> Result<(), EnvironmentError> {
         if let Some(record) = &mut self.record {
             let observation = self.environment.observation();

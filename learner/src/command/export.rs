@@ -140,6 +140,8 @@ pub fn export_data(args: &ExportDataArgs) -> anyhow::Result<()> {
         algorithm: &experiment.algorithm,
         iteration: last.step as i64,
         seed: experiment.seed,
+        run: Some(config.run.name.as_str()),
+        weights: None,
     };
     let (environment, dims) = (&experiment.environment, last.dims());
     write_experience(&args.out, environment, dims, &metadata, &episodes)

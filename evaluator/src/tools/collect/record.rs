@@ -1,15 +1,16 @@
 //! Mixes episodes of a search's policies, from the first to the last, into one dataset.
 
-use quad_dataset::{D4rlWriter, DatasetError, EnvironmentSpec, Recipe, RecordedStep};
+use quad_dataset::{D4rlWriter, EnvironmentSpec, Recipe};
 use quad_runtime::{Hint, ProgressBar};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
+use super::recorder::Recorder;
 use super::search::LinearPolicy;
 use super::{MUJOCO, OUT, stream};
-use crate::sim::{self, EnvironmentError, Simulation, Step};
+use crate::sim::Environment;
 
 /// Range of the standard deviation of an episode's Gaussian action noise (actions span ±1): enough
 /// to show the effects of other actions in a state, up to more than most gaits survive.
@@ -55,13 +56,13 @@ pub fn record(
         };
         let drawn: Vec<(&LinearPolicy, u64)> = (0..ROUND).map(&mut draw).collect();
         let running = recorders.par_iter_mut().zip(drawn).with_max_len(1);
-        running.for_each(|(recorder, (policy, seed))| recorder.run(policy, seed, ceiling));
+        running.for_each(|(recorder, (policy, seed))| play(recorder, policy, seed, ceiling));
         for recorder in &recorders {
-            simulated += recorder.steps.len();
+            simulated += recorder.length();
             let score = spec.normalized_score(recorder.episode_return);
             let band = mixture.iter().rposition(|&(from, _)| score >= from).unwrap_or(0);
             if recorder.ended() && (room[band] > 0.0 || !patient) {
-                room[band] -= recorder.steps.len() as f64;
+                room[band] -= recorder.length() as f64;
                 recorder.write(writer).hint(OUT)?;
                 scores.push(score);
             }
@@ -73,74 +74,19 @@ pub fn record(
     }
 }
 
-/// An environment and its last episode.
-struct Recorder {
-    environment: Simulation,
-    /// The initial state, then one after each step.
-    states: Vec<[Vec<f64>; 3]>,
-    /// Clipped actions [action_dim], and what follows.
-    steps: Vec<(Vec<f64>, Step)>,
-    episode_return: f64,
-}
-
-impl Recorder {
-    fn new(spec: &'static EnvironmentSpec) -> Result<Self, EnvironmentError> {
-        let environment = sim::make(spec, 0)?;
-        Ok(Self { environment, states: Vec::new(), steps: Vec::new(), episode_return: 0.0 })
-    }
-
-    /// Runs an episode to its end, or until its score so far is above `ceiling`.
-    fn run(&mut self, policy: &LinearPolicy, seed: u64, ceiling: f64) {
-        self.states.clear();
-        self.steps.clear();
-        self.episode_return = 0.0;
-        let spec = self.environment.spec();
-        let mut random = stream(seed, NOISE_STREAM);
-        let deviation = random.random_range(NOISE);
-        let mut action = vec![0.0; spec.action_dim];
-        self.environment.reset(seed);
-        self.keep_state();
-        loop {
-            policy.act(self.environment.observation(), &mut action);
-            for value in &mut action {
-                let noise: f64 = StandardNormal.sample(&mut random);
-                *value = (f64::from(*value) + deviation * noise).clamp(-1.0, 1.0) as f32;
-            }
-            let step = self.environment.step(&action);
-            self.episode_return += step.reward;
-            self.steps.push((action.iter().copied().map(f64::from).collect(), step));
-            self.keep_state();
-            if self.ended() || spec.normalized_score(self.episode_return) > ceiling {
-                return;
-            }
+/// Runs an episode to its end, or until its score so far is above `ceiling`.
+fn play(recorder: &mut Recorder, policy: &LinearPolicy, seed: u64, ceiling: f64) {
+    let spec = recorder.spec();
+    let mut random = stream(seed, NOISE_STREAM);
+    let deviation = random.random_range(NOISE);
+    let mut action = vec![0.0; spec.action_dim];
+    recorder.begin(seed);
+    while !recorder.ended() && spec.normalized_score(recorder.episode_return) <= ceiling {
+        policy.act(recorder.observation(), &mut action);
+        for value in &mut action {
+            let noise: f64 = StandardNormal.sample(&mut random);
+            *value = (f64::from(*value) + deviation * noise).clamp(-1.0, 1.0) as f32;
         }
-    }
-
-    fn ended(&self) -> bool {
-        let last = self.steps.last();
-        last.is_some_and(|(_, step)| step.terminated || step.truncated)
-    }
-
-    fn keep_state(&mut self) {
-        let simulation = &self.environment;
-        let state = [simulation.observation(), simulation.qpos(), simulation.qvel()];
-        self.states.push(state.map(<[f64]>::to_vec));
-    }
-
-    fn write(&self, writer: &mut D4rlWriter) -> Result<(), DatasetError> {
-        for ((action, step), states) in self.steps.iter().zip(self.states.windows(2)) {
-            let [observation, qpos, qvel] = &states[0];
-            writer.push(&RecordedStep {
-                observation,
-                action,
-                next_observation: &states[1][0],
-                reward: step.reward,
-                terminal: step.terminated,
-                timeout: step.truncated && !step.terminated,
-                qpos,
-                qvel,
-            })?;
-        }
-        Ok(())
+        recorder.advance(&action);
     }
 }

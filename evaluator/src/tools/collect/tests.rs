@@ -1,8 +1,14 @@
 //! Recorded datasets: a function of the seed, and a faithful replay.
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
+use candle_core::{Device, Tensor};
 use quad_dataset::RecordedRows;
+use quad_nn::Layout;
+use quad_policy::{Header, MlpConfig, PolicyConfig};
+use quad_protocol::{Hash, Origin};
+use serde_json::json;
 use tempfile::TempDir;
 
 use super::*;
@@ -14,11 +20,22 @@ fn hopper() -> &'static EnvironmentSpec {
     find("hopper").unwrap()
 }
 
-fn record(folder: &TempDir, seed: u64, threads: usize) -> (PathBuf, Summary) {
-    let path = folder.path().join(format!("{seed}-{threads}.hdf5"));
+fn arguments(folder: &TempDir, seed: u64) -> CollectArgs {
+    CollectArgs {
+        env: hopper(),
+        policy: Vec::new(),
+        mode: false,
+        noise: 0.0,
+        out: folder.path().join(format!("{seed}.hdf5")),
+        transitions: TRANSITIONS as u32,
+        seed,
+    }
+}
+
+/// Records on that many threads.
+fn collect_on(threads: usize, args: &CollectArgs) -> Summary {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-    let summary = pool.unwrap().install(|| collect(hopper(), &path, TRANSITIONS, seed));
-    (path, summary.unwrap())
+    pool.unwrap().install(|| collect(args)).unwrap()
 }
 
 fn read(path: &Path) -> RecordedRows {
@@ -28,16 +45,90 @@ fn read(path: &Path) -> RecordedRows {
 #[test]
 fn the_file_depends_on_the_seed_and_not_on_the_threads() {
     let folder = tempfile::tempdir().unwrap();
-    let rows = |seed, threads| read(&record(&folder, seed, threads).0);
-    let two = rows(1, 2);
-    assert!(rows(1, 1).iter().eq(two.iter()));
-    assert!(!rows(2, 2).iter().eq(two.iter()));
+    let path = folder.path().join("policy.safetensors");
+    fs::write(&path, policy()).unwrap();
+    for policy in [vec![], vec![PathBuf::from("random"), path]] {
+        let file = |seed, threads| {
+            let args = CollectArgs { policy: policy.clone(), ..arguments(&folder, seed) };
+            collect_on(threads, &args);
+            fs::read(args.out).unwrap()
+        };
+        let two = file(1, 2);
+        assert!(file(1, 1) == two);
+        assert!(file(2, 2) != two);
+    }
+}
+
+/// A squashed Gaussian policy whose mode is tanh(0.3) and whose log σ is 0.3 in all states.
+fn policy() -> Vec<u8> {
+    let shape = json!({
+        "observation_dim": 11,
+        "action_dim": 3,
+        "actor": MlpConfig::mish(&[1]),
+        "spread": "squashed",
+    });
+    let policy = json!({ "kind": "gaussian", "shape": shape });
+    let policy: PolicyConfig = serde_json::from_value(policy).unwrap();
+    // Kernels and biases of one hidden unit, then kernels and biases of the outputs.
+    let values = |layout: &Layout| {
+        let mut values = vec![0.0_f32; layout.count()];
+        values[18..].fill(0.3);
+        Tensor::new(values, &Device::Cpu)
+    };
+    let tensors = policy.tensors(values).unwrap();
+    let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 40, episodes: 2 };
+    let about = json!({ "run": "mine", "algorithm": "sac" });
+    Header { about, ..Header::new(policy, origin) }.to_safetensors(&tensors).unwrap()
+}
+
+#[test]
+fn actions_are_drawn_or_the_mode_with_noise_or_uniform_and_the_file_names_the_policy() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("policy.safetensors");
+    fs::write(&path, policy()).unwrap();
+    let weights = Hash::new(&policy()).to_string();
+    let (random, tanh) = (PathBuf::from("random"), 0.3_f64.tanh());
+    let uniform = "uniform random actions";
+    for (policies, mode, noise, mean, std, algorithm) in [
+        // Mean and standard deviation of tanh(u), u ~ N(0.3, e^0.3), by quadrature.
+        (vec![&path], false, 0.0, 0.148, 0.700, "sac, sampled"),
+        (vec![&path], true, 0.0, tanh, 0.0, "sac, mode"),
+        (vec![&path], true, 0.1, tanh, 0.1, "sac, mode, with noise of standard deviation 0.1"),
+        (vec![&random], false, 0.0, 0.0, 0.577, uniform),
+        (vec![&random, &path], true, 0.0, tanh, 0.0, "uniform random actions; sac, mode"),
+    ] {
+        let args = CollectArgs {
+            policy: policies.into_iter().cloned().collect(),
+            mode,
+            noise,
+            ..arguments(&folder, 5)
+        };
+        let mut writer = D4rlWriter::create(&args.out, hopper()).unwrap();
+        let behaviors = args.policy.iter().map(|path| Behavior::read(path, &args).unwrap());
+        let recorded = policies::record(&Vec::from_iter(behaviors), &args, &mut writer).unwrap();
+        writer.finish(&Metadata::default()).unwrap();
+        assert_eq!(recorded.algorithm, algorithm);
+        let is_named = algorithm != uniform;
+        let origin = (recorded.run.as_deref(), recorded.weights.as_ref(), recorded.iteration);
+        let named = (Some("mine"), Some(&weights), 40);
+        assert_eq!(origin, if is_named { named } else { (None, None, 0) });
+        // The second of two policies acts in the second half, but for the end of an episode.
+        let rows = read(&args.out);
+        let half = rows.iter().skip(TRANSITIONS / 2 + 200);
+        let actions = Vec::from_iter(half.flat_map(|row| row.action.to_vec()));
+        let spread = Spread::new(&actions).unwrap();
+        let error = (spread.mean - mean).abs().max((spread.population_std.unwrap() - std).abs());
+        assert!(error < 0.05 && (std > 0.0 || error < 1e-6), "{algorithm}: {spread:?}");
+        let first = rows.row(0).action;
+        assert_eq!(first.iter().all(|x| (x - tanh).abs() < 1e-6), algorithm == "sac, mode");
+    }
 }
 
 #[test]
 fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
     let folder = tempfile::tempdir().unwrap();
-    let (path, summary) = record(&folder, 3, 2);
+    let args = arguments(&folder, 3);
+    let (summary, path) = (collect_on(2, &args), args.out);
     let (transitions, episodes) = (summary.transitions, summary.episodes);
     let rows = read(&path);
     assert!(rows.len() == transitions && transitions >= TRANSITIONS);
@@ -59,7 +150,7 @@ fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
     let best = returns.into_iter().fold(f64::NEG_INFINITY, f64::max);
     let percentiles = summary.score_percentiles;
     assert!(percentiles.is_sorted(), "{percentiles:?}");
-    for (score, episode_return) in [(summary.mean_score, mean), (percentiles[3], best)] {
+    for (score, episode_return) in [(summary.score.mean, mean), (percentiles[3], best)] {
         assert!((score - hopper().normalized_score(episode_return)).abs() < 1e-3, "{score}");
     }
 
@@ -86,9 +177,7 @@ fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
         row.next_observation = &next_observation;
         writer.push(&row).unwrap();
     }
-    let (algorithm, iteration, seed) = ("changed", 0, 0);
-    let metadata = Metadata { algorithm, iteration, seed };
-    writer.finish(&metadata).unwrap();
+    writer.finish(&Metadata::default()).unwrap();
     let report = verify(&changed, hopper()).unwrap();
     assert_eq!((report.rewards_differ, report.terminals_differ), (1, 1));
     for (error, expected) in [(report.reward_error.max, 0.01), (report.obs_error.max, 0.5)] {

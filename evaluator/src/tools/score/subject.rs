@@ -29,6 +29,8 @@ pub struct Subject {
     /// Gradient step of the snapshot.
     pub step: u64,
     pub episodes: u32,
+    /// The run and the algorithm, in an exported policy.
+    pub origin: Option<[String; 2]>,
 }
 
 impl Subject {
@@ -51,6 +53,8 @@ impl Subject {
             .with_context(|| format!("{name} is a policy for another environment"))
             .hint(OTHER_ENVIRONMENT)?;
         let weights = Hash::new(&file);
+        let about = |key: &str| header.about[key].as_str().map(str::to_owned);
+        let exported = about("run").zip(about("algorithm")).map(<[String; 2]>::from);
         let subject = |policy| Self {
             path: path.to_owned(),
             weights,
@@ -59,6 +63,7 @@ impl Subject {
             seed: args.seed.unwrap_or(origin.seed),
             step: origin.step,
             episodes: args.episodes.unwrap_or(origin.episodes),
+            origin: exported.clone(),
         };
         let unchanged = subject(policy);
         unchanged.check()?;
