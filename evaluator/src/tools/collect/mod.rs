@@ -28,8 +28,6 @@ use quad_runtime::Hint;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use policies::Behavior;
-
 const OUT: &str = "choose a file with --out in a folder that you may write to";
 const MAZE: &str = "files of mazes need goals, which this command does not write";
 const MUJOCO: &str =
@@ -146,7 +144,7 @@ struct Recorded {
 pub fn collect(args: &CollectArgs) -> anyhow::Result<Summary> {
     let start = Instant::now();
     RunDir::refuse_own_file(&args.out).hint_of(RunDirError::hint)?;
-    let behaviors = args.policy.iter().map(|path| Behavior::read(path, args));
+    let behaviors = args.policy.iter().map(|path| policies::Behavior::read(path, args));
     let behaviors = behaviors.collect::<anyhow::Result<Vec<_>>>()?;
     let recipe = args.env.collect.as_ref().filter(|_| behaviors.is_empty());
     if behaviors.is_empty() && recipe.is_none() {

@@ -11,6 +11,7 @@ use quad_protocol::{Hash, Origin};
 use serde_json::json;
 use tempfile::TempDir;
 
+use super::policies::Behavior;
 use super::*;
 use crate::tools::verify::{environment_of, verify};
 
