@@ -76,6 +76,8 @@ pub enum Problem {
     NoTransitions(usize),
     #[error("`locomotion` cannot scale the rewards: all returns are the same")]
     SameReturns,
+    #[error("does not fit {file}: {1}", file = .0.display())]
+    Unlike(PathBuf, String),
     #[error("cannot be written")]
     Write(#[source] hdf5::Error),
 }
@@ -281,6 +283,10 @@ impl Problem {
             }
             Self::SameReturns => {
                 "unless all rewards are alike, another reward rule learns from them: --set reward=as-is"
+            }
+            Self::Unlike(..) => {
+                "files that are one dataset are of one environment, with the same columns in the same order: write these anew, or \
+                 train on one of them"
             }
             Self::Write(_) => "check that the disk has room and the folder is writable",
         };

@@ -11,6 +11,7 @@
 
 mod checks;
 mod error;
+mod files;
 mod formats;
 mod inspect;
 mod normalize;
@@ -23,6 +24,7 @@ mod transitions;
 mod warnings;
 
 pub use error::{ArrayProblem, DatasetError, Load, Problem, RowProblem};
+pub use files::DatasetFile;
 pub use formats::arrays::{Arrays, write_own};
 pub use formats::d4rl_writer::{D4rlWriter, Metadata, write_experience};
 pub use formats::hdf5_file::hdf5_library;

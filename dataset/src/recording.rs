@@ -42,8 +42,9 @@ pub(crate) struct Recording {
     pub next_observations: Option<Vec<f32>>,
     /// N × o, stored in a D4RL file and used only for checks.
     pub unused_next_observations: Option<Vec<f32>>,
-    /// Compares next observations of either kind with the following row's observation.
-    pub same_state: SameState,
+    /// True if a row's stored next observation, of either kind, is not the state in which the
+    /// following row starts; empty if the format stores none.
+    pub jumps: Vec<bool>,
     pub kinds: Vec<RowKind>,
     /// True where the mask is 0, so that the critics do not bootstrap.
     pub terminals: Vec<bool>,
@@ -62,17 +63,16 @@ pub(crate) struct Recording {
 }
 
 impl Recording {
-    /// Next observations of the source, used or not.
-    fn stored_next_observations(&self) -> Option<&Vec<f32>> {
+    /// The recording with [`Self::jumps`].
+    pub(crate) fn with_jumps(mut self) -> Self {
         let unused = self.unused_next_observations.as_ref();
-        self.next_observations.as_ref().or(unused)
-    }
-
-    /// The recording with [`Self::same_state`] measured.
-    pub(crate) fn with_same_state(mut self) -> Self {
-        if let Some(next) = self.stored_next_observations() {
-            self.same_state = SameState::between(&self.observations, next, self.observation_dim);
-        }
+        let Some(stored) = self.next_observations.as_ref().or(unused) else { return self };
+        let same = SameState::between(&self.observations, stored, self.observation_dim);
+        let jumps = |row: usize| {
+            let (next, start) = (self.state(stored, row), self.observation(row + 1));
+            same.differ(next, start)
+        };
+        self.jumps = (1..=self.rows()).map(|next| next < self.rows() && jumps(next - 1)).collect();
         self
     }
 
@@ -189,13 +189,7 @@ impl Recording {
 
     /// True if a row's stored next observation is not the state in which the following row starts.
     pub(crate) fn jumps(&self, row: usize) -> bool {
-        match self.stored_next_observations() {
-            Some(stored) if row + 1 < self.rows() => {
-                let (next, start) = (self.state(stored, row), self.observation(row + 1));
-                self.same_state.differ(next, start)
-            }
-            _ => false,
-        }
+        self.jumps.get(row) == Some(&true)
     }
 
     /// Appends a final state to all columns but the observations.
@@ -254,7 +248,7 @@ pub(crate) mod tests {
     impl Recording {
         pub(crate) fn store_next(&mut self, next: Vec<f32>) {
             self.next_observations = Some(next);
-            *self = std::mem::take(self).with_same_state();
+            *self = std::mem::take(self).with_jumps();
         }
     }
 

@@ -48,7 +48,7 @@ pub fn write_dataset(
 /// A summary of a dataset, as JSON and as text.
 #[pyfunction]
 pub fn inspect_dataset(py: Python<'_>, path: PathBuf) -> PyResult<(String, String)> {
-    let inspection = py.detach(|| inspect(path, None)).map_err(|error| refused(&error))?;
+    let inspection = py.detach(|| inspect(&[path], None)).map_err(|error| refused(&error))?;
     Ok((json(serde_json::to_string(&inspection))?, inspection.to_string()))
 }
 

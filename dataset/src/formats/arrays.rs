@@ -66,7 +66,7 @@ impl Arrays {
             timeouts: self.timeouts,
             ..Recording::default()
         };
-        Ok(recording.with_same_state())
+        Ok(recording.with_jumps())
     }
 }
 

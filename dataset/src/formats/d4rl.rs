@@ -68,7 +68,7 @@ pub(super) fn read(
         doubts,
         ..Recording::default()
     };
-    recording = recording.with_same_state();
+    recording = recording.with_jumps();
     for row in 0..rows {
         recording.ends[row] |= recording.terminals[row] && recording.jumps(row);
     }

@@ -67,5 +67,5 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
         doubts: doubt.into_iter().collect(),
         ..Recording::default()
     };
-    Ok(recording.with_same_state())
+    Ok(recording.with_jumps())
 }

@@ -2,12 +2,15 @@
 
 mod page;
 
-use std::path::{Path, PathBuf};
+use std::collections::BTreeSet;
+use std::path::Path;
 
 use serde::Serialize;
 
 use crate::error::DatasetError;
+use crate::files::{self, DatasetFile};
 use crate::formats::{ReadOptions, Source};
+use crate::recording::Recording;
 use crate::statistics::{Range, Summary};
 use crate::tables::benchmarks;
 use crate::tables::environment::{self, EnvironmentSpec};
@@ -22,9 +25,9 @@ pub use page::Histogram;
 #[derive(Debug, Serialize)]
 #[allow(missing_docs)] // The names say what each is.
 pub struct Inspection {
-    pub path: PathBuf,
-    /// `D4RL`, `Minari`, `OGBench` or `transitions`, the custom layout.
-    pub format: &'static str,
+    pub files: Vec<DatasetFile>,
+    /// `D4RL`, `Minari`, `OGBench` or `transitions`, the custom layout; several with commas.
+    pub format: String,
     /// Environment given by the caller, else the one named in the file.
     pub environment: Option<String>,
     pub transitions: usize,
@@ -81,26 +84,31 @@ fn constant(ranges: &[Range]) -> Vec<usize> {
     (0..ranges.len()).filter(is_constant).collect()
 }
 
-/// Summarizes a dataset of any format. Bad numbers are listed as problems; only an unreadable
-/// source is an error. The environment defaults to the one named in the file, if known.
+/// Summarizes the files of a dataset. Bad numbers are listed as problems; only files that cannot be
+/// read, or that do not fit each other, are an error. The environment defaults to the one that they
+/// name, if known.
 pub fn inspect(
-    path: impl AsRef<Path>,
+    paths: &[impl AsRef<Path>],
     environment: Option<&'static EnvironmentSpec>,
 ) -> Result<Inspection, DatasetError> {
-    let path = path.as_ref();
-    let mut source = Source::open(path)?;
-    let claimed = source.environment();
+    let claimed = files::environment(paths, None)?;
     let spec = environment.or_else(|| environment::find(claimed.as_deref()?).ok());
     let reward = spec.map_or(RewardRule::AsIs, |spec| spec.reward);
     let task = spec.and_then(|spec| benchmarks::relabeling(&spec.name));
-    let recording = source.read(spec, task)?;
-
-    let other = environment.and_then(|environment| source.check_environment(environment).err());
-    let refused = other.into_iter().chain(checks::problems(&recording, spec));
-    let refused = Vec::from_iter(refused.map(|problem| format!("{problem}; {}", problem.hint())));
     let options = ReadOptions { reward, ..ReadOptions::default() };
-    let doubts = warnings::warnings(&recording, &options);
-
+    let (mut refused, mut doubts, mut formats) = (Vec::new(), Vec::new(), BTreeSet::new());
+    let check = |path: &Path, source: &Source, recording: &Recording| {
+        let named = |problem| files::name(paths, path, problem);
+        let other = environment.and_then(|environment| source.check_environment(environment).err());
+        let problems = other.into_iter().chain(checks::problems(recording, spec));
+        let problems = problems.map(|problem| format!("{problem}; {}", problem.hint()));
+        refused.extend(problems.map(named));
+        doubts.extend(warnings::file_warnings(recording, &options).into_iter().map(named));
+        formats.insert(source.format());
+        Ok(())
+    };
+    let (recording, files) = files::read(paths, spec, task, check)?;
+    doubts.extend(warnings::number_warnings(&recording, &options));
     let episodes = recording.episodes();
     let lengths = Vec::from_iter(episodes.iter().map(|episode| episode.length as f64));
     let returns = episodes.iter().map(|episode| episode.sum);
@@ -114,8 +122,8 @@ pub fn inspect(
     let observation_ranges = Range::columns(&recording.observations, o, |_| true);
     let reward_ranges = Range::columns(&recording.rewards, 1, is_step);
     Ok(Inspection {
-        path: path.into(),
-        format: source.format(),
+        files,
+        format: Vec::from_iter(formats).join(", "),
         environment: spec.map(|spec| spec.name.clone()).or(claimed),
         transitions: recording.transitions().count(),
         episodes: episodes.len(),

@@ -10,7 +10,13 @@ use crate::statistics::Range;
 
 impl fmt::Display for Inspection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "{}", self.path.display())?;
+        for file in &self.files {
+            write!(f, "{}", file.path.display())?;
+            if self.files.len() > 1 {
+                write!(f, ": {file}")?;
+            }
+            writeln!(f)?;
+        }
         let share = |share: f64| format!("{:.3} % of the steps", 100.0 * share);
         let constant = |columns: &[usize], names: &[String]| match columns {
             [] => String::new(),
@@ -22,7 +28,7 @@ impl fmt::Display for Inspection {
         let size = format!("of size {size:.4} (root mean square)");
         let environment = self.environment.as_deref().unwrap_or("not known");
         for (name, text) in [
-            ("format", self.format.to_owned()),
+            ("format", self.format.clone()),
             ("environment", environment.to_owned()),
             ("transitions", self.transitions.to_string()),
             ("episodes", self.episodes.to_string()),

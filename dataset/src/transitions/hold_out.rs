@@ -93,7 +93,7 @@ impl Recording {
         keep(&mut self.actions, actions, kept);
         keep(&mut self.rewards, 1, kept);
         keep(&mut self.kinds, 1, kept);
-        for flags in [&mut self.terminals, &mut self.timeouts, &mut self.ends] {
+        for flags in [&mut self.terminals, &mut self.timeouts, &mut self.ends, &mut self.jumps] {
             keep(flags, 1, kept);
         }
     }
@@ -103,7 +103,6 @@ impl Recording {
             observation_dim: self.observation_dim,
             action_dim: self.action_dim,
             next_observations: self.next_observations.as_ref().map(|_| Vec::new()),
-            same_state: self.same_state.clone(),
             terminal_array: self.terminal_array,
             goal: self.goal,
             names: self.names.clone(),
@@ -111,7 +110,7 @@ impl Recording {
         }
     }
 
-    pub(super) fn extend(&mut self, from: &Recording, rows: Range<usize>) {
+    pub(crate) fn extend(&mut self, from: &Recording, rows: Range<usize>) {
         if let Ok(part) = from.parts.binary_search_by_key(&rows.start, |(first, _)| *first) {
             self.parts.push((self.rows(), from.parts[part].1.clone()));
         }
@@ -126,7 +125,8 @@ impl Recording {
         self.kinds.extend_from_slice(&from.kinds[rows.clone()]);
         self.terminals.extend_from_slice(&from.terminals[rows.clone()]);
         self.timeouts.extend_from_slice(&from.timeouts[rows.clone()]);
-        self.ends.extend_from_slice(&from.ends[rows]);
+        self.ends.extend_from_slice(&from.ends[rows.clone()]);
+        self.jumps.extend_from_slice(from.jumps.get(rows).unwrap_or_default());
     }
 
     /// Appends a final state if the last row's next observation was in an episode that is removed.
@@ -142,6 +142,9 @@ impl Recording {
 
 /// Moves the rows that stay, in ascending order, to the front of a column.
 fn keep<T: Copy>(column: &mut Vec<T>, width: usize, kept: &[Range<usize>]) {
+    if column.is_empty() {
+        return;
+    }
     let mut end = 0;
     for rows in kept {
         column.copy_within(rows.start * width..rows.end * width, end);

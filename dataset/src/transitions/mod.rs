@@ -12,8 +12,9 @@ use std::sync::{PoisonError, RwLock, RwLockReadGuard};
 use quad_kernels::scaling::Scaling;
 
 use crate::error::{DatasetError, Problem};
+use crate::files::{self, DatasetFile};
+use crate::formats::ReadOptions;
 use crate::formats::arrays::Arrays;
-use crate::formats::{ReadOptions, Source};
 use crate::normalize;
 use crate::online::{OnlineEpisode, Ranges};
 use crate::recording::{Names, Recording, RowKind};
@@ -54,12 +55,14 @@ pub struct Transitions {
 
 /// Training and validation transitions.
 pub struct Split {
-    /// Training transitions; statistics and scaling are of these alone, warnings of the whole file.
+    /// Training transitions; statistics and scaling are of these alone, warnings of whole files.
     pub training: Transitions,
     /// Validation transitions, scaled like the training ones; `None` if no episode is held out.
     pub held_out: Option<Transitions>,
-    /// Indices of the held-out episodes, from 0 in file order.
+    /// Indices of the held-out episodes, from 0 in the order of the files.
     pub episodes: Vec<usize>,
+    /// The files, without hashes; none for arrays in memory.
+    pub files: Vec<DatasetFile>,
 }
 
 impl Transitions {
@@ -67,30 +70,40 @@ impl Transitions {
     /// finite, unnormalized actions outside [-1, 1], other dimensions or another environment than
     /// expected, and files with no transition or no end of an episode.
     pub fn read(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Self, DatasetError> {
-        Ok(Self::read_split(path, options, HoldOut::NONE)?.training)
+        Ok(Self::read_split(&[path], options, HoldOut::NONE)?.training)
     }
 
-    /// Reads a dataset and splits off validation episodes.
+    /// Reads the files of a dataset, one after the other, and splits off validation episodes.
+    /// Refuses files that do not fit each other.
     pub fn read_split(
-        path: impl AsRef<Path>,
+        paths: &[impl AsRef<Path>],
         options: &ReadOptions,
         hold_out: HoldOut<'_>,
     ) -> Result<Split, DatasetError> {
-        let path = path.as_ref();
-        let error = |problem| DatasetError::new(path, problem);
-        let mut source = Source::open(path)?;
-        if let Some(environment) = options.environment {
-            source.check_environment(environment).map_err(error)?;
-        }
-        let recording = source.read(options.environment, options.task)?;
-        Self::split(recording, options, hold_out).map_err(error)
+        let environment = options.environment;
+        files::environment(paths, environment)?;
+        let mut warnings = Vec::new();
+        let (recording, files) =
+            files::read(paths, environment, options.task, |path, _, recording| {
+                checks::accept(recording, environment, options.normalize.actions)?;
+                let doubts = warnings::file_warnings(recording, options).into_iter();
+                warnings.extend(doubts.map(|doubt| files::name(paths, path, doubt)));
+                Ok(())
+            })?;
+        warnings.extend(warnings::number_warnings(&recording, options));
+        let names = Vec::from_iter(files.iter().map(|file| file.path.to_string_lossy()));
+        let error = |problem| DatasetError::new(names.join(", "), problem);
+        let mut split = Self::split(recording, options, hold_out).map_err(error)?;
+        split.training.warnings.splice(..0, warnings);
+        Ok(Split { files, ..split })
     }
 
     /// Checks and wraps arrays in memory, with unchanged rewards.
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new("arrays in memory", problem);
-        let recording = arrays.into_recording().map_err(error)?;
-        let split = Self::split(recording, &ReadOptions::default(), HoldOut::NONE);
+        let (recording, options) = (arrays.into_recording().map_err(error)?, Default::default());
+        checks::accept(&recording, None, false).map_err(error)?;
+        let split = Self::split(recording, &options, HoldOut::NONE);
         Ok(split.map_err(error)?.training)
     }
 
@@ -100,13 +113,7 @@ impl Transitions {
         hold_out: HoldOut<'_>,
     ) -> Result<Split, Problem> {
         let environment = options.environment;
-        checks::accept(&recording, environment, options.normalize.actions)?;
-        let mut warnings = warnings::warnings(&recording, options);
         let (recording, held_out, episodes) = recording.hold_out(hold_out);
-        if matches!(hold_out, HoldOut::Fraction(fraction) if fraction > 0.0 && episodes.is_empty())
-        {
-            warnings.push("a single episode: none is held out".to_owned());
-        }
         if recording.transitions().next().is_none() {
             return Err(Problem::NoTransitions(recording.rows()));
         }
@@ -116,11 +123,14 @@ impl Transitions {
         let new = |recording| Self::new(recording, environment, rewards, scaling.clone());
         let mut held_out = held_out.map(new).filter(|held_out| held_out.len() > 0);
         let mut training = new(recording);
-        training.warnings = warnings;
+        if matches!(hold_out, HoldOut::Fraction(fraction) if fraction > 0.0 && episodes.is_empty())
+        {
+            training.warnings.push("a single episode: none is held out".to_owned());
+        }
         if let Some(held_out) = &mut held_out {
             held_out.training_units = Some(training.standard_units());
         }
-        Ok(Split { training, held_out, episodes })
+        Ok(Split { training, held_out, episodes, files: Vec::new() })
     }
 
     fn new(

@@ -17,15 +17,21 @@ use crate::tables::reward::RewardRule;
 /// Number of evenly spaced rows that are sampled.
 const ENOUGH: usize = 20_000;
 
-/// All that is doubtful in the whole recording, for whatever program reads it.
-pub(crate) fn warnings(recording: &Recording, run: &ReadOptions) -> Vec<String> {
+/// All that is doubtful in the rows of a file, for whatever program reads it.
+pub(crate) fn file_warnings(recording: &Recording, run: &ReadOptions) -> Vec<String> {
     let outside = checks::actions_outside(recording).filter(|_| !run.normalize.actions);
     let outside = outside.map(|problem| format!("{problem}; {}", problem.hint()));
     let mut warnings = recording.doubts.clone();
     warnings.extend(end_warnings(recording));
-    warnings.extend(lengths::chunks(recording, run.chunk));
     warnings.extend(outside);
-    warnings.extend(number_warnings(recording, run));
+    warnings.extend(rows::unwritten(recording));
+    let copied = rows::copied_actions(recording);
+    let resting = rows::resting_observations(recording);
+    let late = match (&copied, &resting) {
+        (None, None) => late::observations(recording),
+        _ => None,
+    };
+    warnings.extend(copied.into_iter().chain(resting).chain(late));
     warnings
 }
 
@@ -46,24 +52,20 @@ fn end_warnings(recording: &Recording) -> Vec<String> {
     warnings
 }
 
-fn number_warnings(recording: &Recording, run: &ReadOptions) -> Vec<String> {
+/// All that is doubtful in the numbers of a dataset, of which a file may have a part: its failures, or
+/// a column that does not move there.
+pub(crate) fn number_warnings(recording: &Recording, run: &ReadOptions) -> Vec<String> {
     let (normalize, rule) = (run.normalize, run.reward);
-    let copied = rows::copied_actions(recording);
-    let resting = rows::resting_observations(recording);
-    let late = match (&copied, &resting) {
-        (None, None) => late::observations(recording),
-        _ => None,
-    };
-    let mut warnings = Vec::from_iter(rewards::alike(recording));
-    if warnings.is_empty() {
+    let mut warnings = Vec::from_iter(lengths::chunks(recording, run.chunk));
+    let alike = rewards::alike(recording);
+    if alike.is_none() {
         warnings.extend(rewards::after_goal(recording));
         // A task's rule or normalization sets the size.
         if rule == RewardRule::AsIs && !normalize.rewards {
             warnings.extend(rewards::size(recording));
         }
     }
-    warnings.extend(rows::unwritten(recording));
-    warnings.extend(copied.into_iter().chain(resting).chain(late));
+    warnings.extend(alike);
     warnings.extend(sizes::columns(recording, normalize));
     warnings
 }

@@ -23,7 +23,7 @@ fn zip(file: &str) -> Vec<u8> {
 
 /// Checks the start of a message after the path, and a part of its hint.
 fn assert_named(path: &Path, what: &str, hint: &str) {
-    let error = inspect(path, None).err().unwrap();
+    let error = inspect(&[path], None).err().unwrap();
     let (text, advice) = (error.problem.to_string(), error.hint());
     assert!(text.starts_with(what), "{text}, not {what}");
     assert!(advice.contains(hint), "{advice}, not {hint}");
@@ -252,7 +252,7 @@ fn an_archive_of_short_numbers_is_read() {
     let (_folder, path) = scratch("log.npz");
     let problems_with = |masks| {
         write_archive(&path, masks);
-        inspect(&path, None).unwrap().problems
+        inspect(&[&path], None).unwrap().problems
     };
     let lacks_masks = |problems: Vec<String>| problems.concat().contains("no array `masks`");
     assert!(lacks_masks(problems_with(None)) && !lacks_masks(problems_with(Some([1; 8]))));
@@ -263,7 +263,7 @@ fn an_archive_of_short_numbers_is_read() {
     // A trajectory that ends where nothing more is to be gained is not truncated.
     for (last, terminals, timeouts) in [(0, 1.0 / 7.0, 0.0), (1, 0.0, 1.0 / 7.0)] {
         write_archive(&path, Some([1, 1, 1, 1, 1, 1, last, last]));
-        let inspection = inspect(&path, None).unwrap();
+        let inspection = inspect(&[&path], None).unwrap();
         assert_eq!(inspection.terminals, terminals);
         assert_eq!(inspection.timeouts, timeouts);
     }

@@ -16,7 +16,7 @@ fn robot() -> Arrays {
 fn figures_of_a_file_that_can_be_followed_by_eye() {
     let (_folder, path) = scratch("robot.hdf5");
     write(&path, &robot());
-    let inspection = serde_json::to_value(inspect(&path, None).unwrap()).unwrap();
+    let inspection = serde_json::to_value(inspect(&[&path], None).unwrap()).unwrap();
     let expected = json!({
         "transitions": 8, // the timeout and the last row make none
         "episodes": 3, "min_length": 2.0, "mean_length": 10.0 / 3.0, "max_length": 4.0,
@@ -37,7 +37,7 @@ fn figures_of_a_file_that_can_be_followed_by_eye() {
 fn figures_are_those_of_training() {
     let file = written("generate", "plain", "d4rl.hdf5");
     let Some((_folder, path)) = file else { return };
-    let inspection = inspect(&path, Some(hopper())).unwrap();
+    let inspection = inspect(&[&path], Some(hopper())).unwrap();
     let text = inspection.to_string();
     let inspection = serde_json::to_value(inspection).unwrap();
     let statistics = *read(&path, Some(hopper()), RewardRule::AsIs).statistics();
@@ -63,7 +63,7 @@ fn everything_that_is_wrong_is_named_at_once() {
     (robot.observations[16], robot.observations[18]) = (f32::NAN, f32::INFINITY);
     (robot.actions[4], robot.rewards[8]) = (7.5, f32::NAN);
     write(&path, &robot);
-    let inspection = inspect(&path, Some(hopper())).unwrap();
+    let inspection = inspect(&[&path], Some(hopper())).unwrap();
     let expected = [
         "`observations` has 3 numbers a row, but `hopper` has 11; choose a dataset of that environment",
         "`actions` has 2 numbers a row, but `hopper` has 3; choose",
@@ -86,7 +86,7 @@ fn everything_that_is_wrong_is_named_at_once() {
 fn an_empty_file_is_described_too() {
     let (_folder, path) = scratch("empty.hdf5");
     write(&path, &steps(0, 3, 2));
-    let inspection = inspect(&path, None).unwrap();
+    let inspection = inspect(&[&path], None).unwrap();
     assert!(inspection.to_string().contains("0 rows"));
     let start = "0 rows, of which none makes a transition; record more";
     warnings::assert_one(&inspection.problems, start, "");
@@ -97,7 +97,7 @@ fn an_empty_file_is_described_too() {
 /// The only problem, which training also warns of.
 fn problem(path: &std::path::Path, environment: &str) -> (Inspection, String) {
     let spec = environment::find(environment).unwrap();
-    let inspection = inspect(path, Some(spec)).unwrap();
+    let inspection = inspect(&[path], Some(spec)).unwrap();
     let transitions = read(path, Some(spec), spec.reward);
     assert_eq!(transitions.warnings(), inspection.problems);
     let problem = inspection.problems.concat();

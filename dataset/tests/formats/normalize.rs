@@ -32,7 +32,7 @@ fn options(columns: &str, reward: RewardRule) -> ReadOptions {
 fn split(arrays: Arrays, options: ReadOptions, held_out: &[usize]) -> Split {
     let (_folder, path) = scratch("own.hdf5");
     write_own(&path, arrays, Names::default()).unwrap();
-    Transitions::read_split(&path, &options, HoldOut::Episodes(held_out)).unwrap()
+    Transitions::read_split(&[&path], &options, HoldOut::Episodes(held_out)).unwrap()
 }
 
 fn normalized(arrays: Arrays, columns: &str) -> Transitions {

@@ -113,9 +113,9 @@ fn arrays_are_written_and_read_again() {
     let files = Vec::from_iter(files.map(|file| file.unwrap().path()));
     assert_eq!(files, [&*path], "nothing partial, and one replaced");
 
-    let inspection = inspect(&path, None).unwrap();
+    let inspection = inspect(&[&path], None).unwrap();
     let problem = &inspection.problems[0];
-    assert_eq!((inspection.format, inspection.episodes), ("transitions", 2));
+    assert_eq!((&*inspection.format, inspection.episodes), ("transitions", 2));
     assert!(!inspection.refused && problem.contains("--normalize actions"));
     let message = "the action 24.5 is outside [-1, 1] (6 such rows)";
     assert_refused(&path, None, message, "--normalize actions");
@@ -151,7 +151,7 @@ fn names_that_place_no_number_are_refused() {
     // A program that does not check names.
     overwrite(&path, b"x\0", b"y\0");
     assert_refused(&path, None, "has the name \"y\" for columns 0, 1", hint);
-    assert!(inspect(&path, None).unwrap().refused);
+    assert!(inspect(&[&path], None).unwrap().refused);
 }
 
 /// Replaces the last bytes of a file that are `old`.
@@ -203,7 +203,7 @@ fn episodes_that_are_held_out_keep_their_next_observations() {
     let (_folder, path) = scratch("own.hdf5");
     write_own(&path, small(), Names::default()).unwrap();
     let (options, next) = (options(None, RewardRule::AsIs), arrays().next_observations);
-    let split = |out: &[usize]| Transitions::read_split(&path, &options, HoldOut::Episodes(out));
+    let split = |out: &[usize]| Transitions::read_split(&[&path], &options, HoldOut::Episodes(out));
     let split_off = split(&[0]).unwrap();
     let held_out = split_off.held_out.unwrap();
     assert_eq!(batch(&held_out).next_observations, next[..9]);

@@ -110,9 +110,10 @@ pub enum DatasetsCommand {
 #[derive(Debug, Args)]
 #[command(after_help = "The exit code is 1 if something is wrong with the dataset.")]
 pub struct InspectArgs {
-    /// A file or folder of any format, a name of `learner datasets list`, or minari:ID
-    #[arg(value_name = "FILE|NAME")]
-    pub dataset: String,
+    /// A file or folder of any format, a name of `learner datasets list`, or minari:ID; several are
+    /// one dataset
+    #[arg(value_name = "FILE|NAME", required = true)]
+    pub datasets: Vec<String>,
     /// Environment that gives sizes, time limit and reference scores [default: the one that the
     /// dataset names]
     #[arg(long, value_name = "NAME", value_parser = environment::find)]

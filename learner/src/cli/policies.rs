@@ -32,9 +32,10 @@ pub struct JudgeArgs {
     /// RUN/snapshots/step_000020000.safetensors; all of runs on the same data
     #[arg(value_name = "RUN|SNAPSHOT", required = true)]
     pub policies: Vec<PathBuf>,
-    /// The data that the runs have learned from, if it is not where they found it
+    /// The data that the runs have learned from, if it is not where they found it; repeatable, in
+    /// their order
     #[arg(long, value_name = "FILE|NAME")]
-    pub dataset: Option<String>,
+    pub dataset: Vec<String>,
     /// Gradient steps of each evaluation, at least 100
     #[arg(long, value_name = "N", default_value_t = 30_000, value_parser = value_parser!(u64).range(100..))]
     pub steps: u64,

@@ -3,12 +3,11 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use anyhow::anyhow;
 use clap::{Args, value_parser};
 use quad_policy::Precision;
 use quad_run::config::tables::{self, parse_assignment};
 use quad_run::config::{Device, presets};
-use quad_runtime::{Hint, parse_address, parse_endpoint};
+use quad_runtime::{parse_address, parse_endpoint};
 use toml::{Table, Value};
 
 use super::{TaskName, algorithm_names};
@@ -53,7 +52,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "NAME")]
     env: Option<String>,
     /// A file (`evaluator collect` records one), a name of `learner datasets list` (fetched if it
-    /// is missing), or minari:ID [default: the task's]
+    /// is missing), or minari:ID; repeatable: several are one dataset [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Vec<String>,
     /// Normalize some of these: actions from their least and largest value to ±1, observations to
@@ -153,15 +152,7 @@ impl TrainArgs {
 
     /// The values that the command line changes: `--agent` overrides `--set`, and other flags
     /// override both.
-    ///
-    /// # Errors
-    /// There are several datasets.
-    pub fn changes(&self) -> anyhow::Result<Table> {
-        if self.dataset.len() > 1 {
-            let names = self.dataset.join(" and ");
-            return Err(anyhow!("a run learns from one dataset, not from {names}"))
-                .hint("`quad-convert FOLDER --out FILE` makes one of a folder's files");
-        }
+    pub fn changes(&self) -> Table {
         let mut changes = Table::new();
         for change in self.set.iter().chain(&self.agent) {
             tables::merge(&mut changes, change.clone());
@@ -171,11 +162,12 @@ impl TrainArgs {
             let online = Table::from_iter([("steps".to_owned(), steps.into())]);
             tables::merge(&mut changes, Table::from_iter([("online".to_owned(), online.into())]));
         }
-        let normalize = Some(self.normalize.clone()).filter(|names| !names.is_empty());
+        let [normalize, dataset] = [&self.normalize, &self.dataset]
+            .map(|names| Some(names.clone()).filter(|names| !names.is_empty()));
         for (key, value) in [
             ("algorithm", self.algorithm.clone().map(Value::from)),
             ("environment", self.env.clone().map(Value::from)),
-            ("dataset", self.dataset.first().cloned().map(Value::from)),
+            ("dataset", dataset.map(Value::from)),
             ("normalize", normalize.map(Value::from)),
             ("hold_out", self.hold_out.map(Value::from)),
             ("steps", flags.steps.map(Value::from)),
@@ -186,7 +178,7 @@ impl TrainArgs {
         ] {
             changes.extend(value.map(|value| (key.to_owned(), value)));
         }
-        Ok(changes)
+        changes
     }
 }
 

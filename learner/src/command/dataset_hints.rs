@@ -15,15 +15,15 @@ pub(super) fn convert_hint(preset: &Preset) -> Option<String> {
 
 /// A hint for any other run whose dataset is not named, or not there.
 pub(super) fn record_hint(experiment: &Experiment) -> String {
-    let (name, file) = (&experiment.environment, experiment.dataset.as_deref());
-    let advice = match file {
-        None => "name a file by --dataset FILE",
-        Some(_) => "check the path",
+    let (name, files) = (&experiment.environment, &*experiment.dataset);
+    let advice = match files {
+        [] => "name a file by --dataset FILE",
+        _ => "check the path",
     };
     let can_record = environment::find(name).is_ok_and(|spec| spec.maze.is_none());
     let other = match can_record {
         true => {
-            let file = file.unwrap_or("FILE");
+            let file = if let [file] = files { file } else { "FILE" };
             format!("`evaluator collect --env {name} --out {file}` records one")
         }
         false => "docs/data.md says what it may be".to_owned(),

@@ -1,7 +1,7 @@
 //! `learner export`: a policy's file with its data, score and settings in the header; and `learner
 //! export-data`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::anyhow;
 use quad_dataset::{DatasetError, Metadata, OnlineEpisode, write_experience};
@@ -85,9 +85,11 @@ fn experience(folder: &RunDir, experiment: &Experiment, step: u64) -> anyhow::Re
 
 fn about(report: &RunReport, step: u64, license: Option<&str>, experience: Value) -> Value {
     let (data, experiment) = (&report.config.dataset, &report.config.experiment);
-    let name = experiment.dataset.clone().unwrap_or_default();
-    let entry = Source::parse(&name).ok().and_then(|source| source.entry());
-    let license = license.or(entry.map(|entry| &*entry.license));
+    let entry = |name: &String| Some(&*Source::parse(name).ok()?.entry()?.license);
+    let licenses: Option<BTreeSet<&str>> = experiment.dataset.iter().map(entry).collect();
+    let licenses = licenses.map(|licenses| Vec::from_iter(licenses).join(", "));
+    let licenses = licenses.filter(|licenses| !licenses.is_empty());
+    let license = license.or(licenses.as_deref());
     if license.is_none() {
         warn!("the file does not say which license the data has; --license says it");
     }
@@ -105,8 +107,8 @@ fn about(report: &RunReport, step: u64, license: Option<&str>, experience: Value
         "steps": report.steps,
         "seed": report.seed,
         "data": {
-            "name": name,
-            "sha256": data.sha256,
+            "name": experiment.dataset.join(", "),
+            "sha256": data.sha256(),
             "license": license,
             "transitions": data.transitions,
             "episodes": data.episodes,

@@ -210,8 +210,7 @@ fn check_run(dir: &Path, about: &str, same_as: Option<&Path>) -> anyhow::Result<
     let config = RunDir::at(dir).read_config()?;
     // By the run's dataset, if that is still there: training leaves out what is far from its range.
     let data = config.experiment.online.as_ref().and_then(|_| {
-        let (path, held_out) = (&config.dataset.path, &config.dataset.held_out);
-        load(path, &config.experiment, Some(held_out)).ok()
+        load(&config.dataset.paths(), &config.experiment, Some(&config.dataset.held_out)).ok()
     });
     let is_left_out = |episode: &Episode| {
         let Episode { observations, actions, rewards, terminated, .. } = episode;
@@ -249,7 +248,7 @@ fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
 }
 
 fn rank(args: &JudgeArgs) -> anyhow::Result<()> {
-    let ranking = judge(&args.policies, args.dataset.as_deref(), args.steps, args.seeds)?;
+    let ranking = judge(&args.policies, &args.dataset, args.steps, args.seeds)?;
     let blocks = ranking.blocks().map(|block| block.render(Style::Text));
     show(args.json, &ranking, || blocks.join("\n"))
 }
@@ -291,19 +290,27 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
 }
 
 fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
-    let source = Source::parse(&args.dataset)?;
-    let environment = args.env.or_else(|| environment::find(&source.entry()?.environment).ok());
-    let path = match &source {
-        Source::Path(path) => path.clone(),
-        source => source.obtain()?.path,
-    };
-    if let Some(doubt) = environment.and_then(|spec| source.doubt(&path, &spec.name)) {
-        warn!("{doubt}");
+    let sources = Source::parse_all(&args.datasets)?;
+    let named = || sources.iter().find_map(|source| Some(&*source.entry()?.environment));
+    let environment = args.env.or_else(|| environment::find(named()?).ok());
+    let mut paths = Vec::new();
+    for source in &sources {
+        let path = match source {
+            Source::Path(path) => path.clone(),
+            source => source.obtain()?.path,
+        };
+        if let Some(doubt) = environment.and_then(|spec| source.doubt(&path, &spec.name)) {
+            warn!("{doubt}");
+        }
+        paths.push(path);
     }
-    let inspection = quad_dataset::inspect(&path, environment).hint_of(DatasetError::hint)?;
+    let mut inspection = quad_dataset::inspect(&paths, environment).hint_of(DatasetError::hint)?;
+    for file in inspection.files.iter_mut().filter(|_| paths.len() > 1) {
+        file.sha256 = Some(Source::Path(file.path.clone()).obtain()?.sha256);
+    }
     show(args.json, &inspection, || inspection.to_string())?;
-    let (problems, path) = (inspection.problems.len(), inspection.path.display());
-    anyhow::ensure!(problems == 0, "{} in {path}", counted(problems, "problem"));
+    let (problems, names) = (inspection.problems.len(), args.datasets.join(", "));
+    anyhow::ensure!(problems == 0, "{} in {names}", counted(problems, "problem"));
     Ok(())
 }
 

@@ -20,6 +20,7 @@ use super::all_readable;
 use super::dataset_hints::record_hint;
 use crate::children::LocalEvaluators;
 use crate::cli::SweepArgs;
+use crate::data::{self, paths};
 use crate::sweep::{LearnerOptions, Outcome, PlannedRun, Study, StudyCost, Sweep};
 
 type Runs = Vec<(PlannedRun, State)>;
@@ -102,20 +103,20 @@ fn shares(cores: usize, threads: usize, jobs: Option<u16>, runs: usize) -> (usiz
     (jobs, left.max(1))
 }
 
-/// The data of each run, by its name or path; `None` where there is none.
-type Datasets = BTreeMap<Option<String>, Option<PathBuf>>;
+/// The files of each run's data, by their names; `None` where there is none.
+type Datasets = BTreeMap<Vec<String>, Option<Vec<PathBuf>>>;
 
 /// Fetches each dataset once, in place of each learner. Fails if no run of several can begin.
 fn obtain(left: &Runs, is_alone: bool) -> anyhow::Result<Datasets> {
     let (mut datasets, mut refusal) = (Datasets::new(), None);
     for (run, _) in left {
         let fetch = || {
-            let dataset = run.source.obtain().hint(record_hint(&run.experiment));
+            let files = data::obtain(&run.sources).hint(record_hint(&run.experiment));
             let refused = |error| {
                 warn!("no run on the data of {} can begin: {error:#}", run.name);
                 refusal = Some(error);
             };
-            dataset.map_err(refused).ok().map(|dataset| dataset.path)
+            files.map_err(refused).ok().map(|files| paths(&files))
         };
         datasets.entry(run.experiment.dataset.clone()).or_insert_with(fetch);
     }

@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
 use quad_algorithms::{Agent, Examples};
-use quad_dataset::{Split, Task, environment};
+use quad_dataset::{DatasetFile, Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo};
@@ -26,7 +26,7 @@ use super::dry_run;
 use super::from;
 use super::outside::{Outside, training_threads};
 use crate::cli::TrainArgs;
-use crate::data::{LocalDataset, Source, load, warnings};
+use crate::data::{LocalDataset, Source, load, obtain, paths, warnings};
 use crate::live::{
     Display, Ending, Events, Incarnation, MainLoop, Metrics, PageState, Run, STUCK, Threads,
 };
@@ -43,19 +43,21 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         (Some(source), Some(path)) => from::read(source, path, args.fresh)?,
         _ => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
     };
-    let changes = args.changes()?;
+    let changes = args.changes();
     let experiment = preset.resolve(&changes).hint_of(ConfigError::hint)?;
     if experiment.from.is_some() && (args.from.is_none() || changes.contains_key("from")) {
         return Err(anyhow!("the key `from` names a checkpoint, which is not there"))
             .hint("leave it out: --from RUN sets it, and begins with the run's last checkpoint");
     }
     let label = &preset.label;
-    let Some(dataset) = &experiment.dataset else {
+    if experiment.dataset.is_empty() {
         return Err(anyhow!("{label} has no dataset of its own"))
             .hint(convert_hint(&preset).unwrap_or_else(|| record_hint(&experiment)));
-    };
-    let source = Source::parse(dataset)?;
-    source.check_environment(&experiment.environment)?;
+    }
+    let sources = Source::parse_all(&experiment.dataset)?;
+    for source in &sources {
+        source.check_environment(&experiment.environment)?;
+    }
     let (variant, seed) = (experiment.variant()?, experiment.seed);
     // With and without online steps these are two runs.
     let online = experiment.online_begins().map_or("", |_| "-online");
@@ -66,8 +68,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let outside = Outside::new(args, &experiment)?;
 
     check_device(args.device, experiment.precision)?;
-    let dataset = source.obtain().hint(record_hint(&experiment))?;
-    from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &dataset.sha256))?;
+    let files = obtain(&sources).hint(record_hint(&experiment))?;
+    from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &files))?;
 
     let threads = training_threads();
     let pool = ThreadPoolBuilder::new().thread_name(|_| "training".to_owned());
@@ -77,15 +79,16 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         .hint("choose fewer by RAYON_NUM_THREADS")?;
     let held_out = begun.as_ref().and_then(ExistingRun::held_out);
     let held_out = held_out.or(from.as_ref().map(|from| &*from.held_out));
-    let data = load(&dataset.path, &experiment, held_out)?;
-    for warning in warnings(&dataset.path, &data.training) {
+    let paths = paths(&files);
+    let data = load(&paths, &experiment, held_out)?;
+    for warning in warnings(&paths, &data.training) {
         warn!("{warning}");
     }
-    let config = run_config(args, &name, preset.task_name(), experiment, dataset, &data)?;
+    let config = run_config(args, &name, preset.task_name(), experiment, files, &data)?;
     if let Some(begun) = &begun {
         begun.check_same_config(&config)?;
     }
-    announce(&config, &preset, &changes, &source)?;
+    announce(&config, &preset, &changes, &sources)?;
     debug!("{config:?}");
     if args.dry_run {
         return dry_run::estimate(&path, &config, data);
@@ -107,7 +110,7 @@ fn announce(
     config: &RunConfig,
     preset: &Preset,
     changes: &Table,
-    source: &Source,
+    sources: &[Source],
 ) -> anyhow::Result<()> {
     info!("{}", config.dataset.summary());
     let experiment = &config.experiment;
@@ -121,8 +124,10 @@ fn announce(
             experiment.environment
         );
     }
-    if let Some(doubt) = source.doubt(&config.dataset.path, &experiment.environment) {
-        warn!("{doubt}");
+    for (source, file) in sources.iter().zip(&config.dataset.files) {
+        if let Some(doubt) = source.doubt(&file.path, &experiment.environment) {
+            warn!("{doubt}");
+        }
     }
     if !experiment.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
@@ -324,7 +329,7 @@ fn run_config(
     name: &Name,
     task: &str,
     experiment: Experiment,
-    dataset: LocalDataset,
+    files: Vec<LocalDataset>,
     data: &Split,
 ) -> anyhow::Result<RunConfig> {
     let statistics = data.training.statistics();
@@ -332,6 +337,9 @@ fn run_config(
     let cpu = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let cpu = cpu.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
     let threads = counted(rayon::current_num_threads(), "thread");
+    let hashes = files.into_iter().map(|file| Some(file.sha256));
+    let files = data.files.iter().cloned().zip(hashes);
+    let files = files.map(|(file, sha256)| DatasetFile { sha256, ..file }).collect();
     Ok(RunConfig {
         run: RunInfo {
             name: name.clone(),
@@ -342,8 +350,6 @@ fn run_config(
             device: args.device,
         },
         dataset: DatasetInfo {
-            path: dataset.path,
-            sha256: Some(dataset.sha256),
             transitions: statistics.transitions as u64,
             episodes: statistics.episodes as u64,
             held_out: data.episodes.clone(),
@@ -351,6 +357,7 @@ fn run_config(
             mean_return: statistics.return_mean,
             max_return: statistics.return_max,
             mean_score: statistics.score_mean,
+            files,
         },
         experiment,
     })

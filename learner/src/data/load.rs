@@ -1,6 +1,6 @@
 //! The transitions of a run.
 
-use std::path::Path;
+use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
 use quad_dataset::{
@@ -10,11 +10,11 @@ use quad_run::config::Experiment;
 use quad_runtime::Hint;
 use toml::Value;
 
-/// Reads a file or folder of transitions for an experiment. A run that has begun has `held_out`
+/// Reads the transitions of files or folders for an experiment. A run that has begun has `held_out`
 /// episodes. Fewer transitions than a batch are an error: a batch never holds one twice while there
 /// are others.
 pub fn load(
-    path: &Path,
+    paths: &[PathBuf],
     experiment: &Experiment,
     held_out: Option<&[usize]>,
 ) -> anyhow::Result<Split> {
@@ -27,9 +27,9 @@ pub fn load(
         chunk: chunk as usize,
     };
     let hold_out = held_out.map_or(HoldOut::Fraction(experiment.hold_out), HoldOut::Episodes);
-    let result = Transitions::read_split(path, &options, hold_out).hint_of(DatasetError::hint);
-    let path = path.display();
-    let split = result.with_context(|| format!("cannot learn from {path}"))?;
+    let result = Transitions::read_split(paths, &options, hold_out).hint_of(DatasetError::hint);
+    let names = Vec::from_iter(paths.iter().map(|path| path.to_string_lossy())).join(", ");
+    let split = result.with_context(|| format!("cannot learn from {names}"))?;
     let (there, batch) = (split.training.len(), experiment.batch_size);
     if there < batch as usize {
         let error = anyhow!("{there} transitions are fewer than a batch of {batch}");
@@ -38,9 +38,13 @@ pub fn load(
     Ok(split)
 }
 
-/// Suspicious properties of the transitions at `path`, a sentence each.
-pub fn warnings(path: &Path, transitions: &Transitions) -> impl Iterator<Item = String> {
-    transitions.warnings().iter().map(move |warning| format!("{}: {warning}", path.display()))
+/// Suspicious properties of the transitions, each a sentence with the file's name.
+pub fn warnings(paths: &[PathBuf], transitions: &Transitions) -> Vec<String> {
+    let named = |warning: &String| match paths {
+        [path] => format!("{}: {warning}", path.display()),
+        _ => warning.clone(),
+    };
+    transitions.warnings().iter().map(named).collect()
 }
 
 #[cfg(test)]
@@ -79,8 +83,8 @@ mod tests {
                 "algorithm = 'qc'\nenvironment = 'robot'\nbatch_size = 8\nhold_out = 0.2\nseed = {seed}\nagent.chunk = 11"
             );
             let experiment = preset.resolve(&changes.parse().unwrap()).unwrap();
-            let split = load(&path, &experiment, begun).unwrap();
-            let warnings = Vec::from_iter(warnings(&path, &split.training));
+            let split = load(&[path.clone()], &experiment, begun).unwrap();
+            let warnings = warnings(&[path.clone()], &split.training);
             assert!(warnings.len() == 1 && warnings[0].contains("the longest 10"), "{warnings:?}");
             split.episodes
         };

@@ -42,6 +42,11 @@ impl Source {
         }
     }
 
+    /// [Parses](Self::parse) the names of a dataset's files.
+    pub fn parse_all(names: &[String]) -> anyhow::Result<Vec<Self>> {
+        names.iter().map(|name| Self::parse(name)).collect()
+    }
+
     pub fn named(name: &str) -> anyhow::Result<Self> {
         const LIST: &str =
             "`learner datasets list` prints all names; to train on a file, give its path";
@@ -111,6 +116,20 @@ impl Source {
             Self::Path(path) => local(path.clone()),
         }
     }
+}
+
+/// [Obtains](Source::obtain) each of the files.
+pub fn obtain(sources: &[Source]) -> anyhow::Result<Vec<LocalDataset>> {
+    sources.iter().map(Source::obtain).collect()
+}
+
+pub fn paths(files: &[LocalDataset]) -> Vec<PathBuf> {
+    files.iter().map(|file| file.path.clone()).collect()
+}
+
+/// SHA-256 of each file, separated by commas.
+pub fn hashes(files: &[LocalDataset]) -> String {
+    Vec::from_iter(files.iter().map(|file| &*file.sha256)).join(", ")
 }
 
 fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {

@@ -17,7 +17,7 @@ use quad_runtime::Hint;
 use tracing::warn;
 
 use super::snapshots::Snapshot;
-use crate::data::Source;
+use crate::data::{Source, hashes, obtain, paths};
 
 const BATCH_SIZE: usize = 256;
 /// Share of the episodes that are held out where no run has done so.
@@ -41,7 +41,7 @@ impl Data {
     /// episodes that every run with held-out episodes has held out.
     pub fn read(
         snapshots: &[Snapshot],
-        dataset: Option<&str>,
+        dataset: &[String],
         mut conditions: Conditions,
     ) -> anyhow::Result<Self> {
         let first = snapshots.first().context("there is no policy to judge")?;
@@ -49,7 +49,7 @@ impl Data {
         let environment = &first.config.experiment.environment;
         for Snapshot { folder, config, .. } in snapshots {
             let (other, theirs) = (folder.path().display(), &config.experiment.environment);
-            if config.dataset.sha256 != data.sha256 {
+            if config.dataset.sha256() != data.sha256() {
                 return Err(anyhow!("{run} and {other} have not learned from the same data"))
                     .hint("judge them apart: values that come from different data do not compare");
             }
@@ -60,14 +60,18 @@ impl Data {
                     .hint("judge them apart: values of different rewards do not compare");
             }
         }
-        let source = dataset.map_or_else(|| Ok(Source::Path(data.path.clone())), Source::parse)?;
-        let dataset = source.obtain().hint(format!(
+        let sources = match dataset {
+            [] => data.paths().into_iter().map(Source::Path).collect(),
+            names => Source::parse_all(names)?,
+        };
+        let files = obtain(&sources).hint(format!(
             "name the data of the run {run} by --dataset; a relative path in the run is below the folder where `learner train` was started"
         ))?;
-        if data.sha256.as_ref().is_some_and(|sha256| *sha256 != dataset.sha256) {
-            let path = dataset.path.display();
-            return Err(anyhow!("{path} is not the data that {run} has learned from"))
-                .hint("name a copy of that file by --dataset");
+        let (paths, sha256) = (paths(&files), hashes(&files));
+        if data.sha256().is_some_and(|recorded| recorded != sha256) {
+            let names = Vec::from_iter(paths.iter().map(|path| path.to_string_lossy())).join(", ");
+            return Err(anyhow!("{names} is not the data that {run} has learned from"))
+                .hint("name a copy of each of its files by --dataset, in the same order");
         }
         let episodes = shared(snapshots.iter().map(|snapshot| &snapshot.config.dataset.held_out))?;
         if episodes.is_none() {
@@ -83,9 +87,9 @@ impl Data {
             normalize: Normalize { actions: true, observations: true, rewards: false },
             ..ReadOptions::default()
         };
-        let split = Transitions::read_split(&dataset.path, &options, hold_out)
-            .hint_of(DatasetError::hint)?;
-        conditions.dataset = dataset.sha256;
+        let split =
+            Transitions::read_split(&paths, &options, hold_out).hint_of(DatasetError::hint)?;
+        conditions.dataset = sha256;
         conditions.environment = environment.clone();
         Self::new(split, conditions)
     }

@@ -34,10 +34,10 @@ const GAMMA: f32 = 0.99;
 /// gradient steps each. Judgments that the folders have under the same conditions are not computed
 /// again.
 ///
-/// `dataset`: the data of the runs, if it is not where they have learned from it.
+/// `dataset`: the files of the runs' data, if they are not where they have learned from it.
 pub(crate) fn judge(
     paths: &[PathBuf],
-    dataset: Option<&str>,
+    dataset: &[String],
     steps: u64,
     seeds: u64,
 ) -> anyhow::Result<Ranking> {

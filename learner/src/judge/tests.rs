@@ -48,8 +48,8 @@ fn data(training: Transitions, held_out: Transitions) -> Data {
         steps: 200,
         seeds: 1,
     };
-    let split = Split { training, held_out: Some(held_out), episodes: vec![1] };
-    Data::new(split, conditions).unwrap()
+    let (held_out, episodes, files) = (Some(held_out), vec![1], Vec::new());
+    Data::new(Split { training, held_out, episodes, files }, conditions).unwrap()
 }
 
 /// A policy whose actions are tenths of its observations.

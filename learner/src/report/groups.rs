@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use quad_dataset::{GoalDraw, environment};
+use quad_dataset::{DatasetFile, GoalDraw, environment};
 use quad_run::config::settings::{self, Settings, differences_in_brief};
 use quad_run::config::{Device, RunConfig};
 use quad_run::counted;
@@ -264,8 +264,9 @@ pub fn tell_apart(runs: &mut [RunReport]) {
     }
 }
 
-/// The environment and the beginning of the data's SHA-256, which older runs lack.
+/// The environment and the beginning of each file's SHA-256, which older runs lack.
 fn setting(run: &RunReport) -> String {
-    let sha256 = run.config.dataset.sha256.as_deref().unwrap_or("unknown");
-    format!("{}, data {sha256:.8}", run.config.experiment.environment)
+    let begin = |file: &DatasetFile| format!("{:.8}", file.sha256.as_deref().unwrap_or("unknown"));
+    let hashes = Vec::from_iter(run.config.dataset.files.iter().map(begin)).join("+");
+    format!("{}, data {hashes}", run.config.experiment.environment)
 }

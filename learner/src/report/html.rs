@@ -81,8 +81,8 @@ fn group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Value> {
     };
     let dataset = |run: &RunReport| {
         let data = &run.config.dataset;
-        let name = run.config.experiment.dataset.as_deref().unwrap_or_default();
-        let sha256 = data.sha256.as_deref().unwrap_or("unknown");
+        let name = run.config.experiment.dataset.join(", ");
+        let sha256 = data.sha256().unwrap_or_else(|| "unknown".to_owned());
         let (summary, least, most) = (data.summary(), data.min_return, data.max_return);
         let returns = format!("returns from {least:.1} to {most:.1}");
         Some(format!("{name}: {summary}, {returns}\nSHA-256 {sha256}"))

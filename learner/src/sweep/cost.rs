@@ -1,7 +1,7 @@
 //! Estimates the cost of a study from one second of training of each of its configurations.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use indicatif::{HumanBytes, HumanDuration};
@@ -35,13 +35,13 @@ impl StudyCost {
     /// its learner will report the error.
     pub fn measure<'a>(
         runs: &[(PlannedRun, State)],
-        dataset: impl Fn(&PlannedRun) -> Option<&'a Path>,
+        dataset: impl Fn(&PlannedRun) -> Option<&'a [PathBuf]>,
     ) -> anyhow::Result<Self> {
         let one_thread = ThreadPoolBuilder::new().num_threads(1).build()?;
         let mut told = BTreeSet::new();
-        let mut measure = |run: &PlannedRun, path: &Path| {
-            let data = load(path, &run.experiment, None)?;
-            for warning in warnings(path, &data.training) {
+        let mut measure = |run: &PlannedRun, paths: &[PathBuf]| {
+            let data = load(paths, &run.experiment, None)?;
+            for warning in warnings(paths, &data.training) {
                 if told.insert(warning.clone()) {
                     warn!("{warning}");
                 }
@@ -57,7 +57,7 @@ impl StudyCost {
             if costs.len() == MAX_MEASURED || costs.contains_key(&key) {
                 continue;
             }
-            let cost = dataset(run).map(|path| measure(run, path)).transpose();
+            let cost = dataset(run).map(|paths| measure(run, paths)).transpose();
             let cost = cost.unwrap_or_else(|error| {
                 warn!("the run {} cannot begin: {error:#}", run.name);
                 None
@@ -95,5 +95,5 @@ impl StudyCost {
 fn configuration(run: &PlannedRun) -> String {
     let mut settings = settings::from_experiment(&run.experiment);
     settings.remove("seed");
-    format!("{settings:?} {:?}", run.source)
+    format!("{settings:?} {:?}", run.sources)
 }

@@ -71,7 +71,7 @@ pub(crate) struct PlannedRun {
     pub experiment: Experiment,
     /// Warnings about its settings, which other runs may share.
     pub doubts: Vec<String>,
-    pub source: Source,
+    pub sources: Vec<Source>,
 }
 
 impl PlannedRun {
@@ -203,11 +203,16 @@ impl File {
         let read = Preset::read(preset).hint_of(ConfigError::hint)?;
         let experiment = read.resolve(&changes).hint_of(ConfigError::hint)?;
         let doubts = read.doubts(&experiment, &changes)?;
-        let dataset = experiment.dataset.as_deref().context("it names no dataset");
-        let source = Source::parse(dataset.hint("add to [run] a line dataset = \"FILE\"")?)?;
-        source.check_environment(&experiment.environment)?;
+        if experiment.dataset.is_empty() {
+            return Err(anyhow!("it names no dataset"))
+                .hint("add to [run] a line dataset = \"FILE\"");
+        }
+        let sources = Source::parse_all(&experiment.dataset)?;
+        for source in &sources {
+            source.check_environment(&experiment.environment)?;
+        }
         let preset = preset.clone();
-        Ok(PlannedRun { index, name, preset, changes, experiment, doubts, source })
+        Ok(PlannedRun { index, name, preset, changes, experiment, doubts, sources })
     }
 
     /// Changes of a combination. Later tables override earlier ones: [run], method, command line,
@@ -299,7 +304,7 @@ mod tests {
             let path = folder.path().join(dataset);
             let mut config = crate::fixtures::config("run", 0);
             config.experiment = run.experiment.clone();
-            config.experiment.dataset = Some(dataset.to_owned());
+            config.experiment.dataset = vec![dataset.to_owned()];
             RunDir::create(&path, &config).unwrap();
             run.state(&path)
         };

@@ -3,7 +3,7 @@
 use quad_algorithms::{AgentError, Definition};
 use quad_dataset::{Normalize, RewardRule};
 use quad_policy::Precision;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use toml::{Table, Value};
 
 use super::error::{ConfigError, check_ranges};
@@ -25,9 +25,15 @@ const MOST: u64 = i64::MAX as u64;
 pub struct Experiment {
     /// Environment that the data is from and the policy is evaluated in.
     pub environment: String,
-    /// Name or path of the dataset. [`DatasetInfo`](super::DatasetInfo) describes its contents.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub dataset: Option<String>,
+    /// Names or paths of the dataset's files, in order; a file says a single one as text.
+    /// [`DatasetInfo`](super::DatasetInfo) describes their contents.
+    #[serde(
+        default,
+        skip_serializing_if = "Vec::is_empty",
+        deserialize_with = "read_names",
+        serialize_with = "write_names"
+    )]
+    pub dataset: Vec<String>,
     /// Scaling of rewards before training; by default the environment's rule.
     pub reward: RewardRule,
     /// Columns that are normalized for the networks. Snapshots contain the maps, so policies take
@@ -66,6 +72,27 @@ pub struct Experiment {
 
 fn is_zero(share: &f64) -> bool {
     *share == 0.0
+}
+
+#[derive(Deserialize)]
+#[serde(untagged, expecting = "dataset must be a file or name, or a list of these")]
+enum Names {
+    One(String),
+    Several(Vec<String>),
+}
+
+fn read_names<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<String>, D::Error> {
+    Ok(match Names::deserialize(deserializer)? {
+        Names::One(name) => vec![name],
+        Names::Several(names) => names,
+    })
+}
+
+fn write_names<S: Serializer>(names: &[String], serializer: S) -> Result<S::Ok, S::Error> {
+    match names {
+        [name] => name.serialize(serializer),
+        names => names.serialize(serializer),
+    }
 }
 
 impl Experiment {

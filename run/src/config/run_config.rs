@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use quad_dataset::DatasetFile;
 use quad_protocol::Name;
 use serde::{Deserialize, Serialize};
 
@@ -63,22 +64,16 @@ pub struct RunInfo {
     pub device: Device,
 }
 
-/// File, checksum and statistics of the dataset.
+/// Statistics of the dataset, and its files.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(from = "StoredInfo")]
 pub struct DatasetInfo {
-    /// Path of the file or folder.
-    pub path: PathBuf,
-    /// SHA-256 of the file in hexadecimal, of a folder of Minari's that of its `main_data.hdf5`;
-    /// absent in older runs.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub sha256: Option<String>,
     /// Number of transitions that are trained on.
     pub transitions: u64,
     /// Number of trajectories that are trained on.
     pub episodes: u64,
-    /// Indices of the episodes that are kept out of training, in the file's order.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    /// Indices of the episodes that are kept out of training, in the order of the files.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
     pub held_out: Vec<usize>,
     /// Smallest return of a trajectory, unscaled.
     pub min_return: f64,
@@ -87,16 +82,70 @@ pub struct DatasetInfo {
     /// Largest return of a trajectory, unscaled.
     pub max_return: f64,
     /// Mean D4RL-normalized score, where the environment has reference returns.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub mean_score: Option<f64>,
+    /// The files, in the order of their episodes.
+    pub files: Vec<DatasetFile>,
+}
+
+/// Contents of `config.toml`, in which older runs have path and hash of one file.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct StoredInfo {
+    path: Option<PathBuf>,
+    sha256: Option<String>,
+    transitions: u64,
+    episodes: u64,
+    #[serde(default)]
+    held_out: Vec<usize>,
+    min_return: f64,
+    mean_return: f64,
+    max_return: f64,
+    mean_score: Option<f64>,
+    #[serde(default)]
+    files: Vec<DatasetFile>,
+}
+
+impl From<StoredInfo> for DatasetInfo {
+    fn from(stored: StoredInfo) -> Self {
+        let StoredInfo { path, sha256, transitions, episodes, mut files, .. } = stored;
+        files.extend(path.map(|path| DatasetFile { path, sha256, transitions, episodes }));
+        Self {
+            transitions,
+            episodes,
+            held_out: stored.held_out,
+            min_return: stored.min_return,
+            mean_return: stored.mean_return,
+            max_return: stored.max_return,
+            mean_score: stored.mean_score,
+            files,
+        }
+    }
 }
 
 impl DatasetInfo {
+    /// SHA-256 of each file, separated by commas; `None` for older runs, which lack it.
+    pub fn sha256(&self) -> Option<String> {
+        let hashes: Option<Vec<&str>> =
+            self.files.iter().map(|file| file.sha256.as_deref()).collect();
+        Some(hashes?.join(", "))
+    }
+
+    /// Paths of the files.
+    pub fn paths(&self) -> Vec<PathBuf> {
+        self.files.iter().map(|file| file.path.clone()).collect()
+    }
+
     /// Size and quality of the data, in one line.
     pub fn summary(&self) -> String {
         let (transitions, mean) = (self.transitions, self.mean_return);
         let episodes = counted(self.episodes as usize, "episode");
-        let mut text = format!("{transitions} transitions of {episodes}, mean return {mean:.2}");
+        let files = match self.files.len() {
+            0 | 1 => String::new(),
+            count => format!(" in {count} files"),
+        };
+        let mut text =
+            format!("{transitions} transitions of {episodes}{files}, mean return {mean:.2}");
         if let Some(score) = self.mean_score {
             text += &format!(", mean score {score:.2}");
         }

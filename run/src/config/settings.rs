@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
+use toml::Value;
 
 use super::experiment::Experiment;
 use super::run_config::RunConfig;
@@ -15,10 +16,10 @@ pub type Settings = BTreeMap<String, String>;
 pub fn from_run(config: &RunConfig) -> Settings {
     let mut settings = from_experiment(&config.experiment);
     let mut dataset = flat(&config.dataset);
-    // The path says nothing; a known hash says everything.
-    dataset.remove("path");
-    if dataset.contains_key("sha256") {
-        dataset.retain(|key, _| key == "sha256");
+    // Paths say nothing; known hashes say everything.
+    dataset.remove("files");
+    if let Some(sha256) = config.dataset.sha256() {
+        dataset = Settings::from([("sha256".to_owned(), Value::from(sha256).to_string())]);
     }
     for (key, value) in dataset {
         settings.insert(format!("dataset.{key}"), value);

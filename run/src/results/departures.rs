@@ -28,9 +28,12 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     let definition = ours.definition().ok();
     departures
         .extend(definition.and_then(|definition| hyperparameters::not_given(&definition, task)));
-    if let Some(theirs) = paper.dataset.as_deref().filter(|theirs| !is_trained_on(run, theirs)) {
-        let name = ours.dataset.as_deref().unwrap_or("not named");
-        departures.push(format!("dataset is {name}, not {theirs}"));
+    if let Some(theirs) = paper.dataset.first().filter(|theirs| !is_trained_on(run, theirs)) {
+        let names = match ours.dataset.is_empty() {
+            true => "not named".to_owned(),
+            false => ours.dataset.join(", "),
+        };
+        departures.push(format!("dataset is {names}, not {theirs}"));
     }
     let (ours, paper) = (without_seed(ours), without_seed(&paper));
     let keys: BTreeSet<&String> = differences_in_brief(&ours, &paper).collect();
@@ -73,6 +76,6 @@ fn without_seed(experiment: &Experiment) -> Settings {
 /// True if a run learned from the dataset of that name, by its hash or its name.
 fn is_trained_on(run: &RunReport, dataset: &str) -> bool {
     let hash = catalog::find(dataset).and_then(|entry| entry.sha256.as_ref());
-    let same_file = hash.is_some() && run.config.dataset.sha256.as_ref() == hash;
-    same_file || run.config.experiment.dataset.as_deref() == Some(dataset)
+    let same_file = hash.is_some() && run.config.dataset.sha256().as_ref() == hash;
+    same_file || run.config.experiment.dataset == [dataset]
 }

@@ -36,7 +36,7 @@ fn each_case_is_told_by_inspect_and_by_train() {
             Err(error) => vec![format!("{error}; {}", error.hint())],
             Ok(transitions) => transitions.warnings().to_vec(),
         };
-        if let Ok(inspection) = inspect(&path, None) {
+        if let Ok(inspection) = inspect(&[&path], None) {
             // A file that cannot be trained on is named.
             let prefix = format!("{}: ", path.display());
             let told = Vec::from_iter(told.iter().map(|told| told.replace(&prefix, "")));
@@ -62,7 +62,7 @@ fn recordings_of_others_are_sound() {
     ] {
         let Some(path) = shared(file) else { continue };
         for spec in [environment::find(name).ok(), None] {
-            assert_eq!(inspect(&path, spec).unwrap().problems, [""; 0], "{file}");
+            assert_eq!(inspect(&[&path], spec).unwrap().problems, [""; 0], "{file}");
         }
     }
 }

@@ -51,7 +51,7 @@ fn without_timeouts(arrays: &Arrays) -> (usize, Vec<String>) {
     let (_folder, path) = scratch("own.hdf5");
     write_own(&path, arrays.clone(), Names::default()).unwrap();
     hdf5::File::open_rw(&path).unwrap().unlink("timeouts").unwrap();
-    let inspection = inspect(&path, None).unwrap();
+    let inspection = inspect(&[&path], None).unwrap();
     let transitions = Transitions::read(&path, &ReadOptions::default()).unwrap();
     assert_eq!(transitions.warnings(), inspection.problems);
     (inspection.episodes, inspection.problems)
@@ -92,13 +92,13 @@ fn ends_that_d3rlpy_wrote() {
     let file = write(&path, &cart);
     file.unlink("timeouts").unwrap();
     let start = "no array `timeouts`: an episode is taken to end at a terminal alone";
-    assert_eq!(inspect(&path, None).unwrap().problems[0], start);
+    assert_eq!(inspect(&[&path], None).unwrap().problems[0], start);
     let rows = cart.rewards.len();
     let is_end = |row: usize| f32::from(cart.terminals[row] || cart.timeouts[row]);
     let ends = Vec::from_iter((0..rows).map(is_end));
     put(&file, "episode_terminals", &[rows], &ends);
     drop(file);
-    let inspection = inspect(&path, None).unwrap();
+    let inspection = inspect(&[&path], None).unwrap();
     assert_eq!((inspection.episodes, inspection.problems), (30, Vec::new()));
 }
 
@@ -109,7 +109,7 @@ fn a_chunk_longer_than_every_episode_and_a_single_episode() {
     let with = |chunk| ReadOptions { chunk, ..ReadOptions::default() };
     let split = |chunk| {
         let hold_out = HoldOut::Fraction(0.1);
-        Transitions::read_split(&path, &with(chunk), hold_out).unwrap()
+        Transitions::read_split(&[&path], &with(chunk), hold_out).unwrap()
     };
     // Episodes have up to 46 steps.
     assert_eq!(split(46).training.warnings(), [""; 0]);

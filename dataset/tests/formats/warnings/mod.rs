@@ -116,7 +116,7 @@ fn write_as(path: &Path, arrays: &Arrays, own: bool) {
 fn problems(arrays: &Arrays, own: bool) -> Vec<String> {
     let (_folder, path) = scratch("cart.hdf5");
     write_as(&path, arrays, own);
-    inspect(&path, None).unwrap().problems
+    inspect(&[&path], None).unwrap().problems
 }
 
 /// Problems of data that training accepts, which says the same.

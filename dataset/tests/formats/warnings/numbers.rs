@@ -111,7 +111,7 @@ fn numbers_that_never_change_are_named() {
     act(&mut cart, |action| action[1] = 0.3);
     assert_eq!(warnings(&cart, true), [""; 0]);
     write_as(&path, &cart, true);
-    let inspection = inspect(&path, None).unwrap();
+    let inspection = inspect(&[&path], None).unwrap();
     assert_eq!(inspection.constant_observations, [1, 3]);
     assert_eq!(inspection.constant_actions, [1]);
     let page = inspection.to_string();

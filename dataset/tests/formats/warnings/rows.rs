@@ -145,6 +145,6 @@ fn rows_out_of_order_are_not_called_late() {
     let (file, next) = (write(&path, &arrays), &arrays.next_observations);
     put(&file, "next_observations", &[rows, O], next);
     drop(file);
-    let problems = inspect(&path, None).unwrap().problems;
+    let problems = inspect(&[&path], None).unwrap().problems;
     assert_one(&problems, "array `next_observations`, row 0: not the", "");
 }

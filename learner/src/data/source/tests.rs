@@ -22,8 +22,8 @@ fn the_datasets_of_all_tasks_are_known_and_fit() {
     let mut count = 0;
     for task in tasks::all() {
         let experiment = resolve(&task.name, &toml::Table::new()).unwrap();
-        let Some(dataset) = experiment.dataset else { continue };
-        let source = Source::parse(&dataset).unwrap();
+        let Some(dataset) = experiment.dataset.first() else { continue };
+        let source = Source::parse(dataset).unwrap();
         assert!(matches!(source, Source::Named(_)), "{source:?}");
         source.check_environment(&experiment.environment).unwrap();
         count += 1;
