@@ -22,7 +22,7 @@ TOLERANCE = 1e-12
 
 
 class Planar:
-    """Hopper-v4, HalfCheetah-v4 or Walker2d-v4.
+    """Hopper, HalfCheetah or Walker2d, -v4 or -v5.
 
     `spread` is how far the random positions are from the initial ones; the joints in `backwards` bend one way only. States are
     standing, crouching, falling, lying or in the air: often in contact, often beyond what is healthy.
@@ -139,9 +139,6 @@ def halve_margins(model):
 
 
 TASKS = {
-    "hopper": lambda: Planar("Hopper-v4", [2.0, 0.35, 0.3, 0.5, 0.5, 0.8], backwards=[3, 4]),
-    "halfcheetah": lambda: Planar("HalfCheetah-v4", [2.0, 0.4, 2.0] + [0.8] * 6),
-    "walker2d": lambda: Planar("Walker2d-v4", [2.0, 0.6, 1.2] + [0.8] * 6, backwards=[3, 4, 6, 7]),
     "ant": lambda: Planar("Ant-v4", [0.1] * 15),
     "antmaze-umaze": lambda: AntMaze("11111 1R001 11101 1G001 11111"),
     "antmaze-medium": lambda: AntMaze("11111111 1R011001 10010001 11000111 10010001 10100101 100010G1 11111111"),
@@ -149,6 +146,12 @@ TASKS = {
         "111111111111 1R0001000001 101101010101 100000010001 101111011101 100101000001 110101010111 100100010G01 111111111111"
     ),
 }
+for name, version in [("", "v4"), ("-v5", "v5")]:
+    TASKS |= {
+        f"hopper{name}": lambda version=version: Planar(f"Hopper-{version}", [2.0, 0.35, 0.3, 0.5, 0.5, 0.8], backwards=[3, 4]),
+        f"halfcheetah{name}": lambda version=version: Planar(f"HalfCheetah-{version}", [2.0, 0.4, 2.0] + [0.8] * 6),
+        f"walker2d{name}": lambda version=version: Planar(f"Walker2d-{version}", [2.0, 0.6, 1.2] + [0.8] * 6, backwards=[3, 4, 6, 7]),
+    }
 for place in ["medium", "large", "giant"]:
     TASKS[f"antmaze-{place}-singletask-v0"] = lambda place=place: OgBench(f"antmaze-{place}-singletask-v0")
     TASKS[f"pointmaze-{place}-singletask-v0"] = lambda place=place: PointMaze(f"pointmaze-{place}-singletask-v0")

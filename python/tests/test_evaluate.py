@@ -100,8 +100,8 @@ def test_scores_equal_those_of_stepping_by_hand(tmp_path, data):
 
 
 def test_gymnasium_by_id_with_references(tmp_path, data):
-    learner = Learner(tmp_path / "run", data, environment="hopper-v5", steps=20)
-    with quad_rl.Evaluators("hopper-v5", "Hopper-v5", connect=learner.endpoint, workers=1, score=(0.0, 50.0)):
+    learner = Learner(tmp_path / "run", data, environment="pogo", steps=20)
+    with quad_rl.Evaluators("pogo", "Hopper-v5", connect=learner.endpoint, workers=1, score=(0.0, 50.0)):
         code, said = learner.end()
     assert code == 0, said
     for score in learner.scores():

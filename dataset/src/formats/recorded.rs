@@ -42,7 +42,7 @@ pub struct RecordedRows {
     goals: Option<Vec<f64>>,
 }
 
-/// Known environments whose dimensions match those of the file.
+/// Simulations whose dimensions match those of the file, each by the environment of its name.
 pub fn matching_environments(
     path: impl AsRef<Path>,
 ) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
@@ -52,7 +52,7 @@ pub fn matching_environments(
         Err(problem) => Err(DatasetError::new(file.path(), problem)),
     };
     let sizes = (width("observations")?, width("actions")?);
-    let specs = environment::all().iter();
+    let specs = environment::all().iter().filter(|spec| spec.simulation() == spec.name);
     Ok(specs.filter(|spec| spec.sizes() == sizes).collect())
 }
 

@@ -52,6 +52,9 @@ pub struct Planar {
     pub noise: Noise,
     /// Reward per step.
     pub alive_bonus: f64,
+    /// True if the step that ends an episode earns the bonus, too.
+    #[serde(default = "always")]
+    pub bonus_at_end: bool,
     /// Cost weight of the squared action.
     pub control_cost: f64,
     /// Clipping of observed velocities.
@@ -60,6 +63,10 @@ pub struct Planar {
     /// Region outside of which an episode terminates, if any.
     #[serde(default)]
     pub healthy: Option<Healthy>,
+}
+
+fn always() -> bool {
+    true
 }
 
 fn unlimited() -> f64 {

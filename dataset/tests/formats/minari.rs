@@ -28,8 +28,8 @@ fn compare_with_minari(root: &Path, kind: &str, environment: Environment) {
 #[test]
 fn arrays_and_a_dict_in_alphabetical_order_and_a_tuple_in_its_own() {
     for (kind, recorded, spec) in [
-        ("hopper", "hopper", Some(hopper())),
-        ("walker2d", "Walker2d-v5", None),
+        ("hopper", "hopper-v5", Some(hopper())),
+        ("walker2d", "walker2d-v5", environment::find("walker2d-v5").ok()),
         ("antmaze", "AntMaze_UMaze-v4", None),
         ("own", "Robot-v0", None),
         ("tuple", "Robot-v0", None),
@@ -47,11 +47,11 @@ fn datasets_that_are_refused() {
     let group = "`episode_0/observations/achieved_goal` is a group of arrays, but must be an array";
     let discrete = "only continuous actions can be learned";
     let maze = "recorded in `AntMaze_UMaze-v4`, which is not `antmaze-umaze`";
-    let walker = "recorded in `Walker2d-v5`, which is not `walker2d`";
+    let walker = "recorded in `walker2d-v5`, which is not `walker2d`";
     // Another simulation is learned from, but not scored in ours.
     for (kind, name, message, hint) in [
         ("antmaze", "antmaze-umaze", maze, "--task own-data"),
-        ("walker2d", "walker2d", walker, "--task own-data"),
+        ("walker2d", "walker2d", walker, "a task in walker2d-v5"),
         ("nested", "", group, "Dict of arrays"),
         ("discrete", "", discrete, "float32"),
     ] {

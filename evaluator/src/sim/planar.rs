@@ -1,8 +1,8 @@
 //! Robots in a vertical plane, rewarded for running along x: Hopper, HalfCheetah, Walker2d, and any
 //! other with a row `planar` in the table of environments.
 //!
-//! The three are D4RL's locomotion-v2 tasks, gym's "-v2" and Gymnasium's "-v4", and differ in a
-//! model and the numbers of their rows:
+//! The three are D4RL's locomotion-v2 tasks, gym's "-v2" and Gymnasium's "-v4", or else Gymnasium's
+//! "-v5". They differ in a model and the numbers of their rows:
 //!
 //! - qpos: x, z and pitch of the torso, then the joints from the hip down (HalfCheetah: the back
 //!   leg first; Walker2d: the right one); qvel: their velocities. Meters and radians, per second.
@@ -10,8 +10,8 @@
 //! - Action: torques of the joints in that order, as fractions of the motors' strongest, clipped to
 //!   ±1.
 //! - Reward: x's mean velocity over the control period, plus `alive_bonus`, minus `control_cost` ·
-//!   Σ a², with the clipped action. Every step earns the bonus, also the step that ends the
-//!   episode.
+//!   Σ a², with the clipped action. The step that ends the episode earns the bonus only with
+//!   `bonus_at_end`.
 //! - The episode terminates when the robot is not `healthy`, and is truncated after
 //!   `max_episode_steps`.
 
@@ -37,6 +37,8 @@ impl Task for &'static Planar {
         let cost = self.control_cost * squares.sum::<f64>();
         let healthy = self.healthy.as_ref();
         let terminated = healthy.is_some_and(|healthy| !healthy.contains(qpos, qvel));
-        (velocity + self.alive_bonus - cost, terminated)
+        let is_paid = self.bonus_at_end || !terminated;
+        let bonus = if is_paid { self.alive_bonus } else { 0.0 };
+        (velocity + bonus - cost, terminated)
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! # Layout
 //!
-//! - [`collect`]: trains behavior from random to competent and records it as a dataset.
+//! - [`collect`]: records policies, or behavior from random to competent that it trains, as a dataset.
 //! - [`verify`]: replays a recorded dataset and measures how far the simulation is from it.
 //! - `score`: scores saved policies.
 //! - `film`: films saved policies.

@@ -104,12 +104,13 @@ impl fmt::Display for Summary {
         let [p50, p90, p99, max] = self.score_percentiles;
         let (transitions, score) = (self.transitions, self.score);
         let episodes = counted(self.episodes, "episode");
-        let policies = match self.policies {
-            1 => "a policy".to_owned(),
-            several => format!("{several} policies"),
-        };
+        let policies = self.policies;
+        let noun = if policies == 1 { "policy" } else { "policies" };
         let seconds = self.seconds;
-        writeln!(f, "{transitions} transitions, {episodes} of {policies}, in {seconds:.0} s")?;
+        writeln!(
+            f,
+            "{transitions} transitions, {episodes} of {policies} {noun}, in {seconds:.0} s"
+        )?;
         let std = score.std.unwrap_or_default();
         write!(f, "normalized score: mean {:.1} ± {std:.1}, median {p50:.1}, ", score.mean)?;
         write!(f, "p90 {p90:.1}, p99 {p99:.1}, max {max:.1}")

@@ -91,12 +91,8 @@ impl Behavior {
             Some([run, algorithm]) => (Some(run), algorithm),
             None => (None, "unknown algorithm".to_owned()),
         };
-        let noise = match args.noise {
-            0.0 => String::new(),
-            std => format!(", with noise of standard deviation {std}"),
-        };
         let way = if args.mode { "mode" } else { "sampled" };
-        let algorithm = format!("{algorithm}, {way}{noise}");
+        let algorithm = format!("{algorithm}, {way}, noise {}", args.noise);
         Ok(Self { subject: Some(subject), algorithm, run })
     }
 
@@ -110,33 +106,22 @@ impl Behavior {
         let mut rollout = Rollout::new(make, args.env.sizes(), seeds, begin).hint(MUJOCO)?;
         while !rollout.is_done() {
             rollout.step(|observations, states, actions| {
-                self.act(args, observations, states, actions)
+                let Some(subject) = &self.subject else {
+                    draw_uniform(states, actions);
+                    return Ok(());
+                };
+                let policy = &*subject.policy;
+                let acted = match args.mode {
+                    true => policy.act(observations, states, actions),
+                    false => policy.explore(observations, states, actions),
+                };
+                let mut change = |actions: &mut [f32]| add_noise(args.noise, states, actions);
+                if args.noise > 0.0 {
+                    policy.change_actions(actions, &mut change);
+                }
+                acted.with_context(|| subject.cannot_act())
             })?;
         }
         Ok(rollout.into_environments())
-    }
-
-    /// Fills in the actions of n states, `n × action_dim`.
-    fn act(
-        &self,
-        args: &CollectArgs,
-        observations: &[f32],
-        states: &mut [EpisodeState],
-        actions: &mut [f32],
-    ) -> anyhow::Result<()> {
-        let Some(subject) = &self.subject else {
-            draw_uniform(states, actions);
-            return Ok(());
-        };
-        let policy = &*subject.policy;
-        let acted = match args.mode {
-            true => policy.act(observations, states, actions),
-            false => policy.explore(observations, states, actions),
-        };
-        acted.with_context(|| subject.cannot_act())?;
-        if args.noise > 0.0 {
-            policy.change_actions(actions, &mut |actions| add_noise(args.noise, states, actions));
-        }
-        Ok(())
     }
 }

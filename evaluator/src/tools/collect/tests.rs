@@ -89,14 +89,14 @@ fn actions_are_drawn_or_the_mode_with_noise_or_uniform_and_the_file_names_the_po
     fs::write(&path, policy()).unwrap();
     let weights = Hash::new(&policy()).to_string();
     let (random, tanh) = (PathBuf::from("random"), 0.3_f64.tanh());
-    let uniform = "uniform random actions";
+    let (uniform, modal) = ("uniform random actions", "sac, mode, noise 0");
     for (policies, mode, noise, mean, std, algorithm) in [
         // Mean and standard deviation of tanh(u), u ~ N(0.3, e^0.3), by quadrature.
-        (vec![&path], false, 0.0, 0.148, 0.700, "sac, sampled"),
-        (vec![&path], true, 0.0, tanh, 0.0, "sac, mode"),
-        (vec![&path], true, 0.1, tanh, 0.1, "sac, mode, with noise of standard deviation 0.1"),
+        (vec![&path], false, 0.0, 0.148, 0.700, "sac, sampled, noise 0"),
+        (vec![&path], true, 0.0, tanh, 0.0, modal),
+        (vec![&path], true, 0.1, tanh, 0.1, "sac, mode, noise 0.1"),
         (vec![&random], false, 0.0, 0.0, 0.577, uniform),
-        (vec![&random, &path], true, 0.0, tanh, 0.0, "uniform random actions; sac, mode"),
+        (vec![&random, &path], true, 0.0, tanh, 0.0, &*format!("{uniform}; {modal}")),
     ] {
         let args = CollectArgs {
             policy: policies.into_iter().cloned().collect(),
@@ -109,10 +109,9 @@ fn actions_are_drawn_or_the_mode_with_noise_or_uniform_and_the_file_names_the_po
         let recorded = policies::record(&Vec::from_iter(behaviors), &args, &mut writer).unwrap();
         writer.finish(&Metadata::default()).unwrap();
         assert_eq!(recorded.algorithm, algorithm);
-        let is_named = algorithm != uniform;
         let origin = (recorded.run.as_deref(), recorded.weights.as_ref(), recorded.iteration);
         let named = (Some("mine"), Some(&weights), 40);
-        assert_eq!(origin, if is_named { named } else { (None, None, 0) });
+        assert_eq!(origin, if algorithm == uniform { (None, None, 0) } else { named });
         // The second of two policies acts in the second half, but for the end of an episode.
         let rows = read(&args.out);
         let half = rows.iter().skip(TRANSITIONS / 2 + 200);
@@ -120,8 +119,8 @@ fn actions_are_drawn_or_the_mode_with_noise_or_uniform_and_the_file_names_the_po
         let spread = Spread::new(&actions).unwrap();
         let error = (spread.mean - mean).abs().max((spread.population_std.unwrap() - std).abs());
         assert!(error < 0.05 && (std > 0.0 || error < 1e-6), "{algorithm}: {spread:?}");
-        let first = rows.row(0).action;
-        assert_eq!(first.iter().all(|x| (x - tanh).abs() < 1e-6), algorithm == "sac, mode");
+        let is_mode = rows.row(0).action.iter().all(|x| (x - tanh).abs() < 1e-6);
+        assert_eq!(is_mode, algorithm == modal);
     }
 }
 
