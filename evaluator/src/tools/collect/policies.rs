@@ -79,8 +79,7 @@ pub struct Behavior {
 impl Behavior {
     pub fn read(path: &Path, args: &CollectArgs) -> anyhow::Result<Self> {
         if path == Path::new(RANDOM) {
-            let algorithm = "uniform random actions".to_owned();
-            return Ok(Self { subject: None, algorithm, run: None });
+            return Ok(Self { subject: None, algorithm: "uniform".to_owned(), run: None });
         }
         let options = ScoreArgs { env: Some(args.env), ..ScoreArgs::default() };
         let subject = Subject::read(path, &options)?.remove(0);

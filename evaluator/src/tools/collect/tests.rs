@@ -1,15 +1,16 @@
 //! Recorded datasets: a function of the seed, and a faithful replay.
 
+use std::ffi::OsStr;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use candle_core::{Device, Tensor};
+use clap::FromArgMatches;
 use quad_dataset::RecordedRows;
 use quad_nn::Layout;
 use quad_policy::{Header, MlpConfig, PolicyConfig};
 use quad_protocol::{Hash, Origin};
 use serde_json::json;
-use tempfile::TempDir;
 
 use super::policies::Behavior;
 use super::*;
@@ -21,16 +22,12 @@ fn hopper() -> &'static EnvironmentSpec {
     find("hopper").unwrap()
 }
 
-fn arguments(folder: &TempDir, seed: u64) -> CollectArgs {
-    CollectArgs {
-        env: hopper(),
-        policy: Vec::new(),
-        mode: false,
-        noise: 0.0,
-        out: folder.path().join(format!("{seed}.hdf5")),
-        transitions: TRANSITIONS as u32,
-        seed,
-    }
+/// The arguments that record in Hopper, with `options`.
+fn arguments(out: &Path, options: &str) -> CollectArgs {
+    let line = format!("collect --env hopper --transitions {TRANSITIONS} {options} --out");
+    let words = line.split_whitespace().map(OsStr::new).chain([out.as_os_str()]);
+    let command = CollectArgs::augment_args(clap::Command::new("collect"));
+    CollectArgs::from_arg_matches(&command.try_get_matches_from(words).unwrap()).unwrap()
 }
 
 /// Records on that many threads.
@@ -46,13 +43,12 @@ fn read(path: &Path) -> RecordedRows {
 #[test]
 fn the_file_depends_on_the_seed_and_not_on_the_threads() {
     let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("policy.safetensors");
+    let [out, path] = ["data.hdf5", "policy.safetensors"].map(|name| folder.path().join(name));
     fs::write(&path, policy()).unwrap();
-    for policy in [vec![], vec![PathBuf::from("random"), path]] {
+    for options in [String::new(), format!("--policy random --policy {}", path.display())] {
         let file = |seed, threads| {
-            let args = CollectArgs { policy: policy.clone(), ..arguments(&folder, seed) };
-            collect_on(threads, &args);
-            fs::read(args.out).unwrap()
+            collect_on(threads, &arguments(&out, &format!("{options} --seed {seed}")));
+            fs::read(&out).unwrap()
         };
         let two = file(1, 2);
         assert!(file(1, 1) == two);
@@ -85,50 +81,44 @@ fn policy() -> Vec<u8> {
 #[test]
 fn actions_are_drawn_or_the_mode_with_noise_or_uniform_and_the_file_names_the_policy() {
     let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("policy.safetensors");
+    let [out, path] = ["data.hdf5", "policy.safetensors"].map(|name| folder.path().join(name));
     fs::write(&path, policy()).unwrap();
     let weights = Hash::new(&policy()).to_string();
-    let (random, tanh) = (PathBuf::from("random"), 0.3_f64.tanh());
-    let (uniform, modal) = ("uniform random actions", "sac, mode, noise 0");
-    for (policies, mode, noise, mean, std, algorithm) in [
+    let tanh = 0.3_f64.tanh();
+    for (options, mean, std, algorithm) in [
         // Mean and standard deviation of tanh(u), u ~ N(0.3, e^0.3), by quadrature.
-        (vec![&path], false, 0.0, 0.148, 0.700, "sac, sampled, noise 0"),
-        (vec![&path], true, 0.0, tanh, 0.0, modal),
-        (vec![&path], true, 0.1, tanh, 0.1, "sac, mode, noise 0.1"),
-        (vec![&random], false, 0.0, 0.0, 0.577, uniform),
-        (vec![&random, &path], true, 0.0, tanh, 0.0, &*format!("{uniform}; {modal}")),
+        ("--policy FILE", 0.148, 0.700, "sac, sampled, noise 0"),
+        ("--policy FILE --mode", tanh, 0.0, "sac, mode, noise 0"),
+        ("--policy FILE --mode --noise 0.1", tanh, 0.1, "sac, mode, noise 0.1"),
+        ("--policy random", 0.0, 0.577, "uniform"),
+        ("--policy random --policy FILE --mode", tanh, 0.0, "uniform; sac, mode, noise 0"),
     ] {
-        let args = CollectArgs {
-            policy: policies.into_iter().cloned().collect(),
-            mode,
-            noise,
-            ..arguments(&folder, 5)
-        };
-        let mut writer = D4rlWriter::create(&args.out, hopper()).unwrap();
+        let args = arguments(&out, &options.replace("FILE", path.to_str().unwrap()));
+        let mut writer = D4rlWriter::create(&out, hopper()).unwrap();
         let behaviors = args.policy.iter().map(|path| Behavior::read(path, &args).unwrap());
         let recorded = policies::record(&Vec::from_iter(behaviors), &args, &mut writer).unwrap();
         writer.finish(&Metadata::default()).unwrap();
         assert_eq!(recorded.algorithm, algorithm);
         let origin = (recorded.run.as_deref(), recorded.weights.as_ref(), recorded.iteration);
         let named = (Some("mine"), Some(&weights), 40);
-        assert_eq!(origin, if algorithm == uniform { (None, None, 0) } else { named });
+        assert_eq!(origin, if algorithm == "uniform" { (None, None, 0) } else { named });
+        let rows = read(&out);
+        let is_mode = rows.row(0).action.iter().all(|x| (x - tanh).abs() < 1e-6);
+        assert_eq!(is_mode, options.ends_with("FILE --mode") && !options.contains("random"));
         // The second of two policies acts in the second half, but for the end of an episode.
-        let rows = read(&args.out);
         let half = rows.iter().skip(TRANSITIONS / 2 + 200);
         let actions = Vec::from_iter(half.flat_map(|row| row.action.to_vec()));
         let spread = Spread::new(&actions).unwrap();
         let error = (spread.mean - mean).abs().max((spread.population_std.unwrap() - std).abs());
         assert!(error < 0.05 && (std > 0.0 || error < 1e-6), "{algorithm}: {spread:?}");
-        let is_mode = rows.row(0).action.iter().all(|x| (x - tanh).abs() < 1e-6);
-        assert_eq!(is_mode, algorithm == modal);
     }
 }
 
 #[test]
 fn whole_episodes_are_recorded_and_replay_and_changes_are_noticed() {
     let folder = tempfile::tempdir().unwrap();
-    let args = arguments(&folder, 3);
-    let (summary, path) = (collect_on(2, &args), args.out);
+    let path = folder.path().join("data.hdf5");
+    let summary = collect_on(2, &arguments(&path, "--seed 3"));
     let (transitions, episodes) = (summary.transitions, summary.episodes);
     let rows = read(&path);
     assert!(rows.len() == transitions && transitions >= TRANSITIONS);
