@@ -28,6 +28,9 @@ const DIMS: (usize, usize) = (11, 3);
 /// The task whose values all algorithms but QUAD are measured with.
 const TASK: &str = "hopper-medium-v2";
 
+/// The task of QUAD's configurations.
+const PAPER: &str = "hopper-medium-replay-v2";
+
 /// A value in place of the task's.
 type Change = Option<(&'static str, u32)>;
 
@@ -35,8 +38,8 @@ type Change = Option<(&'static str, u32)>;
 /// deploy/bench/bench.py knows QUAD's shapes; algorithms/benches/jax_step.py names all as they are
 /// named here.
 const CONFIGURATIONS: [(&str, [&str; 2], Change); 5] = [
-    ("paper, 10 samples", ["hopper-medium-replay-v2", "quad"], Some(("samples", 10))),
-    ("paper, 1 sample", ["hopper-medium-replay-v2", "quad"], Some(("samples", 1))),
+    ("paper, 10 samples", [PAPER, "quad"], Some(("samples", 10))),
+    ("paper, 1 sample", [PAPER, "quad"], Some(("samples", 1))),
     ("demo", ["hopper-demo", "quad"], Some(("samples", 1))),
     ("demo, IQL", ["hopper-demo", "iql"], None),
     ("qc-fql", [TASK, "fql"], Some(("chunk", 5))),
@@ -51,9 +54,8 @@ struct Experiment {
 }
 
 fn experiment([task, algorithm]: [&str; 2], change: Change) -> Experiment {
-    let definition =
-        *ALGORITHMS.iter().find(|known| known.name == algorithm).expect("an algorithm");
-    let mut values = Values::of(&definition).for_task(Some(task));
+    let definition = *ALGORITHMS.iter().find(|row| row.name == algorithm).expect("an algorithm");
+    let mut values = Values::read(&definition).for_task(Some(task));
     let Some(toml::Value::Table(mut agent)) = values.remove("agent") else {
         panic!("no values for {task}")
     };
@@ -101,11 +103,10 @@ fn updates(criterion: &mut Criterion) {
     for (group, device, precision) in groups {
         let mut group = criterion.benchmark_group(group);
         group.sample_size(20);
-        let others = ALGORITHMS
-            .iter()
-            .filter(|known| known.name != "quad")
-            .map(|known| (known.name, [TASK, known.name], None));
-        for (name, which, change) in CONFIGURATIONS.into_iter().chain(others) {
+        let names = ALGORITHMS.iter().map(|definition| definition.name);
+        let baselines = names.filter(|name| *name != "quad");
+        let baselines = baselines.map(|name| (name, [TASK, name], None));
+        for (name, which, change) in CONFIGURATIONS.into_iter().chain(baselines) {
             let experiment = experiment(which, change);
             let transitions = Arc::new(transitions(2 * experiment.batch_size));
             let context = Context {
@@ -180,7 +181,8 @@ fn parts(criterion: &mut Criterion) {
             .sample_size(20)
             .measurement_time(Duration::from_secs(2))
             .warm_up_time(Duration::from_millis(500));
-        parts_of(&mut group, &experiment(which, change), samples as usize).expect("candle works");
+        bench_parts(&mut group, &experiment(which, change), samples as usize)
+            .expect("candle works");
         group.finish();
     }
 }
@@ -196,7 +198,7 @@ fn bench<R: Send>(
     });
 }
 
-fn parts_of(
+fn bench_parts(
     group: &mut BenchmarkGroup<'_, WallTime>,
     experiment: &Experiment,
     samples: usize,
@@ -205,7 +207,8 @@ fn parts_of(
     let b = experiment.batch_size;
     let (k, steps) = (count("critics"), count("diffusion_steps"));
     let (observation_dim, action_dim) = DIMS;
-    let layers = experiment.agent["critic"].clone().try_into().expect("hidden layers");
+    let layers = experiment.agent["critic"].clone();
+    let layers = layers.try_into().expect("hidden layers");
     let shape = DiffusionShape::quad(DIMS, &layers, k, steps);
     let weights = |layout: Layout| {
         let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu)?;
@@ -226,10 +229,10 @@ fn parts_of(
     bench(group, "target critics", || target_critics.values(&observations, &next));
     let regress = |critics: &Ensemble| {
         let loss = squared_error(&critics.values(&observations, &actions)?, &targets)?;
-        Gradients::of(&loss)?.with_respect_to(critics.weights())
+        Gradients::backward(&loss)?.with_respect_to(critics.weights())
     };
     bench(group, "critic step", || regress(&critics));
-    let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
+    let step = AdamStep::after(0, 1e-9).clipped(1.0);
     let gradient = regress(&critics)?.copy()?;
     critic_adam.set_step(step)?;
     bench(group, "critic optimizer", || critic_adam.apply(critics.weights_mut(), &gradient));
@@ -239,7 +242,7 @@ fn parts_of(
     let t = Tensor::from_iter((0..b).map(|i| (i % steps + 1) as u32), observations.device())?;
     let clone = |actor: &NoisePredictor| {
         let loss = actor.predict(&observations, &actions, &t)?.sqr()?.mean_all()?;
-        Gradients::of(&loss)?.with_respect_to(actor.weights())
+        Gradients::backward(&loss)?.with_respect_to(actor.weights())
     };
     let threshold = experiment.agent["eta"].get("threshold").is_some();
     bench(group, "actor step", || {

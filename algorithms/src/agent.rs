@@ -49,8 +49,8 @@ struct Counters {
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // The messages say what each variant is.
 pub enum StateError {
-    #[error("the state is of the algorithm {found}, this run is of {expected}")]
-    Algorithm { found: String, expected: &'static str },
+    #[error("the state is of the algorithm {0}, this run is of {1}")]
+    Algorithm(String, &'static str),
     #[error(transparent)]
     Policy(#[from] PolicyError),
 }
@@ -158,7 +158,8 @@ impl Agent {
     pub fn save(&mut self) -> Result<Vec<u8>, AlgorithmError> {
         let (algorithm, step) = (self.definition.name.to_owned(), self.step);
         let tensors = self.algorithm.state_dict().save()?;
-        Ok(write_tensors(&tensors, COUNTERS, &Counters { algorithm, step })?)
+        let counters = Counters { algorithm, step };
+        Ok(write_tensors(&tensors, COUNTERS, &counters)?)
     }
 
     /// Resumes from a saved state, bit for bit if the run's configuration is the same.
@@ -169,7 +170,7 @@ impl Agent {
         let counters: Counters = read_header(bytes, COUNTERS)?;
         let expected = self.definition.name;
         if counters.algorithm != expected {
-            return Err(StateError::Algorithm { found: counters.algorithm, expected });
+            return Err(StateError::Algorithm(counters.algorithm, expected));
         }
         let mut tensors = read_tensors(bytes)?;
         self.algorithm.state_dict().load(&mut tensors)?;

@@ -72,7 +72,8 @@ impl Config {
         };
         Diffusion::new(shape, context, |networks, init| {
             networks.actor.decay_weights(*self.weight_decay)?;
-            Ok(AlignIql { value: init.value(&self.value)?, config: self, rule })
+            let value = init.value(&self.value)?;
+            Ok(AlignIql { config: self, rule, value })
         })
     }
 }
@@ -80,7 +81,8 @@ impl Config {
 /// ε_θ toward the noise in the data's actions: DDPM's loss.
 fn bc_loss(networks: &Networks, batch: &Batch, noise: &Denoising) -> Result<Loss> {
     let (_, predicted) = denoise(&networks.actor, batch, noise)?;
-    Ok(Loss::new("bc_loss", (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?))
+    let squares = (predicted - &noise.epsilon)?.sqr()?;
+    Ok(Loss::new("bc_loss", squares.sum(1)?.mean_all()?))
 }
 
 /// The smaller Q̂(s, a), `[B]`.
@@ -92,7 +94,8 @@ impl AlignIql {
     /// V(s) toward an expectile of the smaller Q̂(s, a), `[B]`, IQL's Eq. 5.
     fn value_loss(&self, batch: &Batch, q: &Tensor) -> Result<Loss> {
         let u = (q - state_value(&self.value, &batch.observations)?)?;
-        Ok(Loss::new("value_loss", expectile_loss(&u, *self.config.expectile)?))
+        let loss = expectile_loss(&u, *self.config.expectile)?;
+        Ok(Loss::new("value_loss", loss))
     }
 
     /// Q(s, a) toward r + γ·V(s'), IQL's Eq. 6. Also measures V and, with the smaller Q̂(s, a), the
@@ -119,9 +122,8 @@ impl DiffusionUpdate for AlignIql {
         let adam = |rate: f32| AdamStep::after(step, rate);
         // IDQL's authors move only critics and V online.
         let decayed = *config.actor_learning_rate * context.decay(step, 0.0);
-        networks.actor.adam.set_step(adam(decayed))?;
-        self.value.adam.set_step(adam(*config.value_learning_rate))?;
-        networks.critic.adam.set_step(adam(*config.critic_learning_rate))
+        self.value.set_step(adam(*config.value_learning_rate))?;
+        networks.set_steps([decayed, *config.critic_learning_rate].map(adam))
     }
 
     fn update(
@@ -147,7 +149,8 @@ impl DiffusionUpdate for AlignIql {
     fn losses(&self, networks: &Networks, batch: &Batch, noise: &Denoising) -> Result<Vec<Loss>> {
         let (bc_loss, q) = (bc_loss(networks, batch, noise)?, q(networks, batch)?);
         let value_loss = self.value_loss(batch, &q)?;
-        Ok(vec![bc_loss, value_loss, self.critic_loss(networks, batch, &q)?])
+        let critic_loss = self.critic_loss(networks, batch, &q)?;
+        Ok(vec![bc_loss, value_loss, critic_loss])
     }
 
     fn measure(&self, networks: &Networks, _: &Denoising, _: &[f32]) -> Result<Measured> {
@@ -160,7 +163,8 @@ impl DiffusionUpdate for AlignIql {
         let value = (self.rule == Rule::Nearest).then_some(&*self.value);
         let (actor, critics) = (&networks.actor.target, &networks.critic.target);
         let tensors = DiffusionPolicy::tensors(actor, Some(critics), value)?;
-        Ok((Choice::new(*self.config.candidates, Aggregate::Min, self.rule), tensors))
+        let choice = Choice::new(*self.config.candidates, Aggregate::Min, self.rule);
+        Ok((choice, tensors))
     }
 
     fn add_to<'a>(&'a mut self, dict: StateDict<'a>) -> StateDict<'a> {

@@ -27,6 +27,12 @@ pub(super) fn noise_predictor(
 }
 
 impl Networks {
+    /// Sets the steps of actor and critics.
+    pub fn set_steps(&mut self, [actor, critic]: [AdamStep; 2]) -> Result<()> {
+        self.actor.set_step(actor)?;
+        self.critic.set_step(critic)
+    }
+
     /// Actions of the target actor in the next states, `[B·S, a]`.
     pub fn sample_next(&self, batch: &Batch, noise: &Tensor) -> Result<Tensor> {
         self.actor.target.sample(&batch.next_observations, noise)
@@ -77,7 +83,8 @@ impl Denoising {
     }
 
     /// The estimate of the clean actions in noisy ones, given a predicted noise ε: (a^t − √(1 −
-    /// ᾱ_t)·ε)/√ᾱ_t, clipped to ±1, all `[B, a]`.
+    /// ᾱ_t)·ε)/√ᾱ_t, clipped to ±1, all `[B, a]`. [`Schedule::clean`] is for rows of one t, and rounds
+    /// otherwise.
     pub fn clean(&self, noisy: &Tensor, predicted: &Tensor) -> Result<Tensor> {
         ((noisy - (predicted * &self.deviation)?)? / &self.signal)?.clamp(-1f32, 1f32)
     }
@@ -135,8 +142,8 @@ pub(super) trait DiffusionUpdate: Send {
     /// The losses that [`Self::update`] descends, without a step.
     fn losses(&self, networks: &Networks, batch: &Batch, noise: &Self::Noise) -> Result<Vec<Loss>>;
 
-    /// Metrics that are computed on the CPU, from the noise and the losses' other tensors.
-    fn measure(&self, _: &Networks, _: &Self::Noise, _others: &[f32]) -> Result<Measured> {
+    /// Metrics that are computed on the CPU, from the noise and the losses' metric inputs.
+    fn measure(&self, _: &Networks, _: &Self::Noise, _inputs: &[f32]) -> Result<Measured> {
         Ok(Measured::new())
     }
 
@@ -162,22 +169,28 @@ pub(super) struct Diffusion<U: DiffusionUpdate> {
 impl<U: DiffusionUpdate> Diffusion<U> {
     /// The networks have the data's sizes; `update` may initialize more of them.
     pub fn new(
-        layers: DiffusionShape,
+        mut shape: DiffusionShape,
         context: Context,
         update: impl FnOnce(&mut Networks, &mut Initializer<'_>) -> Result<U>,
     ) -> Result<Self> {
-        let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
-        let shape = DiffusionShape { observation_dim, action_dim, ..layers };
+        shape.observation_dim = context.observation_dim();
+        shape.action_dim = context.action_dim();
         let init = &mut Initializer::new(&context);
         let mut networks = Networks::new(&shape, init)?;
         let update = update(&mut networks, init)?;
-        Ok(Self { context, shape, update, networks, replay: Replay::default(), next: None })
+        let (replay, next) = (Replay::default(), None);
+        Ok(Self { context, shape, update, networks, replay, next })
     }
 
     fn noise(&self, step: u64, batch_size: usize) -> Result<U::Noise> {
-        let random = Random { device: Device::Cpu, ..self.context.random(step) };
-        let actor = &self.networks.actor;
-        self.update.noise(Sampler { random, batch_size, shape: &self.shape, actor })
+        let mut random = self.context.random(step);
+        random.device = Device::Cpu;
+        self.update.noise(Sampler {
+            random,
+            batch_size,
+            shape: &self.shape,
+            actor: &self.networks.actor,
+        })
     }
 }
 
@@ -201,8 +214,9 @@ impl<U: DiffusionUpdate> Algorithm for Diffusion<U> {
         if self.context.device.is_cuda() {
             self.next = Some((step + 1, self.noise(step + 1, batch.size())?));
         }
-        let (mut measured, others) = self.replay.computed()?;
-        measured.extend(self.update.measure(&self.networks, &inputs.1, &others)?);
+        let (mut measured, numbers) = self.replay.computed()?;
+        let (update, networks) = (&self.update, &self.networks);
+        measured.extend(update.measure(networks, &inputs.1, &numbers)?);
         Ok(measured)
     }
 
@@ -210,14 +224,16 @@ impl<U: DiffusionUpdate> Algorithm for Diffusion<U> {
         let noise = self.noise(step, batch.size())?;
         let on_device = noise.on(&self.context.device)?;
         let losses = self.update.losses(&self.networks, batch, &on_device)?;
-        let (mut measured, others) = Computed::new(&losses)?.read()?;
-        measured.extend(self.update.measure(&self.networks, &noise, &others)?);
+        let (mut measured, numbers) = Computed::new(&losses)?.read()?;
+        let (update, networks) = (&self.update, &self.networks);
+        measured.extend(update.measure(networks, &noise, &numbers)?);
         Ok(measured)
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let (choice, tensors) = self.update.policy(&self.networks)?;
-        Ok((PolicyConfig::Diffusion { shape: self.shape.clone(), choice }, tensors))
+        let shape = self.shape.clone();
+        Ok((PolicyConfig::Diffusion { shape, choice }, tensors))
     }
 
     fn state_dict(&mut self) -> StateDict<'_> {

@@ -69,12 +69,14 @@ impl Cloning {
 
     /// Copies of an episode's last action are learned, too: they may be executed.
     fn loss(&self, step: u64, batch: &Batch) -> Result<Loss> {
-        let batch = Batch { within: None, ..batch.clone() };
+        let mut batch = batch.clone();
+        batch.within = None;
         let (random, batch_size) = (self.context.random(step), batch.size());
         let (actor, shape) = (&self.networks.actor, &self.shape);
         let noise = Sampler { random, batch_size, shape, actor }.denoising()?;
         let (_, predicted) = denoise(actor, &batch, &noise)?;
-        Ok(Loss::new("bc_loss", squared_error(&predicted, &noise.epsilon)?))
+        let loss = squared_error(&predicted, &noise.epsilon)?;
+        Ok(Loss::new("bc_loss", loss))
     }
 
     fn learning_rate(&self, step: u64) -> f32 {

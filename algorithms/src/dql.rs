@@ -140,9 +140,8 @@ impl DiffusionUpdate for Config {
     }
 
     fn begin(&mut self, networks: &mut Networks, step: u64, _: &Context) -> Result<()> {
-        let adam = |rate: f32| AdamStep::after(step, rate).clipped(*self.gradient_clip);
-        networks.critic.adam.set_step(adam(*self.critic_learning_rate))?;
-        networks.actor.adam.set_step(adam(*self.actor_learning_rate))
+        let adam = |rate: Positive| AdamStep::after(step, *rate).clipped(*self.gradient_clip);
+        networks.set_steps([self.actor_learning_rate, self.critic_learning_rate].map(adam))
     }
 
     /// Algorithm 1's loop, but for the target actor.

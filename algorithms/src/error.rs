@@ -49,8 +49,8 @@ impl AlgorithmError {
 pub enum AgentError {
     #[error("[agent]: {0}")]
     Parse(String),
-    #[error("agent.{field} is {value}, but must be {range}")]
-    Range { field: &'static str, value: String, range: &'static str },
+    #[error("agent.{0} is {1}, but must be {2}")]
+    Range(&'static str, String, &'static str),
     #[error(
         "{0} learns single actions from single observations, so agent.chunk and agent.history must be 1"
     )]
@@ -90,6 +90,8 @@ pub(super) fn check(
     holds: bool,
     range: &'static str,
 ) -> Result<(), AgentError> {
-    let value = value.to_string();
-    if holds { Ok(()) } else { Err(AgentError::Range { field, value, range }) }
+    match holds {
+        true => Ok(()),
+        false => Err(AgentError::Range(field, value.to_string(), range)),
+    }
 }

@@ -149,8 +149,9 @@ impl Fqe {
             Tensor::from_slice(numbers, (n, numbers.len() / n), &self.context.device)
         };
         let critic = &self.networks.critic.target;
-        let values = critic.values(&rows(observations)?, &rows(actions)?)?.squeeze(0)?;
-        values.affine(self.units.scale, self.units.offset)?.to_device(&Device::Cpu)?.to_vec1()
+        let values = critic.values(&rows(observations)?, &rows(actions)?)?;
+        let values = values.affine(self.units.scale, self.units.offset)?;
+        values.squeeze(0)?.to_device(&Device::Cpu)?.to_vec1()
     }
 
     /// Everything that updates change.

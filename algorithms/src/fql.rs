@@ -128,7 +128,7 @@ impl Algorithm for Fql {
         let losses = self.losses(step, batch)?;
         let [critic_loss, bc_loss, actor_loss] = &losses;
         // The policy's gradient, by the critics as they are before their step.
-        let gradients = Gradients::of(&actor_loss.value)?;
+        let gradients = Gradients::backward(&actor_loss.value)?;
         self.critic.soft_update(*self.config.ema_rate)?;
         self.critic.minimize(&critic_loss.value, adam)?;
         self.flow.minimize(&bc_loss.value, adam)?;

@@ -34,7 +34,7 @@ impl Gaussian {
 
     /// Moves mean and log σ down a loss `[]`.
     pub fn minimize(&mut self, loss: &Tensor, step: AdamStep) -> Result<()> {
-        let gradients = Gradients::of(loss)?;
+        let gradients = Gradients::backward(loss)?;
         self.mean.apply_gradients(&gradients, step)?;
         self.log_std.apply_gradients(&gradients, step)?;
         Ok(())

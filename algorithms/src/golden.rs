@@ -15,13 +15,13 @@ use super::examples::{Columns, Examples};
 use super::losses::Measured;
 use super::replay::Inputs;
 use super::state_dict::StateDict;
-use candle_core::{D, DType, Device, Tensor};
+use candle_core::{D, DType, Device, NdArray, Tensor};
 use quad_dataset::{Arrays, ReadOptions, Transitions, Window};
 use quad_nn::{
     NoisePredictor, NoiseShape, Precision, Reverse, Scaling, Tensors, Weights, open_gpu,
 };
 use quad_policy::{
-    Aggregate, Choice, EpisodeState, Header, PolicyConfig, Rule, Samples, load_policy,
+    Aggregate, EpisodeState, Header, Policy, PolicyConfig, Rule, Samples, load_policy,
 };
 pub(super) use reader::{Golden, MAKE, committed, fresh, goldens, run};
 
@@ -52,13 +52,11 @@ pub(super) fn check_update(
     measured: &Measured,
     state: Tensors,
 ) {
-    let value =
-        |name| measured.iter().find(|metric| metric.0 == name).map_or(0.0, |metric| metric.1);
-    let in_folder = metrics.iter().filter(|Metric { name, .. }| {
-        golden.expected.contains_key(*name) && !state.contains_key(*name)
-    });
-    for Metric { name, .. } in in_folder {
-        golden.close(name, &Tensor::new(value(*name), &Device::Cpu).unwrap());
+    for Metric { name, .. } in metrics {
+        if golden.expected.contains_key(*name) && !state.contains_key(*name) {
+            let value = measured.iter().find(|metric| metric.0 == *name);
+            golden.close(name, &tensor(value.map_or(0.0, |metric| metric.1)));
+        }
     }
     for (name, tensor) in state {
         golden.close(&name, &tensor);
@@ -69,25 +67,29 @@ pub(super) fn check_update(
 pub(super) fn load(golden: &Golden, dict: StateDict<'_>) {
     let mut state = golden.state.clone();
     dict.load(&mut state).unwrap();
-    assert!(state.is_empty(), "tensors that are not read: {:?}", state.keys());
+    let unread = Vec::from_iter(state.keys());
+    assert!(unread.is_empty(), "not read: {unread:?}");
 }
 
 fn numbers(golden: &Golden, name: &str) -> Vec<f32> {
-    golden.inputs[name].to_dtype(DType::F32).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+    let input = golden.inputs[name].to_dtype(DType::F32).unwrap();
+    input.flatten_all().unwrap().to_vec1().unwrap()
+}
+
+fn tensor(numbers: impl NdArray) -> Tensor {
+    Tensor::new(numbers, &Device::Cpu).unwrap()
 }
 
 /// The rows of a golden folder as episodes that may go on after a success, read as OGBench's are.
 fn episodes(golden: &Golden) -> Transitions {
-    let name = format!("golden-{}-{:?}.npz", std::process::id(), std::thread::current().id());
-    let path = std::env::temp_dir().join(name);
-    let arrays =
-        ["observations", "actions", "rewards", "next_observations", "masks", "ends"].map(|name| {
-            (if name == "ends" { "terminals" } else { name }, golden.input(name, &Device::Cpu))
-        });
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("golden.npz");
+    let names = "observations actions rewards next_observations masks ends";
+    let array = |name| (name, golden.input(name, &Device::Cpu));
+    let mut arrays = Vec::from_iter(names.split(' ').map(array));
+    arrays[5].0 = "terminals";
     Tensor::write_npz(&arrays, &path).unwrap();
-    let transitions = Transitions::read(&path, &ReadOptions::default());
-    std::fs::remove_file(path).unwrap();
-    transitions.unwrap()
+    Transitions::read(&path, &ReadOptions::default()).unwrap()
 }
 
 /// The transitions of a golden folder's batch: each is an episode, unless the folder says where
@@ -96,24 +98,25 @@ fn transitions(golden: &Golden) -> Transitions {
     if golden.inputs.contains_key("ends") {
         return episodes(golden);
     }
-    let (o, a) = (golden.count("/observation_dim"), golden.count("/action_dim"));
+    let [o, a] = ["/observation_dim", "/action_dim"].map(|dim| golden.count(dim));
     // A folder of plans has no transitions.
     let given = |name: &str, width: usize| match golden.inputs.contains_key(name) {
         true => numbers(golden, name),
         false => vec![1.0; width],
     };
-    let terminals = Vec::from_iter(given("masks", 1).iter().map(|mask| *mask == 0.0));
-    Transitions::of(Arrays {
+    let flags = |numbers: Vec<f32>, flag| numbers.iter().map(|x| *x == flag).collect();
+    let terminals: Vec<bool> = flags(given("masks", 1), 0.0);
+    let arrays = Arrays {
         observation_dim: o,
         action_dim: a,
         observations: given("observations", o),
         actions: given("actions", a),
         rewards: given("rewards", 1),
         next_observations: given("next_observations", o),
-        timeouts: given("timeouts", terminals.len()).iter().map(|x| *x == 1.0).collect(),
+        timeouts: flags(given("timeouts", terminals.len()), 1.0),
         terminals,
-    })
-    .unwrap()
+    };
+    Transitions::of(arrays).unwrap()
 }
 
 /// The batch of a golden folder. Where that says where episodes end, it has windows of steps.
@@ -125,10 +128,8 @@ pub(super) fn batch(golden: &Golden, window: Window) -> Batch {
         return examples.batch(&indices).unwrap();
     }
     let given = |name: &str| golden.inputs.get(name).cloned();
-    let column = |name: &str| {
-        given(name)
-            .unwrap_or_else(|| Tensor::zeros((indices.len(), 1), DType::F32, &Device::Cpu).unwrap())
-    };
+    let zeros = Tensor::zeros((indices.len(), 1), DType::F32, &Device::Cpu).unwrap();
+    let column = |name: &str| given(name).unwrap_or_else(|| zeros.clone());
     Batch {
         observations: column("observations"),
         actions: column("actions"),
@@ -162,14 +163,19 @@ pub(super) fn table(golden: &Golden) -> toml::Table {
 
 fn check(definition: &Definition, golden: &Golden, device: &Device) {
     let (_, window, start) = definition.read(&table(golden)).unwrap();
-    let context = Context { window, ..context(golden, device) };
+    let mut context = context(golden, device);
+    context.window = window;
     let mut algorithm = (start.new)(context).unwrap();
     load(golden, algorithm.state_dict());
     check_policy(golden, &*algorithm);
-    let batch = batch(golden, window);
-    let batch = if algorithm.copies_batches() { batch } else { batch.on(device).unwrap() };
-    let measured = algorithm.update(golden.count("/step") as u64, &batch).unwrap();
-    check_update(golden, definition.metrics, &measured, algorithm.state_dict().save().unwrap());
+    let mut batch = batch(golden, window);
+    if !algorithm.copies_batches() {
+        batch = batch.on(device).unwrap();
+    }
+    let step = golden.count("/step") as u64;
+    let measured = algorithm.update(step, &batch).unwrap();
+    let state = algorithm.state_dict().save().unwrap();
+    check_update(golden, definition.metrics, &measured, state);
 }
 
 /// Compares the published policy: its candidates and their values, and its actions.
@@ -184,43 +190,51 @@ fn check_policy(golden: &Golden, algorithm: &dyn Algorithm) {
     let observations = numbers(golden, "select_observations");
     let n = observations.len() / policy.observation_dim();
     let noise = (!policy.noise().is_empty()).then(|| {
-        let noise = golden.inputs["select_noise"].reshape((policy.noise()[0], n, ())).unwrap();
-        noise.transpose(0, 1).unwrap().flatten_from(1).unwrap().to_vec2::<f32>().unwrap()
+        let noise = &golden.inputs["select_noise"];
+        let noise = noise.reshape((policy.noise()[0], n, ())).unwrap();
+        let noise = noise.transpose(0, 1).unwrap().flatten_from(1).unwrap();
+        noise.to_vec2::<f32>().unwrap()
     });
     let begin = || -> Vec<EpisodeState> {
         let noise = noise.clone().unwrap_or_else(|| vec![Vec::new(); n]);
         noise.into_iter().map(EpisodeState::with_noise).collect()
     };
-    if let Some(choice) = policy.choice() {
-        assert_eq!(choice.candidates as usize, golden.count("/agent/candidates"));
+    if let Some(mut choice) = policy.choice() {
+        let candidates = choice.candidates as usize;
+        assert_eq!(candidates, golden.count("/agent/candidates"));
         // The folders of all but QUAD have the smaller of the critics' values.
-        let aggregate =
-            if golden.config["algorithm"] == "quad" { choice.aggregate } else { Aggregate::Min };
-        policy = policy.with_choice(Choice { aggregate, ..choice }).unwrap();
-        let Samples { actions, values } = policy.sample(&observations, &mut begin()).unwrap();
-        let [actions, values] = [actions, values].map(|x| Tensor::new(x, &Device::Cpu).unwrap());
+        if name != "quad" {
+            choice.aggregate = Aggregate::Min;
+        }
+        policy = policy.with_choice(choice).unwrap();
+        let sample = |policy: &dyn Policy| policy.sample(&observations, &mut begin()).unwrap();
+        let Samples { actions, values } = sample(&*policy);
+        let values = tensor(values);
         // A planner has more candidates than first actions, and QUAD's folders have none.
         if !["diffuser", "quad"].contains(&name) {
-            golden.close("select.candidates", &actions);
+            golden.close("select.candidates", &tensor(actions));
         }
-        golden.close(if name == "diffuser" { "select.values" } else { "select.q" }, &values);
-        if golden.inputs.contains_key("select_guidance") {
-            let guided = Choice { guidance: numbers(golden, "select_guidance")[0], ..choice };
-            let guided = policy.with_choice(guided).unwrap().sample(&observations, &mut begin());
-            golden.close(
-                "select.guided",
-                &Tensor::new(guided.unwrap().actions, &Device::Cpu).unwrap(),
-            );
-        }
+        let values_name = match name {
+            "diffuser" => "select.values",
+            _ => "select.q",
+        };
+        golden.close(values_name, &values);
         if let Rule::Softmax { temperature } = choice.rule {
             let q = (values.reshape((n, ())).unwrap() / f64::from(temperature)).unwrap();
-            golden.close("select.probabilities", &candle_nn::ops::softmax(&q, D::Minus1).unwrap());
+            let probabilities = candle_nn::ops::softmax(&q, D::Minus1).unwrap();
+            golden.close("select.probabilities", &probabilities);
+        }
+        if golden.inputs.contains_key("select_guidance") {
+            choice.guidance = numbers(golden, "select_guidance")[0];
+            let guided = policy.with_choice(choice).unwrap();
+            golden.close("select.guided", &tensor(sample(&*guided).actions));
         }
     }
     if golden.expected.contains_key("select.actions") {
         let mut actions = vec![0.0; n * policy.action_dim()];
-        policy.act(&observations, &mut begin(), &mut actions).unwrap();
-        golden.close("select.actions", &Tensor::new(actions, &Device::Cpu).unwrap());
+        let acted = policy.act(&observations, &mut begin(), &mut actions);
+        acted.unwrap();
+        golden.close("select.actions", &tensor(actions));
     }
 }
 
@@ -228,9 +242,9 @@ fn check_all(goldens: &[Golden]) {
     for golden in goldens {
         let name = golden.config["algorithm"].as_str().unwrap();
         let definition = ALGORITHMS.iter().find(|definition| definition.name == name);
-        devices().iter().for_each(|device| {
-            definition.into_iter().for_each(|definition| check(definition, golden, device));
-        });
+        if let Some(definition) = definition {
+            devices().iter().for_each(|device| check(definition, golden, device));
+        }
     }
 }
 

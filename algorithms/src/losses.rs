@@ -41,13 +41,14 @@ pub(super) struct Loss {
     /// By name of metric, the loss first.
     pub scalars: Vec<(&'static str, Tensor)>,
     /// Tensors of any shape from which metrics are computed on the CPU.
-    pub others: Vec<Tensor>,
+    pub metric_inputs: Vec<Tensor>,
 }
 
 impl Loss {
     /// A loss that is the metric of this name.
     pub fn new(name: &'static str, value: Tensor) -> Self {
-        Self { scalars: vec![(name, value.clone())], value, others: Vec::new() }
+        let (scalars, metric_inputs) = (vec![(name, value.clone())], Vec::new());
+        Self { value, scalars, metric_inputs }
     }
 
     /// The critics' loss, and the mean of their targets y `[B]`.
@@ -65,25 +66,25 @@ impl Loss {
 /// The numbers of an update's metrics on their device.
 pub(super) struct Computed {
     names: Vec<&'static str>,
-    /// The scalars, then the other numbers, `[n]`.
+    /// The scalars, then the inputs of metrics, `[n]`.
     pub numbers: Tensor,
 }
 
 impl Computed {
     pub fn new(losses: &[Loss]) -> Result<Self> {
         let scalars = || losses.iter().flat_map(|loss| &loss.scalars);
-        let others = losses.iter().flat_map(|loss| &loss.others);
-        Ok(Self {
-            names: scalars().map(|(name, _)| *name).collect(),
-            numbers: joined(scalars().map(|(_, scalar)| scalar).chain(others))?,
-        })
+        let inputs = losses.iter().flat_map(|loss| &loss.metric_inputs);
+        let numbers = joined(scalars().map(|(_, scalar)| scalar).chain(inputs))?;
+        let names = scalars().map(|(name, _)| *name).collect();
+        Ok(Self { names, numbers })
     }
 
-    /// Copies the scalars by name and the other numbers, once they are computed.
+    /// Copies the scalars by name and the inputs of metrics, once they are computed.
     pub fn read(&self) -> Result<(Measured, Vec<f32>)> {
         let mut scalars = self.numbers.to_vec1()?;
-        let others = scalars.split_off(self.names.len());
-        Ok((self.names.iter().copied().zip(scalars).collect(), others))
+        let inputs = scalars.split_off(self.names.len());
+        let names = self.names.iter().copied();
+        Ok((names.zip(scalars).collect(), inputs))
     }
 }
 
@@ -93,5 +94,6 @@ pub(super) fn measured(losses: &[Loss]) -> Result<Measured> {
 
 /// The numbers of some tensors, one tensor after the other, `[n]`.
 pub(super) fn joined<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Result<Tensor> {
-    Tensor::cat(&tensors.into_iter().map(Tensor::flatten_all).collect::<Result<Vec<_>>>()?, 0)
+    let vectors = tensors.into_iter().map(Tensor::flatten_all);
+    Tensor::cat(&vectors.collect::<Result<Vec<_>>>()?, 0)
 }

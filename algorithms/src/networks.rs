@@ -82,7 +82,8 @@ pub(super) struct TrainState<N> {
 
 impl<N: Weighted> TrainState<N> {
     pub fn new(network: N) -> Result<Self> {
-        Ok(Self { adam: Adam::new(network.weights(), 0.0)?, network })
+        let adam = Adam::new(network.weights(), 0.0)?;
+        Ok(Self { network, adam })
     }
 
     /// Makes the weights decay by this share of the learning rate in each step.
@@ -93,12 +94,17 @@ impl<N: Weighted> TrainState<N> {
 
     /// Moves the network down a loss `[]`. Returns the gradient's norm before clipping, `[]`.
     pub fn minimize(&mut self, loss: &Tensor, step: AdamStep) -> Result<Tensor> {
-        self.apply_gradients(&Gradients::of(loss)?, step)
+        self.apply_gradients(&Gradients::backward(loss)?, step)
     }
 
-    /// [`Self::minimize`] with the step that [`Adam::set_step`] has set.
+    /// Sets the step of [`Self::minimize_as_set`].
+    pub fn set_step(&mut self, step: AdamStep) -> Result<()> {
+        self.adam.set_step(step)
+    }
+
+    /// [`Self::minimize`] with the step that [`Self::set_step`] has set.
     pub fn minimize_as_set(&mut self, loss: &Tensor) -> Result<Tensor> {
-        let gradient = Gradients::of(loss)?.with_respect_to(self.network.weights())?;
+        let gradient = Gradients::backward(loss)?.with_respect_to(self.network.weights())?;
         self.adam.apply(self.network.weights_mut(), &gradient)
     }
 
@@ -111,7 +117,8 @@ impl<N: Weighted> TrainState<N> {
 
     /// Adds a target network, which `copy` makes.
     pub fn with_target(self, copy: impl FnOnce(&N) -> Result<N>) -> Result<WithTarget<N>> {
-        Ok(WithTarget { target: copy(&self.network)?, online: self })
+        let target = copy(&self.network)?;
+        Ok(WithTarget { online: self, target })
     }
 }
 
@@ -194,8 +201,8 @@ impl<'a> Initializer<'a> {
     }
 
     /// A network with the weights of another and a new optimizer.
-    pub fn copy(&self, of: &TrainState<Ensemble>) -> Result<TrainState<Ensemble>> {
-        let (weights, shape) = (of.network.weights(), of.network.shape().clone());
+    pub fn copy(&self, other: &TrainState<Ensemble>) -> Result<TrainState<Ensemble>> {
+        let (weights, shape) = (other.network.weights(), other.network.shape().clone());
         let weights = Weights::trainable(weights.layout().clone(), &weights.values().detach())?;
         TrainState::new(Ensemble::new(shape, weights, self.context.precision))
     }
@@ -213,7 +220,9 @@ impl<'a> Initializer<'a> {
 
     /// Q_1 … Q_K with target networks.
     pub fn critics(&mut self, members: usize, layers: &MlpConfig) -> Result<WithTarget<Ensemble>> {
-        self.ensemble(EnsembleShape { members, ..self.shape(layers) })?.with_target(Ensemble::copy)
+        let mut shape = self.shape(layers);
+        shape.members = members;
+        self.ensemble(shape)?.with_target(Ensemble::copy)
     }
 
     /// V(s).
@@ -243,8 +252,9 @@ impl TrainState<Ensemble> {
     pub fn scale_last_layer(mut self, factor: f64) -> Result<Self> {
         let last = format!("{}.", self.network.shape().layers.hidden.len());
         let weights = self.network.weights_mut();
-        let of_last = weights.tensors("")?.into_iter().filter(|(name, _)| name.starts_with(&last));
-        let count = of_last.map(|(_, tensor)| tensor.elem_count()).sum();
+        let mut tensors = weights.tensors("")?;
+        tensors.retain(|name, _| name.starts_with(&last));
+        let count = tensors.values().map(Tensor::elem_count).sum();
         weights.change(|values| {
             let start = values.elem_count() - count; // it lies at the end
             values.slice_set(&(values.narrow(0, start, count)? * factor)?, 0, start)

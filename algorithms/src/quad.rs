@@ -51,7 +51,8 @@ impl Quad {
         };
         let eta = Tensor::new(*config.eta.initial, &context.device)?;
         let averages = Averages::new(&config, &context.device)?;
-        Diffusion::new(shape, context, |_, _| Ok(Self { config, eta, averages }))
+        let quad = Self { config, eta, averages };
+        Diffusion::new(shape, context, |_, _| Ok(quad))
     }
 
     /// y = r + γ·mask·(mean − ρ·std over the critics of each one's value of s') (Eq. 20), `[B]`. A
@@ -90,13 +91,15 @@ impl Quad {
         }
         let critics = &networks.critic.target;
         let noisy = (&noisy, &predicted.detach());
-        let guide = self.averages.guide(&self.config, critics, batch, noise, noisy)?;
+        let averages = &self.averages;
+        let guide = averages.guide(&self.config, critics, batch, noise, noisy)?;
         let gradient = (&guide.gradient * &noise.denoising.deviation)?;
         let pull = gradient.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
         let (loss, bc_loss) = pulled_error(&predicted, epsilon, &self.eta, &pull)?;
-        let others = metrics::lambda_inputs(&guide, error);
-        let loss = Loss { others, ..Loss::new("actor_loss", loss).with("bc_loss", bc_loss) };
-        Ok((loss.with("delta_share", guide.delta_share.clone()), Some(guide)))
+        let mut loss = Loss::new("actor_loss", loss).with("bc_loss", bc_loss);
+        loss.metric_inputs = metrics::lambda_inputs(&guide, error);
+        let loss = loss.with("delta_share", guide.delta_share.clone());
+        Ok((loss, Some(guide)))
     }
 
     /// η after a step of dual ascent: `excess` is how far the BC loss is above its threshold, `[]`.
@@ -117,9 +120,9 @@ impl DiffusionUpdate for Quad {
     fn begin(&mut self, networks: &mut Networks, step: u64, context: &Context) -> Result<()> {
         let config = &self.config;
         let decay = context.decay(step, *config.online_rate);
-        let adam = |rate| AdamStep::after(step, rate * decay).clipped(*config.gradient_clip);
-        networks.critic.adam.set_step(adam(*config.critic_learning_rate))?;
-        networks.actor.adam.set_step(adam(*config.actor_learning_rate))
+        let clip = *config.gradient_clip;
+        let adam = |rate: Positive| AdamStep::after(step, *rate * decay).clipped(clip);
+        networks.set_steps([config.actor_learning_rate, config.critic_learning_rate].map(adam))
     }
 
     /// Algorithm 1's loop, but for the target actor.
@@ -144,7 +147,8 @@ impl DiffusionUpdate for Quad {
             if let Some(threshold) = self.config.eta.threshold {
                 let (_, predicted) = denoise(&networks.actor.detach(), batch, &noise.denoising)?;
                 let bc_loss = squared_error(&predicted, &noise.denoising.epsilon)?;
-                write(&self.eta, &self.ascended_eta((bc_loss - f64::from(*threshold))?)?)?;
+                let eta = self.ascended_eta((bc_loss - f64::from(*threshold))?)?;
+                write(&self.eta, &eta)?;
             }
         }
         let nu_squared = guide.map(|_| self.averages.nu_squared.clone());

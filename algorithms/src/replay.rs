@@ -78,7 +78,8 @@ impl<I: Inputs> Replay<I> {
         }
         // In place, where recorded work reads them.
         overwrite(&kept.numbers, &numbers(inputs)?)?;
-        for (tensor, new) in kept.inputs.tensors().into_iter().zip(inputs.clone().tensors()) {
+        let mut copies = inputs.clone();
+        for (tensor, new) in kept.inputs.tensors().into_iter().zip(copies.tensors()) {
             if new.dtype() != DType::F32 {
                 overwrite(tensor, new)?;
             }
@@ -104,7 +105,8 @@ impl<I: Inputs> Replay<I> {
 /// The inputs' numbers of f32 in one vector, which one copy takes to a GPU.
 fn numbers(inputs: &impl Inputs) -> Result<Tensor> {
     let mut inputs = inputs.clone();
-    joined(inputs.tensors().into_iter().map(|x| &*x).filter(|x| x.dtype() == DType::F32))
+    let tensors = inputs.tensors().into_iter().map(|x| &*x);
+    joined(tensors.filter(|x| x.dtype() == DType::F32))
 }
 
 /// The inputs as views of a vector of [`numbers`]; those of other types are copied to its device.

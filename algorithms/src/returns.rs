@@ -24,7 +24,8 @@ pub(super) fn calibrated(rewards: &[f32], terminates: bool, gamma: f64) -> Vec<f
     if failed && gamma < 1.0 && rewards.iter().all(|reward| *reward == rewards[0]) {
         return vec![(f64::from(rewards[0]) / (1.0 - gamma)) as f32; rewards.len()];
     }
-    discounted(rewards, gamma, 0.0).into_iter().map(|value| value as f32).collect()
+    let returns = discounted(rewards, gamma, 0.0).into_iter();
+    returns.map(|value| value as f32).collect()
 }
 
 /// Least divisor of the returns.
@@ -48,9 +49,14 @@ impl Returns {
     /// The returns to the episodes' ends, discounted by `gamma`.
     pub fn new(rewards: Vec<f32>, episodes: Vec<Range<usize>>, gamma: f32) -> Result<Self> {
         let zeros = |count: usize| Tensor::zeros(count, DType::F32, &Device::Cpu);
-        let (values, targets, scale) = (zeros(rewards.len())?, zeros(rewards.len())?, zeros(2)?);
-        let mut returns =
-            Self { gamma: f64::from(gamma), rewards, episodes, values, targets, scale };
+        let mut returns = Self {
+            gamma: f64::from(gamma),
+            values: zeros(rewards.len())?,
+            targets: zeros(rewards.len())?,
+            scale: zeros(2)?,
+            rewards,
+            episodes,
+        };
         returns.standardize(&returns.planned(None))?;
         Ok(returns)
     }
@@ -68,7 +74,8 @@ impl Returns {
 
     /// The mean value of a range of states, if it is not empty.
     pub fn mean_value(&self, states: Range<usize>) -> Result<Option<f32>> {
-        let values: Vec<f32> = self.values.narrow(0, states.start, states.len())?.to_vec1()?;
+        let values = self.values.narrow(0, states.start, states.len())?;
+        let values: Vec<f32> = values.to_vec1()?;
         Ok((!values.is_empty()).then(|| values.iter().sum::<f32>() / values.len() as f32))
     }
 
@@ -101,12 +108,9 @@ impl Returns {
         let count = returns.len() as f64;
         let mean = returns.iter().sum::<f64>() / count;
         let deviation = (returns.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt();
-        // Not their maximum, which would drop a NaN.
-        let deviation = if deviation < LEAST_DEVIATION { LEAST_DEVIATION } else { deviation };
-        self.targets = Tensor::from_iter(
-            returns.iter().map(|x| ((x - mean) / deviation) as f32),
-            &Device::Cpu,
-        )?;
+        let deviation = deviation.clamp(LEAST_DEVIATION, f64::INFINITY); // keeps a NaN
+        let targets = returns.iter().map(|x| ((x - mean) / deviation) as f32);
+        self.targets = Tensor::from_iter(targets, &Device::Cpu)?;
         self.scale = Tensor::new(&[mean as f32, deviation as f32], &Device::Cpu)?;
         Ok(())
     }
@@ -124,13 +128,13 @@ mod tests {
 
     #[test]
     fn returns_reach_to_the_end_of_an_episode_and_plans_improve_them() {
-        let mut returns =
-            Returns::new(vec![1.0, 2.0, 0.0, 0.0, 4.0], vec![0..2, 2..5], 0.5).unwrap();
+        let (rewards, episodes) = (vec![1.0, 2.0, 0.0, 0.0, 4.0], vec![0..2, 2..5]);
+        let mut returns = Returns::new(rewards, episodes, 0.5).unwrap();
         assert_eq!(returns.planned(None), [2.0, 2.0, 1.0, 2.0, 4.0]);
-        let (targets, deviation): (Vec<f32>, f32) =
-            (returns.targets.to_vec1().unwrap(), 0.96f32.sqrt());
-        assert!((targets[4] - 1.8 / deviation).abs() < 1e-6, "{targets:?}");
-        let unscaled = returns.unscaled(&returns.targets).unwrap().to_vec1::<f32>().unwrap();
+        let targets: Vec<f32> = returns.targets.to_vec1().unwrap();
+        assert!((targets[4] - 1.8 / 0.96f32.sqrt()).abs() < 1e-6, "{targets:?}");
+        let unscaled = returns.unscaled(&returns.targets).unwrap();
+        let unscaled: Vec<f32> = unscaled.to_vec1().unwrap();
         assert!((unscaled[4] - 4.0).abs() < 1e-6, "{unscaled:?}");
         // A value counts where it is larger, and so does it for what came before.
         let values = [0.0, 6.0, 0.0, 1.0, 4.5];

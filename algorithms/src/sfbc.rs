@@ -147,7 +147,7 @@ impl Sfbc {
             Ok((0..rows).map(|_| generator.random_range(FIRST_TIME..1.0)).collect())
         })?;
         let column = |factor: fn(ContinuousNoise) -> f64| {
-            let numbers = t.iter().map(|t| factor(ContinuousNoise::at(*t)) as f32);
+            let numbers = t.iter().map(|t| factor(ContinuousNoise::new(*t)) as f32);
             Tensor::from_vec(numbers.collect(), (rows, 1), &self.context.device)
         };
         let signal = batch.actions.broadcast_mul(&column(|noise| noise.signal)?)?;
@@ -177,7 +177,8 @@ impl Sfbc {
         if states.end == self.examples.len() {
             self.returns.plan()?;
         }
-        Ok(self.returns.mean_value(states)?.map(|mean| ("v_mean", mean)).into_iter().collect())
+        let mean = self.returns.mean_value(states)?;
+        Ok(mean.map(|mean| ("v_mean", mean)).into_iter().collect())
     }
 
     /// Keeps V(s) = Σ softmax(Q/temperature)·Q over S actions of the clone, in units of the return,
@@ -189,7 +190,8 @@ impl Sfbc {
         let observations = batch.observations.to_device(&self.context.device)?;
         let solver = DpmSolver::new(*self.config.evaluations);
         let actions = actor.sample(&solver, &observations, &self.noise(&rows)?)?;
-        let q = critic.detach().values(&observations, &actions)?.reshape((rows.len(), ()))?;
+        let q = critic.detach().values(&observations, &actions)?;
+        let q = q.reshape((rows.len(), ()))?;
         let exponents = q.broadcast_sub(&q.max_keepdim(1)?)?;
         let weights = (exponents / f64::from(*self.config.planning_temperature))?.exp()?;
         let values = ((&weights * q)?.sum(1)? / weights.sum(1)?)?;

@@ -28,22 +28,24 @@ impl Squashed {
 
     /// Makes log σ a learned linear function of the network's output with these initial c₁ and c₂,
     /// and the last layer smaller by a factor.
-    pub fn with_map(self, map: [f32; 2], factor: f64, init: &Initializer<'_>) -> Result<Self> {
-        let map = Some(init.numbers("log_std_map", &map)?);
-        Ok(Self { network: self.network.scale_last_layer(factor)?, map, ..self })
+    pub fn with_map(mut self, map: [f32; 2], factor: f64, init: &Initializer<'_>) -> Result<Self> {
+        self.map = Some(init.numbers("log_std_map", &map)?);
+        self.network = self.network.scale_last_layer(factor)?;
+        Ok(self)
     }
 
     /// The distributions of u in these states, `[n, o]`; differentiable in all that is learned.
     pub fn distribution(&self, observations: &Tensor) -> Result<Normal> {
-        self.of(&self.network, observations)
+        self.forward(&self.network, observations)
     }
 
     /// [`Self::distribution`] as constants.
     pub fn constant_distribution(&self, observations: &Tensor) -> Result<Normal> {
-        Ok(self.of(&self.network.detach(), observations)?.detach())
+        let distribution = self.forward(&self.network.detach(), observations)?;
+        Ok(distribution.detach())
     }
 
-    fn of(&self, network: &Ensemble, observations: &Tensor) -> Result<Normal> {
+    fn forward(&self, network: &Ensemble, observations: &Tensor) -> Result<Normal> {
         let out = network.state_outputs(observations)?.squeeze(0)?;
         let a = out.dim(1)? / 2;
         let (mean, x) = (out.narrow(1, 0, a)?, out.narrow(1, a, a)?);
@@ -54,12 +56,13 @@ impl Squashed {
             }
             None => x,
         };
-        Ok(Normal { mean, log_std: log_std.clamp(self.bounds.0, self.bounds.1)? })
+        let log_std = log_std.clamp(self.bounds.0, self.bounds.1)?;
+        Ok(Normal { mean, log_std })
     }
 
     /// Moves all that is learned down a loss `[]`.
     pub fn minimize(&mut self, loss: &Tensor, step: AdamStep) -> Result<()> {
-        let gradients = Gradients::of(loss)?;
+        let gradients = Gradients::backward(loss)?;
         self.network.apply_gradients(&gradients, step)?;
         if let Some(map) = &mut self.map {
             map.apply_gradients(&gradients, step)?;
@@ -71,14 +74,18 @@ impl Squashed {
     /// layer.
     pub fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let (policy, mut tensors) = gaussian_policy(&self.network, Spread::Squashed, None)?;
-        let Some(map) = &self.map else { return Ok((policy, tensors)) };
-        let (c, shape) = (map.values().detach().to_vec1::<f32>()?, self.network.shape());
+        let Some(map) = &self.map else {
+            return Ok((policy, tensors));
+        };
+        let c: Vec<f32> = map.values().detach().to_vec1()?;
+        let shape = self.network.shape();
         let (a, last) = (shape.outputs / 2, format!(".{}.", shape.layers.hidden.len()));
         for (name, tensor) in tensors.iter_mut().filter(|(name, _)| name.contains(&last)) {
             let columns = tensor.rank() - 1;
             let offset = if name.ends_with("bias") { c[1] } else { 0.0 };
-            let x = tensor.narrow(columns, a, a)?.affine(c[0].into(), offset.into())?;
-            *tensor = Tensor::cat(&[&tensor.narrow(columns, 0, a)?, &x], columns)?;
+            let (mean, x) = (tensor.narrow(columns, 0, a)?, tensor.narrow(columns, a, a)?);
+            let x = x.affine(c[0].into(), offset.into())?;
+            *tensor = Tensor::cat(&[mean, x], columns)?;
         }
         Ok((policy, tensors))
     }
@@ -109,14 +116,15 @@ pub(super) struct Drawn {
 
 impl Normal {
     pub fn detach(&self) -> Self {
-        Self { mean: self.mean.detach(), log_std: self.log_std.detach() }
+        let [mean, log_std] = [&self.mean, &self.log_std].map(Tensor::detach);
+        Self { mean, log_std }
     }
 
     /// Actions tanh(mean + σ·noise) for standard normal noise `[n, S, a]`. Actions and densities
     /// are differentiable in mean and log σ.
     pub fn draw(&self, noise: &Tensor) -> Result<Drawn> {
-        let log_std = self.log_std.unsqueeze(1)?;
-        let u = noise.broadcast_mul(&log_std.exp()?)?.broadcast_add(&self.mean.unsqueeze(1)?)?;
+        let (mean, log_std) = (self.mean.unsqueeze(1)?, self.log_std.unsqueeze(1)?);
+        let u = noise.broadcast_mul(&log_std.exp()?)?.broadcast_add(&mean)?;
         Ok(Drawn { actions: u.tanh()?, log_density: log_density(&u, noise, &log_std)? })
     }
 
@@ -133,10 +141,11 @@ impl Normal {
 /// u rounds to ±1.
 fn log_density(u: &Tensor, noise: &Tensor, log_std: &Tensor) -> Result<Tensor> {
     let size = u.abs()?;
-    let jacobian =
-        ((size.affine(-2.0, 0.0)?.exp()? + 1.0)?.log()? + size)?.affine(-2.0, 2.0 * 2f64.ln())?;
+    let softplus = (size.affine(-2.0, 0.0)?.exp()? + 1.0)?.log()?;
+    let jacobian = (softplus + size)?.affine(-2.0, 2.0 * 2f64.ln())?;
     let half_log_2_pi = 0.5 * (2.0 * std::f64::consts::PI).ln();
-    let normal = noise.sqr()?.affine(-0.5, -half_log_2_pi)?.broadcast_sub(log_std)?;
+    let normal = noise.sqr()?.affine(-0.5, -half_log_2_pi)?;
+    let normal = normal.broadcast_sub(log_std)?;
     (normal - jacobian)?.sum(candle_core::D::Minus1)
 }
 
@@ -145,38 +154,17 @@ mod tests {
     use super::*;
     use candle_core::Device;
 
-    /// One state and as many dimensions as numbers.
-    fn row(numbers: &[f64]) -> Tensor {
-        Tensor::from_slice(numbers, (1, numbers.len()), &Device::Cpu).unwrap()
-    }
-
-    fn normal(mean: &[f64], log_std: &[f64]) -> Normal {
-        Normal { mean: row(mean), log_std: row(log_std) }
-    }
-
-    fn number(x: &Tensor) -> f64 {
-        x.flatten_all().unwrap().to_vec1::<f64>().unwrap()[0]
-    }
-
-    #[test]
-    fn drawn_and_given_actions_have_the_same_density() {
-        let distribution = normal(&[0.3, -0.7], &[-0.4, 0.1]);
-        let noise = row(&[0.5, -1.2]).unsqueeze(1).unwrap();
-        let Drawn { actions, log_density } = distribution.draw(&noise).unwrap();
-        assert_eq!((actions.dims(), log_density.dims()), (&[1, 1, 2][..], &[1, 1][..]));
-        let again = distribution.log_density(&actions.squeeze(1).unwrap()).unwrap();
-        assert!((number(&log_density) - number(&again)).abs() < 1e-10);
-    }
-
     /// The density is still that of u: log(1 − tanh² u) is 2·(log 2 − u) where tanh(u) is 1 in f32.
     #[test]
     fn densities_are_finite_where_actions_round_to_one() {
-        let one = |x: f32| Tensor::from_slice(&[x], (1, 1), &Device::Cpu).unwrap();
-        let distribution = Normal { mean: one(30.0), log_std: one(0.0) };
-        let drawn = distribution.draw(&one(0.0).unsqueeze(1).unwrap()).unwrap();
-        let found = drawn.log_density.flatten_all().unwrap().to_vec1::<f32>().unwrap()[0];
+        let number = |x: f32| Tensor::new(&[[x]], &Device::Cpu).unwrap();
+        let (mean, log_std) = (number(30.0), number(0.0));
+        let noise = number(0.0).unsqueeze(1).unwrap();
+        let drawn = Normal { mean, log_std }.draw(&noise).unwrap();
+        let [action, log_density] = [drawn.actions, drawn.log_density]
+            .map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap()[0]);
         let expected = -0.5 * (2.0 * std::f32::consts::PI).ln() - 2.0 * (2f32.ln() - 30.0);
-        assert_eq!(drawn.actions.flatten_all().unwrap().to_vec1::<f32>().unwrap(), [1.0]);
-        assert!((found - expected).abs() < 1e-4, "{found} {expected}");
+        assert_eq!(action, 1.0);
+        assert!((log_density - expected).abs() < 1e-4, "{log_density}");
     }
 }

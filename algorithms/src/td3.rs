@@ -87,12 +87,12 @@ impl<R: BcRegularizer> Td3<R> {
     /// action a'.
     fn targets(&self, step: u64, batch: &Batch) -> Result<Tensor> {
         let common = self.regularizer.common();
-        let noise = self.context.random(step).normal("target_noise", batch.actions.shape())?;
+        let mut random = self.context.random(step);
+        let noise = random.normal("target_noise", batch.actions.shape())?;
         let limit = f64::from(*common.target_noise_limit);
         let noise = (noise * f64::from(*common.target_noise))?.clamp(-limit, limit)?;
-        let actions = (gaussian_mean(&self.networks.actor.target, &batch.next_observations)?
-            + noise)?
-            .clamp(-1.0, 1.0)?;
+        let mean = gaussian_mean(&self.networks.actor.target, &batch.next_observations)?;
+        let actions = (mean + noise)?.clamp(-1.0, 1.0)?;
         let mut q = smallest(&batch.next_values(&self.networks.critic.target, &actions)?)?;
         if let (Some(penalty), Some(next)) = (self.regularizer.penalty(), &batch.next_actions) {
             q = (q - ((actions - next)?.sqr()?.sum(1)? * f64::from(penalty))?)?;
@@ -130,7 +130,8 @@ impl<R: BcRegularizer> Algorithm for Td3<R> {
                 actor.soft_update(*common.ema_rate)?;
             }
             critic.soft_update(*common.ema_rate)?;
-            write(&self.actor_losses, &joined([&actor_loss, &bc_loss])?.detach())?;
+            let losses = joined([&actor_loss, &bc_loss])?;
+            write(&self.actor_losses, &losses.detach())?;
         }
         if step >= first {
             let [actor_loss, bc_loss] = [self.actor_losses.get(0)?, self.actor_losses.get(1)?];
@@ -141,8 +142,8 @@ impl<R: BcRegularizer> Algorithm for Td3<R> {
 
     fn evaluate(&self, step: u64, batch: &Batch) -> Result<Measured> {
         let [actor_loss, bc_loss] = self.actor_loss(step, batch)?;
-        let critic_loss = self.critic_loss(step, batch)?;
-        measured(&[critic_loss, Loss::new("actor_loss", actor_loss).with("bc_loss", bc_loss)])
+        let actor_loss = Loss::new("actor_loss", actor_loss).with("bc_loss", bc_loss);
+        measured(&[self.critic_loss(step, batch)?, actor_loss])
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {

@@ -36,7 +36,7 @@ pub struct Values {
 impl Values {
     /// Reads an algorithm's values.
     #[allow(clippy::expect_used)] // The file is part of the program; a test reads each.
-    pub fn of(definition: &Definition) -> Self {
+    pub fn read(definition: &Definition) -> Self {
         toml::from_str(definition.presets).expect("the embedded values are valid")
     }
 

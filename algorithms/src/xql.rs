@@ -77,22 +77,23 @@ impl ImplicitLosses for Config {
         step: u64,
         batch: &Batch,
     ) -> Result<Option<(Tensor, Tensor)>> {
-        let (n, noise) = (usize::from(self.random_actions), f64::from(*self.value_noise));
+        let n = usize::from(self.random_actions);
+        let noise = f64::from(*self.value_noise);
         if n == 0 && noise == 0.0 {
             return Ok(None);
         }
         let (mut states, mut actions) = (batch.observations.clone(), batch.actions.clone());
         let (mut random, (b, a)) = (context.random(step), actions.dims2()?);
-        let others = (n > 0).then(|| random.uniform("random_actions", (n * b, a), -1.0..1.0));
+        let drawn = (n > 0).then(|| random.uniform("random_actions", (n * b, a), -1.0..1.0));
         if noise > 0.0 {
             let noise = (random.normal("value_noise", (b, a))? * noise)?;
             actions = (actions + noise.clamp(-LARGEST_NOISE, LARGEST_NOISE)?)?.clamp(-1.0, 1.0)?;
         }
-        if let Some(others) = others.transpose()? {
-            let (_, o) = states.dims2()?;
-            let again = states.unsqueeze(1)?.broadcast_as((b, n, o))?.reshape((n * b, o))?;
-            states = Tensor::cat(&[&states, &again], 0)?;
-            actions = Tensor::cat(&[&actions, &others], 0)?;
+        if let Some(drawn) = drawn.transpose()? {
+            let o = states.dim(1)?;
+            let again = states.unsqueeze(1)?.broadcast_as((b, n, o))?;
+            states = Tensor::cat(&[&states, &again.reshape((n * b, o))?], 0)?;
+            actions = Tensor::cat(&[&actions, &drawn], 0)?;
         }
         Ok(Some((states, actions)))
     }

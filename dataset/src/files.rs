@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::recording::{ACTION_NAMES, OBSERVATION_NAMES, Recording};
-use crate::tables::environment::{EnvironmentSpec, simulation_of};
+use crate::tables::environment::{EnvironmentSpec, simulation_name};
 use crate::tables::maze::MazeTask;
 
 /// A file of a dataset.
@@ -48,7 +48,9 @@ pub(crate) fn environment(
         let (source, error) = (Source::open(path)?, |problem| DatasetError::new(path, problem));
         asked.map_or(Ok(()), |asked| source.check_environment(asked)).map_err(error)?;
         match (&first, source.environment()) {
-            (Some((other, theirs)), Some(own)) if simulation_of(&own) != simulation_of(theirs) => {
+            (Some((other, theirs)), Some(own))
+                if simulation_name(&own) != simulation_name(theirs) =>
+            {
                 let difference = format!("recorded in `{own}`, not in `{theirs}`");
                 return Err(error(Problem::Unlike(other.to_path_buf(), difference)));
             }

@@ -89,7 +89,7 @@ fn select(criterion: &mut Criterion) {
 fn environments(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("environment");
     // Environments of one simulation differ in the goal alone.
-    for spec in environment::all().iter().filter(|spec| spec.name == spec.simulation()) {
+    for spec in environment::specs().iter().filter(|spec| spec.name == spec.simulation()) {
         let mut environment = make(spec, 0).expect("MuJoCo compiles the embedded model");
         let mut random = ChaCha8Rng::seed_from_u64(0);
         let mut action = vec![0.0; spec.action_dim];

@@ -182,6 +182,7 @@ vectorized! {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use super::Activation::{Gelu, Mish, Relu, Silu, Tanh};
     use super::*;
 
     /// Mish and its derivative in double precision.
@@ -195,62 +196,64 @@ pub(crate) mod tests {
     fn exact(f: Activation, x: f64) -> (f64, f64) {
         let sigmoid = 1.0 / (1.0 + (-x).exp());
         match f {
-            Activation::Mish => mish_f64(x),
-            Activation::Relu => (x.max(0.0), f64::from(x > 0.0)),
-            Activation::Silu => (x * sigmoid, sigmoid * (1.0 + x * (1.0 - sigmoid))),
-            Activation::Tanh => (x.tanh(), 1.0 - x.tanh().powi(2)),
-            Activation::Gelu => {
+            Mish => mish_f64(x),
+            Relu => (x.max(0.0), f64::from(x > 0.0)),
+            Silu => (x * sigmoid, sigmoid * (1.0 + x * (1.0 - sigmoid))),
+            Tanh => (x.tanh(), 1.0 - x.tanh().powi(2)),
+            Gelu => {
                 let c = (2.0 / std::f64::consts::PI).sqrt();
                 let t = (c * (x + 0.044715 * x.powi(3))).tanh();
                 let inner = c * (1.0 + 0.134145 * x * x);
-                (0.5 * x * (1.0 + t), 0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * inner)
+                let slope = 0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * inner;
+                (0.5 * x * (1.0 + t), slope)
             }
         }
     }
 
-    const ALL: [Activation; 5] =
-        [Activation::Mish, Activation::Relu, Activation::Silu, Activation::Tanh, Activation::Gelu];
+    const ACTIVATIONS: [Activation; 5] = [Mish, Relu, Silu, Tanh, Gelu];
 
     /// Value and slope by the loop with slopes, of which the value is compared with the other loop.
-    fn at(f: Activation, x: f32) -> (f32, f32) {
+    fn value_and_slope(f: Activation, x: f32) -> (f32, f32) {
         let (mut y, mut plain, mut slope) = ([x], [x], [0.0]);
         activate_with_slope(f, &mut y, &[0.0], &mut slope);
         activate(f, &mut plain, &[0.0]);
-        assert!((y[0] - plain[0]).abs() <= 1e-6 * y[0].abs() || x.is_nan(), "{f:?}({x})");
+        let is_close = (y[0] - plain[0]).abs() <= 1e-6 * y[0].abs();
+        assert!(is_close || x.is_nan(), "{f:?}({x})");
         (y[0], slope[0])
     }
 
     #[test]
     fn activations_match_their_definitions() {
-        for (f, i) in ALL.into_iter().flat_map(|f| (-4000..=4000).map(move |i| (f, i))) {
+        for (f, i) in ACTIVATIONS.into_iter().flat_map(|f| (-4000..=4000).map(move |i| (f, i))) {
             let x = i as f32 * 0.025;
-            let ((y, slope), (y64, slope64)) = (at(f, x), exact(f, f64::from(x)));
-            let errors = [(f64::from(y) - y64).abs(), (f64::from(slope) - slope64).abs()];
-            assert!(errors[0] <= 1e-6 * y64.abs() + 2e-7, "{f:?}({x}) = {y} for {y64}");
+            let (y, slope) = value_and_slope(f, x);
+            let (y64, slope64) = exact(f, f64::from(x));
+            let errors = [f64::from(y) - y64, f64::from(slope) - slope64].map(f64::abs);
+            assert!(errors[0] <= 1e-6 * y64.abs() + 2e-7, "{f:?}({x})");
             assert!(errors[1] <= 2e-6 * slope64.abs() + 1e-6, "{f:?}'({x})");
         }
-        let mish = f64::from(at(Activation::Mish, -30.0).0);
-        assert!((mish / mish_f64(-30.0).0 - 1.0).abs() < 1e-6, "relative error of {mish}");
+        let ratio = f64::from(value_and_slope(Mish, -30.0).0) / mish_f64(-30.0).0;
+        assert!((ratio - 1.0).abs() < 1e-6, "{ratio}");
     }
 
     #[test]
     fn activations_are_finite_and_a_nan_is_kept() {
-        for f in ALL {
+        for f in ACTIVATIONS {
             for x in [-f32::MAX, -1e30, -100.0, -0.0, 88.0, 89.0, 1e30] {
-                let (y, slope) = at(f, x);
-                assert!(y.is_finite() && slope.is_finite(), "{f:?} at {x}: {y} {slope}");
+                let (y, slope) = value_and_slope(f, x);
+                assert!(y.is_finite() && slope.is_finite(), "{f:?}({x})");
             }
-            assert!(at(f, f32::NAN).0.is_nan(), "{f:?}");
+            assert!(value_and_slope(f, f32::NAN).0.is_nan(), "{f:?}");
         }
     }
 
     #[test]
     fn a_unit_that_is_off_makes_no_subnormal_numbers() {
-        for f in [Activation::Mish, Activation::Silu, Activation::Gelu] {
+        for f in [Mish, Silu, Gelu] {
             for x in [-30.0, -87.0, -1e30] {
-                let (y, slope) = at(f, x);
-                let normal = (1e-10 * y).is_normal() && (1e-10 * slope).is_normal();
-                assert!(normal, "{f:?} at {x}: {y} {slope}");
+                let (y, slope) = value_and_slope(f, x);
+                let is_normal = (1e-10 * y).is_normal() && (1e-10 * slope).is_normal();
+                assert!(is_normal, "{f:?}({x})");
             }
         }
     }

@@ -38,6 +38,14 @@ pub(crate) struct Strided<T> {
     pub column: usize,
 }
 
+impl<T> Strided<T> {
+    /// A matrix whose rows are contiguous, `row` elements apart.
+    pub fn row_major(first: *const T, row: usize) -> Self {
+        let column = 1;
+        Self { first, row, column }
+    }
+}
+
 /// Two neighboring terms of a sum, rounded to bfloat16.
 type Pair = i32;
 
@@ -215,7 +223,7 @@ pub(crate) unsafe fn multiply_packed(
     b: *const f32,
     c: *mut f32,
 ) {
-    let a = Strided { first: a, row: k, column: 1 };
+    let a = Strided::row_major(a, k);
     for j in (0..n).step_by(COLUMNS) {
         // SAFETY: block j and its columns of the result are inside.
         unsafe {
@@ -291,7 +299,7 @@ pub(crate) unsafe fn multiply_transposed(
     block_of_b.resize(n * COLUMNS / LANES, Line([0.0; LANES]));
     let block = block_of_b.as_mut_ptr().cast::<f32>();
     // SAFETY: the caller's.
-    let a = unsafe { spread(m, n, Strided { first: a, row: n, column: 1 }, &mut left) };
+    let a = unsafe { spread(m, n, Strided::row_major(a, n), &mut left) };
     for j in (0..k).step_by(COLUMNS) {
         // SAFETY: rows j..j + 32 of `b` become the columns of a block, n × 32.
         unsafe {

@@ -19,13 +19,13 @@ const SUMS: usize = 256;
 /// Prepares a process that computes on one stream. The driver keeps free memory, which it would
 /// return whenever the host waits for the GPU, and arrays have no events, which would order streams.
 pub fn prepare(context: &CudaContext) -> Result<()> {
-    let mut all = u64::MAX;
+    let mut bytes = u64::MAX;
     let threshold = CUmemPool_attribute::CU_MEMPOOL_ATTR_RELEASE_THRESHOLD;
     // SAFETY: the pool is that of the context's device, and this attribute is an unsigned number of
     // 64 bits.
     unsafe {
         let pool = device::get_default_mem_pool(context.cu_device())?;
-        mem_pool::set_attribute(pool, threshold, (&raw mut all).cast())?;
+        mem_pool::set_attribute(pool, threshold, (&raw mut bytes).cast())?;
     }
     // SAFETY: cudarc records events for streams that it has made, of which there are none.
     unsafe { context.disable_event_tracking() };
@@ -59,21 +59,16 @@ pub fn adam(
     let kernels = kernels(stream)?;
     // SAFETY: the kernels write every number.
     let (mut partial, mut norm) = unsafe { (stream.alloc::<f32>(SUMS)?, stream.alloc::<f32>(1)?) };
-    let all = count as u32;
+    let len = count as u32;
     let mut launch = stream.launch_builder(&kernels.squares);
-    launch.arg(gradient).arg(&mut partial).arg(&all);
+    launch.arg(gradient).arg(&mut partial).arg(&len);
     // SAFETY: the arguments are those of the kernel, which has a block for each of the sums.
     unsafe { launch.launch(threads(SUMS * BLOCK as usize))? };
     let (mut first, mut second) = moments.split_at_mut(count);
     let mut launch = stream.launch_builder(&kernels.adam);
-    launch
-        .arg(parameters)
-        .arg(&mut first)
-        .arg(&mut second)
-        .arg(gradient)
-        .arg(&partial)
-        .arg(&mut norm);
-    launch.arg(&all).arg(&clip).arg(rates);
+    launch.arg(parameters).arg(&mut first).arg(&mut second);
+    launch.arg(gradient).arg(&partial).arg(&mut norm);
+    launch.arg(&len).arg(&clip).arg(rates);
     // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
     unsafe { launch.launch(threads(count.min(1024 * BLOCK as usize)))? };
     Ok(norm)
@@ -89,9 +84,9 @@ pub fn ema(
     let count = target.len();
     assert!(online.len() == count, "equally many numbers");
     let kernels = kernels(stream)?;
-    let all = count as u32;
+    let len = count as u32;
     let mut launch = stream.launch_builder(&kernels.ema);
-    launch.arg(target).arg(online).arg(&all).arg(&rate);
+    launch.arg(target).arg(online).arg(&len).arg(&rate);
     // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
     unsafe { launch.launch(threads(count))? };
     Ok(())
@@ -109,7 +104,7 @@ pub fn squared_error(
     let kernels = kernels(stream)?;
     // SAFETY: the kernels write every number.
     let mut out = unsafe { stream.alloc::<f32>(gradient.map_or(1, |_| x.len()))? };
-    let (all, count, none) = (x.len() as u32, y.len() as u32, 0_u64);
+    let (len, period, none) = (x.len() as u32, y.len() as u32, 0_u64);
     let (kernel, config) = match gradient {
         Some(_) => (&kernels.squared_error_gradient, threads(x.len())),
         None => (&kernels.squared_error, ONE),
@@ -123,7 +118,7 @@ pub fn squared_error(
     if let Some(gradient) = gradient {
         launch.arg(gradient);
     }
-    launch.arg(&mut out).arg(&all).arg(&count);
+    launch.arg(&mut out).arg(&len).arg(&period);
     // SAFETY: the arguments are those of the kernel.
     unsafe { launch.launch(config)? };
     Ok(out)

@@ -80,10 +80,12 @@ impl Dense {
     ) -> Option<Self> {
         let fits = widths.len() <= LAYERS + 1 && widths.iter().all(|width| *width <= WIDEST);
         fits.then(|| {
-            let mut all = [0; LAYERS + 1];
-            all.iter_mut().zip(widths).for_each(|(to, width)| *to = *width as u32);
+            let mut padded = [0; LAYERS + 1];
+            for (to, width) in padded.iter_mut().zip(widths) {
+                *to = *width as u32;
+            }
             let [start, members, count] = [start, members, widths.len() - 1].map(|x| x as u32);
-            Self { start, members, count, activation: activation as u32, widths: all }
+            Self { start, members, count, activation: activation as u32, widths: padded }
         })
     }
 
@@ -158,20 +160,18 @@ impl Dense {
         for (columns, part) in columns.iter_mut().zip(parts) {
             *columns = part.columns(stream);
         }
-        let ((config, stride), all, none) = (self.grid(tiles, rows), rows as u32, 0_u64);
+        let ((config, stride), row_count, none) = (self.grid(tiles, rows), rows as u32, 0_u64);
         let mut launch = stream.launch_builder(&tiles.forward);
-        launch
-            .arg(weights)
-            .arg(self)
-            .arg(&columns[0])
-            .arg(&columns[1])
-            .arg(&columns[2])
-            .arg(&mut out);
+        launch.arg(weights).arg(self);
+        for columns in &columns {
+            launch.arg(columns);
+        }
+        launch.arg(&mut out);
         match &mut saved {
             Some(Saved { inputs, slopes }) => launch.arg(inputs).arg(slopes),
             None => launch.arg(&none).arg(&none),
         };
-        launch.arg(&all).arg(&stride);
+        launch.arg(&row_count).arg(&stride);
         // SAFETY: the arguments are those of the kernel.
         unsafe { launch.launch(config)? };
         Ok((out, saved))
@@ -195,12 +195,12 @@ impl Dense {
         let tiles = kernels.tiles(rows, 1);
         // SAFETY: the kernel writes every number.
         let mut out = unsafe { stream.alloc::<f32>(rows * self.outputs())? };
-        let [observations, embeddings] =
-            [observations, embeddings].map(|part| part.columns(stream));
-        let ((config, stride), all) = (self.grid(tiles, rows), rows as u32);
+        let parts = [observations, embeddings].map(|part| part.columns(stream));
+        let ((config, stride), row_count) = (self.grid(tiles, rows), rows as u32);
         let mut launch = stream.launch_builder(&tiles.sample);
-        launch.arg(weights).arg(self).arg(&observations).arg(&embeddings).arg(noise).arg(steps);
-        launch.arg(&mut out).arg(&count).arg(&all).arg(&stride);
+        launch.arg(weights).arg(self).arg(&parts[0]).arg(&parts[1]);
+        launch.arg(noise).arg(steps);
+        launch.arg(&mut out).arg(&count).arg(&row_count).arg(&stride);
         // SAFETY: the arguments are those of the kernel.
         unsafe { launch.launch(config)? };
         Ok(out)
@@ -223,12 +223,12 @@ impl Dense {
         // SAFETY: the kernel writes every number.
         let mut deltas = unsafe { stream.alloc::<f32>(saved.slopes.len())? };
         let count = self.members as usize * rows * columns;
-        let mut of_inputs = match columns {
+        let mut input_gradient = match columns {
             0 => None,
             // SAFETY: as above.
             _ => Some(unsafe { stream.alloc::<f32>(count)? }),
         };
-        let ((config, stride), all, none) = (self.grid(tiles, rows), rows as u32, 0_u64);
+        let ((config, stride), row_count, none) = (self.grid(tiles, rows), rows as u32, 0_u64);
         let last = columns as u32;
         let mut launch = stream.launch_builder(&tiles.backward);
         launch.arg(weights).arg(self);
@@ -237,17 +237,17 @@ impl Dense {
             None => launch.arg(&none),
         };
         launch.arg(&saved.slopes).arg(&mut deltas);
-        match &mut of_inputs {
-            Some(of_inputs) => launch.arg(of_inputs),
+        match &mut input_gradient {
+            Some(gradient) => launch.arg(gradient),
             None => launch.arg(&none),
         };
-        launch.arg(&last).arg(&all).arg(&stride);
+        launch.arg(&last).arg(&row_count).arg(&stride);
         // SAFETY: the arguments are those of the kernel.
         unsafe { launch.launch(config)? };
         if let (Some(out), Some(gradient)) = (weights_gradient, gradient) {
             self.gradients(stream, saved, (gradient, &deltas), rows, out)?;
         }
-        Ok(of_inputs)
+        Ok(input_gradient)
     }
 
     fn gradients(
@@ -263,7 +263,7 @@ impl Dense {
         let tiles = kernels.tiles(inputs.iter().sum::<u32>() as usize, self.members);
         // Rows that a block holds at a time.
         let at_once = (rows as u32).next_multiple_of(32).min(WIDEST as u32);
-        let (all, stride, y_stride) = (rows as u32, at_once + 16, self.stride());
+        let (row_count, stride, y_stride) = (rows as u32, at_once + 16, self.stride());
         let blocks = inputs.iter().map(|width| width / tiles.rows + 1).sum();
         let config = LaunchConfig {
             grid_dim: (blocks, self.members, 1),
@@ -271,8 +271,9 @@ impl Dense {
             shared_mem_bytes: 4 * tiles.rows * (stride + y_stride),
         };
         let mut launch = stream.launch_builder(&tiles.gradients);
-        launch.arg(self).arg(&saved.inputs).arg(gradient).arg(deltas).arg(out);
-        launch.arg(&all).arg(&stride).arg(&y_stride);
+        launch.arg(self).arg(&saved.inputs);
+        launch.arg(gradient).arg(deltas).arg(out);
+        launch.arg(&row_count).arg(&stride).arg(&y_stride);
         // SAFETY: the arguments are those of the kernel.
         unsafe { launch.launch(config)? };
         Ok(())

@@ -93,14 +93,13 @@ mod tests {
 
     /// The formulas in double precision.
     fn exact(row: &[f32], bias: &[f32], scale: &[f32], epsilon: f64) -> Vec<f64> {
-        let z: Vec<f64> =
-            row.iter().zip(bias).map(|(x, b)| f64::from(*x) + f64::from(*b)).collect();
+        let z = row.iter().zip(bias).map(|(x, b)| f64::from(*x) + f64::from(*b));
+        let z = Vec::from_iter(z);
         let mean = z.iter().sum::<f64>() / z.len() as f64;
         let variance = z.iter().map(|z| (z - mean).powi(2)).sum::<f64>() / z.len() as f64;
-        z.iter()
-            .zip(scale)
-            .map(|(z, s)| f64::from(*s) * (z - mean) / (variance + epsilon).sqrt())
-            .collect()
+        let deviation = (variance + epsilon).sqrt();
+        let scaled = z.iter().zip(scale);
+        scaled.map(|(z, scale)| f64::from(*scale) * (z - mean) / deviation).collect()
     }
 
     /// Finite differences of the formulas in double precision.
@@ -114,29 +113,29 @@ mod tests {
             let (bias, scale) = (numbers(width, 0.7), numbers(width, 0.3));
             let (mut y, mut saved) = (x.clone(), vec![f32::NAN; saved_len(rows, width)]);
             normalize(&mut y, Some(&bias), &scale, 1e-2, &mut saved);
-            let all = |x: &[f32], scale: &[f32]| -> Vec<f64> {
-                x.chunks(width).flat_map(|row| exact(row, &bias, scale, 1e-2)).collect()
+            let norm = |x: &[f32], scale: &[f32]| -> Vec<f64> {
+                let rows = x.chunks(width);
+                rows.flat_map(|row| exact(row, &bias, scale, 1e-2)).collect()
             };
             let near = |x: f32, y: f64, by: f64| (f64::from(x) - y).abs() < by * (1.0 + y.abs());
-            for (y, exact) in y.iter().zip(all(&x, &scale)) {
+            for (y, exact) in y.iter().zip(norm(&x, &scale)) {
                 assert!(near(*y, exact, 1e-5), "{width}: {y} for {exact}");
             }
             let mut x_gradient = delta.clone();
             normalize_backward(&mut x_gradient, &scale, &mut saved);
             let loss = |x: &[f32], scale: &[f32]| -> f64 {
-                all(x, scale).iter().zip(&delta).map(|(y, delta)| y * f64::from(*delta)).sum()
+                let y = norm(x, scale).into_iter();
+                y.zip(&delta).map(|(y, delta)| y * f64::from(*delta)).sum()
             };
-            let slope = |at: &[f32], i: usize, loss: &dyn Fn(&[f32]) -> f64| {
-                let (mut above, mut below) = (at.to_vec(), at.to_vec());
+            let slope = |x: &[f32], i: usize, loss: &dyn Fn(&[f32]) -> f64| {
+                let (mut above, mut below) = (x.to_vec(), x.to_vec());
                 above[i] += 0.01;
                 below[i] -= 0.01;
                 (loss(&above) - loss(&below)) / 0.02
             };
             for (i, x_gradient) in x_gradient.iter().enumerate() {
-                assert!(
-                    near(*x_gradient, slope(&x, i, &|x| loss(x, &scale)), 1e-3),
-                    "{width}, x {i}"
-                );
+                let expected = slope(&x, i, &|x| loss(x, &scale));
+                assert!(near(*x_gradient, expected, 1e-3), "{width}, x {i}");
             }
             for i in 0..width {
                 let scale_gradient = slope(&scale, i, &|scale| loss(&x, scale));

@@ -49,9 +49,9 @@ impl Matrix<'_> {
         let (elements, column, row, from, len) = match self {
             Self::RowMajor(elements) => (elements, 1, columns, 0, rows * columns),
             Self::TransposeOf(elements) => (elements, rows, 1, 0, rows * columns),
-            Self::TransposeOfColumns(elements, from, all) => {
-                assert!(from + rows <= all, "columns of an operand");
-                (elements, all, 1, from, all * columns)
+            Self::TransposeOfColumns(elements, from, width) => {
+                assert!(from + rows <= width, "columns of an operand");
+                (elements, width, 1, from, width * columns)
             }
         };
         assert_eq!(elements.len(), len, "operands of a product");

@@ -31,9 +31,9 @@ pub struct Affine {
 impl Affine {
     /// True for a map of this many columns with finite numbers and no scale below 0.
     pub fn is_usable(&self, columns: usize) -> bool {
-        let lengths = (self.offset.len(), self.scale.len()) == (columns, columns);
-        let offsets = self.offset.iter().all(|offset| offset.is_finite());
-        lengths && offsets && self.scale.iter().all(|scale| scale.is_finite() && *scale >= 0.0)
+        let fits = (self.offset.len(), self.scale.len()) == (columns, columns);
+        let mut numbers = self.offset.iter().chain(&self.scale);
+        fits && numbers.all(|x| x.is_finite()) && self.scale.iter().all(|scale| *scale >= 0.0)
     }
 
     /// Converts `rows × columns` numbers to the network's units, in place.
@@ -62,17 +62,22 @@ impl Affine {
 mod tests {
     use super::*;
 
+    fn affine(offset: &[f32], scale: &[f32]) -> Affine {
+        let (offset, scale) = (offset.to_vec(), scale.to_vec());
+        Affine { offset, scale }
+    }
+
     #[test]
     fn maps_that_lose_numbers_are_not_usable() {
         for scale in [-1.0, f32::NAN, f32::INFINITY] {
-            assert!(!Affine { offset: vec![0.0], scale: vec![scale] }.is_usable(1), "{scale}");
+            assert!(!affine(&[0.0], &[scale]).is_usable(1), "{scale}");
         }
-        assert!(!Affine { offset: vec![f32::NAN], scale: vec![1.0] }.is_usable(1));
+        assert!(!affine(&[f32::NAN], &[1.0]).is_usable(1));
     }
 
     #[test]
     fn a_constant_is_kept_exactly() {
-        let affine = Affine { offset: vec![0.1, 3.0], scale: vec![0.0, 2.0] };
+        let affine = affine(&[0.1, 3.0], &[0.0, 2.0]);
         assert!(affine.is_usable(2));
         let mut numbers = [-0.048, 0.5];
         affine.to_user(&mut numbers);

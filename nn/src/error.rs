@@ -6,8 +6,8 @@
 pub enum NetworkError {
     #[error("the weights lack the tensor {0:?}")]
     Missing(String),
-    #[error("tensor {name:?} has type and shape {found}, expected {expected}")]
-    Shape { name: String, found: String, expected: String },
+    #[error("tensor {0:?} has type and shape {1}, expected {2}")]
+    Shape(String, String, String),
     #[error("tensor {0:?} holds a number that is not finite")]
     NotFinite(String),
     #[error("candle failed")]

@@ -45,9 +45,9 @@ pub use diffusion::schedule::{Reverse, Schedule};
 pub use ensemble::Ensemble;
 pub use error::{MAX_DIM, NetworkError};
 pub use gpu::cuda_graph::{CudaGraph, overwrite};
-pub use gpu::device::open_gpu;
 #[cfg(feature = "cuda")]
 pub use gpu::numbers::guide;
+pub use gpu::open_gpu;
 pub use gradients::gradient::Gradients;
 pub use layers::config::{InitScheme, MlpConfig, NormEpsilon};
 pub use quad_kernels::Precision;

@@ -37,7 +37,7 @@ impl EnsembleShape {
     }
 
     /// One network of s.
-    pub fn of_state(observation_dim: usize, layers: &MlpConfig, outputs: usize) -> Self {
+    pub fn state_network(observation_dim: usize, layers: &MlpConfig, outputs: usize) -> Self {
         Self::critics(1, (observation_dim, 0), layers).with_outputs(outputs)
     }
 

@@ -48,8 +48,9 @@ pub fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
             mean.iter_mut().zip(member).for_each(|(mean, x)| *mean += x * share);
         }
         for member in x.chunks_exact(mean.len()) {
-            let squares = member.iter().zip(&mean).map(|(x, mean)| (x - mean) * (x - mean));
-            variance.iter_mut().zip(squares).for_each(|(sum, square)| *sum += square * share);
+            for (sum, (x, mean)) in variance.iter_mut().zip(member.iter().zip(&mean)) {
+                *sum += (x - mean) * (x - mean) * share;
+            }
         }
         (mean, variance)
     })?;

@@ -1,6 +1,7 @@
 //! Helpers of tests.
 
 use crate::gradients::gradient::Gradients;
+use crate::slices::plainly;
 use crate::weights::{Layout, Weights};
 use candle_core::{DType, Device, Result, Shape, Tensor, Var};
 use rand::{Rng, SeedableRng};
@@ -30,18 +31,18 @@ pub(crate) fn numbers(x: &Tensor) -> Vec<f32> {
 }
 
 /// Asserts that two tensors are equal up to rounding.
-pub(crate) fn assert_close(what: &str, found: &Tensor, expected: &Tensor) {
-    assert_within(2e-5, what, found, expected);
+pub(crate) fn assert_close(name: &str, actual: &Tensor, expected: &Tensor) {
+    assert_within(2e-5, name, actual, expected);
 }
 
 /// Asserts that errors are within a tolerance, relative to the root mean square.
-pub(crate) fn assert_within(tolerance: f32, what: &str, found: &Tensor, expected: &Tensor) {
-    assert_eq!(found.dims(), expected.dims(), "{what}");
-    let (found, expected) = (numbers(found), numbers(expected));
+pub(crate) fn assert_within(tolerance: f32, name: &str, actual: &Tensor, expected: &Tensor) {
+    assert_eq!(actual.dims(), expected.dims(), "{name}");
+    let (actual, expected) = (numbers(actual), numbers(expected));
     let size = (expected.iter().map(|x| x * x).sum::<f32>() / expected.len() as f32).sqrt();
-    for (i, (x, y)) in found.iter().zip(&expected).enumerate() {
+    for (i, (x, y)) in actual.iter().zip(&expected).enumerate() {
         let error = (x - y).abs() / (size.max(1e-3) + 5.0 * y.abs());
-        assert!(error <= tolerance, "{what} at {i}: {x} for {y}");
+        assert!(error <= tolerance, "{name} at {i}: {x} for {y}");
     }
 }
 
@@ -53,52 +54,66 @@ pub(crate) fn loss(outputs: &Tensor) -> Result<Tensor> {
 
 /// The gradient of [`loss`] with respect to weights.
 pub(crate) fn gradient(outputs: &Tensor, weights: &Weights) -> Result<Tensor> {
-    Gradients::of(&loss(outputs)?)?.with_respect_to(weights)?.copy()
+    Gradients::backward(&loss(outputs)?)?.with_respect_to(weights)?.copy()
 }
 
 /// Compares the gradient of [`loss`] at an argument of `outputs` with finite differences, along the
 /// gradient and along a random direction. `tolerance` is relative to the gradient's norm.
 pub(crate) fn check_gradient(
-    (what, step, tolerance): (&str, f64, f64),
-    (at, gradient): (&Tensor, &Tensor),
+    (name, step, tolerance): (&str, f64, f64),
+    (x, gradient): (&Tensor, &Tensor),
     outputs: impl Fn(&Tensor) -> Result<Tensor>,
 ) -> Result<()> {
     let norm = |x: &Tensor| Result::Ok(f64::from(x.sqr()?.sum_all()?.to_scalar::<f32>()?).sqrt());
     let size = norm(gradient)?;
-    assert!(size > 1e-3, "{what}: no gradient");
-    for direction in [gradient.detach(), random(at.shape(), 1)] {
+    assert!(size > 1e-3, "{name}: no gradient");
+    for direction in [gradient.detach(), random(x.shape(), 1)] {
         let direction = (&direction / norm(&direction)?)?;
         let value = |by: f64| {
-            let at = (at + (&direction * by)?)?;
-            loss(&outputs(&at)?.to_dtype(DType::F64)?)?.to_scalar::<f64>()
+            let x = (x + (&direction * by)?)?;
+            loss(&outputs(&x)?.to_dtype(DType::F64)?)?.to_scalar::<f64>()
         };
         let slope = |by: f64| Result::Ok((value(by)? - value(-by)?) / (2.0 * by));
         // Richardson extrapolation
-        let found = (4.0 * slope(step / 2.0)? - slope(step)?) / 3.0;
+        let actual = (4.0 * slope(step / 2.0)? - slope(step)?) / 3.0;
         let expected = f64::from((gradient * &direction)?.sum_all()?.to_scalar::<f32>()?);
-        let error = (found - expected).abs() / size;
-        assert!(error < tolerance, "{what}: {found} for {expected}");
+        let error = (actual - expected).abs() / size;
+        assert!(error < tolerance, "{name}: {actual} for {expected}");
     }
     Ok(())
 }
 
 /// [`check_gradient`] for each argument of an operation.
 pub(crate) fn check_gradients(
-    what: &str,
+    name: &str,
     arguments: &[Tensor],
     outputs: impl Fn(&[Tensor]) -> Result<Tensor>,
 ) -> Result<()> {
-    let variables = arguments.iter().map(Var::from_tensor).collect::<Result<Vec<_>>>()?;
-    let tensors: Vec<Tensor> = variables.iter().map(|x| x.as_tensor().clone()).collect();
+    let variables = arguments.iter().map(Var::from_tensor);
+    let variables = variables.collect::<Result<Vec<_>>>()?;
+    let tensors = Vec::from_iter(variables.iter().map(|x| x.as_tensor().clone()));
     let gradients = loss(&outputs(&tensors)?)?.backward()?;
     for (i, variable) in variables.iter().enumerate() {
         let gradient = gradients.get(variable).unwrap();
-        let what = format!("{what}, argument {i}");
-        check_gradient((&what, 1e-3, 0.01), (&arguments[i], gradient), |x| {
+        let name = format!("{name}, argument {i}");
+        check_gradient((&name, 1e-3, 0.01), (&arguments[i], gradient), |x| {
             let mut arguments = arguments.to_vec();
             arguments[i] = x.clone();
             outputs(&arguments)
         })?;
     }
     Ok(())
+}
+
+/// Compares an operation with its plain implementation, and the gradients of both with finite
+/// differences.
+pub(crate) fn check_operation(
+    name: &str,
+    arguments: &[Tensor],
+    outputs: impl Fn(&[Tensor]) -> Result<Tensor> + Copy,
+) -> Result<()> {
+    let fast = outputs(arguments)?;
+    assert_close(name, &fast, &plainly(|| outputs(arguments))?);
+    check_gradients(name, arguments, outputs)?;
+    plainly(|| check_gradients(name, arguments, outputs))
 }

@@ -66,7 +66,8 @@ fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &m
         let mut vector: Vec<f64> = (0..length).map(|_| StandardNormal.sample(generator)).collect();
         for other in &vectors {
             let along: f64 = vector.iter().zip(other).map(|(x, y)| x * y).sum();
-            vector.iter_mut().zip(other).for_each(|(x, y)| *x -= along * y);
+            let numbers = vector.iter_mut().zip(other);
+            numbers.for_each(|(x, y)| *x -= along * y);
         }
         let size = vector.iter().map(|x| x * x).sum::<f64>().sqrt();
         // A vector nearly in the span of the others is drawn again: its rest is rounding error.
@@ -77,7 +78,11 @@ fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &m
     }
     for (i, x) in matrix.iter_mut().enumerate() {
         let (row, column) = (i / columns, i % columns);
-        *x = if columns <= rows { vectors[column][row] } else { vectors[row][column] } as f32;
+        let number = match columns <= rows {
+            true => vectors[column][row],
+            false => vectors[row][column],
+        };
+        *x = number as f32;
     }
 }
 
@@ -136,10 +141,10 @@ pub fn take(
     shape: &[usize],
 ) -> std::result::Result<Tensor, NetworkError> {
     let Some(tensor) = tensors.remove(&name) else { return Err(NetworkError::Missing(name)) };
-    let [found, expected] =
+    let [actual, expected] =
         [(tensor.dtype(), tensor.dims()), (DType::F32, shape)].map(|form| format!("{form:?}"));
-    if found != expected {
-        return Err(NetworkError::Shape { name, found, expected });
+    if actual != expected {
+        return Err(NetworkError::Shape(name, actual, expected));
     }
     check_finite(&name, &tensor)?;
     Ok(tensor)
@@ -165,12 +170,11 @@ pub struct Weights {
 impl Weights {
     /// Weights with gradients: one of candle's variables.
     pub fn trainable(layout: Layout, values: &Tensor) -> Result<Self> {
-        let values = Var::from_tensor(values)?.into_inner();
-        let buffer = match has_fast_implementation(values.device()) {
-            true => Some(Arc::new(GradientBuffer::new(&values)?)),
-            false => None,
-        };
-        Ok(Self { layout, values, buffer })
+        let mut weights = Self::constant(layout, Var::from_tensor(values)?.into_inner());
+        if has_fast_implementation(values.device()) {
+            weights.buffer = Some(Arc::new(GradientBuffer::new(&weights.values)?));
+        }
+        Ok(weights)
     }
 
     /// Weights without gradients.
@@ -190,7 +194,8 @@ impl Weights {
 
     /// A constant copy.
     pub fn copy(&self) -> Result<Self> {
-        Ok(Self::constant(self.layout.clone(), self.values.detach().copy()?))
+        let values = self.values.detach().copy()?;
+        Ok(Self::constant(self.layout.clone(), values))
     }
 
     /// The same weights as constants, in the same memory.
@@ -230,7 +235,8 @@ impl Weights {
         tensors: &mut Tensors,
         prefix: &str,
     ) -> std::result::Result<(), NetworkError> {
-        let values = self.layout.join(tensors, prefix)?.to_device(self.values.device())?;
+        let values = self.layout.join(tensors, prefix)?;
+        let values = values.to_device(self.values.device())?;
         Ok(self.change(|mine| mine.slice_set(&values, 0, 0))?)
     }
 
@@ -279,15 +285,15 @@ mod tests {
 
     #[test]
     fn tensors_have_their_initial_values() -> Result<()> {
-        let spec =
-            |name: &str, shape: &[usize], init| TensorSpec::new(name.to_owned(), shape, init);
+        let spec = |name: &str, shape: &[usize], init| TensorSpec::new(name.into(), shape, init);
         let layout = Layout::new(vec![
             spec("wide", &[2, 3, 5], Init::Orthogonal(2.0)),
             spec("tall", &[1, 5, 3], Init::Orthogonal(2.0)),
             spec("scale", &[4], Init::Constant(1.0)),
             spec("flat", &[100], Init::Uniform(0.25)),
         ]);
-        let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu)?;
+        let generator = &mut ChaCha8Rng::seed_from_u64(0);
+        let values = Weights::initial(&layout, generator, &Device::Cpu)?;
         let tensors = layout.split(&values, "")?;
         let products = tensors["wide"].matmul(&tensors["wide"].t()?)?; // [2, 3, 3]
         let identity = (Tensor::eye(3, DType::F32, &Device::Cpu)? * 4.0)?;

@@ -9,7 +9,7 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from quad_rl._lerobot import act, inputs, places
-from quad_rl.readers.lerobot import names_of
+from quad_rl.readers.lerobot import flat_names
 from quad_rl.readers.video import column
 
 
@@ -61,7 +61,7 @@ class QuadPolicy(PreTrainedPolicy):
 
     def _called(self, feature: str, names: list[str]) -> list[str]:
         """The names of a feature's numbers: the dataset's, or the policy's if only one of them has names."""
-        there = names_of(self._dataset.get(feature, {}).get("names"))
+        there = flat_names(self._dataset.get(feature, {}).get("names"))
         if not there or "image" in feature or names[0] in ("0", feature, f"{feature}[0]"):
             return names
         prefix = f"{feature}." if names[0].startswith(f"{feature}.") else ""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quad_rl._lerobot import act, inputs, places
-from quad_rl.readers.lerobot import names_of
+from quad_rl.readers.lerobot import flat_names
 
 
 def test_each_number_goes_to_its_column():
@@ -31,9 +31,9 @@ def test_names_that_several_columns_have_are_told_apart_by_their_order_alone():
 
 
 def test_the_names_of_two_arms_keep_their_keys_where_they_repeat():
-    assert names_of({"left": ["j0", "j1"], "right": ["j0", "j1"]}) == ["left.j0", "left.j1", "right.j0", "right.j1"]
-    assert names_of({"left": ["l0"], "right": ["r0"]}) == ["l0", "r0"], "as policies know them"
-    assert names_of({"motors": ["pan", "lift"]}) == names_of(["pan", "lift"]) == names_of({"lift": 1, "pan": 0}) == ["pan", "lift"]
+    assert flat_names({"left": ["j0", "j1"], "right": ["j0", "j1"]}) == ["left.j0", "left.j1", "right.j0", "right.j1"]
+    assert flat_names({"left": ["l0"], "right": ["r0"]}) == ["l0", "r0"], "as policies know them"
+    assert flat_names({"motors": ["pan", "lift"]}) == flat_names(["pan", "lift"]) == flat_names({"lift": 1, "pan": 0}) == ["pan", "lift"]
 
 
 def test_features_may_have_two_dots():

@@ -22,28 +22,28 @@ def written(dataset, path):
 def test_the_file_has_the_given_arrays(tmp_path):
     given = arrays()
     after = given["observations"] + 1
-    found = written(Dataset.from_arrays(**given, next_observations=after), tmp_path / "new" / "data.hdf5")
+    actual = written(Dataset.from_arrays(**given, next_observations=after), tmp_path / "new" / "data.hdf5")
     names = {"terminations": "terminals", "truncations": "timeouts"}
     for name, array in {**given, "next_observations": after}.items():
-        assert np.array_equal(found[names.get(name, name)], array.astype(np.float32)), name
-    assert found["terminals"].dtype == bool
+        assert np.array_equal(actual[names.get(name, name)], array.astype(np.float32)), name
+    assert actual["terminals"].dtype == bool
 
 
 def test_next_observations_default_to_the_following_row(tmp_path):
     """Steps 0 to 2 end by a terminal, 3 to 5 are cut off, 6 is cut off at once, 7 terminates as it is cut off, 8 to 9 do not end."""
     o, row = np.arange(10.0)[:, None] * 10, np.arange(10)
-    found = written(
+    actual = written(
         Dataset.from_arrays(
             observations=o, actions=row / 10, rewards=row, terminations=np.isin(row, [2, 7]),
             truncations=np.isin(row, [5, 6, 7]).astype(int),
         ),
         tmp_path / "data.hdf5",
     )
-    assert found["rewards"].tolist() == [0, 1, 2, 3, 4, 7, 8]
-    assert found["observations"][:, 0].tolist() == [0, 10, 20, 30, 40, 70, 80]
-    assert found["next_observations"][:, 0].tolist() == [10, 20, 20, 40, 50, 70, 90]
-    assert found["terminals"].tolist() == [0, 0, 1, 0, 0, 1, 0]
-    assert found["timeouts"].tolist() == [0, 0, 0, 0, 1, 1, 1]
+    assert actual["rewards"].tolist() == [0, 1, 2, 3, 4, 7, 8]
+    assert actual["observations"][:, 0].tolist() == [0, 10, 20, 30, 40, 70, 80]
+    assert actual["next_observations"][:, 0].tolist() == [10, 20, 20, 40, 50, 70, 90]
+    assert actual["terminals"].tolist() == [0, 0, 1, 0, 0, 1, 0]
+    assert actual["timeouts"].tolist() == [0, 0, 0, 0, 1, 1, 1]
 
 
 def test_episodes_and_arrays_make_the_same_rows(tmp_path):
@@ -60,17 +60,17 @@ def test_episodes_and_arrays_make_the_same_rows(tmp_path):
     expected = written(Dataset.from_arrays(**whole), tmp_path / "0.hdf5")
     assert len(expected["rewards"]) == 300 - sum(not e["terminations"][-1] for e in episodes)
     for i, same in enumerate((episodes, by_flag)):
-        found = written(Dataset.from_episodes(same), tmp_path / f"{i}.hdf5")
-        assert all(np.array_equal(found[name], expected[name]) for name in expected)
+        actual = written(Dataset.from_episodes(same), tmp_path / f"{i}.hdf5")
+        assert all(np.array_equal(actual[name], expected[name]) for name in expected)
 
     last = [np.concatenate([e["observations"], np.full((1, OBSERVATION), 9.0)]) for e in episodes]
     known = Dataset.from_episodes({**e, "observations": o} for e, o in zip(episodes, last))
-    found = written(known, tmp_path / "known.hdf5")
-    assert len(known) == len(found["rewards"]) == 300
+    actual = written(known, tmp_path / "known.hdf5")
+    assert len(known) == len(actual["rewards"]) == 300
     open_end = {**episodes[0], "observations": last[0], "terminations": False, "truncations": False}
     cut = written(Dataset.from_episodes([open_end, open_end]), tmp_path / "open.hdf5")
     assert np.flatnonzero(cut["timeouts"]).tolist() == [ends[0] - 1, 2 * ends[0] - 1] and not cut["terminals"].any()
-    assert (found["next_observations"][ends - 1] == 9).all() and (found["terminals"] | found["timeouts"])[ends - 1].all()
+    assert (actual["next_observations"][ends - 1] == 9).all() and (actual["terminals"] | actual["timeouts"])[ends - 1].all()
 
 
 def test_prints_the_summary_of_the_learner(data):

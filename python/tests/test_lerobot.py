@@ -38,12 +38,12 @@ def test_teleoperation_gets_the_rewards_that_are_asked_for(tmp_path, version):
     given = episodes()
     folder = write(tmp_path / "data", given, version)
     dataset = Dataset.from_lerobot(folder, **STATE, reward="step-cost", success=[0, 3])
-    found = rows(dataset)
-    for array, by_hand in zip((found[0], found[1], found[3], found[4]), expected(given, {0, 3})):
+    actual = rows(dataset)
+    for array, by_hand in zip((actual[0], actual[1], actual[3], actual[4]), expected(given, {0, 3})):
         assert np.array_equal(array, by_hand)
-    ends = np.flatnonzero(found[4])
-    assert len(ends) == 2 and (found[2][ends] == 0).all() and np.delete(found[2], ends).tolist() == [-1] * (len(found[2]) - 2)
-    assert np.flatnonzero(found[5]).tolist() == [4 + 5 - 0, 4 + 5 + 6, 4 + 5 + 6 + 8 + 8 - 0, 4 + 5 + 6 + 8 + 8 + 9]
+    ends = np.flatnonzero(actual[4])
+    assert len(ends) == 2 and (actual[2][ends] == 0).all() and np.delete(actual[2], ends).tolist() == [-1] * (len(actual[2]) - 2)
+    assert np.flatnonzero(actual[5]).tolist() == [4 + 5 - 0, 4 + 5 + 6, 4 + 5 + 6 + 8 + 8 - 0, 4 + 5 + 6 + 8 + 8 + 9]
     assert dataset.observation_names == [f"observation.state.{name}" for name in ("pan", "lift", "roll")]
     assert dataset.action_names == ["action.pan", "action.lift"]
     told = "\n".join(dataset.notes)
@@ -64,8 +64,8 @@ def test_files_chunks_row_groups_and_versions_do_not_matter(tmp_path):
                              {"version": "v2.1"}, {"version": "v2.1", "shuffle": np.random.default_rng(1), "row_group": 1}]):
         read.append(Dataset.from_lerobot(write(tmp_path / str(i), given, **how), **STATE))
     assert all(same(read[0], other) for other in read[1:])
-    found = rows(read[0])
-    for array, by_hand in zip((found[0], found[1], found[3], found[4]), expected(given, {0, 2, 4, 6})):
+    actual = rows(read[0])
+    for array, by_hand in zip((actual[0], actual[1], actual[3], actual[4]), expected(given, {0, 2, 4, 6})):
         assert np.array_equal(array, by_hand)
     assert "3 of 7 episodes have next.done without a success, as at a time limit: they count as cut off" in read[0].notes
 
@@ -144,10 +144,10 @@ def test_what_says_that_it_terminated_is_believed(tmp_path):
         folder = tmp_path / "-".join(["without", *left_out])
         read[left_out] = Dataset.from_lerobot(write(folder, [{k: v for k, v in one.items() if k not in left_out} for one in given]), **rule)
     for dataset in read.values():
-        found = rows(dataset)
-        for array, by_hand in zip((found[0], found[1], found[3], found[4]), expected(given, {0, 2, 3})):
+        actual = rows(dataset)
+        for array, by_hand in zip((actual[0], actual[1], actual[3], actual[4]), expected(given, {0, 2, 3})):
             assert np.array_equal(array, by_hand)
-        assert found[5].sum() == 3
+        assert actual[5].sum() == 3
         assert "3 of 6 episodes terminate, as next.terminated says; the others are cut off" in dataset.notes
     asked = Dataset.from_lerobot(tmp_path / "without", **rule, terminate="success")
     assert rows(asked)[4].sum() == 2

@@ -78,11 +78,11 @@ def test_a_policy_acts_by_the_names_of_columns(tmp_path):
     state, frames = rng.normal(size=(2, 4)).astype(np.float32), rng.integers(0, 256, (2, 48, 64, 3)).astype(np.uint8)
     batch = {"observation.state": torch.from_numpy(state), TOP: torch.from_numpy(frames).permute(0, 3, 1, 2) / 255}
     torch.manual_seed(0)
-    found = [after(policy.select_action(before(batch))).numpy() for _ in range(2)]
+    actual = [after(policy.select_action(before(batch))).numpy() for _ in range(2)]
     torch.manual_seed(0)
     seed = int(torch.randint(2**31, ()))
     episodes, rows = Policy.load(snapshot).begin([seed, seed + 1]), np.concatenate([state[:, [2, 3, 0]], gray(frames)], axis=1)
-    assert all(np.array_equal(actions, episodes.act(rows)[:, ::-1]) for actions in found)
+    assert all(np.array_equal(actions, episodes.act(rows)[:, ::-1]) for actions in actual)
     policy.save_pretrained(tmp_path / "again")
     assert (tmp_path / "again/model.safetensors").read_bytes() == snapshot.read_bytes()
 

@@ -33,10 +33,10 @@ def largest(array):
     return np.abs(array).reshape(len(array), -1).max(1)
 
 
-def close(found, expected, by):
+def close(actual, expected, by):
     """Largest error, relative to a row's largest number if that is above 1."""
-    assert found.shape == expected.shape
-    away = largest(found - expected) / np.maximum(1.0, largest(expected))
+    assert actual.shape == expected.shape
+    away = largest(actual - expected) / np.maximum(1.0, largest(expected))
     assert (away <= by).all(), away
 
 
@@ -52,22 +52,22 @@ def compare(policy, path, **choice):
         seen = [states * (i + 1) / chunk["history"] for i in range(chunk["history"])]
         inputs = {"observations": states if len(seen) == 1 else np.stack(seen, axis=1), **policy.noise(len(states), seed=seed, **choice)}
         assert {given.name for given in session.get_inputs()} == set(inputs)
-        found = dict(zip((out.name for out in session.get_outputs()), session.run(None, inputs)))
-        if "values" in found:
+        actual = dict(zip((out.name for out in session.get_outputs()), session.run(None, inputs)))
+        if "values" in actual:
             asked = {name: choice[name] for name in ("candidates", "aggregate", "guidance") if name in choice}
-            close(found["values"], policy.sample(states, seed=seed, **asked)[1], by)
+            close(actual["values"], policy.sample(states, seed=seed, **asked)[1], by)
         episodes = policy.begin(range(seed, seed + len(states)), **choice)
         for before in seen[:-1]:
             episodes.observe(before)
         if chunk["length"] > 1:
-            assert found["actions"].shape == (len(states), chunk["length"], policy.action_size)
+            assert actual["actions"].shape == (len(states), chunk["length"], policy.action_size)
             assert session.get_modelmeta().custom_metadata_map == {"chunk": str(chunk["length"]), "replan": str(chunk["replan"])}
             for i in range(chunk["replan"]):
-                close(found["actions"][:, i], episodes.act(states * (i + 1)), by)
+                close(actual["actions"][:, i], episodes.act(states * (i + 1)), by)
             continue
-        close(found["actions"], episodes.act(states), by)
-        for later in range(1, found.get("plan", states[:, None]).shape[1]):
-            close(found["plan"][:, later], episodes.act(states), by)
+        close(actual["actions"], episodes.act(states), by)
+        for later in range(1, actual.get("plan", states[:, None]).shape[1]):
+            close(actual["plan"][:, later], episodes.act(states), by)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -180,11 +180,11 @@ def test_extreme_uniform_numbers_choose_like_the_policy(snapshots, name, tmp_pat
     for edge in EDGES:
         noise = policy.noise(len(states), rule="softmax:0.1", seed=3)
         noise["uniform"][:] = edge
-        found = session.run(["actions"], {"observations": states, **noise})[0]
+        actual = session.run(["actions"], {"observations": states, **noise})[0]
         place = [sample_by_rule(row, 0.1, edge) for row in values]
         expected = best if edge == 1.0 else drawn[np.arange(len(states)), place]
         assert edge or place == [0] * len(states)
-        close(found, expected, 1e-5)
+        close(actual, expected, 1e-5)
 
 
 @pytest.mark.parametrize("flags", [

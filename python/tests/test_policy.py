@@ -27,8 +27,8 @@ def observations(n, seed=5):
     return np.random.default_rng(seed).normal(3.0, 2.0, (n, OBSERVATION)).astype(np.float32)
 
 
-def close(found, expected):
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+def close(actual, expected):
+    np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", POLICIES)
@@ -53,9 +53,9 @@ def test_acts_like_the_numpy_implementation(snapshots, name):
 def test_a_call_may_change_the_choice(snapshots):
     policy, reference = Policy.load(snapshots["align-iql"]), Reference(snapshots["align-iql"])
     state = observations(1)[0]
-    for rule, of_file in [("best", "best"), ("nearest", "nearest"), ("softmax:0.05", {"softmax": {"temperature": 0.05}})]:
+    for rule, file_rule in [("best", "best"), ("nearest", "nearest"), ("softmax:0.05", {"softmax": {"temperature": 0.05}})]:
         for aggregate in ("min", "mean", "mean-minus-std:0.5"):
-            expected, _, _ = reference.act(state, Random(7, POLICY_STREAM), candidates=9, rule=of_file, aggregate=aggregate)
+            expected, _, _ = reference.act(state, Random(7, POLICY_STREAM), candidates=9, rule=file_rule, aggregate=aggregate)
             close(policy.act(state, candidates=9, rule=rule, aggregate=aggregate, seed=7), expected)
     assert np.array_equal(policy.act(state, seed=7), policy.act(state, **policy.choice, seed=7))
     assert policy.choice["rule"] == "nearest"
@@ -72,7 +72,7 @@ def test_episodes_equal_the_evaluator_s(hopper_runs):
     model = mujoco.MjModel.from_xml_path(str(HOPPER))
     robots = [mujoco.MjData(model) for _ in expected]
     episodes = policy.begin([episode["seed"] for episode in expected])
-    found = [{"seed": episode["seed"], "return": 0.0, "length": 0} for episode in expected]
+    actual = [{"seed": episode["seed"], "return": 0.0, "length": 0} for episode in expected]
     for robot, episode in zip(robots, expected):
         random = Random(episode["seed"], RESET_STREAM)
         for state in (robot.qpos, robot.qvel):
@@ -86,13 +86,13 @@ def test_episodes_equal_the_evaluator_s(hopper_runs):
             robot.ctrl[:] = np.clip(action.astype(np.float64), -1, 1)
             mujoco.mj_step(model, robot, 4)
             velocity = (robot.qpos[0] - x) / (model.opt.timestep * 4)
-            found[i]["return"] += velocity + 1.0 - 1e-3 * sum(control * control for control in robot.ctrl)
-            found[i]["length"] += 1
+            actual[i]["return"] += velocity + 1.0 - 1e-3 * sum(control * control for control in robot.ctrl)
+            actual[i]["length"] += 1
             state = np.concatenate([robot.qpos[2:], robot.qvel])
-            if not (abs(state) < 100).all() or robot.qpos[1] <= 0.7 or abs(robot.qpos[2]) >= 0.2 or found[i]["length"] == 1000:
+            if not (abs(state) < 100).all() or robot.qpos[1] <= 0.7 or abs(robot.qpos[2]) >= 0.2 or actual[i]["length"] == 1000:
                 alive.remove(i)
-    assert found == [{name: episode[name] for name in ("seed", "return", "length")} for episode in expected]
-    assert min(episode["length"] for episode in found) > 5
+    assert actual == [{name: episode[name] for name in ("seed", "return", "length")} for episode in expected]
+    assert min(episode["length"] for episode in actual) > 5
 
 
 def test_a_row_depends_on_its_seed_alone(snapshots):
@@ -199,15 +199,15 @@ def test_releases_the_interpreter_lock(snapshots):
     assert ticks > 5, "this thread stood still"
 
     expected = [policy.act(states[i : i + 100], seed=i) for i in range(8)]
-    found = [None] * 8
+    actual = [None] * 8
 
     def act(i):
-        found[i] = policy.act(states[i : i + 100], seed=i)
+        actual[i] = policy.act(states[i : i + 100], seed=i)
 
     threads = [threading.Thread(target=act, args=(i,)) for i in range(8)]
     [thread.start() for thread in threads]
     [thread.join() for thread in threads]
-    assert all(np.array_equal(*pair) for pair in zip(expected, found))
+    assert all(np.array_equal(*pair) for pair in zip(expected, actual))
 
 
 FORKS = """

@@ -37,15 +37,15 @@ def demonstrations(tmp_path):
 def test_robomimic(demonstrations):
     seen = {"observations": ["eef_pos", "object"]}
     dataset = Dataset.from_robomimic(demonstrations, **seen, filter="train")
-    found = rows(dataset)
+    actual = rows(dataset)
     with h5py.File(demonstrations) as file:
         demos = [file[f"data/demo_{i}"] for i in range(10)]
         beside = [np.concatenate([np.concatenate([d[part][key] for key in seen["observations"]], 1) for d in demos])
                   for part in ("obs", "next_obs")]
         by_hand = [beside[0], np.concatenate([d["actions"] for d in demos]), np.concatenate([d["rewards"] for d in demos]), beside[1],
                    np.concatenate([d["dones"] for d in demos]) > 0]
-    assert all(np.array_equal(array, np.asarray(keys, array.dtype)) for array, keys in zip(found, by_hand))
-    assert found[5].sum() == 2 and dataset.observation_names[2:] == ["eef_pos[2]", "object[0]", "object[1]"]
+    assert all(np.array_equal(array, np.asarray(keys, array.dtype)) for array, keys in zip(actual, by_hand))
+    assert actual[5].sum() == 2 and dataset.observation_names[2:] == ["eef_pos[2]", "object[0]", "object[1]"]
     assert dataset.notes == ["2 of 12 episodes left out: not in 'train'", "left out: 1 streams of images (agentview_image)"]
 
     with h5py.File(demonstrations, "a") as file:
@@ -267,11 +267,11 @@ def test_ogbench_mazes(maze, tmp_path):
     for task in ["", "-task1", "-task2", "-task3", "-task4", "-task5"]:
         name = f"{maze}-navigate-singletask{task}-v0"
         _, theirs, _ = ogbench.make_env_and_datasets(name, dataset_dir=str(tmp_path))
-        found = rows(Dataset.from_ogbench(name, folder=tmp_path))
+        actual = rows(Dataset.from_ogbench(name, folder=tmp_path))
         keys = ("observations", "actions", "rewards", "next_observations")
-        assert all(np.array_equal(array, theirs[key]) for array, key in zip(found, keys)), name
-        assert np.array_equal(found[4], theirs["masks"] == 0) and 10 < found[4].sum() < 200
-        assert np.array_equal(found[4] | found[5], (theirs["masks"] == 0) | (theirs["terminals"] > 0))
+        assert all(np.array_equal(array, theirs[key]) for array, key in zip(actual, keys)), name
+        assert np.array_equal(actual[4], theirs["masks"] == 0) and 10 < actual[4].sum() < 200
+        assert np.array_equal(actual[4] | actual[5], (theirs["masks"] == 0) | (theirs["terminals"] > 0))
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -287,9 +287,9 @@ def test_ogbench_soccer(tmp_path):
         np.savez(tmp_path / f"antsoccer-arena-navigate-v0{part}.npz", **arrays)
     name = "antsoccer-arena-navigate-singletask-task2-v0"
     _, theirs, _ = ogbench.make_env_and_datasets(name, dataset_dir=str(tmp_path))
-    found = rows(Dataset.from_ogbench(name, folder=tmp_path))
-    assert np.array_equal(found[2], theirs["rewards"]) and np.array_equal(found[3], theirs["next_observations"])
-    assert np.array_equal(found[4], theirs["masks"] == 0) and found[4].sum() == 19
+    actual = rows(Dataset.from_ogbench(name, folder=tmp_path))
+    assert np.array_equal(actual[2], theirs["rewards"]) and np.array_equal(actual[3], theirs["next_observations"])
+    assert np.array_equal(actual[4], theirs["masks"] == 0) and actual[4].sum() == 19
     with pytest.raises(ValueError, match="has no rewards.*\nhint: antsoccer-arena-navigate-singletask-task1-v0"):
         Dataset.from_ogbench("antsoccer-arena-navigate-v0")
 
@@ -300,10 +300,10 @@ def test_d3rlpy():
     for i in range(4):
         episodes.append(SimpleNamespace(observations=rng.normal(size=(5, 3)).astype(np.float32), rewards=rng.normal(size=(5, 1)),
                                         actions=rng.uniform(-1, 1, (5, 2)), terminated=i % 2 == 0))
-    found = rows(Dataset.from_d3rlpy(SimpleNamespace(episodes=episodes)))
-    assert len(found[2]) == 5 + 4 + 5 + 4 and np.flatnonzero(found[4]).tolist() == [4, 13]
-    assert np.array_equal(found[2][5:9], episodes[1].rewards[:4, 0].astype(np.float32))
-    assert np.array_equal(found[3][5:9], episodes[1].observations[1:])
+    actual = rows(Dataset.from_d3rlpy(SimpleNamespace(episodes=episodes)))
+    assert len(actual[2]) == 5 + 4 + 5 + 4 and np.flatnonzero(actual[4]).tolist() == [4, 13]
+    assert np.array_equal(actual[2][5:9], episodes[1].rewards[:4, 0].astype(np.float32))
+    assert np.array_equal(actual[3][5:9], episodes[1].observations[1:])
     with pytest.raises(ValueError, match="tuples"):
         Dataset.from_d3rlpy(SimpleNamespace(episodes=[SimpleNamespace(observations=(episodes[0].observations,))]))
     episodes[0].actions = np.zeros((5, 1), int)

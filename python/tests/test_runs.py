@@ -38,8 +38,8 @@ def test_a_damaged_run_is_skipped_with_a_warning(data, tmp_path):
         train(tmp_path / name, data, "--task", "own-data", "--steps", "1")
     (tmp_path / "damaged" / "scores.jsonl").write_text('{"step": 10}\n')
     with pytest.warns(UserWarning, match="damaged cannot be read: .*scores.jsonl, line 1, is not what a learner writes"):
-        found = runs(tmp_path / "*")
-    assert [row["run"] for row in found] == ["whole"]
+        actual = runs(tmp_path / "*")
+    assert [row["run"] for row in actual] == ["whole"]
     (tmp_path / "odd" / "config.toml").mkdir(parents=True)
     with pytest.warns(UserWarning, match="odd cannot be read"):
         assert runs(tmp_path / "odd") == []

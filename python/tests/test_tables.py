@@ -374,9 +374,9 @@ def test_a_library_that_is_missing_is_named_with_its_extra(module, tmp_path):
 
 def test_extras_are_what_the_hints_say():
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-    of_project = {extra: [re.split("[>=]", package)[0] for package in packages]
+    declared = {extra: [re.split("[>=]", package)[0] for package in packages]
                   for extra, packages in project["optional-dependencies"].items()}
-    assert of_project == EXTRAS
+    assert declared == EXTRAS
 
 
 def test_episodes_keep_their_names_and_their_order(tmp_path):

@@ -16,27 +16,27 @@ PAGE = (Path(__file__).parents[2] / "docs/python.md").read_text()
 
 def series(run):
     """The values of a run's files by name and step."""
-    found = {}
+    metrics = {}
     for line in map(json.loads, (run / "metrics.jsonl").read_text().splitlines()):
         step = line.pop("step")
         del line["seconds"]
         for name, value in line.items():
-            found.setdefault(f"train/{name}", {})[step] = value
+            metrics.setdefault(f"train/{name}", {})[step] = value
     by_step = {}
     for line in map(json.loads, (run / "scores.jsonl").read_text().splitlines()):
         by_step.setdefault(line["step"], []).append(line)
     for step, lines in sorted(by_step.items()):
         for name in ("score", "return", "length"):
-            found.setdefault(f"evaluation/{name}", {})[step] = np.mean([line[name] for line in lines])
-        found.setdefault("evaluation/score_std", {})[step] = np.std([line["score"] for line in lines], ddof=1)
-    return found
+            metrics.setdefault(f"evaluation/{name}", {})[step] = np.mean([line[name] for line in lines])
+        metrics.setdefault("evaluation/score_std", {})[step] = np.std([line["score"] for line in lines], ddof=1)
+    return metrics
 
 
-def same(found, expected):
-    assert found.keys() == expected.keys()
+def same(metrics, expected):
+    assert metrics.keys() == expected.keys()
     for name, values in expected.items():
-        assert list(found[name]) == list(values), name
-        np.testing.assert_allclose(list(found[name].values()), list(values.values()), rtol=1e-6, err_msg=name)
+        assert list(metrics[name]) == list(values), name
+        np.testing.assert_allclose(list(metrics[name].values()), list(values.values()), rtol=1e-6, err_msg=name)
 
 
 def run_example(tracker, run, folder, monkeypatch):
@@ -47,14 +47,14 @@ def run_example(tracker, run, folder, monkeypatch):
     exec(compile(example, "docs/python.md", "exec"), {"quad_rl": quad_rl})
 
 
-def of_rows(rows):
+def by_metric(rows):
     """The values of rows by name and step, without times."""
-    found = {}
+    metrics = {}
     for row in rows:
         for name, value in row.items():
             if "/" in name:
-                found.setdefault(name, {})[row["step"]] = value
-    return found
+                metrics.setdefault(name, {})[row["step"]] = value
+    return metrics
 
 
 def test_tensorboard_has_each_value(hopper_runs, tmp_path, monkeypatch):
@@ -91,7 +91,7 @@ def test_weights_and_biases_has_each_value(hopper_runs, tmp_path, monkeypatch):
     [file] = tmp_path.glob("wandb/offline-run-*/*.wandb")
     rows = list(history(file))
     assert [row["_step"] for row in rows] == [row["step"] for row in rows] == [10, 20]
-    same(of_rows({**row, "step": row["_step"]} for row in rows), series(hopper_runs / "seed0"))
+    same(by_metric({**row, "step": row["_step"]} for row in rows), series(hopper_runs / "seed0"))
 
 
 def test_mlflow_has_each_value(hopper_runs, tmp_path, monkeypatch):
@@ -103,8 +103,8 @@ def test_mlflow_has_each_value(hopper_runs, tmp_path, monkeypatch):
     run_example("mlflow", hopper_runs / "seed0", tmp_path, monkeypatch)
     client, run = mlflow.MlflowClient(), mlflow.last_active_run()
     assert run.info.run_name == "mine"
-    found = {name: client.get_metric_history(run.info.run_id, name) for name in run.data.metrics if "/" in name}
-    same({name: {one.step: one.value for one in values} for name, values in found.items()}, series(hopper_runs / "seed0"))
+    actual = {name: client.get_metric_history(run.info.run_id, name) for name in run.data.metrics if "/" in name}
+    same({name: {one.step: one.value for one in values} for name, values in actual.items()}, series(hopper_runs / "seed0"))
 
 
 def test_a_row_has_all_metrics_of_its_step(hopper_runs, tmp_path):
@@ -114,6 +114,6 @@ def test_a_row_has_all_metrics_of_its_step(hopper_runs, tmp_path):
     rows = quad_rl.metrics(tmp_path / "cut off")
     assert [row["step"] for row in rows] == [10, 20]
     assert "train/target_q_mean" not in rows[0] and {"seconds", "train/target_q_mean", "evaluation/score_std"} <= rows[1].keys()
-    same(of_rows(rows), series(hopper_runs / "seed0"))
+    same(by_metric(rows), series(hopper_runs / "seed0"))
     with pytest.raises(FileNotFoundError, match="nothing"):
         quad_rl.metrics(tmp_path / "nothing")

@@ -55,11 +55,11 @@ def recorded(root, version="v3.0"):
 @pytest.mark.parametrize("version", PATHS)
 def test_each_frame_is_seen_in_its_row(tmp_path, version):
     dataset = Dataset.from_lerobot(recorded(tmp_path / "data", version), **RULE, features={TOP: gray})
-    found = dataset._rows
+    actual = dataset._rows
     assert dataset.observation_names[-2:] == ["observation.state.roll", f"{TOP}.gray[0]"]
-    assert np.abs(found.observations[:, 3] - np.concatenate(GRAYS)).max() < 1.9
-    after = ~found.terminals
-    assert np.array_equal(found.next_observations[after], np.roll(found.observations, -1, 0)[after]) and after.sum() == 39
+    assert np.abs(actual.observations[:, 3] - np.concatenate(GRAYS)).max() < 1.9
+    after = ~actual.terminals
+    assert np.array_equal(actual.next_observations[after], np.roll(actual.observations, -1, 0)[after]) and after.sum() == 39
     assert not any("streams of images" in note for note in dataset.notes)
 
 

@@ -9,7 +9,8 @@ use quad_dataset::{Arrays, Window};
 const METRICS: &[Metric] = &metrics! { target_q_mean: ""; critic_loss: ""; };
 
 fn numbers(tensor: &Tensor) -> Vec<f32> {
-    tensor.to_device(&Device::Cpu).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+    let tensor = tensor.to_device(&Device::Cpu).unwrap();
+    tensor.flatten_all().unwrap().to_vec1().unwrap()
 }
 
 #[test]

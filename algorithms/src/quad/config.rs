@@ -108,23 +108,24 @@ impl Config {
     /// Reads an `[agent]` table and checks what the types do not say.
     pub fn read(table: &toml::Table) -> Result<Self, AgentError> {
         let config: Self = read(table)?;
-        check("tau", config.tau, config.tau > 0.0, "above 0 (`inf` is allowed)")?;
-        let holds = config.guidance != Guidance::None || config.guidance_at == GuidanceAt::Noisy;
-        check("guidance_at", "denoised", holds, "absent where agent.guidance is `none`")?;
-        match (config.guidance, config.lambda) {
-            (Guidance::Constant, None) => {
-                check("lambda", "absent", false, "given where agent.guidance is `constant`")?
-            }
-            (Guidance::Constant, _) | (_, None) => {}
-            (_, Some(lambda)) => {
-                check("lambda", *lambda, false, "absent unless agent.guidance is `constant`")?
-            }
-        }
-        let eta = config.eta;
-        let (initial, range) = (*eta.initial, *eta.minimum..=*eta.maximum);
-        check("eta.maximum", range.end(), range.start() <= range.end(), "at least eta.minimum")?;
-        let within = range.contains(&initial);
-        check("eta.initial", initial, within, "between eta.minimum and eta.maximum")?;
+        let (tau, guidance) = (config.tau, config.guidance);
+        check("tau", tau, tau > 0.0, "above 0 (`inf` is allowed)")?;
+        let holds = guidance != Guidance::None || config.guidance_at == GuidanceAt::Noisy;
+        let range = "absent where agent.guidance is `none`";
+        check("guidance_at", "denoised", holds, range)?;
+        let (is_constant, lambda) = (guidance == Guidance::Constant, config.lambda);
+        let range = match is_constant {
+            true => "given where agent.guidance is `constant`",
+            false => "absent unless agent.guidance is `constant`",
+        };
+        let value = lambda.map_or("absent".to_owned(), |lambda| lambda.to_string());
+        check("lambda", value, lambda.is_some() == is_constant, range)?;
+        let [initial, least, most] =
+            [config.eta.initial, config.eta.minimum, config.eta.maximum].map(|eta| *eta);
+        check("eta.maximum", most, least <= most, "at least eta.minimum")?;
+        let (within, range) =
+            ((least..=most).contains(&initial), "between eta.minimum and eta.maximum");
+        check("eta.initial", initial, within, range)?;
         Ok(config)
     }
 }

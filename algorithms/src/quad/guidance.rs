@@ -19,9 +19,11 @@ fn lambda(
     match config.guidance {
         Guidance::Quad | Guidance::Mean | Guidance::Shuffled => {
             let (tau, delta) = (f64::from(config.tau), f64::from(*config.delta));
-            let denominator = sigma_squared.affine(1.0 / tau, delta)?.broadcast_add(nu_squared)?;
-            let decided = denominator.lt(100.0 * delta)?.to_dtype(DType::F32)?.mean_all()?;
-            Ok((denominator.recip()?.broadcast_mul(nu_squared)?, decided))
+            let scaled = sigma_squared.affine(1.0 / tau, delta)?;
+            let denominator = scaled.broadcast_add(nu_squared)?;
+            let decided = denominator.lt(100.0 * delta)?.to_dtype(DType::F32)?;
+            let lambda = denominator.recip()?.broadcast_mul(nu_squared)?;
+            Ok((lambda, decided.mean_all()?))
         }
         Guidance::Dac | Guidance::None => Ok((ones, zero)),
         Guidance::Constant => {
@@ -56,9 +58,11 @@ pub(super) struct Averages {
 
 impl Averages {
     pub fn new(config: &Config, device: &Device) -> Result<Self> {
+        let nu_squared = Tensor::new(-1f32, device)?;
         let unset = || Tensor::full(-1f32, *config.diffusion_steps, device);
-        let lambda_means = (config.guidance == Guidance::Mean).then(unset).transpose()?;
-        Ok(Self { nu_squared: Tensor::new(-1f32, device)?, lambda_means })
+        let lambda_means = (config.guidance == Guidance::Mean).then(unset);
+        let lambda_means = lambda_means.transpose()?;
+        Ok(Self { nu_squared, lambda_means })
     }
 
     /// Overwrites them with newer ones.
@@ -164,6 +168,7 @@ fn means_by_step(before: &Tensor, lambda: &Tensor, t: &Tensor, config: &Config) 
     let count = is_at.sum(1)?;
     let mean = (is_at.broadcast_mul(lambda)?.sum(1)? / count.maximum(1f32)?)?;
     let rate = f64::from(*config.nu_ema_rate);
-    let rate = before.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - rate, rate)?;
+    let is_first = before.lt(0f32)?.to_dtype(DType::F32)?;
+    let rate = is_first.affine(1.0 - rate, rate)?;
     before + ((mean - before)? * (rate * count.minimum(1f32)?)?)?
 }

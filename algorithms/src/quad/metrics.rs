@@ -56,16 +56,17 @@ pub(super) fn measure_lambda(numbers: &[f32], t: &[u32], steps: usize, delta: f3
     let lambda_mean = mean(lambda.iter().copied());
     let [low, median, high] = quantiles(lambda);
     let width = gradient.len() / t.len();
-    let cosines =
-        gradient.chunks(width).zip(error.chunks(width)).map(|(one, other)| cosine(one, other));
+    let rows = gradient.chunks(width).zip(error.chunks(width));
+    let above_99 = lambda.iter().map(|lambda| f32::from(*lambda > 0.99));
+    let variance = mean(sigma_squared.iter().copied());
     let mut measured = vec![
         ("lambda_mean", lambda_mean),
         ("lambda_quantile_10", low),
         ("lambda_quantile_50", median),
         ("lambda_quantile_90", high),
-        ("lambda_above_99_share", mean(lambda.iter().map(|lambda| f32::from(*lambda > 0.99)))),
-        ("variance_ratio", mean(sigma_squared.iter().copied()) / (nu_squared + delta)),
-        ("guidance_cosine", mean(cosines)),
+        ("lambda_above_99_share", mean(above_99)),
+        ("variance_ratio", variance / (nu_squared + delta)),
+        ("guidance_cosine", mean(rows.map(|(g, error)| cosine(g, error)))),
     ];
     let fifths = FIFTHS.into_iter().zip(by_fifth(lambda, t, steps));
     measured.extend(fifths.filter_map(|(name, mean)| Some((name, mean?))));
@@ -83,7 +84,7 @@ fn quantiles(values: &[f32]) -> [f32; 3] {
     sorted.sort_unstable_by(f32::total_cmp);
     [0.1, 0.5, 0.9].map(|share| {
         let place = share * (sorted.len() - 1) as f32;
-        let (below, above) = (sorted[place.floor() as usize], sorted[place.ceil() as usize]);
+        let [below, above] = [place.floor(), place.ceil()].map(|place| sorted[place as usize]);
         below + (above - below) * place.fract()
     })
 }
@@ -103,5 +104,8 @@ fn by_fifth(lambda: &[f32], t: &[u32], steps: usize) -> [Option<f32>; FIFTHS.len
 fn cosine(one: &[f32], other: &[f32]) -> f32 {
     let dot = |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| x * y).sum::<f32>();
     let size = (dot(one, one) * dot(other, other)).sqrt();
-    if size == 0.0 { 0.0 } else { dot(one, other) / size }
+    match size {
+        0.0 => 0.0,
+        _ => dot(one, other) / size,
+    }
 }

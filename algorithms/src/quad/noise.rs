@@ -53,7 +53,9 @@ fn shuffled(t: &[u32], generator: &mut impl Rng) -> Vec<u32> {
     takers.sort_by_key(|row| t[*row as usize]);
     givers.sort_by_key(|row| t[*row as usize]);
     let mut permutation = vec![0; t.len()];
-    takers.into_iter().zip(givers).for_each(|(taker, giver)| permutation[taker as usize] = giver);
+    for (taker, giver) in takers.into_iter().zip(givers) {
+        permutation[taker as usize] = giver;
+    }
     permutation
 }
 
@@ -67,7 +69,8 @@ mod tests {
     fn a_shuffle_permutes_the_samples_of_each_denoising_step() {
         let t = Vec::from_iter((0..500).map(|row| row % 3 + 1));
         let mut rows = shuffled(&t, &mut ChaCha8Rng::seed_from_u64(0));
-        assert!(rows.iter().zip(&t).all(|(row, step)| t[*row as usize] == *step));
+        let keeps_step = |(row, step): (&u32, &u32)| t[*row as usize] == *step;
+        assert!(rows.iter().zip(&t).all(keeps_step));
         // Of n things in random order one stays on average; of three t's three do.
         let stay = rows.iter().zip(0..).filter(|(row, place)| *row == place);
         assert!(stay.count() < 20);

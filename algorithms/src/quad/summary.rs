@@ -22,22 +22,25 @@ pub(super) fn summarize(lines: &[MetricsLine], variant: &str) -> Option<Summary>
     let from_step = to_step / PARTS + 1;
     lines.retain(|line| step(line) >= from_step);
     let mut sums: BTreeMap<&str, (f64, u32)> = BTreeMap::new();
-    for (name, value) in
-        lines.iter().flat_map(|line| line.iter()).filter(|(name, _)| is_summarized(name))
-    {
+    let values = lines.iter().flat_map(|line| line.iter());
+    for (name, value) in values.filter(|(name, _)| is_summarized(name)) {
         let (sum, count) = sums.entry(name).or_default();
         (*sum, *count) = (*sum + value, *count + 1);
     }
-    let means: BTreeMap<_, _> =
-        sums.into_iter().map(|(name, (sum, count))| (name, sum / f64::from(count))).collect();
-    let is_dac = lines.iter().all(|line| line.get("lambda_mean").is_some_and(|mean| *mean > ONE));
+    let mean = |(name, (sum, count))| (name, sum / f64::from(count));
+    let means: BTreeMap<_, _> = sums.into_iter().map(mean).collect();
+    let mut lambda_means = lines.iter().map(|line| line.get("lambda_mean"));
+    let is_dac = lambda_means.all(|mean| mean.is_some_and(|mean| *mean > ONE));
     let mut text = text(&means, from_step, to_step);
     if is_dac && variant != "dac" {
         text.push_str("λ stayed above 0.99: this run is DAC to within 1 %\n");
     }
     let mut json = json!({ "from_step": from_step, "to_step": to_step, "is_dac": is_dac });
-    means.into_iter().for_each(|(name, mean)| json[name] = mean.into());
-    Some(Summary { key: "lambda", title: "λ", json, text })
+    for (name, mean) in means {
+        json[name] = mean.into();
+    }
+    let (key, title) = ("lambda", "λ");
+    Some(Summary { key, title, json, text })
 }
 
 fn text(means: &BTreeMap<&str, f64>, from_step: u64, to_step: u64) -> String {

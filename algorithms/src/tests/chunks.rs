@@ -33,9 +33,11 @@ fn a_policy_of_chunks_acts_step_by_step() {
         variant.table.insert("history".to_owned(), 2.into());
         let mut trial = variant.start(&context(0, &Device::Cpu));
         let values = trial.train(STEPS).concat();
-        assert!(values.iter().flatten().all(|value| value.is_finite()), "{values:?}");
+        let mut measured = values.iter().flatten();
+        assert!(measured.all(|value| value.is_finite()), "{values:?}");
         let policy = load_policy(&trial.policy(), Precision::F32).unwrap();
-        assert_eq!((policy.observation_dim(), policy.action_dim()), DIMS, "{}", variant.name);
+        let dims = (policy.observation_dim(), policy.action_dim());
+        assert_eq!(dims, DIMS, "{}", variant.name);
         let mut states = [policy.begin(1)];
         let mut act = |observation: f32| {
             let mut action = [0.0; DIMS.1];

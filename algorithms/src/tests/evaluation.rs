@@ -28,12 +28,14 @@ fn an_evaluation_measures_the_losses_of_an_update() {
         for step in 0..STEPS {
             let updated = trial.agent.update(&batch).unwrap();
             let evaluated = trial.agent.evaluate(&batch).unwrap();
-            for ((metric, x), y) in variant.definition.metrics.iter().zip(updated).zip(evaluated) {
+            let metrics = variant.definition.metrics.iter();
+            for (metric, (x, y)) in metrics.zip(updated.into_iter().zip(evaluated)) {
                 // TD3+BC's policy first moves in its second update, RLPD's not in every one.
                 let is_measured =
                     x.is_some() || matches!((name, step), ("td3-bc", 0) | ("rlpd", _));
                 assert_eq!(y.is_some(), metric.held_out && is_measured, "{metric:?}");
-                measured.entry(name).or_default().extend(y.map(|_| metric.name));
+                let names = measured.entry(name).or_default();
+                names.extend(y.map(|_| metric.name));
                 let close = |(x, y): (f32, f32)| (x - y).abs() <= 1e-5 * x.abs().max(1e-3);
                 let text = || format!("{name}, step {step}: {} is {x:?} and {y:?}", metric.name);
                 assert!(x.zip(y).is_none_or(close), "{}", text());
@@ -41,8 +43,10 @@ fn an_evaluation_measures_the_losses_of_an_update() {
         }
     }
     for (name, measured) in measured {
-        let metrics = variant(name).definition.metrics.iter().filter(|metric| metric.held_out);
-        assert_eq!(measured, metrics.map(|metric| metric.name).collect(), "{name}");
+        let metrics = variant(name).definition.metrics.iter();
+        let held_out = metrics.filter(|metric| metric.held_out);
+        let held_out = held_out.map(|metric| metric.name).collect();
+        assert_eq!(measured, held_out, "{name}");
     }
 }
 
@@ -54,8 +58,9 @@ fn an_evaluation_changes_nothing() {
             let before = measured.save();
             let [first, _, again] = [step + 1, step, step + 1]
                 .map(|step| measured.agent.evaluate(&measured.batch(step)).unwrap());
-            assert!(first == again && measured.save() == before, "{}", variant.name);
-            assert_eq!(measured.train(1), alone.train(1), "{}", variant.name);
+            let name = variant.name;
+            assert!(first == again && measured.save() == before, "{name}");
+            assert_eq!(measured.train(1), alone.train(1), "{name}");
         }
         assert!(measured.save() == alone.save(), "{}", variant.name);
     }

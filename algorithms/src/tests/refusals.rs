@@ -24,7 +24,8 @@ fn contradictory_hyper_parameters_are_refused() {
     ] {
         let mut variant = variant(name);
         merge(&mut variant.table, change.parse().unwrap());
-        let error = variant.definition.check(&variant.table).unwrap_err().to_string();
+        let error = variant.definition.check(&variant.table).unwrap_err();
+        let error = error.to_string();
         assert!(error.contains(words), "{name}: {error}");
     }
 }
@@ -32,7 +33,7 @@ fn contradictory_hyper_parameters_are_refused() {
 #[test]
 fn an_error_names_the_hyper_parameter() {
     for definition in ALGORITHMS {
-        let mut values = Values::of(definition).for_task(None);
+        let mut values = Values::read(definition).for_task(None);
         let agent = values.remove("agent").unwrap().as_table().unwrap().clone();
         for key in agent.keys().filter(|key| agent[*key].is_float()) {
             for (value, words) in
@@ -65,7 +66,8 @@ fn data_without_examples_is_refused_with_a_hint() {
         }
         let trial = variant.start(&context(0, &Device::Cpu));
         let error = trial.agent.examples(single.clone()).err().unwrap();
-        assert!(error.to_string().contains(words) && error.hint().contains(hint), "{error}");
+        assert!(error.to_string().contains(words), "{error}");
+        assert!(error.hint().contains(hint), "{error}");
     }
 }
 
@@ -84,7 +86,7 @@ fn an_unfit_state_is_refused() {
         (variant("iql"), &saved[..saved.len() - 1], ""),
         (variant("iql"), &policy, "`state`"),
     ] {
-        let error = variant.start(&context).agent.load(bytes).unwrap_err().to_string();
-        assert!(error.contains(words), "{error}");
+        let error = variant.start(&context).agent.load(bytes).unwrap_err();
+        assert!(error.to_string().contains(words), "{error}");
     }
 }

@@ -89,7 +89,7 @@ fn keys(group: &Table) -> Vec<String> {
 #[test]
 fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
     for definition in ALGORITHMS {
-        let values = Values::of(definition);
+        let values = Values::read(definition);
         for task in tasks() {
             let keys: Vec<_> = values
                 .groups_for(&task)
@@ -112,7 +112,7 @@ fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
 #[test]
 fn a_group_with_another_network_names_all_of_it() {
     for definition in ALGORITHMS {
-        let values = Values::of(definition);
+        let values = Values::read(definition);
         let shared = &values.shared["agent"];
         for (pattern, group) in &values.groups {
             let agent = group.get("agent").and_then(Value::as_table).into_iter().flatten();

@@ -52,7 +52,7 @@ pub fn matching_environments(
         Err(problem) => Err(DatasetError::new(file.path(), problem)),
     };
     let sizes = (width("observations")?, width("actions")?);
-    let specs = environment::all().iter().filter(|spec| spec.simulation() == spec.name);
+    let specs = environment::specs().iter().filter(|spec| spec.simulation() == spec.name);
     Ok(specs.filter(|spec| spec.sizes() == sizes).collect())
 }
 

@@ -145,13 +145,13 @@ static TABLES: LazyLock<Tables> = LazyLock::new(|| {
 });
 
 /// All benchmarks.
-pub fn all() -> &'static [Benchmark] {
+pub fn list() -> &'static [Benchmark] {
     &TABLES.benchmark
 }
 
 /// Benchmark of the given name.
 pub fn find(name: &str) -> Option<&'static Benchmark> {
-    all().iter().find(|benchmark| benchmark.name == name)
+    list().iter().find(|benchmark| benchmark.name == name)
 }
 
 pub(super) struct BenchmarkEnvironment {
@@ -166,7 +166,7 @@ pub(super) struct BenchmarkEnvironment {
 }
 
 static ENVIRONMENTS: LazyLock<Vec<BenchmarkEnvironment>> =
-    LazyLock::new(|| all().iter().flat_map(Benchmark::environments).collect());
+    LazyLock::new(|| list().iter().flat_map(Benchmark::environments).collect());
 
 pub(super) fn environments() -> &'static [BenchmarkEnvironment] {
     &ENVIRONMENTS

@@ -94,28 +94,28 @@ static DATASETS: LazyLock<Vec<NamedDataset>> = LazyLock::new(|| {
 });
 
 /// All datasets.
-pub fn all() -> &'static [NamedDataset] {
+pub fn datasets() -> &'static [NamedDataset] {
     &DATASETS
 }
 
 /// Dataset of the given name.
 pub fn find(name: &str) -> Option<&'static NamedDataset> {
-    all().iter().find(|dataset| dataset.name == name)
+    datasets().iter().find(|dataset| dataset.name == name)
 }
 
 /// Dataset with the given file name; folders are ignored.
 pub fn find_file(file: &str) -> Option<&'static NamedDataset> {
-    all().iter().find(|dataset| dataset.file == file)
+    datasets().iter().find(|dataset| dataset.file == file)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tables::environment::{self, simulation_of};
+    use crate::tables::environment::{self, simulation_name};
 
     #[test]
     fn the_table_is_consistent() {
-        for dataset in all() {
+        for dataset in datasets() {
             let (name, file) = (&dataset.name, &dataset.file);
             assert_eq!([find(name), find_file(file)], [Some(dataset); 2], "unique");
             let addresses = &dataset.addresses;
@@ -127,13 +127,13 @@ mod tests {
             if let Some(digest) = &dataset.sha256 {
                 assert!(digest.len() == 64 && digest.chars().all(is_digit), "{name}");
                 assert!(dataset.bytes.is_some(), "{name}");
-                assert!(name.starts_with(&*simulation_of(environment)), "{name}");
+                assert!(name.starts_with(&*simulation_name(environment)), "{name}");
             }
             let is_simulated = environment::find(environment).is_ok();
             let is_relabeled = benchmarks::relabeling(environment).is_some();
             assert!(is_simulated || is_relabeled, "{name}");
         }
-        assert_eq!(all().len(), 54);
+        assert_eq!(datasets().len(), 54);
         let address =
             "https://rail.eecs.berkeley.edu/datasets/ogbench/antsoccer-medium-stitch-v0.npz";
         let stitch = find("antsoccer-medium-stitch-v0").unwrap();

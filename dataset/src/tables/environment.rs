@@ -54,7 +54,7 @@ static ENVIRONMENTS: LazyLock<Vec<EnvironmentSpec>> = LazyLock::new(|| {
 });
 
 /// All environments.
-pub fn all() -> &'static [EnvironmentSpec] {
+pub fn specs() -> &'static [EnvironmentSpec] {
     &ENVIRONMENTS
 }
 
@@ -68,29 +68,29 @@ pub struct UnknownEnvironment {
 
 /// Names of all environments.
 pub fn names() -> Vec<&'static str> {
-    all().iter().map(|spec| spec.name.as_str()).collect()
+    specs().iter().map(|spec| spec.name.as_str()).collect()
 }
 
 fn simulations() -> Vec<&'static str> {
-    let own = all().iter().filter(|spec| spec.simulation() == spec.name);
+    let own = specs().iter().filter(|spec| spec.simulation() == spec.name);
     own.map(|spec| spec.name.as_str()).collect()
 }
 
 /// Environment of the given name.
 pub fn find(name: &str) -> Result<&'static EnvironmentSpec, UnknownEnvironment> {
     let name = name.to_owned();
-    let spec = all().iter().find(|spec| spec.name == name);
+    let spec = specs().iter().find(|spec| spec.name == name);
     spec.ok_or(UnknownEnvironment { name })
 }
 
 /// Environment of a Gymnasium id such as `Hopper-v5`.
 pub(crate) fn find_gymnasium(id: &str) -> Option<&'static EnvironmentSpec> {
-    let has_id = |spec: &&EnvironmentSpec| spec.gymnasium.iter().any(|known_id| known_id == id);
-    all().iter().find(has_id)
+    let has_id = |spec: &&EnvironmentSpec| spec.gymnasium.iter().any(|other| other == id);
+    specs().iter().find(has_id)
 }
 
 /// Name of an environment's physics, simulated here or not.
-pub fn simulation_of(name: &str) -> String {
+pub fn simulation_name(name: &str) -> String {
     match (find(name), benchmarks::environment(name)) {
         (Ok(spec), _) => spec.simulation().to_owned(),
         (_, Some(environment)) => environment.simulation.clone(),
@@ -140,7 +140,7 @@ impl EnvironmentSpec {
 
     /// Another simulation with observations and actions of the same sizes.
     pub fn same_sized(&self) -> Option<&'static Self> {
-        let mut alike = all().iter().filter(|spec| spec.sizes() == self.sizes());
+        let mut alike = specs().iter().filter(|spec| spec.sizes() == self.sizes());
         alike.find(|spec| spec.simulation() != self.simulation())
     }
 
@@ -157,8 +157,8 @@ mod tests {
 
     #[test]
     fn the_table_is_consistent() {
-        assert_eq!(all().len(), 3 * 2 + 3 * 2 + 6 * 6);
-        for spec in all() {
+        assert_eq!(specs().len(), 3 * 2 + 3 * 2 + 6 * 6);
+        for spec in specs() {
             let name = &spec.name;
             assert_eq!(find(name), Ok(spec), "names are unique");
             let physics = find(spec.simulation()).unwrap();
@@ -167,7 +167,7 @@ mod tests {
             let (min, max) = spec.reference_returns;
             assert!(max > min, "{name}");
         }
-        for recipe in all().iter().filter_map(|spec| spec.collect.as_ref()) {
+        for recipe in specs().iter().filter_map(|spec| spec.collect.as_ref()) {
             let (bounds, shares): (Vec<f64>, Vec<f64>) = recipe.mixture.iter().copied().unzip();
             assert!(bounds.is_sorted() && bounds[0] == f64::NEG_INFINITY);
             let whole: f64 = shares.iter().sum();

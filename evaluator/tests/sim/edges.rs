@@ -1,7 +1,7 @@
 //! Behavior of simulations beyond the comparison with Gymnasium: initial states, rare bounds, time
 //! limits, and values that are not finite.
 
-use quad_dataset::environment::{EnvironmentSpec, all, find};
+use quad_dataset::environment::{EnvironmentSpec, find, specs};
 use quad_evaluator::sim::{Simulation, Step, make};
 
 fn simulation(name: &str) -> Simulation {
@@ -10,7 +10,7 @@ fn simulation(name: &str) -> Simulation {
 
 #[test]
 fn an_episode_is_a_function_of_its_seed() {
-    for spec in all() {
+    for spec in specs() {
         let (mut one, mut other) = (make(spec, 0).unwrap(), make(spec, 0).unwrap());
         let sizes = [one.observation(), one.qpos(), one.qvel()].map(<[f64]>::len);
         assert_eq!(sizes, [spec.observation_dim, spec.qpos_dim, spec.qvel_dim], "{}", spec.name);
@@ -131,7 +131,7 @@ fn endless(spec: &EnvironmentSpec) -> Option<Vec<f64>> {
 #[test]
 fn the_time_limit_truncates_and_does_not_terminate() {
     // The tasks of one simulation differ in start and goal alone.
-    for spec in all().iter().filter(|spec| spec.name == spec.simulation()) {
+    for spec in specs().iter().filter(|spec| spec.name == spec.simulation()) {
         let Some(qpos) = endless(spec) else { continue };
         let (mut simulation, still) = (make(spec, 0).unwrap(), vec![0.0; spec.action_dim]);
         simulation.reset(0);
@@ -150,7 +150,7 @@ fn the_time_limit_truncates_and_does_not_terminate() {
 #[test]
 fn values_that_are_not_finite_end_the_episode_without_reward() {
     let end = |step: Step| (step.reward, step.terminated, step.truncated) == (0.0, true, false);
-    for spec in all() {
+    for spec in specs() {
         let mut simulation = make(spec, 0).unwrap();
         simulation.reset(0);
         // Even at the goal.

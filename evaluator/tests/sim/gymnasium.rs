@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use quad_dataset::Simulator;
-use quad_dataset::environment::{all, find};
+use quad_dataset::environment::{find, specs};
 use quad_evaluator::sim::{make, mjcf};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -115,7 +115,7 @@ fn assert_steps(name: &str, terminated: RangeInclusive<f64>) {
 
 #[test]
 fn planar_robots_are_gymnasiums() {
-    for spec in all().iter().filter(|spec| !spec.gymnasium.is_empty()) {
+    for spec in specs().iter().filter(|spec| !spec.gymnasium.is_empty()) {
         let ends = matches!(&spec.simulator, Simulator::Planar(robot) if robot.healthy.is_some());
         assert_gymnasiums(&spec.name, if ends { 0.1..=0.9 } else { 0.0..=0.0 });
     }

@@ -130,7 +130,7 @@ unsafe fn round_left(
             }
         }
     }
-    Strided { first: to, row, column: 1 }
+    Strided::row_major(to, row)
 }
 
 /// Rounds columns `j..j + 32` of the right side of a product, `k × n`, to rows of pairs.
@@ -241,7 +241,7 @@ impl Rounded {
     /// of whole registers.
     pub fn new(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
         assert_eq!(matrix.len(), k * n, "the matrix's shape");
-        let b = Strided { first: matrix.as_ptr(), row: n, column: 1 };
+        let b = Strided::row_major(matrix.as_ptr(), n);
         if !serves([1, k, n], b) {
             return None;
         }
@@ -268,7 +268,7 @@ impl Rounded {
         let (pairs, n, mut left) = (self.k / 2, self.n, LEFT.take());
         // SAFETY: whole blocks of pairs × 32 are behind each other.
         unsafe {
-            let a = round_left(m, self.k, Strided { first: a, row: self.k, column: 1 }, &mut left);
+            let a = round_left(m, self.k, Strided::row_major(a, self.k), &mut left);
             let b: *const Pair = self.blocks.as_ptr().cast();
             for j in (0..n).step_by(COLUMNS) {
                 let block = b.add(j * pairs);
@@ -295,10 +295,8 @@ mod tests {
         }
         let mut generator = ChaCha8Rng::seed_from_u64(0);
         let mut numbers =
-            |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
-        for (m, k, n) in
-            [(1, 32, 32), (2, 64, 96), (16, 32, 32), (17, 32, 64), (33, 96, 32), (100, 256, 64)]
-        {
+            |len: usize| Vec::from_iter((0..len).map(|_| generator.random_range(-1.0..1.0f32)));
+        for (m, k, n) in [(1, 32, 32), (2, 64, 96), (16, 32, 32), (17, 32, 64), (100, 256, 64)] {
             let (a, b) = (numbers(m * k), numbers(k * n));
             let right = Rounded::new(&b, k, n).unwrap();
             let by = |tiles| {

@@ -226,7 +226,7 @@ impl TypedValueParser for TaskName {
     }
 
     fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
-        Some(Box::new(tasks::all().iter().map(|task| PossibleValue::new(&*task.name))))
+        Some(Box::new(tasks::list().iter().map(|task| PossibleValue::new(&*task.name))))
     }
 }
 

@@ -24,7 +24,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let elsewhere = "another folder is chosen by --run-dir";
     doctor::folder(&mut findings, "run folder", &args.run_dir, elsewhere);
     locks(&mut findings, &args.run_dir);
-    for benchmark in benchmarks::all() {
+    for benchmark in benchmarks::list() {
         let Some(variable) = &benchmark.cache.variable else { continue };
         let hint =
             format!("{variable} chooses another folder for datasets that are fetched by name");

@@ -103,7 +103,7 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
         return print_metrics(args.algorithm.as_deref());
     }
     let mut tasks = table(["task", "environment", "dataset", "what it is"]);
-    for task in tasks::all().iter().filter(|task| task.is_listed) {
+    for task in tasks::list().iter().filter(|task| task.is_listed) {
         let [environment, dataset] =
             ["environment", "dataset"].map(|key| task.text(key).unwrap_or("-"));
         tasks.push([&*task.name, environment, dataset, &task.about].map(str::to_owned));
@@ -111,7 +111,7 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     let header = ["algorithm", "what it is", "its authors give values for", "GFLOP a step"];
     let mut algorithms = table(header);
     for definition in ALGORITHMS {
-        let (name, values) = (definition.name.to_owned(), Values::of(definition));
+        let (name, values) = (definition.name.to_owned(), Values::read(definition));
         let words = |(name, tasks): (_, &Vec<_>)| format!("{name}: {}", tasks.join(", "));
         let given = Vec::from_iter(values.given.iter().map(words)).join("; ");
         algorithms.push([name, values.about, given, values.gflop]);
@@ -274,7 +274,7 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
                 table.push(dataset?);
             }
             let mut folders = Vec::new();
-            for benchmark in benchmarks::all() {
+            for benchmark in benchmarks::list() {
                 let folder = cache_folder(benchmark)?;
                 folders.push(format!("{} of {}", folder.display(), benchmark.name));
             }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, anyhow};
 use indicatif::HumanBytes;
 use quad_dataset::benchmarks::{Benchmark, Cache};
-use quad_dataset::environment::{self, simulation_of};
+use quad_dataset::environment::{self, simulation_name};
 use quad_dataset::{DatasetError, NamedDataset, catalog};
 use quad_run::config::{did_you_mean, tasks};
 use quad_runtime::Hint;
@@ -50,7 +50,7 @@ impl Source {
     pub fn named(name: &str) -> anyhow::Result<Self> {
         const LIST: &str =
             "`learner datasets list` prints all names; to train on a file, give its path";
-        let names = catalog::all().iter().map(|dataset| dataset.name.as_str());
+        let names = catalog::datasets().iter().map(|dataset| dataset.name.as_str());
         let hint = match tasks::named(name).map(|task| task.text("dataset")) {
             Ok(Some(dataset)) => format!("it is a task, whose dataset is {dataset}"),
             Ok(None) => {
@@ -76,7 +76,7 @@ impl Source {
         let Some(NamedDataset { name, environment: other, .. }) = self.entry() else {
             return Ok(());
         };
-        if simulation_of(other) == simulation_of(environment) {
+        if simulation_name(other) == simulation_name(environment) {
             return Ok(());
         }
         Err(anyhow!("{name} is a dataset of {other}, but the policy is for {environment}"))
@@ -158,7 +158,7 @@ pub fn cache_folder(benchmark: &Benchmark) -> anyhow::Result<PathBuf> {
 /// The catalog: name, environment, size, and state of the file in its folder. Does not compute
 /// checksums.
 pub fn cached() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
-    catalog::all().iter().map(|dataset| {
+    catalog::datasets().iter().map(|dataset| {
         let NamedDataset { name, environment, bytes, .. } = dataset;
         let path = cache_folder(dataset.benchmark)?.join(&dataset.file);
         let parts = partial_files(&path).into_iter().map(|(_, length)| length);

@@ -33,7 +33,8 @@ impl NoisePredictor {
         let observations = &repeat_rows(observations, rows / observations.dim(0)?.max(1))?;
         let times = Tensor::full(t as u32, rows, actions.device())?;
         let epsilon = self.predict(observations, actions, &times)?.detach();
-        let actions = self.schedule().clean(t, actions, &epsilon)?.clamp(-1f32, 1f32)?;
+        let actions = self.schedule().clean(t, actions, &epsilon)?;
+        let actions = actions.clamp(-1f32, 1f32)?;
         let gradients = critics.action_gradients(observations, &actions)?;
         Ok(Denoised { epsilon, actions, gradients })
     }
@@ -49,19 +50,12 @@ impl NoisePredictor {
         strength: f32,
     ) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
-        let (steps, rows, _) = noise.dims3()?;
-        let (schedule, observations) =
-            (self.schedule(), repeat_rows(observations, rows / observations.dim(0)?)?);
-        let mut actions = noise.get(0)?;
-        for t in (1..=steps).rev() {
-            let Denoised { epsilon, gradients, .. } =
-                self.denoised(critics, &observations, &actions, t)?;
-            let pull = f64::from(strength * schedule.deviation(t));
-            let epsilon = (epsilon - (mean_and_variance(&gradients)?.0 * pull)?)?;
-            let z = (t > 1).then(|| noise.get(steps - t + 1)).transpose()?;
-            actions = schedule.reverse(t, &actions, &epsilon, z.as_ref())?;
-        }
-        Ok(actions)
+        let observations = repeat_rows(observations, noise.dim(1)? / observations.dim(0)?)?;
+        self.reverse_process(noise, |t, actions| {
+            let denoised = self.denoised(critics, &observations, actions, t)?;
+            let pull = f64::from(strength * self.schedule().deviation(t));
+            denoised.epsilon - (mean_and_variance(&denoised.gradients)?.0 * pull)?
+        })
     }
 
     /// Numbers held by [`Self::sample_guided`] beside its arguments and the networks' tiles.

@@ -45,7 +45,12 @@ impl NoisePredictor {
             steps_tensor: OnceLock::new(),
             shape,
         };
-        Self { architecture: Arc::new(architecture), weights, packing: Packing::default() }
+        Self::with_weights(Arc::new(architecture), weights)
+    }
+
+    fn with_weights(architecture: Arc<Architecture>, weights: Weights) -> Self {
+        let packing = Packing::default();
+        Self { architecture, weights, packing }
     }
 
     /// Sizes and hidden layers.
@@ -70,24 +75,26 @@ impl NoisePredictor {
     }
 
     fn embed(&self, features: &Tensor) -> Result<Tensor> {
-        self.architecture.time.forward(&self.weights, &[features])?.squeeze(0)
+        let embedding = self.architecture.time.forward(&self.weights, &[features]);
+        embedding?.squeeze(0)
     }
 
     /// The embeddings of t = 1..T, `[T, 32]`.
     fn embeddings(&self) -> Result<Tensor> {
-        self.embed(&self.features()?.narrow(0, 1, self.architecture.shape.diffusion_steps)?)
+        let steps = self.architecture.shape.diffusion_steps;
+        self.embed(&self.features()?.narrow(0, 1, steps)?)
     }
 
     /// The coefficients of all reverse steps, `[T, 7]`, on the weights' device.
     #[cfg(feature = "cuda")]
     fn reverse_steps(&self) -> Result<Tensor> {
-        let Architecture { schedule, steps_tensor, .. } = &*self.architecture;
-        if let Some(tensor) = steps_tensor.get() {
+        let made = &self.architecture.steps_tensor;
+        if let Some(tensor) = made.get() {
             return Ok(tensor.clone());
         }
-        let tensor =
-            Tensor::from_vec(schedule.reverse_steps(), ((), 7), self.weights.values().device())?;
-        Ok(steps_tensor.get_or_init(|| tensor).clone())
+        let (steps, device) = (self.schedule().reverse_steps(), self.weights.values().device());
+        let tensor = Tensor::from_vec(steps, ((), 7), device)?;
+        Ok(made.get_or_init(|| tensor).clone())
     }
 
     /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`.
@@ -104,8 +111,7 @@ impl NoisePredictor {
 
     /// The same network with constant weights, in the same memory.
     pub fn detach(&self) -> Self {
-        let (architecture, weights) = (self.architecture.clone(), self.weights.detach());
-        Self { architecture, weights, packing: Packing::default() }
+        Self::with_weights(self.architecture.clone(), self.weights.detach())
     }
 
     /// Draws actions `[rows, a]` by the reverse process (DDPM), without gradients.
@@ -136,19 +142,29 @@ impl NoisePredictor {
     fn composed_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
         let trunk = &self.architecture.trunk;
-        let (steps, rows, _) = noise.dims3()?;
-        let embeddings = self.embeddings()?;
+        let (rows, embeddings) = (noise.dim(1)?, self.embeddings()?);
         #[cfg(feature = "cuda")]
         if let Some(dense) = crate::gpu::dense::dense(&trunk.layers, &self.weights) {
             let (parts, steps) = ([observations, &embeddings], self.reverse_steps()?);
             return crate::gpu::dense::sample(dense, &self.weights, parts, noise, &steps);
         }
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
-        let mut actions = noise.get(0)?;
-        for t in (1..=steps).rev() {
+        self.reverse_process(noise, |t, actions| {
             let embedding = embeddings.get(t - 1)?.broadcast_left(rows)?.contiguous()?;
-            let inputs = [&observations, &actions, &embedding];
-            let epsilon = trunk.forward(&self.weights, &inputs)?.squeeze(0)?;
+            let inputs = [&observations, actions, &embedding];
+            trunk.forward(&self.weights, &inputs)?.squeeze(0)
+        })
+    }
+
+    /// a^0 from the `noise` of [`Self::sample`] and the noise that `predict` finds in a^t.
+    pub(super) fn reverse_process(
+        &self,
+        noise: &Tensor,
+        predict: impl Fn(usize, &Tensor) -> Result<Tensor>,
+    ) -> Result<Tensor> {
+        let (steps, mut actions) = (noise.dim(0)?, noise.get(0)?);
+        for t in (1..=steps).rev() {
+            let epsilon = predict(t, &actions)?;
             let z = (t > 1).then(|| noise.get(steps - t + 1)).transpose()?;
             actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
         }
@@ -158,27 +174,22 @@ impl NoisePredictor {
     /// [`Self::sample`], differentiable in the weights through every reverse step; slower.
     pub fn sample_with_gradient(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
-        let (steps, rows, _) = noise.dims3()?;
+        let rows = noise.dim(1)?;
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
-        let mut actions = noise.get(0)?;
-        for t in (1..=steps).rev() {
+        self.reverse_process(noise, |t, actions| {
             let times = Tensor::full(t as u32, rows, noise.device())?;
-            let epsilon = self.predict(&observations, &actions, &times)?;
-            let z = (t > 1).then(|| noise.get(steps - t + 1)).transpose()?;
-            actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
-        }
-        Ok(actions)
+            self.predict(&observations, actions, &times)
+        })
     }
 
     pub(super) fn check_noise(&self, observations: &Tensor, noise: &Tensor) -> Result<()> {
         let shape = &self.architecture.shape;
         let ((states, o), (steps, rows, a)) = (observations.dims2()?, noise.dims3()?);
         let is_whole = states > 0 && rows > 0 && rows.is_multiple_of(states);
-        let wanted = (shape.observation_dim, shape.action_dim, shape.diffusion_steps);
-        if !is_whole || (o, a, steps) != wanted {
-            bail!(
-                "a noise predictor of {shape:?} got {states} × {o} and noise {steps} × {rows} × {a}"
-            );
+        let fits = (o, a) == (shape.observation_dim, shape.action_dim);
+        if !is_whole || !fits || steps != shape.diffusion_steps {
+            let noise = noise.shape();
+            bail!("a noise predictor of {shape:?} got {states} × {o} and noise {noise:?}");
         }
         Ok(())
     }

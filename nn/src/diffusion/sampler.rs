@@ -3,12 +3,12 @@
 
 use crate::diffusion::schedule::Schedule;
 use crate::layers::flat::TILE;
-use crate::layers::mlp::{Kernels, Mlp, member_kernels};
-use crate::layers::network::{Network, rows_of};
+use crate::layers::mlp::{Kernels, Mlp};
+use crate::layers::network::row_slice;
 use crate::layers::workspace::with_workspace;
 use crate::shape::{NoiseShape, TIME_EMBEDDING, TIME_FEATURES};
 use candle_core::Tensor;
-use quad_kernels::Precision;
+use quad_kernels::Precision::F32;
 use quad_kernels::narrow::FirstLayer;
 use quad_kernels::product::product;
 use rayon::prelude::*;
@@ -37,12 +37,13 @@ impl Architecture {
     fn shifts(&self, weights: &[f32]) -> Vec<f32> {
         let (network, shape) = (self.trunk.network(weights, 0), &self.shape);
         let mut embedding = vec![0.0; shape.diffusion_steps * TIME_EMBEDDING];
-        self.time.run(weights, None, &self.features[TIME_FEATURES..], &mut embedding);
+        let features = &self.features[TIME_FEATURES..];
+        self.time.run(weights, None, features, &mut embedding);
         let width = network.width();
         let mut shifts = vec![0.0; shape.diffusion_steps * width];
         let before = shape.observation_dim + shape.action_dim;
         let kernel = network.first_kernel(before, TIME_EMBEDDING);
-        product(Precision::F32, &embedding, kernel, &mut shifts, TIME_EMBEDDING, width);
+        product(F32, &embedding, kernel, &mut shifts, TIME_EMBEDDING, width);
         for row in shifts.chunks_exact_mut(width) {
             row.iter_mut().zip(network.bias(0)).for_each(|(x, b)| *x += b);
         }
@@ -59,8 +60,7 @@ impl Architecture {
     ) -> Vec<f32> {
         let (o, a) = (self.shape.observation_dim, self.shape.action_dim);
         let steps = self.shape.diffusion_steps;
-        let packed = member_kernels(packed, 0);
-        let network = Network { packed, ..self.trunk.network(weights, 0) };
+        let network = self.trunk.packed_network(weights, packed, 0);
         let (shifts, width) = (self.shifts(weights), network.width());
         let kernel = network.first_kernel(o, a);
         let numbers = noise.len() / steps;
@@ -70,8 +70,9 @@ impl Architecture {
         let states = (share / repeat).max(1);
         let tile = states * repeat * a;
         let mut actions = vec![0.0; numbers];
-        actions.par_chunks_mut(tile).enumerate().for_each(|(i, actions)| {
-            let observations = rows_of(observations, i * states, states, o);
+        let tiles = actions.par_chunks_mut(tile).enumerate();
+        tiles.for_each(|(i, actions)| {
+            let observations = row_slice(observations, i * states, states, o);
             let len = observations.len() / o * width;
             with_workspace(|work| {
                 work.with_base(len, actions.len(), |base, epsilon, work| {

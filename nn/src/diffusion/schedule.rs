@@ -2,6 +2,7 @@
 
 use candle_core::{Device, Result, Tensor};
 use serde::{Deserialize, Serialize};
+use std::iter::repeat_n;
 
 /// Formula of a reverse step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -67,12 +68,16 @@ impl Schedule {
                 deviation: (1.0 - alpha_bar).sqrt() as f32,
                 from_clean: (before.sqrt() * (1.0 - alpha) / (1.0 - alpha_bar)) as f32,
                 from_noisy: (alpha.sqrt() * (1.0 - before) / (1.0 - alpha_bar)) as f32,
-                noise: if t == 1 { 0.0 } else { ((1.0 - alpha) * posterior).sqrt() as f32 },
+                noise: match t {
+                    1 => 0.0,
+                    _ => ((1.0 - alpha) * posterior).sqrt() as f32,
+                },
             };
             before = alpha_bar;
             step
         };
-        Self { steps: (1..=steps).map(step).collect(), reverse }
+        let steps = (1..=steps).map(step).collect();
+        Self { steps, reverse }
     }
 
     /// The variance of the noise of a reverse step, 0 at t = 1.
@@ -105,15 +110,15 @@ impl Schedule {
     /// √ᾱ_t and √(1 − ᾱ_t) for each t in 1..=T, repeated in all columns, `[B, width]` each; the second
     /// is also the guidance weight w(t).
     pub fn noising(&self, t: &[u32], width: usize, device: &Device) -> Result<(Tensor, Tensor)> {
-        let rows = |of: fn(&Step) -> f32| {
-            let row = |t: &u32| std::iter::repeat_n(of(&self.steps[*t as usize - 1]), width);
+        let rows = |number: fn(&Step) -> f32| {
+            let row = |t: &u32| repeat_n(number(&self.steps[*t as usize - 1]), width);
             Tensor::from_vec(t.iter().flat_map(row).collect(), (t.len(), width), device)
         };
         Ok((rows(|step| step.signal)?, rows(|step| step.deviation)?))
     }
 
     /// x_0 = (x_t − √(1 − ᾱ_t)·ε)/√ᾱ_t for a predicted noise ε, clipped to ±1 unless samples are; all
-    /// `[rows, a]`.
+    /// `[rows, a]`. Multiplies by 1/√ᾱ_t as the samplers on slices and GPUs do, which it is to match.
     pub fn clean(&self, t: usize, x: &Tensor, epsilon: &Tensor) -> Result<Tensor> {
         let step = self.steps[t - 1];
         let clean = ((x - (epsilon * f64::from(step.deviation))?)? * f64::from(1.0 / step.signal))?;
@@ -144,11 +149,11 @@ impl Schedule {
     #[cfg(feature = "cuda")]
     pub(crate) fn reverse_steps(&self) -> Vec<f32> {
         let (clean, sample) = self.bounds();
-        let of_one = |step: &Step| {
-            let Step { signal, deviation, from_clean, from_noisy, noise } = *step;
-            [deviation, 1.0 / signal, clean, from_clean, from_noisy, noise, sample]
+        let coefficients = |step: &Step| {
+            let means = [step.from_clean, step.from_noisy, step.noise];
+            [&[step.deviation, 1.0 / step.signal, clean][..], &means, &[sample]].concat()
         };
-        self.steps.iter().flat_map(of_one).collect()
+        self.steps.iter().flat_map(coefficients).collect()
     }
 
     /// Bounds of the predicted x_0 and of x_{t−1}.
@@ -166,7 +171,10 @@ impl Schedule {
         for (i, (x, epsilon)) in x.iter_mut().zip(epsilon).enumerate() {
             let clean = ((*x - step.deviation * epsilon) * scale).clamp(-clean_bound, clean_bound);
             let mean = step.from_clean * clean + step.from_noisy * *x;
-            let next = if t > 1 { mean + step.noise * z[i] } else { mean };
+            let next = match t {
+                1 => mean,
+                _ => mean + step.noise * z[i],
+            };
             *x = next.clamp(-bound, bound);
         }
     }

@@ -42,10 +42,10 @@ fn contiguous<'a>(tensors: impl IntoIterator<Item = &'a Tensor>) -> Result<Vec<T
 
 /// The outputs `[K, rows, out]` for the inputs of [`crate::layers::mlp::Mlp::forward`].
 pub(crate) fn forward(dense: Dense, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
-    let Some((last, others)) = inputs.split_last() else { bail!("networks got no inputs") };
+    let Some((last, first)) = inputs.split_last() else { bail!("networks got no inputs") };
     let rows = last.dim(0)?;
     // The operation has a gradient of the last part only.
-    let parts = match others.iter().any(|other| other.track_op()) {
+    let parts = match first.iter().any(|input| input.track_op()) {
         true => vec![plain::side_by_side(inputs)?],
         false => contiguous(inputs.iter().copied())?,
     };
@@ -166,25 +166,29 @@ impl CustomOp2 for Forward {
         let Some(saved) = &*saved else { bail!("nothing was saved") };
         let (gradient, stream) = (gradient.contiguous()?, stream(weights)?);
         let width = if x.track_op() { x.dim(1)? } else { 0 };
-        let mut of_weights = match weights.track_op() {
+        let mut weights_gradient = match weights.track_op() {
             true => Some(stream.alloc_zeros(weights.elem_count()).map_err(Error::wrap)?),
             false => None,
         };
-        let of_inputs = read(&weights.detach(), |values| {
+        let gradient = read(&weights.detach(), |values| {
             read(&gradient, |gradient| {
                 let gradient = (Some(gradient), self.rows);
-                let out = of_weights.as_mut();
+                let out = weights_gradient.as_mut();
                 self.dense
                     .backward(&stream, values, saved, gradient, width, out)
                     .map_err(Error::wrap)
             })
         })?;
-        let of_inputs = of_inputs.map(|of_inputs| {
+        let inputs_gradient = gradient.map(|gradient| {
             let members = self.dense.members();
-            let of_members = tensor(of_inputs, (members, self.rows, width), x)?;
-            if members == 1 { of_members.squeeze(0) } else { of_members.sum(0) }
+            let gradient = tensor(gradient, (members, self.rows, width), x)?;
+            match members {
+                1 => gradient.squeeze(0),
+                _ => gradient.sum(0),
+            }
         });
-        let of_weights = of_weights.map(|of_weights| tensor(of_weights, weights.shape(), weights));
-        Ok((of_weights.transpose()?, of_inputs.transpose()?))
+        let tensor = |gradient| tensor(gradient, weights.shape(), weights);
+        let weights_gradient = weights_gradient.map(tensor);
+        Ok((weights_gradient.transpose()?, inputs_gradient.transpose()?))
     }
 }

@@ -44,7 +44,7 @@ impl GradientBuffer {
     pub fn write(&self, range: Range<usize>, work: impl FnOnce(&mut [f32])) -> Result<()> {
         let pass = PASS.get();
         if pass == 0 {
-            bail!("the gradients of weights are taken by `Gradients::of`");
+            bail!("the gradients of weights are taken by `Gradients::backward`");
         }
         let mut written = lock(&self.written);
         if written.0 != pass {

@@ -13,9 +13,10 @@ pub struct Gradients {
 
 impl Gradients {
     /// Runs the backward pass of a loss `[]`.
-    pub fn of(loss: &Tensor) -> Result<Self> {
+    pub fn backward(loss: &Tensor) -> Result<Self> {
         let (store, pass) = backward_pass(|| loss.backward());
-        Ok(Self { store: store?, pass })
+        let store = store?;
+        Ok(Self { store, pass })
     }
 
     /// Gradient of a network's weights, `[P]`. The next backward pass to these weights overwrites

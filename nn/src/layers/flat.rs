@@ -50,7 +50,7 @@ impl Layers {
         let mut layers = Self { members, config, precision, widths, offsets };
         for layer in 0..layers.count() {
             let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
-            let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;
+            let numbers = (inputs + 1 + 2 * usize::from(normed)) * outputs;
             layers.offsets.push(layers.offsets[layer] + members * numbers);
         }
         layers
@@ -64,8 +64,10 @@ impl Layers {
     /// Arithmetic of the products with a layer's kernel. Inputs and outputs are not rounded: their
     /// products are few.
     pub fn precision(&self, layer: usize) -> Precision {
-        let is_inner = layer > 0 && layer + 1 < self.count();
-        if is_inner { self.precision } else { Precision::F32 }
+        match layer > 0 && layer + 1 < self.count() {
+            true => self.precision,
+            false => Precision::F32,
+        }
     }
 
     /// True if products between hidden layers round their factors.
@@ -135,13 +137,14 @@ impl Layers {
             let ((inputs, outputs), precision) = (self.shape(layer), self.precision(layer));
             let (kernels, behind) = rest.split_at_mut(self.members * inputs * outputs);
             let (biases, behind) = behind.split_at_mut(self.members * outputs);
-            let norms = if self.is_normed(layer) { self.members * outputs } else { 0 };
+            let norms = usize::from(self.is_normed(layer)) * self.members * outputs;
             let (scales, behind) = behind.split_at_mut(norms);
             let (shifts, behind) = behind.split_at_mut(norms);
             rest = behind;
-            let mut norms = scales.chunks_exact_mut(outputs).zip(shifts.chunks_exact_mut(outputs));
-            let members =
-                kernels.chunks_exact_mut(inputs * outputs).zip(biases.chunks_exact_mut(outputs));
+            let [biases, scales, shifts] =
+                [biases, scales, shifts].map(|vectors| vectors.chunks_exact_mut(outputs));
+            let mut norms = scales.zip(shifts);
+            let members = kernels.chunks_exact_mut(inputs * outputs).zip(biases);
             split.extend(members.enumerate().map(|(member, (kernel, bias))| {
                 let norm = norms.next().map(|(scale, shift)| [scale, shift]);
                 LayerMut { layer, member, precision, kernel, bias, norm }
@@ -161,7 +164,8 @@ impl Layers {
             let mut push = |kind: &str, shape: &[usize], init| {
                 let members = leading.then_some(self.members);
                 let shape: Vec<usize> = members.into_iter().chain(shape.iter().copied()).collect();
-                specs.push(TensorSpec::new(format!("{prefix}{layer}.{kind}"), &shape, init));
+                let name = format!("{prefix}{layer}.{kind}");
+                specs.push(TensorSpec { name, shape, init });
             };
             push("kernel", &[inputs, outputs], kernel);
             push("bias", &[outputs], bias);

@@ -6,7 +6,7 @@
 
 use crate::gradients::buffer::GradientBuffer;
 use crate::layers::flat::{Layers, TILE};
-use crate::layers::network::{Network, rows_of};
+use crate::layers::network::{Network, row_slice};
 use crate::layers::plain;
 use crate::layers::saved::SavedActivations;
 use crate::layers::workspace::with_workspace;
@@ -21,11 +21,6 @@ use std::sync::Arc;
 
 /// Packed kernels between the hidden layers of each network; empty where packing gains nothing.
 pub(crate) type Kernels = Vec<Vec<Packed>>;
-
-/// Packed kernels of one member.
-pub(crate) fn member_kernels(packed: Option<&Kernels>, member: usize) -> Option<&[Packed]> {
-    packed.and_then(|packed| packed.get(member)).map(Vec::as_slice)
-}
 
 /// Networks in a range of a vector of weights.
 #[derive(Clone)]
@@ -61,13 +56,12 @@ impl Mlp {
         let x = plain::side_by_side(inputs)?;
         let (values, layers) = (weights.values(), &self.layers);
         if !matches!(*x.dims(), [rows, width] if rows > 0 && width == layers.inputs()) {
-            let (members, inputs) = (layers.members, layers.inputs());
-            bail!("{members} networks of {inputs} numbers got inputs of shape {:?}", x.dims());
+            bail!("networks of {} numbers got {:?}", layers.inputs(), x.dims());
         }
         if !self.is_fast(weights) {
             return self.plain_forward(weights, &x);
         }
-        let buffer = if values.track_op() { weights.gradient_buffer().cloned() } else { None };
+        let buffer = weights.gradient_buffer().filter(|_| values.track_op()).cloned();
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
         let constant = inputs.iter().take_while(|input| !input.track_op());
         let constant = constant.map(|input| input.dim(1)).sum::<Result<_>>()?;
@@ -83,29 +77,44 @@ impl Mlp {
     /// [`Self::forward`] in candle's operations, also for inputs of each member, `[K, rows, in]`.
     pub fn plain_forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
         let tensors = weights.layout().split(weights.values(), "")?;
-        let x = if x.rank() == 2 { x.unsqueeze(0)? } else { x.clone() };
-        plain::mlp(&tensors, self.prefix, &self.layers, &x)
+        match x.rank() {
+            2 => plain::mlp(&tensors, self.prefix, &self.layers, &x.unsqueeze(0)?),
+            _ => plain::mlp(&tensors, self.prefix, &self.layers, x),
+        }
     }
 
     pub fn network<'a>(&'a self, weights: &'a [f32], member: usize) -> Network<'a> {
-        Network { weights, layers: &self.layers, member, packed: None }
+        self.packed_network(weights, None, member)
+    }
+
+    /// A member with its packed kernels, if there are any.
+    pub fn packed_network<'a>(
+        &'a self,
+        weights: &'a [f32],
+        packed: Option<&'a Kernels>,
+        member: usize,
+    ) -> Network<'a> {
+        let packed = packed.and_then(|packed| packed.get(member)).map(Vec::as_slice);
+        let layers = &self.layers;
+        Network { weights, layers, member, packed }
     }
 
     /// A forward pass without gradients: `x`, `rows × in` → `out`, `K × rows × out`.
     pub fn run(&self, weights: &[f32], packed: Option<&Kernels>, x: &[f32], out: &mut [f32]) {
         let (inputs, outputs) = (self.layers.inputs(), self.layers.outputs());
         let rows = out.len() / (self.layers.members * outputs);
-        out.par_chunks_mut(rows * outputs).enumerate().for_each(|(member, out)| {
-            let network =
-                Network { packed: member_kernels(packed, member), ..self.network(weights, member) };
-            out.par_chunks_mut(TILE * outputs).enumerate().for_each(|(i, out)| {
-                let x = rows_of(x, i * TILE, TILE, inputs);
+        let members = out.par_chunks_mut(rows * outputs).enumerate();
+        members.for_each(|(member, out)| {
+            let network = self.packed_network(weights, packed, member);
+            let tiles = out.par_chunks_mut(TILE * outputs).enumerate();
+            tiles.for_each(|(i, out)| {
+                let x = row_slice(x, i * TILE, TILE, inputs);
+                let len = x.len() / inputs * network.width();
                 with_workspace(|work| {
-                    work.with_base(x.len() / inputs * network.width(), 0, |base, _, work| {
+                    work.with_base(len, 0, |base, _, work| {
                         network.first_part(x, inputs, base);
-                        let (shift, none) = (network.bias(0), &[]);
-                        let first =
-                            FirstLayer { base, repeat: 1, shift, actions: none, kernel: none };
+                        let (repeat, shift, kernel, actions) = (1, network.bias(0), &[], &[]);
+                        let first = FirstLayer { base, repeat, shift, actions, kernel };
                         network.forward(first, work, out);
                     });
                 });
@@ -122,11 +131,14 @@ impl Mlp {
         (observations, states): (&[f32], usize),
         (actions, rows): (&[f32], usize),
     ) -> Vec<f32> {
-        let (o, a, repeat) = (observations.len() / states, actions.len() / rows, rows / states);
+        let (o, a) = (observations.len() / states, actions.len() / rows);
+        let repeat = rows / states;
         let mut out = vec![0.0; self.layers.members * rows * a];
-        out.par_chunks_mut(rows * a).enumerate().for_each(|(member, out)| {
+        let members = out.par_chunks_mut(rows * a).enumerate();
+        members.for_each(|(member, out)| {
             let network = self.network(weights, member);
-            out.par_chunks_mut(TILE * a).enumerate().for_each(|(i, out)| {
+            let tiles = out.par_chunks_mut(TILE * a).enumerate();
+            tiles.for_each(|(i, out)| {
                 let count = out.len() / a;
                 let mut x = Vec::with_capacity(count * (o + a)); // [s, a]
                 for row in i * TILE..i * TILE + count {
@@ -172,7 +184,7 @@ impl Operation {
         let layers = &self.mlp.layers;
         saved.resize(layers, out.len() / (layers.members * layers.outputs()));
         saved.tiles(out).into_par_iter().for_each(|mut tile| {
-            let x = rows_of(x, tile.index * TILE, TILE, layers.inputs());
+            let x = row_slice(x, tile.index * TILE, TILE, layers.inputs());
             let network = self.mlp.network(weights, tile.member);
             with_workspace(|work| network.forward_saving(x, &mut tile.activations, work, tile.out));
         });
@@ -190,7 +202,8 @@ impl Operation {
         let (members, inputs) = (layers.members, layers.inputs());
         let rows = gradient.len() / (members * layers.outputs());
         // A copy, since tiles are mutable.
-        saved.tiles(&mut gradient.to_vec()).into_par_iter().for_each(|mut tile| {
+        let mut copy = gradient.to_vec();
+        saved.tiles(&mut copy).into_par_iter().for_each(|mut tile| {
             let network = self.mlp.network(weights, tile.member);
             with_workspace(|work| network.backward(tile.out, &mut tile.activations, work));
         });
@@ -204,14 +217,16 @@ impl Operation {
             return Ok(None);
         }
         let mut members_gradients = vec![0.0; members * rows * width];
-        members_gradients.par_chunks_mut(rows * width).enumerate().for_each(|(member, out)| {
-            let delta = saved.first_delta(member);
-            self.mlp.network(weights, member).input_gradient(delta, (self.constant, width), out);
+        let gradients = members_gradients.par_chunks_mut(rows * width).enumerate();
+        gradients.for_each(|(member, out)| {
+            let (network, delta) = (self.mlp.network(weights, member), saved.first_delta(member));
+            network.input_gradient(delta, (self.constant, width), out);
         });
         let mut sum = vec![0.0; rows * inputs];
         for member in members_gradients.chunks_exact(rows * width) {
             for (sum, x) in sum.chunks_exact_mut(inputs).zip(member.chunks_exact(width)) {
-                sum[self.constant..].iter_mut().zip(x).for_each(|(sum, x)| *sum += x);
+                let sum = sum[self.constant..].iter_mut();
+                sum.zip(x).for_each(|(sum, x)| *sum += x);
             }
         }
         Ok(Some(sum))

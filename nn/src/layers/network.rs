@@ -57,14 +57,15 @@ impl<'a> Network<'a> {
 
     /// `out[states × width] = x · kernel` for the first `inputs` inputs, without the bias.
     pub fn first_part(&self, x: &[f32], inputs: usize, out: &mut [f32]) {
-        product(
-            self.layers.precision(0),
-            x,
-            self.first_kernel(0, inputs),
-            out,
-            inputs,
-            self.width(),
-        );
+        let (precision, kernel) = (self.layers.precision(0), self.first_kernel(0, inputs));
+        product(precision, x, kernel, out, inputs, self.width());
+    }
+
+    /// `out = x · kernel` of a layer, without the bias.
+    fn product(&self, layer: usize, x: &[f32], out: &mut [f32]) {
+        let (inputs, outputs) = self.layers.shape(layer);
+        let precision = self.layers.precision(layer);
+        product(precision, x, self.kernel(layer), out, inputs, outputs);
     }
 
     /// The transposed kernel of the output layer, `outputs × width`.
@@ -89,7 +90,8 @@ impl<'a> Network<'a> {
     pub fn pack(&self) -> Option<Vec<Packed>> {
         let pack = |layer| {
             let (inputs, outputs) = self.layers.shape(layer);
-            Packed::new(self.layers.precision(layer), self.kernel(layer), inputs, outputs)
+            let precision = self.layers.precision(layer);
+            Packed::new(precision, self.kernel(layer), inputs, outputs)
         };
         (1..self.last()).map(pack).collect()
     }
@@ -106,9 +108,9 @@ impl<'a> Network<'a> {
         };
         let states = (block / input.repeat).max(1);
         let rows = states * input.repeat;
-        for (i, (base, out)) in
-            input.base.chunks(states * width).zip(out.chunks_mut(rows * outputs)).enumerate()
-        {
+        let blocks = input.base.chunks(states * width);
+        let blocks = blocks.zip(out.chunks_mut(rows * outputs));
+        for (i, (base, out)) in blocks.enumerate() {
             let count = out.len() / outputs;
             let actions = &input.actions[i * rows * action_dim..][..count * action_dim];
             let first = FirstLayer { base, actions, ..input };
@@ -133,14 +135,7 @@ impl<'a> Network<'a> {
                 let (x, y) = (x.sized(count * inputs), y.sized(count * width));
                 match self.packed {
                     Some(kernels) => kernels[layer - 1].product(x, y),
-                    None => product(
-                        self.layers.precision(layer),
-                        x,
-                        self.kernel(layer),
-                        y,
-                        inputs,
-                        width,
-                    ),
+                    None => self.product(layer, x, y),
                 }
                 let bias =
                     self.normalize(layer, y, || work.norm_scratch.sized(saved_len(count, width)));
@@ -164,15 +159,16 @@ impl<'a> Network<'a> {
     ) {
         let last = self.last();
         for layer in 0..last {
-            let (inputs, width) = self.layers.shape(layer);
             let (before, here) = saved.x.split_at_mut(layer);
             let x = before.last().map_or(input, |x| &**x);
-            product(self.layers.precision(layer), x, self.kernel(layer), here[0], inputs, width);
+            self.product(layer, x, here[0]);
             let bias = self.normalize(layer, here[0], || saved.norm[layer]);
-            activate_with_slope(self.layers.config.activation, here[0], bias, saved.slope[layer]);
+            let activation = self.layers.config.activation;
+            activate_with_slope(activation, here[0], bias, saved.slope[layer]);
             self.normalize_after(layer, here[0], || saved.norm[layer]);
         }
-        let (output, width) = (self.output_rows(&mut work.output), self.layers.shape(last).0);
+        let output = self.output_rows(&mut work.output);
+        let width = self.layers.shape(last).0;
         dots(saved.x[last - 1], output, self.bias(last), out, width);
     }
 
@@ -239,14 +235,8 @@ impl<'a> Network<'a> {
             let (below, above) = slope.split_at_mut(layer);
             let (below, above) = (&mut *below[layer - 1], &*above[0]);
             let temporary = work.pair[0].sized(below.len());
-            product_transposed(
-                self.layers.precision(layer),
-                above,
-                self.kernel(layer),
-                temporary,
-                inputs,
-                width,
-            );
+            let (precision, kernel) = (self.layers.precision(layer), self.kernel(layer));
+            product_transposed(precision, above, kernel, temporary, inputs, width);
             through_norm(layer - 1, after, temporary);
             multiply(below, temporary);
             through_norm(layer - 1, !after, below);
@@ -265,7 +255,7 @@ impl<'a> Network<'a> {
 }
 
 /// Rows `from..from + count`, fewer at the end, of a matrix with `width` columns.
-pub(crate) fn rows_of(matrix: &[f32], from: usize, count: usize, width: usize) -> &[f32] {
+pub(crate) fn row_slice(matrix: &[f32], from: usize, count: usize, width: usize) -> &[f32] {
     let end = ((from + count) * width).min(matrix.len());
     &matrix[from * width..end]
 }

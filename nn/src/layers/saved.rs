@@ -53,7 +53,8 @@ impl SavedActivations {
         let each_member = rows.div_ceil(TILE);
         let tile = |(i, out)| {
             let (member, index) = (i / each_member, i % each_member);
-            Tile { member, index, activations: Activations::default(), out }
+            let activations = Activations::default();
+            Tile { member, index, activations, out }
         };
         let mut tiles: Vec<_> = cut(out).enumerate().map(tile).collect();
         for ((x, slope), width) in self.x.iter_mut().zip(&mut self.slope).zip(&self.widths) {
@@ -106,9 +107,14 @@ impl SavedActivations {
                 };
                 let inputs = kernel.len() / columns;
                 // A single network is split, for all threads to work.
-                let rows = if self.members == 1 { inputs.min(TILE) } else { inputs };
-                kernel.par_chunks_mut(rows * columns).enumerate().for_each(|(i, kernel)| {
-                    outer_rows(precision, x, gradient, kernel, (i * rows, inputs), columns);
+                let rows = match self.members {
+                    1 => inputs.min(TILE),
+                    _ => inputs,
+                };
+                let parts = kernel.par_chunks_mut(rows * columns).enumerate();
+                parts.for_each(|(i, kernel)| {
+                    let rows = (i * rows, inputs);
+                    outer_rows(precision, x, gradient, kernel, rows, columns);
                 });
                 column_sums(gradient, bias);
                 for (i, out) in norm.into_iter().flatten().enumerate() {

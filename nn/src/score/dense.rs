@@ -2,7 +2,7 @@
 
 use crate::layers::config::InitScheme;
 use crate::layers::flat::TILE;
-use crate::layers::network::rows_of;
+use crate::layers::network::row_slice;
 use crate::layers::plain;
 use crate::slices::{has_fast_implementation, read_all};
 use crate::weights::TensorSpec;
@@ -68,7 +68,7 @@ impl Dense {
         let out = read_all([weights, &x.contiguous()?, &added], |[weights, x, added]| {
             let mut out = vec![0.0; rows * n];
             out.par_chunks_mut(TILE * n).enumerate().for_each(|(i, out)| {
-                self.apply(weights, rows_of(x, i * TILE, TILE, self.inputs), out, None);
+                self.apply(weights, row_slice(x, i * TILE, TILE, self.inputs), out, None);
                 if !added.is_empty() {
                     for (row, out) in out.chunks_exact_mut(n).enumerate() {
                         add(out, &added[(i * TILE + row) / repeat * n..][..n]);

@@ -6,7 +6,7 @@
 
 use crate::gradients::buffer::GradientBuffer;
 use crate::layers::flat::TILE;
-use crate::layers::network::rows_of;
+use crate::layers::network::row_slice;
 use crate::layers::plain::repeat_rows;
 use crate::pool::{Pool, Pooled};
 use crate::score::dense::{Dense, add};
@@ -86,8 +86,8 @@ impl DenseGraph {
         let is_last = |i: usize, number: &usize| {
             !steps[i + 1..].iter().any(|step| step.values().any(|n| n == *number))
         };
-        let done = steps.iter().enumerate();
-        let done = done.map(|(i, step)| step.values().filter(|n| is_last(i, n)).collect());
+        let numbered = steps.iter().enumerate();
+        let done = numbered.map(|(i, step)| step.values().filter(|n| is_last(i, n)).collect());
         let done = done.collect();
         Self { inputs: count, steps, widths, done, len, pool: Arc::default() }
     }
@@ -101,8 +101,9 @@ impl DenseGraph {
             let rows = inputs.iter().map(|x| x.dims()[0]).max().unwrap_or(0);
             let repeated = inputs.iter().map(|x| repeat_rows(x, rows / x.dims()[0]));
             let x = Tensor::cat(&repeated.collect::<Result<Vec<_>>>()?, 1)?.detach();
-            let (graph, buffer, chunks) = (self.clone(), buffer.clone(), self.pool.lend());
-            return values.apply_op2(&x, Operation { graph, buffer, chunks });
+            let operation =
+                Operation { graph: self.clone(), buffer: buffer.clone(), chunks: self.pool.lend() };
+            return values.apply_op2(&x, operation);
         }
         let mut computed: Vec<Option<Tensor>> = inputs.iter().cloned().map(Some).collect();
         for (step, done) in self.steps.iter().zip(&self.done) {
@@ -120,7 +121,8 @@ impl DenseGraph {
             // Frees their memory.
             done.iter().for_each(|number| computed[*number] = None);
         }
-        computed.pop().flatten().map_or_else(|| bail!("a network without layers"), Ok)
+        let output = computed.pop().flatten();
+        output.map_or_else(|| bail!("a network without layers"), Ok)
     }
 
     /// The output of some rows of the concatenated inputs.
@@ -207,7 +209,10 @@ impl DenseGraph {
 
 /// Adds to a gradient, or begins it.
 fn deposit(gradient: &mut Vec<f32>, more: &[f32]) {
-    if gradient.is_empty() { gradient.extend_from_slice(more) } else { add(gradient, more) }
+    match gradient.is_empty() {
+        true => gradient.extend_from_slice(more),
+        false => add(gradient, more),
+    }
 }
 
 /// The operation of (weights, concatenated inputs).
@@ -236,13 +241,15 @@ impl CustomOp2 for Operation {
     ) -> Result<(CpuStorage, Shape)> {
         let (weights, x) = (slice(weights, weights_layout)?, slice(x, x_layout)?);
         let (rows, width) = x_layout.shape().dims2()?;
-        let (outputs, len) = (self.graph.widths[self.graph.widths.len() - 1], chunk_len(rows));
+        let outputs = self.graph.widths[self.graph.widths.len() - 1];
+        let len = chunk_len(rows);
         let mut out = vec![0.0; rows * outputs];
         let mut chunks = self.chunks.lock();
         chunks.resize_with(rows.div_ceil(len), Chunk::default);
-        let tasks = chunks.par_iter_mut().zip(out.par_chunks_mut(len * outputs)).enumerate();
-        tasks.with_max_len(1).for_each(|(i, (chunk, out))| {
-            self.graph.forward_chunk(weights, rows_of(x, i * len, len, width), chunk, out);
+        let tasks = chunks.par_iter_mut().zip(out.par_chunks_mut(len * outputs));
+        tasks.enumerate().with_max_len(1).for_each(|(i, (chunk, out))| {
+            let x = row_slice(x, i * len, len, width);
+            self.graph.forward_chunk(weights, x, chunk, out);
         });
         Ok((CpuStorage::F32(out), (rows, outputs).into()))
     }
@@ -257,8 +264,9 @@ impl CustomOp2 for Operation {
         let (rows, outputs) = gradient.dims2()?;
         let mut chunks = self.chunks.lock();
         read_all([weights, &gradient.contiguous()?], |[weights, gradient]| {
-            let tasks = chunks.par_iter_mut().zip(gradient.par_chunks(chunk_len(rows) * outputs));
-            tasks.with_max_len(1).for_each(|(chunk, gradient)| {
+            let gradients = gradient.par_chunks(chunk_len(rows) * outputs);
+            let tasks = chunks.par_iter_mut().zip(gradients).with_max_len(1);
+            tasks.for_each(|(chunk, gradient)| {
                 self.graph.backward_chunk(weights, gradient, chunk);
             });
         })?;
@@ -266,7 +274,8 @@ impl CustomOp2 for Operation {
             out.par_chunks_mut(TOGETHER).enumerate().for_each(|(i, out)| {
                 out.fill(0.0);
                 for chunk in chunks.iter() {
-                    add(out, rows_of(&chunk.weights_gradient, i * TOGETHER, TOGETHER, 1));
+                    let gradient = &chunk.weights_gradient[i * TOGETHER..];
+                    add(out, &gradient[..out.len()]);
                 }
             });
         })?;

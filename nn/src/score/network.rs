@@ -58,9 +58,13 @@ impl<'a> GraphBuilder<'a> {
 
     /// The next layer in the vector of weights.
     fn dense(&mut self, name: &str, (inputs, outputs): (usize, usize), active: bool) -> Dense {
-        let activation = active.then_some(self.layers.activation);
-        let precision = Precision::F32;
-        let layer = Dense { start: self.start, inputs, outputs, activation, precision };
+        let layer = Dense {
+            start: self.start,
+            inputs,
+            outputs,
+            activation: active.then_some(self.layers.activation),
+            precision: Precision::F32,
+        };
         self.start = layer.range().end;
         self.specs.extend(layer.specs(name, self.layers.initial));
         layer
@@ -111,7 +115,8 @@ fn build(shape: &ScoreShape, precision: Precision) -> (DenseGraph, Layout) {
     let time = builder.layer("time", 1, (EMBEDDING, EMBEDDING), false);
     let both = builder.step(Step::Concat(state, time));
     let mixed = builder.layer("mix.0", both, (2 * EMBEDDING, narrowest), true);
-    let condition = (builder.layer("mix.1", mixed, (narrowest, narrowest), true), narrowest);
+    let mixed = builder.layer("mix.1", mixed, (narrowest, narrowest), true);
+    let condition = (mixed, narrowest);
     let (mut x, mut width, mut skips) = (2, a, Vec::new());
     for (i, outputs) in widths.iter().enumerate() {
         x = builder.block(&format!("down.{i}"), x, (width, *outputs), condition);
@@ -128,7 +133,8 @@ fn build(shape: &ScoreShape, precision: Precision) -> (DenseGraph, Layout) {
     let widest = widths.first().copied().unwrap_or(1);
     builder.layer("last", both, (2 * widest, a), false);
     let inputs = vec![shape.observation_dim, EMBEDDING, a];
-    (DenseGraph::new(inputs, builder.steps, builder.start), Layout::new(builder.specs))
+    let graph = DenseGraph::new(inputs, builder.steps, builder.start);
+    (graph, Layout::new(builder.specs))
 }
 
 /// A noise predictor in continuous time, and its weights.
@@ -204,23 +210,24 @@ impl ScoreNetwork {
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &[f64]) -> Result<Tensor> {
         let (n, rows) = (observations.dim(0)?, actions.dim(0)?);
         if n == 0 || n != t.len() || !rows.is_multiple_of(n) {
-            bail!("a noise predictor got {n} states, {} times and {rows} actions", t.len());
+            let times = t.len();
+            bail!("a noise predictor got {n} states, {times} times and {rows} actions");
         }
         let time = self.time_features(t, observations.device())?;
-        self.graph.forward(&self.weights, &[observations.clone(), time, actions.clone()])
+        let inputs = [observations.clone(), time, actions.clone()];
+        self.graph.forward(&self.weights, &inputs)
     }
 
     /// Sines, then cosines of 2π·t·frequency, `[n, 32]`.
     fn time_features(&self, t: &[f64], device: &Device) -> Result<Tensor> {
         let frequencies = self.frequencies.to_vec1::<f32>()?;
-        let row = |t: &f64| {
-            let angles = frequencies.iter().map(|frequency| TAU * t * f64::from(*frequency));
-            let angles = Vec::from_iter(angles);
-            [f64::sin, f64::cos]
-                .map(|wave| Vec::from_iter(angles.iter().map(|x| wave(*x))))
-                .concat()
-        };
-        let features: Vec<f32> = t.iter().flat_map(row).map(|x| x as f32).collect();
+        let mut features = Vec::with_capacity(t.len() * EMBEDDING);
+        for t in t {
+            for wave in [f64::sin, f64::cos] {
+                let angles = frequencies.iter().map(|x| TAU * t * f64::from(*x));
+                features.extend(angles.map(|angle| wave(angle) as f32));
+            }
+        }
         Tensor::from_vec(features, (t.len(), EMBEDDING), device)
     }
 
@@ -251,11 +258,11 @@ mod tests {
         let generator = &mut ChaCha8Rng::seed_from_u64(0);
         let mut layers = MlpConfig::mish(hidden);
         (layers.activation, layers.initial) = (Activation::Silu, InitScheme::Torch);
-        let (observation_dim, action_dim) = (5, 3);
-        let shape = ScoreShape { observation_dim, action_dim, layers };
+        let shape = ScoreShape { observation_dim: 5, action_dim: 3, layers };
         let weights = weights(shape.layout(), generator);
         let frequencies = ScoreShape::frequencies(generator)?;
-        Ok(ScoreNetwork::new(shape, weights, frequencies, Precision::F32))
+        let precision = Precision::F32;
+        Ok(ScoreNetwork::new(shape, weights, frequencies, precision))
     }
 
     /// Rows fill several tiles and chunks, or none.
@@ -265,7 +272,8 @@ mod tests {
             [(&[24, 16, 8][..], 300, 1), (&[16, 32], 40, 7), (&[7], 3, 1), (&[16; 4], 1500, 1)]
         {
             let network = network(hidden)?;
-            let (observations, actions) = (random((states, 5), 1), random((states * repeat, 3), 2));
+            let observations = random((states, 5), 1);
+            let actions = random((states * repeat, 3), 2);
             let t: Vec<f64> = (1..=states).map(|i| i as f64 / states as f64).collect();
             let predict = || network.predict(&observations, &actions, &t);
             let (fast, plain) = (predict()?, plainly(predict)?);

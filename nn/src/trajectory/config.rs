@@ -77,7 +77,8 @@ impl TrajectoryConfig {
         }
         let last = self.multipliers[levels - 1];
         let range = "such that channels × the last is a multiple of 4 × groups";
-        is("network.multipliers", last, (channels * last).is_multiple_of(4 * groups), range)?;
+        let holds = (channels * last).is_multiple_of(4 * groups);
+        is("network.multipliers", last, holds, range)?;
         if let Some(Attention { heads, width }) = self.attention {
             up_to("network.attention.heads", heads, MAX_DIM, "from 1 to 65535")?;
             let range = "at least 1, and with the heads at most 65535";
@@ -88,7 +89,8 @@ impl TrajectoryConfig {
 
     /// Channels of each level.
     pub fn widths(&self) -> Vec<usize> {
-        self.multipliers.iter().map(|multiplier| self.channels * multiplier).collect()
+        let width = |multiplier| self.channels * multiplier;
+        self.multipliers.iter().map(width).collect()
     }
 
     /// Steps of each level.
@@ -108,8 +110,8 @@ pub(crate) struct LayoutBuilder {
 impl LayoutBuilder {
     /// Begins with the embedding of a denoising step: `time.{0,1}`.
     pub fn new(config: &TrajectoryConfig) -> Self {
-        let (specs, embedding, attention) = (Vec::new(), config.channels, config.attention);
-        let mut builder = Self { specs, embedding, attention };
+        let embedding = config.channels;
+        let mut builder = Self { specs: Vec::new(), embedding, attention: config.attention };
         builder.linear("time.0", embedding, 4 * embedding);
         builder.linear("time.1", 4 * embedding, embedding);
         builder

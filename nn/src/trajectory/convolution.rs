@@ -151,9 +151,13 @@ impl Convolution {
     fn kernel_gradient(&self, x: &[f32], gradient: &[f32]) -> Vec<f32> {
         let (inputs, outputs) = (self.inputs, self.outputs);
         let mut out = vec![0.0; self.taps * inputs * outputs];
-        out.par_chunks_mut(inputs * outputs).enumerate().for_each(|(tap, out)| match self.taps {
+        let kernels = out.par_chunks_mut(inputs * outputs).enumerate();
+        kernels.for_each(|(tap, out)| match self.taps {
             1 => outer(F32, x, gradient, out, inputs, outputs),
-            _ => outer(F32, &self.unfold(x, tap..tap + 1), gradient, out, inputs, outputs),
+            _ => {
+                let x = self.unfold(x, tap..tap + 1);
+                outer(F32, &x, gradient, out, inputs, outputs);
+            }
         });
         out
     }
@@ -175,7 +179,8 @@ impl CustomOp3 for Convolution {
     ) -> Result<(CpuStorage, Shape)> {
         let (kernel, bias) = (slice(kernel, kernel_layout)?, slice(bias, bias_layout)?);
         let out = self.forward(slice(x, x_layout)?, kernel, bias);
-        Ok((CpuStorage::F32(out), (x_layout.dims()[0], self.steps(), self.outputs).into()))
+        let shape = (x_layout.dims()[0], self.steps(), self.outputs);
+        Ok((CpuStorage::F32(out), shape.into()))
     }
 
     fn bwd(
@@ -188,21 +193,19 @@ impl CustomOp3 for Convolution {
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let (gradient, device) = (gradient.contiguous()?, gradient.device());
         read_all([x, kernel, &gradient], |[x_numbers, kernel_numbers, g]| {
-            let tensor = |numbers: Option<Vec<f32>>, of: &Tensor| {
-                numbers.map(|numbers| Tensor::from_vec(numbers, of.shape(), device)).transpose()
+            let tensor = |argument: &Tensor, gradient: &dyn Fn() -> Vec<f32>| {
+                let gradient = argument.track_op().then(gradient);
+                let tensor = |numbers| Tensor::from_vec(numbers, argument.shape(), device);
+                gradient.map(tensor).transpose()
             };
-            let x_gradient = x.track_op().then(|| self.input_gradient(kernel_numbers, g));
-            let kernel_gradient = kernel.track_op().then(|| self.kernel_gradient(x_numbers, g));
-            let bias_gradient = bias.track_op().then(|| {
+            let x_gradient = tensor(x, &|| self.input_gradient(kernel_numbers, g))?;
+            let kernel_gradient = tensor(kernel, &|| self.kernel_gradient(x_numbers, g))?;
+            let bias_gradient = tensor(bias, &|| {
                 let mut sums = vec![0.0; self.outputs];
                 column_sums(g, &mut sums);
                 sums
-            });
-            Ok((
-                tensor(x_gradient, x)?,
-                tensor(kernel_gradient, kernel)?,
-                tensor(bias_gradient, bias)?,
-            ))
+            })?;
+            Ok((x_gradient, kernel_gradient, bias_gradient))
         })?
     }
 }
@@ -210,18 +213,16 @@ impl CustomOp3 for Convolution {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slices::plainly;
-    use crate::testing::{assert_close, check_gradients, random};
+    use crate::testing::{assert_close, check_gradients, check_operation, random};
 
     /// The golden test of Diffuser compares both with a definition.
     #[test]
     fn a_convolution_matches_the_plain_one_and_finite_differences() -> Result<()> {
         for (length, taps, stride) in [(6, 5, 1), (1, 5, 1), (5, 3, 2), (6, 3, 2), (3, 1, 1)] {
-            let arguments = [random((2, length, 3), 6), random((taps, 3, 2), 7), random(2, 8)];
-            let of = |x: &[Tensor]| convolve(&x[0], &x[1], &x[2], stride);
-            assert_close("convolution", &of(&arguments)?, &plainly(|| of(&arguments))?);
-            check_gradients("convolution", &arguments, of)?;
-            plainly(|| check_gradients("plain convolution", &arguments, of))?;
+            let (x, kernel) = (random((2, length, 3), 6), random((taps, 3, 2), 7));
+            let arguments = [x, kernel, random(2, 8)];
+            let convolved = |x: &[Tensor]| convolve(&x[0], &x[1], &x[2], stride);
+            check_operation("convolution", &arguments, convolved)?;
         }
         Ok(())
     }
@@ -229,15 +230,16 @@ mod tests {
     #[test]
     fn doubling_matches_its_definition_and_finite_differences() -> Result<()> {
         let arguments = [random((2, 3, 3), 9), random((3, 4, 2), 10), random(2, 11)];
-        let of = |x: &[Tensor]| double(&x[0], &x[1], &x[2]);
-        check_gradients("doubling", &arguments, of)?;
+        let doubled = |x: &[Tensor]| double(&x[0], &x[1], &x[2]);
+        check_gradients("doubling", &arguments, doubled)?;
         // Tap j of step 1 alone adds to step 1 + j.
         let [x, kernel, bias] = &arguments;
         let one = Tensor::new(&[0f32, 1.0, 0.0], x.device())?.reshape((1, 3, 1))?;
         let step = x.narrow(1, 1, 1)?.reshape((2, 3))?;
         let products = step.matmul(&kernel.reshape((3, 8))?)?.reshape((2, 4, 2))?;
         let expected = products.pad_with_zeros(1, 1, 1)?.broadcast_add(bias)?;
-        assert_close("doubling", &double(&x.broadcast_mul(&one)?, kernel, bias)?, &expected);
+        let doubled = double(&x.broadcast_mul(&one)?, kernel, bias)?;
+        assert_close("doubling", &doubled, &expected);
         Ok(())
     }
 }

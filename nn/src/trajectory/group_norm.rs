@@ -67,8 +67,11 @@ impl NormedMish {
         let mut mean = vec![0.0; self.channels];
         add_rows(&mut mean, x, x, |x, _| x);
         self.spread(&mut mean);
-        for (x, out) in x.chunks_exact(self.channels).zip(out.chunks_exact_mut(self.channels)) {
-            out.iter_mut().zip(x.iter().zip(&mean)).for_each(|(out, (x, mean))| *out = x - mean);
+        let rows = x.chunks_exact(self.channels);
+        for (x, out) in rows.zip(out.chunks_exact_mut(self.channels)) {
+            for (out, (x, mean)) in out.iter_mut().zip(x.iter().zip(&mean)) {
+                *out = x - mean;
+            }
         }
         let mut inverse = vec![0.0; self.channels];
         add_rows(&mut inverse, out, out, |x, y| x * y);
@@ -110,13 +113,13 @@ impl NormedMish {
         add_rows(scale_gradient, out, &normed, |delta, x| delta * x);
         add_rows(shift_gradient, out, &normed, |delta, _| delta);
         // The gradient before scale and shift, then through the moments.
-        let mean_of = |sums: &[f32]| {
+        let scaled_mean = |sums: &[f32]| {
             let mut scaled = sums.to_vec();
             scale_rows(&mut scaled, scale);
             self.spread(&mut scaled);
             scaled
         };
-        let (along, mean) = (mean_of(scale_gradient), mean_of(shift_gradient));
+        let [along, mean] = [&*scale_gradient, shift_gradient].map(scaled_mean);
         let rows = normed.chunks_exact(self.channels);
         for (out, normed) in out.chunks_exact_mut(self.channels).zip(rows) {
             for (i, (out, x)) in out.iter_mut().zip(normed).enumerate() {
@@ -174,27 +177,25 @@ impl CustomOp3 for NormedMish {
         let mut both = vec![0.0; 2 * self.channels];
         add_rows(&mut both, &sums, &sums, |x, _| x);
         let shift_gradient = both.split_off(self.channels);
-        let tensor = |numbers: Vec<f32>, of: &Tensor| {
-            Tensor::from_vec(numbers, of.shape(), of.device()).map(Some)
+        let tensor = |numbers: Vec<f32>, argument: &Tensor| {
+            Tensor::from_vec(numbers, argument.shape(), x.device()).map(Some)
         };
-        Ok((tensor(out, x)?, tensor(both, scale)?, tensor(shift_gradient, shift)?))
+        let scale_gradient = tensor(both, scale)?;
+        Ok((tensor(out, x)?, scale_gradient, tensor(shift_gradient, shift)?))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slices::plainly;
-    use crate::testing::{assert_close, check_gradients, random};
+    use crate::testing::{check_operation, random};
 
     #[test]
     fn group_norm_matches_the_plain_one_and_finite_differences() -> Result<()> {
         let arguments = [random((3, 5, 12), 0), random(12, 1), random(12, 2)];
         for groups in [1, 3, 12] {
-            let of = |x: &[Tensor]| normed_mish(&x[0], &x[1], &x[2], groups);
-            assert_close("group norm", &of(&arguments)?, &plainly(|| of(&arguments))?);
-            check_gradients("group norm", &arguments, of)?;
-            plainly(|| check_gradients("plain group norm", &arguments, of))?;
+            let normed = |x: &[Tensor]| normed_mish(&x[0], &x[1], &x[2], groups);
+            check_operation("group norm", &arguments, normed)?;
         }
         Ok(())
     }

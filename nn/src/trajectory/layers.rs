@@ -39,11 +39,12 @@ impl<'a> Layers<'a> {
         let angle = |t: u32, k: usize| {
             f64::from(t - 1) * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp()
         };
-        let row = |t: &u32| {
-            let angles = Vec::from_iter((0..half).map(|k| angle(*t, k)));
-            [f64::sin, f64::cos].map(|of| Vec::from_iter(angles.iter().map(|x| of(*x)))).concat()
-        };
-        let features: Vec<f32> = t.iter().flat_map(row).map(|x| x as f32).collect();
+        let mut features = Vec::with_capacity(t.len() * 2 * half);
+        for t in t {
+            for wave in [f64::sin, f64::cos] {
+                features.extend((0..half).map(|k| wave(angle(*t, k)) as f32));
+            }
+        }
         let features = Tensor::from_vec(features, (t.len(), 1, 2 * half), device)?;
         let embedding = self.linear("time.1", &mish(&self.linear("time.0", &features)?)?)?;
         Ok(Time { activated: mish(&embedding)?, embedding })
@@ -67,8 +68,8 @@ impl<'a> Layers<'a> {
     }
 
     pub fn block(&self, name: &str, x: &Tensor, time: &Time) -> Result<Tensor> {
-        let of_time = self.linear(&format!("{name}.time"), &time.activated)?;
-        let inside = self.normed(&format!("{name}.0"), x)?.broadcast_add(&of_time)?;
+        let time = self.linear(&format!("{name}.time"), &time.activated)?;
+        let inside = self.normed(&format!("{name}.0"), x)?.broadcast_add(&time)?;
         let inside = self.normed(&format!("{name}.1"), &inside)?;
         let skip = format!("{name}.skip");
         match self.tensors.contains_key(&format!("{skip}.kernel")) {
@@ -96,9 +97,12 @@ impl<'a> Layers<'a> {
         let normed = layer_norm(x, scale, shift, EPSILON)?;
         let kernel = self.get(name, "queries.kernel")?;
         let none = Tensor::zeros(kernel.dim(1)?, x.dtype(), x.device())?;
-        let all = convolve(&normed, &kernel.unsqueeze(0)?, &none, 1)?
-            .reshape((batch, length, 3, heads, width))?;
-        let part = |part: usize| all.narrow(2, part, 1)?.squeeze(2)?.transpose(1, 2)?.contiguous();
+        let projected = convolve(&normed, &kernel.unsqueeze(0)?, &none, 1)?;
+        let projected = projected.reshape((batch, length, 3, heads, width))?;
+        let part = |part: usize| {
+            let part = projected.narrow(2, part, 1)?.squeeze(2)?;
+            part.transpose(1, 2)?.contiguous()
+        };
         let (queries, keys, values) = (part(0)?, part(1)?, part(2)?); // [B, heads, L, width]
         let powers = keys.broadcast_sub(&keys.max_keepdim(2)?.detach())?.exp()?;
         let keys = powers.broadcast_div(&powers.sum_keepdim(2)?)?;

@@ -74,7 +74,7 @@ impl DiffusionShape {
     /// Shape of the value function.
     pub fn value(&self) -> Option<EnsembleShape> {
         let layers = self.value.as_ref()?;
-        Some(EnsembleShape::of_state(self.observation_dim, layers, 1))
+        Some(EnsembleShape::state_network(self.observation_dim, layers, 1))
     }
 }
 

@@ -57,7 +57,7 @@ impl GaussianShape {
             Spread::Squashed => 2 * self.action_dim,
             _ => self.action_dim,
         };
-        EnsembleShape::of_state(self.observation_dim, &self.actor, outputs)
+        EnsembleShape::state_network(self.observation_dim, &self.actor, outputs)
     }
 
     /// Layout of log σ, `[a]`, of [`Spread::Shared`].

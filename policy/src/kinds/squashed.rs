@@ -20,7 +20,7 @@ impl SquashedActor {
 
     /// Shape of the network, which returns the mean, then log σ.
     pub fn shape(policy: &ActorCriticShape) -> EnsembleShape {
-        EnsembleShape::of_state(policy.observation_dim, &policy.actor, 2 * policy.action_dim)
+        EnsembleShape::state_network(policy.observation_dim, &policy.actor, 2 * policy.action_dim)
     }
 
     /// Actions `[rows, a]` from standard normal `noise`, `[rows, a]`, for `observations`, `[n, o]`,

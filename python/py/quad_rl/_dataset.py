@@ -14,7 +14,7 @@ from typing import Any, ParamSpec
 from numpy.typing import ArrayLike
 
 from quad_rl import _quad_rl
-from quad_rl._rows import Rows, Source, followed, rows_of, rows_of_episodes
+from quad_rl._rows import Rows, Source, followed, rows_from_arrays, rows_from_episodes
 from quad_rl.readers import d3rlpy, frame, lerobot, minari, ogbench, robomimic
 
 P = ParamSpec("P")
@@ -75,7 +75,7 @@ class Dataset:
         Raises ValueError for shapes that do not fit one another, for whole numbers as actions, and, with the row, for NaN, numbers
         that a masked array hides, and flags that are neither 0 nor 1.
         """
-        rows = rows_of("", observations, actions, rewards, terminations, truncations, next_observations)
+        rows = rows_from_arrays("", observations, actions, rewards, terminations, truncations, next_observations)
         return Dataset(rows if next_observations is not None else followed(rows))
 
     @staticmethod
@@ -91,7 +91,7 @@ class Dataset:
 
         Raises ValueError as `from_arrays`, with the episode, counted from 0.
         """
-        return Dataset(rows_of_episodes(episodes))
+        return Dataset(rows_from_episodes(episodes))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes an HDF5 file in the layout for own data, once it is whole; one that is there is replaced.

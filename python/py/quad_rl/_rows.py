@@ -31,7 +31,7 @@ class Source(NamedTuple):
     notes: list[str] = []
 
 
-def rows_of_episodes(episodes: Iterable[Any]) -> Rows:
+def rows_from_episodes(episodes: Iterable[Any]) -> Rows:
     parts = [episode_rows(f"episode {i}: ", episode) for i, episode in enumerate(episodes)]
     if not parts:
         raise ValueError("there is no episode")
@@ -65,14 +65,14 @@ def episode_rows(where: str, episode: Any) -> Rows:
     observations = plain(where, "observations", get("observations"))
     after = observations[1:] if len(observations) == steps + 1 else None
     before = observations if after is None else observations[:-1]
-    rows = rows_of(where, before, get("actions"), get("rewards"), ends[0], ends[1], after)
+    rows = rows_from_arrays(where, before, get("actions"), get("rewards"), ends[0], ends[1], after)
     if after is None:
         return followed(rows)
     rows.timeouts[-1] |= not rows.terminals[-1]
     return rows
 
 
-def rows_of(
+def rows_from_arrays(
     where: str,
     observations: ArrayLike,
     actions: ArrayLike,

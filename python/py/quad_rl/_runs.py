@@ -33,7 +33,7 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
     rows: list[dict[str, Any]] = []
     for path in paths:
         try:
-            rows += rows_of(path) if Path(path, "config.toml").exists() else []
+            rows += run_rows(path) if Path(path, "config.toml").exists() else []
         except (OSError, RuntimeError) as error:
             warnings.warn(f"the run in {path} cannot be read: {error}", stacklevel=2)
     return rows
@@ -56,7 +56,7 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
     for line in map(json.loads, lines):
         named = {name if name in ("step", "seconds") else f"train/{name}": value for name, value in line.items()}
         rows[line["step"]] = named
-    for scored in rows_of(folder):
+    for scored in run_rows(folder):
         if scored["complete"]:
             row = rows.setdefault(scored["step"], {"step": scored["step"]})
             values = {name: scored[name] for name in ("score", "score_std", "return", "length")}
@@ -64,7 +64,7 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
     return [rows[step] for step in sorted(rows)]
 
 
-def rows_of(folder: str | PathLike[str]) -> list[dict[str, Any]]:
+def run_rows(folder: str | PathLike[str]) -> list[dict[str, Any]]:
     """The rows of `runs` for one run. Raises RuntimeError if a file is invalid."""
     run, config = map(json.loads, _quad_rl.read_run(folder))
     common = _flat("", {name: value for name, value in run.items() if name not in ("evaluations", "episodes_missing")})

@@ -24,7 +24,7 @@ from typing import Any, TextIO
 from quad_rl import _quad_rl
 from quad_rl._dataset import Dataset
 from quad_rl._process import exit_code, start
-from quad_rl._runs import metrics, rows_of
+from quad_rl._runs import metrics, run_rows
 
 _LINE = re.compile(r"\S+Z +([A-Z]+) (.*)")
 _STEP = re.compile(r"step (\d+)/(\d+) ")
@@ -53,7 +53,7 @@ class Run:
     @property
     def scores(self) -> list[dict[str, Any]]:
         """Its rows of `runs`: a dictionary for each evaluation. Raises RuntimeError if it cannot be read."""
-        return [row for row in rows_of(self.folder) if row["step"] is not None]
+        return [row for row in run_rows(self.folder) if row["step"] is not None]
 
     @property
     def metrics(self) -> list[dict[str, float]]:

@@ -7,14 +7,14 @@ use super::tasks::Task;
 
 /// A warning about a benchmark's task for which an algorithm's authors give no values.
 pub fn not_given(definition: &Definition, task: &Task) -> Option<String> {
-    let values = Values::of(definition);
+    let values = Values::read(definition);
     let given = task.benchmark.and_then(|benchmark| values.given.get(&benchmark.name));
     let is_given = given.is_some_and(|tasks| tasks.iter().any(|pattern| fits(pattern, &task.name)));
     // A task without a dataset of its own is no benchmark's.
     if is_given || task.text("dataset").is_none() {
         return None;
     }
-    let instead = match (task.values_of(), values.group_for(&task.name)) {
+    let instead = match (task.values_task(), values.group_for(&task.name)) {
         (other, _) if other != task.name => format!("those for {other} are used"),
         (_, Some(group)) => format!("those for {group} are used"),
         _ => "its general values are used".to_owned(),

@@ -69,7 +69,7 @@ impl Preset {
     /// online run, the file's keys and `changes`, the later over the earlier, and checks them.
     pub fn resolve(&self, changes: &Table) -> Result<Experiment, ConfigError> {
         let definition = self.algorithm(changes)?;
-        let mut table = Values::of(&definition).for_task(self.task.map(Task::values_of));
+        let mut table = Values::read(&definition).for_task(self.task.map(Task::values_task));
         let has_online = table.contains_key("online");
         let online_values = table.remove("online_values");
         let mut task_keys = self.task.map_or_else(Table::new, |task| task.keys.clone());
@@ -88,7 +88,8 @@ impl Preset {
         merge(&mut table, changes.clone());
         table.insert("algorithm".to_owned(), definition.name.into());
         if table.contains_key("online") && !has_online {
-            let can = |other: &Definition| Values::of(other).for_task(None).contains_key("online");
+            let can =
+                |other: &Definition| Values::read(other).for_task(None).contains_key("online");
             let names = hyperparameters::names_where(can);
             return Err(ConfigError::new(
                 format!("{} learns from a dataset alone, not online", definition.name),

@@ -74,7 +74,7 @@ impl From<BenchmarkTask> for Task {
 
 impl Task {
     /// The task whose values of algorithms apply.
-    pub fn values_of(&self) -> &str {
+    pub fn values_task(&self) -> &str {
         self.values.as_deref().unwrap_or(&self.name)
     }
 
@@ -85,17 +85,17 @@ impl Task {
 }
 
 /// All tasks, in the order of their list.
-pub fn all() -> &'static [Task] {
+pub fn list() -> &'static [Task] {
     &TASKS
 }
 
 /// Finds a task by name.
 pub fn named(name: &str) -> Result<&'static Task, ConfigError> {
-    let task = all().iter().find(|task| task.name == name);
+    let task = list().iter().find(|task| task.name == name);
     task.ok_or_else(|| ConfigError::unknown("task", name, unknown_hint(name)))
 }
 
 /// The hint for an unknown task: similar names.
 pub fn unknown_hint(name: &str) -> String {
-    did_you_mean(name, all().iter().map(|task| &*task.name)) + "`learner presets` lists all tasks"
+    did_you_mean(name, list().iter().map(|task| &*task.name)) + "`learner presets` lists all tasks"
 }

@@ -25,13 +25,14 @@ fn a_run_whose_lambda_stays_near_one_is_called_dac() {
     };
     let near = lines(|_| 0.995);
     assert!(is_called_dac(&near, "quad") && !is_called_dac(&near, "dac"));
-    assert!(!is_called_dac(&lines(|number| if number == 11 { 0.98 } else { 1.0 }), "quad"));
+    let dips = lines(|number| if number == 11 { 0.98 } else { 1.0 });
+    assert!(!is_called_dac(&dips, "quad"));
 }
 
 #[test]
 fn lambda_is_summarized_after_the_first_tenth() {
-    let Summary { text, json, .. } =
-        summarize(&lines(|number| if number % 2 == 0 { 0.5 } else { 0.75 }), "quad").unwrap();
+    let lines = lines(|number| if number % 2 == 0 { 0.5 } else { 0.75 });
+    let Summary { text, json, .. } = summarize(&lines, "quad").unwrap();
     for words in [
         "steps 201 to 2000: mean 0.625, of a batch 10 % below 0.125",
         "50.0 % above 0.99",
@@ -40,22 +41,15 @@ fn lambda_is_summarized_after_the_first_tenth() {
     ] {
         assert!(text.contains(words), "{words} is missing in\n{text}");
     }
-    assert_eq!(
-        (&json["from_step"], &json["to_step"], &json["is_dac"]),
-        (&json!(201), &json!(2000), &json!(false))
-    );
-    assert!(
-        (json["lambda_mean"].as_f64().unwrap() - 0.625).abs() < 1e-12
-            && json.get("bc_loss").is_none(),
-        "{json}"
-    );
+    assert_eq!([&json["from_step"], &json["to_step"]], [201, 2000]);
+    assert!(json["is_dac"] == false && json.get("bc_loss").is_none(), "{json}");
+    assert!((json["lambda_mean"].as_f64().unwrap() - 0.625).abs() < 1e-12);
 }
 
 #[test]
 fn a_run_without_lambda_has_no_summary_of_it() {
-    let other = MetricsLine::from([("step".to_owned(), 100.0), ("critic_loss".to_owned(), 1.0)]);
-    assert_eq!(
-        (summarize(&[], "quad"), summarize(&[other], "quad"), summarize(&lines(|_| 0.0), "none"),),
-        (None, None, None)
-    );
+    let line = MetricsLine::from([("step".to_owned(), 100.0), ("critic_loss".to_owned(), 1.0)]);
+    assert_eq!(summarize(&[], "quad"), None);
+    assert_eq!(summarize(&[line], "quad"), None);
+    assert_eq!(summarize(&lines(|_| 0.0), "none"), None);
 }

@@ -19,7 +19,7 @@ use std::time::Instant;
 
 use anyhow::{Context, anyhow};
 use clap::{Args, value_parser};
-use quad_dataset::environment::{all, find};
+use quad_dataset::environment::{find, specs};
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata, Recipe, Simulator};
 use quad_run::counted;
 use quad_run::folder::{RunDir, RunDirError};
@@ -125,7 +125,7 @@ pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
         Ok(spec) if is_plane(spec) => return Ok(spec),
         Ok(_) => format!("no dataset can be recorded in {name}: {MAZE}"),
     };
-    let possible = all().iter().filter(|spec| is_plane(spec));
+    let possible = specs().iter().filter(|spec| is_plane(spec));
     let names = Vec::from_iter(possible.map(|spec| spec.name.as_str()));
     Err(format!("{problem}; datasets can be recorded in {}", names.join(", ")))
 }

@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn every_robot_has_a_stage_and_a_maze_is_seen_from_above() {
-        for spec in quad_dataset::environment::all() {
+        for spec in quad_dataset::environment::specs() {
             let model = model(spec, (320, 240)).unwrap();
             let name = &spec.name;
             assert_eq!(model.nq() as usize, spec.qpos_dim, "{name}: poses fit the model");

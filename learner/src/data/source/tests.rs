@@ -20,7 +20,7 @@ fn names_and_paths() {
 #[test]
 fn the_datasets_of_all_tasks_are_known_and_fit() {
     let mut count = 0;
-    for task in tasks::all() {
+    for task in tasks::list() {
         let experiment = resolve(&task.name, &toml::Table::new()).unwrap();
         let Some(dataset) = experiment.dataset.first() else { continue };
         let source = Source::parse(dataset).unwrap();

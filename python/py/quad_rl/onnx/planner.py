@@ -25,12 +25,12 @@ def plan(file: File, observations: Value, noise: Value, plans: int) -> tuple[Val
     graph, guidance, horizon = noise.graph, file.shape["guidance"], file.shape["network"]["horizon"]
     o, a, steps, taken = (file.shape[name] for name in ("observation_dim", "action_dim", "diffusion_steps", "replan_every"))
     width = o + a
-    # x·others + first sets the first state of a window.
+    # x·mask + first sets the first state of a window.
     place = np.zeros((o, width, horizon))
     place[np.arange(o), np.arange(a, width), 0] = 1
     first = (observations @ place.reshape(o, -1)).reshape(-1, 1, width, horizon)
     first = graph("Tile", first, np.array([1, plans, 1, 1])).reshape(-1, width, horizon)
-    others: Array = 1 - place.sum(0)
+    mask: Array = 1 - place.sum(0)
     from_clean, from_noisy, variance = schedule(steps)
 
     def drawn(index: Value) -> Value:
@@ -41,17 +41,17 @@ def plan(file: File, observations: Value, noise: Value, plans: int) -> tuple[Val
         model, value = Model(file, "model.", times), ValueFunction(file, "value.", times)
 
         def body(i: Value, x: Value) -> Value:
-            def of(numbers: Array) -> Value:
+            def at_step(numbers: Array) -> Value:
                 return graph.constant(numbers[times]).at(0, i)
 
             for _ in range(guidance["steps"] if guided else 0):
-                x = (x + value(x, i)[1]() * of(guidance["scale"] * variance)) * others + first
-            z = drawn(i + np.array(steps - times[0] + 1)) * of(np.sqrt(variance))
-            return (model(x, i) * of(from_clean) + x * of(from_noisy) + z) * others + first
+                x = (x + value(x, i)[1]() * at_step(guidance["scale"] * variance)) * mask + first
+            z = drawn(i + np.array(steps - times[0] + 1)) * at_step(np.sqrt(variance))
+            return (model(x, i) * at_step(from_clean) + x * at_step(from_noisy) + z) * mask + first
 
         return graph.repeat(len(times), x, body) if times else x
 
-    x = drawn(graph.constant(np.array(0))) * others + first
+    x = drawn(graph.constant(np.array(0))) * mask + first
     stop = max(guidance["stop"], 1)
     x = denoise(x, list(range(steps, stop, -1)), guided=True)
     x = denoise(x, list(range(min(stop, steps), 1, -1)), guided=False)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from quad_rl._extras import library
 
 
-def array_of(column: Any, name: str, place: str) -> NDArray[Any]:
+def to_array(column: Any, name: str, place: str) -> NDArray[Any]:
     """A column of pyarrow's: N numbers or texts, or N rows of lists that are all of the same length.
 
     place: what errors call the table. Raises ValueError for an empty place and for lists of several lengths.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quad_rl._rows import Source, rows_of_episodes
+from quad_rl._rows import Source, rows_from_episodes
 
 
 def from_d3rlpy(dataset: Any) -> Source:
@@ -19,4 +19,4 @@ def from_d3rlpy(dataset: Any) -> Source:
             raise ValueError("observations are tuples, but only rows of numbers are learned from")
         arrays = {name: getattr(episode, name) for name in ("observations", "actions", "rewards")}
         episodes.append({**arrays, "terminated": bool(episode.terminated), "truncated": False})
-    return Source(rows_of_episodes(episodes))
+    return Source(rows_from_episodes(episodes))

@@ -49,7 +49,7 @@ class Log(NamedTuple):
     continuous: bool = False  # Whole numbers are actions, too.
 
 
-def columns_of(*rules: Any) -> set[str] | None:
+def rule_columns(*rules: Any) -> set[str] | None:
     """The columns that these rules name, words among them; None, all of them, where a function may look at any."""
     rules = tuple([rule] if isinstance(rule, str) or callable(rule) else rule for rule in rules if rule is not None)
     flat = [name for rule in rules for name in rule]
@@ -108,7 +108,7 @@ def dataset(
     if empty:
         notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
     names = [[name for column in columns for name in _names(log, column)] for columns in (observations, actions)]
-    for several in [name for of_array in names for name in of_array if of_array.count(name) > 1][:1]:
+    for several in [name for array in names for name in array if array.count(name) > 1][:1]:
         hint = "hint: each number needs its own, by which policies and robots find it; rename it in the source (LeRobot: meta/info.json)"
         raise ValueError(f"several numbers of an observation or an action are called {several!r}\n{hint}")
     transitions = joined(parts)
@@ -124,7 +124,7 @@ def _check(log: Log, name: str) -> None:
         raise ValueError(f"there is no column {name!r}{where}\nhint: there are {', '.join(map(repr, there))}")
     if log.episodes[0].columns[name].dtype.kind not in "fiub":
         values = [(episode.name, row, value) for episode in log.episodes
-                  for row, of_row in enumerate(episode.columns[name]) for value in np.ravel(of_row)]
+                  for row, numbers in enumerate(episode.columns[name]) for value in np.ravel(numbers)]
         number, row, value = next((place for place in values if not is_number(place[2])), values[0])
         hint = "hint: numbers are written like 0.5; leave out rows without one, or fill them"
         raise ValueError(f"column {name!r}, row {row} of episode {number} holds {str(value)!r} in place of a number\n{hint}")

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from quad_rl._extras import library
 from quad_rl._rows import Source, plain
-from quad_rl.readers.arrow import array_of
-from quad_rl.readers.episodes import FEWEST, Episode, Log, Rule, Success, columns_of, dataset, is_number
+from quad_rl.readers.arrow import to_array
+from quad_rl.readers.episodes import FEWEST, Episode, Log, Rule, Success, dataset, is_number, rule_columns
 
 TABLES = (".csv", ".tsv", ".parquet")  # Of the files in a folder.
 _EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # Empty places, as libraries of tables write them.
@@ -71,7 +71,7 @@ def from_frame(
     named = {episode, *(rule for rule in (reward, terminal, success) if isinstance(rule, str))}
     actions = _matching(actions, there, named)
     observations = _matching(observations, there, {*named, *actions})
-    words = columns_of(observations, actions, reward, terminal, success)
+    words = rule_columns(observations, actions, reward, terminal, success)
     read = {name: key for name, key in zip(there, keys) if words is None or name in words or name == episode}
     for name in [name for name in read if there.count(name) > 1]:
         raise ValueError(f"{place} has several columns {name!r}")
@@ -155,7 +155,7 @@ def _matching(names: Sequence[str], there: list[str], named: set[str]) -> Sequen
 
 def _column(column: Any, name: str, place: str) -> NDArray[Any]:
     if hasattr(column, "combine_chunks"):
-        return array_of(column, name, place)
+        return to_array(column, name, place)
     to_numpy: Callable[[], Any] | None = getattr(column, "to_numpy", None)
     array = plain(f"{place}: ", name, to_numpy() if to_numpy else column)
     if array.dtype == object and len(array) and not isinstance(array[0], str):

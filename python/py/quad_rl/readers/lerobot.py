@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from quad_rl._extras import library
 from quad_rl._rows import Source
-from quad_rl.readers.arrow import array_of
-from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
+from quad_rl.readers.arrow import to_array
+from quad_rl.readers.episodes import Episode, Log, Rule, Success, dataset, rule_columns
 from quad_rl.readers.video import Encoder, column, encoded
 
 Columns = dict[str, NDArray[Any]]
@@ -69,7 +69,7 @@ def from_lerobot(
     features = features or {}
     seen = [*observations, *(column(name, encoder) for name, encoder in features.items())] if features else observations
     notes = _check_images(root, {name: stream["dtype"] for name, stream in streams.items()}, {*observations, action}, features)
-    words = columns_of(observations, action, reward, success, terminate)
+    words = rule_columns(observations, action, reward, success, terminate)
     plain = [name for name, stream in streams.items() if stream["dtype"] not in ("image", "video", "string", "language")]
     wanted = {_REWARD, _SUCCESS, _DONE, _TERMINATED, _TRUNCATED, "task_index", *_INDEX, *(plain if words is None else words)}
     columns, unreadable = _frames(root, [name for name in plain if name in wanted])
@@ -85,7 +85,7 @@ def from_lerobot(
     episodes = _cut(parts, ends, notes)
     if rewarded and won and reward in (None, _REWARD):
         _suspect_shift(episodes, notes)
-    names = {name: names_of(stream.get("names")) for name, stream in streams.items()}
+    names = {name: flat_names(stream.get("names")) for name, stream in streams.items()}
     log = Log(episodes, notes, plain, names, rewarded, won, done, terminated, continuous=continuous)
     return dataset(log, seen, [action], reward, success, terminate)
 
@@ -112,7 +112,7 @@ def _frames(root: Path, wanted: list[str]) -> tuple[Columns, list[str]]:
         except (library("pyarrow", "lerobot").ArrowInvalid, OSError):
             unreadable.append(str(path.relative_to(root)))
             continue
-        parts.append({name: array_of(table[name], name, str(path)) for name in table.column_names})
+        parts.append({name: to_array(table[name], name, str(path)) for name in table.column_names})
     there = [name for name in wanted if parts and all(name in part for part in parts)]
     if not {*_INDEX} <= {*there}:
         why = f"; {_UNFINISHED}{', '.join(unreadable)}" if unreadable else ""
@@ -173,11 +173,11 @@ def _whole(
         notes.append(f"meta/info.json has splits ({', '.join(f'{name} {part}' for name, part in splits.items())}); all are read")
     for number, part in there.items():
         frames, row = part["frame_index"].reshape(-1), rows.get(number, {})
-        of_all = {name: value for name, value in row.items()
-                  if name not in part and "/" not in name and isinstance(value, (bool, int, float))}
+        constants = {name: value for name, value in row.items()
+                     if name not in part and "/" not in name and isinstance(value, (bool, int, float))}
         steps, said = len(frames), row.get("length", len(frames))
         if steps >= said and np.array_equal(frames, np.arange(steps)):
-            kept[number] = part | {name: np.full(steps, value) for name, value in of_all.items()}
+            kept[number] = part | {name: np.full(steps, value) for name, value in constants.items()}
             longer += [f"episode {number}: {said}, but data has {steps}"] if steps > said else []
     broken = [str(number) for number in there if number not in kept]
     if broken:
@@ -215,13 +215,13 @@ def _with_task(root: Path, parts: dict[int, Columns], task: str | None, notes: l
     return {number: parts[number] for number in chosen}
 
 
-def names_of(names: Any) -> list[str]:
+def flat_names(names: Any) -> list[str]:
     """LeRobot has a list, lists in a dictionary, the place of each name, or nothing. Names that several lists have, as those of two
     arms, get their keys: `left.j0`."""
     if isinstance(names, Mapping):
         if all(isinstance(place, int) for place in names.values()):
             return sorted(names, key=lambda name: int(names[name]))
-        pairs = [(key, name) for key, part in names.items() for name in names_of(part)]
+        pairs = [(key, name) for key, part in names.items() for name in flat_names(part)]
         plain = [name for _, name in pairs]
         return plain if len({*plain}) == len(plain) else [f"{key}.{name}" for key, name in pairs]
     return [str(name) for name in names or ()]

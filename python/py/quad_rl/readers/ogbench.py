@@ -9,7 +9,7 @@ import numpy as np
 
 from quad_rl import _quad_rl
 from quad_rl._extras import library
-from quad_rl._rows import Source, rows_of
+from quad_rl._rows import Source, rows_from_arrays
 
 
 def from_ogbench(name: str, *, folder: str | PathLike[str] = "~/.ogbench/data") -> Source:
@@ -46,7 +46,7 @@ def from_ogbench(name: str, *, folder: str | PathLike[str] = "~/.ogbench/data") 
             ends = np.append(last[1:], True)[steps]
         reached = np.linalg.norm(qpos[:, x : x + 2] - np.array(goal), axis=-1) <= reach
         rewards, masks = reached - 1.0, 1.0 - reached
-    return Source(rows_of("", before, actions, rewards, masks == 0, ends & (masks != 0), after))
+    return Source(rows_from_arrays("", before, actions, rewards, masks == 0, ends & (masks != 0), after))
 
 
 def _download(file: str, folder: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_rl._rows import Source
-from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
+from quad_rl.readers.episodes import Episode, Log, Rule, Success, dataset, rule_columns
 from quad_rl.readers.hdf5 import opened
 
 _REWARDS, _SUCCESS, _DONE = "rewards", "success", "dones"
@@ -57,7 +57,7 @@ def from_robomimic(
             chosen = {name.decode() if isinstance(name, bytes) else str(name) for name in masks[filter][()]}
             notes.append(f"{len([n for n in names if n not in chosen])} of {len(names)} episodes left out: not in {filter!r}")
             names = [name for name in names if name in chosen]
-        words = columns_of(observations, actions, reward, success, terminate)
+        words = rule_columns(observations, actions, reward, success, terminate)
         episodes: list[Episode] = []
         for name in names:
             group = source["data"][name]

@@ -28,7 +28,7 @@ fn a_warning_names_the_values_that_are_used() {
 fn every_algorithm_has_values_for_every_task() {
     for definition in ALGORITHMS {
         let changes = toml::Table::from_iter([("algorithm".to_owned(), definition.name.into())]);
-        for task in tasks::all() {
+        for task in tasks::list() {
             let resolved = resolve(&task.name, &changes);
             // It learns from experience alone, of which this task has none.
             if definition.name == "rlpd" && task.name == "own-data" {
