@@ -5,6 +5,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+#[path = "../fixtures/python.rs"]
+mod python;
+use python::python;
+
 /// Largest error, relative to the number itself or, for numbers near zero, to their tensor's root
 /// mean square.
 const TOLERANCE: f32 = 1e-4;
@@ -30,21 +34,10 @@ pub struct Golden {
     tolerance: f32,
 }
 
-/// Runs a script of the repository that needs JAX; says whether it ran. Without the Python that
-/// deploy/setup.sh --tests sets up it is skipped, unless QUAD_REQUIRE_PEERS=1 asks for it.
-#[allow(clippy::print_stderr)] // what is skipped is said
+/// Runs a script of the repository that needs JAX; says whether it ran.
 pub fn run(script: &str, arguments: &[&str]) -> bool {
     let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let python =
-        std::env::var_os("QUAD_PYTHON").map_or(home.join(".deps/venv/bin/python"), PathBuf::from);
-    let has_jax = Command::new(&python).args(["-c", "import jax, safetensors"]).output();
-    if !has_jax.is_ok_and(|output| output.status.success()) {
-        let remedy = "deploy/setup.sh --tests installs it";
-        let required = std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");
-        assert!(!required, "{} has no jax; {remedy}", python.display());
-        eprintln!("skipped, because {} has no jax; {remedy}", python.display());
-        return false;
-    }
+    let Some(python) = python("jax, safetensors") else { return false };
     let output = Command::new(python).arg(home.join(script)).args(arguments).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{script} {}: {text}", arguments.join(" "));
@@ -123,7 +116,7 @@ impl Golden {
     }
 
     /// Asserts that numbers are those expected under this name, whatever their shape.
-    pub fn close(&self, name: &str, found: &Tensor) {
+    pub fn close(&self, name: &str, actual: &Tensor) {
         let expected = self
             .expected
             .get(name)
@@ -131,15 +124,15 @@ impl Golden {
         let numbers = |x: &Tensor| {
             x.to_dtype(DType::F32).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap()
         };
-        let (found, expected) = (numbers(found), numbers(expected));
-        assert_eq!(found.len(), expected.len(), "{name} in {}", self.folder.display());
+        let (actual, expected) = (numbers(actual), numbers(expected));
+        assert_eq!(actual.len(), expected.len(), "{name} in {}", self.folder.display());
         let size = (expected.iter().map(|x| x * x).sum::<f32>() / expected.len() as f32).sqrt();
-        for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {
-            let error = (found - expected).abs() / expected.abs().max(size).max(1e-30);
+        for (i, (actual, expected)) in actual.iter().zip(&expected).enumerate() {
+            let error = (actual - expected).abs() / expected.abs().max(size).max(1e-30);
             let place = self.folder.display();
             assert!(
                 error <= self.tolerance,
-                "{name} at {i} in {place}: {found}, but expected is {expected}"
+                "{name} at {i} in {place}: {actual}, but expected is {expected}"
             );
         }
     }

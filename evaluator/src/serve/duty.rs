@@ -51,7 +51,7 @@ enum State {
     Returning(Job, Option<String>),
 }
 
-/// What an evaluator is to do in a run.
+/// A step of an evaluator's turn in a run.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Step {
     Claim {
@@ -172,8 +172,14 @@ impl Duty {
         (self.in_turn, self.delivered_again) = (true, false);
     }
 
-    fn end_turn(&mut self, turn: Turn) {
-        (self.in_turn, self.turn) = (false, turn);
+    fn end_turn(&mut self, ready_at: Instant) {
+        (self.in_turn, self.turn) = (false, Turn::new(ready_at));
+    }
+
+    /// Ends a turn that has failed.
+    fn rest(&mut self, now: Instant) {
+        self.in_turn = false;
+        self.turn.failed(now);
     }
 
     /// The next step of a turn; `None` once it has ended. A new claim gets the `random` number.
@@ -211,7 +217,7 @@ impl Duty {
             JobReply::Job(job) => self.state = State::Claimed(job),
             JobReply::Wait { milliseconds, .. } => {
                 let pause = Duration::from_millis(milliseconds).clamp(PAUSE[0], PAUSE[1]);
-                self.end_turn(Turn::new(now + pause.mul_f64(spread)));
+                self.end_turn(now + pause.mul_f64(spread));
             }
             JobReply::HandedBack { .. } => self.in_turn = false,
         }
@@ -233,7 +239,7 @@ impl Duty {
     pub fn scored(&mut self, reply: ScoreReply, now: Instant) -> Vec<Note> {
         if let Some(report) = self.again.take() {
             self.delivered_again = true;
-            // What is left of the job comes back with the next claim.
+            // The next claim brings the rest of the job.
             self.state = match mem::take(&mut self.state) {
                 State::Claimed(job) => State::Returning(job, None),
                 other => other,
@@ -246,7 +252,7 @@ impl Duty {
         if let ScoreReply::Refused { reason, .. } = reply {
             return self.refused(job, format!("refused the scores: {reason}"));
         }
-        self.end_turn(Turn::new(now));
+        self.end_turn(now);
         // The job of scores that come too early was of an earlier process.
         self.delivered(report, reply)
     }
@@ -293,7 +299,7 @@ impl Duty {
                 ahead.map(|()| Vec::new())
             }
             PieceReply::Recorded { duplicate, .. } => {
-                self.end_turn(Turn::new(now));
+                self.end_turn(now);
                 let (step, seed, rows) = (job.step, parcel.seed(), parcel.rows);
                 Ok(vec![Note::Experience { step, seed, rows, duplicate }])
             }
@@ -315,12 +321,10 @@ impl Duty {
     pub fn handed_back(&mut self, now: Instant) {
         let failed = matches!(self.state, State::Returning(_, Some(_)));
         self.state = State::Idle;
-        let mut turn = self.turn.clone();
         match failed {
-            true => turn.failed(now),
-            false => turn = Turn::new(now),
+            true => self.rest(now),
+            false => self.end_turn(now),
         }
-        self.end_turn(turn);
     }
 
     /// A step got no usable answer: it is tried again in another turn.
@@ -332,9 +336,7 @@ impl Duty {
         {
             self.state = State::Idle;
         }
-        let mut turn = self.turn.clone();
-        turn.failed(now);
-        self.end_turn(turn);
+        self.rest(now);
     }
 
     /// The evaluator leaves: from now on it claims and plays nothing.

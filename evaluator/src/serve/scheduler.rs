@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 
 /// Time at which a run is due.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct Turn {
     pub ready_at: Instant,
     /// The pause after the next failure.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 use quad_dataset::Simulator;
@@ -11,24 +11,14 @@ use quad_evaluator::sim::{make, mjcf};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
+use crate::python::python;
+
 const TOLERANCE: f64 = 1e-9;
 
 /// The output of the script; `None` if Gymnasium is not installed and not required.
 fn reference<T: DeserializeOwned>(arguments: &[&str]) -> Option<T> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let python = std::env::var_os("QUAD_PYTHON");
-    let python = python.map_or(folder.join("../.deps/venv/bin/python"), PathBuf::from);
-    let mut import = Command::new(&python);
-    import.args(["-c", "import gymnasium, mujoco, ogbench"]);
-    let imported = import.stderr(Stdio::null()).status();
-    if !imported.is_ok_and(|status| status.success()) {
-        let required = std::env::var_os("QUAD_REQUIRE_PEERS");
-        let problem = format!("{} has no gymnasium", python.display());
-        let hint = "deploy/setup.sh --tests installs it";
-        assert!(required.is_none_or(|value| value != "1"), "{problem}; {hint}");
-        println!("skipped, because {problem}; {hint}");
-        return None;
-    }
+    let python = python("gymnasium, mujoco, ogbench")?;
     let mut command = Command::new(python);
     command.args(["-W", "ignore"]).args([folder.join("tests/gymnasium_reference.py")]);
     // MuJoCo logs its warnings to a file in the current directory.

@@ -3,4 +3,6 @@
 
 mod edges;
 mod gymnasium;
+#[path = "../../../tests/fixtures/python.rs"]
+mod python;
 mod rollout;

@@ -57,7 +57,7 @@ fn a_score_in_a_batch_is_that_of_stepping_its_environment_alone() {
     }
 }
 
-/// What a step does, given the observed seed and number of steps, and the action.
+/// Effect of a step, given the observed seed and number of steps, and the action.
 type Rules = dyn Fn(&mut [f64; 2], f32) -> Result<Step, EnvironmentError> + Send + Sync;
 
 /// Observes its seed and its number of steps.

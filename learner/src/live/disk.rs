@@ -19,7 +19,7 @@ pub(crate) struct Writer {
     /// Its output, as a metric's label and for people.
     pub label: &'static str,
     output: &'static str,
-    /// What a disk that hangs means, for people.
+    /// Consequence of a disk that hangs, for people.
     pub waits: &'static str,
 }
 

@@ -1,4 +1,4 @@
-//! What has come of an online episode.
+//! An online episode, as far as it has come.
 
 use std::mem;
 use std::sync::Arc;

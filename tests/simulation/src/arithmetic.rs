@@ -1,4 +1,4 @@
-//! What training and policies compute, in place of networks: hashes of everything that they depend
+//! Results of training and policies, in place of networks': hashes of everything that they depend
 //! on. Two runs have learned from the same input if and only if their hashes are equal.
 
 use quad_protocol::{Episode, EpisodeScore, Exploration, Hash, Name};

@@ -1,4 +1,4 @@
-//! What must hold in any world.
+//! Invariants of any world.
 
 use quad_evaluator::serve::duty::Note;
 use quad_learner::service::End;
@@ -30,7 +30,7 @@ impl World {
         }
     }
 
-    /// What the learner has acknowledged is on the disk from then on.
+    /// Results that the learner has acknowledged are on the disk from then on.
     pub fn noted(&mut self, number: usize, note: Note) -> Result<(), String> {
         let owed = &mut self.evaluators[number].owed;
         let mut settle = |step| {

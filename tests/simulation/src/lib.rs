@@ -1,14 +1,14 @@
 //! The service in a simulation: one learner and up to 64 evaluators as state machines, with virtual
 //! time, a network, a disk and strangers. Every choice follows from a seed.
 //!
-//! What must hold for any schedule: each episode of an evaluation counts once, with the first bits
+//! Invariants of any schedule: each episode of an evaluation counts once, with the first bits
 //! that are on the disk; each online episode is recorded once; training takes them in their order, so
 //! that its weights are those of a run without faults; nothing that was acknowledged is lost, nor
 //! given up by an evaluator before; nothing is played needlessly; and the run ends, without its
 //! scores only if no evaluator is there.
 //!
 //! # Layout
-//! `world` has time and the order of events, `checks` what must hold, `network` the messages,
+//! `world` has time and the order of events, `checks` the invariants, `network` the messages,
 //! `settings` a run and its faults; `learner`, `training` and `disk` are a learner's process,
 //! `evaluator` is an evaluator's, `arithmetic` what they compute; `strangers` send nonsense.
 

@@ -155,7 +155,7 @@ impl Training {
     }
 }
 
-/// What a run without any fault learns: its snapshots, and its last state.
+/// Snapshots and last state of a run without any fault.
 #[derive(Debug)]
 pub struct Reference {
     pub snapshots: BTreeMap<u64, Hash>,

@@ -19,7 +19,7 @@ use crate::access::HOST;
 /// Time for an answer that must not come; one that must is asked for again.
 const LULL: Duration = Duration::from_millis(500);
 
-/// What a subscriber has heard: a key, then words.
+/// Messages that a subscriber has heard: a key, then words.
 type Heard = Arc<Mutex<BTreeSet<String>>>;
 
 /// A listener's memory, and what is to be called with each sample.

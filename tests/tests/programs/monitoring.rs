@@ -40,7 +40,7 @@ fn alerts_fire_in_their_cases_only() {
 
 #[test]
 fn grafanas_files_follow_the_schema_and_alerts_are_documented() {
-    let Some(python) = peers::python(&["jsonschema", "yaml"]) else { return };
+    let Some(python) = peers::python("jsonschema, yaml") else { return };
     for (script, argument) in [("grafana_files.py", "deploy/grafana"), ("alert_files.py", ".")] {
         let script = repository("tests/peers").join(script);
         let output = Command::new(&python).arg(script).arg(repository(argument)).output();

@@ -45,7 +45,7 @@ fn commands_print_what_their_transcripts_have() {
     for name in ["usage", "shell", "runs", "data", "datasets", "doctor", "policies", "judge"] {
         cases.case(transcripts.join(format!("{name}.trycmd")));
     }
-    let mirror = peers::python(&["numpy", "http.server"]).map(|python| {
+    let mirror = peers::python("numpy, http.server").map(|python| {
         let script = |name: &str, argument: &str| {
             let mut command = Command::new(&python);
             command.arg(repository.join("tests/peers").join(name)).arg(argument);

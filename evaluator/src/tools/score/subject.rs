@@ -170,7 +170,7 @@ fn has_one_critic(policy: &PolicyConfig) -> bool {
 mod tests {
     use std::fs;
 
-    use quad_policy::{Aggregate, DiffusionShape, MlpConfig, Rule};
+    use quad_policy::{Aggregate, DiffusionShape, MlpConfig};
     use quad_protocol::episode_seeds;
 
     use super::super::measure;
@@ -186,21 +186,6 @@ mod tests {
         let path = folder.path().join("policy.safetensors");
         fs::write(&path, file(environment, shape, 1)).unwrap();
         Subject::read(&path, args)
-    }
-
-    #[test]
-    fn options_replace_the_policy_s_own_choice() {
-        let (mut own, mut args) = (Choice::best_of(7), ScoreArgs::default());
-        own.aggregate = Aggregate::Min;
-        assert!(choices(&args, Some(own)).is_empty());
-        let with = |candidates| Choice { candidates, ..own };
-        args.candidates = vec![10, 1, 10, 1];
-        assert_eq!(choices(&args, Some(own)), [with(10), with(1)]);
-        own.rule = Rule::Softmax { temperature: 0.5 };
-        (args.candidates, args.rule) = (Vec::new(), Some(own.rule));
-        assert_eq!(choices(&args, Some(own)), [own]);
-        (own.guidance, args.rule, args.guidance) = (0.5, None, Some(2.0));
-        assert_eq!(choices(&args, Some(own)), [Choice { guidance: 2.0, ..own }]);
     }
 
     #[test]
