@@ -17,8 +17,6 @@ use super::metrics::Metrics;
 pub(super) const REDRAW: Duration = Duration::from_millis(250);
 /// Interval of log lines.
 const LINE: Duration = Duration::from_secs(5);
-/// Time of training before the forecast of its duration.
-const ESTIMATE: Duration = Duration::from_secs(3);
 /// Number of the newest evaluations that are shown.
 const SCORES_SHOWN: usize = 3;
 
@@ -28,13 +26,11 @@ pub(crate) struct Display {
     /// Hidden if stderr is no terminal, or one that cannot draw (`TERM=dumb`). Measures the rate
     /// all the same.
     bar: ProgressBar,
-    begin: Instant,
     /// Gradient steps that were done before.
     first: u64,
     /// Newest last: gradient step and mean score.
     scores: VecDeque<(u64, f64)>,
     last_line: Instant,
-    estimated: bool,
 }
 
 impl Display {
@@ -47,11 +43,10 @@ impl Display {
         {
             bar.set_style(style);
         }
-        let (first, now) = (metrics.training.gradient_steps.get(), Instant::now());
+        let first = metrics.training.gradient_steps.get();
         bar.set_position(first);
         bar.reset_eta();
-        let scores = VecDeque::new();
-        Self { metrics, steps, bar, begin: now, first, scores, last_line: now, estimated: false }
+        Self { metrics, steps, bar, first, scores: VecDeque::new(), last_line: Instant::now() }
     }
 
     pub fn line(&self, text: &str) {
@@ -66,31 +61,16 @@ impl Display {
         }
     }
 
-    pub fn tick(&mut self, now: Instant) {
+    pub fn tick(&mut self) {
         let step = self.metrics.training.gradient_steps.get();
         self.bar.set_position(step);
-        self.estimate(step, now);
         let (training, evaluation) = (self.training_figures(step), self.evaluation_figures());
         if !self.bar.is_hidden() {
             self.bar.set_message(format!("{training}\n{evaluation}"));
-        } else if step < self.steps && now.duration_since(self.last_line) >= LINE {
-            self.last_line = now;
+        } else if step < self.steps && self.last_line.elapsed() >= LINE {
+            self.last_line = Instant::now();
             let percent = 100.0 * step as f64 / self.steps as f64;
             info!("step {step}/{} ({percent:.0} %), {training}, {evaluation}", self.steps);
-        }
-    }
-
-    /// Prints once how long training will take, if that is more than a minute: the user may have
-    /// meant fewer steps.
-    fn estimate(&mut self, step: u64, now: Instant) {
-        if self.estimated || now.duration_since(self.begin) < ESTIMATE || step == self.first {
-            return;
-        }
-        self.estimated = true;
-        let left = self.bar.eta();
-        if left > Duration::from_secs(60) {
-            let (rate, left) = (self.bar.per_sec(), HumanDuration(left));
-            self.line(&format!("{rate:.1} steps/s: this takes about {left}"));
         }
     }
 

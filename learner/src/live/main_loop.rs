@@ -1,7 +1,7 @@
 //! The main loop of a run: reports events, and decides when the run is over.
 
 use std::mem;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use quad_run::counted;
 use quad_run::folder::RunDir;
@@ -173,7 +173,7 @@ impl MainLoop {
     fn tick(&mut self, state: &mut State) -> Option<End> {
         self.beat.alive();
         self.watch_disk(&mut state.hanging);
-        self.display.tick(Instant::now());
+        self.display.tick();
         let waited = self.metrics.online.wait_seconds.get();
         let training_waits = mem::replace(&mut state.waited, waited) < waited;
         for order in self.threads.carrier().tick(training_waits) {
