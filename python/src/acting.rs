@@ -78,8 +78,12 @@ pub fn noise<'py>(
     policy: &dyn Policy,
     states: &mut [EpisodeState],
 ) -> PyResult<Bound<'py, PyDict>> {
-    let (shape, draws) = (policy.noise(), policy.choice().map_or(0, |choice| choice.uniforms()));
-    let row = if shape.is_empty() { 0 } else { shape.iter().product() };
+    let shape = policy.noise();
+    let draws = policy.choice().map_or(0, |choice| choice.uniforms());
+    let row = match shape.is_empty() {
+        true => 0,
+        false => shape.iter().product(),
+    };
     let (mut normal, mut uniform) = (vec![0.0; states.len() * row], Vec::new());
     for (i, state) in states.iter_mut().enumerate() {
         state.fill_normal(&mut normal[i * row..][..row]);
@@ -114,32 +118,29 @@ pub fn not_seeds(or: &str) -> PyErr {
     PyValueError::new_err(format!("a seed must be an int from 0 to 2**64 - 1, or {or}"))
 }
 
-/// Arguments that change the choice of the file.
-#[derive(Default, PartialEq)]
-pub struct Changes {
-    pub candidates: Option<i64>,
-    pub rule: Option<String>,
-    pub aggregate: Option<String>,
-    pub guidance: Option<f32>,
-}
-
 /// The policy with a changed choice.
-pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn Policy>> {
-    if changes == Changes::default() {
+pub fn choosing(
+    policy: &Arc<dyn Policy>,
+    candidates: Option<i64>,
+    rule: Option<String>,
+    aggregate: Option<String>,
+    guidance: Option<f32>,
+) -> PyResult<Arc<dyn Policy>> {
+    if candidates.is_none() && rule.is_none() && aggregate.is_none() && guidance.is_none() {
         return Ok(policy.clone());
     }
     let mut choice = policy.choice().unwrap_or(Choice::best_of(1));
-    choice.guidance = changes.guidance.unwrap_or(choice.guidance);
-    if let Some(candidates) = changes.candidates {
+    choice.guidance = guidance.unwrap_or(choice.guidance);
+    if let Some(candidates) = candidates {
         let most = Choice::MOST_CANDIDATES;
         let count = u32::try_from(candidates).ok().filter(|n| (1..=most).contains(n));
         let error = format!("candidates is {candidates}, but must be from 1 to {most}");
         choice.candidates = count.ok_or_else(|| PyValueError::new_err(error))?;
     }
-    if let Some(rule) = changes.rule {
+    if let Some(rule) = rule {
         choice.rule = parse("rule", &rule)?;
     }
-    if let Some(aggregate) = changes.aggregate {
+    if let Some(aggregate) = aggregate {
         choice.aggregate = parse("aggregate", &aggregate)?;
     }
     policy.with_choice(choice).map(Arc::from).map_err(|error| policy_error(&error))

@@ -57,8 +57,12 @@ impl<'a> Rows<'a> {
             ArrayLike::Numbers(numbers) => {
                 let array: PyArrayLikeDyn<'_, f32, AllowTypeChange> =
                     stacked(name, numbers, names)?.extract()?;
-                let Rows { values, count, single } = Rows::from_array(name, &array, width, names)?;
-                return Ok(Self { values: Cow::Owned(values.into_owned()), count, single });
+                let rows = Rows::from_array(name, &array, width, names)?;
+                return Ok(Self {
+                    values: Cow::Owned(rows.values.into_owned()),
+                    count: rows.count,
+                    single: rows.single,
+                });
             }
         };
         if !names.is_empty() && !columns.is_empty() && columns != names {
@@ -81,11 +85,12 @@ impl<'a> Rows<'a> {
             [columns] if columns == width => (1, true),
             [count, columns] if columns == width => (count, false),
             ref shape => {
-                let shape = shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
-                let list = names.join(", ");
-                let list = if names.is_empty() { list } else { format!(": {list}") };
+                let list = match names {
+                    [] => String::new(),
+                    _ => format!(": {}", names.join(", ")),
+                };
                 return refused(format!(
-                    "{name} has shape [{shape}], but must have [n, {width}] or [{width}]{list}"
+                    "{name} has shape {shape:?}, but must have [n, {width}] or [{width}]{list}"
                 ));
             }
         };

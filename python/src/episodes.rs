@@ -27,8 +27,8 @@ impl Episodes {
 
     /// Checks observations of this many episodes.
     fn rows<'a>(&self, observations: &'a ArrayLike<'_>, episodes: usize) -> PyResult<Rows<'a>> {
-        let width = self.policy.observation_dim();
-        let given = Rows::new("observations", observations, width, &self.names.observations)?;
+        let (width, names) = (self.policy.observation_dim(), &self.names.observations);
+        let given = Rows::new("observations", observations, width, names)?;
         if given.count != episodes {
             return Err(PyValueError::new_err(format!(
                 "{} rows of observations for {episodes} episodes; rows=[…] says to which of them they belong",

@@ -135,9 +135,16 @@ pub fn serve_environment(
 ) -> PyResult<()> {
     let precision =
         precision.parse().map_err(|error| PyValueError::new_err(format!("precision: {error}")))?;
-    let http_hosts = Vec::new();
-    let args = ServeArgs { connect, certificates, http: None, http_hosts, name: None, precision };
-    let environments = Arc::new(PythonEnvironments { name, sizes, factory: Arc::new(factory) });
+    let args = ServeArgs {
+        connect,
+        certificates,
+        http: None,
+        http_hosts: Vec::new(),
+        name: None,
+        precision,
+    };
+    let factory = Arc::new(factory);
+    let environments = Arc::new(PythonEnvironments { name, sizes, factory });
     let served = py.detach(|| {
         let _logging = init_logging();
         serve(args, environments)

@@ -12,7 +12,7 @@ use quad_protocol::Origin;
 use quad_run::files;
 
 use crate::acting::{
-    Array, Changes, act, as_dictionary, begin, choosing, compute, noise, not_seeds, parts, seeds,
+    Array, act, as_dictionary, begin, choosing, compute, noise, not_seeds, parts, seeds,
 };
 use crate::arrays::{ArrayLike, Rows};
 use crate::episodes::Episodes;
@@ -128,7 +128,7 @@ impl PyPolicy {
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Array<'py>> {
         let rows = self.rows(&observations)?;
-        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate, guidance })?;
+        let policy = choosing(&self.policy, candidates, rule, aggregate, guidance)?;
         let mut states = begin(&*policy, &seeds(seed, rows.count)?);
         act(py, &*policy, &rows, &mut states)
     }
@@ -147,8 +147,7 @@ impl PyPolicy {
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<(Array<'py>, Array<'py>)> {
         let rows = self.rows(&observations)?;
-        let changes = Changes { candidates, aggregate, guidance, rule: None };
-        let policy = choosing(&self.policy, changes)?;
+        let policy = choosing(&self.policy, candidates, None, aggregate, guidance)?;
         let mut states = begin(&*policy, &seeds(seed, rows.count)?);
         let (actions, values) = compute(py, || {
             let (mut actions, mut values) = (Vec::new(), Vec::new());
@@ -184,7 +183,7 @@ impl PyPolicy {
             let error = format!("{n} observations, but {m} actions: one action for each");
             return Err(PyValueError::new_err(error));
         }
-        let policy = choosing(&self.policy, Changes { aggregate, ..Changes::default() })?;
+        let policy = choosing(&self.policy, None, None, aggregate, None)?;
         let values = match rows.count {
             0 => Vec::new(),
             _ => compute(py, || policy.value(&rows.values, &taken.values))?,
@@ -208,7 +207,7 @@ impl PyPolicy {
         guidance: Option<f32>,
         seed: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Bound<'py, PyDict>> {
-        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate, guidance })?;
+        let policy = choosing(&self.policy, candidates, rule, aggregate, guidance)?;
         noise(py, &*policy, &mut begin(&*policy, &seeds(seed, n)?))
     }
 
@@ -226,7 +225,7 @@ impl PyPolicy {
         aggregate: Option<String>,
         guidance: Option<f32>,
     ) -> PyResult<Episodes> {
-        let policy = choosing(&self.policy, Changes { candidates, rule, aggregate, guidance })?;
+        let policy = choosing(&self.policy, candidates, rule, aggregate, guidance)?;
         let seeds = match seeds.extract::<u64>() {
             Ok(seed) => vec![seed],
             Err(_) => seeds.extract().map_err(|_| not_seeds("a sequence of them"))?,
@@ -290,7 +289,8 @@ impl PyPolicy {
 
 impl PyPolicy {
     fn rows<'a>(&self, observations: &'a ArrayLike<'_>) -> PyResult<Rows<'a>> {
-        Rows::new("observations", observations, self.observation_size, &self.names.observations)
+        let (width, names) = (self.observation_size, &self.names.observations);
+        Rows::new("observations", observations, width, names)
     }
 }
 

@@ -1,5 +1,6 @@
 //! Tests of `values.rs`.
 
+use std::collections::BTreeSet;
 use toml::toml;
 
 use super::*;
@@ -98,11 +99,13 @@ fn no_two_patterns_of_a_file_rank_equally_for_a_key() {
                     keys(table).into_iter().map(|key| (letters(pattern), key))
                 })
                 .collect();
-            let different: std::collections::BTreeSet<_> = keys.iter().collect();
-            assert_eq!(different.len(), keys.len(), "{} for {}: {keys:?}", definition.name, task);
+            let different = BTreeSet::from_iter(&keys).len();
+            let name = definition.name;
+            assert_eq!(different, keys.len(), "{name} for {task}: {keys:?}");
         }
         for pattern in values.groups.keys().chain(values.given.values().flatten()) {
-            assert!(tasks().iter().any(|task| fits(pattern, task)), "no task fits {pattern}");
+            let fits = tasks().iter().any(|task| fits(pattern, task));
+            assert!(fits, "no task fits {pattern}");
         }
     }
 }
@@ -115,7 +118,8 @@ fn a_group_with_another_network_names_all_of_it() {
         let values = Values::read(definition);
         let shared = &values.shared["agent"];
         for (pattern, group) in &values.groups {
-            let agent = group.get("agent").and_then(Value::as_table).into_iter().flatten();
+            let agent = group.get("agent").and_then(Value::as_table);
+            let agent = agent.into_iter().flatten();
             for (name, network) in agent.filter(|(_, value)| value.get("activation").is_some()) {
                 for key in shared[name].as_table().unwrap().keys() {
                     let named = network.get(key).is_some();
@@ -129,6 +133,8 @@ fn a_group_with_another_network_names_all_of_it() {
 #[test]
 fn merging_changes_the_named_keys_alone() {
     let mut table = toml::toml! { a = 1.5 b = [1, 2] [c] d = 1 e = "x" };
-    merge(&mut table, toml::toml! { a = 2 b = [3] [c] e = "y" f = true });
-    assert_eq!(table, toml::toml! { a = 2.0 b = [3] [c] d = 1 e = "y" f = true });
+    let changes = toml! { a = 2 b = [3] [c] e = "y" f = true };
+    let expected = toml! { a = 2.0 b = [3] [c] d = 1 e = "y" f = true };
+    merge(&mut table, changes);
+    assert_eq!(table, expected);
 }
