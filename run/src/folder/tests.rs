@@ -102,22 +102,6 @@ fn metrics_after_the_resumed_step_are_cut_off() {
     assert_eq!(Vec::from_iter(text.lines().map(parse)), [100, 200, 300]);
 }
 
-#[test]
-fn scores_survive_and_an_incomplete_line_is_cut_off() {
-    let (_folder, path, run, mut log) = new_run();
-    log.append(&[line(1, 1, 0.1)]).unwrap();
-    drop(log);
-    run.score_log().unwrap().append(&[line(1, 2, 0.2)]).unwrap();
-    let path = path.join("scores.jsonl");
-    let text = fs::read_to_string(&path).unwrap() + "{\"step\":1,";
-    for tail in ["", &"x".repeat(200_000)] {
-        fs::write(&path, format!("{text}{tail}")).unwrap();
-        assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2)]);
-        run.score_log().unwrap().append(&[line(1, 3, 0.3)]).unwrap();
-        assert_eq!(seeds(&run), [1, 2, 3]);
-    }
-}
-
 /// The seeds of all scores.
 fn seeds(run: &RunDir) -> Vec<u64> {
     run.read_scores().unwrap().into_iter().map(|line| line.seed).collect()
@@ -125,7 +109,7 @@ fn seeds(run: &RunDir) -> Vec<u64> {
 
 /// After a power cut, a later part of what was not synchronized may be there without an earlier.
 #[test]
-fn a_torn_append_of_scores_is_dropped_and_damage_before_it_is_an_error() {
+fn scores_survive_a_torn_append_is_dropped_and_damage_before_it_is_an_error() {
     let (_folder, path, run, mut log) = new_run();
     let path = path.join("scores.jsonl");
     log.append(&[line(1, 1, 0.1), line(1, 2, 0.2)]).unwrap();
@@ -150,6 +134,13 @@ fn a_torn_append_of_scores_is_dropped_and_damage_before_it_is_an_error() {
         assert_eq!(run.read_scores().unwrap().len(), kept);
         run.score_log().unwrap().append(&[line(3, 6, 0.6)]).unwrap();
         assert_eq!(seeds(&run), Vec::from_iter((1..=kept as u64).chain([6])));
+    }
+
+    for tail in ["{\"step\":1,", &"x".repeat(200_000)] {
+        fs::write(&path, [&whole, tail.as_bytes()].concat()).unwrap();
+        assert_eq!(run.read_scores().unwrap()[4], line(2, 5, 0.5));
+        run.score_log().unwrap().append(&[line(3, 6, 0.6)]).unwrap();
+        assert_eq!(seeds(&run), [1, 2, 3, 4, 5, 6]);
     }
 
     zeroed(5, 9);

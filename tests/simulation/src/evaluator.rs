@@ -259,6 +259,10 @@ impl World {
             Some(Reply::Service(Answer::Piece(reply))) if reply.incarnation() == followed => {
                 duty.sent(reply, now)
             }
+            reply if evaluator.leaves_at.is_some() => {
+                duty.leaving_failed(reply.is_some(), false);
+                Ok(Vec::new())
+            }
             _ => {
                 duty.unanswered(now);
                 duty.follow_next(&evaluator.incarnations, now);
