@@ -35,6 +35,8 @@ pub struct Definition {
     /// True if it can learn chunks of actions (`agent.chunk`) from several observations
     /// (`agent.history`).
     pub chunks: bool,
+    /// False if it can learn from experience alone.
+    pub needs_data: bool,
     /// Reads an `[agent]` table, without `chunk`, `replan` and `history`, into the type of its
     /// hyper-parameters.
     pub read: fn(&Table) -> Result<Start, AgentError>,
@@ -51,6 +53,7 @@ impl Definition {
         acts_after: None,
         summary: None,
         chunks: false,
+        needs_data: true,
         read: |_| unreachable!("an algorithm reads its own table"),
     };
 

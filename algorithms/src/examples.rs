@@ -112,8 +112,8 @@ impl Examples {
         &self.transitions
     }
 
-    /// Number of the dataset's examples, at least 1.
-    #[allow(clippy::len_without_is_empty)] // Never empty.
+    /// Number of the dataset's examples; 0 only without a dataset.
+    #[allow(clippy::len_without_is_empty)]
     pub fn len(&self) -> usize {
         self.rows.as_ref().map_or(self.transitions.len(), Vec::len)
     }

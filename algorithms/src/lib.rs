@@ -12,7 +12,8 @@
 //!   updates as CUDA graphs of their inputs; `pool`: threads that stay awake during an update.
 //! - TD3+BC and ReBRAC share `td3`; IQL, IVR and XQL `in_sample`; CQL, DTQL and RLPD `squashed`;
 //!   QUAD, Diffusion-QL, AlignIQL and IDQL `diffusion`; `gaussian` is a policy of several. `fql` is
-//!   the one to read first; `qc` shares its flow, and `diffusion_policy` QUAD's noise predictor.
+//!   the one to read first; `qc` shares its flow, `diffusion_policy` QUAD's noise predictor, and SAC
+//!   is `rlpd` with other values.
 //!
 //! CONTRIBUTING.md says what a new algorithm needs.
 
@@ -89,6 +90,7 @@ pub const ALGORITHMS: &[Definition] = &[
     qc::DEFINITION,
     rebrac::DEFINITION,
     rlpd::DEFINITION,
+    rlpd::SAC,
     sfbc::DEFINITION,
     td3bc::DEFINITION,
     xql::DEFINITION,

@@ -29,6 +29,7 @@ pub(super) const DEFINITION: Definition = Definition {
     acts_after: Some("actor_ema_start"),
     summary: Some(summary::summarize),
     chunks: true,
+    needs_data: true,
     read: |table| Ok(start(Config::read(table)?, Quad::start)),
 };
 

@@ -2,6 +2,9 @@
 //! Offline Data"): soft actor-critic on batches that are half of the dataset, half of experience,
 //! with an ensemble of critics that have layer norm, and many updates for each environment step. Its
 //! presets have no steps before online learning. Its update is its authors' code's.
+//!
+//! SAC (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications") is the same update
+//! with other hyper-parameters: two critics without norm, of which the policy sees the smaller one.
 
 use super::prelude::*;
 use super::squashed::Squashed;
@@ -13,15 +16,19 @@ pub(super) const DEFINITION: Definition = Definition {
     name: "rlpd",
     presets: include_str!("../../presets/rlpd.toml"),
     metrics: METRICS,
+    needs_data: false,
     read: |table| Ok(start(Config::read(table)?, Rlpd::new)),
     ..Definition::PLAIN
 };
 
+pub(super) const SAC: Definition =
+    Definition { name: "sac", presets: include_str!("../../presets/sac.toml"), ..DEFINITION };
+
 const METRICS: &[Metric] = &metrics! {
     target_q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(min Q̂_k(s', a') − α·log π(a'|s')) over target_critics of them, drawn in each step, with a' from the policy; without the last term if entropy_backup is false.";
     critic_loss ["critic loss"] held_out: "Mean over batch and critics of (Q_k(s, a) − y)².";
-    actor_loss ["actor loss"] held_out: "Mean over the batch of α·log π(a|s) − mean of Q_k(s, a) over all critics with a from the policy. Measured in the policy's steps.";
-    entropy ["entropy"] held_out: "−mean over the batch of log π(a|s) with a from the policy; α holds it at −(dimensions of an action)/2. Measured in the policy's steps.";
+    actor_loss ["actor loss"] held_out: "Mean over the batch of α·log π(a|s) − Q(s, a) with a from the policy, where Q is all critics' mean, or their least value if actor_q is min. Measured in the policy's steps.";
+    entropy ["entropy"] held_out: "−mean over the batch of log π(a|s) with a from the policy; α holds it at target_entropy·(dimensions of an action). Measured in the policy's steps.";
     alpha: "α, the weight of the entropy, before its step. Measured in the policy's steps.";
 };
 
@@ -37,8 +44,14 @@ struct Config {
     gamma: UnitInterval,
     /// Reward the next action's entropy in the target.
     entropy_backup: bool,
+    /// The critics' value of which the policy's loss has more.
+    actor_q: ActorQ,
     /// Weight α of the entropy at the first step.
     temperature: Positive,
+    /// Entropy at which α holds the policy, for each dimension of an action.
+    target_entropy: Finite,
+    /// The form of α's loss.
+    temperature_loss: TemperatureLoss,
     /// Learning rate of actor, critics and α.
     learning_rate: Positive,
     /// Let the learning rate fall to 0 along a cosine over the run.
@@ -46,6 +59,22 @@ struct Config {
     ema_rate: Rate,
     /// Steps of the critics for each step of policy and α.
     actor_every: Steps,
+}
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum ActorQ {
+    Mean,
+    Min,
+}
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum TemperatureLoss {
+    /// α·(entropy − target).
+    Alpha,
+    /// log α·(entropy − target).
+    Log,
 }
 
 impl Config {
@@ -103,16 +132,30 @@ impl Rlpd {
         batch.critic_loss(&self.critic, &batch.target(*self.config.gamma, &q)?)
     }
 
-    /// The policy toward large entropy and large Q by the mean of all critics; and its entropy, `[]`,
-    /// a constant.
+    /// The policy toward large entropy and large Q; and its entropy, `[]`, a constant.
     fn actor_loss(&self, batch: &Batch, noise: &Noise) -> Result<(Loss, Tensor)> {
         let drawn = self.actor.distribution(&batch.observations)?.draw(&noise.policy)?;
-        let q = batch.values_at(&self.critic.detach(), &drawn.actions.squeeze(1)?)?.mean(0)?;
+        let q = batch.values_at(&self.critic.detach(), &drawn.actions.squeeze(1)?)?;
+        let q = match self.config.actor_q {
+            ActorQ::Mean => q.mean(0)?,
+            ActorQ::Min => smallest(&q)?,
+        };
         let (alpha, log_density) = (self.alpha()?, drawn.log_density.squeeze(1)?);
         let entropy = log_density.detach().mean_all()?.neg()?;
         let loss = (log_density.broadcast_mul(&alpha)? - q)?.mean_all()?;
         let loss = Loss::new("actor_loss", loss).with("entropy", entropy.clone());
         Ok((loss.with("alpha", alpha), entropy))
+    }
+
+    /// α toward less where the entropy, `[]`, is above its target.
+    fn temperature_loss(&self, entropy: &Tensor) -> Result<Tensor> {
+        let target = *self.config.target_entropy * self.context.action_dim() as f32;
+        let log_alpha = self.log_alpha.values().sum_all()?;
+        let weight = match self.config.temperature_loss {
+            TemperatureLoss::Alpha => log_alpha.exp()?,
+            TemperatureLoss::Log => log_alpha,
+        };
+        weight * (entropy - f64::from(target))?
     }
 }
 
@@ -130,10 +173,8 @@ impl Algorithm for Rlpd {
         if (step + 1).is_multiple_of(every) {
             let (actor_loss, entropy) = self.actor_loss(batch, &noise)?;
             let adam = AdamStep::after(step / every, rate);
-            let excess = (entropy + 0.5 * self.context.action_dim() as f64)?;
             self.actor.minimize(&actor_loss.value, adam)?;
-            let alpha_loss = (self.log_alpha.values().exp()?.sum_all()? * excess)?;
-            self.log_alpha.minimize(&alpha_loss, adam)?;
+            self.log_alpha.minimize(&self.temperature_loss(&entropy)?, adam)?;
             losses.push(actor_loss);
         }
         measured(&losses)

@@ -74,7 +74,7 @@ pub enum Problem {
     Endless(usize),
     #[error("{0} rows, of which none makes a transition")]
     NoTransitions(usize),
-    #[error("`locomotion` cannot scale the rewards: all returns are the same")]
+    #[error("`locomotion` cannot scale the rewards: no two returns of a dataset differ")]
     SameReturns,
     #[error("does not fit {file}: {1}", file = .0.display())]
     Unlike(PathBuf, String),

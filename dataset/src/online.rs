@@ -61,7 +61,7 @@ impl OnlineEpisode<'_> {
     }
 }
 
-/// Ranges of a dataset's columns.
+/// Ranges of a dataset's columns; NaN without a dataset, from which nothing is far.
 pub(crate) struct Ranges {
     observations: Vec<Range>,
     actions: Vec<Range>,

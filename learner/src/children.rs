@@ -78,6 +78,12 @@ pub(crate) fn hide_certificates(command: &mut Command, endpoint: &str) {
     }
 }
 
+/// The evaluator beside the learner, else the one on the PATH.
+pub(crate) fn evaluator_program() -> io::Result<PathBuf> {
+    let program = std::env::current_exe()?.with_file_name(EVALUATOR);
+    Ok(if program.exists() { program } else { EVALUATOR.into() })
+}
+
 /// Evaluators that the learner or a sweep starts itself.
 #[derive(Default)]
 pub(crate) struct LocalEvaluators {
@@ -96,10 +102,7 @@ impl LocalEvaluators {
         if count == 0 {
             return Ok(Self::default());
         }
-        let mut program = std::env::current_exe()?.with_file_name(EVALUATOR);
-        if !program.exists() {
-            program = EVALUATOR.into();
-        }
+        let program = evaluator_program()?;
         let output = Command::new(&program)
             .arg("--version")
             .output()

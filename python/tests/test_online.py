@@ -81,6 +81,15 @@ def test_any_number_of_evaluators_and_any_kill_make_the_same_run(tmp_path, data)
     assert verified.returncode == 0 and "bit for bit by evaluators with the same arithmetic" in verified.stdout, verified
 
 
+def test_learns_without_a_dataset(tmp_path):
+    networks, endpoint = {"actor.hidden": [16], "critic.hidden": [16]}, free_endpoint()
+    with quad_rl.Evaluators("walk", lambda seed: Fall(), connect=endpoint, workers=1):
+        lengths = {"online_steps": 1_500, "eval_interval": 500, "episodes": 2}
+        run = quad_rl.train(env="walk", algorithm="sac", run_dir=tmp_path / "run", listen=endpoint, agent=networks, set={"sizes": [11, 3]}, **lengths)
+    assert [(score["step"], score["environment_steps"]) for score in run.scores] == [(500, 1_500)]
+    assert run.scores[0]["dataset_score"] is None and run.policy().action_size == 3
+
+
 class Glitches(Fall):
     """In some online episodes it diverges, in some a sensor gives 1e30 once. Its space is narrower than the data's actions."""
 

@@ -1,5 +1,6 @@
 """One update of RLPD (Ball et al. 2023), in the order of its authors' code: critics and their targets, and in the last of
-`actor_every` steps the policy, by the critics as they are then, and α.
+`actor_every` steps the policy, by the critics as they are then, and α. And one of SAC, by the same functions with other
+values; stable-baselines3's SAC moves α first, but uses it as it was.
 """
 
 import jax
@@ -11,21 +12,25 @@ from implicit import SIZES
 from networks import adam_step, compiled, configuration, ensemble, fast_values, follow, near, random_batch, random_moments
 from networks import random_network, shape, single, values
 
-FOLDERS = {"rlpd": (60, "small"), "rlpd-critics": (61, "small")}
+FOLDERS = {"rlpd": (60, "small"), "rlpd-critics": (61, "small"), "sac": (62, "small")}
 LOG_STD = -20.0, 2.0
-AGENT = {"critics": 4, "gamma": 0.99, "temperature": 0.5, "learning_rate": 0.02, "decay": False, "ema_rate": 0.05}
+AGENT = {"gamma": 0.99, "temperature": 0.5, "learning_rate": 0.02, "decay": False, "ema_rate": 0.05}
+RLPD = {"critics": 4, "actor_q": "mean", "target_entropy": -0.5, "temperature_loss": "alpha"}
+SAC = {"critics": 2, "actor_q": "min", "target_entropy": -1.0, "temperature_loss": "log"}
 # The policy's step, and one of the critics alone.
 VARIANTS = {
-    "rlpd": (701, {"target_critics": 2, "entropy_backup": True, "actor_every": 2}),
-    "rlpd-critics": (700, {"target_critics": 1, "entropy_backup": False, "actor_every": 3}),
+    "rlpd": (701, RLPD | {"target_critics": 2, "entropy_backup": True, "actor_every": 2}),
+    "rlpd-critics": (700, RLPD | {"target_critics": 1, "entropy_backup": False, "actor_every": 3}),
+    "sac": (700, SAC | {"target_critics": 2, "entropy_backup": True, "actor_every": 1}),
 }
 
 
 def make_config(variant, size):
     (step, own), hidden = VARIANTS[variant], SIZES[size]["hidden"]
     activation = "mish" if size == "hopper" else "relu"
-    networks = {"actor": shape([hidden, hidden], activation), "critic": shape([hidden, hidden - 1], activation, True)}
-    return configuration("rlpd", SIZES[size]["batch_size"], step, networks | AGENT | own)
+    algorithm = variant.partition("-")[0]
+    networks = {"actor": shape([hidden, hidden], activation), "critic": shape([hidden, hidden - 1], activation, algorithm == "rlpd")}
+    return configuration(algorithm, SIZES[size]["batch_size"], step, networks | AGENT | own)
 
 
 def sampled(actor, states, noise, activation):
@@ -40,10 +45,10 @@ def critic_loss(critics, states, actions, targets, activation):
     return jnp.mean((values(critics, states, actions, activation) - targets) ** 2)
 
 
-def actor_loss(actor, critics, states, noise, alpha, activation, critic_activation):
+def actor_loss(actor, critics, states, noise, alpha, is_mean, activation, critic_activation):
     actions, density = sampled(actor, states, noise, activation)
-    q = values(critics, states, actions, critic_activation).mean(0)
-    return jnp.mean(alpha * density - q), density.mean()
+    q = values(critics, states, actions, critic_activation)
+    return jnp.mean(alpha * density - jnp.where(is_mean, q.mean(0), q.min(0))), density.mean()
 
 
 fast_sampled, fast_mean = compiled(sampled), compiled(ensemble)
@@ -68,11 +73,13 @@ def update(config, state, inputs):
     out["target_critic"] = follow(state["target_critic"], out["critic"], agent["ema_rate"])
 
     if step % agent["actor_every"] == agent["actor_every"] - 1:
-        given = out["critic"], s, inputs["policy_noise"], alpha, activation, critic_activation
+        is_mean = agent["actor_q"] == "mean"
+        given = out["critic"], s, inputs["policy_noise"], alpha, is_mean, activation, critic_activation
         (out["actor_loss"], density), gradients = actor_gradient(state["actor"], *given)
         out |= {"entropy": -density, "alpha": alpha}
         out |= adam_step(state, "actor", gradients, rate, step // agent["actor_every"])
-        slope = alpha * (-density + config["action_dim"] / 2)
+        excess = -density - agent["target_entropy"] * config["action_dim"]
+        slope = excess * (alpha if agent["temperature_loss"] == "alpha" else 1)
         out |= adam_step(state, "log_alpha", {"value": slope * np.ones(1)}, rate, step // agent["actor_every"])
     return out, None
 

@@ -41,6 +41,20 @@ pub struct EnvironmentSpec {
     pub simulator: Simulator,
     /// Recipe for recording a dataset, if any.
     pub collect: Option<Recipe>,
+    /// D4RL's files, if it has some.
+    pub d4rl: Option<D4rl>,
+}
+
+/// The policies of D4RL's files, and the files' mean normalized scores.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+#[allow(missing_docs)] // The names say it.
+pub struct D4rl {
+    /// Epoch, from 0, of the policy that is medium.
+    pub epoch: u64,
+    pub medium: f64,
+    pub medium_replay: f64,
+    pub expert: f64,
 }
 
 #[allow(clippy::expect_used)] // The table is part of the program; the first test here reads it.
@@ -125,6 +139,7 @@ impl EnvironmentSpec {
             maze: Some(environment.task?),
             simulator,
             collect: None,
+            d4rl: None,
         })
     }
 

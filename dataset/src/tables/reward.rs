@@ -58,15 +58,13 @@ impl RewardScaling {
 }
 
 impl RewardRule {
-    /// The rule's map, given the trajectory returns; `None` if a division by their range is by 0.
+    /// The rule's map, given the trajectory returns; `None` if it divides by their range, which is 0
+    /// or that of no returns.
     pub(crate) fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
         let (subtract, times) = match self {
             Self::Locomotion => {
                 let Summary { min, max, .. } = Summary::new(returns);
-                if min == max {
-                    return None;
-                }
-                (0.0, 1000.0 / (max - min))
+                (0.0, 1000.0 / Some(max - min).filter(|range| *range > 0.0)?)
             }
             Self::AsIs => return Some(RewardScaling::default()),
             Self::Subtract1 => (1.0, 1.0),

@@ -19,7 +19,7 @@ use crate::normalize;
 use crate::online::{OnlineEpisode, Ranges};
 use crate::recording::{Names, Recording, RowKind};
 use crate::tables::environment::EnvironmentSpec;
-use crate::tables::reward::RewardScaling;
+use crate::tables::reward::{RewardRule, RewardScaling};
 use crate::{checks, warnings};
 use hold_out::HoldOut;
 use rows::Rows;
@@ -107,6 +107,16 @@ impl Transitions {
         Ok(split.map_err(error)?.training)
     }
 
+    /// No dataset, for experience with these lengths of observations and actions.
+    ///
+    /// # Errors
+    /// The rule scales rewards by a dataset's returns.
+    pub fn without_data((o, a): (usize, usize), reward: RewardRule) -> Result<Self, Problem> {
+        let reward = reward.scaling(&[]).ok_or(Problem::SameReturns)?;
+        let none = Recording { observation_dim: o, action_dim: a, ..Recording::default() };
+        Ok(Self::new(none, None, reward, Scaling::default()))
+    }
+
     fn split(
         recording: Recording,
         options: &ReadOptions,
@@ -155,8 +165,8 @@ impl Transitions {
         }
     }
 
-    /// Number of the dataset's transitions, at least 1.
-    #[allow(clippy::len_without_is_empty)] // Never empty.
+    /// Number of the dataset's transitions; 0 only without a dataset.
+    #[allow(clippy::len_without_is_empty)]
     pub fn len(&self) -> usize {
         self.dataset.len()
     }
@@ -209,7 +219,8 @@ impl Transitions {
 
     /// Adds an online episode. Its rewards and numbers are transformed as the dataset's were,
     /// and actions beyond its range clipped; anything else that a dataset would be refused for is an
-    /// error. Leaves out an episode with a number far outside the dataset's range, and names it.
+    /// error. Leaves out an episode with a number far outside the range of the dataset, if there is
+    /// one, and names it.
     pub fn add_episode(&self, episode: OnlineEpisode<'_>) -> Result<Option<String>, Problem> {
         let recording = episode.recording(self.observation_dim(), self.action_dim())?;
         checks::accept(&recording, None, true)?;

@@ -84,7 +84,7 @@ impl OnlineSampler {
     }
 
     /// Indices of the batch of gradient step `step`, out of `len` transitions of the dataset and
-    /// `experience` that follow them. Nothing but these and the arguments of [`new`](Self::new)
+    /// `experience` that follow them; without a dataset all are experience. Nothing but these and the arguments of [`new`](Self::new)
     /// decides.
     ///
     /// # Panics
@@ -94,7 +94,8 @@ impl OnlineSampler {
         generator.set_stream(step);
         let [len, all] = [len as u32, (len + experience) as u32];
         let size = self.indices.len();
-        let shared = self.share.map(|share| size - (share * size as f64).round() as usize);
+        let share = self.share.filter(|_| len > 0);
+        let shared = share.map(|share| size - (share * size as f64).round() as usize);
         for (i, index) in self.indices.iter_mut().enumerate() {
             *index = generator.random_range(match shared {
                 None => 0..all,
@@ -177,6 +178,8 @@ mod tests {
                 assert!(part.iter().all(|n| (n - each).abs() < 150), "{share:?}: {counts:?}");
             }
         }
+        let all = OnlineSampler::new(256, Some(0.5), 7).indices(0, 0, 10).to_vec();
+        assert!((0..10).all(|row| all.contains(&row)), "without a dataset: {all:?}");
         let batch = OnlineSampler::new(5, Some(0.3), 1).indices(0, 30, 10).to_vec();
         assert_eq!(batch.iter().filter(|index| **index >= 30).count(), 2, "0.3 · 5 is rounded");
     }

@@ -5,7 +5,6 @@ use quad_kernels::scaling::Affine;
 use super::*;
 use crate::recording::RowKind::{Dropped, LastState, Transition};
 use crate::recording::tests::recording;
-use crate::tables::reward::RewardRule;
 
 fn transitions(recording: Recording) -> Transitions {
     let scaling = RewardRule::AsIs.scaling(&[]).unwrap();
@@ -242,4 +241,18 @@ fn a_column_that_hardly_moved_may_move_online() {
     };
     assert!(!is_left_out(-50.0, 999.0));
     assert!(is_left_out(21_000.0, 0.0) && is_left_out(20.0, -1001.0));
+}
+
+/// Nothing is far outside the range of no data.
+#[test]
+fn without_a_dataset_all_transitions_are_experience() {
+    assert!(Transitions::without_data((1, 1), RewardRule::Locomotion).is_err());
+    let transitions = Transitions::without_data((1, 1), RewardRule::Subtract1).unwrap();
+    let (observations, actions, rewards) = (&[0.0, 1e30, 2.0], &[0.5, -0.5], &[1.0, 0.0]);
+    let episode = OnlineEpisode { observations, actions, rewards, terminated: true };
+    assert_eq!(transitions.add_episode(episode).unwrap(), None);
+    assert_eq!((transitions.len(), transitions.experience_len()), (0, 2));
+    let batch = transitions.gather(&[1, 0]);
+    assert_eq!((batch.next_observations, batch.rewards), (vec![2.0, 1e30], vec![-1.0, 0.0]));
+    assert_eq!(batch.masks, [0.0, 1.0]);
 }

@@ -9,7 +9,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use clap::{Arg, Args, Parser, Subcommand};
+use clap::{Arg, Args, Parser, Subcommand, value_parser};
 use clap_complete::Shell;
 use quad_algorithms::ALGORITHMS;
 use quad_dataset::{EnvironmentSpec, environment};
@@ -24,6 +24,12 @@ pub use train::TrainArgs;
 const FETCH_NOTE: &str = "\
 The learner writes the file into its benchmark's cache folder: $D4RL_DATASET_DIR or ~/.d4rl/datasets, or ~/.ogbench/data. It tries
 $QUAD_DATASETS_URL, the address of a folder, first. After a broken connection it continues the fetch, also the next time.";
+
+const MAKE_NOTE: &str = "\
+It writes NAME-random-seed0.hdf5, NAME-medium-replay-seed0.hdf5 (all rows of a training run) and NAME-medium-seed0.hdf5 (a million
+rows by that run's last policy) into $QUAD_DATASETS_DIR or ~/.quad/datasets, where --dataset NAME-medium-seed0 finds them; then it
+prints their scores beside those of D4RL's files. The run is kept there, too. After Ctrl-C the same command goes on. The files
+are the same for any number of evaluators.";
 
 const DOCTOR_NOTE: &str = "\
 The learner prints a line per check: ok, warn or FAIL, with a hint if you can do something. The exit code is 1 if a check
@@ -105,6 +111,32 @@ pub enum DatasetsCommand {
     },
     /// Print what a dataset contains and what is wrong with it, before you train on it
     Inspect(InspectArgs),
+    /// Make files like D4RL's by its recipe: SAC learns from nothing, and its policies record
+    #[command(after_help = MAKE_NOTE)]
+    Make(MakeArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct MakeArgs {
+    /// hopper, walker2d or halfcheetah
+    #[arg(value_name = "ENVIRONMENT", value_parser = environment::find)]
+    pub env: &'static EnvironmentSpec,
+    /// Seed of the training and of the recordings
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u32,
+    /// Share of D4RL's epochs and rows, for smaller files and worse policies
+    #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = parse_scale)]
+    pub scale: f64,
+    /// Epoch of the medium policy [default: 400 for hopper, 300 for walker2d, 200 for halfcheetah,
+    /// times the scale]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(..=100_000))]
+    pub epoch: Option<u64>,
+    /// Train for 3,000 epochs, which takes a night, for medium-expert and expert, too
+    #[arg(long)]
+    pub expert: bool,
+    /// Number of evaluators to start [default: as `learner train`]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]
+    pub evaluators: Option<u16>,
 }
 
 #[derive(Debug, Args)]
@@ -228,6 +260,11 @@ impl TypedValueParser for TaskName {
     fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
         Some(Box::new(tasks::list().iter().map(|task| PossibleValue::new(&*task.name))))
     }
+}
+
+fn parse_scale(text: &str) -> Result<f64, &'static str> {
+    let scale = text.parse().ok().filter(|scale| *scale > 0.0 && *scale <= 1.0);
+    scale.ok_or("write a share above 0, at most 1")
 }
 
 fn algorithm_names() -> PossibleValuesParser {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::{Args, value_parser};
 use quad_policy::Precision;
 use quad_run::config::tables::{self, parse_assignment};
-use quad_run::config::{Device, presets};
+use quad_run::config::{ConfigError, Device, Preset, presets};
 use quad_runtime::{parse_address, parse_endpoint};
 use toml::{Table, Value};
 
@@ -19,6 +19,9 @@ Examples:
 
   # Data of your own, by another algorithm.
   learner train --task own-data --env my-robot --dataset my-robot.hdf5 --normalize actions,observations --algorithm iql
+
+  # From nothing but the episodes that evaluators play.
+  learner train --env hopper --algorithm sac
 
   # QUAD without guidance, which is behavior cloning.
   learner train --task hopper-demo --agent guidance=none --dataset data/hopper-demo.hdf5
@@ -34,8 +37,8 @@ interrupted run ends with the same weights, bit for bit, as a run without interr
 #[derive(Debug, Args)]
 pub struct TrainArgs {
     /// The task: an environment, a dataset, and the algorithm's values for them (`learner presets`
-    /// lists tasks; own-data trains on any file, without evaluations)
-    #[arg(long, value_name = "NAME", value_parser = TaskName, hide_possible_values = true, required_unless_present_any = ["preset", "from"])]
+    /// lists tasks; own-data trains on any file, without evaluations) [default: none, with --env]
+    #[arg(long, value_name = "NAME", value_parser = TaskName, hide_possible_values = true, required_unless_present_any = ["preset", "from", "env"])]
     task: Option<String>,
     /// The algorithm (`learner presets` lists algorithms) [default: quad]
     #[arg(long, value_name = "NAME", value_parser = algorithm_names(), hide_possible_values = true)]
@@ -52,7 +55,8 @@ pub struct TrainArgs {
     #[arg(long, value_name = "NAME")]
     env: Option<String>,
     /// A file (`evaluator collect` records one), a name of `learner datasets list` (fetched if it
-    /// is missing), or minari:ID; repeatable: several are one dataset [default: the task's]
+    /// is missing), or minari:ID; repeatable: several are one dataset [default: the task's; rlpd and
+    /// sac need none]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Vec<String>,
     /// Normalize some of these: actions from their least and largest value to ±1, observations to
@@ -143,11 +147,11 @@ struct OverrideArgs {
 }
 
 impl TrainArgs {
-    /// The name of a task, or the path of a preset file.
-    pub fn preset(&self) -> &str {
-        // clap requires one of them.
-        let named = self.task.as_deref().or(self.preset.as_deref());
-        named.unwrap_or_default()
+    /// The task, a file of the user's own, or neither.
+    pub fn preset(&self) -> Result<Preset, ConfigError> {
+        // clap requires one of them, or an environment.
+        let without = || Ok(Preset::without_task(self.env.as_deref().unwrap_or_default()));
+        self.task.as_deref().or(self.preset.as_deref()).map_or_else(without, Preset::read)
     }
 
     /// The values that the command line changes: `--agent` overrides `--set`, and other flags

@@ -41,7 +41,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let named = args.run_dir.clone().or_else(|| args.from.as_deref().map(from::usual_folder));
     let (from, preset) = match (&args.from, &named) {
         (Some(source), Some(path)) => from::read(source, path, args.fresh)?,
-        _ => (None, Preset::read(args.preset()).hint_of(ConfigError::hint)?),
+        _ => (None, args.preset().hint_of(ConfigError::hint)?),
     };
     let changes = args.changes();
     let experiment = preset.resolve(&changes).hint_of(ConfigError::hint)?;

@@ -112,7 +112,8 @@ impl Threads {
 
         let stop = Arc::new(AtomicBool::new(false));
         let size = experiment.batch_size as usize;
-        let sampler = BatchSampler::new(examples.len(), size, experiment.seed, step);
+        // Without a dataset nothing is drawn from it.
+        let sampler = BatchSampler::new(examples.len().max(1), size, experiment.seed, step);
         let training = Training {
             sampler,
             examples,

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use quad_algorithms::{Agent, AlgorithmError, Examples};
-use quad_dataset::{BatchSampler, Split};
+use quad_dataset::{BatchSampler, OnlineEpisode, Problem, Split, Transitions};
 use quad_run::config::{Device, Experiment};
 use quad_run::folder::Checkpoint;
 
@@ -38,8 +38,11 @@ impl RunCost {
         let (mut agent, mut examples) = begin(experiment, device, data.training)?;
         let held_out = data.held_out;
         let held_out = held_out.and_then(|episodes| HeldOut::new(experiment, episodes, &agent));
+        if examples.len() == 0 {
+            add_row(examples.transitions())?;
+        }
         let size = experiment.batch_size as usize;
-        let mut sampler = BatchSampler::new(examples.len(), size, experiment.seed, 0);
+        let mut sampler = BatchSampler::new(examples.len().max(1), size, experiment.seed, 0);
         let steps = [experiment.steps, experiment.total_steps()];
         let step_seconds = mean_step(&mut agent, &mut examples, &mut sampler, steps)?;
         held_out.map(|mut held_out| held_out.measure(&agent)).transpose()?;
@@ -69,6 +72,14 @@ impl RunCost {
         let kept = Checkpoint::KEPT as u64 * self.checkpoint_bytes;
         snapshots.max(1) * self.snapshot_bytes + kept + rows * self.row_bytes
     }
+}
+
+/// Adds a row of experience, so that batches have one without a dataset.
+fn add_row(transitions: &Transitions) -> Result<(), Problem> {
+    let (o, a) = (transitions.observation_dim(), transitions.action_dim());
+    let (observations, actions) = (&vec![0.0; 2 * o], &vec![0.0; a]);
+    let episode = OnlineEpisode { observations, actions, rewards: &[0.0], terminated: true };
+    transitions.add_episode(episode).map(drop)
 }
 
 /// Mean seconds of a gradient step over a run with this number of steps on the dataset alone and in

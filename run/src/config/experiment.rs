@@ -34,6 +34,10 @@ pub struct Experiment {
         serialize_with = "write_names"
     )]
     pub dataset: Vec<String>,
+    /// Lengths of an observation and an action, for a run without a dataset in an environment that
+    /// QUAD does not simulate.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sizes: Option<[usize; 2]>,
     /// Scaling of rewards before training; by default the environment's rule.
     pub reward: RewardRule,
     /// Columns that are normalized for the networks. Snapshots contain the maps, so policies take

@@ -17,8 +17,8 @@ pub struct Online {
     pub warmup: u64,
     /// True if actions during warm-up are uniform in [-1, 1] in place of the policy's.
     pub uniform_warmup: bool,
-    /// Share of experience in each batch. Without it, batches are uniform over dataset and
-    /// experience together.
+    /// Share of experience in each batch, which is all without a dataset. Without a share, batches
+    /// are uniform over dataset and experience together.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub share: Option<f64>,
     /// Standard deviation of the normal noise on the policy's actions, which are within [-1, 1].

@@ -54,6 +54,11 @@ impl Preset {
         Ok(Self { label: stem.unwrap_or("preset").to_owned(), task, own })
     }
 
+    /// No task: an algorithm's general values, in the environment that changes name.
+    pub fn without_task(environment: &str) -> Self {
+        Self { label: environment.to_owned(), task: None, own: Table::new() }
+    }
+
     /// The settings of a run, as `own` keys.
     pub fn from_run(config: &RunConfig, own: Table) -> Result<Self, ConfigError> {
         let label = format!("{}-online", config.run.name);
@@ -102,10 +107,11 @@ impl Preset {
                 "begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks",
             ));
         };
-        if !table.contains_key("reward")
-            && let Ok(rule) = Value::try_from(environment::reward_rule(&text_of(environment)))
-        {
-            table.insert("reward".to_owned(), rule);
+        if !table.contains_key("reward") {
+            let has_data = definition.needs_data || table.contains_key("dataset");
+            let rule = has_data.then(|| environment::reward_rule(&text_of(environment)));
+            let rule = Value::try_from(rule.unwrap_or_default());
+            table.extend(rule.map(|rule| ("reward".to_owned(), rule)));
         }
         let mut experiment = Experiment::deserialize(table).map_err(|error| {
             let (preset, reason) = (&self.label, in_words(&error));
@@ -145,6 +151,12 @@ impl Preset {
         let is_online = |key: &&String| key.starts_with("online.") && *key != "online.steps";
         for unused in changed.iter().filter(|key| experiment.online.is_none() && is_online(key)) {
             doubts.push(format!("{unused} has no effect without online steps (--online-steps N)"));
+        }
+        if experiment.dataset.is_none()
+            && !definition.needs_data
+            && changes.contains_key("hold_out")
+        {
+            doubts.push("hold_out has no effect without a dataset (--dataset)".to_owned());
         }
         let steps = experiment.total_steps();
         if let Some(key) = definition.acts_after

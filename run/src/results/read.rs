@@ -69,6 +69,7 @@ impl RunReport {
         };
         let normalized = environment::find(&experiment.environment).is_ok();
         let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
+        let dataset_score = config.dataset.mean_score.unwrap_or(config.dataset.mean_return);
         Ok(Self {
             dir: path.to_owned(),
             run: config.run.name.to_string(),
@@ -81,7 +82,7 @@ impl RunReport {
             normalized,
             own_score: !normalized && lines.iter().any(|line| line.score != line.episode_return),
             scored_in: joined(&precisions),
-            dataset_score: config.dataset.mean_score.unwrap_or(config.dataset.mean_return),
+            dataset_score: Some(dataset_score).filter(|score| !score.is_nan()),
             mean_last_3: last(3),
             mean_last_5: last(5),
             mean_last_50000_steps: final_steps.and_then(in_final_steps),

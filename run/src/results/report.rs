@@ -35,8 +35,8 @@ pub struct RunReport {
     pub normalized: bool,
     /// Precision of the policies that were scored; several if evaluators differed.
     pub scored_in: String,
-    /// Mean score of the dataset's trajectories.
-    pub dataset_score: f64,
+    /// Mean score of the dataset's trajectories; absent without a dataset.
+    pub dataset_score: Option<f64>,
     pub evaluations: Vec<EvaluationReport>,
     /// Episodes of planned evaluations without a score.
     pub episodes_missing: u64,
@@ -129,10 +129,10 @@ impl RunReport {
         }
     }
 
-    /// [`Self::measure`] of the dataset's trajectories, their mean; absent where evaluators define the
-    /// score, which the dataset does not have.
+    /// [`Self::measure`] of the dataset's trajectories, their mean; absent without a dataset, and where
+    /// evaluators define the score, which the dataset does not have.
     pub fn dataset_measure(&self) -> Option<f64> {
-        (!self.own_score).then_some(self.dataset_score)
+        self.dataset_score.filter(|_| !self.own_score)
     }
 
     /// [`Self::measure`] with its unit; in a maze, the fraction of episodes that reach the goal.

@@ -5,3 +5,4 @@
 mod disk;
 mod folder;
 mod kills;
+mod make;
