@@ -35,7 +35,7 @@ pub use normalize::Normalize;
 pub use online::OnlineEpisode;
 pub use recording::Names;
 pub use tables::catalog::NamedDataset;
-pub use tables::environment::{EnvironmentSpec, UnknownEnvironment};
+pub use tables::environment::{D4rl, EnvironmentSpec, UnknownEnvironment};
 pub use tables::maze::{CELL, GoalDraw, Judged, MazeTask};
 pub use tables::reward::RewardRule;
 pub use tables::simulator::{Drive, Healthy, Noise, Planar, Recipe, Robot, Simulator};

@@ -77,6 +77,8 @@ pub struct Scores {
     pub min_score: f64,
     pub mean_score: f64,
     pub max_score: f64,
+    /// Standard deviation.
+    pub score_std: f64,
 }
 
 fn constant(ranges: &[Range]) -> Vec<usize> {
@@ -139,6 +141,7 @@ pub fn inspect(
             min_score: spec.normalized_score(sum.min),
             mean_score: spec.normalized_score(sum.mean),
             max_score: spec.normalized_score(sum.max),
+            score_std: spec.normalized_score(sum.deviation) - spec.normalized_score(0.0),
         }),
         constant_observations: constant(&observation_ranges),
         constant_actions: constant(&action_ranges),

@@ -2,6 +2,7 @@
 //! export-data`.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 use anyhow::anyhow;
 use quad_dataset::{DatasetError, Metadata, OnlineEpisode, write_experience};
@@ -90,7 +91,8 @@ fn about(report: &RunReport, step: u64, license: Option<&str>, experience: Value
     let licenses = licenses.map(|licenses| Vec::from_iter(licenses).join(", "));
     let licenses = licenses.filter(|licenses| !licenses.is_empty());
     let license = license.or(licenses.as_deref());
-    if license.is_none() {
+    let has_data = !data.files.is_empty();
+    if license.is_none() && has_data {
         warn!("the file does not say which license the data has; --license says it");
     }
     let score = report.evaluations.iter().find(|evaluation| evaluation.step == step);
@@ -107,8 +109,8 @@ fn about(report: &RunReport, step: u64, license: Option<&str>, experience: Value
         "steps": report.steps,
         "seed": report.seed,
         "data": {
-            "name": experiment.dataset.join(", "),
-            "sha256": data.sha256(),
+            "name": has_data.then(|| experiment.dataset.join(", ")),
+            "sha256": data.sha256().filter(|_| has_data),
             "license": license,
             "transitions": data.transitions,
             "episodes": data.episodes,
@@ -124,11 +126,22 @@ fn about(report: &RunReport, step: u64, license: Option<&str>, experience: Value
 
 /// `learner export-data`: the experience of a run as a dataset.
 pub fn export_data(args: &ExportDataArgs) -> anyhow::Result<()> {
-    RunDir::refuse_own_file(&args.out)?;
-    let (folder, config) = RunDir::open(&args.run)?;
-    let played = read_experience(folder.path())?;
+    print(&write_first_rows(&args.run, &args.out, u64::MAX)?)
+}
+
+/// Writes the experience of a run, up to the episode that completes this number of rows. Returns
+/// what was written, in words.
+pub(super) fn write_first_rows(run: &Path, out: &Path, most: u64) -> anyhow::Result<String> {
+    RunDir::refuse_own_file(out)?;
+    let (folder, config) = RunDir::open(run)?;
+    let (mut played, mut before) = (read_experience(folder.path())?, 0);
+    played.retain(|episode| {
+        let is_among = before < most;
+        before += episode.rewards.len() as u64;
+        is_among
+    });
     let Some(last) = played.last() else {
-        return Err(anyhow!("{} has no experience", args.run.display())).hint(
+        return Err(anyhow!("{} has no experience", run.display())).hint(
             "`learner train --online-steps N` lets evaluators play; the learner keeps their episodes",
         );
     };
@@ -146,9 +159,8 @@ pub fn export_data(args: &ExportDataArgs) -> anyhow::Result<()> {
         weights: None,
     };
     let (environment, dims) = (&experiment.environment, last.dims());
-    write_experience(&args.out, environment, dims, &metadata, &episodes)
-        .hint_of(DatasetError::hint)?;
+    write_experience(out, environment, dims, &metadata, &episodes).hint_of(DatasetError::hint)?;
     let rows: usize = episodes.iter().map(|(rows, _)| rows.rewards.len()).sum();
-    let (name, episodes) = (args.out.display(), counted(episodes.len(), "episode"));
-    print(&format!("{name}: {rows} rows of {episodes} in {environment}"))
+    let (name, episodes) = (out.display(), counted(episodes.len(), "episode"));
+    Ok(format!("{name}: {rows} rows of {episodes} in {environment}"))
 }

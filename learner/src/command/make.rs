@@ -6,13 +6,13 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, anyhow};
 use clap::Parser;
-use quad_dataset::{DatasetError, D4rl};
+use quad_dataset::{D4rl, DatasetError};
 use quad_run::folder::RunDir;
 use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, print};
 use tracing::info;
 
-use super::export::write_experience_rows;
+use super::export::write_first_rows;
 use super::table;
 use crate::children::evaluator_program;
 use crate::cli::{Cli, MakeArgs};
@@ -36,11 +36,10 @@ pub fn make(args: &MakeArgs) -> anyhow::Result<()> {
     }
     for kind in making.kinds() {
         let path = making.path(kind);
-        match (path.exists(), kind) {
+        match (path.exists(), *kind) {
             (true, _) => info!("{} is there", path.display()),
             (false, "medium-replay") => {
-                let rows = rows_after(making.medium);
-                write_experience_rows(&making.run, &path, rows)?;
+                info!("{}", write_first_rows(&making.run, &path, rows_after(making.medium))?);
             }
             (false, _) => making.record(kind)?,
         }
@@ -118,8 +117,7 @@ impl<'a> Making<'a> {
 
     /// Records a file of the policies that it is of.
     fn record(&self, kind: &str) -> anyhow::Result<()> {
-        let snapshot =
-            |epoch: u64| RunDir::at(&self.run).snapshot_path(EPOCH * (epoch + 1));
+        let snapshot = |epoch: u64| RunDir::at(&self.run).snapshot_path(EPOCH * (epoch + 1));
         let policies = match kind {
             "random" => vec!["random".into()],
             "medium" => vec![snapshot(self.medium)],
@@ -131,7 +129,9 @@ impl<'a> Making<'a> {
         let mut command = Command::new(evaluator_program()?);
         command.args(["collect", "--env", &self.args.env.name]).arg("--out").arg(&path);
         command.args(["--transitions", &rows.to_string(), "--seed", &self.args.seed.to_string()]);
-        policies.iter().for_each(|policy| drop(command.arg("--policy").arg(policy)));
+        for policy in &policies {
+            command.arg("--policy").arg(policy);
+        }
         let status = command.stdout(Stdio::null()).status();
         let status = status.context("there is no program `evaluator` beside the learner")?;
         match status.success() {
@@ -148,7 +148,7 @@ impl<'a> Making<'a> {
             let inspection = quad_dataset::inspect(&[path.clone()], Some(self.args.env));
             let inspection = inspection.hint_of(DatasetError::hint)?;
             let score = inspection.scores.as_ref().map_or(String::new(), |scores| {
-                format!("{:.1} ± {:.1}", scores.mean_score, scores.score_deviation)
+                format!("{:.1} ± {:.1}", scores.mean_score, scores.score_std)
             });
             let theirs = match *kind {
                 "medium" => format!("{:.1}", self.d4rl.medium),

@@ -6,6 +6,7 @@ mod doctor;
 mod dry_run;
 mod export;
 mod from;
+mod make;
 mod outside;
 mod sweep;
 mod train;
@@ -50,7 +51,8 @@ const NOTHING: &str = "nothing is checked: the run has no evaluations, and neith
                        kept the hash of a snapshot; --same-as OTHER compares it with another run";
 
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
-    if matches!(cli.command, Command::Train(_) | Command::Sweep(_)) {
+    use DatasetsCommand::Make;
+    if matches!(cli.command, Command::Train(_) | Command::Sweep(_) | Command::Datasets(Make(_))) {
         unfinished_at_signal();
     }
     let done = match &cli.command {
@@ -286,6 +288,7 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
             print(&dataset.path.display().to_string())
         }
         DatasetsCommand::Inspect(args) => inspect(args),
+        DatasetsCommand::Make(args) => make::make(args),
     }
 }
 

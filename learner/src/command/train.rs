@@ -50,7 +50,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
             .hint("leave it out: --from RUN sets it, and begins with the run's last checkpoint");
     }
     let label = &preset.label;
-    if experiment.dataset.is_empty() {
+    if experiment.dataset.is_empty() && experiment.definition()?.needs_data {
         return Err(anyhow!("{label} has no dataset of its own"))
             .hint(convert_hint(&preset).unwrap_or_else(|| record_hint(&experiment)));
     }

@@ -4,13 +4,14 @@ use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
 use quad_dataset::{
-    DatasetError, HoldOut, ReadOptions, Split, Transitions, benchmarks, environment,
+    DatasetError, EnvironmentSpec, HoldOut, Normalize, Problem, ReadOptions, Split, Transitions,
+    benchmarks, environment,
 };
 use quad_run::config::Experiment;
 use quad_runtime::Hint;
 use toml::Value;
 
-/// Reads the transitions of files or folders for an experiment. A run that has begun has `held_out`
+/// Reads the transitions of files or folders for an experiment, none without a file. A run that has begun has `held_out`
 /// episodes. Fewer transitions than a batch are an error: a batch never holds one twice while there
 /// are others.
 pub fn load(
@@ -18,6 +19,10 @@ pub fn load(
     experiment: &Experiment,
     held_out: Option<&[usize]>,
 ) -> anyhow::Result<Split> {
+    if paths.is_empty() {
+        let training = without_data(experiment)?;
+        return Ok(Split { training, held_out: None, episodes: Vec::new(), files: Vec::new() });
+    }
     let chunk = experiment.agent.get("chunk").and_then(Value::as_integer).unwrap_or(1);
     let options = ReadOptions {
         environment: environment::find(&experiment.environment).ok(),
@@ -36,6 +41,25 @@ pub fn load(
         return Err(error).hint("record more data, or ask for less with --set batch_size=N");
     }
     Ok(split)
+}
+
+fn without_data(experiment: &Experiment) -> anyhow::Result<Transitions> {
+    let name = &experiment.environment;
+    for (key, is_absent) in [
+        ("steps", experiment.steps == 0),
+        ("normalize", experiment.normalize == Normalize::default()),
+    ] {
+        if !is_absent {
+            return Err(anyhow!("{key} is about a dataset, and there is none"))
+                .hint(format!("name one by --dataset, or leave out {key}"));
+        }
+    }
+    let sizes = environment::find(name).map(EnvironmentSpec::sizes).ok();
+    let sizes = sizes.or(experiment.sizes.map(Into::into));
+    let sizes = sizes.with_context(|| format!("the sizes of {name} are not known")).hint(
+        "--set sizes=[11,3] says that an observation has 11 numbers, an action 3; or name a dataset by --dataset",
+    )?;
+    Transitions::without_data(sizes, experiment.reward).hint_of(Problem::hint)
 }
 
 /// Suspicious properties of the transitions, each a sentence with the file's name.

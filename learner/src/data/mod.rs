@@ -14,4 +14,4 @@ mod transfer;
 
 pub(crate) use fetch::LocalDataset;
 pub(crate) use load::{load, warnings};
-pub(crate) use source::{Source, cache_folder, cached, hashes, obtain, paths};
+pub(crate) use source::{Source, cache_folder, cached, hashes, made_folder, obtain, paths};

@@ -28,17 +28,22 @@ pub enum Source {
 }
 
 impl Source {
-    /// Parses `--dataset`. A name of the catalog comes before a file of that name; `./NAME` is the
-    /// file.
+    /// Parses `--dataset`. A name of the catalog, or of a file that `learner datasets make` has made,
+    /// comes before a file of that name; `./NAME` is the file.
     pub fn parse(text: &str) -> anyhow::Result<Self> {
         if let Some(id) = text.strip_prefix(MINARI) {
             return Ok(Self::Minari(id.to_owned()));
         }
         let path = Path::new(text);
+        let made = || Some(made_folder().ok()?.join(format!("{text}.hdf5")));
         let is_path = path.exists() || text.contains('/') || path.extension().is_some();
         match Self::named(text) {
-            Err(_) if is_path => Ok(Self::Path(path.to_owned())),
-            named => named,
+            Ok(named) => Ok(named),
+            Err(error) => match made().filter(|made| made.exists()) {
+                Some(made) => Ok(Self::Path(made)),
+                None if is_path => Ok(Self::Path(path.to_owned())),
+                None => Err(error),
+            },
         }
     }
 
@@ -140,7 +145,16 @@ fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
 
 /// The cache folder of a benchmark, shared with its Python package.
 pub fn cache_folder(benchmark: &Benchmark) -> anyhow::Result<PathBuf> {
-    let Cache { folder, variable } = &benchmark.cache;
+    named_folder(&benchmark.cache)
+}
+
+/// The folder of the files that `learner datasets make` makes.
+pub fn made_folder() -> anyhow::Result<PathBuf> {
+    let variable = Some("QUAD_DATASETS_DIR".to_owned());
+    named_folder(&Cache { folder: ".quad/datasets".to_owned(), variable })
+}
+
+fn named_folder(Cache { folder, variable }: &Cache) -> anyhow::Result<PathBuf> {
     let named = variable.as_ref().and_then(std::env::var_os);
     if let Some(named) = named.filter(|named| !named.is_empty()) {
         return Ok(named.into());

@@ -60,6 +60,10 @@ impl Data {
                     .hint("judge them apart: values of different rewards do not compare");
             }
         }
+        if dataset.is_empty() && data.files.is_empty() {
+            return Err(anyhow!("{run} has learned without a dataset"))
+                .hint("name one by --dataset");
+        }
         let sources = match dataset {
             [] => data.paths().into_iter().map(Source::Path).collect(),
             names => Source::parse_all(names)?,
@@ -68,7 +72,8 @@ impl Data {
             "name the data of the run {run} by --dataset; a relative path in the run is below the folder where `learner train` was started"
         ))?;
         let (paths, sha256) = (paths(&files), hashes(&files));
-        if data.sha256().is_some_and(|recorded| recorded != sha256) {
+        let recorded = data.sha256().filter(|_| !data.files.is_empty());
+        if recorded.is_some_and(|recorded| recorded != sha256) {
             let names = Vec::from_iter(paths.iter().map(|path| path.to_string_lossy())).join(", ");
             return Err(anyhow!("{names} is not the data that {run} has learned from"))
                 .hint("name a copy of each of its files by --dataset, in the same order");

@@ -267,6 +267,9 @@ pub fn tell_apart(runs: &mut [RunReport]) {
 /// The environment and the beginning of each file's SHA-256, which older runs lack.
 fn setting(run: &RunReport) -> String {
     let begin = |file: &DatasetFile| format!("{:.8}", file.sha256.as_deref().unwrap_or("unknown"));
+    if run.config.dataset.files.is_empty() {
+        return format!("{}, no data", run.config.experiment.environment);
+    }
     let hashes = Vec::from_iter(run.config.dataset.files.iter().map(begin)).join("+");
     format!("{}, data {hashes}", run.config.experiment.environment)
 }

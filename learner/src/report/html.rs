@@ -81,6 +81,9 @@ fn group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Value> {
     };
     let dataset = |run: &RunReport| {
         let data = &run.config.dataset;
+        if data.files.is_empty() {
+            return Some(data.summary());
+        }
         let name = run.config.experiment.dataset.join(", ");
         let sha256 = data.sha256().unwrap_or_else(|| "unknown".to_owned());
         let (summary, least, most) = (data.summary(), data.min_return, data.max_return);

@@ -203,7 +203,7 @@ impl File {
         let read = Preset::read(preset).hint_of(ConfigError::hint)?;
         let experiment = read.resolve(&changes).hint_of(ConfigError::hint)?;
         let doubts = read.doubts(&experiment, &changes)?;
-        if experiment.dataset.is_empty() {
+        if experiment.dataset.is_empty() && experiment.definition()?.needs_data {
             return Err(anyhow!("it names no dataset"))
                 .hint("add to [run] a line dataset = \"FILE\"");
         }

@@ -152,7 +152,7 @@ impl Preset {
         for unused in changed.iter().filter(|key| experiment.online.is_none() && is_online(key)) {
             doubts.push(format!("{unused} has no effect without online steps (--online-steps N)"));
         }
-        if experiment.dataset.is_none()
+        if experiment.dataset.is_empty()
             && !definition.needs_data
             && changes.contains_key("hold_out")
         {

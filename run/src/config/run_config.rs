@@ -64,7 +64,8 @@ pub struct RunInfo {
     pub device: Device,
 }
 
-/// Statistics of the dataset, and its files.
+/// Statistics of the dataset, and its files. Without a dataset there are no files, and returns are
+/// NaN.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(from = "StoredInfo")]
 pub struct DatasetInfo {
@@ -138,10 +139,13 @@ impl DatasetInfo {
 
     /// Size and quality of the data, in one line.
     pub fn summary(&self) -> String {
+        if self.files.is_empty() {
+            return "no dataset".to_owned();
+        }
         let (transitions, mean) = (self.transitions, self.mean_return);
         let episodes = counted(self.episodes as usize, "episode");
         let files = match self.files.len() {
-            0 | 1 => String::new(),
+            1 => String::new(),
             count => format!(" in {count} files"),
         };
         let mut text =
