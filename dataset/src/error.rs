@@ -76,8 +76,8 @@ pub enum Problem {
     NoTransitions(usize),
     #[error("`locomotion` cannot scale the rewards: no two returns of a dataset differ")]
     SameReturns,
-    #[error("does not fit {file}: {1}", file = .0.display())]
-    Unlike(PathBuf, String),
+    #[error("does not fit {file} ({1}: {2}, not {3})", file = .0.display())]
+    Unlike(PathBuf, &'static str, String, String),
     #[error("cannot be written")]
     Write(#[source] hdf5::Error),
 }
@@ -285,8 +285,7 @@ impl Problem {
                 "unless all rewards are alike, another reward rule learns from them: --set reward=as-is"
             }
             Self::Unlike(..) => {
-                "files that are one dataset are of one environment, with the same columns in the same order: write these anew, or \
-                 train on one of them"
+                "files of one dataset have the same columns in the same order, and one layout: write one of them anew, or leave it out"
             }
             Self::Write(_) => "check that the disk has room and the folder is writable",
         };

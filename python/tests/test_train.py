@@ -63,6 +63,9 @@ def test_the_run_keeps_the_data_that_it_has_learned_from(tmp_path):
     quad_rl.train(other, run_dir=run.folder, steps=2, fresh=True, **SMALL)
     (name,) = kept(run.folder)
     assert name != data.name and name in (run.folder / "config.toml").read_text()
+    both = quad_rl.train([data.parent / name, first], run_dir=tmp_path / "both", steps=2, **SMALL)
+    config = (both.folder / "config.toml").read_text()
+    assert config.count("[[dataset.files]]") == 2 and f'"{both.folder / kept(both.folder)[0]}"' in config
     with pytest.raises(RuntimeError, match="unexpected argument"):
         quad_rl.train(first, run_dir=tmp_path / "refused", color=7)
     assert not (tmp_path / "refused").exists()

@@ -10,8 +10,8 @@ pub fn config(name: &str, seed: u64) -> RunConfig {
     (experiment.seed, experiment.episodes) = (seed, 2);
     let run = json!({ "name": name, "incarnation": 1, "task": "hopper-demo", "version": "0.1.0" });
     let dataset = json!({
-        "path": "data.hdf5", "transitions": 100, "episodes": 3, "min_return": 10.0, "mean_return": 20.0, "max_return": 30.0,
-        "mean_score": 10.7,
+        "transitions": 100, "episodes": 3, "min_return": 10.0, "mean_return": 20.0, "max_return": 30.0, "mean_score": 10.7,
+        "files": [{ "path": "data.hdf5", "transitions": 100, "episodes": 3 }],
     });
     serde_json::from_value(json!({ "run": run, "dataset": dataset, "experiment": experiment }))
         .unwrap()

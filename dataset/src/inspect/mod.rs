@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use crate::error::DatasetError;
 use crate::files::{self, DatasetFile};
-use crate::formats::{ReadOptions, Source};
+use crate::formats::{ReadOptions, Source, recorded_environment};
 use crate::recording::Recording;
 use crate::statistics::{Range, Summary};
 use crate::tables::benchmarks;
@@ -93,14 +93,18 @@ pub fn inspect(
     paths: &[impl AsRef<Path>],
     environment: Option<&'static EnvironmentSpec>,
 ) -> Result<Inspection, DatasetError> {
-    let claimed = files::environment(paths, None)?;
+    let claimed = paths.iter().map(recorded_environment).collect::<Result<Vec<_>, _>>()?;
+    let claimed = claimed.into_iter().flatten().next();
     let spec = environment.or_else(|| environment::find(claimed.as_deref()?).ok());
     let reward = spec.map_or(RewardRule::AsIs, |spec| spec.reward);
     let task = spec.and_then(|spec| benchmarks::relabeling(&spec.name));
     let options = ReadOptions { reward, ..ReadOptions::default() };
     let (mut refused, mut doubts, mut formats) = (Vec::new(), Vec::new(), BTreeSet::new());
     let check = |path: &Path, source: &Source, recording: &Recording| {
-        let named = |problem| files::name(paths, path, problem);
+        let named = |problem| match paths {
+            [_] => problem,
+            _ => format!("{}: {problem}", path.display()),
+        };
         let other = environment.and_then(|environment| source.check_environment(environment).err());
         let problems = other.into_iter().chain(checks::problems(recording, spec));
         let problems = problems.map(|problem| format!("{problem}; {}", problem.hint()));
@@ -109,7 +113,7 @@ pub fn inspect(
         formats.insert(source.format());
         Ok(())
     };
-    let (recording, files) = files::read(paths, spec, task, check)?;
+    let (recording, files) = files::read(paths, None, spec, task, check)?;
     doubts.extend(warnings::number_warnings(&recording, &options));
     let episodes = recording.episodes();
     let lengths = Vec::from_iter(episodes.iter().map(|episode| episode.length as f64));

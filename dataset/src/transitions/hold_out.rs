@@ -77,23 +77,15 @@ impl Recording {
     /// Drops all other rows in place: there may be no memory for a second dataset.
     fn keep(&mut self, kept: &[Range<usize>]) {
         let (states, actions) = (self.observation_dim, self.action_dim);
-        let (mut parts, mut first) = (Vec::new(), 0);
-        for rows in kept {
-            if let Ok(part) = self.parts.binary_search_by_key(&rows.start, |(row, _)| *row) {
-                parts.push((first, self.parts[part].1.clone()));
-            }
-            first += rows.len();
-        }
-        self.parts = parts;
-        self.unused_next_observations = None;
         if let Some(next) = &mut self.next_observations {
             keep(next, states, kept);
+            keep(&mut self.jumps, 1, kept);
         }
         keep(&mut self.observations, states, kept);
         keep(&mut self.actions, actions, kept);
         keep(&mut self.rewards, 1, kept);
         keep(&mut self.kinds, 1, kept);
-        for flags in [&mut self.terminals, &mut self.timeouts, &mut self.ends, &mut self.jumps] {
+        for flags in [&mut self.terminals, &mut self.timeouts, &mut self.ends] {
             keep(flags, 1, kept);
         }
     }
@@ -103,7 +95,6 @@ impl Recording {
             observation_dim: self.observation_dim,
             action_dim: self.action_dim,
             next_observations: self.next_observations.as_ref().map(|_| Vec::new()),
-            terminal_array: self.terminal_array,
             goal: self.goal,
             names: self.names.clone(),
             ..Recording::default()
@@ -111,13 +102,11 @@ impl Recording {
     }
 
     pub(crate) fn extend(&mut self, from: &Recording, rows: Range<usize>) {
-        if let Ok(part) = from.parts.binary_search_by_key(&rows.start, |(first, _)| *first) {
-            self.parts.push((self.rows(), from.parts[part].1.clone()));
-        }
         let columns = |width: usize| rows.start * width..rows.end * width;
         let (states, actions) = (columns(from.observation_dim), columns(from.action_dim));
-        if let (Some(next), Some(from)) = (&mut self.next_observations, &from.next_observations) {
-            next.extend_from_slice(&from[states.clone()]);
+        if let (Some(next), Some(stored)) = (&mut self.next_observations, &from.next_observations) {
+            next.extend_from_slice(&stored[states.clone()]);
+            self.jumps.extend_from_slice(&from.jumps[rows.clone()]);
         }
         self.observations.extend_from_slice(&from.observations[states]);
         self.actions.extend_from_slice(&from.actions[actions]);
@@ -125,8 +114,7 @@ impl Recording {
         self.kinds.extend_from_slice(&from.kinds[rows.clone()]);
         self.terminals.extend_from_slice(&from.terminals[rows.clone()]);
         self.timeouts.extend_from_slice(&from.timeouts[rows.clone()]);
-        self.ends.extend_from_slice(&from.ends[rows.clone()]);
-        self.jumps.extend_from_slice(from.jumps.get(rows).unwrap_or_default());
+        self.ends.extend_from_slice(&from.ends[rows]);
     }
 
     /// Appends a final state if the last row's next observation was in an episode that is removed.
@@ -142,9 +130,6 @@ impl Recording {
 
 /// Moves the rows that stay, in ascending order, to the front of a column.
 fn keep<T: Copy>(column: &mut Vec<T>, width: usize, kept: &[Range<usize>]) {
-    if column.is_empty() {
-        return;
-    }
     let mut end = 0;
     for rows in kept {
         column.copy_within(rows.start * width..rows.end * width, end);
@@ -164,8 +149,6 @@ mod tests {
             Transition, Transition, Transition, Dropped, Transition, LastState, Transition,
         ]);
         (whole.ends[1], whole.terminals[1], whole.ends[3]) = (true, true, true);
-        let part = |first: usize| (first, first.to_string());
-        whole.parts = [0, 2, 4, 6].map(part).to_vec();
         whole
     }
 
@@ -189,10 +172,6 @@ mod tests {
                 let is_last = |row: usize| row + 1 == part.rows();
                 assert!(!part.transitions().any(is_last), "no next state");
             }
-            assert_eq!(held_out.parts, [(0, rows.start.to_string())]);
-            let is_there =
-                |(first, name): &(usize, String)| training.rewards[*first].to_string() == *name;
-            assert!(training.parts.len() == 3 && training.parts.iter().all(is_there));
         }
     }
 

@@ -81,19 +81,19 @@ impl Transitions {
         hold_out: HoldOut<'_>,
     ) -> Result<Split, DatasetError> {
         let environment = options.environment;
-        files::environment(paths, environment)?;
         let mut warnings = Vec::new();
-        let (recording, files) =
-            files::read(paths, environment, options.task, |path, _, recording| {
-                checks::accept(recording, environment, options.normalize.actions)?;
-                let doubts = warnings::file_warnings(recording, options).into_iter();
-                warnings.extend(doubts.map(|doubt| files::name(paths, path, doubt)));
-                Ok(())
-            })?;
-        warnings.extend(warnings::number_warnings(&recording, options));
+        let check = |path: &Path, _: &_, recording: &Recording| {
+            let doubts = warnings::file_warnings(recording, options).into_iter();
+            warnings.extend(doubts.map(|doubt| format!("{}: {doubt}", path.display())));
+            checks::accept(recording, environment, options.normalize.actions)
+        };
+        let (recording, files) = files::read(paths, environment, environment, options.task, check)?;
         let names = Vec::from_iter(files.iter().map(|file| file.path.to_string_lossy()));
-        let error = |problem| DatasetError::new(names.join(", "), problem);
-        let mut split = Self::split(recording, options, hold_out).map_err(error)?;
+        let names = names.join(", ");
+        let doubts = warnings::number_warnings(&recording, options).into_iter();
+        warnings.extend(doubts.map(|doubt| format!("{names}: {doubt}")));
+        let split = Self::split(recording, options, hold_out);
+        let mut split = split.map_err(|problem| DatasetError::new(names, problem))?;
         split.training.warnings.splice(..0, warnings);
         Ok(Split { files, ..split })
     }

@@ -62,7 +62,6 @@ impl Rows {
         let goes_on =
             Vec::from_iter((0..recording.rows()).map(|row| recording.recording_goes_on(row)));
         normalize::apply(scaling, &mut recording);
-        recording.unused_next_observations = None;
         for action in &mut recording.actions {
             *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT);
         }

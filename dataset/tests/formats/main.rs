@@ -17,6 +17,7 @@ mod broken;
 mod d4rl;
 mod foreign;
 mod inspect;
+mod joined;
 mod minari;
 mod normalize;
 mod ogbench;

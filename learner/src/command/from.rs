@@ -10,8 +10,6 @@ use quad_runtime::Hint;
 use toml::Table;
 use tracing::info;
 
-use crate::data::{LocalDataset, hashes};
-
 /// The end of a complete run.
 pub(super) struct EarlierRun {
     pub checkpoint: Checkpoint,
@@ -97,16 +95,15 @@ impl EarlierRun {
 
     /// Checks that there are online steps, that the dataset is the run's, and that the checkpoint's
     /// numbers still mean the same.
-    pub fn check(&self, here: &Experiment, files: &[LocalDataset]) -> anyhow::Result<()> {
+    pub fn check(&self, here: &Experiment, sha256: &str) -> anyhow::Result<()> {
         if here.online.is_none() {
             return Err(anyhow!("without online steps there is nothing to continue with"))
                 .hint("give a number of environment steps above 0 by --online-steps N");
         }
         let there = &self.experiment;
-        let sha256 = hashes(files);
-        let is_same = self.dataset_sha256.as_ref().is_none_or(|recorded| *recorded == sha256);
+        let recorded = self.dataset_sha256.as_deref().unwrap_or(sha256);
         let kept = [
-            ("dataset", is_same),
+            ("dataset", recorded == sha256),
             ("steps", there.steps == here.steps),
             ("reward", there.reward == here.reward),
             ("normalize", there.normalize == here.normalize),

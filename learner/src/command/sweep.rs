@@ -20,7 +20,7 @@ use super::all_readable;
 use super::dataset_hints::record_hint;
 use crate::children::LocalEvaluators;
 use crate::cli::SweepArgs;
-use crate::data::{self, paths};
+use crate::data;
 use crate::sweep::{LearnerOptions, Outcome, PlannedRun, Study, StudyCost, Sweep};
 
 type Runs = Vec<(PlannedRun, State)>;
@@ -116,7 +116,7 @@ fn obtain(left: &Runs, is_alone: bool) -> anyhow::Result<Datasets> {
                 warn!("no run on the data of {} can begin: {error:#}", run.name);
                 refusal = Some(error);
             };
-            files.map_err(refused).ok().map(|files| paths(&files))
+            files.map_err(refused).ok().map(|(paths, _)| paths)
         };
         datasets.entry(run.experiment.dataset.clone()).or_insert_with(fetch);
     }

@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
 use quad_algorithms::{Agent, Examples};
-use quad_dataset::{DatasetFile, Split, Task, environment};
+use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{ConfigError, DatasetInfo, Experiment, Preset, RunConfig, RunInfo};
@@ -26,7 +26,7 @@ use super::dry_run;
 use super::from;
 use super::outside::{Outside, training_threads};
 use crate::cli::TrainArgs;
-use crate::data::{LocalDataset, Source, load, obtain, paths, warnings};
+use crate::data::{Source, load, obtain};
 use crate::live::{
     Display, Ending, Events, Incarnation, MainLoop, Metrics, PageState, Run, STUCK, Threads,
 };
@@ -68,8 +68,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let outside = Outside::new(args, &experiment)?;
 
     check_device(args.device, experiment.precision)?;
-    let files = obtain(&sources).hint(record_hint(&experiment))?;
-    from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &files))?;
+    let (paths, hashes) = obtain(&sources).hint(record_hint(&experiment))?;
+    from.as_ref().map_or(Ok(()), |from| from.check(&experiment, &hashes.join(", ")))?;
 
     let threads = training_threads();
     let pool = ThreadPoolBuilder::new().thread_name(|_| "training".to_owned());
@@ -79,12 +79,11 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         .hint("choose fewer by RAYON_NUM_THREADS")?;
     let held_out = begun.as_ref().and_then(ExistingRun::held_out);
     let held_out = held_out.or(from.as_ref().map(|from| &*from.held_out));
-    let paths = paths(&files);
     let data = load(&paths, &experiment, held_out)?;
-    for warning in warnings(&paths, &data.training) {
+    for warning in data.training.warnings() {
         warn!("{warning}");
     }
-    let config = run_config(args, &name, preset.task_name(), experiment, files, &data)?;
+    let config = run_config(args, &name, preset.task_name(), experiment, hashes, &data)?;
     if let Some(begun) = &begun {
         begun.check_same_config(&config)?;
     }
@@ -113,6 +112,9 @@ fn announce(
     sources: &[Source],
 ) -> anyhow::Result<()> {
     info!("{}", config.dataset.summary());
+    for file in config.dataset.files.iter().filter(|_| sources.len() > 1) {
+        info!("{}: {file}", file.path.display());
+    }
     let experiment = &config.experiment;
     info!("{}", experiment.summary()?);
     for doubt in preset.doubts(experiment, changes)? {
@@ -329,7 +331,7 @@ fn run_config(
     name: &Name,
     task: &str,
     experiment: Experiment,
-    files: Vec<LocalDataset>,
+    hashes: Vec<String>,
     data: &Split,
 ) -> anyhow::Result<RunConfig> {
     let statistics = data.training.statistics();
@@ -337,9 +339,10 @@ fn run_config(
     let cpu = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let cpu = cpu.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
     let threads = counted(rayon::current_num_threads(), "thread");
-    let hashes = files.into_iter().map(|file| Some(file.sha256));
-    let files = data.files.iter().cloned().zip(hashes);
-    let files = files.map(|(file, sha256)| DatasetFile { sha256, ..file }).collect();
+    let mut files = data.files.clone();
+    for (file, sha256) in files.iter_mut().zip(hashes) {
+        file.sha256 = Some(sha256);
+    }
     Ok(RunConfig {
         run: RunInfo {
             name: name.clone(),

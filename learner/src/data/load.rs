@@ -62,15 +62,6 @@ fn without_data(experiment: &Experiment) -> anyhow::Result<Transitions> {
     Transitions::without_data(sizes, experiment.reward).hint_of(Problem::hint)
 }
 
-/// Suspicious properties of the transitions, each a sentence with the file's name.
-pub fn warnings(paths: &[PathBuf], transitions: &Transitions) -> Vec<String> {
-    let named = |warning: &String| match paths {
-        [path] => format!("{}: {warning}", path.display()),
-        _ => warning.clone(),
-    };
-    transitions.warnings().iter().map(named).collect()
-}
-
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
@@ -108,7 +99,7 @@ mod tests {
             );
             let experiment = preset.resolve(&changes.parse().unwrap()).unwrap();
             let split = load(&[path.clone()], &experiment, begun).unwrap();
-            let warnings = warnings(&[path.clone()], &split.training);
+            let warnings = split.training.warnings();
             assert!(warnings.len() == 1 && warnings[0].contains("the longest 10"), "{warnings:?}");
             split.episodes
         };

@@ -12,6 +12,5 @@ mod load;
 mod source;
 mod transfer;
 
-pub(crate) use fetch::LocalDataset;
-pub(crate) use load::{load, warnings};
-pub(crate) use source::{Source, cache_folder, cached, hashes, made_folder, obtain, paths};
+pub(crate) use load::load;
+pub(crate) use source::{Source, cache_folder, cached, made_folder, obtain};

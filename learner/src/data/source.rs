@@ -123,18 +123,10 @@ impl Source {
     }
 }
 
-/// [Obtains](Source::obtain) each of the files.
-pub fn obtain(sources: &[Source]) -> anyhow::Result<Vec<LocalDataset>> {
-    sources.iter().map(Source::obtain).collect()
-}
-
-pub fn paths(files: &[LocalDataset]) -> Vec<PathBuf> {
-    files.iter().map(|file| file.path.clone()).collect()
-}
-
-/// SHA-256 of each file, separated by commas.
-pub fn hashes(files: &[LocalDataset]) -> String {
-    Vec::from_iter(files.iter().map(|file| &*file.sha256)).join(", ")
+/// [Obtains](Source::obtain) the files of a dataset: their paths and hashes.
+pub fn obtain(sources: &[Source]) -> anyhow::Result<(Vec<PathBuf>, Vec<String>)> {
+    let files = sources.iter().map(Source::obtain);
+    files.map(|file| file.map(|LocalDataset { path, sha256 }| (path, sha256))).collect()
 }
 
 fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {

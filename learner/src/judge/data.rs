@@ -17,7 +17,7 @@ use quad_runtime::Hint;
 use tracing::warn;
 
 use super::snapshots::Snapshot;
-use crate::data::{Source, hashes, obtain, paths};
+use crate::data::{Source, obtain};
 
 const BATCH_SIZE: usize = 256;
 /// Share of the episodes that are held out where no run has done so.
@@ -68,10 +68,10 @@ impl Data {
             [] => data.paths().into_iter().map(Source::Path).collect(),
             names => Source::parse_all(names)?,
         };
-        let files = obtain(&sources).hint(format!(
+        let (paths, hashes) = obtain(&sources).hint(format!(
             "name the data of the run {run} by --dataset; a relative path in the run is below the folder where `learner train` was started"
         ))?;
-        let (paths, sha256) = (paths(&files), hashes(&files));
+        let sha256 = hashes.join(", ");
         let recorded = data.sha256().filter(|_| !data.files.is_empty());
         if recorded.is_some_and(|recorded| recorded != sha256) {
             let names = Vec::from_iter(paths.iter().map(|path| path.to_string_lossy())).join(", ");

@@ -85,10 +85,10 @@ fn group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Value> {
             return Some(data.summary());
         }
         let name = run.config.experiment.dataset.join(", ");
-        let sha256 = data.sha256().unwrap_or_else(|| "unknown".to_owned());
         let (summary, least, most) = (data.summary(), data.min_return, data.max_return);
         let returns = format!("returns from {least:.1} to {most:.1}");
-        Some(format!("{name}: {summary}, {returns}\nSHA-256 {sha256}"))
+        let files = data.files.iter().map(|file| format!("\n{}: {file}", file.path.display()));
+        Some(format!("{name}: {summary}, {returns}{}", files.collect::<String>()))
     };
     let summary =
         |run: &RunReport| Some(format!("{}: {}", run.run, run.summary.as_ref()?.text.trim()));

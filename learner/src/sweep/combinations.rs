@@ -66,6 +66,7 @@ pub(super) fn name(combination: &Combination<'_>) -> String {
                 allowed(&Path::new(path).file_stem().unwrap_or_default().to_string_lossy())
             }
             ("task" | "method" | "algorithm" | "preset" | "dataset", Some(word)) => allowed(word),
+            ("dataset", None) => allowed(&value.to_string()),
             (_, Some(word)) => format!("{short}-{}", allowed(word)),
             (_, None) => format!("{short}{}", allowed(&value.to_string())),
         }

@@ -13,7 +13,7 @@ use rayon::ThreadPoolBuilder;
 use tracing::warn;
 
 use super::study::PlannedRun;
-use crate::data::{load, warnings};
+use crate::data::load;
 use crate::train::RunCost;
 
 /// Further configurations are assumed to cost as much as the mean of these.
@@ -41,7 +41,7 @@ impl StudyCost {
         let mut told = BTreeSet::new();
         let mut measure = |run: &PlannedRun, paths: &[PathBuf]| {
             let data = load(paths, &run.experiment, None)?;
-            for warning in warnings(paths, &data.training) {
+            for warning in data.training.warnings() {
                 if told.insert(warning.clone()) {
                     warn!("{warning}");
                 }

@@ -13,7 +13,7 @@ import sys
 import sysconfig
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from os import PathLike
@@ -90,7 +90,7 @@ def _serve_page(folder: Path, answer: SimpleQueue[str | Exception]) -> None:
 
 
 def train(
-    dataset: Dataset | str | PathLike[str] | None = None,
+    dataset: Dataset | str | PathLike[str] | Sequence[Dataset | str | PathLike[str]] = (),
     *,
     run_dir: str | PathLike[str],
     algorithm: str | None = None,
@@ -102,8 +102,8 @@ def train(
 ) -> Run:
     """Runs `learner train` to the end of training and its evaluations, and shows its progress.
 
-    dataset: an argument of `--dataset`, or a Dataset, which the run's folder keeps as a file. Without one there is no task by
-        default: `algorithm="sac", env="NAME"` learns from evaluators' episodes alone.
+    dataset: an argument of `--dataset`, or a Dataset, which the run's folder keeps as a file; or a list of these, joined in order.
+        Without one there is no task by default: `algorithm="sac", env="NAME"` learns from evaluators' episodes alone.
     run_dir: folder of the run. If it contains a run of the same configuration, that run continues.
     algorithm, steps, online_steps, normalize, task: as in `learner train --help`.
     options: any other option, with _ for -: `eval_interval=5000`, `fresh=True`. A dictionary repeats an option:
@@ -112,16 +112,15 @@ def train(
     An interrupt (Ctrl-C) stops the learner after a checkpoint, and the same call continues the run; a second one stops it at
     once. The learner also stops with this process. Raises RuntimeError with the learner's error and hint.
     """
-    if dataset is None and task == "own-data":
+    files = [dataset] if isinstance(dataset, (Dataset, str, PathLike)) else list(dataset)
+    if not files and task == "own-data":
         task = None
     own = {"task": task, "algorithm": algorithm, "steps": steps, "online_steps": online_steps, "normalize": normalize}
     own["run_dir"] = os.fspath(run_dir)
     with ExitStack() as stack:
-        if isinstance(dataset, Dataset):
-            dataset = stack.enter_context(_kept(dataset, Path(run_dir)))
+        paths = [stack.enter_context(_kept(file, Path(run_dir))) if isinstance(file, Dataset) else file for file in files]
         display = _Display()
-        named = [] if dataset is None else [f"--dataset={os.fspath(dataset)}"]
-        process = _start("train", *named, *_flags(own | options))
+        process = _start("train", *(f"--dataset={os.fspath(path)}" for path in paths), *_flags(own | options))
         error: list[str] = []
         try:
             display.follow(process, error)

@@ -3,6 +3,7 @@
 use quad_algorithms::{AgentError, Definition};
 use quad_dataset::{Normalize, RewardRule};
 use quad_policy::Precision;
+use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use toml::{Table, Value};
 
@@ -78,18 +79,11 @@ fn is_zero(share: &f64) -> bool {
     *share == 0.0
 }
 
-#[derive(Deserialize)]
-#[serde(untagged, expecting = "dataset must be a file or name, or a list of these")]
-enum Names {
-    One(String),
-    Several(Vec<String>),
-}
-
-fn read_names<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<String>, D::Error> {
-    Ok(match Names::deserialize(deserializer)? {
-        Names::One(name) => vec![name],
-        Names::Several(names) => names,
-    })
+fn read_names<'de, D: Deserializer<'de>>(source: D) -> Result<Vec<String>, D::Error> {
+    match Value::deserialize(source)? {
+        Value::String(name) => Ok(vec![name]),
+        names => names.try_into().map_err(D::Error::custom),
+    }
 }
 
 fn write_names<S: Serializer>(names: &[String], serializer: S) -> Result<S::Ok, S::Error> {

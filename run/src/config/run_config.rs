@@ -4,7 +4,9 @@ use std::path::PathBuf;
 
 use quad_dataset::DatasetFile;
 use quad_protocol::Name;
-use serde::{Deserialize, Serialize};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize};
+use toml::Table;
 
 use super::experiment::Experiment;
 use crate::counted;
@@ -36,6 +38,7 @@ impl Device {
 #[allow(missing_docs)] // The types say what each is.
 pub struct RunConfig {
     pub run: RunInfo,
+    #[serde(deserialize_with = "read_dataset")]
     pub dataset: DatasetInfo,
     pub experiment: Experiment,
 }
@@ -67,14 +70,14 @@ pub struct RunInfo {
 /// Statistics of the dataset, and its files. Without a dataset there are no files, and returns are
 /// NaN.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(from = "StoredInfo")]
+#[serde(deny_unknown_fields)]
 pub struct DatasetInfo {
     /// Number of transitions that are trained on.
     pub transitions: u64,
     /// Number of trajectories that are trained on.
     pub episodes: u64,
     /// Indices of the episodes that are kept out of training, in the order of the files.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub held_out: Vec<usize>,
     /// Smallest return of a trajectory, unscaled.
     pub min_return: f64,
@@ -83,45 +86,23 @@ pub struct DatasetInfo {
     /// Largest return of a trajectory, unscaled.
     pub max_return: f64,
     /// Mean D4RL-normalized score, where the environment has reference returns.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mean_score: Option<f64>,
     /// The files, in the order of their episodes.
     pub files: Vec<DatasetFile>,
 }
 
-/// Contents of `config.toml`, in which older runs have path and hash of one file.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct StoredInfo {
-    path: Option<PathBuf>,
-    sha256: Option<String>,
-    transitions: u64,
-    episodes: u64,
-    #[serde(default)]
-    held_out: Vec<usize>,
-    min_return: f64,
-    mean_return: f64,
-    max_return: f64,
-    mean_score: Option<f64>,
-    #[serde(default)]
-    files: Vec<DatasetFile>,
-}
-
-impl From<StoredInfo> for DatasetInfo {
-    fn from(stored: StoredInfo) -> Self {
-        let StoredInfo { path, sha256, transitions, episodes, mut files, .. } = stored;
-        files.extend(path.map(|path| DatasetFile { path, sha256, transitions, episodes }));
-        Self {
-            transitions,
-            episodes,
-            held_out: stored.held_out,
-            min_return: stored.min_return,
-            mean_return: stored.mean_return,
-            max_return: stored.max_return,
-            mean_score: stored.mean_score,
-            files,
-        }
+/// Reads what a run has learned from; an older run's path and hash are those of its one file.
+fn read_dataset<'de, D: Deserializer<'de>>(source: D) -> Result<DatasetInfo, D::Error> {
+    let mut info = Table::deserialize(source)?;
+    let mut file: Table =
+        ["path", "sha256"].iter().filter_map(|key| info.remove_entry(*key)).collect();
+    if !file.is_empty() {
+        let counts = ["transitions", "episodes"].iter();
+        file.extend(counts.filter_map(|key| Some((key.to_string(), info.get(*key)?.clone()))));
+        info.insert("files".to_owned(), vec![file].into());
     }
+    info.try_into().map_err(D::Error::custom)
 }
 
 impl DatasetInfo {

@@ -29,10 +29,7 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     departures
         .extend(definition.and_then(|definition| hyperparameters::not_given(&definition, task)));
     if let Some(theirs) = paper.dataset.first().filter(|theirs| !is_trained_on(run, theirs)) {
-        let names = match ours.dataset.is_empty() {
-            true => "not named".to_owned(),
-            false => ours.dataset.join(", "),
-        };
+        let names = ours.dataset.join(", ");
         departures.push(format!("dataset is {names}, not {theirs}"));
     }
     let (ours, paper) = (without_seed(ours), without_seed(&paper));

@@ -1,5 +1,6 @@
 use quad_dataset::{ReadOptions, Transitions, environment, inspect};
 
+use super::without_name;
 use crate::shared;
 
 /// A file of `cases`, and what its user is told in one problem, in this order; nothing if it is sound.
@@ -34,7 +35,7 @@ fn each_case_is_told_by_inspect_and_by_train() {
         let options = ReadOptions::default();
         let told = match Transitions::read(&path, &options) {
             Err(error) => vec![format!("{error}; {}", error.hint())],
-            Ok(transitions) => transitions.warnings().to_vec(),
+            Ok(transitions) => without_name(transitions.warnings(), &path),
         };
         if let Ok(inspection) = inspect(&[&path], None) {
             // A file that cannot be trained on is named.

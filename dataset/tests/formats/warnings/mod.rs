@@ -132,7 +132,13 @@ fn training_warnings(arrays: &Arrays, own: bool, normalize: Normalize) -> Vec<St
     write_as(&path, arrays, own);
     let options = ReadOptions { normalize, ..ReadOptions::default() };
     let transitions = Transitions::read(&path, &options).unwrap();
-    transitions.warnings().to_vec()
+    without_name(transitions.warnings(), &path)
+}
+
+/// Warnings without the file's name before each.
+pub(super) fn without_name(warnings: &[String], path: &Path) -> Vec<String> {
+    let name = format!("{}: ", path.display());
+    warnings.iter().map(|warning| warning.replacen(&name, "", 1)).collect()
 }
 
 /// Checks the start of the only warning, and a part of it.
