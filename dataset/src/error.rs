@@ -76,8 +76,8 @@ pub enum Problem {
     NoTransitions(usize),
     #[error("`locomotion` cannot scale the rewards: no two returns of a dataset differ")]
     SameReturns,
-    #[error("does not fit {file} ({1}: {2}, not {3})", file = .0.display())]
-    Unlike(PathBuf, &'static str, String, String),
+    #[error("does not fit {file} ({1})", file = .0.display())]
+    Unlike(PathBuf, String),
     #[error("cannot be written")]
     Write(#[source] hdf5::Error),
 }

@@ -75,7 +75,8 @@ pub(crate) fn read(
                     own != theirs && !own.is_empty() && !theirs.is_empty()
                 });
                 if let Some(((name, own), (_, theirs))) = unlike {
-                    return Err(error(Problem::Unlike(other, name, own, theirs.clone())));
+                    let difference = format!("{name}: {own}, not {theirs}");
+                    return Err(error(Problem::Unlike(other, difference)));
                 }
                 joined.extend(&recording, 0..recording.rows());
                 if joined.names == Names::default() {

@@ -145,7 +145,7 @@ impl<'a> Making<'a> {
         let mut table: Table = table(["file", "rows", "episodes", "normalized score", "D4RL's"]);
         for kind in self.kinds() {
             let path = self.path(kind);
-            let inspection = quad_dataset::inspect(&[path.clone()], Some(self.args.env));
+            let inspection = quad_dataset::inspect(&[&path], Some(self.args.env));
             let inspection = inspection.hint_of(DatasetError::hint)?;
             let score = inspection.scores.as_ref().map_or(String::new(), |scores| {
                 format!("{:.1} ± {:.1}", scores.mean_score, scores.score_std)

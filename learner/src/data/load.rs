@@ -98,7 +98,7 @@ mod tests {
                 "algorithm = 'qc'\nenvironment = 'robot'\nbatch_size = 8\nhold_out = 0.2\nseed = {seed}\nagent.chunk = 11"
             );
             let experiment = preset.resolve(&changes.parse().unwrap()).unwrap();
-            let split = load(&[path.clone()], &experiment, begun).unwrap();
+            let split = load(std::slice::from_ref(&path), &experiment, begun).unwrap();
             let warnings = split.training.warnings();
             assert!(warnings.len() == 1 && warnings[0].contains("the longest 10"), "{warnings:?}");
             split.episodes
