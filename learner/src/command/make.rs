@@ -8,7 +8,7 @@ use anyhow::{Context, anyhow};
 use clap::Parser;
 use quad_dataset::{D4rl, DatasetError};
 use quad_run::folder::RunDir;
-use quad_run::table::{Style, Table};
+use quad_run::table::Style;
 use quad_runtime::{Hint, print};
 use tracing::info;
 
@@ -86,7 +86,7 @@ impl<'a> Making<'a> {
         }
     }
 
-    /// A name tells apart all that makes another file.
+    /// Path of a file, whose name has all that makes it another.
     fn path(&self, kind: &str) -> PathBuf {
         let MakeArgs { env, seed, scale, epoch, .. } = self.args;
         let mut name = format!("{}-{kind}", env.name);
@@ -115,7 +115,7 @@ impl<'a> Making<'a> {
         super::run(&Cli::try_parse_from(words)?)
     }
 
-    /// Records a file of the policies that it is of.
+    /// Records a file, by its policies in turn.
     fn record(&self, kind: &str) -> anyhow::Result<()> {
         let snapshot = |epoch: u64| RunDir::at(&self.run).snapshot_path(EPOCH * (epoch + 1));
         let policies = match kind {
@@ -142,7 +142,8 @@ impl<'a> Making<'a> {
 
     /// Size and scores of the files, and the scores of D4RL's.
     fn table(&self) -> anyhow::Result<String> {
-        let mut table: Table = table(["file", "rows", "episodes", "normalized score", "D4RL's"]);
+        let header = ["file", "transitions", "episodes", "normalized score", "D4RL's"];
+        let mut table = table(header);
         for kind in self.kinds() {
             let path = self.path(kind);
             let inspection = quad_dataset::inspect(&[&path], Some(self.args.env));
@@ -157,8 +158,9 @@ impl<'a> Making<'a> {
                 _ => "-".to_owned(),
             };
             let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let [rows, episodes] = [inspection.transitions, inspection.episodes];
-            table.push([name, rows.to_string(), episodes.to_string(), score, theirs]);
+            let sizes = [inspection.transitions, inspection.episodes];
+            let [transitions, episodes] = sizes.map(|size| size.to_string());
+            table.push([name, transitions, episodes, score, theirs]);
         }
         let (table, folder) = (table.render(Style::Text), self.folder.display());
         Ok(format!("{table}\nin {folder}; `learner train --dataset NAME` finds them there"))

@@ -39,7 +39,7 @@ use crate::cli::{
     Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, JudgeArgs, ListArgs, PageArgs,
     PresetsArgs, ReportArgs, VerifyArgs,
 };
-use crate::data::{Source, cache_folder, cached, load};
+use crate::data::{Source, cache_folder, cached, load, made_folder};
 use crate::judge::judge;
 use crate::page;
 use crate::report::{Report, draw_all, write_html};
@@ -280,6 +280,7 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
                 let folder = cache_folder(benchmark)?;
                 folders.push(format!("{} of {}", folder.display(), benchmark.name));
             }
+            folders.push(format!("{} of `datasets make`", made_folder()?.display()));
             let (table, folders) = (table.render(Style::Text), folders.join(", "));
             print(&format!("{table}\ncache folders: {folders}"))
         }

@@ -11,9 +11,9 @@ use quad_run::config::Experiment;
 use quad_runtime::Hint;
 use toml::Value;
 
-/// Reads the transitions of files or folders for an experiment, none without a file. A run that has begun has `held_out`
-/// episodes. Fewer transitions than a batch are an error: a batch never holds one twice while there
-/// are others.
+/// Reads the transitions of files or folders for an experiment, none without a file. A run that has
+/// begun has `held_out` episodes. Fewer transitions than a batch are an error: a batch never holds
+/// one twice while there are others.
 pub fn load(
     paths: &[PathBuf],
     experiment: &Experiment,

@@ -16,6 +16,7 @@ use crate::counted;
 /// Upper bounds, far above any use; each evaluation keeps a snapshot.
 const MOST_EPISODES: u64 = 10_000;
 const MOST_BATCH: u64 = 1 << 20;
+const MOST_SIZE: u64 = 1 << 20;
 const MOST_EVALUATIONS: u64 = 1_000_000;
 /// The largest integer of TOML, in which a run's settings are saved.
 const MOST: u64 = i64::MAX as u64;
@@ -181,6 +182,9 @@ impl Experiment {
             ("episodes", self.episodes.into(), 1, MOST_EPISODES),
             ("batch_size", self.batch_size.into(), 1, MOST_BATCH),
         ])?;
+        for size in self.sizes.into_iter().flatten() {
+            check_ranges(&[("sizes", size as u64, 1, MOST_SIZE)])?;
+        }
         self.online.as_ref().map_or(Ok(()), Online::check_ranges)?;
         if self.total_steps() == 0 {
             return Err(ConfigError::new(
