@@ -216,10 +216,9 @@ def choose(values, halves, distances, count):
     return np.stack([x.mean(1) for x in numbers], 1)
 
 
-def distances(file, observations, actions):
+def distances(files, observations, actions):
     """From actions [n, candidates, a] to the nearest action of the SIMILAR recorded states that are most like the observation."""
-    with h5py.File(file) as data:
-        recorded, taken = data["observations"][:], data["actions"][:]
+    recorded, taken = (np.concatenate([h5py.File(file)[name][:] for file in files]) for name in ("observations", "actions"))
     scale = recorded.std(0)
     recorded, observations = (x[:, scale > 0] / scale[scale > 0] for x in (recorded, observations))
     similar = [np.argpartition(((recorded - x) ** 2).sum(1), SIMILAR - 1)[:SIMILAR] for x in observations]
@@ -272,7 +271,7 @@ def choice_tables(run, states, rollouts, seed):
     taken = [(states[i][0], a, seed) for i in range(len(states)) for a in actions[i] for seed in rollouts[i]]
     returns = run.returns(taken).reshape(len(states), CANDIDATES, -1)
     halves = [half.mean(2) for half in np.array_split(returns, 2, axis=2)]
-    away = distances(run.about["dataset.path"], observations, actions)
+    away = distances([file["path"] for file in run.about["dataset.files"]], observations, actions)
     return tables_of_choices({name: values for name, (_, values) in drawn.items()}, halves, away)
 
 
