@@ -44,7 +44,7 @@ struct Config {
     gamma: UnitInterval,
     /// Reward the next action's entropy in the target.
     entropy_backup: bool,
-    /// The critics' value of which the policy's loss has more.
+    /// The critics' value in the policy's loss: their mean, or the least.
     actor_q: ActorQ,
     /// Weight α of the entropy at the first step.
     temperature: Positive,
